@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-PURPOSES = ("training", "validation", "pairs", "evaluation", "simulator", "shuffle")
+PURPOSES = ("training", "validation", "pairs", "evaluation", "simulator", "shuffle", "dropout")
 
 
 def generator(seed: int, purpose: str, index: int) -> np.random.Generator:

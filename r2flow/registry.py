@@ -19,9 +19,9 @@ def did_you_mean(name: str, known: Mapping[str, Any] | list[str]) -> str:
 class Registry(Generic[T]):
     """Named values of one kind, read like the table they are.
 
-        BACKBONES = Registry("backbone", hdit=HDiT, adm_unet=ADMUNet)
-        BACKBONES["hditt"]
-        # no backbone named 'hditt'; known: adm_unet, hdit. Did you mean 'hdit'?
+    BACKBONES = Registry("backbone", hdit=HDiT, adm_unet=ADMUNet)
+    BACKBONES["hditt"]
+    # no backbone named 'hditt'; known: adm_unet, hdit. Did you mean 'hdit'?
     """
 
     def __init__(self, kind: str, **entries: T) -> None:

@@ -1,0 +1,1 @@
+"""Data sets, the loader of a run, and the DataModule that all stages share."""

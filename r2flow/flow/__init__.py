@@ -1,0 +1,1 @@
+"""Paths, times, losses, solvers: pure functions of tensors."""

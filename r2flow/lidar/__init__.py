@@ -1,0 +1,1 @@
+"""Sensors, projection, encoding, scan files: pure geometry, no learning."""

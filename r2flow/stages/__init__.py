@@ -1,0 +1,51 @@
+"""LightningModules, one for each stage, and the one place where a config becomes one."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import nn
+
+from r2flow.backbones import build_backbone
+from r2flow.errors import InputError
+from r2flow.lidar.encoding import Encoding, build_encoding
+from r2flow.lidar.sensors import Convention, Sensor, build_sensor
+from r2flow.registry import Registry, reject_unknown_options
+from r2flow.stages.rectify import RectifiedFlow
+
+STAGES = Registry("stage", rectify=RectifiedFlow)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a config describes of a model: its sensor, its encoding and its backbone."""
+
+    sensor: Sensor
+    encoding: Encoding
+    backbone: nn.Module
+
+
+def build_parts(config: Mapping[str, Any]) -> Parts:
+    """Sensor, encoding and backbone of a config with the keys `sensor`, `encoding` and `backbone`.
+
+    Raises:
+        InputError: a key is missing, a name is unknown, an option is, or the sizes do not fit together.
+    """
+    for key in ("sensor", "encoding", "backbone"):
+        if key not in config:
+            raise InputError(f"the config has no '{key}'.")
+    options = dict(config["sensor"])
+    convention: Convention = options.pop("rays", "centre")
+    reject_unknown_options("sensor", build_sensor, options)
+    sensor = build_sensor(**options)
+    encoding = build_encoding(config["encoding"], sensor)
+    rays = sensor.rays(convention)
+    return Parts(sensor, encoding, build_backbone(config["backbone"], rays, encoding.channels))
+
+
+def build_stage(config: Mapping[str, Any], backbone: nn.Module) -> RectifiedFlow:
+    """The LightningModule of a config's `stage`, around a backbone; it carries the config into its checkpoints."""
+    options = {"batch_size": config["data"]["batch_size"], "seed": config["seed"], **config["stage"]}
+    stage = STAGES.build(options, backbone)
+    stage.config = dict(config)
+    return stage

@@ -1,0 +1,96 @@
+"""The averaged weights, which are the model."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import WeightAveraging
+from torch import Tensor
+
+
+def ema_decay(step: int, warmup: int, highest: float = 0.995, power: float = 2 / 3) -> float:
+    """min(highest, 1 - (1 + n)^(-power)) with n the steps since the warm-up ended, and 0 during it.
+
+    A decay of 0 copies the weights, so the average is never that of an untrained model.
+    """
+    n = step - warmup
+    return 0.0 if n <= 0 else min(highest, 1 - (1 + n) ** -power)
+
+
+class EMA(WeightAveraging):
+    """Exponential moving average of the weights, in float32, for validation, pictures and the checkpoint.
+
+    Every `every` steps: average <- decay average + (1 - decay) weights, with the decay of `ema_decay`.
+
+    Args:
+        decay: Highest decay.
+        every: Steps between two updates.
+        warmup_steps: Steps during which the average copies the weights; None takes the stage's
+            learning-rate warm-up.
+    """
+
+    def __init__(self, decay: float = 0.995, every: int = 10, warmup_steps: int | None = None) -> None:
+        # Buffers are constants here (ray angles, frequencies): averaging them would only cost time.
+        super().__init__(use_buffers=False, avg_fn=self._average)
+        self.decay, self.every, self.warmup_steps = decay, every, warmup_steps
+        self._step = 0
+        self._raw: list[Tensor] = []
+
+    def _average(self, average: Tensor, weight: Tensor, updates: Any) -> Tensor:
+        decay = ema_decay(self._step, self.warmup_steps or 0, self.decay)
+        return average + (1 - decay) * (weight - average)
+
+    def should_update(self, step_idx: int | None = None, epoch_idx: int | None = None) -> bool:
+        if step_idx is None:
+            return False
+        self._step = step_idx
+        return step_idx % self.every == 0
+
+    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        super().setup(trainer, pl_module, stage)
+        if self.warmup_steps is None:
+            self.warmup_steps = int(getattr(pl_module, "warmup_steps", 0))
+        if self._average_model is not None:
+            # A half-precision average stalls: its steps are smaller than its spacing.
+            self._average_model.float().requires_grad_(False)
+
+    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        # Built before the module moved to its device; left behind, every update would cross the bus.
+        if self._average_model is not None and self._device is None:
+            self._average_model.to(pl_module.device)
+
+    # The base class swaps weights and average in place, which rounds a float32 average to the weights'
+    # precision; here the weights step aside and come back, and the average is never written.
+    def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if self._average_model is not None:
+            self._raw = [p.detach().clone() for p in pl_module.parameters()]
+            self._copy_average_to_current(pl_module)
+
+    def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if self._raw:
+            with torch.no_grad():
+                for weight, raw in zip(pl_module.parameters(), self._raw, strict=True):
+                    weight.copy_(raw)
+            self._raw = []
+
+    @contextmanager
+    def averaged(self, trainer: L.Trainer, pl_module: L.LightningModule) -> Iterator[None]:
+        """The module with the averaged weights in it, for the length of a block."""
+        self.on_validation_epoch_start(trainer, pl_module)
+        try:
+            yield
+        finally:
+            self.on_validation_epoch_end(trainer, pl_module)
+
+
+@contextmanager
+def averaged_weights(trainer: L.Trainer, pl_module: L.LightningModule) -> Iterator[None]:
+    """The averaged weights where the run keeps an average, else the weights as they are."""
+    average = next((c for c in trainer.callbacks if isinstance(c, EMA)), None)  # type: ignore[attr-defined]
+    if average is None:
+        yield
+    else:
+        with average.averaged(trainer, pl_module):
+            yield

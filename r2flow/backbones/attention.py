@@ -1,0 +1,264 @@
+"""Neighbourhood attention on an azimuth ring: each token attends to the window around it.
+
+Azimuth wraps, so that every window is centred. Elevation ends: at the top and bottom the window is moved
+inside, start = clamp(i - half, 0, H - rows), and always holds the same number of rows. A ring narrower than
+the window goes round more than once, and tokens met twice count twice, as in the published models.
+
+Backends, all of the same values and gradients:
+    dense    every pair of tokens and a mask: the definition, for tests and small maps
+    tiles    blocks of queries against the keys around them: plain matrix products, the best in eager mode
+    shifts   one pass for each place of the window, for torch.compile, which fuses them into one loop
+    flex     flex_attention, where its kernels exist: CUDA
+    natten   natten.na2d, where its kernels are installed: CUDA
+"""
+
+import functools
+import importlib.util
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.registry import Registry
+
+
+def neighbourhood_attention(
+    q: Tensor, k: Tensor, v: Tensor, window: tuple[int, int], wrap: bool = True, backend: str = "auto"
+) -> Tensor:
+    """softmax_{j in window(i)}(q_i . k_j) v_j.
+
+    The logits are not scaled: q and k come scaled.
+
+    Args:
+        q, k, v: (B, H, W, N, D), N heads of D channels.
+        window: Rows and columns, both odd; clamped to the rows (and without wrap the columns) there are.
+        wrap: Whether the columns are a ring; if not, windows are moved inside as the rows' are.
+        backend: A name in `BACKENDS`, or "auto" for the fastest that there is.
+
+    Returns:
+        (B, H, W, N, D).
+
+    Raises:
+        InputError: an even or empty window, no such backend, or one that cannot be had here.
+    """
+    if any(size < 1 or size % 2 == 0 for size in window):
+        raise InputError(f"the attention window must have odd sizes of at least 1, found {tuple(window)}.")
+    rows = _Axis(q.shape[1], window[0], wrap=False)
+    columns = _Axis(q.shape[2], window[1], wrap=wrap)
+    name = _fastest(q, rows, columns) if backend == "auto" else backend
+    return BACKENDS[name](q, k, v, rows, columns)
+
+
+class _Axis(NamedTuple):
+    """One axis of the map, `size` tokens of which each sees `asked` (fewer where there are not as many)."""
+
+    size: int
+    asked: int
+    wrap: bool
+
+    @property
+    def span(self) -> int:
+        return self.asked if self.wrap else min(self.asked, self.size)
+
+    def start(self, token: int) -> int:
+        """First place that the token sees; on a ring it may lie outside [0, size) and is meant modulo."""
+        first = token - self.asked // 2
+        return first if self.wrap else max(0, min(first, self.size - self.span))
+
+    def starts(self, device: torch.device) -> Tensor:
+        first = torch.arange(self.size, device=device) - self.asked // 2
+        return first if self.wrap else first.clamp(0, self.size - self.span)
+
+    def counts(self, device: torch.device) -> Tensor:
+        """How often token i (rows) sees token j (columns), (size, size)."""
+        seen = (self.starts(device)[:, None] + torch.arange(self.span, device=device)) % self.size
+        return F.one_hot(seen, self.size).sum(1)
+
+
+def _dense(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:
+    counts = torch.kron(rows.counts(q.device), columns.counts(q.device))
+    q, k, v = (x.flatten(1, 2).transpose(1, 2) for x in (q, k, v))  # (B, N, HW, D)
+    # a token seen n times adds n exp(logit): log n on the logit, -inf for the unseen
+    weights = torch.softmax(q @ k.mT + counts.to(q.dtype).log(), dim=-1)
+    return (weights @ v).transpose(1, 2).unflatten(1, (rows.size, columns.size))
+
+
+TILE = (4, 8)  # queries; its 6 x 16 keys keep 27 of 96 products, yet bigger and smaller tiles are slower
+
+
+def _tiles(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:
+    batch, _, _, heads, channels = q.shape
+    tile_h, tile_w = min(TILE[0], rows.size), min(TILE[1], columns.size)
+    tiles_h, tiles_w = -(-rows.size // tile_h), -(-columns.size // tile_w)
+    q = F.pad(q, (0, 0, 0, 0, 0, tiles_w * tile_w - columns.size, 0, tiles_h * tile_h - rows.size))
+    q = q.view(batch, tiles_h, tile_h, tiles_w, tile_w, heads, channels).permute(0, 1, 3, 5, 2, 4, 6)
+    # keys and values, (B, tiles_h, tiles_w, N, keys, D)
+    k, v = (
+        _halo(_halo(x, 1, rows, tile_h), 3, columns, tile_w).permute(0, 1, 3, 5, 2, 4, 6).flatten(4, 5) for x in (k, v)
+    )
+    mask = _tile_mask(rows, columns, (tile_h, tile_w), q.dtype, q.device)
+    weights = torch.softmax(q.flatten(4, 5) @ k.mT + mask, dim=-1)
+    out = (weights @ v).unflatten(4, (tile_h, tile_w)).permute(0, 1, 4, 2, 5, 3, 6)
+    out = out.reshape(batch, tiles_h * tile_h, tiles_w * tile_w, heads, channels)
+    return out[:, : rows.size, : columns.size]
+
+
+def _halo(x: Tensor, dim: int, axis: _Axis, tile: int) -> Tensor:
+    """The keys of each tile along `dim`, which becomes (tiles, keys of a tile)."""
+    places = _halo_places(axis, tile)
+    if not axis.wrap:
+        return torch.stack([x.narrow(dim, first, length) for first, length in places], dim)
+    first, length = places[0]
+    last = places[-1][0] + length
+    if -first <= axis.size and last <= 2 * axis.size:
+        parts = x.narrow(dim, axis.size + first, -first), x, x.narrow(dim, 0, last - axis.size)
+        ring = torch.cat(parts, dim)
+    else:  # narrower than its own halo: round it more than once
+        ring = x.index_select(dim, torch.arange(first, last, device=x.device) % axis.size)
+    return ring.unfold(dim, length, tile).movedim(-1, dim + 1)
+
+
+def _halo_places(axis: _Axis, tile: int) -> list[tuple[int, int]]:
+    """First place and number of the keys that the queries of each tile see between them."""
+    length = tile + axis.span - 1
+    if axis.wrap:
+        return [(axis.start(first), length) for first in range(0, axis.size, tile)]
+    length = min(length, axis.size)
+    return [(min(axis.start(first), axis.size - length), length) for first in range(0, axis.size, tile)]
+
+
+@functools.lru_cache(maxsize=256)
+def _tile_mask(rows: _Axis, columns: _Axis, tile: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """0 where a query of the tile sees a key of its halo, -inf elsewhere, (tiles_h, tiles_w, 1, tile, keys)."""
+    with torch.inference_mode(False):  # or a mask made while sampling could not be used in training
+        seen_h, seen_w = (_tile_sees(axis, size) for axis, size in zip((rows, columns), tile, strict=True))
+        seen = seen_h[:, None, :, None, :, None] & seen_w[None, :, None, :, None, :]
+        seen = seen.flatten(4, 5).flatten(2, 3).unsqueeze(2)
+        return torch.zeros(seen.shape, dtype=dtype).masked_fill(~seen, -torch.inf).to(device)
+
+
+def _tile_sees(axis: _Axis, tile: int) -> Tensor:
+    """Whether query i of a tile sees place j of its halo, (tiles, tile, keys); one tile stands for a ring's."""
+    places = _halo_places(axis, tile)[: 1 if axis.wrap else None]
+    seen = []
+    for index, (first, length) in enumerate(places):
+        # queries beyond the last token are padding: they see what the last token sees, and are cropped
+        tokens = [min(index * tile + i, axis.size - 1) if not axis.wrap else i for i in range(tile)]
+        starts = torch.tensor([axis.start(token) - first for token in tokens])[:, None]
+        keys = torch.arange(length)
+        seen.append((starts <= keys) & (keys < starts + axis.span))
+    return torch.stack(seen)
+
+
+def _shifts(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:
+    places = [(i, j) for i in range(rows.span) for j in range(columns.span)]
+    logits = [(q * _shift(_shift(k, 1, rows, i), 2, columns, j)).sum(-1) for i, j in places]
+    weights = torch.softmax(torch.stack(logits, dim=-1), dim=-1).unsqueeze(-2)
+    out = torch.zeros_like(q)
+    for place, (i, j) in enumerate(places):
+        out = out + weights[..., place] * _shift(_shift(v, 1, rows, i), 2, columns, j)
+    return out
+
+
+def _shift(x: Tensor, dim: int, axis: _Axis, place: int) -> Tensor:
+    """What each token sees at a place of its window: x[start(i) + place] along `dim`.
+
+    Slices, not an index: their gradient is a sum of slices, where that of an index is a scatter.
+    """
+    if axis.wrap:
+        return x.roll(axis.asked // 2 - place, dim)
+    # as many windows differ as fit into the axis; tokens at the ends share the first and the last of them
+    shared = axis.span - 1
+    top = min(axis.asked // 2, shared)
+    seen = x.narrow(dim, place, axis.size - shared)
+    first, last = seen.narrow(dim, 0, 1), seen.narrow(dim, -1, 1)
+    return torch.cat([*[first] * top, seen, *[last] * (shared - top)], dim)
+
+
+@functools.cache
+def _compiled_flex() -> Callable[..., Tensor]:
+    from torch.nn.attention.flex_attention import flex_attention
+
+    return torch.compile(flex_attention, dynamic=False)
+
+
+@functools.lru_cache(maxsize=64)
+def _flex_mask(rows: _Axis, columns: _Axis, device: torch.device):  # type: ignore[no-untyped-def]
+    from torch.nn.attention.flex_attention import create_block_mask
+
+    def sees(batch: Tensor, head: Tensor, query: Tensor, key: Tensor) -> Tensor:
+        inside = torch.ones_like(query, dtype=torch.bool)
+        places = (query // columns.size, key // columns.size), (query % columns.size, key % columns.size)
+        for axis, (i, j) in zip((rows, columns), places, strict=True):
+            start = i - axis.asked // 2
+            if not axis.wrap:
+                start = start.clamp(0, axis.size - axis.span)
+            inside = inside & ((j - start) % axis.size < axis.span)
+        return inside
+
+    tokens = rows.size * columns.size
+    with torch.inference_mode(False):
+        return create_block_mask(sees, None, None, tokens, tokens, device=str(device))
+
+
+def _flex(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:
+    if q.device.type != "cuda":
+        raise InputError(
+            f"attention backend 'flex' has kernels for CUDA only, and this tensor is on {q.device.type}: "
+            "use 'auto' or 'tiles'."
+        )
+    if columns.span > columns.size:
+        raise InputError(
+            f"attention backend 'flex' cannot see a token twice, and {columns.size} columns are fewer than "
+            f"the window's {columns.span}: use 'auto' or 'tiles'."
+        )
+    q, k, v = (x.flatten(1, 2).transpose(1, 2) for x in (q, k, v))
+    mask = _flex_mask(rows, columns, q.device)
+    out = _compiled_flex()(q, k, v, block_mask=mask, scale=1.0)
+    return out.transpose(1, 2).unflatten(1, (rows.size, columns.size))
+
+
+@functools.cache
+def _natten_kernels() -> bool:
+    if importlib.util.find_spec("natten") is None:
+        return False
+    import natten
+
+    return bool(getattr(natten, "HAS_LIBNATTEN", False))
+
+
+def _natten(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:
+    if q.device.type != "cuda" or not _natten_kernels():
+        raise InputError(
+            "attention backend 'natten' needs a CUDA device and NATTEN built with its kernels (HAS_LIBNATTEN); "
+            f"here: device {q.device.type}, kernels {'found' if _natten_kernels() else 'not found'}. "
+            "Use 'auto', which needs neither."
+        )
+    from natten import na2d
+
+    # NATTEN moves every window inside; with half a window of the ring's other side on both ends, each real
+    # token's window is centred, and the added columns are cropped
+    half = columns.asked // 2 if columns.wrap else 0
+    if half:
+        index = torch.arange(-half, columns.size + half, device=q.device) % columns.size
+        q, k, v = (x.index_select(2, index) for x in (q, k, v))
+    out = na2d(q, k, v, kernel_size=(rows.span, columns.span), scale=1.0)
+    return out[:, :, half : half + columns.size]
+
+
+Backend = Callable[[Tensor, Tensor, Tensor, _Axis, _Axis], Tensor]
+BACKENDS: Registry[Backend] = Registry(
+    "attention backend", dense=_dense, tiles=_tiles, shifts=_shifts, flex=_flex, natten=_natten
+)
+
+
+def _fastest(q: Tensor, rows: _Axis, columns: _Axis) -> str:
+    if q.device.type == "cuda":
+        if _natten_kernels() and q.dtype != torch.float64 and rows.span > 1:
+            return "natten"
+        if q.dtype != torch.float64 and columns.span <= columns.size and not torch.compiler.is_compiling():
+            return "flex"
+    return "shifts" if torch.compiler.is_compiling() else "tiles"

@@ -1,0 +1,368 @@
+"""HDiT: an hourglass of transformer blocks on image tokens (paper, figure 4), with rays for positions."""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from r2flow.backbones.attention import BACKENDS, neighbourhood_attention
+from r2flow.backbones.encodings import ENCODINGS, Encoding, Rotary, mean_rays, position_name, rotate
+from r2flow.backbones.layers import (
+    GEGLU,
+    AdaRMSNorm,
+    ExactBuffers,
+    ExactLinear,
+    RandomFourierFeatures,
+    RMSNorm,
+    at_least_float32,
+    mapping_network,
+    pair,
+    times,
+    zero_initialised,
+)
+from r2flow.errors import InputError
+
+
+class HDiT(ExactBuffers):
+    """Velocity v(t, x) by an hourglass transformer.
+
+    Tokens of patch_h x patch_w pixels; at each outer level `depths[l]` blocks of neighbourhood attention on
+    the way down and as many on the way up, 2 x 2 tokens merged between levels and the width doubled; in the
+    middle `depths[-1]` blocks of global attention. Queries and keys are rotated by the ray angles (`Rotary`).
+    Parameters carry the names of the published weights.
+
+    Args:
+        rays: Elevation and azimuth of every pixel in radians, (2, H, W).
+        in_channels: Channels C of the image.
+        base_channels: Width of the outermost level, doubled at each level further in.
+        depths: Blocks of each level, the last one the middle.
+        num_heads: Heads of each level; the middle takes the last.
+        time_channels: Width of the time embedding.
+        position: What is added to the tokens: "learnable", "fourier_features", "polar",
+            "spherical_harmonics" or "none".
+        window: Rows and columns of the attention window, odd.
+        patch: Rows and columns of a token.
+        ring: Whether the columns are a full turn.
+        dropout: Share of attention outputs and of feed-forward activations dropped in training.
+        attention: Backend of `neighbourhood_attention`.
+
+    Raises:
+        InputError: a shape, head count, window, position or backend that cannot work.
+    """
+
+    coords: Tensor
+
+    def __init__(
+        self,
+        rays: Tensor,
+        in_channels: int = 2,
+        base_channels: int = 128,
+        depths: Sequence[int] = (3, 3, 3, 3),
+        num_heads: Sequence[int] = (2, 4, 8, 16),
+        time_channels: int = 256,
+        position: str | None = "learnable",
+        window: Sequence[int] = (3, 9),
+        patch: Sequence[int] = (1, 4),
+        ring: bool = True,
+        dropout: float = 0.0,
+        attention: str = "auto",
+    ) -> None:
+        super().__init__()
+        levels = len(depths)
+        if not 1 <= levels <= len(num_heads) or min(depths) < 1:
+            raise InputError(
+                "hdit needs a depth of at least 1 and a number of heads for each level, "
+                f"found depths {list(depths)} and num_heads {list(num_heads)}."
+            )
+        if attention != "auto":
+            BACKENDS[attention]  # a wrong name is told now, not at the first call
+        self.in_channels, self.patch, self.levels = in_channels, pair(patch), levels
+        _check_shape(rays, self.patch, levels)
+        rows, columns = (size // p for size, p in zip(rays.shape[1:], self.patch, strict=True))
+        heads = [*num_heads[: levels - 1], num_heads[-1]]
+        widths = [base_channels * 2**level for level in range(levels)]
+
+        def block(level: int, local: bool) -> Block:
+            highest = max((rows // 2) >> level, 1), max((columns // 2) >> level, 1)
+            attend = (pair(window), ring, attention) if local else None
+            return Block(widths[level], heads[level], time_channels, highest, attend, dropout)
+
+        embed = RandomFourierFeatures(time_channels)
+        self.timestep_pe = nn.Sequential(embed, mapping_network(time_channels, dropout=dropout))
+        self.tokenizer = nn.Sequential(nn.Conv2d(in_channels, base_channels, self.patch, self.patch, bias=False))
+        self.spatial_pe = _position(position, (rows, columns), base_channels, dropout)
+        self.down_levels, self.up_levels = nn.ModuleDict(), nn.ModuleDict()
+        for level in range(levels - 1):
+            for side in (self.down_levels, self.up_levels):
+                blocks = [block(level, local=True) for _ in range(depths[level])]
+                side[f"level_{level}"] = nn.ModuleList(blocks)
+            self.down_levels[f"merge_{level}"] = Merge(widths[level])
+            self.up_levels[f"expand_{level}"] = Expand(widths[level])
+        self.mid_levels = nn.ModuleList([block(levels - 1, local=False) for _ in range(depths[-1])])
+        pixels = zero_initialised(nn.Linear(base_channels, math.prod(self.patch) * in_channels, bias=False))
+        self.detokenizer = nn.Sequential(RMSNorm(base_channels), pixels)
+        device = next(self.parameters()).device
+        self.register_buffer("coords", rays[None].to(device, torch.float32, copy=True))
+        self.follow_rays()
+        self.register_load_state_dict_post_hook(_follow_loaded_rays)
+
+    def forward(self, t: Tensor | float, x: Tensor) -> Tensor:
+        """Velocity (B, C, H, W) at times t, a scalar or (B,), of x (B, C, H, W)."""
+        if x.shape[1:] != (self.in_channels, *self.coords.shape[2:]):
+            expected = (self.in_channels, *self.coords.shape[2:])
+            raise InputError(f"this hdit was built for images of {expected}, found {tuple(x.shape[1:])}.")
+        condition = self.timestep_pe(times(t, x))
+        h = self.tokenizer(x.to(next(self.tokenizer.parameters()).dtype)).permute(0, 2, 3, 1)
+        if self.spatial_pe is not None:
+            h = h + self.spatial_pe().to(h.dtype)
+        skips = []
+        for level in range(self.levels - 1):
+            for block in _level(self.down_levels, level):
+                h = block(h, condition, self._table(level))
+            skips.append(h)
+            h = self.down_levels[f"merge_{level}"](h)
+        for block in self._blocks(self.levels - 1):
+            h = block(h, condition, self._table(self.levels - 1))
+        for level in reversed(range(self.levels - 1)):
+            h = self.up_levels[f"expand_{level}"](h, skips.pop())
+            for block in _level(self.up_levels, level):
+                h = block(h, condition, self._table(level))
+        return _unshuffle(self.detokenizer(h), self.patch).permute(0, 3, 1, 2).to(x.dtype)
+
+    def follow_rays(self) -> None:
+        """Compute again what derives from `coords`: rotary tables and position features, of fixed size.
+
+        They are buffers outside the state_dict, in float32. Loading a state_dict calls this.
+        """
+        for level in range(self.levels):
+            scale = 2**level
+            rays = mean_rays(self.coords, (self.patch[0] * scale, self.patch[1] * scale))
+            rope = self._blocks(level)[0].residual_attn.rope  # those of a level are equal
+            self.register_buffer(f"table_{level}", rope.table(rays), persistent=False)
+        if isinstance(self.spatial_pe, FeaturePosition):
+            cast(RayFeatures, self.spatial_pe[0]).follow(mean_rays(self.coords, self.patch))
+
+    def _table(self, level: int) -> Tensor:
+        return self.get_buffer(f"table_{level}")
+
+    def _blocks(self, level: int) -> list["Block"]:
+        if level == self.levels - 1:
+            return list(cast(Iterable[Block], self.mid_levels))
+        return [*_level(self.down_levels, level), *_level(self.up_levels, level)]
+
+
+def _level(side: nn.ModuleDict, level: int) -> Iterable["Block"]:
+    return cast(Iterable[Block], side[f"level_{level}"])
+
+
+def _follow_loaded_rays(model: HDiT, _keys: object) -> None:
+    for level in range(model.levels):
+        first, *others = (block.residual_attn.rope for block in model._blocks(level))
+        for name, buffer in first.named_buffers():
+            if not buffer.is_meta and any(not torch.equal(buffer, other.get_buffer(name)) for other in others):
+                raise InputError(f"the blocks of hdit level {level} differ in their rotary {name}; they must not.")
+    model.follow_rays()
+
+
+class LearnablePosition(nn.Module):
+    """One learned vector for each token, added to it: the absolute position embedding of the paper."""
+
+    def __init__(self, tokens: tuple[int, int], channels: int) -> None:
+        super().__init__()
+        self.embedding = nn.Parameter(nn.init.trunc_normal_(torch.empty(1, *tokens, channels), std=0.02))
+
+    def forward(self) -> Tensor:
+        return self.embedding
+
+
+class FeaturePosition(nn.Sequential):
+    """Features of the mean ray of each token through a mapping network."""
+
+    def __init__(self, name: str, tokens: tuple[int, int], channels: int, dropout: float) -> None:
+        features = RayFeatures(ENCODINGS[name](tokens), channels)
+        super().__init__(features, mapping_network(channels, linear=nn.Linear, dropout=dropout))
+
+    def forward(self) -> Tensor:  # type: ignore[override]  # its input are the rays, which it holds
+        features, mapping = self
+        return mapping(features())
+
+
+class RayFeatures(ExactBuffers):
+    """W f(rays) for fixed features f, which are computed once."""
+
+    features: Tensor
+
+    def __init__(self, embedding: Encoding, channels: int) -> None:
+        super().__init__()
+        self.embedding = embedding
+        self.linear = ExactLinear(embedding.channels, channels, bias=False)
+
+    def follow(self, rays: Tensor) -> None:
+        self.register_buffer("features", self.embedding(rays).permute(0, 2, 3, 1), persistent=False)
+
+    def forward(self) -> Tensor:
+        return self.linear(self.features).to(self.linear.weight.dtype)
+
+
+def _position(name: str | None, tokens: tuple[int, int], channels: int, dropout: float) -> nn.Module | None:
+    name = position_name(name, "learnable", "none")
+    if name == "none":
+        return None
+    if name == "learnable":
+        return LearnablePosition(tokens, channels)
+    return FeaturePosition(name, tokens, channels, dropout)
+
+
+class Block(nn.Module):
+    """x + attention(x), then x + feed-forward(x), both normed under the condition.
+
+    Args:
+        channels: Width C.
+        heads: Attention heads N.
+        condition_channels: Width of the condition.
+        highest: Highest harmonics of the rotation in elevation and azimuth.
+        local: Window, ring and backend of neighbourhood attention; None for global attention.
+        dropout: See `HDiT`.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        heads: int,
+        condition_channels: int,
+        highest: tuple[int, int],
+        local: tuple[tuple[int, int], bool, str] | None,
+        dropout: float,
+    ) -> None:
+        super().__init__()
+        self.residual_attn = Attention(channels, heads, condition_channels, highest, local, dropout)
+        self.residual_ffn = FeedForward(channels, condition_channels, dropout)
+
+    def forward(self, x: Tensor, condition: Tensor, table: Tensor) -> Tensor:
+        """x (B, H, W, C), condition (B or 1, K), table of `Rotary`."""
+        x = x + self.residual_attn(x, condition, table)
+        return x + self.residual_ffn(x, condition)
+
+
+LARGEST_LOG_SCALE = math.log(100.0)
+
+
+class Attention(nn.Module):
+    """Cosine attention: logits s (q / |q|) . (k / |k|), rotated, with a learned scale s <= 100 per head."""
+
+    def __init__(
+        self,
+        channels: int,
+        heads: int,
+        condition_channels: int,
+        highest: tuple[int, int],
+        local: tuple[tuple[int, int], bool, str] | None,
+        dropout: float,
+    ) -> None:
+        super().__init__()
+        if channels % (4 * heads):
+            raise InputError(
+                f"{channels} channels cannot be shared by {heads} heads: each needs a multiple of 4 for its rotation."
+            )
+        self.heads, self.local = heads, local
+        self.scale = nn.Parameter(torch.full((heads, 1), math.log(10.0)))
+        self.norm = AdaRMSNorm(channels, condition_channels)
+        self.qkv_proj = nn.Linear(channels, 3 * channels, bias=False)
+        self.rope = Rotary(heads, channels // heads, highest)
+        self.dropout = nn.Dropout(dropout)
+        self.out_proj = zero_initialised(nn.Linear(channels, channels, bias=False))
+
+    def forward(self, x: Tensor, condition: Tensor, table: Tensor) -> Tensor:
+        qkv = self.qkv_proj(self.norm(x, condition)).unflatten(-1, (3, self.heads, -1))
+        qk, v = qkv[..., :2, :, :], qkv[..., 2, :, :]
+        q, k = rotate(self._normalised(qk), table).to(v.dtype).unbind(-3)
+        if self.local is None:
+            out = _global_attention(q, k, v)
+        else:
+            window, ring, backend = self.local
+            out = neighbourhood_attention(q, k, v, window, ring, backend)
+        return self.out_proj(self.dropout(out.flatten(-2)))
+
+    def _normalised(self, qk: Tensor) -> Tensor:
+        """q and k, (..., N, D), each with length sqrt(s); float32, since s multiplies their rounding."""
+        qk = at_least_float32(qk)
+        scale = at_least_float32(self.scale).clamp(max=LARGEST_LOG_SCALE).exp().sqrt()
+        return qk * (scale * torch.rsqrt(qk.square().sum(-1, keepdim=True) + 1e-6))
+
+
+def _global_attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    rows, columns = q.shape[1:3]
+    q, k, v = (x.flatten(1, 2).transpose(1, 2) for x in (q, k, v))
+    return F.scaled_dot_product_attention(q, k, v, scale=1.0).transpose(1, 2).unflatten(1, (rows, columns))
+
+
+class FeedForward(nn.Module):
+    """W_2 GEGLU(W_1 ada_rms_norm(x)), three times as wide inside."""
+
+    def __init__(self, channels: int, condition_channels: int, dropout: float) -> None:
+        super().__init__()
+        self.adarms = AdaRMSNorm(channels, condition_channels)
+        self.gegelu = nn.Linear(channels, 2 * 3 * channels, bias=False)
+        self.glu = GEGLU()
+        self.dropout = nn.Dropout(dropout)
+        self.linear = zero_initialised(nn.Linear(3 * channels, channels, bias=False))
+
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+        return self.linear(self.dropout(self.glu(self.gegelu(self.adarms(x, condition)))))
+
+
+class Merge(nn.Sequential):
+    """2 x 2 tokens of C channels become one of 2C."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(Shuffle((2, 2)), nn.Linear(4 * channels, 2 * channels, bias=False))
+
+
+class Shuffle(nn.Module):
+    """(B, H p, W q, C) to (B, H, W, p q C)."""
+
+    def __init__(self, patch: tuple[int, int]) -> None:
+        super().__init__()
+        self.patch = patch
+
+    def forward(self, x: Tensor) -> Tensor:
+        p, q = self.patch
+        x = x.unflatten(2, (-1, q)).unflatten(1, (-1, p))
+        return x.permute(0, 1, 3, 2, 4, 5).flatten(3)
+
+
+def _unshuffle(x: Tensor, patch: tuple[int, int]) -> Tensor:
+    """(B, H, W, p q C) to (B, H p, W q, C)."""
+    p, q = patch
+    return x.unflatten(3, (p, q, -1)).permute(0, 1, 3, 2, 4, 5).flatten(3, 4).flatten(1, 2)
+
+
+class Expand(nn.Module):
+    """One token of 2C channels becomes 2 x 2 of C, mixed with the tokens skipped: lerp(skip, x, sigmoid(alpha))."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.alpha = nn.Parameter(torch.zeros(channels))
+        self.linear = nn.Linear(2 * channels, 4 * channels, bias=False)
+
+    def forward(self, x: Tensor, skip: Tensor) -> Tensor:
+        x = _unshuffle(self.linear(x), (2, 2))
+        return torch.lerp(skip, x.to(skip.dtype), self.alpha.sigmoid().to(skip.dtype))
+
+
+def _check_shape(rays: Tensor, patch: tuple[int, int], levels: int) -> None:
+    if rays.ndim != 3 or rays.shape[0] != 2:
+        raise InputError(f"rays must be elevation and azimuth, (2, H, W); found {tuple(rays.shape)}.")
+    merges = 2 ** (levels - 1)
+    for name, size, p in zip(("height", "width"), rays.shape[1:], patch, strict=True):
+        unit = p * merges
+        if size % unit or size == 0:
+            below = size // unit * unit
+            nearest = ", ".join(str(n) for n in (below, below + unit) if n > 0)
+            raise InputError(
+                f"{name} {size} cannot be used by hdit with {levels} levels: it must be a multiple of "
+                f"{p} (patch) x {merges} ({levels - 1} 2x merges) = {unit}; nearest: {nearest}."
+            )

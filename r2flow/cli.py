@@ -1,0 +1,162 @@
+"""r2flow VERB: what is done with scans and checkpoints from the command line."""
+
+import logging
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from r2flow.errors import InputError
+
+# Imports of torch and matplotlib stay inside the verbs: --help and a mistyped option answer at once.
+
+app = typer.Typer(
+    help="Rectified flows for LiDAR scans. Train with train.py; sample, show and measure here.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+)
+
+CheckpointOption = Annotated[
+    Path, typer.Option("--checkpoint", "-c", help="A checkpoint file or a run folder.", show_default=False)
+]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", show_default=False)]
+SensorOption = Annotated[str, typer.Option(help="Name of the sensor.")]
+SizeOption = Annotated[str | None, typer.Option(help="Rows x columns, as 64x1024; the sensor's own if left out.")]
+ProjectionOption = Annotated[str, typer.Option(help="spherical or unfolding.")]
+ConventionOption = Annotated[str, typer.Option(help="centre, or reference for the published models'.")]
+ScaleOption = Annotated[float, typer.Option(help="Value in the file that means full reflectance, often 255.")]
+
+
+@app.command(epilog="Example: r2flow sample --checkpoint runs/simulated-hdit_tiny --num 16 --steps 64 --out scans")
+def sample(
+    checkpoint: CheckpointOption,
+    out: OutOption,
+    num: Annotated[int, typer.Option(help="Number of scans.")] = 4,
+    steps: Annotated[int, typer.Option(help="Equal steps from noise to data.")] = 32,
+    seed: Annotated[int, typer.Option(help="Scan i depends on the seed and on i alone.")] = 0,
+    solver: Annotated[str, typer.Option(help="euler, midpoint, heun2, heun3, rk4, torchdiffeq:dopri5, ...")] = "euler",
+    tolerance: Annotated[float, typer.Option(help="Of an adaptive solver.")] = 1e-5,
+    format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
+    pictures: Annotated[int, typer.Option(help="Scans that get a picture.")] = 8,
+    batch_size: Annotated[int, typer.Option(help="Scans at once.")] = 1,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto",
+) -> None:
+    """Draw scans from a trained flow: point clouds, range images and pictures."""
+    from r2flow.checkpoints import load_checkpoint
+    from r2flow.reports.outputs import FORMATS, write_samples
+
+    loaded = load_checkpoint(checkpoint, device=choose_device(device))
+    formats = format.split(",") if format else [f for f in FORMATS if loaded.encoding.reflectance or f != "bin"]
+    write_samples(loaded, out, num, steps, seed, solver, formats, pictures, batch_size, tolerance)
+    seen = f", pictures in {out / 'samples.png'}" if pictures else ""
+    print(f"{num} scans ({', '.join(formats)}) in {out}{seen}")
+
+
+@app.command(epilog="Example: r2flow show scans/000000.ply velodyne/0000000100.bin --out views")
+def show(
+    files: Annotated[list[Path], typer.Argument(help="Scan files, range images (.npy), or folders of them.")],
+    out: OutOption,
+    sensor: SensorOption = "hdl64e",
+    size: SizeOption = None,
+    projection: ProjectionOption = "spherical",
+    reflectance_scale: Annotated[
+        float | None, typer.Option(help="Value in the file that means full reflectance; guessed if left out.")
+    ] = None,
+    most: Annotated[int, typer.Option(help="The most scans to draw of a folder.")] = 16,
+) -> None:
+    """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each."""
+    from r2flow.reports.pictures import save_figure, scan_figure
+    from r2flow.reports.views import open_view, scans_of
+
+    chosen = build_sized(sensor, size)
+    paths = [path for file in files for path in scans_of(file, most)]
+    for path in paths:
+        image, rays = open_view(path, chosen, projection, reflectance_scale)
+        written = save_figure(scan_figure(image, rays, path.name), out / f"{unique_stem(path, paths)}.png")
+        print(written)
+
+
+@app.command(
+    epilog="Example: r2flow project velodyne/0000000100.bin --projection unfolding --size 64x1024 --out image.npy"
+)
+def project(
+    scan: Annotated[Path, typer.Argument(help="A scan file.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The .npy to write.", show_default=False)],
+    projection: ProjectionOption = "spherical",
+    convention: ConventionOption = "centre",
+    sensor: SensorOption = "hdl64e",
+    size: SizeOption = None,
+    reflectance_scale: ScaleOption = 1.0,
+) -> None:
+    """Project a scan to a range image: float32 (2, H, W), range in metres and reflectance, 0 where missing."""
+    import numpy as np
+
+    from r2flow.files import atomic_write
+    from r2flow.reports.views import project_file
+
+    image = project_file(scan, build_sized(sensor, size), projection, convention, reflectance_scale)
+    with atomic_write(out) as file:
+        np.save(file, image)
+    returns = int((image[0] > 0).sum())
+    print(f"{out}: {image.shape[1]} x {image.shape[2]}, {returns} returns ({returns / image[0].size:.1%})")
+
+
+@app.command(epilog="Example: r2flow info runs/simulated-hdit_tiny")
+def info(
+    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file or a run folder.")],
+    json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """Say what is in a checkpoint."""
+    from r2flow.reports.contents import describe, print_contents
+
+    contents = describe(checkpoint)
+    if json:
+        import json as encoder
+
+        print(encoder.dumps(contents, indent=2))
+    else:
+        print_contents(contents)
+
+
+def build_sized(sensor: str, size: str | None) -> "Sensor":  # type: ignore[name-defined] # noqa: F821
+    """The sensor at an image size written as 64x1024."""
+    from r2flow.lidar.sensors import build_sensor
+
+    if size is None:
+        return build_sensor(sensor)
+    parts = size.lower().split("x")
+    if len(parts) != 2 or not all(part.isdigit() and int(part) > 0 for part in parts):
+        raise InputError(f"--size must be ROWSxCOLUMNS, as 64x1024; found {size!r}.")
+    return build_sensor(sensor, int(parts[0]), int(parts[1]))
+
+
+def choose_device(name: str) -> str:
+    """`auto` takes a GPU where there is one."""
+    import torch
+
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise InputError(f"--device {name}, but torch sees no GPU here; use --device cpu.")
+    return name
+
+
+def unique_stem(path: Path, paths: list[Path]) -> str:
+    """The file's stem, with its folder's name where two files share one."""
+    shared = sum(other.stem == path.stem for other in paths) > 1
+    return f"{path.parent.name}_{path.name.replace('.', '_')}" if shared else path.stem
+
+
+def main() -> None:
+    """Run a verb; what the user can mend is one line and exit code 2."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    try:
+        app()
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        sys.exit(130)

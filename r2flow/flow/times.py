@@ -1,0 +1,70 @@
+"""Where on the path to train: densities of t, each given by its inverse CDF.
+
+A time sampler maps u ~ Uniform[0, 1) to t. The uniform draw comes from outside (counter-based, one per
+image), so the time of image k depends on k alone.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.registry import Registry
+
+TimeSampler = Callable[[Tensor], Tensor]
+
+
+class Uniform:
+    """p(t) = 1, the density of 1-RF."""
+
+    def __call__(self, u: Tensor) -> Tensor:
+        return u
+
+
+class UShaped:
+    """p(t) proportional to e^(a t) + e^(a (1 - t)), a = 4 (Lee et al. 2024, as the paper uses it).
+
+    The paper prints e^(-a t) for the second term, which is not U-shaped on [0, 1]: a slip. Each branch is
+    taken half of the time; one has the inverse CDF t = ln(u (e^a - 1) + 1) / a, the other is its mirror.
+    """
+
+    def __init__(self, a: float = 4.0) -> None:
+        if not a > 0:
+            raise InputError(f"the U-shaped time density needs a > 0, found {a}.")
+        self.a = a
+
+    def __call__(self, u: Tensor) -> Tensor:
+        rising = u < 0.5
+        v = torch.where(rising, 2 * u, 2 * u - 1)
+        t = torch.log1p(v * math.expm1(self.a)) / self.a
+        # float32 can return 1 + 1e-7, which is outside the path.
+        return torch.where(rising, t, 1 - t).clamp(0, 1)
+
+
+class LogitNormal:
+    """logit(t) ~ N(mean, std^2) (Esser et al. 2024): most weight in the middle of the path."""
+
+    def __init__(self, mean: float = 0.0, std: float = 1.0) -> None:
+        self.mean, self.std = mean, std
+
+    def __call__(self, u: Tensor) -> Tensor:
+        normal = torch.special.ndtri(u.double().clamp(1e-12, 1 - 1e-12))
+        return torch.sigmoid(self.mean + self.std * normal).to(u.dtype)
+
+
+class Grid:
+    """t uniform on {0, 1/k, ..., (k-1)/k}, the times that k Euler steps visit (timestep distillation)."""
+
+    def __init__(self, k: int) -> None:
+        if k < 1:
+            raise InputError(f"a time grid needs at least one step, found k={k}.")
+        self.k = k
+
+    def __call__(self, u: Tensor) -> Tensor:
+        # u just below 1 times k can round up to k in float32.
+        return torch.floor(u * self.k).clamp(max=self.k - 1) / self.k
+
+
+TIMES = Registry("time density", uniform=Uniform, u_shaped=UShaped, logit_normal=LogitNormal, grid=Grid)

@@ -1,0 +1,142 @@
+"""Between metres and model space: what a network sees of a range image."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.lidar.projection import unproject
+from r2flow.lidar.sensors import Sensor
+from r2flow.registry import Registry
+
+# Decoding may miss a range limit by float32's rounding; within this share of it, it is the limit.
+LIMIT_TOLERANCE = 1e-5
+
+
+class LogScale:
+    """log2(r + 1) / log2(r_max + 1), the paper's eq. 4: finer near the sensor."""
+
+    channels = 1
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.scale = math.log2(sensor.max_range + 1)
+
+    def forward(self, r: Tensor) -> Tensor:
+        return torch.log2(r + 1) / self.scale
+
+    def inverse(self, y: Tensor) -> Tensor:
+        return torch.exp2(y * self.scale) - 1
+
+
+class Inverse:
+    """r_min / r, 0 where there is no return."""
+
+    channels = 1
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.min_range = sensor.min_range
+
+    def forward(self, r: Tensor) -> Tensor:
+        return torch.where(r > 0, self.min_range / r.clamp(min=1e-12), 0.0)
+
+    def inverse(self, y: Tensor) -> Tensor:
+        return torch.where(y > 0, self.min_range / y.clamp(min=1e-12), 0.0)
+
+
+class Metric:
+    """r / r_max."""
+
+    channels = 1
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.max_range = sensor.max_range
+
+    def forward(self, r: Tensor) -> Tensor:
+        return r / self.max_range
+
+    def inverse(self, y: Tensor) -> Tensor:
+        return y * self.max_range
+
+
+class Cartesian:
+    """(x, y, z) / r_max, shifted from [-1, 1] to [0, 1]; a ray without return is the sensor's origin."""
+
+    channels = 3
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.max_range = sensor.max_range
+        self.rays = sensor.rays()
+
+    def forward(self, r: Tensor) -> Tensor:
+        return (unproject(r, self.rays) / self.max_range + 1) / 2
+
+    def inverse(self, y: Tensor) -> Tensor:
+        return torch.linalg.vector_norm(2 * y - 1, dim=-3, keepdim=True) * self.max_range
+
+
+FORMATS = Registry("range format", logscale=LogScale, inverse=Inverse, metric=Metric, cartesian=Cartesian)
+
+
+class Encoding:
+    """Range images in metres to model space, [-1, 1] in every channel, and back.
+
+    Args:
+        sensor: Its range limits decide what counts as a return.
+        format: `logscale` (the paper's), `inverse`, `metric`, or `cartesian` (three channels).
+        reflectance: Whether reflectance is a channel; without it a model is of range alone.
+    """
+
+    def __init__(self, sensor: Sensor, format: str = "logscale", reflectance: bool = True) -> None:
+        self.sensor = sensor
+        self.reflectance = reflectance
+        self.format: Any = FORMATS[format](sensor)
+
+    @property
+    def channels(self) -> int:
+        return self.format.channels + int(self.reflectance)
+
+    def encode(self, image: Tensor) -> Tensor:
+        """(..., 2 or 1, H, W) in metres and reflectance of [0, 1] -> (..., channels, H, W).
+
+        A dropped ray, range 0, becomes exactly -1 (the origin, 0, under `cartesian`).
+
+        Raises:
+            InputError: reflectance is a channel of the model and the image has none.
+        """
+        y = self.format.forward(image[..., :1, :, :])
+        if self.reflectance:
+            if image.shape[-3] < 2:
+                raise InputError(
+                    "the model has a reflectance channel and the scan has none; train with encoding.reflectance=false."
+                )
+            y = torch.cat([y, image[..., 1:2, :, :]], dim=-3)
+        return 2 * y - 1
+
+    def decode(self, x: Tensor) -> Tensor:
+        """(..., channels, H, W) -> range in metres and reflectance, (..., 2 or 1, H, W).
+
+        Whatever lies outside [min_range, max_range] is a dropped ray, 0 in both; reflectance is held in [0, 1].
+        """
+        y = (x + 1) / 2
+        ranges = self.format.channels
+        near, far = self.sensor.min_range, self.sensor.max_range
+        r = self.format.inverse(y[..., :ranges, :, :])
+        returned = (r >= near * (1 - LIMIT_TOLERANCE)) & (r <= far * (1 + LIMIT_TOLERANCE))
+        zero = torch.zeros_like(r)
+        image = torch.where(returned, r.clamp(near, far), zero)
+        if self.reflectance:
+            reflectance = y[..., ranges:, :, :].clamp(0, 1)
+            image = torch.cat([image, torch.where(returned, reflectance, zero)], dim=-3)
+        return image
+
+
+def build_encoding(options: Mapping[str, Any], sensor: Sensor) -> Encoding:
+    """The encoding a config describes: `format` and `reflectance`."""
+    known = {"format", "reflectance"}
+    for key in options:
+        if key not in known:
+            raise InputError(f"encoding has no option {key!r}; it knows: {', '.join(sorted(known))}.")
+    return Encoding(sensor, **options)

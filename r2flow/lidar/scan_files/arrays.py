@@ -1,0 +1,111 @@
+"""Files that are one array: KITTI and nuScenes rows of float32 without a header, and NumPy's .npy."""
+
+import math
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from r2flow.errors import InputError
+from r2flow.lidar.scan_files.points import Points, checked_points
+
+KITTI = "KITTI rows of 4 little-endian float32 (x, y, z, reflectance)"
+NUSCENES = "nuScenes rows of 5 little-endian float32 (x, y, z, intensity, ring)"
+
+_SIGNATURES = {b"ply\n": "ply", b"ply\r": "ply", b"# .PCD": "pcd", b"VERSION": "pcd", b"\x93NUMPY": "npy"}
+
+
+def read_kitti(path: Path) -> Points:
+    """Rows of x, y, z, reflectance; see `read_points`."""
+    rows = _float_rows(path, 4, KITTI)
+    return checked_points(path, rows[:, :3], rows[:, 3], layout=KITTI)
+
+
+def read_nuscenes(path: Path) -> Points:
+    """Rows of x, y, z, intensity, ring; see `read_points`."""
+    rows = _float_rows(path, 5, NUSCENES)
+    return checked_points(path, rows[:, :3], rows[:, 3], rows[:, 4], layout=NUSCENES)
+
+
+def _float_rows(path: Path, columns: int, layout: str) -> np.ndarray:
+    content = np.fromfile(path, dtype=np.uint8)
+    _refuse_other_content(path, content[:64].tobytes(), layout)
+    width = 4 * columns
+    rows, remainder = divmod(content.size, width)
+    if remainder:
+        hint = ""
+        if content.size % 20 == 0:
+            hint = " Its size fits nuScenes' rows of 5: if it is one, pass format='pcd.bin'."
+        elif content.size % 16 == 0:
+            hint = " Its size fits KITTI's rows of 4: if it is one, pass format='bin'."
+        raise InputError(
+            f"{path} is not a whole number of {layout}: {rows} rows of {width} bytes and {remainder} bytes more. "
+            f"Is it cut short, or another layout?{hint}"
+        )
+    return content.view("<f4").reshape(rows, columns)
+
+
+def _refuse_other_content(path: Path, head: bytes, layout: str) -> None:
+    for signature, name in _SIGNATURES.items():
+        if head.startswith(signature):
+            raise InputError(
+                f"{path} is not {layout}: it begins like a .{name} file; rename it or pass format={name!r}."
+            )
+    if all(32 <= byte < 127 or byte in b"\t\r\n" for byte in head):
+        raise InputError(f"{path} is not {layout}: it is text, beginning with {head[:24].decode()!r}.")
+
+
+def write_kitti(file: IO[bytes], table: np.ndarray) -> None:
+    """Rows of x, y, z, reflectance out of a table (N, 4)."""
+    file.write(table.tobytes())
+
+
+def read_npy(path: Path) -> Points:
+    """An array (N, 3) or (N, 4) of floats; see `read_points`. Never unpickles."""
+    with path.open("rb") as file:
+        shape, fortran_order, dtype = _npy_header(path, file)
+        body = np.fromfile(file, dtype=np.uint8)
+    if dtype.kind != "f":
+        raise InputError(f"{path} holds {dtype} values, not floats: points are float (N, 3) or (N, 4).")
+    if len(shape) != 2 or shape[1] not in (3, 4):
+        raise InputError(
+            f"{path} holds an array of shape {shape}, not points: these are (N, 3) or (N, 4), "
+            f"x y z and perhaps reflectance.{_shape_hint(shape)}"
+        )
+    size = math.prod(shape) * dtype.itemsize
+    if body.size != size:
+        raise InputError(
+            f"{path} declares {shape[0]} rows of {shape[1]} {dtype}, {size} bytes, but {body.size} follow its header. "
+            "Is it damaged?"
+        )
+    array = body.view(dtype).reshape(shape, order="F" if fortran_order else "C")
+    return checked_points(path, array[:, :3], array[:, 3] if shape[1] == 4 else None)
+
+
+def _npy_header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """The declared shape, whether it is in Fortran's order, and the type.
+
+    Not `np.load`, which allocates what is declared; nor a memory map, which kills the process when
+    somebody shortens the file meanwhile.
+    """
+    try:
+        version = np.lib.format.read_magic(file)
+        if version == (1, 0):
+            return np.lib.format.read_array_header_1_0(file)
+        return np.lib.format.read_array_header_2_0(file)  # 3.0 is for field names, which points have not
+    except Exception as error:  # NumPy evaluates the header and promises no particular exception
+        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+        raise InputError(f"{path} is not a readable .npy file ({reason[:160]}). Is it damaged?") from None
+
+
+def _shape_hint(shape: tuple[int, ...]) -> str:
+    if len(shape) == 3 and shape[0] == 2:
+        return " It looks like a (2, H, W) range image: unproject it first."
+    if len(shape) == 2 and shape[0] in (3, 4):
+        return " It looks transposed."
+    return ""
+
+
+def write_npy(file: IO[bytes], table: np.ndarray) -> None:
+    """The table itself, (N, 3) or (N, 4)."""
+    np.save(file, table, allow_pickle=False)

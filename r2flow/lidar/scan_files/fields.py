@@ -1,0 +1,159 @@
+"""Named fields, which PCD and PLY share: finding x, y, z among them, and taking them out of rows."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+
+import numpy as np
+
+from r2flow.errors import InputError
+from r2flow.lidar.scan_files.points import Points, checked_points
+
+# The first name that is there wins: Ouster writes both an intensity and a calibrated reflectivity.
+ROLES: Mapping[str, tuple[str, ...]] = {
+    "x": ("x",),
+    "y": ("y",),
+    "z": ("z",),
+    "reflectance": ("intensity", "reflectance", "reflectivity", "remission", "i"),
+    "ring": ("ring",),
+}
+
+HEADER_LIMIT = 1 << 16  # bytes; a header is a few hundred, and a damaged one must not be looked for forever
+
+
+@dataclass(frozen=True)
+class Field:
+    """`count` numbers of one type under one name."""
+
+    name: str
+    dtype: np.dtype
+    count: int = 1
+
+    @property
+    def nbytes(self) -> int:
+        return self.dtype.itemsize * self.count
+
+
+def split_header(path: Path, data: bytes, last: str) -> tuple[list[list[str]], int]:
+    """The words of each line of a text header, the line that begins with `last` being its end.
+
+    Returns:
+        The lines that are not blank, `last` included, and the offset of the first byte behind them.
+
+    Raises:
+        InputError: there is no such line within the first `HEADER_LIMIT` bytes.
+    """
+    lines: list[list[str]] = []
+    start = 0
+    while (end := data.find(b"\n", start, HEADER_LIMIT)) >= 0:
+        words = data[start:end].decode("ascii", "replace").split()
+        start = end + 1
+        if words:
+            lines.append(words)
+            if words[0] == last:
+                return lines, start
+    raise InputError(f"{path} has no line {last!r} to end its header. Is it cut short, or another format?")
+
+
+def whole_number(path: Path, what: str, word: str) -> int:
+    """A count out of a header.
+
+    Raises:
+        InputError: not decimal digits, or more of them than any count has.
+    """
+    if not (word.isascii() and word.isdigit() and len(word) <= 18):
+        raise InputError(f"{path} declares {what} {word[:24]!r}, which is not a whole number. Is it damaged?")
+    return int(word)
+
+
+def point_count(path: Path, count: int) -> int:
+    """`count` itself.
+
+    Raises:
+        InputError: it is 0.
+    """
+    if not count:
+        raise InputError(f"{path} declares 0 points; leave it out, or fetch it again.")
+    return count
+
+
+def find_roles(path: Path, fields: Sequence[Field]) -> dict[str, int]:
+    """Which field holds x, y, z and, where present, reflectance and ring.
+
+    Names are compared without case and without CloudCompare's prefix `scalar_`.
+
+    Raises:
+        InputError: x, y or z is missing, a name is there twice, or a field holds several numbers.
+    """
+    names = [field.name.lower().removeprefix("scalar_") for field in fields]
+    roles: dict[str, int] = {}
+    for role, aliases in ROLES.items():
+        name = next((alias for alias in aliases if alias in names), None)
+        if name is None:
+            continue
+        index = names.index(name)
+        if names.count(name) > 1 or fields[index].count != 1:
+            raise InputError(f"{path} declares {fields[index].name!r} more than once; one number a point is needed.")
+        roles[role] = index
+    missing = [role for role in ("x", "y", "z") if role not in roles]
+    if missing:
+        found = ", ".join(field.name for field in fields)[:120] or "none"
+        raise InputError(f"{path} has no field {', '.join(missing)}; it has: {found}. Points need x, y and z.")
+    return roles
+
+
+def binary_columns(
+    payload: memoryview, count: int, fields: Sequence[Field], roles: Mapping[str, int]
+) -> dict[str, np.ndarray]:
+    """Views of the wanted columns, (count,) each, of rows that `payload` is known to hold in full."""
+    offsets = list(accumulate((field.nbytes for field in fields), initial=0))
+    rows = np.dtype(
+        {
+            "names": list(roles),
+            "formats": [fields[index].dtype for index in roles.values()],
+            "offsets": [offsets[index] for index in roles.values()],
+            "itemsize": offsets[-1],
+        }
+    )
+    table = np.frombuffer(payload, dtype=rows, count=count)
+    return {role: table[role] for role in roles}
+
+
+def text_columns(
+    path: Path, lines: Sequence[str], fields: Sequence[Field], roles: Mapping[str, int]
+) -> dict[str, np.ndarray]:
+    """The wanted columns, float64 (len(lines),) each, of lines with one point each.
+
+    Raises:
+        InputError: a word that is no number, or a line with another number of words than the fields have.
+    """
+    offsets = list(accumulate((field.count for field in fields), initial=0))
+    try:
+        # Every word is parsed, also of unwanted fields, because that is what finds a damaged line.
+        table = np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2)
+    except ValueError as error:
+        reason = str(error).split(";")[0].rstrip(".")
+        raise InputError(f"{path} has a damaged line among its points: {reason}.") from None
+    if table.shape[1] != offsets[-1]:
+        raise InputError(f"{path} has {table.shape[1]} numbers a line where its header declares {offsets[-1]}.")
+    return {role: table[:, offsets[index]] for role, index in roles.items()}
+
+
+def text_lines(path: Path, payload: bytes) -> list[str]:
+    """The lines of a text body that are not blank.
+
+    Raises:
+        InputError: bytes that are not ASCII.
+    """
+    try:
+        return [line for line in payload.decode("ascii").split("\n") if line.strip()]
+    except UnicodeDecodeError:
+        raise InputError(f"{path} declares text but holds other bytes. Is it damaged, or binary?") from None
+
+
+def column_points(path: Path, columns: Mapping[str, np.ndarray]) -> Points:
+    """Points from columns by role, checked."""
+    with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, and so dropped
+        xyz = np.stack([np.asarray(columns[axis], dtype=np.float32) for axis in ("x", "y", "z")], axis=1)
+    return checked_points(path, xyz, columns.get("reflectance"), columns.get("ring"))

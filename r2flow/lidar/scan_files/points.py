@@ -1,0 +1,134 @@
+"""Points as a scan file gave them, and the checks that tell a scan from something else."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from r2flow.errors import InputError
+
+# No LiDAR reaches 10 km, and none returns from within a millimetre: bytes read in the wrong order or
+# width land beyond these limits nearly everywhere, because they move the exponent of a float.
+FARTHEST = 1e4
+NEAREST = 1e-3
+SAMPLE = 4096  # rows that are looked at
+
+_OTHER_LAYOUTS = "Is it big-endian, float64, text, or another row layout?"
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """The N points of one scan, in the file's order.
+
+    Attributes:
+        xyz: Coordinates in metres, (N, 3), float32, sensor frame: x ahead, y left, z up.
+        reflectance: As stored, (N,), float32, not rescaled; None when the file has none.
+        ring: Number of the beam, (N,), uint16; None when the file has none.
+        dropped: Rows that were left out because a coordinate or the reflectance was NaN or infinite.
+    """
+
+    xyz: np.ndarray
+    reflectance: np.ndarray | None = None
+    ring: np.ndarray | None = None
+    dropped: int = 0
+
+
+def checked_points(
+    path: Path,
+    xyz: np.ndarray,
+    reflectance: np.ndarray | None = None,
+    ring: np.ndarray | None = None,
+    layout: str | None = None,
+) -> Points:
+    """Drop what is not finite, refuse what is not a scan.
+
+    Args:
+        path: The file, for messages.
+        xyz: Coordinates in metres, (N, 3), any number type.
+        reflectance: (N,), any number type, or None.
+        ring: (N,), any number type, or None.
+        layout: The row that was assumed, where the file has no header to say so. Such a file is
+            also refused for a majority of rows that are not finite, or for negative reflectance.
+
+    Raises:
+        InputError: no point, no finite point, or values that no LiDAR measures.
+    """
+    if not len(xyz):
+        raise InputError(f"{path} is well-formed but holds no points; leave it out, or fetch it again.")
+    total = len(xyz)
+    with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, and so dropped
+        # Copied, since these may be views of a file's bytes, which cannot be written to.
+        xyz = np.array(xyz, dtype=np.float32, order="C")
+        reflectance = None if reflectance is None else np.array(reflectance, dtype=np.float32)
+    if not (_all_finite(xyz) and (reflectance is None or _all_finite(reflectance))):
+        keep = np.isfinite(xyz).all(axis=1)
+        keep &= True if reflectance is None else np.isfinite(reflectance)
+        xyz = xyz[keep]
+        reflectance = None if reflectance is None else reflectance[keep]
+        ring = None if ring is None else ring[keep]
+    if not len(xyz):
+        raise InputError(
+            f"{path} holds no finite point: each of its {total} rows has a coordinate or reflectance that "
+            "is NaN or infinite; was it written by something that failed?"
+        )
+    dropped = total - len(xyz)
+    _refuse_implausible(path, xyz, layout)
+    if layout is not None:
+        _refuse_wrong_layout(path, reflectance, dropped, total, layout)
+    return Points(xyz, reflectance, None if ring is None else _whole_rings(path, ring), dropped)
+
+
+def _all_finite(values: np.ndarray) -> bool:
+    # Two reductions, no temporary: NaN and infinity both survive a minimum and a maximum.
+    with np.errstate(invalid="ignore"):
+        return bool(np.isfinite(values.min()) and np.isfinite(values.max()))
+
+
+def _refuse_implausible(path: Path, xyz: np.ndarray, layout: str | None) -> None:
+    if not xyz.any():
+        raise InputError(f"{path} holds {len(xyz)} points, all at (0, 0, 0): no ray returned. Is it whole?")
+    # A wrong layout is wrong all over, so that some thousand rows tell; all of them would cost as much
+    # time as reading the file.
+    size = np.abs(xyz[:: max(1, len(xyz) // SAMPLE)])
+    largest = np.maximum(np.maximum(size[:, 0], size[:, 1]), size[:, 2])
+    largest = largest[largest > 0]  # an organised scan keeps rays without return as (0, 0, 0)
+    returns = len(largest)
+    far = np.count_nonzero(largest > FARTHEST)
+    near = np.count_nonzero(largest < NEAREST)
+    # A twentieth, not one: a few flipped bits must not cost the scan, and the projection drops them.
+    # A file of float64 read as float32 has a third of its rows out there, so the margin is wide.
+    if far <= returns / 20 and near <= returns / 2:
+        return
+    found = f"of {returns} points, {far} lie beyond {FARTHEST:g} m and {near} within {NEAREST:g} m"
+    if layout is None:
+        raise InputError(
+            f"{path} does not look like one scan: {found}. Is it damaged, or are its coordinates not metres "
+            "in the sensor's frame (millimetres, a map's frame)?"
+        )
+    raise InputError(f"{path} does not look like {layout}: {found}. {_OTHER_LAYOUTS}")
+
+
+def _refuse_wrong_layout(path: Path, reflectance: np.ndarray | None, dropped: int, total: int, layout: str) -> None:
+    # Rows of three or five floats read as four put coordinates into the reflectance, and half of
+    # these are negative.
+    negative = 0 if reflectance is None else np.count_nonzero(reflectance < 0)
+    if dropped > total / 2:
+        found = f"{dropped} of {total} rows are NaN or infinite"
+    elif negative > (total - dropped) / 20:
+        found = f"{negative} of {total - dropped} reflectances are negative"
+    else:
+        return
+    raise InputError(f"{path} does not look like {layout}: {found}. {_OTHER_LAYOUTS}")
+
+
+def _whole_rings(path: Path, ring: np.ndarray) -> np.ndarray:
+    """Ring numbers as uint16, (N,), whatever the type they were stored in."""
+    with np.errstate(invalid="ignore"):
+        whole = (ring >= 0) & (ring <= np.iinfo(np.uint16).max) & (ring == np.floor(ring))
+    if not whole.all():
+        first = int(np.argmin(whole))
+        raise InputError(
+            f"{path} has a ring number that is none: {ring[first]!s} at point {first}; rings are whole and "
+            "from 0 to 65535. Is it damaged, or another layout?"
+        )
+    return ring.astype(np.uint16)

@@ -1,0 +1,175 @@
+"""Scans as pictures: range, reflectance, bird's-eye view, 3-D perspective."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from r2flow.files import atomic_write
+from r2flow.lidar.projection import image_to_points
+
+BACKGROUND, FOREGROUND = "#101418", "#d8dee4"
+VIEW = 50.0  # metres shown to each side in the bird's-eye view
+HEIGHTS = (-2.2, 3.0)  # metres over which height is coloured, sensor frame
+
+
+def scan_figure(image: np.ndarray, rays: Tensor, title: str = "") -> Figure:
+    """One scan on a page.
+
+    Args:
+        image: Range in metres and reflectance, (2 or 1, H, W).
+        rays: Elevation and azimuth in radians, (2, H, W).
+    """
+    figure = _figure(13, 8.6)
+    strips = len(image)
+    grid = figure.add_gridspec(
+        strips + 1, 2, height_ratios=[1] * strips + [5.2], hspace=0.28, wspace=0.06,
+        left=0.03, right=0.97, top=0.93, bottom=0.03, width_ratios=[1, 1.45],
+    )  # fmt: skip
+    draw_range(figure.add_subplot(grid[0, :]), image)
+    if strips > 1:
+        draw_reflectance(figure.add_subplot(grid[1, :]), image)
+    xyz, _ = image_to_points(image, rays)
+    draw_birds_eye(figure.add_subplot(grid[strips, 0]), xyz)
+    draw_perspective(figure.add_subplot(grid[strips, 1]), xyz)
+    returns = int((image[0] > 0).sum())
+    share = returns / image[0].size
+    figure.suptitle(
+        f"{title}   {image.shape[1]} x {image.shape[2]}, {returns:,} returns ({share:.0%})".strip(),
+        color=FOREGROUND, fontsize=11, x=0.03, ha="left",
+    )  # fmt: skip
+    return figure
+
+
+def contact_sheet(images: Sequence[np.ndarray], rays: Tensor, titles: Sequence[str] = ()) -> Figure:
+    """Several scans under each other: their strips on the left, bird's-eye view and perspective on the right."""
+    rows = len(images)
+    figure = _figure(15, 2.5 * rows)
+    grid = figure.add_gridspec(
+        rows, 3, width_ratios=[2.6, 0.9, 1.3], hspace=0.12, wspace=0.03,
+        left=0.01, right=0.99, top=1 - 0.3 / (2.5 * rows), bottom=0.01,
+    )  # fmt: skip
+    for row, image in enumerate(images):
+        strips = grid[row, 0].subgridspec(len(image), 1, hspace=0.16)
+        axes = figure.add_subplot(strips[0])
+        draw_range(axes, image, label=row == 0)
+        if row < len(titles):
+            axes.text(
+                0.004, 0.94, titles[row], transform=axes.transAxes, va="top", fontsize=8, color="white",
+                bbox={"facecolor": BACKGROUND, "edgecolor": "none", "alpha": 0.7, "pad": 1.5},
+            )  # fmt: skip
+        if len(image) > 1:
+            draw_reflectance(figure.add_subplot(strips[1]), image, label=row == 0)
+        xyz, _ = image_to_points(image, rays)
+        draw_birds_eye(figure.add_subplot(grid[row, 1]), xyz, label=row == 0)
+        draw_perspective(figure.add_subplot(grid[row, 2]), xyz, label=row == 0)
+    return figure
+
+
+def loss_figure(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+    """Loss against optimiser step; each curve is (steps, values), a long noisy one also smoothed."""
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for colour, (name, (steps, values)) in zip(("C0", "C1", "C2"), curves.items(), strict=False):
+        long = len(values) > 100
+        axes.plot(steps, values, color=colour, alpha=0.25 if long else 1, lw=1, marker="" if long else "o", ms=3,
+                  label=None if long else name)  # fmt: skip
+        if long:
+            width = max(len(values) // 50, 5)
+            smooth = np.convolve(values, np.ones(width) / width, mode="valid")
+            axes.plot(steps[width - 1 :], smooth, color=colour, lw=1.8, label=f"{name} (mean of {width})")
+    axes.set(xlabel="optimiser step", ylabel="loss", yscale="log")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    return figure
+
+
+def draw_range(axes: Any, image: np.ndarray, label: bool = True) -> None:
+    """Range on a logarithmic colour scale, dropped rays black."""
+    r = image[0]
+    shown = np.ma.masked_where(r <= 0, np.log(np.maximum(r, 1e-3)))
+    axes.imshow(
+        shown, cmap=_colours("turbo_r"), vmin=np.log(2), vmax=np.log(80), aspect="auto", interpolation="nearest"
+    )
+    _strip(axes, "range" if label else "")
+
+
+def draw_reflectance(axes: Any, image: np.ndarray, label: bool = True) -> None:
+    """Reflectance of [0, 1] in greys, its square root shown, dropped rays black."""
+    shown = np.ma.masked_where(image[0] <= 0, np.sqrt(np.clip(image[1], 0, 1)))
+    axes.imshow(shown, cmap=_colours("cividis"), vmin=0, vmax=0.9, aspect="auto", interpolation="nearest")
+    _strip(axes, "reflectance" if label else "")
+
+
+def draw_birds_eye(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
+    """Points from above, driving direction upwards, coloured by height."""
+    near = np.abs(xyz[:, :2]).max(axis=1) < VIEW if len(xyz) else np.zeros(0, bool)
+    x, y, z = xyz[near].T if len(xyz) else np.zeros((3, 0))
+    axes.scatter(-y, x, c=z, s=_dot(len(x)), cmap="turbo", vmin=HEIGHTS[0], vmax=HEIGHTS[1], lw=0, rasterized=True)
+    axes.set(xlim=(-VIEW, VIEW), ylim=(-VIEW, VIEW), aspect="equal")
+    axes.plot(0, 0, marker="^", color="white", ms=4)
+    _strip(axes, f"bird's-eye view, {2 * VIEW:.0f} m" if label else "")
+
+
+def draw_perspective(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
+    """Points from behind and above the sensor, looking ahead, coloured by height."""
+    # A pinhole camera 16 m behind and 9 m above the sensor, pitched down: x' right, y' up, depth ahead.
+    eye, pitch = np.array([-16.0, 0.0, 9.0]), np.deg2rad(18)
+    ahead = np.array([np.cos(pitch), 0, -np.sin(pitch)])
+    up = np.array([np.sin(pitch), 0, np.cos(pitch)])
+    relative = xyz - eye
+    depth = relative @ ahead
+    front = depth > 3
+    relative, depth, z = relative[front], depth[front], xyz[front, 2]
+    order = np.argsort(-depth)
+    u, v = (-relative[:, 1] / depth)[order], (relative @ up / depth)[order]
+    size = np.clip(14 / depth[order], 0.15, 2.2) * np.sqrt(30_000 / max(len(xyz), 1))
+    axes.scatter(u, v, c=z[order], s=size, cmap="turbo", vmin=HEIGHTS[0], vmax=HEIGHTS[1], lw=0, rasterized=True)
+    axes.set(xlim=(-0.95, 0.95), ylim=(-0.52, 0.42))
+    _strip(axes, "perspective" if label else "")
+
+
+def save_figure(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
+    """Write a PNG, whole or not at all."""
+    path = Path(path)
+    with atomic_write(path) as file:
+        figure.savefig(file, format="png", dpi=dpi, facecolor=figure.get_facecolor())
+    return path
+
+
+def figure_pixels(figure: Figure, dpi: int = 80) -> np.ndarray:
+    """The figure as (height, width, 3) uint8."""
+    figure.set_dpi(dpi)
+    canvas = figure.canvas
+    assert isinstance(canvas, FigureCanvasAgg)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), facecolor=BACKGROUND)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _colours(name: str) -> Any:
+    from matplotlib import colormaps
+
+    return colormaps[name].with_extremes(bad="black")
+
+
+def _dot(points: int) -> float:
+    return float(np.clip(20_000 / max(points, 1), 0.25, 3.0))
+
+
+def _strip(axes: Any, title: str) -> None:
+    axes.set(xticks=[], yticks=[], facecolor="black")
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    if title:
+        axes.set_title(title, color=FOREGROUND, fontsize=8, loc="left", pad=3)

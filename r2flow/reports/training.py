@@ -1,0 +1,69 @@
+"""The end of a run: its curve, its samples, and where everything is."""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r2flow.checkpoints import find_checkpoint, load_checkpoint
+from r2flow.reports.outputs import write_samples
+
+Curve = tuple[np.ndarray, np.ndarray]
+
+
+def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/loss")) -> dict[str, Curve]:
+    """Logged values against optimiser steps, (steps, values) by name.
+
+    Every resumption logs into a folder of its own; where two of them logged one step, the later counts.
+    """
+    values: dict[str, dict[int, float]] = {name: {} for name in names}
+    folders = Path(run, "metrics").glob("version_*/metrics.csv")
+    for path in sorted(folders, key=lambda p: int(p.parent.name.split("_")[1])):
+        with path.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                for name in names:
+                    if row.get(name):
+                        # Lightning logs the number of the step that was being taken.
+                        values[name][int(row["step"]) + 1] = float(row[name])
+    curves = {}
+    for name, points in values.items():
+        if points:
+            steps = sorted(points)
+            curves[name] = (np.array(steps), np.array([points[step] for step in steps]))
+    return curves
+
+
+def finish(run: str | Path, samples: Mapping[str, Any], seed: int) -> None:
+    """Draw the loss curve and a few scans of a finished run, and say where everything lies and what comes next."""
+    from r2flow.reports.pictures import loss_figure, save_figure
+
+    run = Path(run)
+    curves = read_curves(run)
+    if curves:
+        save_figure(loss_figure(curves), run / "loss.png")
+    path = find_checkpoint(run)
+    checkpoint = load_checkpoint(path)
+    out = run / "samples"
+    formats = ("ply", "bin", "npy") if checkpoint.encoding.reflectance else ("ply", "npy")
+    write_samples(
+        checkpoint, out, samples["num"], samples["steps"], seed, samples["method"], formats,
+        pictures=samples["num"],
+    )  # fmt: skip
+    for name, (steps, values) in curves.items():
+        tenth = max(len(values) // 10, 1)
+        print(f"{name}: {values[:tenth].mean():.4f} at the start, {values[-tenth:].mean():.4f} at step {steps[-1]}")
+    print(
+        f"""
+checkpoint    {path}
+pictures      {out / "samples.png"} and one page a scan beside it; during training: {run / "pictures"}
+point clouds  {out / "000000.ply"} ...
+loss curve    {run / "loss.png"}; tensorboard --logdir {run / "tensorboard"}
+
+next
+  r2flow sample --checkpoint {run} --num 16 --steps 64 --seed 1 --out {run / "more"}
+  r2flow show {out / "000000.ply"} --out {run / "views"}
+  python train.py data=kitti_raw data.root=FOLDER backbone=hdit_small""",
+        flush=True,
+    )

@@ -1,0 +1,110 @@
+"""A run's folder: what it holds, and whether a command may go on in it."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from r2flow.checkpoints import checkpoints_of, read_checkpoint
+from r2flow.errors import InputError
+from r2flow.files import atomic_write
+
+CONFIG = "config.yaml"
+
+# What may differ when a run goes on: where and how it computes, not what.
+FREE = (
+    "run_dir",
+    "name",
+    "loggers",
+    "samples",
+    "callbacks.pictures",
+    "callbacks.progress",
+    "callbacks.checkpoint",
+    "data.root",
+    "data.validation.data.root",
+    "data.workers",
+    "data.memory_gib",
+    "trainer.accelerator",
+    "trainer.strategy",
+    "trainer.devices",
+    "trainer.num_nodes",
+    "trainer.accumulate_grad_batches",
+    "trainer.precision",
+    "trainer.default_root_dir",
+    "trainer.enable_progress_bar",
+    "trainer.log_every_n_steps",
+    "trainer.max_time",
+    "trainer.profiler",
+    "trainer.val_check_interval",
+)
+
+
+def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """('a.b', value) for every leaf of a nested mapping."""
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            yield from flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _is_free(key: str) -> bool:
+    return any(key == free or key.startswith(f"{free}.") for free in FREE)
+
+
+def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """The keys, with both values, in which a command departs from the run that it would go on with."""
+    before, now = dict(flatten(old)), dict(flatten(new))
+    return [
+        f"{key}={before.get(key)} there, {now.get(key)} here"
+        for key in sorted(before.keys() | now.keys())
+        if before.get(key) != now.get(key) and not _is_free(key)
+    ]
+
+
+def read_config(run: str | Path) -> dict[str, Any] | None:
+    """The config that a run folder was begun with, or None."""
+    path = Path(run, CONFIG)
+    return yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+
+def write_config(run: str | Path, config: Mapping[str, Any]) -> None:
+    with atomic_write(Path(run, CONFIG), "w") as file:
+        yaml.safe_dump(dict(config), file, sort_keys=False)
+
+
+def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
+    """Enter a run folder: the newest whole checkpoint to go on from, or None where a run begins.
+
+    Raises:
+        InputError: the folder holds a run of another config.
+    """
+    old = read_config(run)
+    if old is None:
+        write_config(run, config)
+        return None
+    differing = contradictions(old, config)
+    newest = _newest_whole(run)
+    if not differing:
+        return newest
+    if newest is None:  # nothing has been learned there yet
+        write_config(run, config)
+        return None
+    more = f" (and {len(differing) - 3} more)" if len(differing) > 3 else ""
+    raise InputError(
+        f"{run} holds a run of another config: {'; '.join(differing[:3])}{more}. "
+        "Give the same command to go on with it, or name=OTHER for a new one."
+    )
+
+
+def _newest_whole(run: str | Path) -> Path | None:
+    import logging
+
+    for path in checkpoints_of(run):
+        try:
+            read_checkpoint(path)
+            return path
+        except InputError as error:
+            logging.getLogger(__name__).warning("%s Going on from the one before.", error)
+    return None

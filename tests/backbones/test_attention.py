@@ -1,0 +1,113 @@
+"""Neighbourhood attention: the definition by loops, and every backend against the dense one."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from r2flow.backbones.attention import BACKENDS, neighbourhood_attention
+from r2flow.errors import InputError
+
+EVERYWHERE = ["tiles", "shifts"]  # flex and natten need CUDA kernels
+# (rows, columns, window): tiled evenly or not, rings narrower than the window, fewer rows than the window
+MAPS = [
+    (8, 24, (3, 9)),
+    (4, 8, (3, 9)),
+    (9, 19, (3, 9)),
+    (7, 15, (5, 7)),
+    (5, 4, (3, 9)),
+    (6, 1, (3, 9)),
+    (2, 16, (3, 9)),
+    (1, 3, (5, 9)),
+    (3, 9, (3, 9)),
+    (5, 6, (1, 1)),
+]
+
+
+def qkv(rows: int, columns: int, batch: int = 2, heads: int = 2, channels: int = 4) -> tuple[Tensor, ...]:
+    generator = torch.Generator().manual_seed(rows * 100 + columns)
+    shape = (batch, rows, columns, heads, channels)
+    return tuple(torch.randn(shape, generator=generator, dtype=torch.float64) for _ in range(3))
+
+
+def by_loops(q: Tensor, k: Tensor, v: Tensor, window: tuple[int, int], wrap: bool) -> Tensor:
+    """The definition, one token at a time."""
+    _, rows, columns, _, _ = q.shape
+    height, width = min(window[0], rows), window[1] if wrap else min(window[1], columns)
+    out = torch.empty_like(q)
+    for i in range(rows):
+        top = max(0, min(i - window[0] // 2, rows - height))
+        for j in range(columns):
+            left = j - window[1] // 2 if wrap else max(0, min(j - window[1] // 2, columns - width))
+            seen = [(a, b % columns) for a in range(top, top + height) for b in range(left, left + width)]
+            keys = torch.stack([k[:, a, b] for a, b in seen], dim=-2)  # (B, N, seen, D)
+            values = torch.stack([v[:, a, b] for a, b in seen], dim=-2)
+            weights = torch.softmax((q[:, i, j, :, None] * keys).sum(-1), dim=-1)
+            out[:, i, j] = (weights[..., None] * values).sum(-2)
+    return out
+
+
+@pytest.mark.parametrize("wrap", [True, False])
+@pytest.mark.parametrize(("rows", "columns", "window"), MAPS)
+def test_dense_is_the_definition(rows, columns, window, wrap):
+    q, k, v = qkv(rows, columns)
+    dense = neighbourhood_attention(q, k, v, window, wrap, backend="dense")
+    torch.testing.assert_close(dense, by_loops(q, k, v, window, wrap), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("wrap", [True, False])
+@pytest.mark.parametrize(("rows", "columns", "window"), MAPS)
+@pytest.mark.parametrize("backend", EVERYWHERE)
+def test_backends_agree_with_dense_in_value_and_gradient(backend, rows, columns, window, wrap):
+    inputs = [x.requires_grad_() for x in qkv(rows, columns)]
+    weights = torch.randn(inputs[0].shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    results = []
+    for name in ("dense", backend):
+        out = neighbourhood_attention(*inputs, window, wrap, backend=name)
+        results.append([out, *torch.autograd.grad((out * weights).sum(), inputs)])
+    for expected, found in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("columns", [8, 5])
+@pytest.mark.parametrize("backend", ["dense", *EVERYWHERE])
+def test_gradcheck(backend, columns):
+    inputs = [x.requires_grad_() for x in qkv(3, columns, batch=1, channels=2)]
+    assert torch.autograd.gradcheck(lambda *x: neighbourhood_attention(*x, (3, 7), backend=backend), inputs)
+
+
+@pytest.mark.parametrize("backend", ["dense", *EVERYWHERE, "auto"])
+def test_a_rolled_ring_gives_a_rolled_output(backend):
+    q, k, v = qkv(4, 16)
+    out = neighbourhood_attention(q, k, v, (3, 9), backend=backend)
+    rolled = neighbourhood_attention(*(x.roll(5, 2) for x in (q, k, v)), (3, 9), backend=backend)
+    torch.testing.assert_close(rolled, out.roll(5, 2), rtol=0, atol=1e-13)
+
+
+def test_a_mask_made_while_sampling_serves_training():
+    q, k, v = qkv(6, 12)
+    with torch.inference_mode():
+        neighbourhood_attention(q, k, v, (3, 5), backend="tiles")
+    neighbourhood_attention(q.requires_grad_(), k, v, (3, 5), backend="tiles").sum().backward()
+    assert q.grad is not None
+
+
+@pytest.mark.parametrize(
+    ("backend", "message"),
+    [
+        ("tile", "no attention backend named 'tile'.*Did you mean 'tiles'"),
+        ("flex", "'flex' has kernels for CUDA only.*cpu"),
+        ("natten", "'natten' needs a CUDA device and NATTEN built with its kernels"),
+    ],
+)
+def test_a_backend_that_cannot_be_had_says_why(backend, message):
+    with pytest.raises(InputError, match=message):
+        neighbourhood_attention(*qkv(4, 8), (3, 9), backend=backend)
+
+
+def test_an_even_window_is_refused():
+    with pytest.raises(InputError, match=r"odd sizes.*\(4, 9\)"):
+        neighbourhood_attention(*qkv(4, 8), (4, 9))
+
+
+def test_every_backend_is_tested_or_needs_a_gpu():
+    assert set(BACKENDS) == {"dense", *EVERYWHERE, "flex", "natten"}

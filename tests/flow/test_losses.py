@@ -1,0 +1,56 @@
+import math
+
+import pytest
+import torch
+
+from r2flow.flow.losses import LOSSES, mse, pseudo_huber, pseudo_huber_elementwise
+
+
+def test_the_paper_s_pseudo_huber_is_per_sample():
+    v, u = torch.randn(3, 2, 8, 16, dtype=torch.float64), torch.randn(3, 2, 8, 16, dtype=torch.float64)
+    d = 2 * 8 * 16
+    c = 0.00054 * math.sqrt(d)
+    expected = (((v - u) ** 2).sum((1, 2, 3)) + c**2).sqrt() - c  # eq. 3
+    torch.testing.assert_close(pseudo_huber(v, u).double() * math.sqrt(d), expected, rtol=1e-5, atol=0)
+
+
+def test_the_reference_pseudo_huber_is_per_element(shared):
+    case = torch.load(shared / "oracle" / "training.pt", weights_only=False)["pseudo_huber"]
+    torch.testing.assert_close(pseudo_huber_elementwise(case["v"], case["u"]).mean(), case["loss"], rtol=1e-6, atol=0)
+    torch.testing.assert_close(pseudo_huber_elementwise(case["v2"], case["u2"]).mean(), case["loss2"], rtol=1e-6, atol=0)
+    torch.testing.assert_close(mse(case["v2"], case["u2"]).mean(), case["mse2"], rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("name", list(LOSSES))
+class TestEveryLoss:
+    def test_is_zero_with_zero_gradient_where_the_estimate_is_right(self, name):
+        v = torch.randn(2, 2, 4, 8, requires_grad=True)
+        loss = LOSSES[name](v, v.detach())
+        loss.sum().backward()
+        assert loss.tolist() == [0, 0]
+        assert v.grad.abs().max() == 0
+
+    def test_has_one_value_per_sample_and_they_are_independent(self, name):
+        v, u = torch.randn(3, 2, 4, 8), torch.randn(3, 2, 4, 8)
+        together = LOSSES[name](v, u)
+        alone = torch.cat([LOSSES[name](v[i : i + 1], u[i : i + 1]) for i in range(3)])
+        torch.testing.assert_close(together, alone, rtol=1e-6, atol=0)
+
+    @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+    def test_is_finite_at_large_residuals_of_half_precision(self, name, dtype):
+        v = torch.full((1, 2, 4, 8), 3e4, dtype=dtype, requires_grad=True)
+        loss = LOSSES[name](v, torch.zeros(1, 2, 4, 8))
+        loss.sum().backward()
+        assert loss.isfinite().all()
+        assert v.grad.isfinite().all()
+
+    def test_gradient_is_that_of_finite_differences(self, name):
+        # float32 inside: differences over 1e-2 of a smooth function, compared to a percent.
+        v, u = torch.randn(1, 1, 2, 2), torch.randn(1, 1, 2, 2)
+        v.requires_grad_()
+        (gradient,) = torch.autograd.grad(LOSSES[name](v, u).sum(), v)
+        h = torch.zeros_like(v)
+        h[0, 0, 1, 1] = 1e-2
+        with torch.no_grad():
+            difference = (LOSSES[name](v + h, u) - LOSSES[name](v - h, u)).item() / 2e-2
+        assert gradient[0, 0, 1, 1].item() == pytest.approx(difference, rel=0.01, abs=1e-3)

@@ -1,0 +1,64 @@
+import math
+
+import pytest
+import torch
+
+from r2flow.errors import InputError
+from r2flow.flow.times import TIMES, Grid, LogitNormal, Uniform, UShaped
+
+N = 400_000
+U = (torch.arange(N, dtype=torch.float64) + 0.5) / N  # every quantile once: no sampling error
+
+
+def u_shaped_cdf(t, a=4.0):
+    """Integral of the density (e^(at) + e^(a(1-t))) / Z from 0 to t."""
+    z = 2 * math.expm1(a) / a
+    return ((torch.expm1(a * t) + math.exp(a) * (1 - torch.exp(-a * t))) / a) / z
+
+
+@pytest.mark.parametrize(
+    ("time", "cdf"),
+    [
+        (Uniform(), lambda t: t),
+        (UShaped(), u_shaped_cdf),
+        (LogitNormal(), lambda t: torch.special.ndtr(torch.logit(t))),
+    ],
+)
+def test_times_follow_their_distribution(time, cdf):
+    t = time(U).sort().values
+    empirical = torch.arange(1, N + 1, dtype=torch.float64) / N
+    assert (cdf(t.clamp(1e-15, 1 - 1e-15)) - empirical).abs().max() < 1e-4
+
+
+def test_a_grid_takes_each_of_its_times_equally_often():
+    for k in (1, 2, 4, 5):
+        values, counts = Grid(k)(U).unique(return_counts=True)
+        assert values.tolist() == [i / k for i in range(k)]
+        assert (counts / N - 1 / k).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("options", [{"name": n} for n in ("uniform", "u_shaped", "logit_normal")] + [{"name": "grid", "k": 4}])
+def test_times_stay_on_the_path_in_float32(options):
+    last = torch.tensor([0.0, 0.5, math.nextafter(0.5, 0), 1 - 2**-24], dtype=torch.float32)
+    t = TIMES.build(options)(last)
+    assert t.dtype == torch.float32
+    assert ((t >= 0) & (t <= 1)).all()
+    if options["name"] == "grid":
+        assert (t < 1).all()
+
+
+def test_the_reference_densities(shared):
+    reference = torch.load(shared / "oracle" / "training.pt", weights_only=False)["time"]
+    edges = reference["edges"].double()
+    share = torch.histogram(UShaped(reference["a"])(U), edges).hist / N / edges.diff()
+    assert (share / reference["u_shaped_exact_bin_density"] - 1).abs().max() < 0.01
+    share = torch.histogram(LogitNormal()(U), edges).hist / N / edges.diff()
+    middle = reference["hist"]["logit_normal"]["density"][5:-5]
+    assert (share[5:-5] / middle - 1).abs().max() < 0.05
+
+
+def test_bad_options_are_refused():
+    with pytest.raises(InputError, match="a > 0"):
+        UShaped(0)
+    with pytest.raises(InputError, match="at least one step"):
+        Grid(0)

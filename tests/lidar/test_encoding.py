@@ -1,0 +1,74 @@
+import math
+
+import pytest
+import torch
+
+from r2flow.errors import InputError
+from r2flow.lidar.encoding import FORMATS, Encoding
+from r2flow.lidar.sensors import SENSORS
+
+HDL64E = SENSORS["hdl64e"]
+
+
+def ramp(sensor, reflectance=True):
+    """Ranges over the whole of the sensor's, its limits included, and some dropped rays."""
+    height, width = sensor.shape
+    r = torch.linspace(sensor.min_range, sensor.max_range, height * width).view(1, height, width)
+    r[:, ::5, ::7] = 0
+    return torch.cat([r, torch.rand(1, height, width) * (r > 0)]) if reflectance else r
+
+
+@pytest.mark.parametrize("format", list(FORMATS))
+@pytest.mark.parametrize("reflectance", [True, False])
+def test_encode_then_decode_is_within_a_millimetre(sensor, format, reflectance):
+    image = ramp(sensor, reflectance)
+    encoding = Encoding(sensor, format, reflectance)
+    x = encoding.encode(image[None])
+    assert x.shape == (1, encoding.channels, *sensor.shape)
+    assert x.abs().max() <= 1
+    decoded = encoding.decode(x)[0]
+    assert (decoded[0] - image[0]).abs().max() < 1e-3
+    assert torch.equal(decoded[0] == 0, image[0] == 0)
+    if reflectance:
+        assert (decoded[1] - image[1]).abs().max() < 1e-6
+
+
+def test_logscale_is_the_paper_s():
+    encoding = Encoding(HDL64E)
+    image = torch.zeros(2, *HDL64E.shape)
+    image[:, 0, 0] = torch.tensor([1.45, 0.25])
+    image[:, 0, 1] = torch.tensor([80.0, 1.0])
+    x = encoding.encode(image)
+    assert x[:, 5, 5].tolist() == [-1, -1]  # a dropped ray is exactly -1
+    assert x[0, 0, 0].item() == pytest.approx(2 * math.log2(2.45) / math.log2(81) - 1, abs=1e-6)
+    assert x[0, 0, 0].item() == pytest.approx(-0.592, abs=5e-4)
+    assert x[1, 0, 0].item() == pytest.approx(-0.5)
+    assert x[:, 0, 1].tolist() == pytest.approx([1, 1])
+
+
+def test_whatever_lies_outside_the_range_is_dropped():
+    encoding = Encoding(HDL64E)
+    x = torch.full((2, *HDL64E.shape), 0.3)
+    x[0, 0, :4] = torch.tensor([-1.0, -0.6, 1.01, 7.0])  # none, 1.41 m, 82 m, absurd
+    decoded = encoding.decode(x)
+    assert decoded[:, 0, :4].abs().max() == 0
+    assert (decoded[:, 0, 4:] > 0).all()
+
+
+def test_reflectance_is_held_in_its_range():
+    x = torch.zeros(2, *HDL64E.shape)
+    x[1, 0, :2] = torch.tensor([-3.0, 3.0])
+    assert Encoding(HDL64E).decode(x)[1, 0, :2].tolist() == [0, 1]
+
+
+def test_a_nan_is_a_dropped_ray_and_touches_no_other():
+    x = torch.zeros(2, *HDL64E.shape)
+    x[0, 0, 0] = math.nan
+    decoded = Encoding(HDL64E).decode(x)
+    assert decoded[:, 0, 0].tolist() == [0, 0]
+    assert decoded.isfinite().all()
+
+
+def test_missing_reflectance_is_an_error_not_a_guess():
+    with pytest.raises(InputError, match="encoding.reflectance=false"):
+        Encoding(HDL64E).encode(torch.ones(1, *HDL64E.shape))

@@ -1,0 +1,166 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.errors import InputError
+from r2flow.lidar.projection import image_to_points, project, unproject
+from r2flow.lidar.scan_files import read_points
+from r2flow.lidar.sensors import SENSORS, Sensor
+
+HDL64E = SENSORS["hdl64e"]
+
+
+def random_image(sensor: Sensor, seed: int = 0, filled: float = 0.8) -> np.ndarray:
+    draw = np.random.default_rng(seed)
+    r = draw.uniform(sensor.min_range * 1.01, sensor.max_range * 0.99, sensor.shape)
+    hit = draw.random(sensor.shape) < filled
+    # A ring is told apart by points on both sides of straight ahead.
+    hit[:, sensor.columns // 2 - 1 : sensor.columns // 2 + 1] = True
+    return np.stack([r, draw.random(sensor.shape)]).astype(np.float32) * hit
+
+
+def point(r: float, elevation: float, azimuth: float) -> list[float]:
+    e, a = math.radians(elevation), math.radians(azimuth)
+    return [r * math.cos(e) * math.cos(a), r * math.cos(e) * math.sin(a), r * math.sin(e)]
+
+
+@pytest.mark.parametrize("projection", ["spherical", "unfolding"])
+def test_points_to_image_to_points(sensor, projection):
+    image = random_image(sensor)
+    xyz, reflectance = image_to_points(image, sensor.rays())
+    again = project(xyz, reflectance, sensor, projection)
+    np.testing.assert_allclose(again[0], image[0], rtol=1e-6)
+    np.testing.assert_array_equal(again[1], image[1])
+    back, back_reflectance = image_to_points(again, sensor.rays())
+    np.testing.assert_allclose(back, xyz, rtol=0, atol=1e-4)
+    np.testing.assert_array_equal(back_reflectance, reflectance)
+
+
+def test_unproject_agrees_with_trigonometry():
+    rays = torch.tensor([[[0.0, math.pi / 6]], [[math.pi / 2, 0.0]]])
+    xyz = unproject(torch.full((1, 1, 1, 2), 2.0), rays)[0]
+    torch.testing.assert_close(xyz[:, 0, 0], torch.tensor([0.0, 2.0, 0.0]), rtol=0, atol=1e-6)
+    torch.testing.assert_close(xyz[:, 0, 1], torch.tensor([math.sqrt(3), 0.0, 1.0]), rtol=0, atol=1e-6)
+
+
+def test_azimuth_starts_behind_on_the_left_and_falls():
+    points = np.array([point(10, -1, a) for a in (179.9, 90, 0, -90, -179.9)])
+    image = project(points, np.arange(1, 6) / 10, HDL64E)
+    columns = {round(float(image[1, h, w]) * 10): w for h, w in np.argwhere(image[0] > 0)}
+    assert columns == {1: 0, 2: 256, 3: 512, 4: 768, 5: 1023}
+
+
+def test_the_nearest_return_wins_in_any_order():
+    points = np.array([point(r, -5, 20) for r in (30, 12, 50)])
+    for order in ([0, 1, 2], [1, 0, 2], [2, 0, 1]):
+        image = project(points[order], np.array([0.3, 0.1, 0.5])[order], HDL64E)
+        assert image[0].max() == pytest.approx(12, rel=1e-6)
+        assert image[1].max() == pytest.approx(0.1)
+        assert (image[0] > 0).sum() == 1
+
+
+def test_a_return_too_near_does_not_hide_what_is_behind_it():
+    points = np.array([point(1.0, -5, 20), point(30, -5, 20)])
+    assert project(points, np.ones(2), HDL64E)[0].max() == pytest.approx(30, rel=1e-6)
+    # The reference chooses the nearest first and masks it afterwards: a hole.
+    assert project(points, np.ones(2), HDL64E, convention="reference")[0].max() == 0
+
+
+def test_points_out_of_view_are_dropped_not_clamped():
+    points = np.array([point(10, 8, 0), point(10, -40, 0)])
+    assert project(points, np.ones(2), HDL64E)[0].max() == 0
+    clamped = project(points, np.ones(2), HDL64E, convention="reference")
+    assert clamped[0, [0, 63], 512] == pytest.approx([10, 10], rel=1e-6)
+
+
+def test_uneven_beams_get_the_row_of_the_nearest_edge_pair():
+    sensor = Sensor("uneven", (10.0, 4.0, 1.0, 0.0, -3.0, -20.0), columns=8)
+    image = random_image(sensor, filled=1.0)
+    xyz, reflectance = image_to_points(image, sensor.rays())
+    np.testing.assert_allclose(project(xyz, reflectance, sensor)[0], image[0], rtol=1e-6)
+    edges = sensor.row_edges
+    just_inside = np.array([point(10, edges[3] - 0.01, 1), point(20, edges[3] + 0.01, -1)])
+    rows = np.argwhere(project(just_inside, np.ones(2), sensor)[0] > 0)[:, 0]
+    assert sorted(rows) == [2, 3]
+
+
+def test_a_ring_column_in_the_file_gives_the_rows():
+    sensor = SENSORS["hdl32e"].resized(columns=64)
+    image = random_image(sensor)
+    rows, columns = np.nonzero(image[0])
+    shuffled = np.random.default_rng(0).permutation(len(rows))
+    rays = sensor.rays().numpy()
+    r = image[0, rows, columns]
+    e, a = rays[:, rows, columns]
+    xyz = np.stack([r * np.cos(e) * np.cos(a), r * np.cos(e) * np.sin(a), r * np.sin(e)], 1)[shuffled]
+    for ring in (rows, 31 - rows):  # numbered from the top, or from the bottom
+        again = project(xyz, None, sensor, "unfolding", ring=ring[shuffled])
+        np.testing.assert_allclose(again[0], image[0], rtol=1e-5)
+
+
+def test_a_scan_that_does_not_unfold_says_so():
+    draw = np.random.default_rng(0)
+    with pytest.raises(InputError, match=r"unfolds into \d+ rings, but sensor 'hdl64e' has 64"):
+        project(draw.normal(size=(5000, 3)) * 10, None, HDL64E, "unfolding")
+
+
+def reference_rows_and_columns(points):
+    """facts of the reference, written as they read, in float64 where it matters little."""
+    d = np.linalg.norm(points[:, :3], axis=1)
+    h = np.floor((1 - (np.arcsin(points[:, 2] / d) + np.deg2rad(25)) / np.deg2rad(28)) * 64)
+    w = np.floor((-np.arctan2(points[:, 1], points[:, 0]) / np.pi + 1) / 2 % 1 * 1024)
+    return d, h.clip(0, 63).astype(int), w.clip(0, 1023).astype(int)
+
+
+def test_the_reference_s_convention_on_real_scans(shared):
+    for path in sorted((shared / "real" / "kitti360").rglob("*.bin"))[:4]:
+        points = np.fromfile(path, np.float32).reshape(-1, 4)
+        d, h, w = reference_rows_and_columns(points)
+        expected = np.zeros((2, 64, 1024), np.float32)
+        order = np.argsort(-d)
+        expected[0, h[order], w[order]], expected[1, h[order], w[order]] = d[order], points[order, 3]
+        expected *= (expected[0] >= 1.45) & (expected[0] <= 80)
+        ours = project(points[:, :3], points[:, 3], HDL64E, convention="reference")
+        assert (ours != expected).any(0).mean() < 1e-3
+
+
+def test_the_reference_s_unfolding_on_real_scans(shared):
+    for path in sorted((shared / "real" / "raw").rglob("*.bin"))[:3]:
+        points = np.fromfile(path, np.float32).reshape(-1, 4)
+        d, _, w = reference_rows_and_columns(points)
+        x, y = points[:, 0], points[:, 1]
+        quadrant = np.select([(x >= 0) & (y >= 0), (x < 0) & (y >= 0), (x < 0) & (y < 0)], [0, 1, 2], 3)
+        starts = [i for i in range(len(x)) if quadrant[i] == 0 and quadrant[i - 1] == 3]
+        h = np.zeros(len(x), int)
+        for row, (start, end) in zip(range(63, -1, -1), zip(starts[::-1], [*starts[1:], len(x)][::-1], strict=True)):
+            h[start:end] = row
+        expected = np.zeros((64, 1024), np.float32)
+        order = np.argsort(-d)
+        expected[h[order], w[order]] = d[order]
+        expected *= (expected >= 1.45) & (expected <= 80)
+        ours = project(points[:, :3], points[:, 3], HDL64E, "unfolding", "reference")[0]
+        assert (ours != expected).mean() < 1e-3
+
+
+def test_bin_centres_halve_the_reference_s_error_on_real_scans(shared):
+    def relative_error(convention):
+        errors = []
+        for path in sorted((shared / "real" / "kitti360").rglob("*.bin"))[:3]:
+            points = read_points(path)
+            image = project(points.xyz, None, HDL64E, convention=convention)
+            pixel = project(points.xyz, np.arange(len(points.xyz), dtype=np.float64), HDL64E, convention=convention)
+            true = points.xyz[pixel[1][image[0] > 0].astype(int)]
+            there = unproject(torch.from_numpy(image[None, :1]), HDL64E.rays(convention))[0].numpy()
+            errors.append(np.linalg.norm(there[:, image[0] > 0].T - true, axis=1) / image[0][image[0] > 0])
+        return np.concatenate(errors).mean()
+
+    assert relative_error("centre") < 0.55 * relative_error("reference")
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(InputError, match="no projection named"):
+        project(np.ones((1, 3)), None, HDL64E, "cylindrical")
+    with pytest.raises(InputError, match="no projection convention"):
+        project(np.ones((1, 3)), None, HDL64E, convention="center")

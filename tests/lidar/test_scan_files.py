@@ -1,0 +1,308 @@
+"""Scan files against bytes assembled here, by hand or with struct, and against themselves."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r2flow.errors import InputError
+from r2flow.lidar.scan_files import SCAN_ENDINGS, read_points, write_points
+
+# Three points with values that float32 holds exactly, a reflectance each, and a ring.
+ROWS = [(1.5, -2.0, 0.25, 0.5, 3), (-10.0, 20.0, -1.75, 0.0, 0), (0.0, 0.0, 7.0, 1.0, 31)]
+XYZ = [row[:3] for row in ROWS]
+REFLECTANCE = [row[3] for row in ROWS]
+RING = [row[4] for row in ROWS]
+
+WRITTEN = [("bin", None), ("ply", None), ("npy", None)]
+WRITTEN += [("pcd", encoding) for encoding in ("ascii", "binary", "binary_compressed")]
+
+
+def saved(folder: Path, name: str, content: bytes | str) -> Path:
+    path = folder / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def pcd_header(fields: str, size: str, kind: str, data: str, count: int = 3) -> str:
+    return (
+        f"# .PCD v0.7\nVERSION 0.7\nFIELDS {fields}\nSIZE {size}\nTYPE {kind}\n"
+        f"COUNT {' '.join('1' for _ in fields.split())}\nWIDTH {count}\nHEIGHT 1\n"
+        f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA {data}\n"
+    )
+
+
+def expect_rows(points, reflectance=REFLECTANCE, ring=None):
+    assert points.xyz.dtype == np.float32
+    np.testing.assert_array_equal(points.xyz, XYZ)
+    assert points.dropped == 0
+    if reflectance is None:
+        assert points.reflectance is None
+    else:
+        assert points.reflectance.dtype == np.float32
+        np.testing.assert_array_equal(points.reflectance, reflectance)
+    if ring is None:
+        assert points.ring is None
+    else:
+        assert points.ring.dtype == np.uint16
+        np.testing.assert_array_equal(points.ring, ring)
+
+
+# --- what each format says, by hand ---
+
+
+def test_kitti_rows_are_four_little_endian_floats(tmp_path):
+    path = saved(tmp_path, "a.bin", b"".join(struct.pack("<4f", *row[:4]) for row in ROWS))
+    expect_rows(read_points(path))
+
+
+def test_nuscenes_rows_are_five_floats_and_the_last_is_the_ring(tmp_path):
+    path = saved(tmp_path, "a.pcd.bin", b"".join(struct.pack("<5f", *row) for row in ROWS))
+    expect_rows(read_points(path), ring=RING)
+
+
+def test_a_format_given_wins_over_the_ending(tmp_path):
+    path = saved(tmp_path, "sweep.data", b"".join(struct.pack("<5f", *row) for row in ROWS))
+    expect_rows(read_points(path, format=".pcd.bin"), ring=RING)
+    expect_rows(read_points(path, format="pcd.bin"), ring=RING)
+
+
+def test_pcd_ascii_in_any_order_and_case_with_other_fields(tmp_path):
+    text = pcd_header("label Z Remission X ring y", "2 4 8 4 2 4", "U F F F U F", "ascii")
+    text += "".join(f"9 {z} {i} {x} {ring} {y}\n" for x, y, z, i, ring in ROWS)
+    expect_rows(read_points(saved(tmp_path, "a.PCD", text)), ring=RING)
+
+
+def test_pcd_binary_of_mixed_types_with_a_field_of_several_numbers(tmp_path):
+    # Padding fields share the name "_" in PCL's own files.
+    header = (
+        "VERSION .7\nFIELDS _ x y z _ intensity normal ring\nSIZE 1 8 4 4 1 1 4 1\nTYPE U F F F U U F I\n"
+        "COUNT 3 1 1 1 2 1 3 1\nWIDTH 1\nHEIGHT 3\nPOINTS 3\nDATA binary\n"
+    )
+    rows = [struct.pack("<3Bdff2BB3fb", 7, 7, 7, x, y, z, 7, 7, int(i * 2), 9, 9, 9, ring) for x, y, z, i, ring in ROWS]
+    points = read_points(saved(tmp_path, "a.pcd", header.encode() + b"".join(rows)))
+    expect_rows(points, reflectance=[1, 0, 2], ring=RING)  # as stored, not rescaled
+
+
+def test_pcd_compressed_is_stored_field_by_field(tmp_path):
+    columns = [struct.pack("<3f", *(row[k] for row in ROWS)) for k in (1, 0, 2, 3)]
+    plain = b"".join(columns)
+    packed = b"".join(bytes([len(column) - 1]) + column for column in columns)  # literals only
+    body = struct.pack("<II", len(packed), len(plain)) + packed
+    header = pcd_header("y x z i", "4 4 4 4", "F F F F", "binary_compressed")
+    expect_rows(read_points(saved(tmp_path, "a.pcd", header.encode() + body)))
+
+
+def test_pcd_without_count_and_points_lines_and_without_reflectance(tmp_path):
+    text = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 3\nHEIGHT 1\nDATA ascii\n"
+    text += "\n".join(f"{x} {y} {z}" for x, y, z in XYZ)
+    expect_rows(read_points(saved(tmp_path, "a.pcd", text)), reflectance=None)
+
+
+def test_intensity_is_preferred_where_an_ouster_writes_reflectivity_too(tmp_path):
+    text = pcd_header("x y z reflectivity intensity", "4 4 4 2 4", "F F F U F", "ascii")
+    text += "".join(f"{x} {y} {z} 200 {i}\n" for x, y, z, i, _ in ROWS)
+    expect_rows(read_points(saved(tmp_path, "a.pcd", text)))
+
+
+PLY_ASCII = """ply
+format ascii 1.0
+comment by hand
+element camera 1
+property float f
+property list uchar int pixels
+element vertex 3
+property double X
+property float y
+property list uchar float echoes
+property float z
+property float scalar_Intensity
+element face 1
+property list uchar int vertex_indices
+end_header
+0.5 2 10 20
+1.5 -2 2 8 8 0.25 0.5
+-10 2e1 0 -1.75 0
+0 0 1 5 7 1
+3 0 1 2
+"""
+
+
+def test_ply_ascii_with_lists_and_other_elements(tmp_path):
+    expect_rows(read_points(saved(tmp_path, "a.ply", PLY_ASCII)))
+    expect_rows(read_points(saved(tmp_path, "b.ply", PLY_ASCII.replace("\n", "\r\n"))))
+
+
+@pytest.mark.parametrize(("order", "name"), [("<", "little"), (">", "big")])
+def test_ply_binary_in_both_byte_orders(tmp_path, order, name):
+    header = (
+        f"ply\nformat binary_{name}_endian 1.0\nelement pose 2\nproperty short p\nelement vertex 3\n"
+        "property uchar red\nproperty float x\nproperty double y\nproperty float32 z\nproperty ushort ring\n"
+        "property uint8 reflectance\nend_header\n"
+    )
+    rows = [struct.pack(order + "BfdfHB", 9, *row[:3], row[4], int(row[3] * 2)) for row in ROWS]
+    body = struct.pack(order + "hh", 1, 2) + b"".join(rows)
+    points = read_points(saved(tmp_path, "a.ply", header.encode() + body))
+    expect_rows(points, reflectance=[1, 0, 2], ring=RING)
+
+
+@pytest.mark.parametrize(("order", "name"), [("<", "little"), (">", "big")])
+def test_ply_binary_with_lists_among_the_vertices_and_faces_behind_them(tmp_path, order, name):
+    header = (
+        f"ply\nformat binary_{name}_endian 1.0\nelement vertex 3\nproperty float x\n"
+        "property list ushort double echoes\nproperty float y\nproperty float z\nproperty float intensity\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = []
+    for echoes, (x, y, z, i, _) in enumerate(ROWS):
+        rows.append(struct.pack(f"{order}fH{echoes}d3f", x, echoes, *[4.0] * echoes, y, z, i))
+    body = b"".join(rows) + struct.pack(order + "B3i", 3, 0, 1, 2)
+    expect_rows(read_points(saved(tmp_path, "a.ply", header.encode() + body)))
+
+
+@pytest.mark.parametrize("dtype", ["<f2", "<f4", ">f4", "<f8", ">f8"])
+def test_npy_of_any_float_type_and_order(tmp_path, dtype):
+    np.save(tmp_path / "a.npy", np.array([row[:4] for row in ROWS], dtype=dtype))
+    expect_rows(read_points(tmp_path / "a.npy"))
+    np.save(tmp_path / "b.npy", np.asfortranarray(np.array(XYZ, dtype=dtype)))
+    expect_rows(read_points(tmp_path / "b.npy"), reflectance=None)
+
+
+# --- rows that are not finite ---
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("column", range(4))
+def test_a_row_that_is_not_finite_is_dropped_and_counted(tmp_path, bad, column):
+    rows = np.array([row[:4] for row in ROWS], dtype=np.float32)
+    rows[1, column] = bad
+    points = read_points(saved(tmp_path, "a.bin", rows.tobytes()))
+    assert points.dropped == 1
+    np.testing.assert_array_equal(points.xyz, [XYZ[0], XYZ[2]])
+    np.testing.assert_array_equal(points.reflectance, [REFLECTANCE[0], REFLECTANCE[2]])
+
+
+def test_rings_follow_their_points_when_rows_are_dropped(tmp_path):
+    rows = np.array(ROWS, dtype=np.float32)
+    rows[0, 2] = np.nan
+    points = read_points(saved(tmp_path, "a.pcd.bin", rows.tobytes()))
+    np.testing.assert_array_equal(points.ring, RING[1:])
+
+
+def test_an_organised_pcd_may_be_mostly_nan(tmp_path):
+    text = pcd_header("x y z", "4 4 4", "F F F", "ascii", count=4) + "nan nan nan\n" * 3 + "1 2 3\n"
+    points = read_points(saved(tmp_path, "a.pcd", text))
+    assert points.dropped == 3
+    np.testing.assert_array_equal(points.xyz, [[1, 2, 3]])
+
+
+def test_a_coordinate_beyond_float32_is_dropped_as_infinite(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([[1.0, 2.0, 3.0], [1e300, 0.0, 0.0]]))
+    assert read_points(tmp_path / "a.npy").dropped == 1
+
+
+# --- round trips ---
+
+
+def scan(count: int = 5000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    xyz = (rng.standard_normal((count, 3)) * [20, 20, 2]).astype(np.float32)
+    return xyz, rng.integers(0, 100, count).astype(np.float32) / np.float32(100)
+
+
+@pytest.mark.parametrize(("ending", "encoding"), WRITTEN)
+def test_what_is_written_is_read_back_to_the_last_bit(tmp_path, ending, encoding):
+    xyz, reflectance = scan()
+    path = tmp_path / "new folder" / f"a.{ending}"
+    write_points(path, xyz, reflectance, encoding=encoding)
+    points = read_points(path)
+    np.testing.assert_array_equal(points.xyz, xyz)
+    np.testing.assert_array_equal(points.reflectance, reflectance)
+    assert points.dropped == 0
+    assert [file.name for file in path.parent.iterdir()] == [path.name]  # no temporary file stays
+
+
+@pytest.mark.parametrize(("ending", "encoding"), WRITTEN[1:])
+def test_a_scan_without_reflectance_is_read_back_without(tmp_path, ending, encoding):
+    xyz, _ = scan()
+    write_points(tmp_path / "a", xyz, format=ending, encoding=encoding)
+    points = read_points(tmp_path / "a", format=ending)
+    np.testing.assert_array_equal(points.xyz, xyz)
+    assert points.reflectance is None
+
+
+def test_what_is_read_may_be_changed(tmp_path):
+    # PyTorch warns of, and a caller may trip over, arrays that are views of a file's bytes.
+    for ending, encoding in WRITTEN:
+        write_points(tmp_path / f"a.{ending}", *scan(8), encoding=encoding)
+        points = read_points(tmp_path / f"a.{ending}")
+        assert points.xyz.flags.writeable
+        assert points.xyz.flags.c_contiguous
+        assert points.reflectance.flags.writeable
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "word"),
+    [
+        ("a.bin", {"reflectance": None}, "reflectance"),
+        ("a.pcd.bin", {}, "not written"),
+        ("a.las", {}, ".npy"),
+        ("a.pcd", {"encoding": "zip"}, "binary_compressed"),
+        ("a.ply", {"encoding": "ascii"}, "PCD"),
+        ("a.ply", {"format": "stl"}, ".npy"),
+        ("a.ply", {"xyz": np.zeros((3, 4))}, r"\(3, 4\)"),
+        ("a.ply", {"reflectance": np.zeros(4)}, r"\(4,\)"),
+        ("a.ply", {"xyz": np.full((3, 3), np.nan)}, "NaN"),
+        ("a.ply", {"xyz": np.full((3, 3), 1e300)}, "infinite"),
+    ],
+)
+def test_what_cannot_be_written_leaves_the_old_file(tmp_path, name, change, word):
+    path = saved(tmp_path, name, b"old")
+    with pytest.raises(InputError, match=word):
+        write_points(path, **({"xyz": np.array(XYZ), "reflectance": np.array(REFLECTANCE)} | change))
+    assert path.read_bytes() == b"old"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_writing_over_a_folder_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="cannot be written"):
+        write_points(tmp_path, np.array(XYZ), format="ply")
+
+
+def test_the_endings_are_the_longest_first():
+    assert set(SCAN_ENDINGS) == {".bin", ".pcd.bin", ".pcd", ".ply", ".npy"}
+    assert SCAN_ENDINGS.index(".pcd.bin") < SCAN_ENDINGS.index(".bin")
+
+
+# --- real sensors ---
+
+OTHER = {  # points, ring count, whether there is a reflectance: from the sensors' own file sizes
+    "nuscenes_hdl32e/*.pcd.bin": (693760 // 20, 32, True),
+    "rellis_os1_64/*.bin": (64 * 2048, None, True),
+    "rellis_vlp32c/*.bin": (597344 // 16, None, True),
+    "vlp16/000000.pcd": (22988, None, False),
+    "vlp16/000200.pcd": (19993, None, False),
+    "vlp16/000400.pcd": (14294, None, False),
+}
+
+
+@pytest.mark.parametrize("pattern", OTHER)
+def test_scans_of_other_sensors_are_read(shared, pattern):
+    count, rings, has_reflectance = OTHER[pattern]
+    (path,) = (shared / "real" / "other_sensors").glob(pattern)
+    points = read_points(path)
+    assert points.xyz.shape == (count, 3)
+    assert points.dropped == 0
+    assert np.linalg.norm(points.xyz, axis=1).max() < 300
+    assert (points.reflectance is not None) == has_reflectance
+    assert (None if points.ring is None else len(np.unique(points.ring))) == rings
+
+
+def test_every_hdl64_scan_is_read(shared):
+    paths = [p for p in sorted((shared / "real").rglob("*.bin")) if "other_sensors" not in p.parts]
+    assert len(paths) > 50
+    for path in paths:
+        points = read_points(path)
+        assert len(points.xyz) == path.stat().st_size // 16
+        assert 0 <= points.reflectance.min() <= points.reflectance.max() < 1

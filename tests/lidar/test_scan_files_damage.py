@@ -1,0 +1,350 @@
+"""Damaged scan files: the clear line that names the file, or finite points; never anything else."""
+
+import json
+import os
+import re
+import struct
+import time
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r2flow.errors import InputError
+from r2flow.lidar.scan_files import Points, read_points, write_points
+
+# A reader that warns has met something it was not made for.
+pytestmark = pytest.mark.filterwarnings("error")
+
+COUNT = 64  # small, so that every cut and every header bit can be tried; 16 divides 20 COUNT and 12 COUNT
+RNG = np.random.default_rng(7)
+XYZ = np.round(RNG.standard_normal((COUNT, 3)) * [20, 20, 2], 2).astype(np.float32)
+REFLECTANCE = np.round(RNG.random(COUNT), 2).astype(np.float32)
+RING = (np.arange(COUNT) % 32).astype(np.float32)
+TABLE = np.column_stack([XYZ, REFLECTANCE])
+
+FORMATS = ("bin", "pcd.bin", "npy", "ply", "ply ascii", "pcd ascii", "pcd binary", "pcd binary_compressed")
+BODY_STARTS = {"npy": rb"\} *\n", "ply": rb"end_header\n", "pcd": rb"DATA \w+\n"}
+
+
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory) -> dict[str, bytes]:
+    """The same scan in every format."""
+    folder = tmp_path_factory.mktemp("originals")
+    files = {"bin": TABLE.tobytes(), "pcd.bin": np.column_stack([TABLE, RING]).tobytes()}
+    for name in FORMATS[2:]:
+        ending, _, encoding = name.partition(" ")
+        if name == "ply ascii":
+            files[name] = ply_ascii()
+            continue
+        write_points(folder / f"a.{ending}", XYZ, REFLECTANCE, encoding=encoding or None)
+        files[name] = (folder / f"a.{ending}").read_bytes()
+    return files
+
+
+def ply_ascii() -> bytes:
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
+    rows = "".join(" ".join(str(value) for value in row) + "\n" for row in TABLE)
+    return f"ply\nformat ascii 1.0\nelement vertex {COUNT}\n{names}end_header\n{rows}".encode()
+
+
+def read(path: Path) -> Points | None:
+    """The points, checked for what every caller relies on, or None when the file was refused as it should be."""
+    began, points, refusal = time.perf_counter(), None, ""
+    try:
+        points = read_points(path)
+    except InputError as error:
+        refusal = str(error)
+    assert time.perf_counter() - began < 5
+    if points is None:
+        assert str(path) in refusal
+        assert "\n" not in refusal
+        return None
+    assert points.xyz.dtype == np.float32
+    assert points.xyz.shape == (len(points.xyz), 3)
+    assert 0 < len(points.xyz) <= COUNT
+    assert np.isfinite(points.xyz).all()
+    if points.reflectance is not None:
+        assert points.reflectance.shape == (len(points.xyz),)
+        assert np.isfinite(points.reflectance).all()
+    return points
+
+
+def read_bytes(folder: Path, name: str, content: bytes) -> Points | None:
+    path = folder / f"damaged.{name.partition(' ')[0]}"
+    path.write_bytes(content)
+    return read(path)
+
+
+def body_start(name: str, content: bytes) -> int:
+    match = re.search(BODY_STARTS[name.partition(" ")[0]], content)
+    assert match
+    return match.end()
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_undamaged_file_is_read(tmp_path, originals, name):
+    points = read_bytes(tmp_path, name, originals[name])
+    np.testing.assert_array_equal(points.xyz, XYZ)
+    np.testing.assert_array_equal(points.reflectance, REFLECTANCE)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_cut_is_refused_but_where_nothing_can_show_it(tmp_path, originals, name):
+    whole = originals[name]
+    accepted = []
+    for length in range(len(whole)):
+        points = read_bytes(tmp_path, name, whole[:length])
+        if points is not None:
+            accepted.append(length)
+            np.testing.assert_array_equal(points.xyz, XYZ[: len(points.xyz)])
+    if name in ("bin", "pcd.bin"):  # a cut between two rows leaves a shorter scan
+        row = len(whole) // COUNT
+        assert accepted == list(range(row, len(whole), row))
+    elif name.endswith("ascii"):  # the last number, a reflectance, may lose digits
+        assert min(accepted) > whole.rfind(b" ") + 1
+    else:
+        assert accepted == []
+
+
+@pytest.mark.parametrize("name", FORMATS[2:])
+def test_no_flipped_bit_in_a_header_changes_a_coordinate(tmp_path, originals, name):
+    whole = originals[name]
+    refused = 0
+    for bit in range(8 * body_start(name, whole)):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        points = read_bytes(tmp_path, name, bytes(damaged))
+        if points is None:
+            refused += 1
+        else:
+            np.testing.assert_array_equal(points.xyz, XYZ)
+    assert refused > 100
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("name", FORMATS)
+def test_flipped_bits_in_the_body_cost_their_own_points_at_most(tmp_path, originals, name, seed):
+    whole = originals[name]
+    start = 0 if name in ("bin", "pcd.bin") else body_start(name, whole)
+    rng = np.random.default_rng(seed)
+    damaged = bytearray(whole)
+    for bit in rng.integers(8 * start, 8 * len(whole), 2):
+        damaged[bit // 8] ^= 1 << bit % 8
+    points = read_bytes(tmp_path, name, bytes(damaged))
+    if points is not None and not name.endswith("compressed"):  # a damaged copy repeats itself
+        assert len(points.xyz) + points.dropped == COUNT
+        known = {tuple(row) for row in XYZ.tolist()}
+        assert sum(tuple(row) not in known for row in points.xyz.tolist()) <= 2
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("name", FORMATS)
+def test_overwritten_stretches_are_refused_or_read_as_finite_points(tmp_path, originals, name, seed):
+    rng = np.random.default_rng(seed)
+    damaged = bytearray(originals[name])
+    first, last = sorted(rng.integers(0, len(damaged), 2))
+    damaged[first:last] = [bytes(last - first), rng.bytes(last - first), b"\xff" * (last - first)][seed % 3]
+    read_bytes(tmp_path, name, bytes(damaged))
+
+
+@pytest.mark.parametrize("name", FORMATS[2:])
+@pytest.mark.parametrize("junk", [b"\x01", b"1 2 3 4\n", bytes(range(1, 33))])
+def test_bytes_behind_the_last_point_are_refused(tmp_path, originals, name, junk):
+    assert read_bytes(tmp_path, name, originals[name] + junk) is None
+
+
+def layouts() -> dict[str, bytes]:
+    """Bytes that are no KITTI rows, all of a size that rows of 16 bytes divide."""
+    noise = np.random.default_rng(0).bytes
+    nan_majority = np.where(np.arange(COUNT)[:, None] < 40, np.nan, TABLE).astype("<f4")
+    return {
+        "big-endian": TABLE.astype(">f4").tobytes(),
+        "float64": TABLE.astype("<f8").tobytes(),
+        "float16": TABLE.astype("<f2").tobytes(),
+        "millimetres in int32": (TABLE * 1000).astype("<i4").tobytes(),
+        "centimetres in int16": (TABLE * 100).astype("<i2").tobytes(),
+        "rows of 3": XYZ.tobytes(),
+        "rows of 5": np.column_stack([TABLE, RING]).tobytes(),
+        "rows of 6": np.column_stack([TABLE, RING, RING]).tobytes(),
+        "noise": noise(1024),
+        "zeros": bytes(1024),
+        "ones": b"\xff" * 1024,
+        "NaN": np.full((64, 4), np.nan, "<f4").tobytes(),
+        "infinity": np.full((64, 4), np.inf, "<f4").tobytes(),
+        "mostly NaN": nan_majority.tobytes(),
+        "map coordinates": (TABLE + np.float32([450000, 5400000, 110, 0])).tobytes(),
+        "text": b"1.25 3.50 -0.25 0.5\n" * 64,
+        "JSON": json.dumps(TABLE.tolist()).encode()[:1024],
+        "a picture": b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + noise(1008),
+        "a pickle": b"\x80\x04\x95" + noise(1021),
+    }
+
+
+@pytest.mark.parametrize("layout", layouts())
+def test_no_other_layout_passes_for_kitti(tmp_path, layout):
+    content = layouts()[layout]
+    assert len(content) % 16 == 0
+    assert read_bytes(tmp_path, "bin", content) is None
+
+
+@pytest.mark.parametrize("name", ["npy", "ply", "pcd"])
+@pytest.mark.parametrize("layout", [k for k in layouts() if k not in ("mostly NaN", "rows of 3")])
+def test_nothing_else_passes_for_a_file_with_a_header(tmp_path, name, layout):
+    assert read_bytes(tmp_path, name, layouts()[layout]) is None
+
+
+@pytest.mark.parametrize("shown", FORMATS)
+@pytest.mark.parametrize("given", ["bin", "pcd.bin", "npy", "ply", "pcd"])
+def test_no_format_passes_for_another(tmp_path, originals, shown, given):
+    if shown.partition(" ")[0] != given:
+        content = originals[shown]
+        assert read_bytes(tmp_path, given, content + bytes(-len(content) % 80)) is None
+
+
+HUGE = 10**12
+PCD = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA {1}\n"
+PLY = "ply\nformat {1} 1.0\nelement vertex {0}\n{2}property float x\nproperty float y\nproperty float z\nend_header\n"
+ROWS_OF_3 = {"ascii": b"1 2 3\n" * 9, "binary": XYZ.tobytes()}
+
+
+def declarations() -> dict[str, tuple[str, bytes]]:
+    """Headers that promise far more than the file holds."""
+    packed = struct.pack("<II", 40, 2**32 - 1) + bytes(40)
+    files = {
+        "pcd ascii": ("pcd", PCD.format(HUGE, "ascii").encode() + ROWS_OF_3["ascii"]),
+        "pcd binary": ("pcd", PCD.format(HUGE, "binary").encode() + ROWS_OF_3["binary"]),
+        "pcd binary_compressed": ("pcd", PCD.format(HUGE, "binary_compressed").encode() + packed),
+        "pcd bomb": ("pcd", PCD.format((2**32 - 1) // 12, "binary_compressed").encode() + packed),
+        "pcd count": ("pcd", PCD.format(1, "binary").replace("1 1 1", f"1 1 {HUGE}").encode() + bytes(99)),
+        "pcd digits": ("pcd", PCD.format("9" * 5000, "ascii").encode() + ROWS_OF_3["ascii"]),
+        "ply ascii": ("ply", PLY.format(HUGE, "ascii", "").encode() + ROWS_OF_3["ascii"]),
+    }
+    for order in ("little", "big"):
+        kind = f"binary_{order}_endian"
+        long_list = "property list int double echoes\n"
+        empty = f"element nothing {HUGE}\nelement vertex"
+        files |= {
+            kind: ("ply", PLY.format(HUGE, kind, "").encode() + ROWS_OF_3["binary"]),
+            f"{kind} lists": ("ply", PLY.format(HUGE, kind, long_list).encode() + b"\x7f" * 999),
+            f"{kind} negative list": ("ply", PLY.format(9, kind, long_list).encode() + b"\xff" * 999),
+            f"{kind} empty element": (
+                "ply", PLY.format(HUGE, kind, "").replace("element vertex", empty).encode() + bytes(99)
+            ),
+        }  # fmt: skip
+    for shape in ((HUGE, 3), (2**62, 4), (2**64, 3), (-1, 3)):
+        header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}}}\n".encode()
+        content = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + XYZ.tobytes()
+        files[f"npy {shape}"] = ("npy", content)
+    return files
+
+
+@pytest.mark.parametrize("name", declarations())
+def test_a_declared_size_is_not_believed(tmp_path, name):
+    ending, content = declarations()[name]
+    tracemalloc.start()
+    try:
+        assert read_bytes(tmp_path, ending, content) is None
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "word"),
+    [
+        ("a.bin", b"", "empty"),
+        ("a.bin", TABLE.tobytes()[:-7], "9 bytes more"),
+        ("a.bin", np.column_stack([TABLE, RING])[:5].tobytes(), "pcd.bin"),
+        ("a.pcd.bin", TABLE[:6].tobytes(), "format='bin'"),
+        ("a.bin", b"x,y,z,i\n1,2,3,4\n", "text"),
+        ("a.bin", ply_ascii(), "format='ply'"),
+        ("a.bin", TABLE.astype(">f4").tobytes(), "big-endian"),
+        ("a.pcd.bin", np.column_stack([TABLE, RING + 0.5]).astype("<f4").tobytes(), "ring"),
+        ("a.las", b"LASF", r"\.pcd\.bin, \.bin, \.pcd, \.ply, \.npy"),
+        ("a.pcd", PCD.format(0, "ascii").encode(), "0 points"),
+        ("a.pcd", PCD.format(2, "zip").encode(), "binary_compressed"),
+        ("a.pcd", PCD.format(2, "ascii").replace("x y z", "x y w").encode(), "no field z; it has: x, y, w"),
+        ("a.pcd", PCD.format(2, "ascii").replace("x y z", "x y").encode(), "2 FIELDS but 3 SIZE"),
+        ("a.pcd", PCD.format(2, "ascii").replace("HEIGHT 1", "HEIGHT 3").encode(), "WIDTH x HEIGHT = 6"),
+        ("a.pcd", PCD.format(2, "ascii").replace("F F F", "F F U").replace("4 4 4", "4 4 3").encode(), "'3'"),
+        ("a.pcd", PCD.format(2, "ascii").encode() + b"1 2 3\n4 5\n", "number of columns changed"),
+        ("a.pcd", PCD.format(2, "ascii").encode() + b"1 2 3\n4 5 six\n", "six"),
+        ("a.pcd", PCD.format(2, "ascii").encode() + b"1 2 3 4\n" * 2, "4 numbers a line"),
+        ("a.pcd", PCD.format(2, "ascii").encode() + b"1 2 3\n\xe9 5 6\n", "other bytes"),
+        ("a.pcd", PCD.format(2, "ascii").encode() + b"nan 2 3\n" * 2, "no finite point"),
+        ("a.ply", ply_ascii().replace(b"vertex", b"vertices"), "'vertex'"),
+        ("a.ply", ply_ascii().replace(b"format ascii 1.0\n", b""), "format"),
+        ("a.ply", ply_ascii().replace(b"property float x", b"property list uchar float x"), "lists"),
+        ("a.ply", ply_ascii().replace(b"float x", b"list float float x"), "does not know"),
+        ("a.ply", ply_ascii().replace(b"vertex 64", b"vertex 0"), "0 points"),
+        ("a.ply", ply_ascii().replace(b"vertex 64", b"vertex -4"), "whole number"),
+    ],
+)
+def test_the_line_says_what_was_found(tmp_path, name, content, word):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=word) as caught:
+        read_points(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("array", "word"),
+    [
+        (np.zeros((2, 64, 1024), np.float32), "range image"),
+        (np.zeros((4, 100), np.float32), "transposed"),
+        (np.zeros((100, 5), np.float32), r"\(100, 5\)"),
+        (np.zeros((0, 3), np.float32), "no points"),
+        (np.float32(3), r"shape \(\)"),
+        (np.ones((100, 3), np.int64), "int64"),
+        (np.ones((100, 3), np.complex64), "complex64"),
+        (np.ones(100, [("x", "f4"), ("y", "f4"), ("z", "f4")]), "not floats"),
+        (np.array([["x", "y", "z"]]), "not floats"),
+    ],
+)
+def test_an_array_that_is_no_points_is_said(tmp_path, array, word):
+    np.save(tmp_path / "a.npy", array)
+    with pytest.raises(InputError, match=word):
+        read_points(tmp_path / "a.npy")
+
+
+def test_a_pickle_in_a_npy_is_never_run(tmp_path):
+    class Bomb:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "ran"),)
+
+    np.save(tmp_path / "a.npy", np.array([Bomb()], dtype=object), allow_pickle=True)
+    assert read(tmp_path / "a.npy") is None
+    assert not (tmp_path / "ran").exists()
+
+
+def test_what_is_no_file_is_said(tmp_path):
+    (tmp_path / "folder.bin").mkdir()
+    (tmp_path / "link.bin").symlink_to(tmp_path / "gone.bin")
+    (tmp_path / "loop.bin").symlink_to(tmp_path / "loop.bin")
+    os.mkfifo(tmp_path / "pipe.bin")
+    for name in ("folder", "link", "loop", "pipe", "missing", "missing/a", "n" * 300, "nul\0"):
+        assert read(tmp_path / f"{name}.bin") is None
+    with pytest.raises(InputError, match=r"link to .*gone\.bin"):
+        read_points(tmp_path / "link.bin")
+
+
+def test_a_file_too_large_for_one_scan_is_not_loaded(tmp_path):
+    for name in ("a.bin", "a.pcd", "a.ply", "a.npy"):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(1 << 40)  # sparse: takes no disk
+        assert read(tmp_path / name) is None
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_real_scan_in_a_wrong_layout_is_refused(shared, tmp_path, seed):
+    paths = sorted((shared / "real").rglob("*.bin"))
+    rows = read_points(paths[seed * len(paths) // 10])
+    table = np.column_stack([rows.xyz, rows.reflectance])
+    table = table[: len(table) // 4 * 4]
+    assert read_bytes(tmp_path, "bin", table.astype(">f4").tobytes()) is None
+    assert read_bytes(tmp_path, "bin", table.astype("<f8").tobytes()) is None
+    assert read_bytes(tmp_path, "bin", table[:, :3].tobytes()) is None
+    assert read_bytes(tmp_path, "bin", b"\n" + table[:-1].tobytes() + bytes(15)) is None

@@ -1,0 +1,25 @@
+import os
+import stat
+
+import pytest
+
+from r2flow.files import atomic_write
+
+
+def test_the_file_is_whole_or_the_old_one(tmp_path):
+    path = tmp_path / "folder" / "file.txt"
+    with atomic_write(path, "w") as file:
+        file.write("old")
+    with pytest.raises(RuntimeError), atomic_write(path, "w") as file:
+        file.write("half of the new o")
+        raise RuntimeError
+    assert path.read_text() == "old"
+    assert os.listdir(path.parent) == ["file.txt"]
+
+
+def test_the_file_is_as_readable_as_any_other(tmp_path):
+    with atomic_write(tmp_path / "ours") as file:
+        file.write(b"1")
+    (tmp_path / "plain").write_bytes(b"1")
+    modes = [stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("ours", "plain")]
+    assert modes[0] == modes[1]

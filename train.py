@@ -1,0 +1,175 @@
+"""Compose the config, build what it names, fit. With no arguments: the demo on simulated scans.
+
+    python train.py
+    python train.py data=kitti_raw data.root=FOLDER backbone=hdit_small
+    python train.py experiment=r2flow_1rf data.root=KITTI-360 trainer=ddp
+    python train.py -m backbone=hdit_tiny,hdit_small seed=1,2,3
+
+The same command again goes on from the run's last checkpoint.
+"""
+
+import logging
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from r2flow.errors import InputError
+
+log = logging.getLogger("r2flow")
+
+OmegaConf.register_new_resolver(
+    "path_safe", lambda name: str(name).replace("/", "_").replace("..", "_") or "default", replace=True
+)
+
+
+def fit(config: dict[str, Any]) -> None:
+    """Train the stage that a plain config describes, in its run folder, from where it stopped."""
+    # Imported here: a misspelt config should answer at once, not after torch has loaded.
+    import lightning as L
+
+    from callbacks import build_callbacks, build_loggers
+    from r2flow.checkpoints import AtomicCheckpointIO
+    from r2flow.data.datamodule import ScanDataModule
+    from r2flow.registry import reject_unknown_options
+    from r2flow.reports.training import finish
+    from r2flow.runs import open_run
+    from r2flow.stages import build_parts, build_stage
+
+    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+
+    run_dir = Path(config["run_dir"])
+    trainer_options = dict(config["trainer"])
+    check_trainer(trainer_options)
+    parts = build_parts(config)
+    stage = build_stage(config, parts.backbone)
+    reject_unknown_options("data", ScanDataModule, config["data"])
+    data = ScanDataModule(parts.sensor, parts.encoding, config["seed"], **config["data"])
+    data.setup()
+    last = open_run(run_dir, config)
+    if last is not None:
+        log.info("going on from %s", last)
+    trainer = L.Trainer(
+        **trainer_options,
+        callbacks=build_callbacks(config, parts),
+        logger=build_loggers(config["loggers"], run_dir),
+        plugins=[AtomicCheckpointIO()],
+    )
+    trainer.fit(stage, data, ckpt_path=last, weights_only=True)
+    if trainer.interrupted:
+        log.info("stopped at step %d; the same command goes on from the last checkpoint", trainer.global_step)
+    elif trainer.is_global_zero and not trainer_options["fast_dev_run"]:
+        finish(run_dir, config["samples"], config["seed"])
+
+
+def check_trainer(options: dict[str, Any]) -> None:
+    """Refuse what Lightning would change in silence or end in a traceback."""
+    import torch
+
+    gpu = torch.cuda.is_available()
+    if options["accelerator"] in ("gpu", "cuda") and not gpu:
+        raise InputError("trainer.accelerator=gpu, but torch sees no GPU here; use trainer=cpu.")
+    on_cpu = options["accelerator"] == "cpu" or (options["accelerator"] == "auto" and not gpu)
+    if on_cpu and str(options["precision"]) in ("16-mixed", "16", "16-true"):
+        raise InputError(
+            f"trainer.precision={options['precision']} does not exist on a CPU (Lightning would turn it into "
+            "bfloat16 in silence); use bf16-mixed or 32-true."
+        )
+
+
+def sweep_job(config: DictConfig) -> int:
+    """One job of a sweep, as its own process: its failure or its DDP relaunch touches no other job."""
+    overrides = list(HydraConfig.get().overrides.task)
+    run_dir = HydraConfig.get().runtime.output_dir
+    command = [sys.executable, __file__, *overrides, f"run_dir={run_dir}"]
+    log.info("job %s: %s", HydraConfig.get().job.num, " ".join(overrides))
+    return subprocess.run(command, check=False, env={**os.environ, "HYDRA_FULL_ERROR": "1"}).returncode
+
+
+failed_jobs: list[str] = []
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="train")
+def run(config: DictConfig) -> None:
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        if sweep_job(config):
+            failed_jobs.append(" ".join(HydraConfig.get().overrides.task))
+        return
+    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert isinstance(plain, dict)
+    fit({str(key): value for key, value in plain.items()})
+
+
+def main() -> int:
+    """Run, and turn what the user can mend into one line and exit code 2."""
+    # Otherwise Hydra prints composition errors itself, over many lines, and exits with 1.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        run()
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except (HydraException, OmegaConfBaseException) as error:
+        print(f"error: {explain(error)}", file=sys.stderr)
+        return 2
+    if failed_jobs:
+        print(f"error: {len(failed_jobs)} jobs of the sweep failed: {'; '.join(failed_jobs)}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def explain(error: Exception) -> str:
+    """Hydra's complaint in one line, with the nearest key that exists."""
+    import re
+
+    from r2flow.registry import did_you_mean
+
+    text = str(error)
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    unknown = re.search(r"Could not override '([^']+)'", text)
+    if unknown:
+        key = unknown.group(1)
+        return f"the config has no key '{key}'.{did_you_mean(key, known_keys())} See --cfg job for all of them."
+    choice = re.search(r"Could not find '([^/']+)/([^']+)'", text)
+    if choice:
+        group, name = choice.groups()
+        folder = Path(__file__).parent / "conf" / group
+        known = sorted(path.stem for path in folder.glob("*.yaml"))
+        return f"no {group} config named '{name}'; known: {', '.join(known)}.{did_you_mean(name, known)}"
+    return " ".join(lines[:2])
+
+
+def known_keys() -> list[str]:
+    """Every key of the default config, and its groups."""
+    from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(Path(__file__).parent / "conf"), version_base="1.3"):
+        composed = compose("train", return_hydra_config=False)
+    keys = []
+
+    def walk(node: DictConfig, prefix: str) -> None:
+        for key in node:
+            keys.append(f"{prefix}{key}")
+            value = node._get_node(key)
+            if isinstance(value, DictConfig) and not value._is_none():
+                walk(value, f"{prefix}{key}.")
+
+    walk(composed, "")
+    return keys
+
+
+if __name__ == "__main__":
+    sys.exit(main())
