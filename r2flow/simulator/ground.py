@@ -1,0 +1,252 @@
+"""The ground: a rolling surface with streets, kerbs, pavements and verges, and where rays meet it."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from r2flow.simulator.labels import LABELS
+from r2flow.simulator.materials import INDEX, column
+from r2flow.simulator.rays import Rays
+
+SAMPLES = 72  # points of a column's profile; between them the ground is straight
+NEAREST = 1.5  # metres: the profile's first point; nearer the ground is level with it
+REACH = 90.0  # metres: the profile's last point
+
+# A number or an array of them: places are asked one by one while a scene is drawn, by the thousand when seen.
+Where = Any
+
+
+def _sin(x: Where) -> Where:
+    return math.sin(x) if isinstance(x, float) else np.sin(x)  # numpy takes ten times as long for a number
+
+
+def _larger(x: Where, y: Where) -> Where:
+    return max(x, y) if isinstance(x, float) and isinstance(y, float) else np.maximum(x, y)
+
+
+class Street(NamedTuple):
+    """A strip along v = offset + curvature u^2 / 2, u along the heading and v to its left.
+
+    Attributes:
+        heading: Direction in radians.
+        offset: Lateral place v of the middle line in metres.
+        curvature: 1 / radius, 1 / metre.
+        half_width: Half of the carriageway in metres.
+        pavement: Width of the pavement beside it in metres; 0 for none.
+        start: Where it begins, metres along.
+        stop: Where it ends.
+        lines: Lateral places of painted lines in metres from the middle; the middle one is dashed.
+    """
+
+    heading: float
+    offset: float
+    curvature: float
+    half_width: float
+    pavement: float
+    start: float = -1e6
+    stop: float = 1e6
+    lines: tuple[float, ...] = ()
+
+    def locate(self, x: Where, y: Where) -> tuple[Where, Where]:
+        """(u, lateral): metres along the street, and to the left of its middle line."""
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        u = x * c + y * s
+        return u, y * c - x * s - self.offset - (self.curvature / 2) * u * u
+
+    def place(self, u: float, lateral: float) -> tuple[float, float, float]:
+        """(x, y, heading) of the point at u metres along and `lateral` to the left."""
+        v = self.offset + self.curvature / 2 * u * u + lateral
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        return u * c - v * s, u * s + v * c, self.heading + math.atan(self.curvature * u)
+
+    def away(self, x: Where, y: Where) -> Where:
+        """Distance to the carriageway in metres, negative on it."""
+        u, lateral = self.locate(x, y)
+        beside = abs(lateral) - self.half_width
+        if self.start > -1e6 or self.stop < 1e6:
+            beside = _larger(beside, _larger(self.start - u, u - self.stop))
+        return beside
+
+
+class Patch(NamedTuple):
+    """A rectangle of another surface: a drive, a car park; x, y, yaw, length and width as of a box."""
+
+    x: float
+    y: float
+    yaw: float
+    length: float
+    width: float
+    label: int
+    material: int
+
+
+class GroundHit(NamedTuple):
+    """Where rays meet the ground; (B, W) each. A ray that meets none has distance inf."""
+
+    distance: np.ndarray
+    cosine: np.ndarray
+
+
+@dataclass(frozen=True)
+class Ground:
+    """z = -drop + lean . p + sum_k A_k [sin(k . p + phi) - sin phi - cos phi (k . p)] + banks, and a kerb.
+
+    The bracket has neither height nor slope at the origin: the car stands level there, but for its springs.
+
+    Attributes:
+        waves: Rows (A in metres, k_x and k_y in radians / metre, phi).
+        lean: Slope of the ground along x and y as the car, on its springs, sees it.
+        drop: How much lower than usual the ground lies below the sensor, in metres.
+        streets: The streets; without any the ground is a plain surface of the verge.
+        kerb: Height of the kerb in metres.
+        banks: Rise beside the first street, left and right, in metres.
+        corner: Radius of the kerb where streets meet, in metres.
+        verge: (label, material) of what lies beyond the pavements.
+        patches: Rectangles of other surfaces beside the street.
+        albedo: Reflectance reading of each material here, (M,).
+    """
+
+    waves: tuple[tuple[float, float, float, float], ...] = ()
+    lean: tuple[float, float] = (0.0, 0.0)
+    drop: float = 0.0
+    streets: tuple[Street, ...] = ()
+    kerb: float = 0.0
+    banks: tuple[float, float] = (0.0, 0.0)
+    corner: float = 4.0
+    verge: tuple[int, int] = (LABELS["terrain"], INDEX["grass"])
+    patches: tuple[Patch, ...] = ()
+    albedo: np.ndarray = field(default_factory=lambda: column("albedo"))
+
+    def height(self, x: Where, y: Where) -> Where:
+        """Height of the carriageway's level in metres; kerbs not included."""
+        z = self.lean[0] * x + self.lean[1] * y - self.drop
+        for amplitude, kx, ky, phase in self.waves:
+            t = kx * x + ky * y
+            z = z + amplitude * (_sin(t + phase) - math.sin(phase) - math.cos(phase) * t)
+        return z + self._bank(x, y) if any(self.banks) else z
+
+    def _bank(self, x: Where, y: Where) -> Where:
+        """A smooth step of the banks' heights, over 12 metres from the pavement outwards."""
+        street = self.streets[0]
+        _, lateral = street.locate(x, y)
+        out = (abs(lateral) - street.half_width - street.pavement - 1) / 12
+        t = 1 - _larger(1 - _larger(out, 0.0), 0.0)
+        left, right = self.banks
+        return (right + (left - right) * (lateral > 0)) * t * t * (3 - 2 * t)
+
+    def off_street(self, x: Where, y: Where) -> Where:
+        """Distance to the nearest carriageway in metres, negative on one; corners are rounded."""
+        first, *others = self.streets
+        distance = first.away(x, y)
+        for street in others:
+            d = street.away(x, y)
+            blend = _larger(self.corner - abs(distance - d), 0.0)
+            distance = -_larger(-distance, -d) - blend * blend / (4 * self.corner)
+        return distance
+
+    def surface(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """SemanticKITTI label, material and reflectance reading of the ground at points, (N,) each."""
+        label = np.full(x.shape, self.verge[0], np.uint16)
+        material = np.full(x.shape, self.verge[1], np.uint8)
+        for patch in self.patches:
+            c, s = math.cos(patch.yaw), math.sin(patch.yaw)
+            dx, dy = x - patch.x, y - patch.y
+            on = (abs(dx * c + dy * s) * 2 <= patch.length) & (abs(dy * c - dx * s) * 2 <= patch.width)
+            label[on], material[on] = patch.label, patch.material
+        if self.streets:
+            away = self.off_street(x, y)
+            pavement = max(street.pavement for street in self.streets)
+            beside, on = away <= pavement, away <= 0
+            label[beside], material[beside] = LABELS["sidewalk"], INDEX["paving"]
+            label[on], material[on] = LABELS["road"], INDEX["asphalt"]
+            painted = self._painted(x, y)
+            label[painted], material[painted] = LABELS["lane-marking"], INDEX["marking"]
+        # repairs, wear and damp: a reading that wanders over a few metres
+        stains = 0.03 * np.sin(1.1 * x + 0.4 * y) * np.sin(0.5 * x - 1.3 * y) + 0.02 * np.sin(0.23 * x + 0.31 * y)
+        return label, material, self.albedo[material] + stains
+
+    def _painted(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Points on a painted line of the first street, outside of the crossings."""
+        street, *others = self.streets
+        if not street.lines:
+            return np.zeros(x.shape, bool)
+        u, lateral = street.locate(x, y)
+        on = np.zeros(x.shape, bool)
+        for place in street.lines:
+            line = abs(lateral - place) < 0.08
+            on |= line & (np.mod(u, 9) < 3) if place == 0 else line
+        for other in others:
+            on &= other.away(x, y) > 1
+        return on & (u > street.start) & (u < street.stop)
+
+    def meet(self, rays: Rays) -> GroundHit:
+        """First meeting of every ray with the ground, kerbs included.
+
+        The profile of each column is a chain of straight pieces; a ray first meets the piece up to whose
+        end the running maximum of (ground - laser) / s, the slope to the ground's skyline, exceeds its own.
+        """
+        s = np.geomspace(NEAREST, REACH, SAMPLES).astype(np.float32)[:, None]
+        z = self.height(s * rays.cos, s * rays.sin)
+        distance = np.full(rays.shape, np.inf, np.float32)
+        steepness = np.zeros(rays.shape, np.float32)
+        for block in np.unique(rays.beams.block):
+            rows = np.flatnonzero(rays.beams.block == block)
+            distance[rows], steepness[rows] = _meet_profile(s, z, rays.slope[rows], rays.height[rows])
+        approach = steepness - rays.slope[:, None]  # how fast ray and ground close in, per metre of s
+        cosine = approach / np.sqrt((1 + rays.slope[:, None] ** 2) * (1 + steepness**2))
+        if self.kerb > 0 and self.streets:
+            distance, cosine = self._step_up(rays, distance, approach, cosine)
+        return GroundHit(distance, cosine)
+
+    def _step_up(
+        self, rays: Rays, low: np.ndarray, approach: np.ndarray, cosine: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Raise all that is not carriageway by the kerb.
+
+        A ray comes first to the raised level, kerb / approach before the low one. Beside the street it stops
+        there; over the street it goes on, to the low level or to the kerb's face where that is nearer.
+        """
+        met = np.isfinite(low)
+        s_low, c, s = (np.broadcast_to(q, met.shape)[met] for q in (low, rays.cos, rays.sin))
+        s_high = np.maximum(s_low - np.float32(self.kerb) / approach[met], 0)
+        d_high, d_low = self.off_street(s_high * c, s_high * s), self.off_street(s_low * c, s_low * s)
+        face = (d_high <= 0) & (d_low > 0)
+        share = d_high / np.where(face, d_high - d_low, 1)
+        out, facing = low.copy(), cosine.copy()
+        out[met] = np.where(d_high > 0, s_high, np.where(face, s_high + share * (s_low - s_high), s_low))
+        facing[met] = np.where(face, np.maximum(cosine[met], 0.6), cosine[met])
+        return out, facing
+
+
+def _meet_profile(s: np.ndarray, z: np.ndarray, slope: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays of falling slopes T from about one height meet profiles z(s).
+
+    Which piece a ray meets is decided from the mean height, the place on the piece from its own.
+
+    Args:
+        s: Distances of the profile's points, (S, 1).
+        z: Heights of the ground there, (S, W).
+        slope: T of each ray, (R,).
+        height: Height of each laser, (R,).
+
+    Returns:
+        Distance of the first meeting, inf for none, and the ground's own slope there; (R, W) each.
+    """
+    (samples, columns), rays = z.shape, len(slope)
+    skyline = np.maximum.accumulate((z - height.mean()) / s, axis=0)
+    covered = np.searchsorted(-slope, -skyline, side="left")  # rays above the skyline so far, (S, W)
+    # A ray's piece is the number of profile points whose skyline is still below it: a histogram of
+    # `covered` per column, summed upwards from the lowest ray.
+    cells = covered * columns + np.arange(columns)
+    count = np.bincount(cells.ravel(), minlength=(rays + 1) * columns).reshape(rays + 1, columns)
+    piece = np.cumsum(count[::-1], axis=0)[::-1][1:]
+    start, end = np.clip(piece - 1, 0, samples - 2), np.clip(piece, 1, samples - 1)
+    w = np.arange(columns)
+    s_0, s_1, z_0, z_1 = s[start, 0], s[end, 0], z[start, w], z[end, w]
+    own = (z_1 - z_0) / (s_1 - s_0)
+    level = piece == 0  # nearer than the first point: level ground
+    own, z_0, s_0 = np.where(level, 0, own), np.where(level, z[0], z_0), np.where(level, 0, s_0)
+    distance = s_0 + (height[:, None] + s_0 * slope[:, None] - z_0) / np.maximum(own - slope[:, None], 1e-6)
+    return np.where(piece < samples, distance, np.inf), own

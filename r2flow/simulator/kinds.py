@@ -1,0 +1,148 @@
+"""Kinds of places, and the ground plan of one: where its streets run and how its ground rolls."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from r2flow.simulator.draws import Draws
+from r2flow.simulator.ground import Ground, Patch, Street
+from r2flow.simulator.labels import LABELS
+from r2flow.simulator.materials import INDEX, MATERIALS
+
+Span = tuple[float, float]
+
+
+class Kind(NamedTuple):
+    """A kind of place.
+
+    Attributes:
+        share: How often it is drawn.
+        half_width: Half of the carriageway, from and to, in metres.
+        pavement: Width of the pavement, from and to, in metres.
+        setback: Distance of the houses from the pavement, from and to, in metres.
+        gap: Mean gap between houses in metres.
+        storeys: From and to.
+        built: Share of plots with a house; the others are green.
+        parked: Share of the kerb taken by parked cars.
+        plants: Trees and bushes for each 10 metres of front.
+        hedges: Share of fronts with a hedge.
+        fences: Share of fronts with a fence or wall.
+        people: Mean number of people.
+        traffic: Mean number of moving vehicles.
+        crossing: Probability of a crossing street.
+    """
+
+    share: float
+    half_width: Span
+    pavement: Span
+    setback: Span
+    gap: float
+    storeys: tuple[int, int]
+    built: float
+    parked: float
+    plants: float
+    hedges: float
+    fences: float
+    people: float
+    traffic: float
+    crossing: float
+
+
+KINDS = {
+    "residential": Kind(
+        share=0.45, half_width=(2.5, 4.0), pavement=(1.2, 2.4), setback=(1.0, 6.5), gap=6.0, storeys=(2, 3),
+        built=0.64, parked=0.28, plants=5.0, hedges=0.50, fences=0.30, people=0.8, traffic=0.8, crossing=0.75,
+    ),
+    "urban": Kind(
+        share=0.22, half_width=(3.2, 5.5), pavement=(1.8, 4.0), setback=(0.0, 3.0), gap=5.0, storeys=(3, 5),
+        built=0.74, parked=0.35, plants=2.5, hedges=0.08, fences=0.10, people=5.0, traffic=2.2, crossing=0.8,
+    ),
+    "suburb": Kind(
+        share=0.25, half_width=(2.5, 3.8), pavement=(0.0, 2.0), setback=(3.0, 10.0), gap=12.0, storeys=(1, 2),
+        built=0.55, parked=0.12, plants=6.0, hedges=0.55, fences=0.22, people=0.4, traffic=0.6, crossing=0.6,
+    ),
+    "highway": Kind(
+        share=0.08, half_width=(6.0, 9.0), pavement=(0.0, 0.0), setback=(14.0, 30.0), gap=30.0, storeys=(1, 4),
+        built=0.40, parked=0.0, plants=5.0, hedges=0.0, fences=0.0, people=0.0, traffic=5.0, crossing=0.0,
+    ),
+}  # fmt: skip
+
+
+def draw_ground(draws: Draws, name: str) -> Ground:
+    """The ground plan of a place of a kind: its streets, slopes and surfaces."""
+    kind = KINDS[name]
+    streets = _streets(draws, kind, straight=name == "highway")
+    main = streets[0]
+    steep = 0.7 if kind.setback[1] > 10 else 0.3
+    bank_left, bank_right = (draws.normal(0.3, 0.8) if draws.chance(steep) else 0.0 for _ in range(2))
+    paved = kind.setback[1] < 4
+    verge = (LABELS["other-ground"], INDEX["paving"]) if paved else (LABELS["terrain"], INDEX["grass"])
+    albedo = [min(max(draws.normal(m.albedo, m.spread), 0.01), 0.99) for m in MATERIALS]
+    return Ground(
+        waves=tuple(_wave(draws, *wave) for wave in _WAVES),
+        lean=(draws.normal(0.009, 0.007), draws.normal(0, 0.018)),
+        drop=draws.normal(0.01, 0.03),
+        streets=streets,
+        kerb=draws.uniform(0.05, 0.14) if main.pavement > 0 else 0.0,
+        banks=(bank_left, bank_right),
+        verge=verge,
+        patches=_drives(draws, main) if main.pavement > 0 else (),
+        albedo=np.array(albedo, dtype=np.float32),
+    )
+
+
+# Length and height in metres of the waves that the ground is made of.
+_WAVES = ((7.0, 0.012), (16.0, 0.03), (38.0, 0.07), (80.0, 0.20), (170.0, 0.40))
+
+
+def _wave(draws: Draws, length: float, height: float) -> tuple[float, float, float, float]:
+    number, turn = 2 * math.pi / (length * draws.uniform(0.8, 1.25)), draws.uniform(0, 2 * math.pi)
+    amplitude = height * draws.uniform(0.3, 1.5)
+    return amplitude, number * math.cos(turn), number * math.sin(turn), draws.uniform(0, 2 * math.pi)
+
+
+def _streets(draws: Draws, kind: Kind, straight: bool) -> tuple[Street, ...]:
+    """The street that the car drives on, its right half, and perhaps one that crosses or joins it."""
+    half = draws.uniform(*kind.half_width)
+    lines = (0.0, half - 0.3, 0.3 - half) if straight or draws.chance(0.35) else ()
+    main = Street(
+        heading=draws.normal(0, 0.35 if draws.chance(0.25) else 0.05),
+        offset=half / 2 * draws.uniform(0.6, 1.05),
+        curvature=draws.normal(0, 0.0008 if straight else 0.0035),
+        half_width=half,
+        pavement=draws.uniform(*kind.pavement),
+        lines=lines,
+    )
+    if not draws.chance(kind.crossing):
+        return (main,)
+    return _crossed(draws, main)
+
+
+def _crossed(draws: Draws, main: Street) -> tuple[Street, ...]:
+    """A crossroads, a side street to one side, or the end of the main street at another."""
+    at, half = draws.uniform(-40, 50), draws.uniform(2.6, 4.5)
+    across = Street(
+        heading=math.pi / 2 + draws.normal(0, 0.2), offset=-at, curvature=draws.normal(0, 0.0025),
+        half_width=half, pavement=draws.uniform(1.2, 2.5),
+    )  # fmt: skip
+    form = draws.pick(("cross", "left", "right", "end"), (0.4, 0.2, 0.2, 0.2))
+    if form == "end" and abs(at) > 12:
+        return (main._replace(stop=at) if at > 0 else main._replace(start=at)), across
+    middle = main.offset + main.curvature * at * at / 2
+    if form == "left":
+        across = across._replace(start=middle)
+    elif form == "right":
+        across = across._replace(stop=middle)
+    return main, across
+
+
+def _drives(draws: Draws, main: Street) -> tuple[Patch, ...]:
+    """Paved drives and yards beside the street."""
+    out = []
+    for _ in range(draws.whole(1, 5)):
+        length, width = draws.uniform(2.5, 9), draws.uniform(4, 10)
+        lateral = draws.side() * (main.half_width + main.pavement + width / 2)
+        x, y, heading = main.place(draws.uniform(-40, 40), lateral)
+        out.append(Patch(x, y, heading, length, width, LABELS["parking"], INDEX["paving"]))
+    return tuple(out)

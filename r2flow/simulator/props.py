@@ -1,0 +1,188 @@
+"""The things of a street, built of solids: houses, plants, fences, poles, people."""
+
+import math
+
+from r2flow.simulator.scene import FACADE, SceneBuilder
+from r2flow.simulator.shapes import Blobs, Boxes, Cylinders, Frusta
+from r2flow.simulator.vehicles import bicycle
+
+
+def house(b: SceneBuilder, x: float, y: float, yaw: float, length: float, width: float, height: float) -> None:
+    """A block with rows of windows under a gable roof, sometimes with a bay or a porch."""
+    ground = b.level(x, y)
+    wall = "plaster" if b.draws.chance(0.75) else "brick"
+    albedo = b.albedo(wall)
+    block = Boxes(x, y, yaw, length, width, ground - 2, ground + height)
+    b.add(block, "building", wall, albedo, pattern=FACADE, base=ground)
+    pitch = b.draws.uniform(0.9, 1.6)  # metres inwards for each metre up
+    roof = Frusta(
+        x, y, yaw, length + 0.4, width + 0.8, ground + height, ground + height + (width / 2 + 0.4) / pitch,
+        0.0, 0.0, pitch,
+    )  # fmt: skip
+    b.add(roof, "building", "brick")
+    if b.draws.chance(0.5):
+        c, s = math.cos(yaw), math.sin(yaw)
+        u = b.draws.uniform(-0.35, 0.35) * length
+        for v in (-width / 2, width / 2):
+            bay = Boxes(
+                x + u * c - v * s, y + u * s + v * c, yaw, b.draws.uniform(1.4, 3.5), b.draws.uniform(0.8, 2.4),
+                ground - 1, ground + b.draws.uniform(2.4, height),
+            )  # fmt: skip
+            b.add(bay, "building", wall, albedo, pattern=FACADE, base=ground)
+
+
+def _clumps(
+    b: SceneBuilder, x: float, y: float, z: float, radius: float, height: float, size: float, count: int, path: float
+) -> None:
+    """Leafy clumps of about one size, spread evenly over an ellipsoid around (x, y, z)."""
+    draws, albedo = b.draws, b.albedo("leaves")
+    for _ in range(count):
+        turn, up = draws.uniform(0, 2 * math.pi), draws.uniform(-1, 1)
+        far = draws.unit() ** (1 / 3)
+        out = far * math.sqrt(1 - up * up) * radius
+        clump = size * draws.uniform(0.6, 1.4)
+        blob = Blobs(
+            x + out * math.cos(turn), y + out * math.sin(turn), z + far * up * height,
+            clump, clump * draws.uniform(0.6, 1.0), path * draws.uniform(0.4, 1.6),
+        )  # fmt: skip
+        b.add(blob, "vegetation", "leaves", albedo)
+
+
+def tree(b: SceneBuilder, x: float, y: float, size: float = 1.0) -> None:
+    """A trunk and a crown."""
+    draws, ground = b.draws, b.level(x, y)
+    trunk, clear = draws.uniform(0.07, 0.20) * size, draws.uniform(1.5, 2.8)
+    crown, tall = draws.uniform(1.2, 2.6) * size, draws.uniform(1.2, 2.2) * size
+    b.add(Cylinders(x, y, trunk, ground - 0.5, ground + clear + tall), "trunk", "bark")
+    near = math.hypot(x, y) < 40  # far away there are fewer rays to tell clumps apart
+    count, clump = (draws.whole(13, 18), 0.30) if near else (draws.whole(6, 8), 0.42)
+    _clumps(b, x, y, ground + clear + tall, crown, tall, clump * crown, count, draws.uniform(0.4, 1.3))
+
+
+def bush(b: SceneBuilder, x: float, y: float, size: float = 1.0) -> None:
+    """A few leafy clumps on the ground."""
+    height = b.draws.uniform(0.3, 0.9) * size
+    z = b.level(x, y) + height * 0.8
+    _clumps(b, x, y, z, 0.8 * size, height, 0.38 * size, b.draws.whole(4, 7), b.draws.uniform(0.15, 0.5))
+
+
+def thicket(b: SceneBuilder, x: float, y: float) -> None:
+    """Tall trees whose leaves reach the ground."""
+    draws = b.draws
+    height = draws.uniform(2.0, 4.0)
+    near = math.hypot(x, y) < 40
+    count, clump = (draws.whole(14, 22), 0.9) if near else (draws.whole(6, 9), 1.4)
+    z = b.level(x, y) + height * 0.9
+    _clumps(b, x, y, z, draws.uniform(2.0, 3.6), height, clump, count, draws.uniform(0.5, 1.6))
+
+
+def woods(b: SceneBuilder, x: float, y: float) -> None:
+    """Trees so far away that only their mass is seen."""
+    draws, ground, albedo = b.draws, b.level(x, y), b.albedo("leaves")
+    for _ in range(draws.whole(2, 4)):
+        radius, height = draws.uniform(2.0, 4.5), draws.uniform(2.5, 5.0)
+        blob = Blobs(
+            x + draws.normal(0, 4), y + draws.normal(0, 4), ground + 0.8 * height,
+            radius, height, draws.uniform(0.4, 2.0),
+        )  # fmt: skip
+        b.add(blob, "vegetation", "leaves", albedo)
+
+
+def hedge(b: SceneBuilder, x: float, y: float, yaw: float, length: float, height: float) -> None:
+    """A cut hedge, in pieces of uneven height and depth."""
+    albedo = b.albedo("leaves")
+    c, s = math.cos(yaw), math.sin(yaw)
+    pieces = max(1, round(length / 2.5))
+    for piece in range(pieces):
+        u = ((piece + 0.5) / pieces - 0.5) * length
+        px, py = x + u * c, y + u * s
+        ground = b.level(px, py)
+        box = Boxes(
+            px, py, yaw + b.draws.uniform(-0.03, 0.03), length / pieces + 0.1, b.draws.uniform(0.7, 1.1),
+            ground - 0.3, ground + height * b.draws.uniform(0.9, 1.08),
+        )  # fmt: skip
+        b.add(box, "vegetation", "leaves", albedo)
+
+
+def fence(b: SceneBuilder, x: float, y: float, yaw: float, length: float) -> None:
+    """A wall, a plank fence, slats or wire with posts."""
+    ground, style = b.level(x, y), b.draws.unit()
+    height = b.draws.uniform(0.9, 1.9)
+    if style < 0.35:
+        wall = Boxes(x, y, yaw, length, 0.25, ground - 0.5, ground + min(height, 1.4))
+        b.add(wall, "fence", "concrete")
+        return
+    closed = 1.0 if style < 0.6 else b.draws.uniform(0.25, 0.7)
+    b.add(Boxes(x, y, yaw, length, 0.04, ground, ground + height), "fence", "wood", closed=closed)
+    c, s = math.cos(yaw), math.sin(yaw)
+    posts = max(2, round(length / 2.5))
+    for post in range(posts):
+        u = (post / (posts - 1) - 0.5) * length
+        b.add(Cylinders(x + u * c, y + u * s, 0.05, ground, ground + height + 0.08), "fence", "wood")
+
+
+def pole(b: SceneBuilder, x: float, y: float, tall: float | None = None) -> None:
+    """A lamp post."""
+    ground = b.level(x, y)
+    tall = b.draws.uniform(4.5, 8.5) if tall is None else tall
+    b.add(Cylinders(x, y, b.draws.uniform(0.05, 0.11), ground - 0.3, ground + tall), "pole", "metal")
+    if b.draws.chance(0.3):  # a foot with a door in it
+        b.add(Cylinders(x, y, b.draws.uniform(0.10, 0.15), ground - 0.3, ground + 0.9), "pole", "metal")
+
+
+def sign(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
+    """A retro-reflecting plate on a post, facing along yaw."""
+    ground, low = b.level(x, y), b.draws.uniform(1.7, 2.4)
+    size = b.draws.uniform(0.45, 0.8)
+    b.add(Cylinders(x, y, 0.04, ground - 0.3, ground + low + size), "pole", "metal")
+    c, s = math.cos(yaw), math.sin(yaw)
+    plate = Boxes(x + 0.07 * c, y + 0.07 * s, yaw, 0.03, size, ground + low, ground + low + size)
+    b.add(plate, "traffic-sign", "retro")
+
+
+def bollard(b: SceneBuilder, x: float, y: float) -> None:
+    """A waist-high post with a reflecting band."""
+    ground, radius = b.level(x, y), b.draws.uniform(0.06, 0.12)
+    tall = b.draws.uniform(0.8, 1.1)
+    b.add(Cylinders(x, y, radius, ground, ground + tall), "pole", "metal")
+    b.add(Cylinders(x, y, radius + 0.01, ground + tall - 0.3, ground + tall - 0.15), "pole", "retro")
+
+
+def bin_(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
+    """A refuse bin."""
+    ground, size = b.level(x, y), b.draws.uniform(0.45, 0.7)
+    b.add(Boxes(x, y, yaw, size, size, ground, ground + 1.05), "other-object", "plastic")
+
+
+def cabinet(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
+    """A switch box of the electricity works."""
+    ground = b.level(x, y)
+    box = Boxes(x, y, yaw, b.draws.uniform(0.6, 1.4), 0.4, ground, ground + b.draws.uniform(0.9, 1.4))
+    b.add(box, "other-structure", "concrete")
+
+
+def person(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = True) -> None:
+    """Two legs, a trunk, arms and a head."""
+    ground, tall = b.level(x, y), b.draws.uniform(1.55, 1.9)
+    label = "moving-person" if moving else "person"
+    albedo, stride = b.albedo("cloth"), b.draws.uniform(0.05, 0.25)
+    c, s = math.cos(yaw), math.sin(yaw)
+    for side in (-1, 1):
+        u, v = side * stride, side * 0.09
+        leg = Cylinders(x + u * c - v * s, y + u * s + v * c, 0.08, ground, ground + 0.48 * tall)
+        b.add(leg, label, "cloth")
+        u, v = -side * stride * 0.7, side * 0.23
+        arm = Blobs(x + u * c - v * s, y + u * s + v * c, ground + 0.64 * tall, 0.07, 0.17 * tall, 0)
+        b.add(arm, label, "cloth", albedo)
+    b.add(Blobs(x, y, ground + 0.66 * tall, 0.20, 0.21 * tall, 0), label, "cloth", albedo)
+    b.add(Blobs(x, y, ground + 0.93 * tall, 0.11, 0.13, 0), label, "skin")
+
+
+def cyclist(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
+    """A rider on a bicycle."""
+    bicycle(b, x, y, yaw, "moving-bicyclist")
+    ground, albedo = b.level(x, y), b.albedo("cloth")
+    b.add(Blobs(x, y, ground + 1.25, 0.22, 0.34, 0), "moving-bicyclist", "cloth", albedo)
+    b.add(Blobs(x + 0.1 * math.cos(yaw), y + 0.1 * math.sin(yaw), ground + 1.68, 0.11, 0.13, 0),
+          "moving-bicyclist", "skin")  # fmt: skip
+    b.add(Cylinders(x, y, 0.12, ground + 0.4, ground + 1.0), "moving-bicyclist", "cloth")

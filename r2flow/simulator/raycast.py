@@ -1,0 +1,107 @@
+"""Rays into a scene: the nearest meeting of each, and what it is with.
+
+Solids give fragments (pixel, distance); the nearest fragment of a pixel wins; only winners are looked at
+more closely (normal, material, window or wall).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from r2flow.simulator.facades import divided, relief
+from r2flow.simulator.rays import Rays
+from r2flow.simulator.scene import Scene, Surface
+from r2flow.simulator.shapes import Fragments, Normal, Shape
+
+DRIFT = 0.03  # of half a bin, how far the firings move from one bin to the next
+
+
+class Hits(NamedTuple):
+    """What each ray meets first; (B, W) each. Rays that meet nothing have distance inf and label 0.
+
+    Attributes:
+        distance: Horizontal distance s from the sensor's axis in metres.
+        cosine: Cosine of the angle between ray and surface normal.
+        label: SemanticKITTI id.
+        material: Index into `materials.MATERIALS`.
+        albedo: Reflectance reading at perpendicular incidence.
+    """
+
+    distance: np.ndarray
+    cosine: np.ndarray
+    label: np.ndarray
+    material: np.ndarray
+    albedo: np.ndarray
+
+
+def cast(scene: Scene, rays: Rays, rng: np.random.Generator) -> Hits:
+    """The nearest meeting of every ray; `rng` decides which rays pass through leaves and slats."""
+    ground = scene.ground.meet(rays)
+    distance = ground.distance.ravel().copy()
+    met = [_visible(shape, surface, rays, distance, rng) for shape, surface in _tables(scene)]
+    for fragments in met:
+        np.minimum.at(distance, fragments.pixel, fragments.distance)
+    hits = _on_ground(scene, rays, ground.distance.ravel(), ground.cosine.ravel())
+    hits = hits._replace(distance=distance)
+    # All winners are found before any is written: writing moves some a little behind their surface.
+    won = [fragments.distance == distance[fragments.pixel] for fragments in met]
+    for fragments, first, (shape, surface) in zip(met, won, _tables(scene), strict=True):
+        _on_solid(hits, rays, shape, surface, Fragments(*(q[first] for q in fragments)))
+    return Hits(*(q.reshape(rays.shape) for q in hits))
+
+
+def _tables(scene: Scene) -> list[tuple[Shape, Surface]]:
+    return list(zip(scene.solids, scene.surfaces, strict=True))
+
+
+def _visible(shape: Shape, surface: Surface, rays: Rays, limit: np.ndarray, rng: np.random.Generator) -> Fragments:
+    """Fragments before the ground, less those that pass between slats."""
+    fragments = shape.fragments(rays, rng)
+    keep = fragments.distance < limit[fragments.pixel]
+    fragments = Fragments(*(q[keep] for q in fragments))
+    if (surface.closed == 1).all():
+        return fragments
+    keep = rng.random(len(fragments.solid), dtype=np.float32) < surface.closed[fragments.solid]
+    return Fragments(*(q[keep] for q in fragments))
+
+
+def _on_ground(scene: Scene, rays: Rays, distance: np.ndarray, cosine: np.ndarray) -> Hits:
+    """Hits as if there were no solids, (B W,) each."""
+    label = np.zeros(distance.shape, np.uint16)
+    material = np.zeros(distance.shape, np.uint8)
+    met = np.flatnonzero(np.isfinite(distance))
+    w = met % rays.columns
+    x, y = distance[met] * rays.cos[w], distance[met] * rays.sin[w]
+    albedo = np.zeros(distance.shape, np.float32)
+    label[met], material[met], albedo[met] = scene.ground.surface(x, y)
+    return Hits(distance, cosine.copy(), label, material, albedo)
+
+
+def _on_solid(hits: Hits, rays: Rays, shape: Shape, surface: Surface, fragments: Fragments) -> None:
+    """Write the winning fragments of one table into the hits."""
+    pixel, s, k = fragments
+    b, w = pixel // rays.columns, pixel % rays.columns
+    x, y, z = s * rays.cos[w], s * rays.sin[w], rays.height[b] + s * rays.slope[b]
+    normal = shape.normal(k, x, y, z)
+    ahead = normal.x * rays.cos[w] + normal.y * rays.sin[w] + normal.z * rays.slope[b]
+    hits.cosine[pixel] = np.abs(ahead) / np.sqrt(1 + rays.slope[b] ** 2)
+    hits.label[pixel] = surface.label[k]
+    hits.material[pixel], hits.albedo[pixel] = divided(surface, k, normal, z)
+    moved = s + relief(surface, k, normal, z) / np.maximum(np.abs(ahead), 0.3)
+    if not rays.beams.straight:
+        moved = moved * _between_columns(rays, b, w, normal, ahead)
+    hits.distance[pixel] = moved
+
+
+def _between_columns(rays: Rays, b: np.ndarray, w: np.ndarray, normal: Normal, ahead: np.ndarray) -> np.ndarray:
+    """Factors of s for lasers that fire beside the middle of the bin, (N,).
+
+    A plane n . p = const met along d at s is met along d' at s (n . d) / (n . d'). Each laser fires about
+    twice in a bin, and the nearer return is the one that the bin keeps.
+    """
+    firing = (rays.beams.phase[b] + DRIFT * w) % 1
+    across = normal.y * rays.cos[w] - normal.x * rays.sin[w]  # d(n . d) / da
+    turn = np.where(across * ahead > 0, firing, firing - 1) * (np.pi / rays.columns)
+    other = ahead * np.cos(turn) + across * np.sin(turn)
+    factor = ahead / np.where(np.abs(other) < 1e-3, ahead, other)
+    return np.where(normal.flat, np.clip(factor, 0.93, 1.0), 1).astype(np.float32)

@@ -1,0 +1,112 @@
+"""A scene: the ground and tables of solids, with what each solid is made of."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from r2flow.simulator.draws import Draws
+from r2flow.simulator.ground import Ground
+from r2flow.simulator.labels import LABELS
+from r2flow.simulator.materials import INDEX, MATERIALS
+from r2flow.simulator.shapes import Blobs, Boxes, Cylinders, Frusta, Shape
+
+PLAIN, FACADE, CABIN, BODY = range(4)  # patterns: how a solid's surface is divided among materials
+
+
+class Surface(NamedTuple):
+    """What solids are made of; every field (P,).
+
+    Attributes:
+        label: SemanticKITTI id.
+        material: Index into `materials.MATERIALS`.
+        albedo: Reflectance reading at perpendicular incidence.
+        closed: Share of the rays that the solid stops; a fence of slats is not wholly closed.
+        pattern: PLAIN, FACADE (windows), CABIN (panes), BODY (number plates and lamps).
+        base: Height of the ground at the solid, from which patterns are measured.
+    """
+
+    label: np.ndarray
+    material: np.ndarray
+    albedo: np.ndarray
+    closed: np.ndarray
+    pattern: np.ndarray
+    base: np.ndarray
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything that rays can meet, in metres; z = 0 is the ground below the sensor.
+
+    Attributes:
+        ground: The ground.
+        solids: Tables of solids, one of each kind.
+        surfaces: What they are made of, one table for each of `solids`.
+        kind: Name of the kind of place.
+        rig: Which silhouettes of the own car stand in the view.
+    """
+
+    ground: Ground
+    solids: tuple[Shape, ...] = ()
+    surfaces: tuple[Surface, ...] = ()
+    kind: str = "bare"
+    rig: int | None = None
+
+
+class SceneBuilder:
+    """Collects solids one at a time.
+
+    Attributes:
+        ground: What they stand on.
+        draws: Where whatever is random about them comes from.
+    """
+
+    SHAPES = (Boxes, Frusta, Cylinders, Blobs)
+
+    def __init__(self, ground: Ground, draws: Draws) -> None:
+        self.ground = ground
+        self.draws = draws
+        self._rows: dict[type, list[tuple[float, ...]]] = {shape: [] for shape in self.SHAPES}
+        self._surfaces: dict[type, list[tuple[float, ...]]] = {shape: [] for shape in self.SHAPES}
+
+    def level(self, x: float, y: float) -> float:
+        """Height of the ground at a place, kerb included, in metres."""
+        raised = bool(self.ground.streets) and self.ground.off_street(x, y) > 0
+        return float(self.ground.height(x, y)) + self.ground.kerb * raised
+
+    def albedo(self, material: str) -> float:
+        """The reading of one object of a material, drawn around the usual one."""
+        m = MATERIALS[INDEX[material]]
+        return min(max(self.draws.normal(m.albedo, m.spread), 0.01), 0.99)
+
+    def add(
+        self,
+        solid: Boxes | Frusta | Cylinders | Blobs,
+        label: str,
+        material: str,
+        albedo: float | None = None,
+        closed: float = 1.0,
+        pattern: int = PLAIN,
+        base: float = 0.0,
+    ) -> None:
+        """Put one solid, its fields numbers, into the scene."""
+        kind = type(solid)
+        self._rows[kind].append(tuple(solid))
+        albedo = self.albedo(material) if albedo is None else albedo
+        self._surfaces[kind].append((LABELS[label], INDEX[material], albedo, closed, pattern, base))
+
+    def build(self, kind: str, rig: int | None) -> Scene:
+        """The scene as tables."""
+        kinds = [shape for shape in self.SHAPES if self._rows[shape]]
+        solids = tuple(shape(*_columns(self._rows[shape])) for shape in kinds)
+        surfaces = tuple(_surface(_columns(self._surfaces[shape])) for shape in kinds)
+        return Scene(self.ground, solids, surfaces, kind, rig)
+
+
+def _columns(rows: list[tuple[float, ...]]) -> np.ndarray:
+    return np.ascontiguousarray(np.array(rows, dtype=np.float32).T)
+
+
+def _surface(columns: np.ndarray) -> Surface:
+    label, material, albedo, closed, pattern, base = columns
+    return Surface(label.astype(np.uint16), material.astype(np.uint8), albedo, closed, pattern.astype(np.uint8), base)

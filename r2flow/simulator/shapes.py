@@ -1,0 +1,298 @@
+"""Solids that a scene is built of, each a table of many, met by all rays that can reach them at once.
+
+A shape answers two questions: `fragments`, which rays meet which of its solids and where; and `normal`,
+which way the surface faces where one was met. Coordinates are metres in the scene's frame: x ahead and y
+left of the sensor's axis, z up. Solids turned by `yaw` have their length along (cos yaw, sin yaw).
+"""
+
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from r2flow.simulator.rays import Rays, column_windows, row_windows
+
+# A field of all solids of a table, (P,) float32; of a single one, on its way into a table, a number.
+Column = Any
+
+NEAR = 0.05  # metres: nothing is looked for nearer than this
+
+
+class Fragments(NamedTuple):
+    """Meetings of rays and solids: pixel b W + w, horizontal distance s in metres, solid k; (F,) each."""
+
+    pixel: np.ndarray
+    distance: np.ndarray
+    solid: np.ndarray
+
+
+class Normal(NamedTuple):
+    """How a surface lies where it was met; every field (N,).
+
+    Attributes:
+        x, y, z: Outward unit normal.
+        along: Place along the face, metres from its middle; 0 where there is no face.
+        end: Whether it is the front or back of something long.
+        flat: Whether it is a plane.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    z: np.ndarray
+    along: np.ndarray
+    end: np.ndarray
+    flat: np.ndarray
+
+
+class Shape(Protocol):
+    """A table of solids of one kind."""
+
+    def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments: ...
+
+    def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal: ...
+
+
+class Boxes(NamedTuple):
+    """Upright boxes; every field a column."""
+
+    x: Column
+    y: Column
+    yaw: Column
+    length: Column
+    width: Column
+    bottom: Column
+    top: Column
+
+    def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
+        """Side, top or bottom, whichever is met first."""
+        k, w, near, far = _box_spans(self, rays)
+        return _upright(rays, k, w, near, far, self.bottom[k], self.top[k])
+
+    def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
+        """Of the face that the point (N,) lies nearest to."""
+        u, v, c, s = _into(self, k, x, y)
+        outside = np.stack(
+            [
+                np.abs(u) - self.length[k] / 2,
+                np.abs(v) - self.width[k] / 2,
+                z - self.top[k],
+                self.bottom[k] - z,
+            ]
+        )
+        face = outside.argmax(0)
+        nu = np.where(face == 0, np.sign(u), 0)
+        nv = np.where(face == 1, np.sign(v), 0)
+        nz = (face == 2).astype(np.float32) - (face == 3)
+        return Normal(nu * c - nv * s, nu * s + nv * c, nz, np.where(face == 0, v, u), face == 0, face < 2)
+
+
+class Frusta(NamedTuple):
+    """Boxes whose four sides lean inwards by so many metres (>= 0) a metre of height; every field a column."""
+
+    x: Column
+    y: Column
+    yaw: Column
+    length: Column
+    width: Column
+    bottom: Column
+    top: Column
+    front: Column
+    back: Column
+    sides: Column
+
+    def _planes(self, k: np.ndarray) -> list[tuple[float, float, np.ndarray, np.ndarray]]:
+        """(a, b, lean, reach) of the half-spaces a u + b v + lean (z - bottom) <= reach."""
+        half_length, half_width = self.length[k] / 2, self.width[k] / 2
+        return [
+            (1.0, 0.0, self.front[k], half_length),
+            (-1.0, 0.0, self.back[k], half_length),
+            (0.0, 1.0, self.sides[k], half_width),
+            (0.0, -1.0, self.sides[k], half_width),
+        ]
+
+    def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
+        """Each ray in the box around a solid is clipped by the solid's leaning sides, top and bottom."""
+        k, w, near, far = _box_spans(self, rays)
+        n, b = row_windows(rays, near, far, self.bottom[k], self.top[k])
+        k, w, near, far = k[n], w[n], near[n], far[n]
+        slope, rise = rays.slope[b], rays.height[b] - self.bottom[k]
+        u, v, c, s = _into(self, k, np.float32(0), np.float32(0))
+        du, dv = rays.cos[w] * c + rays.sin[w] * s, rays.sin[w] * c - rays.cos[w] * s
+        for a, bb, lean, reach in self._planes(k):
+            near, far = _clip(near, far, a * du + bb * dv + lean * slope, reach - a * u - bb * v - lean * rise)
+        near, far = _clip(near, far, slope, self.top[k] - self.bottom[k] - rise)
+        near, far = _clip(near, far, -slope, rise)
+        hit = near < far
+        return Fragments((b * rays.columns + w)[hit], near[hit], k[hit])
+
+    def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
+        """Of the plane that the point (N,) lies nearest to."""
+        u, v, c, s = _into(self, k, x, y)
+        rise = z - self.bottom[k]
+        planes = self._planes(k)
+        outside = [a * u + b * v + lean * rise - reach for a, b, lean, reach in planes]
+        face = np.stack([*outside, z - self.top[k], self.bottom[k] - z]).argmax(0)
+        nu, nv, nz = (np.zeros(len(k), np.float32) for _ in range(3))
+        for index, (a, b, lean, _) in enumerate(planes):
+            on = face == index
+            norm = np.sqrt(1 + lean[on] ** 2)
+            nu[on], nv[on], nz[on] = a / norm, b / norm, lean[on] / norm
+        nz[face == 4], nz[face == 5] = 1, -1
+        return Normal(nu * c - nv * s, nu * s + nv * c, nz, np.where(face < 2, v, u), face < 2, face < 4)
+
+
+class Cylinders(NamedTuple):
+    """Upright cylinders; every field a column."""
+
+    x: Column
+    y: Column
+    radius: Column
+    bottom: Column
+    top: Column
+
+    def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
+        """Mantle, top or bottom, whichever is met first."""
+        k, w, middle, half = _chords(self.x, self.y, self.radius, rays)
+        near, far = np.maximum(middle - half, NEAR), middle + half
+        ahead = far > NEAR
+        k, w, near, far = k[ahead], w[ahead], near[ahead], far[ahead]
+        return _upright(rays, k, w, near, far, self.bottom[k], self.top[k])
+
+    def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
+        """Away from the axis, or up or down on the ends."""
+        u, v = x - self.x[k], y - self.y[k]
+        away = np.hypot(u, v)
+        on_top = z - self.top[k] > away - self.radius[k]
+        below = self.bottom[k] - z > away - self.radius[k]
+        side = np.where(on_top | below, 0, 1 / np.maximum(away, 1e-6))
+        nz = on_top.astype(np.float32) - below
+        return _round(u * side, v * side, nz)
+
+
+class Blobs(NamedTuple):
+    """Ellipsoids of revolution, upright; every field a column.
+
+    `path` is the mean free path of a pulse inside, in metres; 0 is solid. A pulse goes in, and is sent
+    back after a distance drawn from Exp(path) unless it has left by then: that is what lets rays through
+    a tree.
+    """
+
+    x: Column
+    y: Column
+    z: Column
+    radius: Column
+    height: Column
+    path: Column
+
+    def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments:
+        """Roots of |p(s) - c|^2 = 1 in units of the half axes, the near one moved inwards by the free path."""
+        k, w, middle, half = _chords(self.x, self.y, self.radius, rays)
+        ahead = middle - half > NEAR
+        k, w, middle, half = k[ahead], w[ahead], middle[ahead], half[ahead]
+        n, b = row_windows(rays, middle - half, middle + half, self.z[k] - self.height[k], self.z[k] + self.height[k])
+        k, w, middle, half = k[n], w[n], middle[n], half[n]
+        level = (1 / self.radius**2)[k]  # (s - middle)^2 level + (z + s T - c)^2 upright = half^2 level
+        upright = (1 / self.height**2)[k]
+        slope, rise = rays.slope[b], rays.height[b] - self.z[k]
+        a = level + slope**2 * upright
+        h = middle * level - slope * rise * upright
+        d = h * h - a * ((middle**2 - half**2) * level + rise**2 * upright)
+        root = np.sqrt(np.maximum(d, 0))
+        distance = (h - root) / a
+        path = self.path[k]
+        distance += path * rng.standard_exponential(len(k), dtype=np.float32)
+        hit = (d > 0) & ((path == 0) | (distance < (h + root) / a))
+        return Fragments((b * rays.columns + w)[hit], distance[hit], k[hit])
+
+    def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
+        """Gradient of the ellipsoid through the point."""
+        u, v = (x - self.x[k]) / self.radius[k] ** 2, (y - self.y[k]) / self.radius[k] ** 2
+        t = (z - self.z[k]) / self.height[k] ** 2
+        norm = 1 / np.maximum(np.sqrt(u * u + v * v + t * t), 1e-6)
+        return _round(u * norm, v * norm, t * norm)
+
+
+def _round(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
+    """A normal of something without faces."""
+    return Normal(x, y, z, np.zeros_like(x), np.zeros(len(x), bool), np.zeros(len(x), bool))
+
+
+def _into(solids: "Boxes | Frusta", k: np.ndarray, x: Column, y: Column) -> tuple[np.ndarray, ...]:
+    """The points in the solids' own axes, and cos and sin of their yaw: (u, v, c, s), (N,) each."""
+    c, s = np.cos(solids.yaw)[k], np.sin(solids.yaw)[k]
+    dx, dy = x - solids.x[k], y - solids.y[k]
+    return dx * c + dy * s, dy * c - dx * s, c, s
+
+
+def _box_spans(solids: "Boxes | Frusta", rays: Rays) -> tuple[np.ndarray, ...]:
+    """Where each column enters and leaves the outlines of the solids seen from above.
+
+    Returns:
+        Solid k, column w, and the horizontal distances near < far in metres; (N,) each.
+    """
+    everyone = np.arange(len(solids.x))
+    u, v, c, s = _into(solids, everyone, np.float32(0), np.float32(0))
+    a, b = solids.length / 2, solids.width / 2
+    corner_x = [solids.x + i * a * c - j * b * s for i, j in _CORNERS]
+    corner_y = [solids.y + i * a * s + j * b * c for i, j in _CORNERS]
+    middle = np.arctan2(solids.y, solids.x).astype(np.float64)
+    turn = np.arctan2(corner_y, corner_x) - middle
+    half = np.abs((turn + np.pi) % (2 * np.pi) - np.pi).max(0)
+    half[(np.abs(u) <= a) & (np.abs(v) <= b)] = np.pi  # the sensor's axis is inside
+    k, w = column_windows(middle, half + 1e-6, rays.columns)
+    u, v, c, s, a, b = (q[k] for q in (u, v, c, s, a, b))
+    du, dv = rays.cos[w] * c + rays.sin[w] * s, rays.sin[w] * c - rays.cos[w] * s
+    near, far = np.full(len(k), NEAR, np.float32), np.full(len(k), np.inf, np.float32)
+    for position, direction, reach in ((u, du, a), (v, dv, b)):
+        direction = np.where(np.abs(direction) < 1e-7, np.float32(1e-7), direction)
+        one, two = (-reach - position) / direction, (reach - position) / direction
+        near, far = np.maximum(near, np.minimum(one, two)), np.minimum(far, np.maximum(one, two))
+    met = near < far
+    return k[met], w[met], near[met], far[met]
+
+
+_CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+
+
+def _chords(x: np.ndarray, y: np.ndarray, radius: np.ndarray, rays: Rays) -> tuple[np.ndarray, ...]:
+    """Where each column crosses circles seen from above: solid k, column w, middle and half of the chord."""
+    distance = np.hypot(x, y)
+    inside = distance <= radius
+    half = np.where(inside, np.pi, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-6), 1)))
+    k, w = column_windows(np.arctan2(y, x).astype(np.float64), half.astype(np.float64), rays.columns)
+    middle = x[k] * rays.cos[w] + y[k] * rays.sin[w]
+    across = y[k] * rays.cos[w] - x[k] * rays.sin[w]
+    square = radius[k] ** 2 - across**2
+    met = (square > 0) & ((middle > 0) | inside[k])
+    return k[met], w[met], middle[met], np.sqrt(square[met])
+
+
+def _upright(
+    rays: Rays,
+    k: np.ndarray,
+    w: np.ndarray,
+    near: np.ndarray,
+    far: np.ndarray,
+    bottom: np.ndarray,
+    top: np.ndarray,
+) -> Fragments:
+    """First meeting with upright walls between near and far that reach from bottom to top, lids included."""
+    n, b = row_windows(rays, near, far, bottom, top)
+    k, w, near, far, bottom, top = (q[n] for q in (k, w, near, far, bottom, top))
+    slope, height = rays.slope[b], rays.height[b]
+    z = height + near * slope
+    lid = np.where(z > top, top, bottom)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        over = (lid - height) / slope  # where a ray that passes above or below the wall comes to the lid
+    on_wall = (z <= top) & (z >= bottom)
+    distance = np.where(on_wall, near, over)
+    hit = on_wall | ((over > near) & (over < far))
+    return Fragments((b * rays.columns + w)[hit], distance[hit], k[hit])
+
+
+def _clip(near: np.ndarray, far: np.ndarray, direction: np.ndarray, room: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The part of near..far where direction s <= room."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = room / direction
+    near = np.where(direction < 0, np.maximum(near, at), near)
+    far = np.where(direction > 0, np.minimum(far, at), far)
+    return near, np.where((direction == 0) & (room < 0), -np.inf, far)

@@ -1,0 +1,35 @@
+"""Procedural places around a car that drives along x."""
+
+import numpy as np
+
+from r2flow.simulator import fronts, roadside
+from r2flow.simulator.draws import Draws
+from r2flow.simulator.ego import RIGS
+from r2flow.simulator.kinds import KINDS, draw_ground
+from r2flow.simulator.scene import Scene, SceneBuilder
+
+
+def draw_scene(rng: np.random.Generator, kind: str | None = None) -> Scene:
+    """A place of a kind, or of any kind by its share.
+
+    Args:
+        rng: Where all that is random about it comes from.
+        kind: A name in `kinds.KINDS`, or None to draw one.
+    """
+    draws = Draws(rng)
+    drawn = draws.pick(list(KINDS), [k.share for k in KINDS.values()])
+    name = kind or drawn
+    b, k = SceneBuilder(draw_ground(draws, name), draws), KINDS[name]
+    streets = b.ground.streets
+    for street in streets:
+        for side in (1, -1):
+            fronts.line_front(b, k, street, side)
+            roadside.park(b, k, street, side)
+            roadside.furnish(b, street, side)
+        fronts.close_street(b, street)
+    fronts.close_view(b)
+    roadside.drive(b, k, streets[0])
+    roadside.walk(b, k, streets[0])
+    if name == "highway":
+        roadside.guard(b, streets[0])
+    return b.build(name, rig=draws.pick(range(len(RIGS)), (0.7, 0.3)))

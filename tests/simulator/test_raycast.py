@@ -1,0 +1,151 @@
+"""Ray casting against what geometry says."""
+
+import numpy as np
+import pytest
+
+from r2flow.lidar.sensors import SENSORS
+from r2flow.simulator.beams import along_rows, beams_of
+from r2flow.simulator.draws import Draws
+from r2flow.simulator.ground import Ground
+from r2flow.simulator.labels import LABELS
+from r2flow.simulator.materials import INDEX
+from r2flow.simulator.raycast import cast
+from r2flow.simulator.rays import Rays
+from r2flow.simulator.scene import SceneBuilder
+from r2flow.simulator.shapes import Blobs, Boxes, Cylinders, Frusta
+
+HDL64E = SENSORS["hdl64e"]
+HEIGHT = HDL64E.height
+
+
+def look(*solids, ground=None, sensor=HDL64E, beams=None, material="concrete"):
+    """Hits of all rays on a few solids over flat ground, and r = s / cos e."""
+    b = SceneBuilder(ground or Ground(), Draws(np.random.default_rng(0)))
+    for label, solid in solids:
+        b.add(solid, label, material)
+    rays = Rays(beams or along_rows(sensor), sensor.columns, sensor.height)
+    hits = cast(b.build("test", None), rays, np.random.default_rng(1))
+    return hits, hits.distance / np.cos(rays.beams.elevation)[:, None], rays
+
+
+def directions(rays):
+    """Unit vectors of all rays, (3, B, W), float64."""
+    e, a = np.broadcast_arrays(rays.beams.elevation[:, None], rays.azimuth)
+    return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+
+
+def test_a_sensor_above_flat_ground_measures_minus_h_over_sin_e():
+    _, r, rays = look()
+    e = rays.beams.elevation[:, None]
+    exact = np.where(np.sin(e) < -0.02, -HEIGHT / np.sin(e), np.inf)
+    down = np.isfinite(exact[:, 0])
+    np.testing.assert_allclose(r[down], np.broadcast_to(exact, r.shape)[down], rtol=1e-5)
+    assert np.isinf(r[rays.beams.elevation >= 0]).all()
+
+
+def test_lasers_above_the_origin_see_flat_ground_at_their_own_height():
+    beams = beams_of(HDL64E)
+    hits, _, _ = look(beams=beams)
+    down = beams.elevation < -0.05
+    exact = -(HEIGHT + beams.height) / np.tan(beams.elevation)
+    np.testing.assert_allclose(hits.distance[down], np.repeat(exact[down, None], HDL64E.columns, 1), rtol=1e-5)
+
+
+def test_a_sphere_is_met_at_the_root_of_its_quadratic():
+    centre, radius = np.array([9.0, 4.0, 1.2]), 1.1
+    hits, r, rays = look(("person", Blobs(*centre, radius, radius, 0.0)))
+    d = directions(rays)
+    c = centre - [0, 0, HEIGHT]
+    along = np.tensordot(c, d, 1)
+    root = radius**2 - (c @ c - along**2)
+    exact = along - np.sqrt(np.where(root > 0, root, np.nan))
+    on = hits.label == LABELS["person"]
+    clear = root > 1e-3
+    assert clear.sum() > 500
+    assert on[clear & (along > 0)].mean() == 1
+    np.testing.assert_allclose(r[on], exact[on], atol=2e-3)
+
+
+def test_an_upright_cylinder_is_met_at_the_near_side_of_the_chord():
+    x, y, radius = 7.0, -3.0, 0.4
+    hits, _, rays = look(("pole", Cylinders(x, y, radius, -1.0, 6.0)))
+    a = np.broadcast_to(rays.azimuth, rays.shape)
+    along, across = x * np.cos(a) + y * np.sin(a), y * np.cos(a) - x * np.sin(a)
+    exact = along - np.sqrt(np.maximum(radius**2 - across**2, 0))
+    on = hits.label == LABELS["pole"]
+    assert on.sum() > 100
+    np.testing.assert_allclose(hits.distance[on], exact[on], atol=2e-3)
+
+
+@pytest.mark.parametrize("shape", [Boxes, Frusta])
+def test_the_face_of_a_turned_box_is_met_in_its_plane(shape):
+    yaw, length, width = 0.6, 4.0, 2.0
+    middle = np.array([8.0, 5.0])
+    lean = (0.0, 0.0, 0.0) if shape is Frusta else ()
+    hits, _, rays = look(("car", shape(*middle, yaw, length, width, 0.0, 5.0, *lean)))
+    on = np.argwhere(hits.label == LABELS["car"])
+    assert len(on) > 200
+    s = hits.distance[tuple(on.T)].astype(float)
+    a, z = rays.azimuth[on[:, 1]], HEIGHT + s * np.tan(rays.beams.elevation[on[:, 0]])
+    p = np.stack([s * np.cos(a), s * np.sin(a)]) - middle[:, None]
+    u, v = p[0] * np.cos(yaw) + p[1] * np.sin(yaw), p[1] * np.cos(yaw) - p[0] * np.sin(yaw)
+    outside = np.max([np.abs(u) - length / 2, np.abs(v) - width / 2, z - 5.0, -z], axis=0)
+    np.testing.assert_allclose(outside, 0, atol=2e-3)
+
+
+def test_a_leaning_windscreen_is_met_in_its_plane():
+    hits, _, rays = look(("car", Frusta(10.0, 0.0, np.pi, 4.0, 4.0, 0.0, 2.0, 0.5, 0.0, 0.0)))
+    w = HDL64E.columns // 2
+    rows = np.flatnonzero(hits.label[:, w] == LABELS["car"])
+    z = HEIGHT + hits.distance[rows, w] * np.tan(rays.beams.elevation[rows])
+    # its front looks at the sensor: at x = 8 on the ground, half a metre farther for each metre of height
+    leaning = z < 2 - 1e-3
+    np.testing.assert_allclose(hits.distance[rows, w][leaning], 8 + 0.5 * z[leaning], atol=0.02)
+
+
+def test_a_wall_hides_what_is_behind_it_and_nothing_before_it():
+    wall = ("building", Boxes(12.0, 0.0, 0.0, 0.5, 200.0, -1.0, 50.0))
+    near, far = Cylinders(8.0, 0.0, 0.3, 0.0, 4.0), Cylinders(20.0, 1.0, 0.3, 0.0, 4.0)
+    with_wall, _, _ = look(wall, ("pole", near), ("trunk", far))
+    without, _, _ = look(("pole", near))
+    assert (with_wall.label != LABELS["trunk"]).all()
+    before = without.distance < 11.7
+    np.testing.assert_array_equal(with_wall.distance[before], without.distance[before])
+    assert (with_wall.label == LABELS["pole"]).sum() == (without.label == LABELS["pole"]).sum()
+
+
+def test_the_nearest_of_many_overlapping_things_wins():
+    solids = [("car", Boxes(x, 0.3 * x, 0.2 * x, 1.5, 1.0, 0.0, 2.0)) for x in (5.0, 6.0, 7.0, 9.0, 14.0)]
+    together, _, _ = look(*solids)
+    apart = np.min([look(one)[0].distance for one in solids], axis=0)
+    np.testing.assert_array_equal(together.distance, apart)
+
+
+def test_a_free_path_lets_through_the_share_that_an_exponential_says():
+    radius, path = 2.0, 1.5
+    hits, _, rays = look(("vegetation", Blobs(15.0, 0.0, 1.7, radius, radius, path)))
+    d, c = directions(rays), np.array([15.0, 0.0, 1.7 - HEIGHT])
+    root = radius**2 - (c @ c - np.tensordot(c, d, 1) ** 2)
+    inner = (root > 0.9 * radius**2) & (np.tensordot(c, d, 1) > 0)
+    chord = 2 * np.sqrt(root[inner])
+    expected = 1 - np.exp(-chord / path).mean()
+    share = (hits.label[inner] == LABELS["vegetation"]).mean()
+    assert share == pytest.approx(expected, abs=4 * np.sqrt(0.25 / inner.sum()))
+
+
+def test_walls_seen_face_on_have_cosine_one_and_grazed_ground_sin_e():
+    hits, _, rays = look(("building", Boxes(10.0, 0.0, 0.0, 1.0, 40.0, -1.0, 9.0)))
+    middle = HDL64E.columns // 2
+    e = rays.beams.elevation
+    wall = hits.label[:, middle] == LABELS["building"]
+    np.testing.assert_allclose(hits.cosine[wall, middle], np.cos(e[wall]), atol=1e-4)
+    flat = (hits.label[:, 0] == LABELS["terrain"]) & (e < -0.05)
+    np.testing.assert_allclose(hits.cosine[flat, 0], np.sin(-e[flat]), atol=1e-4)
+
+
+def test_a_bare_scene_is_terrain_of_grass():
+    hits, _, _ = look()
+    met = np.isfinite(hits.distance)
+    assert (hits.label[met] == LABELS["terrain"]).all()
+    assert (hits.material[met] == INDEX["grass"]).all()
+    assert (hits.label[~met] == 0).all()

@@ -1,0 +1,131 @@
+"""From hits to an image: rows, noise, lost pulses, reflectance, the own car."""
+
+import numpy as np
+import pytest
+
+from r2flow.lidar.sensors import SENSORS
+from r2flow.simulator import observe
+from r2flow.simulator.beams import HDL64E, along_rows, beams_of, rows_of
+from r2flow.simulator.draws import Draws
+from r2flow.simulator.ego import RIGS, hidden
+from r2flow.simulator.ground import Ground
+from r2flow.simulator.labels import LABELS
+from r2flow.simulator.materials import INDEX, MATERIALS
+from r2flow.simulator.scene import SceneBuilder
+from r2flow.simulator.shapes import Boxes, Cylinders
+
+SENSOR = SENSORS["hdl64e"]
+VLP16 = SENSORS["vlp16"]
+
+
+def wall(material: str, distance: float = 10.0, sensor=VLP16, albedo: float | None = None):
+    """The scan of a wall ahead of the sensor, and the pixels that look at it within 30 degrees."""
+    b = SceneBuilder(Ground(), Draws(np.random.default_rng(0)))
+    usual = MATERIALS[INDEX[material]].albedo if albedo is None else albedo
+    b.add(Boxes(distance + 5, 0, 0, 10, 200, -1, 100), "building", material, usual)
+    scan = observe(b.build("test", None), sensor, np.random.default_rng(1))
+    return scan, np.abs(sensor.rays().numpy()[1]) < np.pi / 6
+
+
+def test_rows_and_edges_of_the_image_agree():
+    middle, edges = np.deg2rad(SENSOR.elevations), np.deg2rad(SENSOR.row_edges)
+    np.testing.assert_array_equal(rows_of(SENSOR, np.tan(middle).astype(np.float32)), np.arange(64))
+    just_below = np.tan(edges[:-1] - 1e-5).astype(np.float32)
+    np.testing.assert_array_equal(rows_of(SENSOR, just_below), np.arange(64))
+    outside = np.tan(np.deg2rad([3.01, -25.01])).astype(np.float32)
+    np.testing.assert_array_equal(rows_of(SENSOR, outside), [-1, -1])
+
+
+def test_lasers_of_an_hdl64e_fall_by_a_third_of_a_degree_above_and_half_below():
+    steps = -np.diff(np.rad2deg(HDL64E.elevation))
+    assert (steps > 0).all()
+    assert steps[:31].mean() == pytest.approx(1 / 3, abs=0.03)
+    assert steps[32:].mean() == pytest.approx(1 / 2, abs=0.03)
+    assert beams_of(SENSOR.resized(32, 256)) is HDL64E
+
+
+def test_other_sensors_fire_along_their_rows():
+    beams = beams_of(VLP16)
+    np.testing.assert_allclose(np.rad2deg(beams.elevation), VLP16.elevations)
+    assert beams.straight
+
+
+def test_a_wall_is_measured_to_within_the_noise():
+    scan, ahead = wall("plaster")
+    e, a = VLP16.rays().numpy().astype(float)
+    exact = 10.0 / np.cos(a) / np.cos(e)
+    seen = ahead & (scan.labels == LABELS["building"])
+    error = (scan.image[0] - exact)[seen]
+    assert seen.sum() > 1000
+    assert abs(error.mean()) < 0.002
+    assert 0.003 < error.std() < 0.025
+
+
+def test_ranges_come_in_steps_of_two_millimetres_and_reflectance_in_hundredths():
+    scan, _ = wall("plaster")
+    r, reflectance = scan.image.astype(float)
+    np.testing.assert_allclose(r / 0.002, np.round(r / 0.002), atol=0.05)
+    np.testing.assert_allclose(reflectance * 100, np.round(reflectance * 100), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("material", "low", "high"), [("retro", 0.85, 1.0), ("plaster", 0.35, 0.5), ("rubber", 0.0, 0.1)]
+)
+def test_materials_read_as_bright_as_they_are(material, low, high):
+    scan, ahead = wall(material)
+    seen = ahead & (scan.image[0] > 0) & (scan.labels == LABELS["building"])
+    assert low <= scan.image[1][seen].mean() <= high
+
+
+def test_glass_swallows_its_share_of_pulses():
+    scan, ahead = wall("pane", albedo=0.5)
+    share = MATERIALS[INDEX["pane"]].swallow
+    looked = ahead & (VLP16.rays().numpy()[0] > 0.01)
+    lost = (scan.image[0][looked] == 0).mean()
+    assert lost == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / looked.sum()))
+
+
+def test_dark_walls_lose_more_returns_the_farther_they_are():
+    lost = []
+    for distance in (6.0, 25.0, 60.0):
+        scan, ahead = wall("rubber", distance, albedo=0.0)
+        upwards = ahead & (VLP16.rays().numpy()[0] > 0.01)
+        lost.append((scan.image[0][upwards] == 0).mean())
+    assert lost[0] < lost[1] < lost[2]
+
+
+def test_grazing_incidence_darkens_a_glossy_wall():
+    scan, _ = wall("metal", albedo=0.6)
+    a = np.abs(VLP16.rays().numpy()[1])
+    wall_seen = scan.labels == LABELS["building"]
+    facing = scan.image[1][wall_seen & (a < 0.2)].mean()
+    grazing = scan.image[1][wall_seen & (a > 1.2) & (a < 1.4)].mean()
+    assert grazing < 0.7 * facing
+
+
+@pytest.mark.parametrize("rig", range(len(RIGS)))
+def test_the_own_car_hides_what_is_below_and_nothing_above(rig):
+    beams = along_rows(SENSOR)
+    mask = hidden(beams, 1024, rig)
+    assert not mask[beams.elevation > np.deg2rad(-10)].any()
+    assert mask[-1].mean() > 0.3
+    assert mask[:, 512][-4:].all()  # the roof ahead
+
+
+def test_neighbouring_lasers_see_the_own_car_from_either_side():
+    mask = hidden(HDL64E, 1024, 0)
+    instrument = mask[:, 640:780]
+    rows = np.flatnonzero(instrument.sum(1) > 30)
+    middle = np.array([np.flatnonzero(instrument[row]).mean() for row in rows])
+    assert (np.sign(np.diff(middle)) == -np.sign(np.diff(middle))[0] * (-1) ** np.arange(1, len(rows))).all()
+
+
+def test_the_nearest_of_several_lasers_in_a_pixel_wins():
+    # at 16 rows about four lasers share a row: a thin near bar must not be overwritten by what is behind
+    coarse = SENSOR.resized(16, 1024)
+    b = SceneBuilder(Ground(), Draws(np.random.default_rng(0)))
+    b.add(Boxes(20, 0, 0, 1, 200, -1, 50), "building", "plaster", 0.4)
+    b.add(Cylinders(10, 0, 0.5, 1.6, 1.7), "pole", "plaster", 0.4)  # a bar seen by two lasers at most
+    scan = observe(b.build("test", None), coarse, np.random.default_rng(1))
+    column = scan.labels[:, 512]
+    assert (column == LABELS["pole"]).sum() >= 1
