@@ -40,6 +40,7 @@ def fit(config: dict[str, Any]) -> None:
     from callbacks import build_callbacks, build_loggers
     from r2flow.checkpoints import AtomicCheckpointIO
     from r2flow.data.datamodule import ScanDataModule
+    from r2flow.noise import seed_torch
     from r2flow.registry import reject_unknown_options
     from r2flow.reports.training import finish
     from r2flow.runs import open_run
@@ -52,6 +53,7 @@ def fit(config: dict[str, Any]) -> None:
     run_dir = Path(config["run_dir"])
     trainer_options = dict(config["trainer"])
     check_trainer(trainer_options)
+    seed_torch(config["seed"], "weights")
     parts = build_parts(config)
     stage = build_stage(config, parts.backbone)
     reject_unknown_options("data", ScanDataModule, config["data"])
@@ -124,7 +126,7 @@ def main() -> int:
         print(f"error: {explain(error)}", file=sys.stderr)
         return 2
     if failed_jobs:
-        print(f"error: {len(failed_jobs)} jobs of the sweep failed: {'; '.join(failed_jobs)}", file=sys.stderr)
+        print(f"error: {len(failed_jobs)} of the sweep's jobs failed: {'; '.join(failed_jobs)}", file=sys.stderr)
         return 2
     return 0
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-PURPOSES = ("training", "validation", "pairs", "evaluation", "simulator", "shuffle", "dropout")
+PURPOSES = ("training", "validation", "pairs", "evaluation", "simulator", "shuffle", "dropout", "weights")
 
 
 def generator(seed: int, purpose: str, index: int) -> np.random.Generator:
@@ -39,3 +39,8 @@ def generator(seed: int, purpose: str, index: int) -> np.random.Generator:
 def standard_normal(shape: tuple[int, ...], seed: int, purpose: str, index: int) -> Tensor:
     """x_0 ~ N(0, I) of one index, float32 on the CPU, of the given shape."""
     return torch.from_numpy(generator(seed, purpose, index).standard_normal(shape, dtype=np.float32))
+
+
+def seed_torch(seed: int, purpose: str, index: int = 0) -> None:
+    """Start torch's own generators from a draw of ours, for what draws from them: initial weights, dropout."""
+    torch.manual_seed(int(generator(seed, purpose, index).integers(2**63)))

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from r2flow.flow.losses import LOSSES
 from r2flow.flow.path import interpolate
 from r2flow.flow.times import TIMES
-from r2flow.noise import generator
+from r2flow.noise import seed_torch
 
 Batch = dict[str, Tensor]
 
@@ -77,7 +77,7 @@ class RectifiedFlow(L.LightningModule):
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         # Dropout draws from torch's own generator: seeded by position, a resumed run draws the same.
         position = batch_idx * self.trainer.world_size + self.global_rank
-        torch.manual_seed(int(generator(self.seed, "dropout", position).integers(2**31)))
+        seed_torch(self.seed, "dropout", position)
 
     def configure_optimizers(self) -> Any:
         optimizer = torch.optim.AdamW(
@@ -97,7 +97,7 @@ class RectifiedFlow(L.LightningModule):
 
 
 def learning_rate_factor(step: int, warmup: int, total: int) -> float:
-    """step / warmup during the warm-up, then (1 + cos(pi s)) / 2 with s the share of the rest that is done."""
+    """step / warmup during the warm-up, then (1 + cos(pi s)) / 2 with s the share of the rest done."""
     if step < warmup:
         return step / warmup
-    return 0.5 * (1 + math.cos(math.pi * min((step - warmup) / max(total - warmup, 1), 1.0)))
+    return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(total - warmup, 1)))

@@ -1,0 +1,99 @@
+import lightning as L
+import pytest
+import torch
+from torch import nn
+
+from callbacks.ema import EMA, averaged_weights, ema_decay
+
+
+def test_the_decay_is_the_reference_s(shared):
+    reference = torch.load(shared / "oracle" / "training.pt", weights_only=False)["ema"]
+    for step, decay in reference["decay_at_step_after10000"].items():
+        # That table is of a counter that stands one past the step.
+        assert ema_decay(max(step - 1, 0), 10_000, reference["beta"]) == pytest.approx(decay, abs=1e-6)
+
+
+class Scripted(L.LightningModule):
+    """A module whose weight takes given values, step by step."""
+
+    def __init__(self, values: list[float]) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(()))
+        self.values = values
+        self.automatic_optimization = False
+        self.warmup_steps = 0
+
+    def training_step(self, batch, batch_idx):
+        optimizer = self.optimizers()
+        optimizer.step()
+        with torch.no_grad():
+            self.weight.fill_(self.values[batch_idx])
+
+    def validation_step(self, batch, batch_idx):
+        self.seen = self.weight.item()
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.0)
+
+
+class Watch(L.Callback):
+    def __init__(self, ema: EMA) -> None:
+        self.ema, self.trace = ema, []
+
+    def on_train_batch_end(self, trainer, pl_module, *rest):
+        with averaged_weights(trainer, pl_module):
+            average = pl_module.weight.item()
+        self.trace.append((pl_module.weight.item(), average))
+
+
+def trainer(callbacks: list[L.Callback], steps: int, tmp_path, **options) -> L.Trainer:
+    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    return L.Trainer(
+        max_steps=steps, max_epochs=-1, accelerator="cpu", callbacks=callbacks, enable_model_summary=False,
+        default_root_dir=tmp_path, num_sanity_val_steps=0, **quiet, **options,
+    )  # fmt: skip
+
+
+def test_the_average_follows_the_reference_s_trace(shared, tmp_path):
+    reference = torch.load(shared / "oracle" / "training.pt", weights_only=False)["ema"]
+    values = [raw for _, raw, _, _ in reference["trace"]]
+    ema = EMA(reference["beta"], reference["update_every"], reference["update_after_step"])
+    watch = Watch(ema)
+    loader = torch.utils.data.DataLoader(range(len(values)))
+    trainer([ema, watch], len(values), tmp_path).fit(Scripted(values), loader)
+    assert len(watch.trace) == len(values)
+    for (raw, average), (_, expected_raw, expected, _) in zip(watch.trace, reference["trace"], strict=True):
+        assert raw == pytest.approx(expected_raw, abs=1e-6)
+        assert average == pytest.approx(expected, abs=1e-5)
+
+
+def test_validation_sees_the_average_and_leaves_the_weights(tmp_path):
+    module = Scripted([1.0, 2.0, 3.0, 4.0])
+    ema = EMA(decay=0.5, every=1, warmup_steps=0)
+    watch = Watch(ema)
+    loader = torch.utils.data.DataLoader(range(4))
+    trainer([ema, watch], 4, tmp_path, val_check_interval=4, check_val_every_n_epoch=None).fit(module, loader, loader)
+    raw, average = watch.trace[-1]
+    assert raw == 4.0
+    # By hand: decays 0, 1 - 2^(-2/3) = 0.370, then 0.5, 0.5 at most: 1 -> 1.630 -> 2.315 -> 3.157.
+    assert average == pytest.approx(3.1575, abs=1e-3)
+    assert module.seen == pytest.approx(average)
+    assert module.weight.item() == pytest.approx(average)  # after fit the module is the model
+
+
+def test_the_average_is_float32_whatever_the_weights_are():
+    module = Scripted([])
+    module.to(torch.bfloat16)
+    ema = EMA(every=1, warmup_steps=0)
+    ema.setup(None, module, "fit")  # type: ignore[arg-type]
+    assert all(p.dtype == torch.float32 for p in ema._average_model.parameters())
+    # An average of bfloat16 weights 1 and 1 + 2^-7 keeps what lies between two bfloat16 numbers.
+    ema.should_update(step_idx=0)
+    with torch.no_grad():
+        module.weight.fill_(1.0)
+    ema._average_model.update_parameters(module)
+    ema.should_update(step_idx=10**6)
+    with torch.no_grad():
+        module.weight.fill_(1 + 2**-7)
+    ema._average_model.update_parameters(module)
+    assert ema._average_model.module.weight.item() == pytest.approx(1 + 0.005 * 2**-7, abs=1e-7)

@@ -1,0 +1,134 @@
+"""train.py as a user runs it: in a process, from a folder, with overrides."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint
+from tests.training.conftest import ROOT, TINY, Run
+
+
+def weights(run: Path) -> tuple[dict, dict]:
+    """(raw, averaged) of the last checkpoint."""
+    content = read_checkpoint(checkpoints_of(run)[0])
+    return content["current_model_state"], content["state_dict"]
+
+
+def assert_bit_equal(first: Path, second: Path) -> None:
+    for a, b in zip(weights(first), weights(second), strict=True):
+        assert a.keys() == b.keys()
+        assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_a_run_leaves_everything_in_its_folder_and_says_where(alone: tuple[Path, str]):
+    run, said = alone
+    for name in ("config.yaml", "loss.png", "samples/000000.ply", "samples/000000.npy", "samples/samples.png"):
+        assert (run / name).is_file(), name
+    for words in (str(Path("runs/alone/checkpoints")), "loss.png", "000000.ply", "r2flow sample", "val/loss"):
+        assert words in said
+    assert [p.name for p in checkpoints_of(run)] == ["step-00000012.ckpt", "step-00000010.ckpt"]
+    loaded = load_checkpoint(run)
+    assert loaded.step == 12
+    assert loaded.config == yaml.safe_load((run / "config.yaml").read_text())
+
+
+def test_a_finished_run_is_not_trained_again(train: Run, copied: Path):
+    before = weights(copied)
+    done = train("name=copied")
+    assert "scans/s" not in done.stdout
+    assert "checkpoint" in done.stdout
+    assert all(torch.equal(a[name], b[name]) for a, b in zip(before, weights(copied), strict=True) for name in a)
+
+
+def kill_when(run: Path, step: int, scans: Path, cwd: Path, *overrides: str) -> None:
+    """Start the run and kill -9 it once it has written the checkpoint of a step."""
+    command = [sys.executable, str(ROOT / "train.py"), *TINY, f"data.root={scans}", *overrides]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(
+        command, cwd=cwd, env=environment, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    waited = time.monotonic()
+    while not (run / "checkpoints" / f"step-{step:08d}.ckpt").exists():
+        assert process.poll() is None, process.stdout and process.stdout.read().decode()
+        assert time.monotonic() - waited < 200
+        time.sleep(0.005)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+@pytest.mark.parametrize(("step", "workers"), [(2, 0), (6, 2)])
+def test_a_killed_run_ends_as_the_one_left_alone(
+    train: Run, alone: tuple[Path, str], scans: Path, tmp_path: Path, step: int, workers: int
+):
+    killed = tmp_path / "runs" / "killed"
+    kill_when(killed, step, scans, tmp_path, "name=killed", f"data.workers={workers}")
+    train("name=killed", f"data.workers={workers}")
+    assert_bit_equal(alone[0], killed)
+
+
+def test_a_damaged_last_checkpoint_is_passed_over(train: Run, alone: tuple[Path, str], copied: Path):
+    newest = checkpoints_of(copied)[0]
+    newest.write_bytes(newest.read_bytes()[:1000])
+    done = train("name=copied")
+    assert "Going on from the one before" in done.stdout + done.stderr
+    assert_bit_equal(alone[0], copied)
+
+
+def test_a_moved_run_goes_on(train: Run, alone: tuple[Path, str], copied: Path):
+    moved = copied.rename(copied.parent / "moved")
+    checkpoints_of(moved)[0].unlink()  # as if killed before the last step
+    train("name=moved")
+    assert_bit_equal(alone[0], moved)
+
+
+def test_another_config_in_the_same_folder_is_refused(train: Run, copied: Path):
+    before = (copied / "config.yaml").read_text()
+    done = train("name=copied", "seed=5", check=False)
+    assert done.returncode == 2
+    assert done.stderr.strip().splitlines()[-1].startswith("error: runs/copied holds a run of another config: seed=0")
+    assert (copied / "config.yaml").read_text() == before
+
+
+def test_accumulated_batches_are_the_whole_batch(train: Run, tmp_path: Path):
+    # No dropout: its masks are drawn per device batch. Clipping sees the mean gradient in both.
+    train("name=whole", "backbone.dropout=0")
+    train("name=parts", "backbone.dropout=0", "trainer.accumulate_grad_batches=2", "trainer.val_check_interval=6")
+    whole, parts = (weights(tmp_path / "runs" / name)[0] for name in ("whole", "parts"))
+    for name in whole:
+        torch.testing.assert_close(whole[name], parts[name], rtol=0, atol=2e-4)
+
+
+@pytest.mark.slow
+def test_two_processes_are_one(train: Run, tmp_path: Path):
+    train("name=one", "backbone.dropout=0")
+    train("name=two", "backbone.dropout=0", "trainer.devices=2", "trainer.strategy=ddp")
+    one, two = (weights(tmp_path / "runs" / name)[0] for name in ("one", "two"))
+    for name in one:
+        torch.testing.assert_close(one[name], two[name], rtol=0, atol=2e-4)
+
+
+def test_a_sweep_runs_every_job_and_reports_the_failed(train: Run, tmp_path: Path):
+    done = train("stage.loss=mse,nonsense", "trainer.max_steps=2", check=False, flags=("-m",))
+    assert done.returncode == 2
+    assert "1 of the sweep's jobs failed" in done.stderr
+    finished = {path.parent.name for path in (tmp_path / "runs" / "sweep").glob("*/samples")}
+    assert len(finished) == 1
+    assert "mse" in finished.pop()
+
+
+@pytest.mark.parametrize("precision", ["bf16-mixed"])
+def test_mixed_precision_trains(train: Run, tmp_path: Path, precision: str):
+    train(f"trainer.precision={precision}", "trainer.max_steps=4", "name=half")
+    assert all(v.dtype == torch.float32 for v in weights(tmp_path / "runs" / "half")[1].values())
+
+
+def test_fast_dev_run_leaves_nothing(train: Run, tmp_path: Path):
+    train("trainer.fast_dev_run=true", "name=quick")
+    assert not (tmp_path / "runs" / "quick" / "checkpoints").exists()
