@@ -27,6 +27,8 @@ from r2flow.errors import InputError
 
 log = logging.getLogger("r2flow")
 
+CONF = Path(__file__).resolve().parent / "conf"
+
 OmegaConf.register_new_resolver(
     "path_safe", lambda name: str(name).replace("/", "_").replace("..", "_") or "default", replace=True
 )
@@ -36,12 +38,13 @@ def fit(config: dict[str, Any]) -> None:
     """Train the stage that a plain config describes, in its run folder, from where it stopped."""
     # Imported here: a misspelt config should answer at once, not after torch has loaded.
     import lightning as L
+    from lightning.fabric.utilities.exceptions import MisconfigurationException
 
     from callbacks import build_callbacks, build_loggers
     from r2flow.checkpoints import AtomicCheckpointIO
     from r2flow.data.datamodule import ScanDataModule
     from r2flow.noise import seed_torch
-    from r2flow.registry import reject_unknown_options
+    from r2flow.registry import check_options
     from r2flow.reports.training import finish
     from r2flow.runs import open_run
     from r2flow.stages import build_parts, build_stage
@@ -56,18 +59,20 @@ def fit(config: dict[str, Any]) -> None:
     seed_torch(config["seed"], "weights")
     parts = build_parts(config)
     stage = build_stage(config, parts.backbone)
-    reject_unknown_options("data", ScanDataModule, config["data"])
+    check_options("data", ScanDataModule, config["data"])
     data = ScanDataModule(parts.sensor, parts.encoding, config["seed"], **config["data"])
     data.setup()
     last = open_run(run_dir, config)
     if last is not None:
         log.info("going on from %s", last)
-    trainer = L.Trainer(
-        **trainer_options,
-        callbacks=build_callbacks(config, parts),
-        logger=build_loggers(config["loggers"], run_dir),
-        plugins=[AtomicCheckpointIO()],
-    )
+    check_options("trainer", L.Trainer, trainer_options)
+    callbacks, loggers = build_callbacks(config, parts), build_loggers(config["loggers"], run_dir)
+    try:
+        trainer = L.Trainer(
+            **trainer_options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()]
+        )
+    except (TypeError, ValueError, MisconfigurationException) as error:
+        raise InputError(f"trainer: {' '.join(str(error).split())}") from None
     trainer.fit(stage, data, ckpt_path=last, weights_only=True)
     if trainer.interrupted:
         log.info("stopped at step %d; the same command goes on from the last checkpoint", trainer.global_step)
@@ -100,9 +105,10 @@ def sweep_job(config: DictConfig) -> int:
 
 
 failed_jobs: list[str] = []
+mistakes: list[str] = []
 
 
-@hydra.main(version_base="1.3", config_path="conf", config_name="train")
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
 def run(config: DictConfig) -> None:
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         if sweep_job(config):
@@ -110,20 +116,25 @@ def run(config: DictConfig) -> None:
         return
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
-    fit({str(key): value for key, value in plain.items()})
+    try:
+        fit({str(key): value for key, value in plain.items()})
+    except InputError as error:  # Hydra would print its own lines around it
+        mistakes.append(str(error))
 
 
 def main() -> int:
     """Run, and turn what the user can mend into one line and exit code 2."""
     # Otherwise Hydra prints composition errors itself, over many lines, and exits with 1.
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    mistakes.clear()
+    failed_jobs.clear()
     try:
         run()
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     except (HydraException, OmegaConfBaseException) as error:
         print(f"error: {explain(error)}", file=sys.stderr)
+        return 2
+    if mistakes:
+        print(f"error: {mistakes[0]}", file=sys.stderr)
         return 2
     if failed_jobs:
         print(f"error: {len(failed_jobs)} of the sweep's jobs failed: {'; '.join(failed_jobs)}", file=sys.stderr)
@@ -146,7 +157,7 @@ def explain(error: Exception) -> str:
     choice = re.search(r"Could not find '([^/']+)/([^']+)'", text)
     if choice:
         group, name = choice.groups()
-        folder = Path(__file__).parent / "conf" / group
+        folder = CONF / group
         known = sorted(path.stem for path in folder.glob("*.yaml"))
         return f"no {group} config named '{name}'; known: {', '.join(known)}.{did_you_mean(name, known)}"
     return " ".join(lines[:2])
@@ -158,7 +169,7 @@ def known_keys() -> list[str]:
     from hydra.core.global_hydra import GlobalHydra
 
     GlobalHydra.instance().clear()
-    with initialize_config_dir(str(Path(__file__).parent / "conf"), version_base="1.3"):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
         composed = compose("train", return_hydra_config=False)
     keys = []
 

@@ -12,7 +12,7 @@ from callbacks.pictures import SamplePictures
 from callbacks.progress import Progress
 from r2flow.checkpoints import FOLDER
 from r2flow.errors import InputError
-from r2flow.registry import Registry, reject_unknown_options
+from r2flow.registry import Registry, check_options
 from r2flow.stages import Parts
 
 
@@ -24,10 +24,10 @@ def build_callbacks(config: Mapping[str, Any], parts: Parts) -> list[Callback]:
     wanted = {name: options for name, options in config["callbacks"].items() if options is not None}
     built: list[Callback] = []
     if "ema" in wanted:
-        reject_unknown_options("callbacks.ema", EMA, wanted["ema"])
+        check_options("callbacks.ema", EMA, wanted["ema"])
         built.append(EMA(**wanted["ema"]))
     if "pictures" in wanted:
-        reject_unknown_options("callbacks.pictures", SamplePictures, wanted["pictures"])
+        check_options("callbacks.pictures", SamplePictures, wanted["pictures"])
         folder = run_dir / "pictures"
         pictures = SamplePictures(folder, parts.sensor, parts.encoding, config["seed"], **wanted["pictures"])
         built.append(pictures)

@@ -218,7 +218,7 @@ def _published_backbone(model: Mapping[str, Any], architecture: str, path: Path)
             "name": "hdit",
             "base_channels": model["base_channels"],
             "depths": list(blocks),
-            "num_heads": list(heads)[: len(blocks)],
+            "num_heads": list(heads),
             "time_channels": model["temb_channels"],
             "position": PUBLISHED_POSITIONS[model["coords_encoding"]],
             "dropout": model.get("dropout", 0.0),

@@ -18,6 +18,9 @@ app = typer.Typer(
     rich_markup_mode="markdown",
 )
 
+report = typer.Typer(help="Measure scans and flows.", no_args_is_help=True, pretty_exceptions_enable=False)
+app.add_typer(report, name="report")
+
 CheckpointOption = Annotated[
     Path, typer.Option("--checkpoint", "-c", help="A checkpoint file or a run folder.", show_default=False)
 ]
@@ -120,6 +123,33 @@ def info(
         print_contents(contents)
 
 
+@report.command(epilog="Example: r2flow report fidelity kitti360/test runs/real/samples --train raw --size 64x1024")
+def fidelity(
+    real: Annotated[Path, typer.Argument(help="Real scans: a folder.")],
+    other: Annotated[Path, typer.Argument(help="Scans to judge: a folder of any known format, or range images.")],
+    train: Annotated[Path | None, typer.Option(help="The scans that were learned from.")] = None,
+    sensor: SensorOption = "hdl64e",
+    size: SizeOption = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for fidelity.md and .json.")] = None,
+) -> None:
+    """Set scans against real ones, beside controls that know nothing of scenes: noise, flat ground, mean, shuffle."""
+    import json
+
+    from r2flow.files import atomic_write
+    from r2flow.reports.fidelity import fidelity as measure
+    from r2flow.reports.fidelity import load_images, markdown
+
+    chosen = build_sized(sensor, size)
+    training = None if train is None else load_images(train, chosen)
+    result = measure(load_images(real, chosen), load_images(other, chosen), chosen, training)
+    text = markdown(result, other.name if other.name not in ("samples", "") else other.parent.name or "other")
+    print(text)
+    if out is not None:
+        for name, content in (("fidelity.md", text + "\n"), ("fidelity.json", json.dumps(result, indent=2))):
+            with atomic_write(out / name, "w") as file:
+                file.write(content)
+
+
 def build_sized(sensor: str, size: str | None) -> "Sensor":  # type: ignore[name-defined] # noqa: F821
     """The sensor at an image size written as 64x1024."""
     from r2flow.lidar.sensors import build_sensor
@@ -151,7 +181,7 @@ def unique_stem(path: Path, paths: list[Path]) -> str:
 
 def main() -> None:
     """Run a verb; what the user can mend is one line and exit code 2."""
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", force=True)
     try:
         app()
     except InputError as error:

@@ -13,6 +13,7 @@ T = TypeVar("T")
 def did_you_mean(name: str, known: Mapping[str, Any] | list[str]) -> str:
     """' Did you mean ...?' for the closest known name, or nothing when none is close."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+    close = close or [other for other in known if other.startswith(name)]
     return f" Did you mean '{close[0]}'?" if close else ""
 
 
@@ -71,17 +72,39 @@ class Registry(Generic[T]):
         constructor = self[name]
         if not callable(constructor):
             raise TypeError(f"{self.kind} {name!r} is a value, not a constructor")
-        reject_unknown_options(f"{self.kind} '{name}'", constructor, chosen)
+        check_options(f"{self.kind} '{name}'", constructor, chosen)
         return constructor(*args, **chosen)
 
 
-def reject_unknown_options(what: str, constructor: Callable[..., Any], options: Mapping[str, Any]) -> None:
-    """Raise InputError for the first option that `constructor` does not take by keyword."""
-    parameters = inspect.signature(constructor).parameters.values()
-    if any(p.kind is p.VAR_KEYWORD for p in parameters):
+def check_options(what: str, constructor: Callable[..., Any], options: Mapping[str, Any]) -> None:
+    """Hold options to the signature that they are meant for.
+
+    Raises:
+        InputError: an option that `constructor` does not take by keyword, or a value of another type than its
+            annotation says where that is bool, int, float or str.
+    """
+    parameters = inspect.signature(constructor).parameters
+    if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
         return
-    known = [p.name for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    for key in options:
+    known = {n: p for n, p in parameters.items() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)}
+    for key, value in options.items():
         if key not in known:
             hint = did_you_mean(key, known)
             raise InputError(f"{what} has no option {key!r}; it knows: {', '.join(known)}.{hint}")
+        wanted = PLAIN_TYPES.get(str(getattr(known[key].annotation, "__name__", known[key].annotation)))
+        if wanted is not None and not _is_a(value, *wanted):
+            raise InputError(f"{what}: {key} must be {wanted[-1]}, found {value!r}.")
+
+
+PLAIN_TYPES: dict[str, tuple[type, str]] = {
+    "bool": (bool, "true or false"),
+    "int": (int, "a whole number"),
+    "float": (float, "a number"),
+    "str": (str, "a word"),
+}
+
+
+def _is_a(value: Any, wanted: type, _: str) -> bool:
+    if wanted is bool or isinstance(value, bool):
+        return wanted is bool and isinstance(value, bool)
+    return isinstance(value, (int, float) if wanted is float else wanted)

@@ -3,15 +3,18 @@
 from collections.abc import Mapping
 from typing import Any
 
-from torch import Tensor, nn
+from torch import Tensor
 
+from r2flow.backbones.adm_unet import ADMUNet
+from r2flow.backbones.base import Backbone
+from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
 from r2flow.registry import Registry
 
-BACKBONES: Registry[type[nn.Module]] = Registry("backbone", hdit=HDiT)
+BACKBONES: Registry[type[Backbone]] = Registry("backbone", hdit=HDiT, adm_unet=ADMUNet, efficient_unet=EfficientUNet)
 
 
-def build_backbone(options: Mapping[str, Any], rays: Tensor, channels: int) -> nn.Module:
+def build_backbone(options: Mapping[str, Any], rays: Tensor, channels: int) -> Backbone:
     """The backbone `options["name"]` for images of `channels` channels seen along `rays` (2, H, W).
 
     Args:

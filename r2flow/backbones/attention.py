@@ -6,8 +6,8 @@ the window goes round more than once, and tokens met twice count twice, as in th
 
 Backends, all of the same values and gradients:
     dense    every pair of tokens and a mask: the definition, for tests and small maps
-    tiles    blocks of queries against the keys around them: plain matrix products, the best in eager mode
-    shifts   one pass for each place of the window, for torch.compile, which fuses them into one loop
+    tiles    blocks of queries against the keys around them: plain matrix products, the best on a CPU
+    shifts   one pass for each place of the window, no products: for torch.compile, which fuses them into one loop
     flex     flex_attention, where its kernels exist: CUDA
     natten   natten.na2d, where its kernels are installed: CUDA
 """
@@ -21,6 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from r2flow.backbones.layers import rows_at_once
 from r2flow.errors import InputError
 from r2flow.registry import Registry
 
@@ -63,18 +64,15 @@ class _Axis(NamedTuple):
     def span(self) -> int:
         return self.asked if self.wrap else min(self.asked, self.size)
 
-    def start(self, token: int) -> int:
-        """First place that the token sees; on a ring it may lie outside [0, size) and is meant modulo."""
-        first = token - self.asked // 2
-        return first if self.wrap else max(0, min(first, self.size - self.span))
-
-    def starts(self, device: torch.device) -> Tensor:
-        first = torch.arange(self.size, device=device) - self.asked // 2
+    def starts(self, tokens: Tensor) -> Tensor:
+        """First place that each token sees; on a ring it may lie outside [0, size) and is meant modulo."""
+        first = tokens - self.asked // 2
         return first if self.wrap else first.clamp(0, self.size - self.span)
 
     def counts(self, device: torch.device) -> Tensor:
         """How often token i (rows) sees token j (columns), (size, size)."""
-        seen = (self.starts(device)[:, None] + torch.arange(self.span, device=device)) % self.size
+        starts = self.starts(torch.arange(self.size, device=device))
+        seen = (starts[:, None] + torch.arange(self.span, device=device)) % self.size
         return F.one_hot(seen, self.size).sum(1)
 
 
@@ -86,71 +84,65 @@ def _dense(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tens
     return (weights @ v).transpose(1, 2).unflatten(1, (rows.size, columns.size))
 
 
-TILE = (4, 8)  # queries; its 6 x 16 keys keep 27 of 96 products, yet bigger and smaller tiles are slower
+TILE = (4, 8)  # queries, whose keys are 6 x 16: smaller ones copy more, bigger ones multiply more in vain
 
 
 def _tiles(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:
-    batch, _, _, heads, channels = q.shape
     tile_h, tile_w = min(TILE[0], rows.size), min(TILE[1], columns.size)
-    tiles_h, tiles_w = -(-rows.size // tile_h), -(-columns.size // tile_w)
-    q = F.pad(q, (0, 0, 0, 0, 0, tiles_w * tile_w - columns.size, 0, tiles_h * tile_h - rows.size))
-    q = q.view(batch, tiles_h, tile_h, tiles_w, tile_w, heads, channels).permute(0, 1, 3, 5, 2, 4, 6)
-    # keys and values, (B, tiles_h, tiles_w, N, keys, D)
-    k, v = (
-        _halo(_halo(x, 1, rows, tile_h), 3, columns, tile_w).permute(0, 1, 3, 5, 2, 4, 6).flatten(4, 5) for x in (k, v)
-    )
-    mask = _tile_mask(rows, columns, (tile_h, tile_w), q.dtype, q.device)
-    weights = torch.softmax(q.flatten(4, 5) @ k.mT + mask, dim=-1)
-    out = (weights @ v).unflatten(4, (tile_h, tile_w)).permute(0, 1, 4, 2, 5, 3, 6)
-    out = out.reshape(batch, tiles_h * tile_h, tiles_w * tile_w, heads, channels)
-    return out[:, : rows.size, : columns.size]
+    padding = -rows.size % tile_h, -columns.size % tile_w
+    if any(padding):
+        q = F.pad(q, (0, 0, 0, 0, 0, padding[1], 0, padding[0]))
+    keys_h, keys_w = _tile_keys(rows, tile_h, q.device), _tile_keys(columns, tile_w, q.device)
+    mask = _tile_mask(_tile_sees(rows, tile_h, keys_h), _tile_sees(columns, tile_w, keys_w), q.dtype)
+    keys_w = keys_w % columns.size
+    band = -(-rows_at_once(q) // tile_h)
+    out = []
+    for top in range(0, len(mask), band):
+        band_of_q = q[:, top * tile_h : (top + band) * tile_h]
+        band_of_q = band_of_q.unflatten(2, (-1, tile_w)).unflatten(1, (-1, tile_h)).permute(0, 1, 3, 5, 2, 4, 6)
+        tiles_of_k, tiles_of_v = (_halo(x, keys_h[top : top + band], keys_w) for x in (k, v))
+        logits = band_of_q.flatten(4, 5) @ tiles_of_k.mT  # (B, tiles_h, tiles_w, N, queries, keys)
+        weights = torch.softmax(logits.add_(mask[top : top + band]), dim=-1)
+        attended = (weights @ tiles_of_v).unflatten(4, (tile_h, tile_w)).permute(0, 1, 4, 2, 5, 3, 6)
+        out.append(attended.flatten(3, 4).flatten(1, 2))
+    return torch.cat(out, dim=1)[:, : rows.size, : columns.size]
 
 
-def _halo(x: Tensor, dim: int, axis: _Axis, tile: int) -> Tensor:
-    """The keys of each tile along `dim`, which becomes (tiles, keys of a tile)."""
-    places = _halo_places(axis, tile)
+def _halo(x: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """Keys of tiles, by rows (tiles_h, keys_h) and columns (tiles_w, keys_w): (B, tiles_h, tiles_w, N, keys, D)."""
+    for dim, places in ((1, rows), (3, columns)):
+        x = x.index_select(dim, places.flatten()).unflatten(dim, places.shape)
+    return x.permute(0, 1, 3, 5, 2, 4, 6).flatten(4, 5)
+
+
+def _tile_keys(axis: _Axis, tile: int, device: torch.device) -> Tensor:
+    """Which places the queries of each tile see between them, (tiles, keys); modulo the size on a ring."""
+    length = tile + axis.span - 1 if axis.wrap else min(tile + axis.span - 1, axis.size)
+    starts = torch.arange(0, axis.size, tile, device=device) - axis.asked // 2
     if not axis.wrap:
-        return torch.stack([x.narrow(dim, first, length) for first, length in places], dim)
-    first, length = places[0]
-    last = places[-1][0] + length
-    if -first <= axis.size and last <= 2 * axis.size:
-        parts = x.narrow(dim, axis.size + first, -first), x, x.narrow(dim, 0, last - axis.size)
-        ring = torch.cat(parts, dim)
-    else:  # narrower than its own halo: round it more than once
-        ring = x.index_select(dim, torch.arange(first, last, device=x.device) % axis.size)
-    return ring.unfold(dim, length, tile).movedim(-1, dim + 1)
+        starts = starts.clamp(0, axis.size - length)
+    return starts[:, None] + torch.arange(length, device=device)
 
 
-def _halo_places(axis: _Axis, tile: int) -> list[tuple[int, int]]:
-    """First place and number of the keys that the queries of each tile see between them."""
-    length = tile + axis.span - 1
+def _tile_mask(seen_h: Tensor, seen_w: Tensor, dtype: torch.dtype) -> Tensor:
+    """0 where a query sees a key, -inf elsewhere, (tiles_h, tiles_w or 1, 1, queries, keys)."""
+    seen = seen_h[:, None, :, None, :, None] & seen_w[None, :, None, :, None, :]
+    seen = seen.flatten(4, 5).flatten(2, 3).unsqueeze(2)
+    return torch.zeros(seen.shape, dtype=dtype, device=seen.device).masked_fill_(~seen, -torch.inf)
+
+
+def _tile_sees(axis: _Axis, tile: int, keys: Tensor) -> Tensor:
+    """Whether each query of a tile sees each of its keys, (tiles, tile, keys); on a ring all tiles are as the first.
+
+    By place, not by token: a narrow ring holds one token in several places.
+    """
     if axis.wrap:
-        return [(axis.start(first), length) for first in range(0, axis.size, tile)]
-    length = min(length, axis.size)
-    return [(min(axis.start(first), axis.size - length), length) for first in range(0, axis.size, tile)]
-
-
-@functools.lru_cache(maxsize=256)
-def _tile_mask(rows: _Axis, columns: _Axis, tile: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """0 where a query of the tile sees a key of its halo, -inf elsewhere, (tiles_h, tiles_w, 1, tile, keys)."""
-    with torch.inference_mode(False):  # or a mask made while sampling could not be used in training
-        seen_h, seen_w = (_tile_sees(axis, size) for axis, size in zip((rows, columns), tile, strict=True))
-        seen = seen_h[:, None, :, None, :, None] & seen_w[None, :, None, :, None, :]
-        seen = seen.flatten(4, 5).flatten(2, 3).unsqueeze(2)
-        return torch.zeros(seen.shape, dtype=dtype).masked_fill(~seen, -torch.inf).to(device)
-
-
-def _tile_sees(axis: _Axis, tile: int) -> Tensor:
-    """Whether query i of a tile sees place j of its halo, (tiles, tile, keys); one tile stands for a ring's."""
-    places = _halo_places(axis, tile)[: 1 if axis.wrap else None]
-    seen = []
-    for index, (first, length) in enumerate(places):
-        # queries beyond the last token are padding: they see what the last token sees, and are cropped
-        tokens = [min(index * tile + i, axis.size - 1) if not axis.wrap else i for i in range(tile)]
-        starts = torch.tensor([axis.start(token) - first for token in tokens])[:, None]
-        keys = torch.arange(length)
-        seen.append((starts <= keys) & (keys < starts + axis.span))
-    return torch.stack(seen)
+        keys = keys[:1]
+    queries = torch.arange(len(keys) * tile, device=keys.device)
+    if not axis.wrap:
+        queries = queries.clamp(max=axis.size - 1)  # those beyond are padding, and cropped
+    starts = axis.starts(queries).view(-1, tile, 1)
+    return (starts <= keys[:, None]) & (keys[:, None] < starts + axis.span)
 
 
 def _shifts(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:
@@ -193,10 +185,7 @@ def _flex_mask(rows: _Axis, columns: _Axis, device: torch.device):  # type: igno
         inside = torch.ones_like(query, dtype=torch.bool)
         places = (query // columns.size, key // columns.size), (query % columns.size, key % columns.size)
         for axis, (i, j) in zip((rows, columns), places, strict=True):
-            start = i - axis.asked // 2
-            if not axis.wrap:
-                start = start.clamp(0, axis.size - axis.span)
-            inside = inside & ((j - start) % axis.size < axis.span)
+            inside = inside & ((j - axis.starts(i)) % axis.size < axis.span)
         return inside
 
     tokens = rows.size * columns.size
@@ -243,8 +232,8 @@ def _natten(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Ten
     # token's window is centred, and the added columns are cropped
     half = columns.asked // 2 if columns.wrap else 0
     if half:
-        index = torch.arange(-half, columns.size + half, device=q.device) % columns.size
-        q, k, v = (x.index_select(2, index) for x in (q, k, v))
+        ring = torch.arange(-half, columns.size + half, device=q.device) % columns.size
+        q, k, v = (x.index_select(2, ring) for x in (q, k, v))
     out = na2d(q, k, v, kernel_size=(rows.span, columns.span), scale=1.0)
     return out[:, :, half : half + columns.size]
 
@@ -256,9 +245,14 @@ BACKENDS: Registry[Backend] = Registry(
 
 
 def _fastest(q: Tensor, rows: _Axis, columns: _Axis) -> str:
-    if q.device.type == "cuda":
-        if _natten_kernels() and q.dtype != torch.float64 and rows.span > 1:
+    """Library kernels where they exist and can take this input, else tiles.
+
+    Compiled on a CPU, shifts are no faster than tiles (float32, with gradients) or far slower (all else).
+    """
+    if q.is_cuda and q.dtype != torch.float64 and not torch.compiler.is_compiling():
+        spans = rows.span, columns.span
+        if _natten_kernels() and all(span > 1 and span % 2 for span in spans) and q.shape[-1] % 8 == 0:
             return "natten"
-        if q.dtype != torch.float64 and columns.span <= columns.size and not torch.compiler.is_compiling():
+        if columns.span <= columns.size and q.shape[-1] >= 16 and importlib.util.find_spec("triton"):
             return "flex"
-    return "shifts" if torch.compiler.is_compiling() else "tiles"
+    return "tiles"

@@ -54,10 +54,11 @@ def rotate(x: Tensor, table: Tensor) -> Tensor:
     """Turn each pair (x_i, x_{i + D/2}) by theta_i; x (..., N, D), table of `Rotary`."""
     cos, sin = table
     first, second = x.chunk(2, dim=-1)
-    return torch.cat([first * cos - second * sin, second * cos + first * sin], dim=-1)
+    turned = torch.addcmul(first * cos, second, sin, value=-1), torch.addcmul(second * cos, first, sin)
+    return torch.cat(turned, dim=-1)
 
 
-class Encoding(ExactBuffers):
+class RayEncoding(ExactBuffers):
     """Features of rays, (1, 2, H, W) to (1, `channels`, H, W), for images of one shape (H, W)."""
 
     channels: int
@@ -66,7 +67,7 @@ class Encoding(ExactBuffers):
         super().__init__()
 
 
-class FourierFeatures(Encoding):
+class FourierFeatures(RayEncoding):
     """sin and cos of 2^k e and 2^k a, for k = 0 .. ceil(log2 n) - 1 on an axis of n pixels."""
 
     freqs: Tensor
@@ -86,7 +87,7 @@ class FourierFeatures(Encoding):
         return torch.cat([theta.sin(), theta.cos()], dim=1)
 
 
-class Polar(Encoding):
+class Polar(RayEncoding):
     """The two angles as they are."""
 
     channels = 2
@@ -95,7 +96,7 @@ class Polar(Encoding):
         return rays
 
 
-class SphericalHarmonics(Encoding):
+class SphericalHarmonics(RayEncoding):
     """Real spherical harmonics of degree 0 to 4, 25 of them, ordered by degree l then order m = -l .. l.
 
     Y_lm = N_lm P_l^|m|(sin e) times sqrt(2) cos(m b), 1 or sqrt(2) sin(|m| b) for m > 0, = 0, < 0, without
@@ -128,7 +129,7 @@ class SphericalHarmonics(Encoding):
         return table
 
 
-ENCODINGS: Registry[type[Encoding]] = Registry(
+ENCODINGS: Registry[type[RayEncoding]] = Registry(
     "position", fourier_features=FourierFeatures, polar=Polar, spherical_harmonics=SphericalHarmonics
 )
 

@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.attention import BACKENDS, neighbourhood_attention
-from r2flow.backbones.encodings import ENCODINGS, Encoding, Rotary, mean_rays, position_name, rotate
+from r2flow.backbones.base import Backbone, integers
+from r2flow.backbones.encodings import ENCODINGS, RayEncoding, Rotary, mean_rays, position_name, rotate
 from r2flow.backbones.layers import (
     GEGLU,
     AdaRMSNorm,
@@ -18,15 +19,14 @@ from r2flow.backbones.layers import (
     RandomFourierFeatures,
     RMSNorm,
     at_least_float32,
+    in_bands,
     mapping_network,
-    pair,
-    times,
     zero_initialised,
 )
 from r2flow.errors import InputError
 
 
-class HDiT(ExactBuffers):
+class HDiT(Backbone):
     """Velocity v(t, x) by an hourglass transformer.
 
     Tokens of patch_h x patch_w pixels; at each outer level `depths[l]` blocks of neighbourhood attention on
@@ -53,8 +53,6 @@ class HDiT(ExactBuffers):
         InputError: a shape, head count, window, position or backend that cannot work.
     """
 
-    coords: Tensor
-
     def __init__(
         self,
         rays: Tensor,
@@ -70,25 +68,25 @@ class HDiT(ExactBuffers):
         dropout: float = 0.0,
         attention: str = "auto",
     ) -> None:
-        super().__init__()
-        levels = len(depths)
-        if not 1 <= levels <= len(num_heads) or min(depths) < 1:
-            raise InputError(
-                "hdit needs a depth of at least 1 and a number of heads for each level, "
-                f"found depths {list(depths)} and num_heads {list(num_heads)}."
-            )
+        levels = max(len(depths), 1)
+        depths = integers("depths", depths, levels)
+        if len(num_heads) > levels:  # the published configs may list more: the middle takes the last
+            num_heads = [*num_heads[: levels - 1], num_heads[-1]]
+        heads = integers("num_heads", num_heads, levels)
+        patch_h, patch_w = integers("patch", patch, 2)
+        super().__init__(rays, in_channels, (patch_h, patch_w), levels)
         if attention != "auto":
             BACKENDS[attention]  # a wrong name is told now, not at the first call
-        self.in_channels, self.patch, self.levels = in_channels, pair(patch), levels
-        _check_shape(rays, self.patch, levels)
-        rows, columns = (size // p for size, p in zip(rays.shape[1:], self.patch, strict=True))
-        heads = [*num_heads[: levels - 1], num_heads[-1]]
+        self.patch, self.levels = (patch_h, patch_w), levels
+        rows, columns = rays.shape[1] // patch_h, rays.shape[2] // patch_w
         widths = [base_channels * 2**level for level in range(levels)]
+        span_h, span_w = integers("window", window, 2)
+        local = (span_h, span_w), ring, attention
 
-        def block(level: int, local: bool) -> Block:
+        def block(level: int) -> Block:
             highest = max((rows // 2) >> level, 1), max((columns // 2) >> level, 1)
-            attend = (pair(window), ring, attention) if local else None
-            return Block(widths[level], heads[level], time_channels, highest, attend, dropout)
+            middle = level == levels - 1
+            return Block(widths[level], heads[level], time_channels, highest, None if middle else local, dropout)
 
         embed = RandomFourierFeatures(time_channels)
         self.timestep_pe = nn.Sequential(embed, mapping_network(time_channels, dropout=dropout))
@@ -97,25 +95,18 @@ class HDiT(ExactBuffers):
         self.down_levels, self.up_levels = nn.ModuleDict(), nn.ModuleDict()
         for level in range(levels - 1):
             for side in (self.down_levels, self.up_levels):
-                blocks = [block(level, local=True) for _ in range(depths[level])]
+                blocks = [block(level) for _ in range(depths[level])]
                 side[f"level_{level}"] = nn.ModuleList(blocks)
             self.down_levels[f"merge_{level}"] = Merge(widths[level])
             self.up_levels[f"expand_{level}"] = Expand(widths[level])
-        self.mid_levels = nn.ModuleList([block(levels - 1, local=False) for _ in range(depths[-1])])
+        self.mid_levels = nn.ModuleList([block(levels - 1) for _ in range(depths[-1])])
         pixels = zero_initialised(nn.Linear(base_channels, math.prod(self.patch) * in_channels, bias=False))
         self.detokenizer = nn.Sequential(RMSNorm(base_channels), pixels)
-        device = next(self.parameters()).device
-        self.register_buffer("coords", rays[None].to(device, torch.float32, copy=True))
         self.follow_rays()
-        self.register_load_state_dict_post_hook(_follow_loaded_rays)
 
-    def forward(self, t: Tensor | float, x: Tensor) -> Tensor:
-        """Velocity (B, C, H, W) at times t, a scalar or (B,), of x (B, C, H, W)."""
-        if x.shape[1:] != (self.in_channels, *self.coords.shape[2:]):
-            expected = (self.in_channels, *self.coords.shape[2:])
-            raise InputError(f"this hdit was built for images of {expected}, found {tuple(x.shape[1:])}.")
-        condition = self.timestep_pe(times(t, x))
-        h = self.tokenizer(x.to(next(self.tokenizer.parameters()).dtype)).permute(0, 2, 3, 1)
+    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
+        condition = self.timestep_pe(t)
+        h = self.tokenizer(x).permute(0, 2, 3, 1).contiguous()
         if self.spatial_pe is not None:
             h = h + self.spatial_pe().to(h.dtype)
         skips = []
@@ -130,20 +121,16 @@ class HDiT(ExactBuffers):
             h = self.up_levels[f"expand_{level}"](h, skips.pop())
             for block in _level(self.up_levels, level):
                 h = block(h, condition, self._table(level))
-        return _unshuffle(self.detokenizer(h), self.patch).permute(0, 3, 1, 2).to(x.dtype)
+        return _unshuffle(self.detokenizer(h), self.patch).permute(0, 3, 1, 2)
 
     def follow_rays(self) -> None:
-        """Compute again what derives from `coords`: rotary tables and position features, of fixed size.
-
-        They are buffers outside the state_dict, in float32. Loading a state_dict calls this.
-        """
+        """Compute again the rotary table of each level and the position features."""
         for level in range(self.levels):
-            scale = 2**level
-            rays = mean_rays(self.coords, (self.patch[0] * scale, self.patch[1] * scale))
-            rope = self._blocks(level)[0].residual_attn.rope  # those of a level are equal
-            self.register_buffer(f"table_{level}", rope.table(rays), persistent=False)
+            rays = mean_rays(self.coords, (self.patch[0] << level, self.patch[1] << level))
+            table = _shared_rotation(level, self._blocks(level)).table(rays)
+            self.register_buffer(f"table_{level}", table, persistent=False)
         if isinstance(self.spatial_pe, FeaturePosition):
-            cast(RayFeatures, self.spatial_pe[0]).follow(mean_rays(self.coords, self.patch))
+            self.spatial_pe.follow(mean_rays(self.coords, self.patch))
 
     def _table(self, level: int) -> Tensor:
         return self.get_buffer(f"table_{level}")
@@ -158,13 +145,13 @@ def _level(side: nn.ModuleDict, level: int) -> Iterable["Block"]:
     return cast(Iterable[Block], side[f"level_{level}"])
 
 
-def _follow_loaded_rays(model: HDiT, _keys: object) -> None:
-    for level in range(model.levels):
-        first, *others = (block.residual_attn.rope for block in model._blocks(level))
-        for name, buffer in first.named_buffers():
-            if not buffer.is_meta and any(not torch.equal(buffer, other.get_buffer(name)) for other in others):
-                raise InputError(f"the blocks of hdit level {level} differ in their rotary {name}; they must not.")
-    model.follow_rays()
+def _shared_rotation(level: int, blocks: Sequence["Block"]) -> Rotary:
+    """The rotation of all blocks of a level, which share one table: what is loaded for one must hold for all."""
+    first, *others = (block.residual_attn.rope for block in blocks)
+    for name, buffer in first.named_buffers():
+        if not buffer.is_meta and any(not torch.equal(buffer, other.get_buffer(name)) for other in others):
+            raise InputError(f"the blocks of hdit level {level} differ in their rotary {name}; they must not.")
+    return first
 
 
 class LearnablePosition(nn.Module):
@@ -185,6 +172,9 @@ class FeaturePosition(nn.Sequential):
         features = RayFeatures(ENCODINGS[name](tokens), channels)
         super().__init__(features, mapping_network(channels, linear=nn.Linear, dropout=dropout))
 
+    def follow(self, rays: Tensor) -> None:
+        cast(RayFeatures, self[0]).follow(rays)
+
     def forward(self) -> Tensor:  # type: ignore[override]  # its input are the rays, which it holds
         features, mapping = self
         return mapping(features())
@@ -195,7 +185,7 @@ class RayFeatures(ExactBuffers):
 
     features: Tensor
 
-    def __init__(self, embedding: Encoding, channels: int) -> None:
+    def __init__(self, embedding: RayEncoding, channels: int) -> None:
         super().__init__()
         self.embedding = embedding
         self.linear = ExactLinear(embedding.channels, channels, bias=False)
@@ -244,7 +234,8 @@ class Block(nn.Module):
     def forward(self, x: Tensor, condition: Tensor, table: Tensor) -> Tensor:
         """x (B, H, W, C), condition (B or 1, K), table of `Rotary`."""
         x = x + self.residual_attn(x, condition, table)
-        return x + self.residual_ffn(x, condition)
+        (x,) = in_bands(lambda x: (x + self.residual_ffn(x, condition),), x)
+        return x
 
 
 LARGEST_LOG_SCALE = math.log(100.0)
@@ -276,15 +267,20 @@ class Attention(nn.Module):
         self.out_proj = zero_initialised(nn.Linear(channels, channels, bias=False))
 
     def forward(self, x: Tensor, condition: Tensor, table: Tensor) -> Tensor:
-        qkv = self.qkv_proj(self.norm(x, condition)).unflatten(-1, (3, self.heads, -1))
-        qk, v = qkv[..., :2, :, :], qkv[..., 2, :, :]
-        q, k = rotate(self._normalised(qk), table).to(v.dtype).unbind(-3)
+        q, k, v = in_bands(lambda x, table: self._project(x, condition, table), x, table)
         if self.local is None:
             out = _global_attention(q, k, v)
         else:
             window, ring, backend = self.local
             out = neighbourhood_attention(q, k, v, window, ring, backend)
         return self.out_proj(self.dropout(out.flatten(-2)))
+
+    def _project(self, x: Tensor, condition: Tensor, table: Tensor) -> tuple[Tensor, ...]:
+        """q, k and v, each (B, H, W, N, D), q and k scaled and rotated."""
+        qkv = self.qkv_proj(self.norm(x, condition)).unflatten(-1, (3, self.heads, -1))
+        qk, v = qkv[..., :2, :, :], qkv[..., 2, :, :]
+        q, k = rotate(self._normalised(qk), table).to(v.dtype).unbind(-3)
+        return q, k, v
 
     def _normalised(self, qk: Tensor) -> Tensor:
         """q and k, (..., N, D), each with length sqrt(s); float32, since s multiplies their rounding."""
@@ -351,18 +347,3 @@ class Expand(nn.Module):
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
         x = _unshuffle(self.linear(x), (2, 2))
         return torch.lerp(skip, x.to(skip.dtype), self.alpha.sigmoid().to(skip.dtype))
-
-
-def _check_shape(rays: Tensor, patch: tuple[int, int], levels: int) -> None:
-    if rays.ndim != 3 or rays.shape[0] != 2:
-        raise InputError(f"rays must be elevation and azimuth, (2, H, W); found {tuple(rays.shape)}.")
-    merges = 2 ** (levels - 1)
-    for name, size, p in zip(("height", "width"), rays.shape[1:], patch, strict=True):
-        unit = p * merges
-        if size % unit or size == 0:
-            below = size // unit * unit
-            nearest = ", ".join(str(n) for n in (below, below + unit) if n > 0)
-            raise InputError(
-                f"{name} {size} cannot be used by hdit with {levels} levels: it must be a multiple of "
-                f"{p} (patch) x {merges} ({levels - 1} 2x merges) = {unit}; nearest: {nearest}."
-            )

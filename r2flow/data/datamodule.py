@@ -21,7 +21,7 @@ from r2flow.data.sources import (
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
-from r2flow.registry import reject_unknown_options
+from r2flow.registry import check_options
 
 SIMULATED = "simulated"
 
@@ -82,7 +82,7 @@ class ScanDataModule(L.LightningDataModule):
         }  # fmt: skip
         self.batch_size, self.workers, self.memory_gib = batch_size, workers, memory_gib
         self.validation = dict(validation or {})
-        reject_unknown_options("data.validation", _validation_options, self.validation)
+        check_options("data.validation", _validation_options, self.validation)
         self.training_source: ScanSource | None = None
         self.validation_source: ScanSource | None = None
 

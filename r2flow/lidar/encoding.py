@@ -10,7 +10,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Sensor
-from r2flow.registry import Registry
+from r2flow.registry import Registry, check_options
 
 # Decoding may miss a range limit by float32's rounding; within this share of it, it is the limit.
 LIMIT_TOLERANCE = 1e-5
@@ -135,8 +135,5 @@ class Encoding:
 
 def build_encoding(options: Mapping[str, Any], sensor: Sensor) -> Encoding:
     """The encoding a config describes: `format` and `reflectance`."""
-    known = {"format", "reflectance"}
-    for key in options:
-        if key not in known:
-            raise InputError(f"encoding has no option {key!r}; it knows: {', '.join(sorted(known))}.")
+    check_options("encoding", Encoding, options)
     return Encoding(sensor, **options)

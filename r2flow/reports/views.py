@@ -20,8 +20,8 @@ def scans_of(path: Path, most: int) -> list[Path]:
     if not path.is_dir():
         return [path]
     found = sorted(p for p in path.rglob("*") if p.name.lower().endswith(tuple(SCAN_ENDINGS)))
-    # A sample is written in several formats: one picture of each is enough.
-    one_of_each = {p.with_suffix(""): p for p in reversed(found)}
+    # A sample is written in several formats: one of each is enough, and its range image is the exact one.
+    one_of_each = {p.with_suffix(""): p for p in sorted(found, key=lambda p: p.suffix == ".npy")}
     chosen = sorted(one_of_each.values())
     if not chosen:
         raise InputError(f"{path} holds no scan; known endings: {', '.join(sorted(SCAN_ENDINGS))}.")

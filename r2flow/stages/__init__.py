@@ -10,7 +10,7 @@ from r2flow.backbones import build_backbone
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding, build_encoding
 from r2flow.lidar.sensors import Convention, Sensor, build_sensor
-from r2flow.registry import Registry, reject_unknown_options
+from r2flow.registry import Registry, check_options
 from r2flow.stages.rectify import RectifiedFlow
 
 STAGES = Registry("stage", rectify=RectifiedFlow)
@@ -36,7 +36,7 @@ def build_parts(config: Mapping[str, Any]) -> Parts:
             raise InputError(f"the config has no '{key}'.")
     options = dict(config["sensor"])
     convention: Convention = options.pop("rays", "centre")
-    reject_unknown_options("sensor", build_sensor, options)
+    check_options("sensor", build_sensor, options)
     sensor = build_sensor(**options)
     encoding = build_encoding(config["encoding"], sensor)
     rays = sensor.rays(convention)

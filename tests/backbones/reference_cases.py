@@ -1,4 +1,4 @@
-"""Reads the reference cases: tensors computed once with the published implementation."""
+"""The reference cases, tensors computed once with the published implementation: reading and comparing."""
 
 import zlib
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 
 def load_case(path: Path) -> dict[str, Any]:
@@ -36,3 +36,17 @@ def _draw(name: str, shape: tuple[int, ...], kind: str, seed: int) -> Tensor:
         "ape": lambda: 0.5 * z,
         "rff": lambda: z,
     }[kind]()
+
+
+def relative(found: Tensor, expected: Tensor) -> float:
+    """|found - expected| / |expected|, in the Euclidean norm of all elements."""
+    return ((found - expected).norm() / expected.norm()).item()
+
+
+def assert_gradients(model: nn.Module, x: Tensor, output: Tensor, case: dict[str, Any]) -> None:
+    """The gradients of sum(output * grad_w) are the reference's to 1e-3: by x in full, by parameters in norm."""
+    (output * case["grad_w"]).sum().backward()
+    assert relative(x.grad, case["grad_x"]) < 1e-3
+    for name, parameter in model.named_parameters():
+        expected = case["grad_param_norms"][name]
+        assert abs(parameter.grad.norm().item() - expected) <= 1e-3 * expected + 1e-6, name

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from r2flow.backbones.attention import BACKENDS, neighbourhood_attention
+from r2flow.backbones.attention import BACKENDS, _Axis, _flex_mask, neighbourhood_attention
 from r2flow.errors import InputError
 
 EVERYWHERE = ["tiles", "shifts"]  # flex and natten need CUDA kernels
@@ -102,6 +102,34 @@ def test_a_mask_made_while_sampling_serves_training():
 def test_a_backend_that_cannot_be_had_says_why(backend, message):
     with pytest.raises(InputError, match=message):
         neighbourhood_attention(*qkv(4, 8), (3, 9), backend=backend)
+
+
+@pytest.mark.parametrize("wrap", [True, False])
+@pytest.mark.parametrize(("rows", "columns", "window"), [shape for shape in MAPS if shape[1] >= shape[2][1]])
+def test_the_mask_for_flex_shows_what_dense_sees(rows, columns, window, wrap):
+    """Its kernels need CUDA; whom it lets see whom does not."""
+    axes = _Axis(rows, window[0], wrap=False), _Axis(columns, window[1], wrap=wrap)
+    seen = torch.kron(*(axis.counts(torch.device("cpu")) for axis in axes)).bool()
+    tokens = torch.arange(rows * columns)
+    zero = torch.zeros((), dtype=torch.long)
+    sees = _flex_mask(*axes, torch.device("cpu")).mask_mod
+    assert torch.equal(sees(zero, zero, tokens[:, None], tokens[None]), seen)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("backend", ["tiles", "shifts", "flex", "natten"])
+def test_backends_agree_with_dense_on_a_gpu(backend):
+    inputs = [x.float().cuda().requires_grad_() for x in qkv(16, 64, channels=32)]
+    weights = torch.randn_like(inputs[0])
+    results = []
+    for name in ("dense", backend):
+        try:
+            out = neighbourhood_attention(*inputs, (3, 9), backend=name)
+        except InputError as error:
+            pytest.skip(str(error))
+        results.append([out, *torch.autograd.grad((out * weights).sum(), inputs)])
+    for expected, found in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, rtol=0, atol=2e-2)  # TF32 in some kernels
 
 
 def test_an_even_window_is_refused():

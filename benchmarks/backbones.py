@@ -1,0 +1,147 @@
+"""How near the backbones come to this machine's matrix products: the share of their rate that each one reaches.
+
+A share is (2 x MACs / time) over the rate of a plain matrix product of the same type, measured next to it, so that
+it means the same on any machine and does not move with what else runs there. MACs by the rule of
+r2flow/backbones/cost.py, three times as many for forward and backward. Medians, one process.
+
+python benchmarks/backbones.py                                  # forward and backward, eager, the three base models
+python benchmarks/backbones.py --backbone hdit --mode compiled-bfloat16
+python benchmarks/backbones.py --device cuda --batch 1 8 64 --attention flex tiles natten --mode compiled-bfloat16
+"""
+
+import argparse
+import json
+import resource
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from r2flow.backbones import Backbone, build_backbone
+from r2flow.backbones.cost import RULE, count_macs, count_parameters
+from r2flow.errors import InputError
+from r2flow.lidar.sensors import build_sensor
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+MODES = ("float32", "bfloat16", "compiled-float32", "compiled-bfloat16", "training-float32", "training-bfloat16")
+ORDER = {"cpu": 2048, "cuda": 8192}  # of the square matrices whose product sets the rate
+
+
+def seconds(work: Callable[[], object], device: str) -> float:
+    """Time of one call, to its end on the device."""
+    start = time.perf_counter()
+    work()
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def built(config: str, rows: int, columns: int, attention: str, device: str) -> Backbone:
+    """The backbone of a config on the paper's sensor, no weight zero: a zero would be as fast, but a special case."""
+    with initialize_config_dir(str(CONF), version_base=None):
+        options: Any = OmegaConf.to_container(compose(f"backbone/{config}").backbone, resolve=True)
+    if options["name"] == "hdit":
+        options["attention"] = attention
+    torch.manual_seed(0)
+    model = build_backbone(options, build_sensor("hdl64e", rows, columns).rays(), 2)
+    for parameter in model.parameters():
+        if not parameter.any():
+            torch.nn.init.normal_(parameter, std=0.02)
+    return model.to(device)
+
+
+def measured(model: Backbone, mode: str, batch: int, repeats: int, device: str) -> dict[str, float]:
+    """Median milliseconds of one call and median share of the matrix product's rate timed beside it."""
+    kind, _, name = mode.rpartition("-")
+    dtype = getattr(torch, name)
+    x = torch.randn(batch, 2, *model.coords.shape[2:], device=device)
+    t = torch.full((batch,), 0.5, device=device)
+    square = torch.randn(2, ORDER[device], ORDER[device], device=device).to(dtype)
+    call = torch.compile(model) if kind == "compiled" else model
+
+    def work() -> None:
+        with torch.autocast(device, dtype=torch.bfloat16, enabled=name == "bfloat16"):
+            output = call(t, x)
+        if kind == "training":
+            model.zero_grad(set_to_none=True)
+            output.square().mean().backward()
+
+    def product() -> None:
+        torch.mm(square[0], square[1])
+
+    operations = 2 * count_macs(model) * batch * (3 if kind == "training" else 1)
+    times, shares = [], []
+    with torch.set_grad_enabled(kind == "training"):
+        first = seconds(work, device)
+        seconds(product, device)
+        for _ in range(repeats):
+            before = seconds(product, device)
+            times.append(seconds(work, device))
+            after = seconds(product, device)
+            rate = 2 * 2 * ORDER[device] ** 3 / (before + after)
+            shares.append(operations / times[-1] / rate)
+    if device == "cuda":
+        memory = torch.cuda.max_memory_allocated() / 2**30
+        torch.cuda.reset_peak_memory_stats()
+    else:
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return {
+        "latency_ms": 1e3 * statistics.median(times),
+        "share": statistics.median(shares),
+        "first_call_s": first,
+        "peak_gib": memory,
+    }
+
+
+def main() -> None:
+    """Print the table, or the same as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--backbone", nargs="+", default=["hdit", "efficient_unet", "adm_unet"])
+    parser.add_argument("--mode", nargs="+", choices=MODES, default=["float32", "bfloat16", "training-float32"])
+    parser.add_argument("--attention", nargs="+", default=["auto"], help="hdit's attention backends")
+    parser.add_argument("--batch", nargs="+", type=int, default=[1])
+    parser.add_argument("--rows", type=int, default=64)
+    parser.add_argument("--columns", type=int, default=1024)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--device", choices=list(ORDER), default="cpu")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    found = []
+    if not options.json:
+        print(f"{RULE}\ntorch {torch.__version__}, {options.device}, {options.threads} threads")
+        print(f"{'backbone':22s} {'mode':18s} {'attention':9s} batch {'ms':>9s} {'share':>6s} {'first s':>8s} peak GiB")
+    for config in options.backbone:
+        for attention in options.attention:
+            model = built(config, options.rows, options.columns, attention, options.device)
+            for mode in options.mode:
+                for batch in options.batch:
+                    row = {"name": config, "mode": mode, "attention": attention, "batch": batch}
+                    try:
+                        row |= measured(model.train("training" in mode), mode, batch, options.repeats, options.device)
+                    except InputError as error:
+                        row["error"] = str(error)
+                    row |= {"parameters": count_parameters(model), "gmac": count_macs(model) / 1e9}
+                    found.append(row)
+                    if not options.json:
+                        print(line(row), flush=True)
+    if options.json:
+        print(json.dumps(found, indent=2))
+
+
+def line(row: dict[str, Any]) -> str:
+    """One row of the table."""
+    start = f"{row['name']:22s} {row['mode']:18s} {row['attention']:9s} {row['batch']:5d}"
+    if "error" in row:
+        return f"{start} {row['error']}"
+    return f"{start} {row['latency_ms']:9.1f} {row['share']:6.1%} {row['first_call_s']:8.1f} {row['peak_gib']:8.2f}"
+
+
+if __name__ == "__main__":
+    main()

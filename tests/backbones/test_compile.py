@@ -1,0 +1,79 @@
+"""torch.compile: one graph without breaks, and a number of graphs that stays."""
+
+import itertools
+import random
+
+import pytest
+import torch
+from test_backbones import BACKBONES, tiny
+from torch import Tensor
+
+MODES = list(itertools.product((True, False), (True, False)))  # gradients, autocast
+
+
+class Counter:
+    """A compiler that runs each graph as it was traced, and counts them."""
+
+    def __init__(self) -> None:
+        self.graphs = 0
+
+    def __call__(self, graph: torch.fx.GraphModule, _inputs: list[Tensor]):
+        self.graphs += 1
+        return graph.forward
+
+
+@pytest.mark.parametrize("name", list(BACKBONES))
+def test_the_whole_model_is_one_graph(name):
+    torch.compiler.reset()
+    model, counter = tiny(name), Counter()
+    compiled, x = torch.compile(model, backend=counter, fullgraph=True), torch.randn(2, 2, 8, 32)
+    for t in (torch.rand(2), torch.rand(2)):
+        torch.testing.assert_close(compiled(t, x), model(t, x), rtol=0, atol=1e-5)
+    assert counter.graphs == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(BACKBONES))
+def test_two_graphs_for_each_mode_and_then_no_more(name):
+    """One for batches of two and more, one for a single image, and never a break (fullgraph)."""
+    torch.compiler.reset()
+    model, counter = tiny(name, rows=16), Counter()
+    compiled = torch.compile(model, backend=counter, dynamic=True, fullgraph=True)
+
+    def call(batch: int, gradients: bool, autocast: bool) -> None:
+        x = torch.randn(batch, 2, 16, 32)
+        with torch.set_grad_enabled(gradients), torch.autocast("cpu", dtype=torch.bfloat16, enabled=autocast):
+            torch.testing.assert_close(compiled(torch.tensor(0.3), x), model(0.3, x), rtol=0, atol=0.1)
+
+    for mode in MODES:
+        for batch in (7, 5, 3, 1):  # finished samples leave the batch of an adaptive solver
+            call(batch, *mode)
+    assert counter.graphs == 2 * len(MODES)
+    draw = random.Random(0)
+    for _ in range(100):
+        call(draw.choice([1, 2, 3, 4, 5, 6, 7, 8]), *draw.choice(MODES))
+    assert counter.graphs == 2 * len(MODES)
+
+
+@pytest.mark.parametrize("backend", ["tiles", "shifts", "dense"])
+def test_attention_backends_compile_without_breaks(backend):
+    torch.compiler.reset()
+    model, counter = tiny("hdit", attention=backend), Counter()
+    compiled = torch.compile(model, backend=counter, fullgraph=True)
+    x = torch.randn(2, 2, 8, 32)
+    torch.testing.assert_close(compiled(torch.tensor(0.3), x), model(0.3, x), rtol=0, atol=1e-5)
+    assert counter.graphs == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(BACKBONES))
+def test_inductor_gives_the_same_values_and_gradients(name):
+    torch.compiler.reset()
+    model = tiny(name)
+    compiled, x, t = torch.compile(model), torch.randn(2, 2, 8, 32, requires_grad=True), torch.rand(2)
+    results = []
+    for call in (model, compiled):
+        output = call(t, x)
+        results.append([output, *torch.autograd.grad(output.square().sum(), [x, *model.parameters()])])
+    for expected, found in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)

@@ -1,0 +1,110 @@
+"""The two U-Nets against the published implementation."""
+
+import pytest
+import torch
+from reference_cases import assert_gradients, load_case
+
+from r2flow.backbones import Backbone, build_backbone
+from r2flow.backbones.adm_unet import ADMBlock
+from r2flow.backbones.convolutions import Resample, SinusoidalTime
+from r2flow.backbones.efficient_unet import Level
+from r2flow.errors import InputError
+
+CASES = {"eff_16x64_polar": "efficient_unet", "adm_16x64_fourier": "adm_unet"}
+
+
+def from_case(name: str, case: dict) -> Backbone:
+    cfg = case["cfg"]
+    options = {
+        "name": CASES[name],
+        "base_channels": cfg["base_channels"],
+        "channel_multiplier": cfg["channel_multiplier"],
+        "num_residual_blocks": cfg["num_residual_blocks"],
+        "num_heads": cfg["attn_num_heads"],
+        "time_channels": cfg.get("temb_channels"),
+        "position": cfg["coords_encoding"],
+    }
+    model = build_backbone(options, torch.zeros(2, *cfg["resolution"]), cfg["in_channels"])
+    model.load_state_dict(case["state_dict"])
+    return model
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_output_and_gradients_are_the_references(shared, name):
+    case = load_case(shared / "oracle" / f"{name}.pt")
+    model = from_case(name, case)
+    x = case["x"].clone().requires_grad_()
+    output = model(case["t"], x)
+    torch.testing.assert_close(output, case["output"], rtol=0, atol=5e-5)
+    assert_gradients(model, x, output, case)
+    with torch.no_grad():
+        at_one_time = model(case["t_scalar"], case["x"][:1])
+    torch.testing.assert_close(at_one_time, case["output_t_scalar"], rtol=0, atol=5e-5)
+
+
+def test_resampling_is_the_references(shared):
+    units = load_case(shared / "oracle" / "units_encodings.pt")
+    cases = [case for case in units["resample"] if "direction" not in case["kw"]]  # no model resamples one axis
+    for case in cases:
+        options = case["kw"]
+        resample = Resample(options.get("window", (1, 3, 3, 1)), "up" in options, options.get("ring", True))
+        torch.testing.assert_close(resample.kernel, case["kernel"], rtol=0, atol=0)
+        torch.testing.assert_close(resample(units["h"]), case["out"], rtol=0, atol=1e-5)
+    assert len(cases) == 6
+
+
+def test_time_features_are_the_references(shared):
+    units = load_case(shared / "oracle" / "units_encodings.pt")
+    torch.testing.assert_close(SinusoidalTime(64)(units["sin_t"]), units["sin64"], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("window", [(1, 1), (1, 3, 3, 1)])
+def test_resampling_keeps_a_constant_ring_constant(window):
+    x = torch.full((1, 3, 8, 16), 2.5)
+    for up in (True, False):
+        inner = Resample(window, up=up, ring=True)(x)[:, :, 1:-1]  # the filter sees zeros above and below
+        torch.testing.assert_close(inner, torch.full_like(inner, 2.5))
+
+
+def randomised(module: torch.nn.Module) -> torch.nn.Module:
+    for parameter in module.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    return module.double()
+
+
+@pytest.mark.parametrize(
+    "block",
+    [
+        lambda: ADMBlock(8, 16, 4, True, 0.0, Resample((1, 1), up=False, ring=True), heads=2),
+        lambda: Level(8, 16, 1, 4, True, 0.0, heads=2, down=True),
+        lambda: Level(8, 8, 1, 4, True, 0.0, heads=2, up=True),
+    ],
+    ids=["adm", "efficient down", "efficient up"],
+)
+def test_gradcheck_of_a_block(block):
+    module = randomised(block())
+    x = torch.randn(1, 8, 4, 4, dtype=torch.float64, requires_grad=True)
+    condition = torch.randn(1, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(module, (x, condition), fast_mode=True)
+    parameters = dict(module.named_parameters())
+
+    def of_weights(*values: torch.Tensor) -> torch.Tensor:
+        weights = dict(zip(parameters, values, strict=True))
+        return torch.func.functional_call(module, weights, (x.detach(), condition.detach()))
+
+    assert torch.autograd.gradcheck(of_weights, tuple(parameters.values()), fast_mode=True)
+
+
+@pytest.mark.parametrize("name", ["adm_unet", "efficient_unet"])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"base_channels": 12}, "12 channels cannot be normed in 8 groups"),
+        ({"base_channels": 8, "num_heads": 3}, "cannot be shared by 3 attention heads"),
+        ({"num_residual_blocks": [1, 2]}, r"num_residual_blocks must be 4 integers of at least 1, found \[1, 2\]"),
+        ({"position": "learnable"}, "no position named 'learnable'; known: none, fourier_features"),
+    ],
+)
+def test_options_that_cannot_work_say_why(name, options, message):
+    with pytest.raises(InputError, match=message), torch.device("meta"):
+        build_backbone({"name": name, **options}, torch.zeros(2, 16, 64), 2)

@@ -1,0 +1,64 @@
+from pathlib import Path
+
+import pytest
+
+from r2flow.data.layouts import LAYOUTS, find_drives
+from r2flow.errors import InputError
+from tests.data.conftest import write_scan
+
+
+def names(drives) -> list[str]:
+    return [drive.name.split("_")[-2] if "drive" in drive.name else drive.name for drive in drives]
+
+
+def test_the_standard_split_of_kitti_360(kitti_360: Path):
+    assert names(find_drives("kitti_360", kitti_360, "train")) == ["0003", "0004", "0010"]
+    assert names(find_drives("kitti_360", kitti_360, "test")) == ["0000", "0002"]
+    assert names(find_drives("kitti_360", kitti_360)) == ["0000", "0002", "0003", "0004", "0010"]
+    assert names(find_drives("kitti_360", kitti_360 / "data_3d_raw", "test")) == ["0000", "0002"]
+
+
+def test_drives_are_taken_by_number_and_by_name(kitti_360: Path):
+    assert names(find_drives("kitti_360", kitti_360, drives=[10, 2])) == ["0010", "0002"]
+    assert names(find_drives("kitti_360", kitti_360, drives=["2013_05_28_drive_0003_sync"])) == ["0003"]
+    with pytest.raises(InputError, match=r"no drive named '7'; known: 2013_05_28_drive_0000_sync"):
+        find_drives("kitti_360", kitti_360, drives=[7])
+
+
+def test_kitti_raw_and_odometry(tmp_path: Path):
+    write_scan(tmp_path / "raw/2011_09_26/2011_09_26_drive_0005_sync/velodyne_points/data/0000000000.bin", 0)
+    write_scan(tmp_path / "raw/2011_09_28/2011_09_28_drive_0001_sync/velodyne_points/data/0000000000.bin", 0)
+    assert names(find_drives("kitti_raw", tmp_path / "raw")) == ["0005", "0001"]
+    assert names(find_drives("kitti_raw", tmp_path / "raw/2011_09_26")) == ["0005"]
+    for sequence in ("00", "08", "11"):
+        write_scan(tmp_path / f"odo/dataset/sequences/{sequence}/velodyne/000000.bin", 0)
+    assert names(find_drives("odometry", tmp_path / "odo", "train")) == ["00"]
+    assert names(find_drives("odometry", tmp_path / "odo/dataset", "validation")) == ["08"]
+
+
+def test_any_folder(tmp_path: Path):
+    write_scan(tmp_path / "b/2.bin", 0)
+    write_scan(tmp_path / "b/1.bin", 0)
+    write_scan(tmp_path / "a/deep/1.bin", 0)
+    (tmp_path / "b/notes.txt").write_text("not a scan")
+    drives = find_drives("folder", tmp_path)
+    assert names(drives) == ["a/deep", "b"]
+    assert [path.name for path in drives[1].scans] == ["1.bin", "2.bin"]
+
+
+@pytest.mark.parametrize("layout", list(LAYOUTS))
+def test_a_missing_or_empty_root_says_what_was_looked_for(layout: str, tmp_path: Path):
+    with pytest.raises(InputError, match="is not a folder"):
+        find_drives(layout, tmp_path / "missing")
+    with pytest.raises(InputError, match=f"holds no {layout} scan"):
+        find_drives(layout, tmp_path)
+
+
+def test_the_real_layouts(shared: Path):
+    real = shared / "real"
+    assert len(find_drives("kitti_360", real / "kitti360", "test")[0].scans) == 15
+    with pytest.raises(InputError, match="of its train split"):
+        find_drives("kitti_360", real / "kitti360", "train")
+    assert [len(d.scans) for d in find_drives("kitti_raw", real / "raw")] == [20, 11]
+    assert names(find_drives("odometry", real / "odometry")) == ["00", "08"]
+    assert sum(len(d.scans) for d in find_drives("folder", real / "other_sensors")) == 6

@@ -1,0 +1,68 @@
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.data.loader import FixedSampler, FlowDataset, RunLoader, RunSampler
+from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.sensors import SENSORS
+
+SENSOR = SENSORS["hdl64e"].resized(4, 8)
+
+
+class Scans:
+    def __len__(self):
+        return 10
+
+    def __getitem__(self, index):
+        return np.full((2, 4, 8), 2.0 + index, np.float32) * [[[1.0]], [[0.01]]]
+
+
+def keys(**options) -> list[list[tuple[int, int]]]:
+    return list(RunSampler(**{"scans": 10, "batch_size": 4, "batches": 10, "seed": 3, **options}))
+
+
+def test_every_scan_is_seen_once_an_epoch_in_another_order():
+    order = [index for batch in keys() for _, index in batch]
+    assert all(Counter(order[e * 10 : e * 10 + 10]) == Counter(range(10)) for e in range(4))
+    assert order[:10] != order[10:20]
+
+
+def test_a_late_start_continues_the_same_order():
+    sampler = RunSampler(10, 4, 10, 3)
+    sampler.first_batch = 7
+    assert list(sampler) == keys()[7:]
+    assert len(sampler) == 10  # the length of the run, not of what is left
+
+
+@pytest.mark.parametrize("ranks", [2, 4])
+def test_ranks_share_every_global_batch(ranks):
+    parts = [keys(rank=rank, ranks=ranks) for rank in range(ranks)]
+    for whole, *shares in zip(keys(), *parts, strict=True):
+        assert sorted(k for share in shares for k in share) == sorted(whole)
+        assert len({len(share) for share in shares}) == 1
+
+
+def test_an_item_depends_on_its_number_alone():
+    dataset = FlowDataset(Scans(), Encoding(SENSOR), 0, "training")
+    first = dataset[(17, 3)]
+    dataset[(18, 3)]
+    again = dataset[(17, 3)]
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not torch.equal(first["x_0"], dataset[(18, 3)]["x_0"])
+    assert torch.equal(first["x_1"], dataset[(18, 3)]["x_1"])
+
+
+def test_workers_change_nothing():
+    def batches(workers):
+        dataset = FlowDataset(Scans(), Encoding(SENSOR), 0, "training")
+        return list(RunLoader(dataset, RunSampler(10, 4, 5, 3), num_workers=workers))
+
+    for a, b in zip(batches(0), batches(2), strict=True):
+        assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_validation_covers_every_scan_once_over_the_ranks():
+    seen = [key for rank in range(3) for batch in FixedSampler(10, 4, rank, 3) for key in batch]
+    assert sorted(seen) == [(i, i) for i in range(10)]

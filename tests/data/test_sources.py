@@ -1,0 +1,112 @@
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r2flow.data.sources import InMemory, ScanFiles, holdout_block, read_scan, spread
+from r2flow.errors import InputError
+from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.sensors import SENSORS
+from tests.data.conftest import write_scan
+
+SENSOR = SENSORS["hdl64e"].resized(16, 64)
+
+
+def ranges(source) -> list[int]:
+    """The number that each scan carries in its range."""
+    return [round(float(source[i][0].max())) - 5 for i in range(len(source))]
+
+
+def files(folder: Path, **options) -> ScanFiles:
+    return ScanFiles(sorted(folder.glob("*.bin")), SENSOR, **options)
+
+
+def test_a_bad_file_stops_the_run_and_is_named(numbered: Path):
+    (numbered / "000003.bin").write_bytes(b"\0" * 30)
+    with pytest.raises(InputError, match=r"000003.bin"):
+        files(numbered)[3]
+
+
+def test_skipping_takes_the_next_good_scan_of_the_same_block(numbered: Path, caplog):
+    for bad in (3, 4, 11):
+        (numbered / f"{bad:06d}.bin").write_bytes(b"\0" * 30)
+    with caplog.at_level(logging.WARNING):
+        source = files(numbered, on_bad_scan="skip")
+        assert ranges(source) == [0, 1, 2, 5, 5, 5, 6, 7, 8, 9, 10, 0]
+        assert ranges(source) == [0, 1, 2, 5, 5, 5, 6, 7, 8, 9, 10, 0]
+    assert len([r for r in caplog.records if "left out" in r.message]) == 3  # each is said once
+    # A block never reaches into its neighbour: scan 11 is not replaced by scan 0 of the training block.
+    assert ranges(source.subset(range(9, 12))) == [9, 10, 9]
+
+
+def test_in_memory_a_skipped_scan_is_gone(numbered: Path):
+    (numbered / "000003.bin").write_bytes(b"")
+    kept = InMemory(files(numbered, on_bad_scan="skip"))
+    assert ranges(kept) == [0, 1, 2, 4, 5, 6, 7, 8, 9, 10, 11]
+    assert ranges(kept.subset([2, 3])) == [2, 4]
+
+
+def test_when_all_are_bad_it_ends(numbered: Path):
+    for path in numbered.glob("*.bin"):
+        path.write_bytes(b"")
+    with pytest.raises(InputError, match="all 12 scans were left out"):
+        files(numbered, on_bad_scan="skip")[0]
+
+
+def test_nan_and_infinite_points_are_dropped_counted_and_said(tmp_path: Path, caplog):
+    rows = np.array([[10, 0, -1, 0.5], [np.nan, 0, 0, 0.5], [10, np.inf, 0, 0.5]] + [[11, 2, -1, 0.5]] * 5, np.float32)
+    rows.tofile(tmp_path / "scan.bin")
+    with caplog.at_level(logging.WARNING):
+        image = read_scan(tmp_path / "scan.bin", SENSOR)
+    assert "dropped 2 points with NaN or infinite" in caplog.text
+    assert (image[0] > 0).sum() == 2
+
+
+def test_a_scan_out_of_range_says_its_ranges(tmp_path: Path):
+    write_scan(tmp_path / "far.bin", 200)
+    with pytest.raises(InputError, match=r"far.bin: none of its 1 points lies within 1.45-80 m .* 205-205 m"):
+        read_scan(tmp_path / "far.bin", SENSOR)
+
+
+def test_missing_reflectance_names_the_key(tmp_path: Path):
+    write_points(tmp_path / "scan.ply", np.array([[10, 0, -1]], np.float32))
+    with pytest.raises(InputError, match=r"scan.ply has no reflectance .* encoding.reflectance=false"):
+        read_scan(tmp_path / "scan.ply", SENSOR)
+    assert read_scan(tmp_path / "scan.ply", SENSOR, reflectance=False).shape == (1, 16, 64)
+
+
+def test_reflectance_out_of_scale_names_the_key(tmp_path: Path):
+    write_scan(tmp_path / "scan.bin", 0, reflectance=235.0)
+    with pytest.raises(InputError, match=r"found up to 235.*reflectance_scale=255"):
+        read_scan(tmp_path / "scan.bin", SENSOR)
+    image = read_scan(tmp_path / "scan.bin", SENSOR, reflectance_scale=255)
+    assert image[1].max() == pytest.approx(235 / 255)
+
+
+def test_the_held_out_block_is_contiguous_and_last():
+    training, held = holdout_block(20, 0.1)
+    assert (list(training), list(held)) == (list(range(18)), [18, 19])
+    assert [len(part) for part in holdout_block(3, 0.0)] == [3, 0]
+    assert [len(part) for part in holdout_block(1, 0.5)] == [1, 0]  # something must be left to learn from
+    with pytest.raises(InputError, match="share"):
+        holdout_block(3, 1.0)
+
+
+def test_few_of_many_are_spread_evenly():
+    assert spread(3, 8) == [0, 1, 2]
+    assert spread(100, 4) == [12, 37, 62, 87]
+
+
+def test_every_real_sensor_is_read_and_projected(shared: Path):
+    others = shared / "real" / "other_sensors"
+    cases = {
+        "nuscenes_hdl32e": ("hdl32e", True, 255.0),
+        "rellis_os1_64": ("hdl64e", True, 1.0),
+        "rellis_vlp32c": ("hdl32e", True, 255.0),
+        "vlp16": ("vlp16", False, 1.0),
+    }
+    for folder, (sensor, reflectance, scale) in cases.items():
+        for path in sorted((others / folder).glob("*[bd]")):
+            image = read_scan(path, SENSORS[sensor], reflectance=reflectance, reflectance_scale=scale)
+            assert (image[0] > 0).mean() > 0.1, path

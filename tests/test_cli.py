@@ -1,0 +1,168 @@
+"""r2flow VERB as a user types it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow import cli
+from r2flow.lidar.scan_files import read_points
+from r2flow.lidar.sensors import SENSORS
+from tests.data.conftest import write_scan
+from tests.test_checkpoints import saved  # noqa: F401  a fixture
+
+
+@pytest.fixture
+def r2flow(monkeypatch, capsys):
+    """Runs a verb in this process: (exit code, standard output, standard error)."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["r2flow", *map(str, arguments)])
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as exit:
+            code = exit.code if isinstance(exit.code, int) else 1
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    """A scan of the ground 1.73 m below, as a KITTI .bin."""
+    from r2flow.lidar.projection import image_to_points
+    from r2flow.lidar.scan_files import write_points
+
+    sensor = SENSORS["hdl64e"]
+    e = sensor.rays()[0].numpy()
+    r = np.where(e < -0.03, -1.73 / np.sin(np.minimum(e, -0.03)), 0)
+    image = np.stack([r, np.full_like(r, 0.3)]).astype(np.float32)
+    write_points(tmp_path / "ground.bin", *image_to_points(image, sensor.rays()))
+    return tmp_path / "ground.bin"
+
+
+def test_sample_writes_the_same_scans_for_the_same_seed(r2flow, saved, tmp_path):  # noqa: F811
+    path, _ = saved
+    code, out, _ = r2flow("sample", "--checkpoint", path, "--num", 3, "--steps", 2, "--seed", 5, "--out", tmp_path / "a")
+    assert code == 0
+    assert str(tmp_path / "a" / "samples.png") in out
+    r2flow("sample", "-c", path.parent.parent, "--num", 1, "--steps", 2, "--seed", 5, "-o", tmp_path / "b", "--pictures", 0)
+    r2flow("sample", "-c", path, "--num", 3, "--steps", 2, "--seed", 6, "-o", tmp_path / "c", "--format", "npy")
+    images = {name: np.load(tmp_path / name / "000000.npy") for name in "abc"}
+    assert images["a"].shape == (2, 8, 64)
+    assert images["a"].dtype == np.float32
+    np.testing.assert_array_equal(images["a"], images["b"])
+    assert (images["a"] != images["c"]).any()
+    assert not list((tmp_path / "b").glob("*.png"))
+    assert sorted(p.suffix for p in (tmp_path / "c").glob("00000*")) == [".npy"] * 3 + [".png"] * 3
+
+
+def test_the_formats_hold_the_same_scan(r2flow, saved, tmp_path):  # noqa: F811
+    r2flow("sample", "-c", saved[0], "--num", 1, "--steps", 2, "-o", tmp_path, "--pictures", 0)
+    image = np.load(tmp_path / "000000.npy")
+    ply, kitti = read_points(tmp_path / "000000.ply"), read_points(tmp_path / "000000.bin")
+    assert len(ply.xyz) == (image[0] > 0).sum() > 0
+    np.testing.assert_array_equal(ply.xyz, kitti.xyz)
+    np.testing.assert_array_equal(ply.reflectance, kitti.reflectance)
+    np.testing.assert_allclose(np.sort(np.linalg.norm(ply.xyz, axis=1)), np.sort(image[0][image[0] > 0]), rtol=1e-5)
+
+
+def test_project_writes_the_image(r2flow, scan, tmp_path):
+    out = tmp_path / "image.npy"
+    code, said, _ = r2flow("project", scan, "--projection", "unfolding", "--size", "64x1024", "--out", out)
+    assert code == 0
+    image = np.load(out)
+    assert (image.shape, image.dtype) == ((2, 64, 1024), np.float32)
+    e = SENSORS["hdl64e"].rays()[0].numpy()
+    seen = image[0] > 0
+    np.testing.assert_allclose(image[0][seen], -1.73 / np.sin(e[seen]), rtol=1e-4)
+    assert "64 x 1024" in said
+
+
+def test_show_draws_files_folders_and_range_images(r2flow, scan, tmp_path):
+    r2flow("project", scan, "--size", "32x256", "--out", tmp_path / "more" / "image.npy")
+    code, said, _ = r2flow("show", scan, tmp_path / "more", "--out", tmp_path / "views")
+    assert code == 0
+    assert sorted(p.name for p in (tmp_path / "views").iterdir()) == ["ground.png", "image.png"]
+    assert (tmp_path / "views" / "ground.png").read_bytes().startswith(b"\x89PNG")
+    assert "views/ground.png" in said
+
+
+def test_info_says_what_is_in_a_checkpoint(r2flow, saved):  # noqa: F811
+    code, said, _ = r2flow("info", saved[0])
+    assert code == 0
+    for words in ("hdit", "2 x 8 x 64", "hdl64e", "logscale", "backbone.base_channels"):
+        assert words in said
+    code, said, _ = r2flow("info", saved[0], "--json")
+    import json
+
+    assert json.loads(said)["step"] == 7
+
+
+@pytest.mark.parametrize("verb", ["sample", "show", "project", "info"])
+def test_every_verb_has_help_with_an_example(r2flow, verb):
+    code, said, _ = r2flow(verb, "--help")
+    assert code == 0
+    assert f"Example: r2flow {verb}" in " ".join(said.split())
+
+
+class TestBadInput:
+    """One clear line, exit code 2, nothing written."""
+
+    def check(self, result, out: Path, *words: str) -> None:
+        code, _, err = result
+        assert code == 2
+        lines = [line for line in err.splitlines() if not line.startswith("WARNING")]
+        assert len(lines) == 1, err
+        assert lines[0].startswith("error: ")
+        for word in words:
+            assert word in lines[0]
+        assert not out.exists()
+
+    @pytest.mark.parametrize(
+        ("content", "words"),
+        [
+            (b"\0" * 30, ("bad.bin", "14 bytes more")),
+            (b"", ("bad.bin", "empty")),
+            (np.full((9, 4), np.nan, np.float32).tobytes(), ("bad.bin",)),
+            (np.full((9, 4), [500, 0, 0, 0.5], np.float32).tobytes(), ("bad.bin", "none of its 9 points", "500")),
+        ],
+    )
+    def test_scans(self, r2flow, tmp_path, content, words):
+        (tmp_path / "bad.bin").write_bytes(content)
+        self.check(r2flow("project", tmp_path / "bad.bin", "--out", tmp_path / "o.npy"), tmp_path / "o.npy", *words)
+        self.check(r2flow("show", tmp_path / "bad.bin", "--out", tmp_path / "views"), tmp_path / "views", *words)
+
+    def test_missing_and_empty_places(self, r2flow, tmp_path):
+        self.check(r2flow("show", tmp_path / "no.bin", "-o", tmp_path / "v"), tmp_path / "v", "no.bin")
+        (tmp_path / "empty").mkdir()
+        self.check(r2flow("show", tmp_path / "empty", "-o", tmp_path / "v"), tmp_path / "v", "holds no scan")
+        self.check(r2flow("sample", "-c", tmp_path / "empty", "-o", tmp_path / "s"), tmp_path / "s", "no checkpoint")
+
+    def test_options(self, r2flow, saved, scan, tmp_path):  # noqa: F811
+        out = tmp_path / "out"
+        self.check(r2flow("project", scan, "--size", "64", "-o", out), out, "ROWSxCOLUMNS", "'64'")
+        self.check(r2flow("project", scan, "--sensor", "hdl64", "-o", out), out, "Did you mean 'hdl64e'?")
+        self.check(r2flow("project", scan, "--projection", "flat", "-o", out), out, "spherical, unfolding")
+        self.check(r2flow("sample", "-c", saved[0], "--solver", "eulr", "-o", out), out, "Did you mean 'euler'?")
+        self.check(r2flow("sample", "-c", saved[0], "--format", "las", "-o", out), out, "ply, bin, npy")
+        self.check(r2flow("sample", "-c", saved[0], "--num", 0, "-o", out), out, "at least one scan")
+        if not torch.cuda.is_available():
+            self.check(r2flow("sample", "-c", saved[0], "--device", "cuda", "-o", out), out, "--device cpu")
+
+    def test_a_scan_that_does_not_unfold(self, r2flow, tmp_path):
+        write_scan(tmp_path / "one.bin", 3)
+        result = r2flow("project", tmp_path / "one.bin", "--projection", "unfolding", "-o", tmp_path / "o.npy")
+        self.check(result, tmp_path / "o.npy", "unfolds into 1 rings")
+
+
+def test_importing_r2flow_loads_neither_lightning_nor_matplotlib():
+    code = "import r2flow, r2flow.cli, r2flow.lidar.projection, r2flow.flow.solvers, r2flow.backbones, sys; "
+    code += "print([m for m in ('lightning', 'matplotlib', 'tensorboard', 'torchdiffeq') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

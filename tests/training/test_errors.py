@@ -1,0 +1,68 @@
+"""What a user gets wrong: one line that names it, exit code 2, nothing written."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+import train as train_script
+from tests.training.conftest import TINY, Run
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["bakcbone.base_channels=8"], ["no key 'bakcbone.base_channels'", "Did you mean 'backbone.base_channels'?"]),
+        (["trainer.max_step=8"], ["no key 'trainer.max_step'", "Did you mean 'trainer.max_steps'?"]),
+        (["backbone=hditt"], ["no backbone config named 'hditt'", "Did you mean 'hdit'?"]),
+        (["backbone.name=hditt"], ["no backbone named 'hditt'", "Did you mean 'hdit'?"]),
+        (["+backbone.widht=8"], ["no option 'widht'"]),
+        (["+data.rot=8"], ["no option 'rot'", "Did you mean 'root'?"]),
+        (["stage.loss=l3"], ["no loss named 'l3'", "mse"]),
+        (["sensor.columns=100"], ["100", "nearest"]),
+        (["data.root=/nowhere/at/all"], ["data.root=/nowhere/at/all", "is not a folder"]),
+        (["data.root=null"], ["data.root=FOLDER"]),
+        (["data.batch_size=3", "trainer.accumulate_grad_batches=2"], ["batch_size=3", "multiple of 2"]),
+        (["trainer.precision=16-mixed"], ["16-mixed", "bf16-mixed"]),
+        (["trainer.max_steps=abc"], ["max_steps must be a whole number", "'abc'"]),
+        (["trainer.strategy=dpp"], ["dpp"]),
+        (["data.batch_size=many"], ["batch_size must be a whole number", "'many'"]),
+        (["stage.learning_rate=fast"], ["learning_rate must be a number", "'fast'"]),
+        (["encoding.format=log"], ["no range format named 'log'", "Did you mean 'logscale'?"]),
+        (["encoding.reflectance=maybe"], ["reflectance must be true or false", "'maybe'"]),
+        (["loggers=csv"], ["loggers=[csv]"]),
+    ],
+)
+def test_wrong_config(scans, tmp_path, monkeypatch, capfd, overrides: list[str], words: list[str]):
+    # In this process: each test costs no import of torch.
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.py", *TINY, f"data.root={scans}", "name=bad", *overrides])
+    assert train_script.main() == 2
+    lines = capfd.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    for word in words:
+        assert word in lines[0]
+    assert not (tmp_path / "runs" / "bad" / "checkpoints").exists()
+
+
+def test_an_empty_root(train: Run, tmp_path: Path):
+    (tmp_path / "empty").mkdir()
+    done = train(f"data.root={tmp_path / 'empty'}", check=False)
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "holds no folder scan" in done.stderr
+
+
+def test_one_bad_scan_stops_the_run_or_is_left_out(train: Run, scans: Path, tmp_path: Path):
+    folder = tmp_path / "copy"
+    folder.mkdir()
+    for path in scans.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    (folder / "000004.bin").write_bytes(b"\0" * 33)
+    done = train(f"data.root={folder}", "name=strict", check=False)
+    assert done.returncode == 2
+    assert "000004.bin" in done.stderr.strip().splitlines()[-1]
+    done = train(f"data.root={folder}", "name=lenient", "data.on_bad_scan=skip", "trainer.max_steps=2")
+    assert "left out" in done.stdout + done.stderr
+    assert (tmp_path / "runs" / "lenient" / "checkpoints").exists()
