@@ -68,9 +68,7 @@ def fit(config: dict[str, Any]) -> None:
     check_options("trainer", L.Trainer, trainer_options)
     callbacks, loggers = build_callbacks(config, parts), build_loggers(config["loggers"], run_dir)
     try:
-        trainer = L.Trainer(
-            **trainer_options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()]
-        )
+        trainer = L.Trainer(**trainer_options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])
     except (TypeError, ValueError, MisconfigurationException) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None
     trainer.fit(stage, data, ckpt_path=last, weights_only=True)

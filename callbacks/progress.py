@@ -20,9 +20,8 @@ class Progress(RichProgressBar):
         if not self._watched:
             self.disable()
 
-    def disable(self) -> None:
-        # The base class only disables ranks; lines for a log file are still ours to write on rank 0.
-        super().disable()
+    def _get_train_description(self, current_epoch: int) -> str:
+        return "training"  # the base class counts epochs, and a run is one
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         super().on_train_start(trainer, pl_module)

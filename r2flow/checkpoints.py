@@ -1,6 +1,7 @@
 """Checkpoints: written whole, read without running code, and turned into models."""
 
 import io
+import json
 import os
 import pickle
 import re
@@ -18,9 +19,11 @@ from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
+from r2flow.published import published_cfg, published_config, published_rings, published_step
 from r2flow.stages import build_parts
 
 FOLDER = "checkpoints"
+PREFIX = "velocity."  # of the backbone's weights in a LightningModule
 
 
 @dataclass(frozen=True)
@@ -130,15 +133,14 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
         InputError: nothing usable is there, or its weights do not fit its config.
     """
     path = find_checkpoint(path)
-    content = read_checkpoint(path)
+    content = read_safetensors(path) if path.suffix == ".safetensors" else read_checkpoint(path)
     if "cfg" in content and "weights" in content:
-        config, weights, step = published_config(content["cfg"], path), content["weights"], _published_step(content)
-        kind = "published"
+        config, weights = published_config(content["cfg"], path), content["weights"]
+        step, kind = published_step(content), "published"
     elif "config" in content and "state_dict" in content:
         config, step, kind = content["config"], int(content.get("global_step", 0)), "r2flow"
         state = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
-        prefix = "velocity."
-        weights = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+        weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
     else:
         raise InputError(
             f"{path} is a torch file but not a checkpoint of a flow: it has neither 'config' and 'state_dict' (ours) "
@@ -147,7 +149,54 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     parts = build_parts(config)
     load_weights(parts.backbone, weights, path)
     model = parts.backbone.eval().requires_grad_(False).to(device)
-    return Checkpoint(model, parts.sensor, parts.encoding, config, step, path, kind)
+    sensor = parts.sensor
+    if kind == "published" and config["data"]["projection"] == "unfolding":
+        sensor = published_rings(sensor, weights["coords"])
+    return Checkpoint(model, sensor, parts.encoding, config, step, path, kind)
+
+
+def read_safetensors(path: Path) -> dict[str, Any]:
+    """Weights and config of a `.safetensors` of ours, in the shape of our other checkpoints.
+
+    Raises:
+        InputError: not a safetensors file, or one without our config.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            notes = file.metadata() or {}
+            weights = {f"{PREFIX}{name}": file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return {"config": json.loads(notes["config"]), "global_step": int(notes["step"]), "state_dict": weights}
+    except (SafetensorError, OSError, ValueError) as error:
+        raise InputError(f"{path} is not a safetensors file, or a damaged one: {error}.") from None
+    except KeyError as error:
+        raise InputError(f"{path} holds weights but no r2flow config (no {error} in its metadata).") from None
+
+
+def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
+    """Write a model with its config: `.safetensors` in our format, `.pth` in the published one, weights bit-equal.
+
+    Raises:
+        InputError: another ending, or a config that the published format cannot say.
+    """
+    path = Path(path)
+    weights = {name: value.detach().cpu().contiguous() for name, value in checkpoint.model.state_dict().items()}
+    if path.suffix == ".safetensors":
+        from safetensors.torch import save
+
+        notes = {"format": "r2flow", "config": json.dumps(checkpoint.config), "step": str(checkpoint.step)}
+        data = save(weights, metadata=notes)
+        with atomic_write(path) as file:
+            file.write(data)
+    elif path.suffix == ".pth":
+        cfg = published_cfg(checkpoint.config)
+        images = checkpoint.step * int(cfg.get("training", {}).get("batch_size", 1))
+        content = {"cfg": cfg, "weights": weights, "optimizer": {}, "lr_scheduler": {}, "num_images": images}
+        with atomic_write(path) as file:
+            torch.save(content, file)
+    else:
+        raise InputError(f"{path}: give .safetensors for our format or .pth for the published one.")
 
 
 def load_weights(model: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:
@@ -170,62 +219,3 @@ def load_weights(model: nn.Module, weights: Mapping[str, Tensor], path: Path) ->
                 f"the config makes it {tuple(value.shape)}."
             )
     model.load_state_dict(dict(weights))
-
-
-PUBLISHED_POSITIONS = {
-    "learnable_embedding": "learnable",
-    "fourier_features": "fourier_features",
-    "polar_coordinates": "polar",
-    "spherical_harmonics": "spherical_harmonics",
-    None: "none",
-}
-
-
-def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Our config of a published R2Flow checkpoint: its `cfg` of data, model, flow, training and finetuning.
-
-    Raises:
-        InputError: a part that is missing or unknown to us.
-    """
-    try:
-        data, model = cfg["data"], cfg["model"]
-        rows, columns = (int(n) for n in data["resolution"])
-        projection = str(data["projection"]).split("-")[0]
-        architecture = model["architecture"]
-        backbone = _published_backbone(model, architecture, path)
-        return {
-            "sensor": {
-                "name": "hdl64e",
-                "rows": rows,
-                "columns": columns,
-                "min_range": float(data["min_depth"]),
-                "max_range": float(data["max_depth"]),
-                "rays": "reference",
-            },
-            "encoding": {"format": data["data_format"], "reflectance": bool(data["train_reflectance"])},
-            "backbone": backbone,
-            "data": {"name": data["dataset"], "projection": projection, "convention": "reference"},
-            "published": dict(cfg),
-        }
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: the published config lacks or garbles {error}.") from None
-
-
-def _published_backbone(model: Mapping[str, Any], architecture: str, path: Path) -> dict[str, Any]:
-    heads, blocks = model["attn_num_heads"], model["num_residual_blocks"]
-    if architecture in ("nat_hdit", "hdit"):
-        return {
-            "name": "hdit",
-            "base_channels": model["base_channels"],
-            "depths": list(blocks),
-            "num_heads": list(heads),
-            "time_channels": model["temb_channels"],
-            "position": PUBLISHED_POSITIONS[model["coords_encoding"]],
-            "dropout": model.get("dropout", 0.0),
-        }
-    raise InputError(f"{path}: no backbone for the published architecture {architecture!r}; known: nat_hdit.")
-
-
-def _published_step(content: Mapping[str, Any]) -> int:
-    batch = content["cfg"].get("training", {}).get("batch_size", 1)
-    return int(content.get("num_images", 0)) // max(int(batch), 1)

@@ -123,6 +123,18 @@ def info(
         print_contents(contents)
 
 
+@app.command(epilog="Example: r2flow convert r2flow-kitti360-1rf.pth 1rf.safetensors")
+def convert(
+    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file of any format, or a run folder.")],
+    out: Annotated[Path, typer.Argument(help="What to write: .safetensors (ours) or .pth (the published format).")],
+) -> None:
+    """Write a model's averaged weights and config in the other format, the weights bit-equal."""
+    from r2flow.checkpoints import load_checkpoint, save_checkpoint
+
+    save_checkpoint(load_checkpoint(checkpoint), out)
+    print(out)
+
+
 @report.command(epilog="Example: r2flow report fidelity kitti360/test runs/real/samples --train raw --size 64x1024")
 def fidelity(
     real: Annotated[Path, typer.Argument(help="Real scans: a folder.")],

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from r2flow.checkpoints import AtomicCheckpointIO, checkpoints_of, load_checkpoint
+from r2flow.checkpoints import AtomicCheckpointIO, checkpoints_of, load_checkpoint, save_checkpoint
 from r2flow.errors import InputError
 from r2flow.stages import build_parts, build_stage
 
@@ -131,3 +131,54 @@ def test_saving_is_whole_or_not_at_all(saved, monkeypatch):
         AtomicCheckpointIO().save_checkpoint({}, path)
     assert path.read_bytes() == before
     assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_conversion_there_and_back_is_bit_equal(shared, tmp_path: Path):
+    published = shared / "oracle" / "published_format.pth"
+    save_checkpoint(load_checkpoint(published), tmp_path / "ours.safetensors")
+    ours = load_checkpoint(tmp_path / "ours.safetensors")
+    assert ours.format == "r2flow"
+    save_checkpoint(ours, tmp_path / "again.pth")
+    first, again = (torch.load(path, weights_only=True) for path in (published, tmp_path / "again.pth"))
+    assert first["cfg"] == again["cfg"]
+    assert first["num_images"] == again["num_images"]
+    assert first["weights"].keys() == again["weights"].keys()
+    assert all(torch.equal(first["weights"][name], again["weights"][name]) for name in first["weights"])
+
+
+def test_a_run_of_ours_converts_to_both_formats(saved, tmp_path: Path):
+    original = load_checkpoint(saved[0])
+    x, t = torch.randn(2, 2, 8, 64), torch.tensor([0.2, 0.7])
+    for name in ("model.safetensors", "model.pth"):
+        save_checkpoint(original, tmp_path / name)
+        loaded = load_checkpoint(tmp_path / name)
+        assert loaded.sensor.shape == (8, 64)
+        assert torch.equal(loaded.model(t, x), original.model(t, x))
+    with pytest.raises(InputError, match=r"\.safetensors for our format or \.pth"):
+        save_checkpoint(original, tmp_path / "model.onnx")
+
+
+def test_what_the_published_format_cannot_say_is_refused(saved, tmp_path: Path):
+    loaded = load_checkpoint(saved[0])
+    loaded.config["backbone"]["patch"] = [2, 4]
+    with pytest.raises(InputError, match="cannot say patch"):
+        save_checkpoint(loaded, tmp_path / "model.pth")
+
+
+def test_damaged_safetensors_say_so(saved, tmp_path: Path):
+    path = tmp_path / "model.safetensors"
+    save_checkpoint(load_checkpoint(saved[0]), path)
+    path.write_bytes(path.read_bytes()[:-10])
+    with pytest.raises(InputError, match=r"model.safetensors is not a safetensors file, or a damaged one"):
+        load_checkpoint(path)
+
+
+def test_an_unfolding_checkpoint_brings_its_ring_angles(shared, tmp_path: Path):
+    content = torch.load(shared / "oracle" / "published_format.pth", weights_only=True)
+    content["cfg"]["data"]["projection"] = "unfolding-192"
+    rings = torch.tensor([2.0 - 1.7 * h - 0.01 * h**2 for h in range(16)]).deg2rad()
+    content["weights"]["coords"][0, 0] = rings[:, None]
+    torch.save(content, tmp_path / "unfolding.pth")
+    loaded = load_checkpoint(tmp_path / "unfolding.pth")
+    torch.testing.assert_close(loaded.sensor.rays()[0, :, 0], rings, rtol=0, atol=1e-6)
+    torch.testing.assert_close(loaded.model.coords[0, 0, :, 0], rings, rtol=0, atol=0)

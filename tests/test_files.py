@@ -10,9 +10,8 @@ def test_the_file_is_whole_or_the_old_one(tmp_path):
     path = tmp_path / "folder" / "file.txt"
     with atomic_write(path, "w") as file:
         file.write("old")
-    with pytest.raises(RuntimeError), atomic_write(path, "w") as file:
-        file.write("half of the new o")
-        raise RuntimeError
+    with pytest.raises(TypeError), atomic_write(path, "w") as file:
+        file.writelines(["half of the new o", None])
     assert path.read_text() == "old"
     assert os.listdir(path.parent) == ["file.txt"]
 

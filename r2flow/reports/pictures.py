@@ -1,6 +1,7 @@
 """Scans as pictures: range, reflectance, bird's-eye view, 3-D perspective."""
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from r2flow.lidar.projection import image_to_points
 
 BACKGROUND, FOREGROUND = "#101418", "#d8dee4"
 VIEW = 50.0  # metres shown to each side in the bird's-eye view
-HEIGHTS = (-2.2, 3.0)  # metres over which height is coloured, sensor frame
+HEIGHTS = (-2.8, 3.0)  # metres over which height is coloured, sensor frame
 
 
 def scan_figure(image: np.ndarray, rays: Tensor, title: str = "") -> Figure:
@@ -27,7 +28,7 @@ def scan_figure(image: np.ndarray, rays: Tensor, title: str = "") -> Figure:
     figure = _figure(13, 8.6)
     strips = len(image)
     grid = figure.add_gridspec(
-        strips + 1, 2, height_ratios=[1] * strips + [5.2], hspace=0.28, wspace=0.06,
+        strips + 1, 2, height_ratios=[1] * strips + [5.2], hspace=0.16, wspace=0.06,
         left=0.03, right=0.97, top=0.93, bottom=0.03, width_ratios=[1, 1.45],
     )  # fmt: skip
     draw_range(figure.add_subplot(grid[0, :]), image)
@@ -93,9 +94,7 @@ def draw_range(axes: Any, image: np.ndarray, label: bool = True) -> None:
     """Range on a logarithmic colour scale, dropped rays black."""
     r = image[0]
     shown = np.ma.masked_where(r <= 0, np.log(np.maximum(r, 1e-3)))
-    axes.imshow(
-        shown, cmap=_colours("turbo_r"), vmin=np.log(2), vmax=np.log(80), aspect="auto", interpolation="nearest"
-    )
+    axes.imshow(shown, cmap=_ranges(), vmin=np.log(2), vmax=np.log(80), aspect="auto", interpolation="nearest")
     _strip(axes, "range" if label else "")
 
 
@@ -128,7 +127,7 @@ def draw_perspective(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
     relative, depth, z = relative[front], depth[front], xyz[front, 2]
     order = np.argsort(-depth)
     u, v = (-relative[:, 1] / depth)[order], (relative @ up / depth)[order]
-    size = np.clip(14 / depth[order], 0.15, 2.2) * np.sqrt(30_000 / max(len(xyz), 1))
+    size = np.clip(18 / depth[order], 0.25, 2.6) * np.sqrt(30_000 / max(len(xyz), 1))
     axes.scatter(u, v, c=z[order], s=size, cmap="turbo", vmin=HEIGHTS[0], vmax=HEIGHTS[1], lw=0, rasterized=True)
     axes.set(xlim=(-0.95, 0.95), ylim=(-0.52, 0.42))
     _strip(axes, "perspective" if label else "")
@@ -161,6 +160,14 @@ def _colours(name: str) -> Any:
     from matplotlib import colormaps
 
     return colormaps[name].with_extremes(bad="black")
+
+
+@cache
+def _ranges() -> Any:
+    """turbo from warm and near to cold and far, without its dark ends, which would pass for dropped rays."""
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(_colours("turbo_r")(np.linspace(0.1, 0.93, 256))).with_extremes(bad="black")
 
 
 def _dot(points: int) -> float:

@@ -17,7 +17,9 @@ def test_the_paper_s_pseudo_huber_is_per_sample():
 def test_the_reference_pseudo_huber_is_per_element(shared):
     case = torch.load(shared / "oracle" / "training.pt", weights_only=False)["pseudo_huber"]
     torch.testing.assert_close(pseudo_huber_elementwise(case["v"], case["u"]).mean(), case["loss"], rtol=1e-6, atol=0)
-    torch.testing.assert_close(pseudo_huber_elementwise(case["v2"], case["u2"]).mean(), case["loss2"], rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        pseudo_huber_elementwise(case["v2"], case["u2"]).mean(), case["loss2"], rtol=1e-6, atol=0
+    )
     torch.testing.assert_close(mse(case["v2"], case["u2"]).mean(), case["mse2"], rtol=1e-6, atol=0)
 
 

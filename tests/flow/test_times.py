@@ -37,7 +37,9 @@ def test_a_grid_takes_each_of_its_times_equally_often():
         assert (counts / N - 1 / k).abs().max() < 1e-5
 
 
-@pytest.mark.parametrize("options", [{"name": n} for n in ("uniform", "u_shaped", "logit_normal")] + [{"name": "grid", "k": 4}])
+@pytest.mark.parametrize(
+    "options", [{"name": n} for n in ("uniform", "u_shaped", "logit_normal")] + [{"name": "grid", "k": 4}]
+)
 def test_times_stay_on_the_path_in_float32(options):
     last = torch.tensor([0.0, 0.5, math.nextafter(0.5, 0), 1 - 2**-24], dtype=torch.float32)
     t = TIMES.build(options)(last)

@@ -1,0 +1,137 @@
+"""The published R2Flow checkpoints' configs in our terms."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.lidar.sensors import Sensor, build_sensor
+from r2flow.registry import did_you_mean
+
+ARCHITECTURES = {
+    "nat_hdit": "hdit",
+    "hdit": "hdit",
+    "adm_unet": "adm_unet",
+    "efficient_unet": "efficient_unet",
+}
+THEIR_POSITIONS = {"learnable": "learnable_embedding", "polar": "polar_coordinates", "none": None}
+DEFAULTS = {"patch": [1, 4], "window": [3, 9], "ring": True}
+
+
+def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Our config of a published checkpoint's `cfg`, which holds data, model, flow, training and finetuning.
+
+    Raises:
+        InputError: a part that is missing or unknown to us.
+    """
+    try:
+        data, model = cfg["data"], cfg["model"]
+        rows, columns = (int(n) for n in data["resolution"])
+        return {
+            "sensor": {
+                "name": "hdl64e",
+                "rows": rows,
+                "columns": columns,
+                "min_range": float(data["min_depth"]),
+                "max_range": float(data["max_depth"]),
+                "rays": "reference",
+            },
+            "encoding": {"format": data["data_format"], "reflectance": bool(data["train_reflectance"])},
+            "backbone": _backbone(model, path),
+            "data": {
+                "name": data["dataset"],
+                "projection": str(data["projection"]).split("-")[0],
+                "convention": "reference",
+            },
+            "published": dict(cfg),
+        }
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: the published config lacks or garbles {error}.") from None
+
+
+def _backbone(model: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    architecture = str(model["architecture"])
+    if architecture not in ARCHITECTURES:
+        raise InputError(
+            f"{path}: no backbone for the published architecture {architecture!r}; known: "
+            f"{', '.join(ARCHITECTURES)}.{did_you_mean(architecture, ARCHITECTURES)}"
+        )
+    heads, blocks = model["attn_num_heads"], model["num_residual_blocks"]
+    common = {
+        "name": ARCHITECTURES[architecture],
+        "base_channels": model["base_channels"],
+        "time_channels": model["temb_channels"],
+        "position": model["coords_encoding"],
+        "dropout": model.get("dropout", 0.0),
+    }
+    if common["name"] == "hdit":
+        return {**common, "depths": list(blocks), "num_heads": list(heads)}
+    # One config class serves all three in the reference: a U-Net has one number of heads.
+    return {
+        **common,
+        "num_residual_blocks": blocks if isinstance(blocks, int) else list(blocks),
+        "channel_multiplier": list(model["channel_multiplier"]),
+        "num_heads": heads if isinstance(heads, int) else list(heads)[-1],
+    }
+
+
+def published_cfg(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The `cfg` of a published checkpoint for a config of ours: its own where it came from one, else a translation.
+
+    Raises:
+        InputError: something that the published format cannot say.
+    """
+    if "published" in config:
+        return dict(config["published"])
+    sensor, encoding, backbone = (dict(config[key]) for key in ("sensor", "encoding", "backbone"))
+    name = backbone["name"]
+    unsaid = [key for key in ("patch", "window", "ring") if backbone.get(key, DEFAULTS[key]) != DEFAULTS[key]]
+    if sensor["name"] != "hdl64e" or name not in ARCHITECTURES.values() or unsaid:
+        what = ", ".join(unsaid) or f"sensor {sensor['name']!r} with backbone {name!r}"
+        raise InputError(f"the published format cannot say {what}; convert to .safetensors instead.")
+    built = build_sensor(sensor["name"], sensor.get("rows"), sensor.get("columns"))
+    rows, columns = built.shape
+    position = backbone.get("position", "learnable" if name == "hdit" else "fourier_features")
+    architecture = next(theirs for theirs, ours in ARCHITECTURES.items() if ours == name)
+    return {
+        "data": {
+            "dataset": config["data"]["name"],
+            "data_format": encoding["format"],
+            "train_reflectance": encoding["reflectance"],
+            "min_depth": sensor.get("min_range") or built.min_range,
+            "max_depth": sensor.get("max_range") or built.max_range,
+            "projection": f"{config['data'].get('projection', 'spherical')}-{columns}",
+            "resolution": [rows, columns],
+        },
+        "model": {
+            "architecture": architecture,
+            "base_channels": backbone.get("base_channels", 128 if name == "hdit" else 64),
+            "temb_channels": backbone.get("time_channels", 256),
+            "channel_multiplier": backbone.get("channel_multiplier", [1, 2, 4, 8]),
+            "num_residual_blocks": backbone.get("depths") or backbone.get("num_residual_blocks", [3, 3, 3, 3]),
+            "attn_num_heads": backbone.get("num_heads", [2, 4, 8, 16] if name == "hdit" else 8),
+            "coords_encoding": THEIR_POSITIONS.get(position, position),
+            "dropout": backbone.get("dropout", 0.0),
+            "gn_num_groups": 8,
+            "gn_eps": 1e-6,
+        },
+        "training": {"batch_size": config["data"].get("batch_size", 8)},
+    }
+
+
+def published_step(content: Mapping[str, Any]) -> int:
+    """Optimiser steps: the images that were seen over the batch size."""
+    batch = content["cfg"].get("training", {}).get("batch_size", 1)
+    return int(content.get("num_images", 0)) // max(int(batch), 1)
+
+
+def published_rings(sensor: Sensor, coords: Tensor) -> Sensor:
+    """The sensor with the ring elevations that an unfolding checkpoint carries in its `coords`, (1, 2, H, W)."""
+    elevations = torch.rad2deg(coords[0, 0, :, 0].double())
+    return replace(sensor, elevations=tuple(elevations.tolist()))
