@@ -1,0 +1,54 @@
+import numpy as np
+import pytest
+
+from r2flow.lidar.sensors import SENSORS
+from r2flow.reports.pictures import contact_sheet, figure_pixels, loss_figure, save_figure, scan_figure
+
+SENSOR = SENSORS["hdl64e"].resized(16, 64)
+E, A = SENSOR.rays().numpy()
+
+
+def image(r: np.ndarray) -> np.ndarray:
+    return np.stack([r, 0.5 * (r > 0)]).astype(np.float32)
+
+
+def lit(pixels: np.ndarray) -> int:
+    """Pixels that are brighter than any background here."""
+    return int((pixels.max(-1) > 90).sum())
+
+
+@pytest.mark.parametrize(
+    "r",
+    [np.zeros(SENSOR.shape), np.where((E < -0.3) & (A > 3.0), 5.0, 0.0), np.full(SENSOR.shape, 79.9), np.full(SENSOR.shape, 1.45)],
+    ids=["empty", "a few returns", "all far", "all near"],
+)  # fmt: skip
+def test_extreme_scans_are_drawn(tmp_path, r):
+    for figure in (scan_figure(image(r), SENSOR.rays(), "scan"), contact_sheet([image(r)[:1]] * 2, SENSOR.rays())):
+        assert save_figure(figure, tmp_path / "scan.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_near_and_far_look_different_and_dropped_rays_are_black():
+    half = np.where(A > 0, 4.0, 60.0)
+    half[:, 24:40] = 0
+    strip = figure_pixels(scan_figure(image(half), SENSOR.rays()))
+    row = strip[int(strip.shape[0] * 0.12)].astype(int)  # through the range strip
+    left, middle, right = (row[int(len(row) * place)] for place in (0.2, 0.5, 0.8))
+    assert middle.max() < 30
+    assert left[0] > left[2]  # near is warm
+    assert right[2] > right[0]  # far is cold
+
+
+def test_a_wall_on_the_left_is_drawn_on_the_left():
+    wall = np.where((A > 1.2) & (A < 1.9), 20.0, 0.0)
+    pixels = figure_pixels(scan_figure(image(wall), SENSOR.rays()))
+    height, width = pixels.shape[:2]
+    birds_eye = pixels[int(height * 0.42) :, : int(width * 0.4)]
+    middle = birds_eye.shape[1] // 2
+    assert lit(birds_eye[:, : middle - 20]) > 10 * max(lit(birds_eye[:, middle + 20 :]), 1)
+
+
+def test_loss_curves_are_drawn_short_and_long():
+    steps = np.arange(1, 500)
+    figure = loss_figure({"train/loss": (steps, 1 / steps), "val/loss": (steps[::100], 1 / steps[::100])})
+    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert labels == ["train/loss (mean of 9)", "val/loss"]
