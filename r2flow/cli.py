@@ -135,6 +135,34 @@ def convert(
     print(out)
 
 
+@app.command(epilog="Example: r2flow backbones --size 64x1024")
+def backbones(
+    only: Annotated[str | None, typer.Option(help="Names, separated by commas; all if left out.")] = None,
+    sensor: SensorOption = "hdl64e",
+    size: SizeOption = None,
+    channels: Annotated[int, typer.Option(help="Channels of the image.")] = 2,
+    repeats: Annotated[int, typer.Option(help="Timed evaluations of each; 0 leaves the latency out.")] = 3,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda, ...")] = "auto",
+    json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """Parameters, multiply-accumulates and measured latency of every configuration: the paper's table II."""
+    from rich.progress import track
+
+    from r2flow.backbones import CONFIGURATIONS
+    from r2flow.reports.backbones import backbone_costs, print_costs
+
+    chosen, where = build_sized(sensor, size), choose_device(device)
+    names = only.split(",") if only else list(CONFIGURATIONS)
+    rows = backbone_costs(chosen, names, channels, repeats, where)
+    measured = list(track(rows, "measuring", total=len(names), disable=json or repeats == 0, transient=True))
+    if json:
+        import json as encoder
+
+        print(encoder.dumps(measured, indent=2))
+    else:
+        print_costs(measured, chosen, where)
+
+
 @report.command(epilog="Example: r2flow report fidelity kitti360/test runs/real/samples --train raw --size 64x1024")
 def fidelity(
     real: Annotated[Path, typer.Argument(help="Real scans: a folder.")],

@@ -1,0 +1,77 @@
+"""What each velocity estimator costs: the paper's table II, measured here."""
+
+import time
+from collections.abc import Iterator, Sequence
+from statistics import median
+from typing import Any
+
+import torch
+from torch import nn
+
+from r2flow.backbones import CONFIGURATIONS, build_backbone
+from r2flow.backbones.cost import RULE, count_macs, count_parameters
+from r2flow.errors import InputError
+from r2flow.lidar.sensors import Sensor
+from r2flow.registry import did_you_mean
+
+
+def backbone_costs(
+    sensor: Sensor, names: Sequence[str] | None = None, channels: int = 2, repeats: int = 3, device: str = "cpu"
+) -> Iterator[dict[str, Any]]:
+    """Parameters, GMAC and median latency of every configuration for one image, one at a time.
+
+    Args:
+        repeats: Timed evaluations after one warm-up; 0 leaves the latency out (None).
+
+    Returns:
+        `{name, parameters, gmac, latency_ms}`; a configuration that cannot take the size has None for the last
+        two and says why under `error`.
+    """
+    for name in names or CONFIGURATIONS:
+        if name not in CONFIGURATIONS:
+            known = ", ".join(CONFIGURATIONS)
+            raise InputError(f"no configuration named {name!r}; known: {known}.{did_you_mean(name, CONFIGURATIONS)}")
+        row: dict[str, Any] = {"name": name, "parameters": None, "gmac": None, "latency_ms": None}
+        try:
+            model = build_backbone(CONFIGURATIONS[name], sensor.rays(), channels).eval()
+        except InputError as error:
+            yield {**row, "error": str(error)}
+            continue
+        row["parameters"], row["gmac"] = count_parameters(model), count_macs(model) / 1e9
+        if repeats > 0:
+            row["latency_ms"] = latency(model.to(device), (1, channels, *sensor.shape), repeats, device)
+        yield row
+
+
+def latency(model: nn.Module, shape: tuple[int, ...], repeats: int, device: str) -> float:
+    """Median milliseconds of one evaluation in float32, without gradients."""
+    x, t = torch.randn(shape, device=device), torch.full((shape[0],), 0.5, device=device)
+    seconds = []
+    with torch.inference_mode():
+        for _ in range(repeats + 1):
+            begin = time.perf_counter()
+            model(t, x)
+            if device.startswith("cuda"):
+                torch.cuda.synchronize()
+            seconds.append(time.perf_counter() - begin)
+    return 1e3 * median(seconds[1:])
+
+
+def print_costs(rows: Sequence[dict[str, Any]], sensor: Sensor, device: str) -> None:
+    """The rows as a table, with the counting rule."""
+    from rich.console import Console
+    from rich.table import Table
+
+    height, width = sensor.shape
+    table = Table("backbone", box=None, header_style="bold", title=f"{height} x {width}, batch 1, float32, {device}")
+    for column in ("parameters", "GMAC", "latency, ms"):
+        table.add_column(column, justify="right")
+    for row in rows:
+        if "error" in row:
+            table.add_row(row["name"], "", "", row["error"])
+        else:
+            shown = "" if row["latency_ms"] is None else f"{row['latency_ms']:,.0f}"
+            table.add_row(row["name"], f"{row['parameters']:,}", f"{row['gmac']:.2f}", shown)
+    console = Console()
+    console.print(table)
+    console.print(f"GMAC: {RULE}.")
