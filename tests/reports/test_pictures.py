@@ -19,7 +19,7 @@ def lit(pixels: np.ndarray) -> int:
 
 @pytest.mark.parametrize(
     "r",
-    [np.zeros(SENSOR.shape), np.where((E < -0.3) & (A > 3.0), 5.0, 0.0), np.full(SENSOR.shape, 79.9), np.full(SENSOR.shape, 1.45)],
+    [np.zeros_like(E), np.where((E < -0.3) & (A > 3.0), 5.0, 0.0), np.full_like(E, 79.9), np.full_like(E, 1.45)],
     ids=["empty", "a few returns", "all far", "all near"],
 )  # fmt: skip
 def test_extreme_scans_are_drawn(tmp_path, r):
