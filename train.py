@@ -71,10 +71,12 @@ def fit(config: dict[str, Any]) -> None:
         trainer = L.Trainer(**trainer_options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])
     except (TypeError, ValueError, MisconfigurationException) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None
-    trainer.fit(stage, data, ckpt_path=last, weights_only=True)
-    if trainer.interrupted:
-        log.info("stopped at step %d; the same command goes on from the last checkpoint", trainer.global_step)
-    elif trainer.is_global_zero and not trainer_options["fast_dev_run"]:
+    try:
+        trainer.fit(stage, data, ckpt_path=last, weights_only=True)
+    except SystemExit:  # how Lightning ends a run on Ctrl-C
+        print(f"stopped at step {trainer.global_step}; the same command goes on from the last checkpoint", flush=True)
+        raise SystemExit(130) from None
+    if trainer.is_global_zero and not trainer_options["fast_dev_run"]:
         finish(run_dir, config["samples"], config["seed"])
 
 

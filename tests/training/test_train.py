@@ -47,8 +47,10 @@ def test_a_finished_run_is_not_trained_again(train: Run, copied: Path):
     assert all(torch.equal(a[name], b[name]) for a, b in zip(before, weights(copied), strict=True) for name in a)
 
 
-def kill_when(run: Path, step: int, scans: Path, cwd: Path, *overrides: str) -> None:
-    """Start the run and kill -9 it once it has written the checkpoint of a step."""
+def stop_when(
+    run: Path, step: int, scans: Path, cwd: Path, *overrides: str, by: int = signal.SIGKILL
+) -> tuple[int, str]:
+    """Start the run and send it a signal once it has written the checkpoint of a step: (exit code, output)."""
     command = [sys.executable, str(ROOT / "train.py"), *TINY, f"data.root={scans}", *overrides]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
@@ -59,8 +61,9 @@ def kill_when(run: Path, step: int, scans: Path, cwd: Path, *overrides: str) -> 
         assert process.poll() is None, process.stdout and process.stdout.read().decode()
         assert time.monotonic() - waited < 200
         time.sleep(0.005)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    os.killpg(process.pid, by)
+    said, _ = process.communicate(timeout=100)
+    return process.returncode, said.decode()
 
 
 @pytest.mark.parametrize(("step", "workers"), [(2, 0), (6, 2)])
@@ -68,9 +71,17 @@ def test_a_killed_run_ends_as_the_one_left_alone(
     train: Run, alone: tuple[Path, str], scans: Path, tmp_path: Path, step: int, workers: int
 ):
     killed = tmp_path / "runs" / "killed"
-    kill_when(killed, step, scans, tmp_path, "name=killed", f"data.workers={workers}")
+    stop_when(killed, step, scans, tmp_path, "name=killed", f"data.workers={workers}")
     train("name=killed", f"data.workers={workers}")
     assert_bit_equal(alone[0], killed)
+
+
+def test_ctrl_c_says_how_to_go_on(train: Run, scans: Path, tmp_path: Path):
+    run = tmp_path / "runs" / "stopped"
+    code, said = stop_when(run, 2, scans, tmp_path, "name=stopped", "trainer.max_steps=500", by=signal.SIGINT)
+    assert code == 130
+    assert "the same command goes on from the last checkpoint" in said
+    assert "Traceback" not in said
 
 
 def test_a_damaged_last_checkpoint_is_passed_over(train: Run, alone: tuple[Path, str], copied: Path):

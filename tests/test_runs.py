@@ -1,0 +1,57 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+from r2flow.checkpoints import AtomicCheckpointIO
+from r2flow.errors import InputError
+from r2flow.runs import contradictions, open_run, read_config
+
+CONFIG = {"seed": 0, "data": {"root": "a", "batch_size": 4}, "trainer": {"devices": 1, "max_steps": 10}}
+
+
+def changed(**leaves) -> dict:
+    new = {key: dict(value) if isinstance(value, dict) else value for key, value in CONFIG.items()}
+    for key, value in leaves.items():
+        section, _, name = key.partition("__")
+        if name:
+            new[section][name] = value
+        else:
+            new[section] = value
+    return new
+
+
+def checkpoint(run: Path, step: int) -> Path:
+    path = run / "checkpoints" / f"step-{step:08d}.ckpt"
+    AtomicCheckpointIO().save_checkpoint({"global_step": step, "weights": torch.zeros(100)}, path)
+    return path
+
+
+def test_a_new_folder_gets_the_config_and_starts_at_nothing(tmp_path: Path):
+    assert open_run(tmp_path / "run", CONFIG) is None
+    assert read_config(tmp_path / "run") == CONFIG
+
+
+def test_the_same_config_goes_on_from_the_newest_whole_checkpoint(tmp_path: Path):
+    open_run(tmp_path, CONFIG)
+    older, newer = checkpoint(tmp_path, 5), checkpoint(tmp_path, 10)
+    assert open_run(tmp_path, CONFIG) == newer
+    newer.write_bytes(b"half")
+    assert open_run(tmp_path, CONFIG) == older
+
+
+def test_where_it_computes_may_change_and_what_may_not(tmp_path: Path):
+    assert contradictions(CONFIG, changed(trainer__devices=4, data__root="moved")) == []
+    assert contradictions(CONFIG, changed(seed=1)) == ["seed=0 there, 1 here"]
+    open_run(tmp_path, CONFIG)
+    newest = checkpoint(tmp_path, 5)
+    assert open_run(tmp_path, changed(trainer__devices=4)) == newest
+    with pytest.raises(InputError, match=r"data.batch_size=4 there, 8 here.*name=OTHER"):
+        open_run(tmp_path, changed(data__batch_size=8))
+    assert read_config(tmp_path) == CONFIG
+
+
+def test_a_folder_in_which_nothing_was_learned_is_free(tmp_path: Path):
+    open_run(tmp_path, CONFIG)
+    assert open_run(tmp_path, changed(seed=3)) is None
+    assert read_config(tmp_path) == changed(seed=3)
