@@ -23,7 +23,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, explain_os_error
 
 log = logging.getLogger("r2flow")
 
@@ -118,8 +118,8 @@ def run(config: DictConfig) -> None:
     assert isinstance(plain, dict)
     try:
         fit({str(key): value for key, value in plain.items()})
-    except InputError as error:  # Hydra would print its own lines around it
-        mistakes.append(str(error))
+    except (InputError, OSError) as error:  # Hydra would print its own lines around it
+        mistakes.append(explain_os_error(error) if isinstance(error, OSError) else str(error))
 
 
 def main() -> int:
@@ -132,6 +132,9 @@ def main() -> int:
         run()
     except (HydraException, OmegaConfBaseException) as error:
         print(f"error: {explain(error)}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"error: {explain_os_error(error)}", file=sys.stderr)
         return 2
     if mistakes:
         print(f"error: {mistakes[0]}", file=sys.stderr)

@@ -55,8 +55,23 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any | None = None
     ) -> None:
-        with atomic_write(Path(path)) as file:
-            torch.save(checkpoint, file)
+        """Write a checkpoint whole; whatever happens, the ones before it stay.
+
+        Raises:
+            InputError: the disk is full, the folder cannot be written, ...
+        """
+        try:
+            with atomic_write(Path(path)) as file:
+                torch.save(checkpoint, file)
+        except (OSError, RuntimeError) as error:
+            # torch's writer ends in a RuntimeError of its own when the file's write fails.
+            cause = error.__context__ if isinstance(error, RuntimeError) else error
+            if not isinstance(cause, OSError):
+                raise
+            raise InputError(
+                f"{path} cannot be written: {cause.strerror or cause}. The checkpoints before it are whole; "
+                "mend that and give the same command again."
+            ) from None
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
         return read_checkpoint(path, map_location)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, explain_os_error
 
 # Imports of torch and matplotlib stay inside the verbs: --help and a mistyped option answer at once.
 
@@ -224,8 +224,9 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", force=True)
     try:
         app()
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
+    except (InputError, OSError) as error:
+        said = explain_os_error(error) if isinstance(error, OSError) else error
+        print(f"error: {said}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)

@@ -1,14 +1,17 @@
 """A run's folder: what it holds, and whether a command may go on in it."""
 
+import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from r2flow.checkpoints import checkpoints_of, read_checkpoint
+from r2flow.checkpoints import FOLDER, checkpoints_of, read_checkpoint
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
+
+log = logging.getLogger(__name__)
 
 CONFIG = "config.yaml"
 
@@ -80,6 +83,8 @@ def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
     Raises:
         InputError: the folder holds a run of another config.
     """
+    for leftover in Path(run, FOLDER).glob(".*.part"):  # of a writer that was killed
+        leftover.unlink(missing_ok=True)
     old = read_config(run)
     if old is None:
         write_config(run, config)
@@ -99,12 +104,10 @@ def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
 
 
 def _newest_whole(run: str | Path) -> Path | None:
-    import logging
-
     for path in checkpoints_of(run):
         try:
             read_checkpoint(path)
             return path
         except InputError as error:
-            logging.getLogger(__name__).warning("%s Going on from the one before.", error)
+            log.warning("%s Going on from the one before.", error)
     return None

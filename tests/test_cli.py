@@ -159,6 +159,11 @@ class TestBadInput:
         if not torch.cuda.is_available():
             self.check(r2flow("sample", "-c", saved[0], "--device", "cuda", "-o", out), out, "--device cpu")
 
+    def test_a_place_that_cannot_be_written(self, r2flow, scan, tmp_path):
+        (tmp_path / "file").write_text("in the way")
+        out = tmp_path / "file" / "views"
+        self.check(r2flow("show", scan, "--out", out), out, str(tmp_path / "file"), "Not a directory")
+
     def test_a_scan_that_does_not_unfold(self, r2flow, tmp_path):
         write_scan(tmp_path / "one.bin", 3)
         result = r2flow("project", tmp_path / "one.bin", "--projection", "unfolding", "-o", tmp_path / "o.npy")

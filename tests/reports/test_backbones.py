@@ -68,3 +68,7 @@ def test_a_size_that_one_cannot_take_is_said_in_its_row():
 def test_latency_is_measured():
     (row,) = backbone_costs(SENSORS["hdl64e"].resized(16, 64), ["hdit_tiny"], repeats=2)
     assert row["latency_ms"] > 0
+
+
+def test_every_configuration_takes_every_sensor_s_shape(sensor):
+    assert [row for row in backbone_costs(sensor, repeats=0) if "error" in row] == []
