@@ -8,8 +8,10 @@
 The same command again goes on from the run's last checkpoint.
 """
 
+import hashlib
 import logging
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -23,29 +25,38 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from r2flow.errors import InputError, explain_os_error
+from r2flow.errors import InputError, explain_mistake
 
 log = logging.getLogger("r2flow")
 
 CONF = Path(__file__).resolve().parent / "conf"
 
-OmegaConf.register_new_resolver(
-    "path_safe", lambda name: str(name).replace("/", "_").replace("..", "_") or "default", replace=True
-)
+
+def job_folder(overrides: str) -> str:
+    """A folder name for a job of a sweep: the values that are swept, and a hash of all overrides."""
+    given = [argument.partition("=") for argument in sys.argv[1:]]
+    swept = {key.lstrip("+~") for key, _, value in given if "," in value}
+    parts = [part for part in overrides.split(",") if part.partition("=")[0].lstrip("+~") in swept]
+    readable = re.sub(r"[^\w.=+-]+", "_", ",".join(parts) or "job")[:80]
+    return f"{readable}-{hashlib.sha256(overrides.encode()).hexdigest()[:6]}"
+
+
+OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
 
 
 def fit(config: dict[str, Any]) -> None:
     """Train the stage that a plain config describes, in its run folder, from where it stopped."""
     # Imported here: a misspelt config should answer at once, not after torch has loaded.
     import lightning as L
+    import torch
     from lightning.fabric.utilities.exceptions import MisconfigurationException
 
     from callbacks import build_callbacks, build_loggers
-    from r2flow.checkpoints import AtomicCheckpointIO
+    from r2flow.checkpoints import AtomicCheckpointIO, checkpoints_of
     from r2flow.data.datamodule import ScanDataModule
     from r2flow.noise import seed_torch
     from r2flow.registry import check_options
-    from r2flow.reports.training import finish
+    from r2flow.reports.training import check_samples, finish
     from r2flow.runs import open_run
     from r2flow.stages import build_parts, build_stage
 
@@ -56,28 +67,36 @@ def fit(config: dict[str, Any]) -> None:
     run_dir = Path(config["run_dir"])
     trainer_options = dict(config["trainer"])
     check_trainer(trainer_options)
+    check_options("samples", check_samples, config["samples"])
+    check_samples(**config["samples"])
+    if not (isinstance(config["seed"], int) and 0 <= config["seed"] < 2**63):
+        raise InputError(f"seed must be a whole number of at least 0, found {config['seed']!r}.")
     seed_torch(config["seed"], "weights")
     parts = build_parts(config)
-    stage = build_stage(config, parts.backbone)
-    check_options("data", ScanDataModule, config["data"])
+    check_options("data", ScanDataModule, config["data"], given=3)
     data = ScanDataModule(parts.sensor, parts.encoding, config["seed"], **config["data"])
     data.setup()
-    last = open_run(run_dir, config)
-    if last is not None:
-        log.info("going on from %s", last)
+    config["scans"] = data.fingerprint()
+    stage = build_stage(config, parts.backbone)
     check_options("trainer", L.Trainer, trainer_options)
     callbacks, loggers = build_callbacks(config, parts), build_loggers(config["loggers"], run_dir)
     try:
         trainer = L.Trainer(**trainer_options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])
     except (TypeError, ValueError, MisconfigurationException) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None
+    data.check_run(trainer.world_size, trainer.accumulate_grad_batches, trainer.max_steps)
+    last = open_run(run_dir, config)
+    if last is not None:
+        log.info("going on from %s", last)
     try:
         trainer.fit(stage, data, ckpt_path=last, weights_only=True)
     except SystemExit:  # how Lightning ends a run on Ctrl-C
-        print(f"stopped at step {trainer.global_step}; the same command goes on from the last checkpoint", flush=True)
+        kept = "goes on from the last checkpoint" if checkpoints_of(run_dir) else "starts it again: no checkpoint yet"
+        print(f"stopped at step {trainer.global_step}; the same command {kept}", flush=True)
         raise SystemExit(130) from None
     if trainer.is_global_zero and not trainer_options["fast_dev_run"]:
-        finish(run_dir, config["samples"], config["seed"])
+        device = "cuda" if torch.cuda.is_available() and trainer_options["accelerator"] != "cpu" else "cpu"
+        finish(run_dir, config["samples"], config["seed"], device, trainer.max_steps)
 
 
 def check_trainer(options: dict[str, Any]) -> None:
@@ -99,7 +118,7 @@ def sweep_job(config: DictConfig) -> int:
     """One job of a sweep, as its own process: its failure or its DDP relaunch touches no other job."""
     overrides = list(HydraConfig.get().overrides.task)
     run_dir = HydraConfig.get().runtime.output_dir
-    command = [sys.executable, __file__, *overrides, f"run_dir={run_dir}"]
+    command = [sys.executable, __file__, *overrides, f"run_dir='{run_dir}'"]
     log.info("job %s: %s", HydraConfig.get().job.num, " ".join(overrides))
     return subprocess.run(command, check=False, env={**os.environ, "HYDRA_FULL_ERROR": "1"}).returncode
 
@@ -119,7 +138,7 @@ def run(config: DictConfig) -> None:
     try:
         fit({str(key): value for key, value in plain.items()})
     except (InputError, OSError) as error:  # Hydra would print its own lines around it
-        mistakes.append(explain_os_error(error) if isinstance(error, OSError) else str(error))
+        mistakes.append(explain_mistake(error))
 
 
 def main() -> int:
@@ -134,7 +153,7 @@ def main() -> int:
         print(f"error: {explain(error)}", file=sys.stderr)
         return 2
     except OSError as error:
-        print(f"error: {explain_os_error(error)}", file=sys.stderr)
+        print(f"error: {explain_mistake(error)}", file=sys.stderr)
         return 2
     if mistakes:
         print(f"error: {mistakes[0]}", file=sys.stderr)
@@ -147,8 +166,6 @@ def main() -> int:
 
 def explain(error: Exception) -> str:
     """Hydra's complaint in one line, with the nearest key that exists."""
-    import re
-
     from r2flow.registry import did_you_mean
 
     text = str(error)

@@ -21,23 +21,32 @@ def build_callbacks(config: Mapping[str, Any], parts: Parts) -> list[Callback]:
     run_dir = Path(config["run_dir"])
     if config["trainer"]["fast_dev_run"]:
         return [Progress()] if config["trainer"]["enable_progress_bar"] else []
-    wanted = {name: options for name, options in config["callbacks"].items() if options is not None}
+    wanted = {name: options for name, options in (config["callbacks"] or {}).items() if options is not None}
     built: list[Callback] = []
     if "ema" in wanted:
         check_options("callbacks.ema", EMA, wanted["ema"])
+        at_least_one("callbacks.ema.every", wanted["ema"].get("every", 1))
         built.append(EMA(**wanted["ema"]))
     if "pictures" in wanted:
-        check_options("callbacks.pictures", SamplePictures, wanted["pictures"])
+        check_options("callbacks.pictures", SamplePictures, wanted["pictures"], given=4)
         folder = run_dir / "pictures"
         pictures = SamplePictures(folder, parts.sensor, parts.encoding, config["seed"], **wanted["pictures"])
         built.append(pictures)
     if "checkpoint" in wanted and config["trainer"]["enable_checkpointing"]:
+        check_options("callbacks.checkpoint", keep_checkpoints, wanted["checkpoint"], given=1)
+        at_least_one("callbacks.checkpoint.every", wanted["checkpoint"].get("every", 1))
         built += keep_checkpoints(run_dir / FOLDER, **wanted["checkpoint"])
     if "progress" in wanted and config["trainer"]["enable_progress_bar"]:
         built.append(Progress(**wanted["progress"]))
     if config["loggers"]:
         built.append(LearningRateMonitor("step"))
     return built
+
+
+def at_least_one(key: str, value: int) -> None:
+    """Refuse a period of no steps."""
+    if value < 1:
+        raise InputError(f"{key} must be at least 1, found {value}.")
 
 
 def keep_checkpoints(folder: Path, every: int = 1000) -> list[Callback]:

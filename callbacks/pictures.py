@@ -43,7 +43,7 @@ class SamplePictures(L.Callback):
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
         step = trainer.global_step
-        due = self.every > 0 and (step % self.every == 0 or step == trainer.max_steps)
+        due = self.every > 0 and step > 0 and (step % self.every == 0 or step == trainer.max_steps)
         path = self.folder / f"step-{step:08d}.png"
         # Under accumulation a step lasts several batches: the first one that ends it draws.
         if due and trainer.is_global_zero and not path.exists():

@@ -1,13 +1,15 @@
 """r2flow VERB: what is done with scans and checkpoints from the command line."""
 
 import logging
+import os
 import sys
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from r2flow.errors import InputError, explain_os_error
+from r2flow.errors import InputError, explain_mistake
 
 # Imports of torch and matplotlib stay inside the verbs: --help and a mistyped option answer at once.
 
@@ -17,6 +19,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
+
+# Its home is click in older releases of typer and typer itself in newer ones.
+USAGE_ERROR: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 report = typer.Typer(help="Measure scans and flows.", no_args_is_help=True, pretty_exceptions_enable=False)
 app.add_typer(report, name="report")
@@ -29,21 +34,21 @@ SensorOption = Annotated[str, typer.Option(help="Name of the sensor.")]
 SizeOption = Annotated[str | None, typer.Option(help="Rows x columns, as 64x1024; the sensor's own if left out.")]
 ProjectionOption = Annotated[str, typer.Option(help="spherical or unfolding.")]
 ConventionOption = Annotated[str, typer.Option(help="centre, or reference for the published models'.")]
-ScaleOption = Annotated[float, typer.Option(help="Value in the file that means full reflectance, often 255.")]
+ScaleOption = Annotated[float, typer.Option(min=1e-6, help="Value in the file that means full reflectance, often 255.")]
 
 
 @app.command(epilog="Example: r2flow sample --checkpoint runs/simulated-hdit_tiny --num 16 --steps 64 --out scans")
 def sample(
     checkpoint: CheckpointOption,
     out: OutOption,
-    num: Annotated[int, typer.Option(help="Number of scans.")] = 4,
-    steps: Annotated[int, typer.Option(help="Equal steps from noise to data.")] = 32,
-    seed: Annotated[int, typer.Option(help="Scan i depends on the seed and on i alone.")] = 0,
+    num: Annotated[int, typer.Option(min=1, help="Number of scans.")] = 4,
+    steps: Annotated[int, typer.Option(min=1, help="Equal steps from noise to data.")] = 32,
+    seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0,
     solver: Annotated[str, typer.Option(help="euler, midpoint, heun2, heun3, rk4, torchdiffeq:dopri5, ...")] = "euler",
     tolerance: Annotated[float, typer.Option(help="Of an adaptive solver.")] = 1e-5,
     format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
-    pictures: Annotated[int, typer.Option(help="Scans that get a picture.")] = 8,
-    batch_size: Annotated[int, typer.Option(help="Scans at once.")] = 1,
+    pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture.")] = 8,
+    batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto",
 ) -> None:
     """Draw scans from a trained flow: point clouds, range images and pictures."""
@@ -67,12 +72,14 @@ def show(
     reflectance_scale: Annotated[
         float | None, typer.Option(help="Value in the file that means full reflectance; guessed if left out.")
     ] = None,
-    most: Annotated[int, typer.Option(help="The most scans to draw of a folder.")] = 16,
+    most: Annotated[int, typer.Option(min=1, help="The most scans to draw of a folder.")] = 16,
 ) -> None:
     """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each."""
     from r2flow.reports.pictures import save_figure, scan_figure
     from r2flow.reports.views import open_view, scans_of
 
+    if projection == "unfolding" and sensor == "hdl64e":
+        sensor = "hdl64e_rings"  # rows are rings then, and these are not evenly spaced
     chosen = build_sized(sensor, size)
     paths = [path for file in files for path in scans_of(file, most)]
     for path in paths:
@@ -140,8 +147,8 @@ def backbones(
     only: Annotated[str | None, typer.Option(help="Names, separated by commas; all if left out.")] = None,
     sensor: SensorOption = "hdl64e",
     size: SizeOption = None,
-    channels: Annotated[int, typer.Option(help="Channels of the image.")] = 2,
-    repeats: Annotated[int, typer.Option(help="Timed evaluations of each; 0 leaves the latency out.")] = 3,
+    channels: Annotated[int, typer.Option(min=1, help="Channels of the image.")] = 2,
+    repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each; 0 leaves the latency out.")] = 3,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, ...")] = "auto",
     json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
@@ -170,6 +177,9 @@ def fidelity(
     train: Annotated[Path | None, typer.Option(help="The scans that were learned from.")] = None,
     sensor: SensorOption = "hdl64e",
     size: SizeOption = None,
+    projection: ProjectionOption = "spherical",
+    reflectance_scale: ScaleOption = 1.0,
+    most: Annotated[int, typer.Option(min=1, help="The most scans of a folder, evenly spread over it.")] = 1000,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for fidelity.md and .json.")] = None,
 ) -> None:
     """Set scans against real ones, beside controls that know nothing of scenes: noise, flat ground, mean, shuffle."""
@@ -180,9 +190,10 @@ def fidelity(
     from r2flow.reports.fidelity import load_images, markdown
 
     chosen = build_sized(sensor, size)
-    training = None if train is None else load_images(train, chosen)
-    result = measure(load_images(real, chosen), load_images(other, chosen), chosen, training)
-    text = markdown(result, other.name if other.name not in ("samples", "") else other.parent.name or "other")
+    load = partial(load_images, sensor=chosen, projection=projection, reflectance_scale=reflectance_scale, most=most)  # type: ignore[arg-type]
+    training = None if train is None else load(train)
+    judged, truth = load(other), load(real)
+    text = markdown(result := measure(truth, judged, chosen, training), "judged")
     print(text)
     if out is not None:
         for name, content in (("fidelity.md", text + "\n"), ("fidelity.json", json.dumps(result, indent=2))):
@@ -208,6 +219,10 @@ def choose_device(name: str) -> str:
 
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.device(name)
+    except RuntimeError:
+        raise InputError(f"--device must be auto, cpu, cuda, cuda:1, ...; found {name!r}.") from None
     if name.startswith("cuda") and not torch.cuda.is_available():
         raise InputError(f"--device {name}, but torch sees no GPU here; use --device cpu.")
     return name
@@ -223,11 +238,20 @@ def main() -> None:
     """Run a verb; what the user can mend is one line and exit code 2."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", force=True)
     try:
-        app()
+        code = app(standalone_mode=False)
+    except BrokenPipeError:  # r2flow ... | head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
     except (InputError, OSError) as error:
-        said = explain_os_error(error) if isinstance(error, OSError) else error
-        print(f"error: {said}", file=sys.stderr)
+        print(f"error: {explain_mistake(error)}", file=sys.stderr)
         sys.exit(2)
+    except USAGE_ERROR as error:
+        print(f"error: {error.format_message()} See --help.", file=sys.stderr)
+        sys.exit(2)
+    except typer.Abort:
+        print("stopped", file=sys.stderr)
+        sys.exit(130)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         sys.exit(130)
+    sys.exit(code if isinstance(code, int) else 0)

@@ -1,5 +1,7 @@
 """The one exception that is the user's to mend."""
 
+import errno
+
 
 class InputError(ValueError):
     """Something that the user gave cannot be used.
@@ -9,7 +11,23 @@ class InputError(ValueError):
     """
 
 
-def explain_os_error(error: OSError) -> str:
-    """What the system refused, in one line: a read-only folder, a full disk, a path that is none."""
-    where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror or error}"
+# What a user can mend: the rest of the system's errors (a lost connection, a broken pipe) are not theirs.
+MENDABLE = {
+    errno.EACCES, errno.EPERM, errno.ENOENT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENOTEMPTY,
+    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.ENAMETOOLONG, errno.ELOOP,
+}  # fmt: skip
+
+
+def explain_mistake(error: InputError | OSError) -> str:
+    """A mistake in one line: an InputError's own, or what the system refused (a read-only folder, a full disk).
+
+    Raises:
+        OSError: the error itself, where it is nothing that a user can mend.
+    """
+    if isinstance(error, OSError):
+        if error.errno not in MENDABLE:
+            raise error
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror or error}"
+    # A loader's worker process wraps the line into its traceback; the line is the last of it.
+    return str(error).strip().splitlines()[-1].split("InputError: ")[-1] if str(error).strip() else "unknown"

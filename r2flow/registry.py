@@ -2,8 +2,9 @@
 
 import difflib
 import inspect
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Generic, TypeVar
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import NoneType, UnionType
+from typing import Any, Generic, TypeVar, Union, get_args, get_origin
 
 from r2flow.errors import InputError
 
@@ -72,39 +73,55 @@ class Registry(Generic[T]):
         constructor = self[name]
         if not callable(constructor):
             raise TypeError(f"{self.kind} {name!r} is a value, not a constructor")
-        check_options(f"{self.kind} '{name}'", constructor, chosen)
+        check_options(f"{self.kind} '{name}'", constructor, chosen, given=len(args))
         return constructor(*args, **chosen)
 
 
-def check_options(what: str, constructor: Callable[..., Any], options: Mapping[str, Any]) -> None:
+def check_options(what: str, constructor: Callable[..., Any], options: Mapping[str, Any], given: int = 0) -> None:
     """Hold options to the signature that they are meant for.
 
+    Args:
+        given: How many parameters are passed by position beside the options.
+
     Raises:
-        InputError: an option that `constructor` does not take by keyword, or a value of another type than its
-            annotation says where that is bool, int, float or str.
+        InputError: an option that `constructor` does not take by keyword, one that it cannot do without, or a value
+            that its annotation does not allow.
     """
-    parameters = inspect.signature(constructor).parameters
-    if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+    parameters = list(inspect.signature(constructor).parameters.values())
+    if parameters and parameters[0].name == "self":  # a decorated __init__
+        parameters = parameters[1:]
+    if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return
-    known = {n: p for n, p in parameters.items() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)}
+    known = {p.name: p for p in parameters[given:] if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)}
     for key, value in options.items():
         if key not in known:
             hint = did_you_mean(key, known)
             raise InputError(f"{what} has no option {key!r}; it knows: {', '.join(known)}.{hint}")
-        wanted = PLAIN_TYPES.get(str(getattr(known[key].annotation, "__name__", known[key].annotation)))
-        if wanted is not None and not _is_a(value, *wanted):
-            raise InputError(f"{what}: {key} must be {wanted[-1]}, found {value!r}.")
+        wanted = _wanted(known[key].annotation)
+        if wanted and not any(fits(value) for _, fits in wanted):
+            raise InputError(f"{what}: {key} must be {' or '.join(word for word, _ in wanted)}, found {value!r}.")
+    for key, parameter in known.items():
+        if parameter.default is parameter.empty and key not in options:
+            raise InputError(f"{what} needs the option {key!r}.")
 
 
-PLAIN_TYPES: dict[str, tuple[type, str]] = {
-    "bool": (bool, "true or false"),
-    "int": (int, "a whole number"),
-    "float": (float, "a number"),
-    "str": (str, "a word"),
+Check = tuple[str, Callable[[Any], bool]]
+
+PLAIN: dict[Any, Check] = {
+    bool: ("true or false", lambda v: isinstance(v, bool)),
+    int: ("a whole number", lambda v: isinstance(v, int) and not isinstance(v, bool)),
+    float: ("a number", lambda v: isinstance(v, int | float) and not isinstance(v, bool)),
+    str: ("a word", lambda v: isinstance(v, str)),
+    NoneType: ("null", lambda v: v is None),
+    list: ("a list", lambda v: isinstance(v, list | tuple)),
+    tuple: ("a list", lambda v: isinstance(v, list | tuple)),
+    Sequence: ("a list", lambda v: isinstance(v, list | tuple)),
+    Mapping: ("a group of keys", lambda v: isinstance(v, Mapping)),
 }
 
 
-def _is_a(value: Any, wanted: type, _: str) -> bool:
-    if wanted is bool or isinstance(value, bool):
-        return wanted is bool and isinstance(value, bool)
-    return isinstance(value, (int, float) if wanted is float else wanted)
+def _wanted(annotation: Any) -> list[Check]:
+    """The checks of an annotation, any of which may hold; none where it cannot be checked."""
+    alternatives = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+    checks = [PLAIN.get(get_origin(one) or one) for one in alternatives]
+    return [] if None in checks else [check for check in checks if check is not None]

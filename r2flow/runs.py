@@ -32,7 +32,6 @@ FREE = (
     "trainer.strategy",
     "trainer.devices",
     "trainer.num_nodes",
-    "trainer.accumulate_grad_batches",
     "trainer.precision",
     "trainer.default_root_dir",
     "trainer.enable_progress_bar",
@@ -92,6 +91,8 @@ def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
     differing = contradictions(old, config)
     newest = _newest_whole(run)
     if not differing:
+        if newest is not None and old != dict(config):  # free keys moved: the folder says what runs now
+            write_config(run, config)
         return newest
     if newest is None:  # nothing has been learned there yet
         write_config(run, config)
@@ -109,5 +110,5 @@ def _newest_whole(run: str | Path) -> Path | None:
             read_checkpoint(path)
             return path
         except InputError as error:
-            log.warning("%s Going on from the one before.", error)
+            log.warning("%s Passing it over.", error)
     return None

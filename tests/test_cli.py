@@ -108,9 +108,9 @@ def test_info_says_what_is_in_a_checkpoint(r2flow, saved):  # noqa: F811
     assert json.loads(said)["step"] == 7
 
 
-@pytest.mark.parametrize("verb", ["sample", "show", "project", "info"])
+@pytest.mark.parametrize("verb", ["sample", "show", "project", "info", "convert", "backbones", "report fidelity"])
 def test_every_verb_has_help_with_an_example(r2flow, verb):
-    code, said, _ = r2flow(verb, "--help")
+    code, said, _ = r2flow(*verb.split(), "--help")
     assert code == 0
     assert f"Example: r2flow {verb}" in " ".join(said.split())
 
@@ -155,7 +155,11 @@ class TestBadInput:
         self.check(r2flow("project", scan, "--projection", "flat", "-o", out), out, "spherical, unfolding")
         self.check(r2flow("sample", "-c", saved[0], "--solver", "eulr", "-o", out), out, "Did you mean 'euler'?")
         self.check(r2flow("sample", "-c", saved[0], "--format", "las", "-o", out), out, "ply, bin, npy")
-        self.check(r2flow("sample", "-c", saved[0], "--num", 0, "-o", out), out, "at least one scan")
+        self.check(r2flow("sample", "-c", saved[0], "--num", 0, "-o", out), out, "--num")
+        self.check(r2flow("sample", "-c", saved[0], "--seed", -1, "-o", out), out, "--seed")
+        self.check(r2flow("sample", "-c", saved[0], "--batch-size", 0, "-o", out), out, "--batch-size")
+        self.check(r2flow("sample", "-c", saved[0], "--device", "foo", "-o", out), out, "--device", "'foo'")
+        self.check(r2flow("sample", "-c", saved[0], "-o", out, "--stepps", 3), out, "--stepps")
         if not torch.cuda.is_available():
             self.check(r2flow("sample", "-c", saved[0], "--device", "cuda", "-o", out), out, "--device cpu")
 

@@ -1,7 +1,10 @@
 """The one DataModule that every stage shares."""
 
+import hashlib
+import logging
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -21,7 +24,9 @@ from r2flow.data.sources import (
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
-from r2flow.registry import check_options
+from r2flow.registry import check_options, did_you_mean
+
+log = logging.getLogger(__name__)
 
 SIMULATED = "simulated"
 
@@ -42,6 +47,7 @@ class ScanDataModule(L.LightningDataModule):
         convention: `centre` or `reference`.
         reflectance_scale: The value in the files that means full reflectance.
         on_bad_scan: `error` or `skip`.
+        flip: Mirror every other training scan, left for right.
         batch_size: Images in one optimiser step, over all devices and accumulated batches.
         workers: Loader processes a device.
         memory_gib: Training scans are kept in memory where they fit into this, else read when needed.
@@ -55,7 +61,7 @@ class ScanDataModule(L.LightningDataModule):
         encoding: Encoding,
         seed: int,
         name: str = SIMULATED,
-        root: str | None = None,
+        root: str | int | None = None,
         split: str | None = None,
         drives: list[str | int] | None = None,
         scenes: int = 512,
@@ -63,6 +69,7 @@ class ScanDataModule(L.LightningDataModule):
         convention: str = "centre",
         reflectance_scale: float = 1.0,
         on_bad_scan: str = "error",
+        flip: bool = False,
         batch_size: int = 8,
         workers: int = 0,
         memory_gib: float = 2.0,
@@ -80,9 +87,11 @@ class ScanDataModule(L.LightningDataModule):
             "projection": projection, "convention": convention,
             "reflectance_scale": reflectance_scale, "on_bad_scan": on_bad_scan,
         }  # fmt: skip
-        self.batch_size, self.workers, self.memory_gib = batch_size, workers, memory_gib
+        self.batch_size, self.workers, self.memory_gib, self.flip = batch_size, workers, memory_gib, flip
+        self.scenes = scenes
         self.validation = dict(validation or {})
         check_options("data.validation", _validation_options, self.validation)
+        self.names: list[str] = []
         self.training_source: ScanSource | None = None
         self.validation_source: ScanSource | None = None
 
@@ -92,7 +101,12 @@ class ScanDataModule(L.LightningDataModule):
         source = self._source(self.options)
         share, most, other = _validation_options(**self.validation)
         if other is not None:
-            held: ScanSource = self._source({**self.options, "split": None, "drives": None, **other})
+            for key in other:
+                if key not in self.options:
+                    hint = did_you_mean(key, self.options)
+                    known = ", ".join(self.options)
+                    raise InputError(f"data.validation.data has no option {key!r}; it knows: {known}.{hint}")
+            held: ScanSource = self._source({**self.options, "split": None, "drives": None, **other}, held_out=True)
             training = source
         else:
             first, last = holdout_block(len(source), share)
@@ -100,15 +114,34 @@ class ScanDataModule(L.LightningDataModule):
         self.training_source = self._kept(training, "training scans")
         self.validation_source = self._kept(held.subset(spread(len(held), most)), "validation scans")
 
-    def _source(self, options: Mapping[str, Any]) -> ScanSource:
+    def fingerprint(self) -> str:
+        """What is trained on, wherever it lies: a run goes on only with the same scans in the same order."""
+        assert self.training_source is not None
+        names = hashlib.sha256("\n".join(self.names).encode()).hexdigest()[:12]
+        return f"{len(self.training_source)} of {len(self.names)} scans, {names}"
+
+    def _source(self, options: Mapping[str, Any], held_out: bool = False) -> ScanSource:
         reflectance = self.encoding.reflectance
         if options["name"] == SIMULATED:
-            return SimulatedScans(self.sensor, self.seed, range(options["scenes"]), reflectance)
+            # Scenes that are held out beside simulated training ones come after them.
+            first = self.scenes if held_out and self.options["name"] == SIMULATED else 0
+            scenes = range(first, first + int(options["scenes"]))
+            self.names = self.names if held_out else [f"scene {scene}" for scene in scenes]
+            return SimulatedScans(self.sensor, self.seed, scenes, reflectance)
         if options["root"] is None:
             raise InputError(f"data={options['name']} needs the folder of its scans: data.root=FOLDER.")
-        drives = find_drives(options["name"], options["root"], options["split"], options["drives"])
+        root = str(options["root"])
+        drives = find_drives(options["name"], root, options["split"], options["drives"])
+        paths = [path for drive in drives for path in drive.scans]
+        if not held_out:
+            self.names = [str(path.relative_to(Path(root).expanduser())) for path in paths]
+        if options["projection"] == "unfolding" and self.sensor.name == "hdl64e":
+            log.warning(
+                "unfolded rows are the sensor's rings, which are not evenly spaced: sensor=hdl64e_rings has their "
+                "elevations, sensor=hdl64e is up to 6 degrees off"
+            )
         return ScanFiles(
-            [path for drive in drives for path in drive.scans],
+            paths,
             self.sensor,
             options["on_bad_scan"],
             projection=options["projection"],
@@ -130,22 +163,29 @@ class ScanDataModule(L.LightningDataModule):
     def _ranks(self) -> tuple[int, int]:
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
+    def check_run(self, ranks: int, accumulated: int, max_steps: int) -> None:
+        """Refuse a run whose global batch cannot be shared, or that has no length.
+
+        Raises:
+            InputError: either of these.
+        """
+        if self.batch_size % (ranks * accumulated):
+            raise InputError(
+                f"data.batch_size={self.batch_size} cannot be shared by {ranks} devices times "
+                f"{accumulated} accumulated batches; give a multiple of {ranks * accumulated}."
+            )
+        if max_steps < 1:
+            raise InputError(
+                f"trainer.max_steps must be at least 1, found {max_steps}: it is the length of a run, which is one epoch."
+            )
+
     def train_dataloader(self) -> RunLoader:
         """The rest of the run: from the trainer's step on, to max_steps."""
         assert self.training_source is not None
         assert self.trainer is not None
         rank, ranks = self._ranks()
         accumulated = self.trainer.accumulate_grad_batches
-        if self.batch_size % (ranks * accumulated):
-            raise InputError(
-                f"data.batch_size={self.batch_size} cannot be shared by {ranks} devices times "
-                f"{accumulated} accumulated batches; give a multiple of {ranks * accumulated}."
-            )
-        if self.trainer.max_steps < 1:
-            raise InputError(
-                f"trainer.max_steps must be at least 1, found {self.trainer.max_steps}: "
-                "it is the length of a run, which is one epoch."
-            )
+        self.check_run(ranks, accumulated, self.trainer.max_steps)
         sampler = RunSampler(
             len(self.training_source),
             self.batch_size // accumulated,
@@ -155,7 +195,7 @@ class ScanDataModule(L.LightningDataModule):
             ranks,
         )
         sampler.first_batch = self.trainer.global_step * accumulated
-        dataset = FlowDataset(self.training_source, self.encoding, self.seed, "training")
+        dataset = FlowDataset(self.training_source, self.encoding, self.seed, "training", self.flip)
         return RunLoader(dataset, sampler, **self._loader_options())
 
     def val_dataloader(self) -> DataLoader[Item] | list[Any]:
@@ -163,7 +203,12 @@ class ScanDataModule(L.LightningDataModule):
         if len(self.validation_source) == 0:
             return []
         rank, ranks = self._ranks()
-        sampler = FixedSampler(len(self.validation_source), max(self.batch_size // ranks, 1), rank, ranks)
+        scans, batch_size = len(self.validation_source), max(self.batch_size // ranks, 1)
+        # Every rank needs as many batches as the others, or they would wait for each other: with fewer scans
+        # than ranks all take all of them, else the few that are left over are left out.
+        if scans < ranks:
+            rank, ranks = 0, 1
+        sampler = FixedSampler(scans - scans % ranks, batch_size, rank, ranks)
         dataset = FlowDataset(self.validation_source, self.encoding, self.seed, "validation")
         return DataLoader(dataset, batch_sampler=sampler, **self._loader_options())
 

@@ -73,7 +73,7 @@ def find_drives(
         layout: A name in `LAYOUTS`.
         root: Folder of the data set.
         split: A part of the layout's standard split; None takes all.
-        drives: Names, ends of names or numbers of the drives to take; None takes all.
+        drives: Names or numbers of the drives to take; None takes all.
 
     Raises:
         InputError: a root that is missing or holds no scan in this layout, an unknown split, or a drive

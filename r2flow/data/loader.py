@@ -20,20 +20,29 @@ class FlowDataset(Dataset[Item]):
 
     x_1 (C, H, W) is the encoded scan, x_0 (C, H, W) its noise and u () the uniform draw that becomes t;
     noise and u depend on (seed, purpose, k) alone.
+
+    Args:
+        flip: Mirror every other scan, left for right: azimuth -> -azimuth, columns reversed, exact because bins
+            lie symmetrically about straight ahead. Which ones depends on k alone.
     """
 
-    def __init__(self, source: ScanSource, encoding: Encoding, seed: int, purpose: str) -> None:
+    def __init__(self, source: ScanSource, encoding: Encoding, seed: int, purpose: str, flip: bool = False) -> None:
         self.source, self.encoding, self.seed, self.purpose = source, encoding, seed, purpose
+        self.flip = flip
 
     def __len__(self) -> int:
         return len(self.source)
 
     def __getitem__(self, key: tuple[int, int]) -> Item:
         k, index = key
-        x_1 = self.encoding.encode(torch.from_numpy(self.source[index]))
+        shape = (self.encoding.channels, *self.encoding.sensor.shape)
         draw = noise.generator(self.seed, self.purpose, k)
-        x_0 = torch.from_numpy(draw.standard_normal(tuple(x_1.shape), dtype=np.float32))
+        x_0 = torch.from_numpy(draw.standard_normal(shape, dtype=np.float32))
         u = torch.tensor(draw.random(dtype=np.float32))
+        image = self.source[index]
+        if self.flip and draw.random() < 0.5:
+            image = image[..., ::-1].copy()
+        x_1 = self.encoding.encode(torch.from_numpy(image))
         return {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
 
 

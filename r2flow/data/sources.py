@@ -135,19 +135,14 @@ class SimulatedScans:
 
 
 class InMemory:
-    """A source read once and kept; the scans that it leaves out are gone, not replaced.
+    """A source read once and kept; what it gives in memory is what it gives from its files.
 
     Args:
         track: Wraps the numbers while they are read, for a progress bar.
     """
 
     def __init__(self, source: ScanSource, track: Callable[[range], Iterable[int]] = lambda numbers: numbers) -> None:
-        images = []
-        for index in track(range(len(source))):
-            image = source[index]
-            if index not in getattr(source, "bad", ()):
-                images.append(image)
-        self.images = np.stack(images)
+        self.images = np.stack([source[index] for index in track(range(len(source)))])
 
     def subset(self, indices: Sequence[int]) -> "InMemory":
         chosen = InMemory.__new__(InMemory)

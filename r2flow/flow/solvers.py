@@ -104,6 +104,7 @@ def solve(
     Raises:
         InputError: an unknown method, fewer than one step, or a tolerance that is not positive.
     """
+    check_method(method)
     if steps < 1:
         raise InputError(f"a solver needs at least 1 step, found {steps}.")
     if not (tolerance > 0 and math.isfinite(tolerance)):
@@ -119,11 +120,33 @@ def solve(
             progress()
         return v
 
-    if method.startswith(TORCHDIFFEQ):
-        end = _torchdiffeq(counted, x, t_0, t_1, method.removeprefix(TORCHDIFFEQ), steps, tolerance)
-    else:
+    if not method.startswith(TORCHDIFFEQ):
         end = _fixed(counted, x, t_0, t_1, SOLVERS[method].step, steps)
-    return Solution(end, torch.full((len(x),), count, dtype=torch.int64))
+        return Solution(end, torch.full((len(x),), count, dtype=torch.int64))
+    # torchdiffeq takes a batch for one state with one error norm, in which a hard scene among easy ones goes
+    # under; one scene at a time, a result does not depend on its neighbours.
+    ends, evaluations = [], []
+    for scene in x.split(1):
+        count = 0
+        ends.append(_torchdiffeq(counted, scene, t_0, t_1, method.removeprefix(TORCHDIFFEQ), steps, tolerance))
+        evaluations.append(count)
+    return Solution(torch.cat(ends), torch.tensor(evaluations))
+
+
+def check_method(method: str) -> None:
+    """Know a solver by its name before it is needed.
+
+    Raises:
+        InputError: an unknown method.
+    """
+    if not method.startswith(TORCHDIFFEQ):
+        SOLVERS[method]
+        return
+    from torchdiffeq._impl.odeint import SOLVERS as known
+
+    name = method.removeprefix(TORCHDIFFEQ)
+    if name not in known:
+        raise InputError(f"torchdiffeq has no method {name!r}; it knows: {', '.join(sorted(known))}.")
 
 
 def _fixed(v: Velocity, x: Tensor, t_0: float, t_1: float, step: Step, steps: int) -> Tensor:
@@ -137,8 +160,6 @@ def _torchdiffeq(v: Velocity, x: Tensor, t_0: float, t_1: float, method: str, st
     import torchdiffeq
     from torchdiffeq._impl.odeint import SOLVERS as known
 
-    if method not in known:
-        raise InputError(f"torchdiffeq has no method {method!r}; it knows: {', '.join(sorted(known))}.")
     options = {} if _is_adaptive(known[method]) else {"step_size": abs(t_1 - t_0) / steps}
     span = torch.tensor([t_0, t_1], dtype=x.dtype, device=x.device)
     return torchdiffeq.odeint(v, x, span, rtol=tolerance, atol=tolerance, method=method, options=options)[-1]

@@ -135,5 +135,5 @@ class Encoding:
 
 def build_encoding(options: Mapping[str, Any], sensor: Sensor) -> Encoding:
     """The encoding a config describes: `format` and `reflectance`."""
-    check_options("encoding", Encoding, options)
+    check_options("encoding", Encoding, options, given=1)
     return Encoding(sensor, **options)

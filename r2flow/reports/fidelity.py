@@ -5,14 +5,26 @@ from typing import Any
 
 import numpy as np
 
+from r2flow.data.sources import read_scan
 from r2flow.errors import InputError
+from r2flow.lidar.projection import Projection
+from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.fidelity import controls, distances, nearest, panel
-from r2flow.reports.views import open_view, scans_of
+from r2flow.reports.views import range_image, scans_of
 
 
-def load_images(path: str | Path, sensor: Sensor, most: int = 1000) -> np.ndarray:
+def load_images(
+    path: str | Path,
+    sensor: Sensor,
+    projection: Projection = "spherical",
+    reflectance_scale: float = 1.0,
+    most: int = 1000,
+) -> np.ndarray:
     """The scans of a file or folder, of any known format or range images, (N, 2 or 1, H, W).
+
+    Reflectance is there only where every scan has it. Of a folder with more than `most` scans, that many are taken,
+    evenly spread over it.
 
     Raises:
         InputError: no scan there, or a range image of another size than the sensor's.
@@ -22,7 +34,10 @@ def load_images(path: str | Path, sensor: Sensor, most: int = 1000) -> np.ndarra
     images = []
     paths = scans_of(Path(path), most)
     for file in track(paths, f"reading {path}", disable=len(paths) < 32, transient=True):
-        image, _ = open_view(file, sensor)
+        image = range_image(file)
+        if image is None:
+            reflectance = read_points(file).reflectance is not None
+            image = read_scan(file, sensor, projection, "centre", reflectance, reflectance_scale)
         if image.shape[1:] != sensor.shape:
             found, wanted = ("x".join(map(str, shape)) for shape in (image.shape[1:], sensor.shape))
             raise InputError(f"{file} is a range image of {found}, the sensor's is {wanted}; give --size {found}.")
@@ -42,6 +57,9 @@ def fidelity(
         `{sets: {name: {line: distance}}, won: [line], lost: [line], nearest: {name: (median, least)}}`; a line
         is won where `other` is nearer to `real` than every control.
     """
+    channels = min(s.shape[1] for s in (real, other, training) if s is not None)
+    real, other = real[:, :channels], other[:, :channels]
+    training = None if training is None else training[:, :channels]
     truth = panel(real, sensor)
     base = real if training is None else training
     sets = {"other": other}

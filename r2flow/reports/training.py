@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from r2flow.checkpoints import find_checkpoint, load_checkpoint
+from r2flow.checkpoints import checkpoints_of, find_checkpoint, load_checkpoint
+from r2flow.errors import InputError
+from r2flow.flow.solvers import check_method
 from r2flow.reports.outputs import write_samples
 
 Curve = tuple[np.ndarray, np.ndarray]
@@ -35,18 +37,37 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
     return curves
 
 
-def finish(run: str | Path, samples: Mapping[str, Any], seed: int) -> None:
-    """Draw the loss curve and a few scans of a finished run, and say where everything lies and what comes next."""
+def check_samples(num: int, steps: int, method: str) -> None:
+    """Refuse before the training what could not be drawn after it.
+
+    Raises:
+        InputError: fewer than no scans, no steps, or an unknown solver.
+    """
+    if num < 0 or steps < 1:
+        raise InputError(f"samples.num must be at least 0 and samples.steps at least 1, found {num} and {steps}.")
+    check_method(method)
+
+
+def finish(run: str | Path, samples: Mapping[str, Any], seed: int, device: str, max_steps: int) -> None:
+    """Draw the loss curve and a few scans of a run, and say where everything lies and what comes next."""
     from r2flow.reports.pictures import loss_figure, save_figure
 
     run = Path(run)
     curves = read_curves(run)
     if curves:
         save_figure(loss_figure(curves), run / "loss.png")
+    if not checkpoints_of(run):
+        print(f"no checkpoint was kept, as configured; loss curve: {run / 'loss.png'}")
+        return
     path = find_checkpoint(run)
-    checkpoint = load_checkpoint(path)
+    checkpoint = load_checkpoint(path, device)
+    if checkpoint.step < max_steps:
+        print(f"stopped at step {checkpoint.step} of {max_steps}: the same command goes on from here")
     out = run / "samples"
     formats = ("ply", "bin", "npy") if checkpoint.encoding.reflectance else ("ply", "npy")
+    if samples["num"] == 0:
+        print(f"checkpoint    {path}")
+        return
     write_samples(
         checkpoint, out, samples["num"], samples["steps"], seed, samples["method"], formats,
         pictures=samples["num"],

@@ -5,18 +5,20 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from r2flow.data.sources import read_scan
+from r2flow.data.sources import read_scan, spread
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import SCAN_ENDINGS, read_points
 from r2flow.lidar.sensors import Sensor
 
 
 def scans_of(path: Path, most: int) -> list[Path]:
-    """The file itself, or the first `most` scans of a folder.
+    """The file itself, or at most `most` scans of a folder, evenly spread over it.
 
     Raises:
         InputError: nothing is there, or a folder without scans.
     """
+    if not path.exists():
+        raise InputError(f"{path} does not exist.")
     if not path.is_dir():
         return [path]
     found = sorted(p for p in path.rglob("*") if p.name.lower().endswith(tuple(SCAN_ENDINGS)))
@@ -25,7 +27,7 @@ def scans_of(path: Path, most: int) -> list[Path]:
     chosen = sorted(one_of_each.values())
     if not chosen:
         raise InputError(f"{path} holds no scan; known endings: {', '.join(sorted(SCAN_ENDINGS))}.")
-    return chosen[:most]
+    return [chosen[index] for index in spread(len(chosen), most)]
 
 
 def project_file(
@@ -45,7 +47,7 @@ def open_view(
     Without a reflectance scale, 1 is taken where the file stays below it, else 255, else its highest value: good
     enough for a picture, and for nothing else.
     """
-    image = _range_image(path)
+    image = range_image(path)
     if image is not None:
         return image, sensor.resized(*image.shape[1:]).rays()
     if reflectance_scale is None:
@@ -55,7 +57,7 @@ def open_view(
     return project_file(path, sensor, projection, "centre", reflectance_scale), sensor.rays()
 
 
-def _range_image(path: Path) -> np.ndarray | None:
+def range_image(path: Path) -> np.ndarray | None:
     if path.suffix.lower() != ".npy" or not path.is_file():
         return None
     try:

@@ -66,3 +66,29 @@ def test_workers_change_nothing():
 def test_validation_covers_every_scan_once_over_the_ranks():
     seen = [key for rank in range(3) for batch in FixedSampler(10, 4, rank, 3) for key in batch]
     assert sorted(seen) == [(i, i) for i in range(10)]
+
+
+class Slope(Scans):
+    """Range rises with the column: its mirror image falls."""
+
+    def __getitem__(self, index):
+        return (
+            np.linspace(2, 70, 8, dtype=np.float32)
+            * np.ones((2, 4, 8), np.float32)
+            * np.float32(1)
+            * np.array([[[1.0]], [[0.01]]], np.float32)
+        )
+
+
+def test_flipping_mirrors_about_half_of_the_scans_and_no_noise():
+    encoding = Encoding(SENSOR)
+    plain, flipped = (FlowDataset(Slope(), encoding, 0, "training", flip) for flip in (False, True))
+    mirrored = 0
+    for k in range(200):
+        a, b = plain[(k, 0)], flipped[(k, 0)]
+        assert torch.equal(a["x_0"], b["x_0"])
+        assert torch.equal(a["u"], b["u"])
+        same, mirror = torch.equal(a["x_1"], b["x_1"]), torch.equal(a["x_1"].flip(-1), b["x_1"])
+        assert same != mirror
+        mirrored += mirror
+    assert 70 < mirrored < 130  # 200 fair coins: 100 +- 7

@@ -74,6 +74,17 @@ def test_the_state_stays_in_float32_around_a_half_precision_network():
     assert end.x.dtype == torch.float32
 
 
+@pytest.mark.parametrize("method", ["euler", "rk4", "torchdiffeq:dopri5", "torchdiffeq:bosh3"])
+def test_a_scene_does_not_depend_on_its_neighbours(method):
+    hard = torch.tensor([[20.0]], dtype=torch.float64)  # steep at the start
+    together = solve(logistic, torch.cat([X_0, hard]), method=method, tolerance=1e-3)
+    alone = solve(logistic, hard, method=method, tolerance=1e-3)
+    assert torch.equal(together.x[3:], alone.x)
+    assert together.evaluations[3] == alone.evaluations[0]
+    if "torchdiffeq" in method:
+        assert together.evaluations[0] < together.evaluations[3]
+
+
 def test_bad_requests_are_refused():
     with pytest.raises(InputError, match=r"Did you mean 'euler'\?"):
         solve(logistic, X_0, method="eulr")

@@ -161,6 +161,19 @@ def test_bin_centres_halve_the_reference_s_error_on_real_scans(shared):
     assert relative_error("centre") < 0.55 * relative_error("reference")
 
 
+def test_unfolded_real_scans_go_back_to_where_they_were(shared):
+    sensor = SENSORS["hdl64e_rings"]
+    for path in sorted((shared / "real" / "kitti360").rglob("*.bin"))[
+        :3
+    ]:  # another car than the rings were measured on
+        points = read_points(path)
+        image = project(points.xyz, np.arange(len(points.xyz), dtype=np.float64), sensor, "unfolding")
+        seen = image[0] > 0
+        there = unproject(torch.from_numpy(image[None, :1]), sensor.rays())[0].numpy()[:, seen].T
+        height_error = np.abs(there[:, 2] - points.xyz[image[1][seen].astype(int), 2])
+        assert np.median(height_error) < 0.05
+
+
 def test_unknown_names_are_refused():
     with pytest.raises(InputError, match="no projection named"):
         project(np.ones((1, 3)), None, HDL64E, "cylindrical")

@@ -1,6 +1,7 @@
 """train.py as a user runs it: in a process, from a folder, with overrides."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -88,7 +89,7 @@ def test_a_damaged_last_checkpoint_is_passed_over(train: Run, alone: tuple[Path,
     newest = checkpoints_of(copied)[0]
     newest.write_bytes(newest.read_bytes()[:1000])
     done = train("name=copied")
-    assert "Going on from the one before" in done.stdout + done.stderr
+    assert "Passing it over" in done.stdout + done.stderr
     assert_bit_equal(alone[0], copied)
 
 
@@ -116,13 +117,24 @@ def test_accumulated_batches_are_the_whole_batch(train: Run, tmp_path: Path):
         torch.testing.assert_close(whole[name], parts[name], rtol=0, atol=2e-4)
 
 
-@pytest.mark.slow
 def test_two_processes_are_one(train: Run, tmp_path: Path):
     train("name=one", "backbone.dropout=0")
     train("name=two", "backbone.dropout=0", "trainer.devices=2", "trainer.strategy=ddp")
     one, two = (weights(tmp_path / "runs" / name)[0] for name in ("one", "two"))
     for name in one:
         torch.testing.assert_close(one[name], two[name], rtol=0, atol=2e-4)
+
+
+def test_a_folder_that_now_holds_other_scans_is_refused(train: Run, copied: Path, scans: Path, tmp_path: Path):
+    other = tmp_path / "other"
+    shutil.copytree(scans, other)
+    checkpoints_of(copied)[0].unlink()
+    moved = train("name=copied", f"data.root={other}")  # the same scans elsewhere
+    assert "going on from" in moved.stdout + moved.stderr
+    (other / "000000.bin").rename(other / "another.bin")
+    done = train("name=copied", f"data.root={other}", check=False)
+    assert done.returncode == 2
+    assert "scans=9 of 12 scans" in done.stderr
 
 
 def test_a_sweep_runs_every_job_and_reports_the_failed(train: Run, tmp_path: Path):
