@@ -176,7 +176,7 @@ class ScanDataModule(L.LightningDataModule):
             )
         if max_steps < 1:
             raise InputError(
-                f"trainer.max_steps must be at least 1, found {max_steps}: it is the length of a run, which is one epoch."
+                f"trainer.max_steps must be at least 1, found {max_steps}: it is the length of a run."
             )
 
     def train_dataloader(self) -> RunLoader:
