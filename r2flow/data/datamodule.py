@@ -175,9 +175,7 @@ class ScanDataModule(L.LightningDataModule):
                 f"{accumulated} accumulated batches; give a multiple of {ranks * accumulated}."
             )
         if max_steps < 1:
-            raise InputError(
-                f"trainer.max_steps must be at least 1, found {max_steps}: it is the length of a run."
-            )
+            raise InputError(f"trainer.max_steps must be at least 1, found {max_steps}: it is the length of a run.")
 
     def train_dataloader(self) -> RunLoader:
         """The rest of the run: from the trainer's step on, to max_steps."""
