@@ -30,10 +30,11 @@ class Solution:
 
 
 class FixedStep(NamedTuple):
-    """One step x(t) -> x(t + h) and the order of its global error."""
+    """One step x(t) -> x(t + h), the order of its global error, and its evaluations of the velocity."""
 
     step: Step
     order: int
+    evaluations: int
 
 
 def euler(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
@@ -69,11 +70,11 @@ def rk4(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
 
 SOLVERS = Registry(
     "solver",
-    euler=FixedStep(euler, 1),
-    midpoint=FixedStep(midpoint, 2),
-    heun2=FixedStep(heun2, 2),
-    heun3=FixedStep(heun3, 3),
-    rk4=FixedStep(rk4, 4),
+    euler=FixedStep(euler, 1, 1),
+    midpoint=FixedStep(midpoint, 2, 2),
+    heun2=FixedStep(heun2, 2, 2),
+    heun3=FixedStep(heun3, 3, 3),
+    rk4=FixedStep(rk4, 4, 4),
 )
 TORCHDIFFEQ = "torchdiffeq:"
 

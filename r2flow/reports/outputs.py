@@ -4,12 +4,23 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+    track,
+)
+from rich.text import Text
 from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
+from r2flow.flow.solvers import SOLVERS
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.sampling import batches, sample
@@ -51,13 +62,15 @@ def write_samples(
         raise InputError("a KITTI .bin holds reflectance and this model has none; use --format ply,npy.")
     out, rays = Path(out), checkpoint.sensor.rays()
     shown: list[np.ndarray] = []
-    columns = TextColumn("sampling"), BarColumn(), MofNCompleteColumn(), TextColumn("scans"), TimeRemainingColumn()
-    with Progress(*columns) as bar:
+    # Between two finished scans the bar moves with the evaluations, whose number a fixed-step method knows.
+    per_step = SOLVERS[method].evaluations if method in SOLVERS else 0
+    share = num / (per_step * steps * batches(num, batch_size)) if per_step else 0.0
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("scans"), ScansPerSecond(), TimeRemainingColumn())
+    with Progress(TextColumn("sampling"), *columns) as bar:
         task = bar.add_task("scans", total=num)
-        evaluations = steps * batches(num, batch_size)
         for drawn in sample(
             checkpoint, num, steps, seed, method, tolerance, batch_size,
-            progress=lambda: bar.advance(task, num / evaluations if method == "euler" else 0),
+            progress=lambda: bar.advance(task, share),
         ):  # fmt: skip
             for offset, image in enumerate(drawn.images.numpy()):
                 write_scan(image, rays, out, f"{drawn.first + offset:06d}", formats)
@@ -67,6 +80,14 @@ def write_samples(
     if shown:
         draw_pages(shown, rays, out)
     return shown
+
+
+class ScansPerSecond(ProgressColumn):
+    """How fast it goes, once that can be told."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text(f"{speed:.2f} scans/s" if speed else "")
 
 
 def write_scan(image: np.ndarray, rays: Tensor, out: Path, name: str, formats: Sequence[str]) -> None:
@@ -85,6 +106,7 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path) -> Path:
     """A page for each image and `samples.png`, the contact sheet of the first 8."""
     from r2flow.reports.pictures import contact_sheet, save_figure, scan_figure
 
-    for index, image in enumerate(images):
+    numbered = list(enumerate(images))
+    for index, image in track(numbered, "drawing", disable=len(numbered) < 3, transient=True):
         save_figure(scan_figure(image, rays, f"sample {index}"), out / f"{index:06d}.png")
     return save_figure(contact_sheet(images[:8], rays), out / "samples.png")
