@@ -87,7 +87,7 @@ def fit(config: dict[str, Any]) -> None:
     except (TypeError, ValueError, MisconfigurationException) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None
     data.check_run(trainer.world_size, trainer.accumulate_grad_batches, trainer.max_steps)
-    last = open_run(run_dir, config)
+    last = None if trainer_options["fast_dev_run"] else open_run(run_dir, config)
     if last is not None:
         log.info("going on from %s", last)
     try:
@@ -122,7 +122,7 @@ def sweep_job(config: DictConfig) -> int:
     run_dir = HydraConfig.get().runtime.output_dir
     command = [sys.executable, __file__, *overrides, f"run_dir='{run_dir}'"]
     log.info("job %s: %s", HydraConfig.get().job.num, " ".join(overrides))
-    return subprocess.run(command, check=False, env={**os.environ, "HYDRA_FULL_ERROR": "1"}).returncode
+    return subprocess.run(command, check=False).returncode
 
 
 failed_jobs: list[str] = []

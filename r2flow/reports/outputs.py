@@ -53,8 +53,10 @@ def write_samples(
         The images drawn as pictures.
 
     Raises:
-        InputError: an unknown format, or `bin` from a model without reflectance.
+        InputError: an unknown format, `bin` from a model without reflectance, or nothing to draw.
     """
+    if num < 1 or steps < 1 or batch_size < 1:
+        raise InputError(f"needs at least one scan, step and scan a batch; found {num}, {steps} and {batch_size}.")
     for name in formats:
         if name not in FORMATS:
             raise InputError(f"no output format named {name!r}; known: {', '.join(FORMATS)}.")

@@ -154,4 +154,10 @@ def test_mixed_precision_trains(train: Run, tmp_path: Path, precision: str):
 
 def test_fast_dev_run_leaves_nothing(train: Run, tmp_path: Path):
     train("trainer.fast_dev_run=true", "name=quick")
-    assert not (tmp_path / "runs" / "quick" / "checkpoints").exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_fast_dev_run_leaves_a_run_as_it_was(train: Run, copied: Path):
+    before = {path: path.stat().st_mtime_ns for path in copied.rglob("*")}
+    train("trainer.fast_dev_run=true", "name=copied")
+    assert {path: path.stat().st_mtime_ns for path in copied.rglob("*")} == before
