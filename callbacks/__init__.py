@@ -1,8 +1,8 @@
 """What happens during a run, and when; what it does is r2flow's."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
@@ -16,41 +16,41 @@ from r2flow.registry import Registry, check_options
 from r2flow.stages import Parts
 
 
+class Entry(NamedTuple):
+    """A callback, or several that belong together, and what it takes by position beside its options."""
+
+    constructor: Callable[..., Any]
+    given: Callable[[Mapping[str, Any], Parts], tuple[Any, ...]] = lambda config, parts: ()
+
+
 def build_callbacks(config: Mapping[str, Any], parts: Parts) -> list[Callback]:
     """The callbacks that a config's `callbacks` names; null leaves one out."""
-    run_dir = Path(config["run_dir"])
     if config["trainer"]["fast_dev_run"]:
         return [Progress()] if config["trainer"]["enable_progress_bar"] else []
     wanted = {name: options for name, options in (config["callbacks"] or {}).items() if options is not None}
+    for name, key in (("checkpoint", "enable_checkpointing"), ("progress", "enable_progress_bar")):
+        if not config["trainer"][key]:
+            wanted.pop(name, None)
     built: list[Callback] = []
-    if "ema" in wanted:
-        check_options("callbacks.ema", EMA, wanted["ema"])
-        at_least_one("callbacks.ema.every", wanted["ema"].get("every", 1))
-        built.append(EMA(**wanted["ema"]))
-    if "pictures" in wanted:
-        check_options("callbacks.pictures", SamplePictures, wanted["pictures"], given=4)
-        folder = run_dir / "pictures"
-        pictures = SamplePictures(folder, parts.sensor, parts.encoding, config["seed"], **wanted["pictures"])
-        built.append(pictures)
-    if "checkpoint" in wanted and config["trainer"]["enable_checkpointing"]:
-        check_options("callbacks.checkpoint", keep_checkpoints, wanted["checkpoint"], given=1)
-        at_least_one("callbacks.checkpoint.every", wanted["checkpoint"].get("every", 1))
-        built += keep_checkpoints(run_dir / FOLDER, **wanted["checkpoint"])
-    if "progress" in wanted and config["trainer"]["enable_progress_bar"]:
-        built.append(Progress(**wanted["progress"]))
+    for name, entry in CALLBACKS.items():
+        if name in wanted:
+            given = entry.given(config, parts)
+            check_options(f"callbacks.{name}", entry.constructor, wanted[name], given=len(given))
+            made = entry.constructor(*given, **wanted[name])
+            built += made if isinstance(made, list) else [made]
     if config["loggers"]:
         built.append(LearningRateMonitor("step"))
     return built
 
 
-def at_least_one(key: str, value: int) -> None:
-    """Refuse a period of no steps."""
-    if value < 1:
-        raise InputError(f"{key} must be at least 1, found {value}.")
-
-
 def keep_checkpoints(folder: Path, every: int = 1000) -> list[Callback]:
-    """A checkpoint every `every` steps and one at the last step; the newest two are kept."""
+    """A checkpoint every `every` steps and one at the last step; the newest two are kept.
+
+    Raises:
+        InputError: `every` is below 1.
+    """
+    if every < 1:
+        raise InputError(f"callbacks.checkpoint.every must be at least 1, found {every}.")
     common: dict[str, Any] = {
         "dirpath": folder,
         "filename": "step-{step:08d}",
@@ -62,6 +62,19 @@ def keep_checkpoints(folder: Path, every: int = 1000) -> list[Callback]:
     regular = ModelCheckpoint(every_n_train_steps=every, save_top_k=2, **common)
     final = ModelCheckpoint(every_n_epochs=1, save_on_train_epoch_end=True, save_top_k=1, **common)
     return [regular, final]
+
+
+# In the order in which they act.
+CALLBACKS = Registry(
+    "callback",
+    ema=Entry(EMA),
+    pictures=Entry(
+        SamplePictures,
+        lambda config, parts: (Path(config["run_dir"], "pictures"), parts.sensor, parts.encoding, config["seed"]),
+    ),
+    checkpoint=Entry(keep_checkpoints, lambda config, parts: (Path(config["run_dir"], FOLDER),)),
+    progress=Entry(Progress),
+)
 
 
 def _csv(run_dir: Path) -> Logger:

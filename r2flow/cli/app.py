@@ -1,0 +1,15 @@
+"""The command, and its group of reports."""
+
+import typer
+
+# Imports of torch and matplotlib stay inside the verbs: --help and a mistyped option answer at once.
+
+app = typer.Typer(
+    help="Rectified flows for LiDAR scans. Train with train.py; sample, show and measure here.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+)
+
+report = typer.Typer(help="Measure scans and flows.", no_args_is_help=True, pretty_exceptions_enable=False)
+app.add_typer(report, name="report")

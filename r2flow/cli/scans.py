@@ -1,0 +1,74 @@
+"""Verbs for scans."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from r2flow.cli.app import app
+from r2flow.cli.options import (
+    ConventionOption,
+    OutOption,
+    ProjectionOption,
+    ScaleOption,
+    SensorOption,
+    SizeOption,
+    build_sized,
+)
+
+
+@app.command(epilog="Example: r2flow show scans/000000.ply velodyne/0000000100.bin --out views")
+def show(
+    files: Annotated[list[Path], typer.Argument(help="Scan files, range images (.npy), or folders of them.")],
+    out: OutOption,
+    sensor: SensorOption = "hdl64e",
+    size: SizeOption = None,
+    projection: ProjectionOption = "spherical",
+    reflectance_scale: Annotated[
+        float | None, typer.Option(help="Value in the file that means full reflectance; guessed if left out.")
+    ] = None,
+    most: Annotated[int, typer.Option(min=1, help="The most scans to draw of a folder.")] = 16,
+) -> None:
+    """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each."""
+    from r2flow.reports.pictures import save_figure, scan_figure
+    from r2flow.reports.views import open_view, scans_of
+
+    if projection == "unfolding" and sensor == "hdl64e":
+        sensor = "hdl64e_rings"  # rows are rings then, and these are not evenly spaced
+    chosen = build_sized(sensor, size)
+    paths = [path for file in files for path in scans_of(file, most)]
+    for path in paths:
+        image, rays = open_view(path, chosen, projection, reflectance_scale)
+        written = save_figure(scan_figure(image, rays, path.name), out / f"{unique_stem(path, paths)}.png")
+        print(written)
+
+
+@app.command(
+    epilog="Example: r2flow project velodyne/0000000100.bin --projection unfolding --size 64x1024 --out image.npy"
+)
+def project(
+    scan: Annotated[Path, typer.Argument(help="A scan file.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The .npy to write.", show_default=False)],
+    projection: ProjectionOption = "spherical",
+    convention: ConventionOption = "centre",
+    sensor: SensorOption = "hdl64e",
+    size: SizeOption = None,
+    reflectance_scale: ScaleOption = 1.0,
+) -> None:
+    """Project a scan to a range image: float32 (2, H, W), range in metres and reflectance, 0 where missing."""
+    import numpy as np
+
+    from r2flow.files import atomic_write
+    from r2flow.reports.views import project_file
+
+    image = project_file(scan, build_sized(sensor, size), projection, convention, reflectance_scale)
+    with atomic_write(out) as file:
+        np.save(file, image)
+    returns = int((image[0] > 0).sum())
+    print(f"{out}: {image.shape[1]} x {image.shape[2]}, {returns} returns ({returns / image[0].size:.1%})")
+
+
+def unique_stem(path: Path, paths: list[Path]) -> str:
+    """The file's stem, with its folder's name where two files share one."""
+    shared = sum(other.stem == path.stem for other in paths) > 1
+    return f"{path.parent.name}_{path.name.replace('.', '_')}" if shared else path.stem
