@@ -1,0 +1,292 @@
+"""Flows whose solution is known: what a solver gives is held against mathematics, not against another solver.
+
+All act on states of any shape (B, ...). The marginals of noise and data are those of rectified flow: x_0 ~ N(0, 1)
+and x_1 drawn independently of it, so that v(t, x) = E[x_1 - x_0 | x_t = x].
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.flow.path import expand_time
+from r2flow.registry import Registry
+
+
+class Problem:
+    """A velocity and the exact way from x_0 along it."""
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        """v(t, x) in x's type, with t of shape () or (B,) and x (B, ...)."""
+        raise NotImplementedError
+
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        """x_t, (B, ...) float64, of the path that is at x_0 at time 0; t of shape () or (B,)."""
+        raise NotImplementedError
+
+    def straightness(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        """s(t) = |(x_1 - x_0) - v(t, x_t)|^2 (paper, eq. 5), exact, per scene, (B,) float64."""
+        x_0, t = x_0.double(), torch.as_tensor(t, dtype=torch.float64)
+        chord = self.solution(x_0, 1.0) - x_0
+        return (chord - self(t, self.solution(x_0, t))).square().flatten(1).sum(1)
+
+
+class Gaussian(Problem):
+    """x_1 ~ N(mean, std^2): x_t = t mean + sigma_t x_0 with sigma_t^2 = (1 - t)^2 + t^2 std^2.
+
+    Args:
+        std: The narrower, the later and the sharper the turn.
+    """
+
+    def __init__(self, mean: float = 0.7, std: float = 0.25) -> None:
+        self.mean, self.std = mean, std
+
+    def deviation(self, x: Tensor) -> Tensor | float:
+        """std in a shape that multiplies x."""
+        return self.std
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        t, s = expand_time(t, x), self.deviation(x)
+        rate = (t * s**2 - (1 - t)) / ((1 - t) ** 2 + (t * s) ** 2)  # sigma' / sigma
+        return self.mean + rate * (x - t * self.mean)
+
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
+        return t * self.mean + ((1 - t) ** 2 + (t * self.deviation(x_0)) ** 2).sqrt() * x_0
+
+
+class Anisotropic(Gaussian):
+    """Every element has a Gaussian of its own, std from `narrowest` to `widest` in equal ratios."""
+
+    def __init__(self, narrowest: float = 1e-4, widest: float = 10.0) -> None:
+        super().__init__(mean=0.0)
+        self.narrowest, self.widest = narrowest, widest
+
+    def deviation(self, x: Tensor) -> Tensor:
+        ends = math.log10(self.narrowest), math.log10(self.widest)
+        return torch.logspace(*ends, x[0].numel(), dtype=x.dtype, device=x.device).view(x.shape[1:])
+
+
+class Mixture(Problem):
+    """x_1 from a mixture of Gaussians, in every element by itself.
+
+    Of component i, x_t has mean t m_i and variance c_i = (1 - t)^2 + t^2 s_i^2, and x_1 - x_0 the conditional mean
+    m_i + (t s_i^2 - (1 - t)) (x - t m_i) / c_i; v is their mean over the posterior of i. The flow of a scalar keeps
+    the order of its paths, hence the share F_t of paths below: x_t solves F_t(x_t) = F_0(x_0).
+    """
+
+    def __init__(self, weights: Sequence[float], means: Sequence[float], stds: Sequence[float]) -> None:
+        self.weights, self.means, self.stds = tuple(weights), tuple(means), tuple(stds)
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        t = expand_time(t, x)
+        scores, slopes = [], []
+        for weight, mean, std in zip(self.weights, self.means, self.stds, strict=True):
+            variance = (1 - t) ** 2 + (t * std) ** 2
+            offset = x - t * mean
+            scores.append(math.log(weight) - 0.5 * variance.log() - 0.5 * offset.square() / variance)
+            slopes.append(mean + (t * std**2 - (1 - t)) / variance * offset)
+        return (torch.stack(scores).softmax(0) * torch.stack(slopes)).sum(0)
+
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        """x_t by bisection, to the last digits: the quantile of a mixture lies between those of its components."""
+        x_0, t = _exact(x_0, t)
+        means = torch.stack([t * mean + torch.zeros_like(x_0) for mean in self.means])
+        stds = torch.stack([((1 - t) ** 2 + (t * std) ** 2).sqrt() + torch.zeros_like(x_0) for std in self.stds])
+        weights = torch.tensor(self.weights, dtype=torch.float64, device=x_0.device).view(-1, *(1,) * x_0.ndim)
+        # The tail in which x_0 lies, of which no digit is lost: 1 - F(x) would lose those of a small remainder.
+        side = torch.where(x_0 < 0, 1.0, -1.0)
+        level = torch.special.ndtr(side * x_0)
+        low, high = (means + stds * x_0).amin(0), (means + stds * x_0).amax(0)
+        for _ in range(64):
+            middle = (low + high) / 2
+            tail = (weights * torch.special.ndtr(side * (middle - means) / stds)).sum(0)
+            above = (tail - level) * side > 0
+            low, high = torch.where(above, low, middle), torch.where(above, middle, high)
+        return (low + high) / 2
+
+
+class TwoModes(Mixture):
+    """Half of the paths go to -apart, half to +apart; between them they part ever more sharply."""
+
+    def __init__(self, apart: float = 0.5, std: float = 0.05) -> None:
+        super().__init__((0.5, 0.5), (-apart, apart), (std, std))
+
+
+class RayDrop(Mixture):
+    """A pixel of a scan: -1 up to `std` where the ray was dropped, else a range around .3."""
+
+    def __init__(self, dropped: float = 0.3, std: float = 1e-3) -> None:
+        super().__init__((dropped, 1 - dropped), (-1.0, 0.3), (std, 0.3))
+
+
+class PointMass(Problem):
+    """x_1 = point: v = (point - x) / (1 - t), a straight line whose velocity is 0 / 0 at t = 1."""
+
+    def __init__(self, point: float = 0.5) -> None:
+        self.point = point
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        return (self.point - x) / (1 - expand_time(t, x))
+
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
+        return (1 - t) * x_0 + t * self.point
+
+    def straightness(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        return torch.zeros(len(x_0), dtype=torch.float64, device=x_0.device)
+
+
+class Straight(Problem):
+    """A reflowed Gaussian, x_1 = mean + std x_0: one Euler step is exact."""
+
+    def __init__(self, mean: float = 0.7, std: float = 0.25) -> None:
+        self.mean, self.std = mean, std
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        t = expand_time(t, x)
+        return self.mean + (self.std - 1) / (1 - t + t * self.std) * (x - t * self.mean)
+
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
+        return (1 - t) * x_0 + t * (self.mean + self.std * x_0)
+
+
+class Rotating(Problem):
+    """x' = w J x: the first half of a scene's elements turns against the second, `turns` full circles until t = 1."""
+
+    def __init__(self, turns: float = 0.5) -> None:
+        self.speed = 2 * math.pi * turns
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        first, second = _halves(x)
+        return self.speed * torch.cat([-second, first], 1).view(x.shape)
+
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
+        first, second = _halves(x_0)
+        angle = self.speed * t.view(-1, 1)
+        c, s = angle.cos(), angle.sin()
+        return torch.cat([c * first - s * second, s * first + c * second], 1).view(x_0.shape)
+
+
+class StiffLinear(Problem):
+    """x' = -rate (x - sin t) + cos t: a slow path that everything nearby falls onto within 1 / rate.
+
+    Prothero, Robinson, On the stability and accuracy of one-step methods for solving stiff systems, 1974.
+    """
+
+    def __init__(self, rate: float = 1e2) -> None:
+        self.rate = rate
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        t = expand_time(t, x)
+        return t.cos() - self.rate * (x - t.sin())
+
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
+        return t.sin() + x_0 * (-self.rate * t).exp()
+
+
+class Discontinuous(Problem):
+    """x' = -x before t = `at`, -x + jump from then on."""
+
+    def __init__(self, jump: float = 3.0, at: float = math.sqrt(2) - 1) -> None:
+        self.jump, self.at = jump, at
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        return self.jump * (expand_time(t, x) >= self.at) - x
+
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
+        return x_0 * (-t).exp() - self.jump * torch.expm1(-(t - self.at).clamp(min=0))
+
+
+class NarrowJet(Problem):
+    """x' = -x + N(t; at, width^2): a kick of 1 within a few widths, which no step that passes over it notices."""
+
+    def __init__(self, width: float = 2e-3, at: float = 0.6) -> None:
+        self.width, self.at = width, at
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        z = (expand_time(t, x) - self.at) / self.width
+        return (-0.5 * z**2).exp() / (self.width * math.sqrt(2 * math.pi)) - x
+
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
+        w = self.width
+        passed = torch.special.ndtr((t - self.at) / w - w) - torch.special.ndtr(torch.as_tensor(-self.at / w - w))
+        return x_0 * (-t).exp() + (self.at - t + w**2 / 2).exp() * passed
+
+
+class Mixed(Problem):
+    """A batch in which every scene has a problem of its own; `select` lets it follow scenes out of the batch.
+
+    Args:
+        problems: One for each scene.
+    """
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        self.problems = tuple(problems)
+        groups: dict[Problem, list[int]] = {}
+        for scene, problem in enumerate(self.problems):
+            groups.setdefault(problem, []).append(scene)
+        self._groups = [(problem, torch.tensor(scenes)) for problem, scenes in groups.items()]
+
+    def select(self, scenes: Tensor) -> "Mixed":
+        """The problem of some of the scenes, indices (N,)."""
+        return Mixed([self.problems[scene] for scene in scenes.tolist()])
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        self._check(x)
+        v = torch.empty_like(x)
+        for problem, scenes in self._groups:
+            v[scenes] = problem(t[scenes] if t.ndim else t, x[scenes])
+        return v
+
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        self._check(x_0)
+        t = torch.as_tensor(t, dtype=torch.float64)
+        x_t = torch.empty_like(x_0, dtype=torch.float64)
+        for problem, scenes in self._groups:
+            x_t[scenes] = problem.solution(x_0[scenes], t[scenes] if t.ndim else t)
+        return x_t
+
+    def _check(self, x: Tensor) -> None:
+        if len(x) != len(self.problems):
+            raise InputError(f"this batch of problems has {len(self.problems)} scenes, the state {len(x)}.")
+
+
+def _exact(x_0: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor]:
+    """x_0 and t in float64, t in a shape that multiplies x_0."""
+    x_0 = x_0.double()
+    return x_0, expand_time(torch.as_tensor(t, dtype=torch.float64, device=x_0.device), x_0)
+
+
+def _halves(x: Tensor) -> tuple[Tensor, Tensor]:
+    flat = x.flatten(1)
+    if flat.shape[1] % 2:
+        raise InputError(f"scenes turn in pairs of elements; found {flat.shape[1]}, an odd number.")
+    first, second = flat.chunk(2, 1)
+    return first, second
+
+
+PROBLEMS: Registry = Registry(
+    "problem",
+    straight=Straight,
+    gaussian=Gaussian,
+    narrow_gaussian=functools.partial(Gaussian, std=0.01),
+    two_modes=TwoModes,
+    ray_drop=RayDrop,
+    point_mass=PointMass,
+    anisotropic=Anisotropic,
+    stiff_1e2=functools.partial(StiffLinear, rate=1e2),
+    stiff_1e4=functools.partial(StiffLinear, rate=1e4),
+    stiff_1e6=functools.partial(StiffLinear, rate=1e6),
+    discontinuous=Discontinuous,
+    narrow_jet=NarrowJet,
+    rotating=Rotating,
+)

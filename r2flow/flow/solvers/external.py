@@ -1,0 +1,129 @@
+"""torchdiffeq's methods, scene by scene."""
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.flow.solvers.adaptive import floored
+from r2flow.flow.solvers.clock import Limits
+from r2flow.flow.solvers.fixed import euler
+from r2flow.flow.solvers.solution import Evaluations, Solution
+
+log = logging.getLogger(__name__)
+
+TORCHDIFFEQ = "torchdiffeq:"
+
+
+def torchdiffeq_methods() -> dict[str, Any]:
+    """torchdiffeq's table of solvers."""
+    from torchdiffeq._impl.odeint import SOLVERS
+
+    return SOLVERS
+
+
+def check_torchdiffeq(name: str) -> None:
+    """Know a method of torchdiffeq by its name.
+
+    Raises:
+        InputError: an unknown method.
+    """
+    known = torchdiffeq_methods()
+    if name not in known:
+        raise InputError(f"torchdiffeq has no method {name!r}; it knows: {', '.join(sorted(known))}.")
+
+
+def is_fixed(name: str) -> bool:
+    """Whether a method of torchdiffeq takes the steps of a grid."""
+    from torchdiffeq._impl.solvers import FixedGridODESolver
+
+    return issubclass(torchdiffeq_methods()[name], FixedGridODESolver)
+
+
+def solve_torchdiffeq(
+    v: Evaluations, x: Tensor, times: Tensor, name: str, limits: Limits, finish: Tensor | None
+) -> Solution:
+    """Scene after scene: torchdiffeq takes a batch for one state with one error norm, in which a hard scene among
+    easy ones goes under.
+
+    Args:
+        times: The grid of a fixed-step method; an adaptive one goes from its first to its last time.
+    """
+    total = len(x)
+    tolerance = limits.tolerance if is_fixed(name) else floored(limits.tolerance, x.dtype) / limits.tighter
+    ends, taken, lost, converged = [], [], [], []
+    for index in range(total):
+        v.only(np.array([index]))
+        field = _Scene(v, x[index : index + 1], limits.max_evaluations)
+        end, whole = _end(field, times, name, tolerance, finish)
+        if not whole:
+            log.warning("%s%s gave up on scene %d: %s.", TORCHDIFFEQ, name, index, field.trouble or "not finite")
+        ends.append(end)
+        taken.append(field.steps - field.rejected)
+        lost.append(field.rejected)
+        converged.append(whole)
+    v.only(np.arange(total))
+    return Solution.build(torch.cat(ends) if ends else x, v.counts, taken, lost, False, converged)
+
+
+class _Spent(Exception):
+    """The budget of a scene is used up."""
+
+
+class _Scene:
+    """One scene's velocity, and what torchdiffeq reports about it."""
+
+    def __init__(self, v: Evaluations, x: Tensor, max_evaluations: int) -> None:
+        self._v, self._left = v, max_evaluations
+        self.last, self.steps, self.rejected, self.trouble = x, 0, 0, ""
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        if self._left == 0:
+            raise _Spent("its evaluations are used up")
+        self._left -= 1
+        return self._v(t, x)
+
+    def step(self, t: Tensor, x: Tensor, h: Tensor) -> None:
+        self.steps += 1
+        self.last = x if torch.isfinite(x).all() else self.last
+
+    def reject(self, t: Tensor, x: Tensor, h: Tensor) -> None:
+        self.rejected += 1
+
+    def callbacks(self, known: set[str]) -> Callable[[Tensor, Tensor], Tensor]:
+        """The field with those callbacks that the method knows: torchdiffeq warns about others."""
+
+        def field(t: Tensor, x: Tensor) -> Tensor:
+            return self(t, x)
+
+        for name, call in (("callback_step", self.step), ("callback_reject_step", self.reject)):
+            if name in known:
+                setattr(field, name, call)
+        return field
+
+
+def _end(field: _Scene, times: Tensor, name: str, tolerance: float, finish: Tensor | None) -> tuple[Tensor, bool]:
+    """State at the end and True, or the last finite one and False."""
+    import torchdiffeq
+
+    method, x = torchdiffeq_methods()[name], field.last
+    grid = times.to(x)
+    options = {"grid_constructor": lambda v, x_0, span: grid} if is_fixed(name) else {}
+    if not torch.isfinite(x).all():
+        return x, False
+    try:
+        end = torchdiffeq.odeint(
+            field.callbacks(method.valid_callbacks()), x, grid[[0, -1]],
+            rtol=tolerance, atol=tolerance, method=name, options=options,
+        )[-1]  # fmt: skip
+        if finish is not None:
+            field.last = end if torch.isfinite(end).all() else field.last
+            end = euler(field, grid[-1], finish.to(x), end)
+    except (_Spent, AssertionError) as error:  # it asserts that steps do not underflow and that values are finite
+        field.trouble = str(error)
+        return field.last, False
+    return (end, True) if torch.isfinite(end).all() else (field.last, False)

@@ -1,0 +1,54 @@
+"""Embedded Runge-Kutta pairs: a step and an estimate of its error from the same stages."""
+
+from typing import NamedTuple
+
+
+class Pair(NamedTuple):
+    """An embedded pair whose last stage is the next step's first ("first same as last").
+
+    Attributes:
+        order: Of the solution that is carried on.
+        nodes: c of stages 2 to s, as shares of the step.
+        rows: a of stages 2 to s; the last row makes the new state.
+        error: Weights of the stages' difference between the two solutions.
+        stability: |h lambda| above which a step is at the edge of what is stable on the negative real axis.
+        evaluations: None: how many a solution takes depends on the scene.
+    """
+
+    order: int
+    nodes: tuple[float, ...]
+    rows: tuple[tuple[float, ...], ...]
+    error: tuple[float, ...]
+    stability: float
+    evaluations: None = None
+
+    @property
+    def stages(self) -> int:
+        """Evaluations a step."""
+        return len(self.rows)
+
+
+# Bogacki, Shampine, A 3(2) pair of Runge-Kutta formulas, 1989.
+bosh3 = Pair(
+    order=3,
+    nodes=(1 / 2, 3 / 4, 1),
+    rows=((1 / 2,), (0, 3 / 4), (2 / 9, 1 / 3, 4 / 9)),
+    error=(2 / 9 - 7 / 24, 1 / 3 - 1 / 4, 4 / 9 - 1 / 3, -1 / 8),
+    stability=1.75,  # 2.51, less what its last two stages see of different times
+)
+
+# Dormand, Prince, A family of embedded Runge-Kutta formulae, 1980.
+dopri5 = Pair(
+    order=5,
+    nodes=(1 / 5, 3 / 10, 4 / 5, 8 / 9, 1, 1),
+    rows=(
+        (1 / 5,),
+        (3 / 40, 9 / 40),
+        (44 / 45, -56 / 15, 32 / 9),
+        (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
+        (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
+        (35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
+    ),
+    error=(71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40),
+    stability=3.0,  # 3.31; Hairer's 3.25 goes with longer steps
+)

@@ -1,0 +1,199 @@
+"""What solvers make of what should not happen: each case with its stated outcome, none of them an exception."""
+
+import logging
+import math
+
+import pytest
+import torch
+
+from r2flow.errors import InputError
+from r2flow.flow.path import expand_time
+from r2flow.flow.problems import Gaussian, Mixed, PointMass, Rotating, StiffLinear, Straight
+from r2flow.flow.solvers import FLOOR, SOLVERS, adaptive, solve
+
+METHODS = [*SOLVERS, "torchdiffeq:dopri5", "torchdiffeq:rk4"]
+ADAPTIVE = ["bosh3", "dopri5"]
+X_0 = torch.randn(4, 16, generator=torch.Generator().manual_seed(3))
+
+
+class Spoiled(Mixed):
+    """Scene 2 becomes NaN once t passes .5."""
+
+    def select(self, scenes):
+        return Spoiled([self.problems[scene] for scene in scenes.tolist()])
+
+    def __call__(self, t, x):
+        late = torch.tensor([problem is SPOILED for problem in self.problems])[:, None] & (expand_time(t, x) > 0.5)
+        return torch.where(late, math.nan, super().__call__(t, x))
+
+
+SPOILED = Straight()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_scene_whose_velocity_becomes_nan_is_flagged_and_the_others_are_right(method):
+    batch = Spoiled([Gaussian(), Gaussian(), SPOILED, Straight()])
+    solution = solve(batch, X_0, method=method, steps=64, tolerance=1e-5)
+    assert solution.converged.tolist() == [True, True, False, True]
+    assert solution.x.isfinite().all()
+    exact = batch.solution(X_0, 1.0)
+    error = (solution.x - exact).abs().amax(1)[[0, 1, 3]].max()
+    # torchdiffeq takes its last step beyond t = 1 and interpolates back.
+    assert error < {"euler": 5e-2, "torchdiffeq:dopri5": 5e-3}.get(method, 1e-3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_nan_at_the_start_is_flagged_at_once(method):
+    x_0 = X_0.clone()
+    x_0[1, 3] = math.nan
+    solution = solve(Gaussian(), x_0, method=method, steps=8, tolerance=1e-4, global_error=True)
+    assert solution.converged.tolist() == [True, False, True, True]
+    assert solution.x[[0, 2, 3]].isfinite().all()
+    assert math.isinf(solution.global_error[1])
+    if method in ADAPTIVE:
+        assert solution.evaluations[1] < 5
+
+
+def test_the_last_finite_state_is_kept():
+    # x' = 1 until t = .5, where it ends: four of eight steps are good.
+    def velocity(t, x):
+        return torch.where(expand_time(t, x) >= 0.5, math.nan, torch.ones_like(x))
+
+    solution = solve(velocity, torch.zeros(1, 2), steps=8)
+    assert solution.x.tolist() == [[0.5, 0.5]]
+    stuck = solve(velocity, torch.zeros(1, 2), method="dopri5")
+    assert stuck.x[0, 0].item() == pytest.approx(0.5, abs=1e-5)
+    assert not stuck.converged.any()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_velocity_a_thousand_times_too_large_is_survived(method):
+    # Blown up or solved, each scene says which; the state stays finite.
+    problem = Rotating(turns=0.5 * 1e3)
+    solution = solve(problem, X_0, method=method, steps=32, tolerance=1e-3, max_evaluations=1000)
+    assert solution.x.isfinite().all()
+    if method in ADAPTIVE:
+        error = (solution.x.double() - problem.solution(X_0, 1.0)).square().mean(1).sqrt()
+        assert ((error < 1) | ~solution.converged).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_growth_beyond_float32_is_flagged(method):
+    # x' = 1000 x grows by e^1000.
+    solution = solve(lambda t, x: 1e3 * x, X_0, method=method, steps=64, tolerance=1e-3)
+    assert not solution.converged.any()
+    assert solution.x.isfinite().all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_nowhere_to_go_is_the_start_at_no_cost(method):
+    for t in (0.0, 1.0):
+        solution = solve(Gaussian(), X_0, t, t, method=method, global_error=True)
+        assert torch.equal(solution.x, X_0)
+        assert solution.evaluations.tolist() == [0] * 4
+        assert solution.converged.all()
+        assert solution.global_error.tolist() == [0.0] * 4
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_t_exactly_0_and_1_are_asked_for_and_answered(method):
+    problem = Gaussian()
+    there = solve(problem, X_0.double(), 0.0, 1.0, method=method, steps=128, tolerance=1e-7).x
+    back = solve(problem, there, 1.0, 0.0, method=method, steps=128, tolerance=1e-7).x
+    torch.testing.assert_close(back, X_0.double(), rtol=0, atol=0.2 if method == "euler" else 1e-2)
+
+
+def test_no_steps_no_budget_and_no_time_are_refused():
+    for wrong, message in [
+        ({"steps": 0}, "at least 1 step, found 0"),
+        ({"tolerance": math.nan}, "must be positive"),
+        ({"finish": 1.0}, "shorter than the whole way"),
+        ({"finish": -1e-3}, "shorter than the whole way"),
+        ({"max_evaluations": 0}, "at least 1 evaluation"),
+        ({"max_step": 0.0}, "a share of the interval"),
+        ({"t_1": math.inf}, "needs two times"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            solve(Gaussian(), X_0, **wrong)
+
+
+@pytest.mark.parametrize("method", [*ADAPTIVE, "torchdiffeq:dopri5"])
+def test_a_tolerance_that_float32_cannot_hold_is_floored_and_said_so_once(method, caplog):
+    adaptive._warned.clear()
+    with caplog.at_level(logging.WARNING):
+        floored = solve(Gaussian(), X_0, method=method, tolerance=1e-12)
+        solve(Gaussian(), X_0, method=method, tolerance=1e-12)
+    assert [record.message for record in caplog.records] == [
+        "a tolerance of 1e-12 is below what float32 can hold: 1e-07 is used."
+    ]
+    at_floor = solve(Gaussian(), X_0, method=method, tolerance=FLOOR[torch.float32])
+    assert torch.equal(floored.x, at_floor.x)
+    assert floored.converged.all()
+    torch.testing.assert_close(floored.x.double(), Gaussian().solution(X_0, 1.0), rtol=0, atol=3e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_a_tolerance_below_the_noise_of_a_half_precision_network_is_floored(dtype, caplog):
+    adaptive._warned.clear()
+    problem = Rotating()
+
+    def network(t, x):
+        return problem(t, x.to(dtype).float()).to(dtype)
+
+    with caplog.at_level(logging.WARNING):
+        noisy = solve(network, X_0, method="dopri5", tolerance=1e-7, global_error=True)
+    assert f"{FLOOR[dtype]:g} is used" in caplog.text
+    assert noisy.x.dtype == torch.float32
+    error = (noisy.x.double() - problem.solution(X_0, 1.0)).square().mean(1).sqrt()
+    assert (error < 0.05).all()
+    assert (noisy.global_error > error / 5).all()
+    assert (noisy.global_error < error * 5).all()
+
+
+def test_autocast_around_the_network_counts_as_its_precision(caplog):
+    adaptive._warned.clear()
+    weight = torch.eye(16)
+    with torch.autocast("cpu", dtype=torch.bfloat16), caplog.at_level(logging.WARNING):
+        solution = solve(lambda t, x: (x @ weight).float(), X_0, method="dopri5", tolerance=1e-6)
+    assert "below what bfloat16 can hold" in caplog.text
+    torch.testing.assert_close(solution.x, math.e * X_0, rtol=2e-2, atol=2e-2)
+
+
+@pytest.mark.parametrize("method", [*ADAPTIVE, "torchdiffeq:dopri5"])
+def test_a_budget_is_kept_to_and_what_exhausts_it_is_flagged(method):
+    easy = Straight()
+    batch = Mixed([easy, StiffLinear(1e6), easy])
+    solution = solve(batch, X_0[:3], method=method, tolerance=1e-3, max_evaluations=200)
+    assert solution.converged.tolist() == [True, False, True]
+    assert (solution.evaluations <= 200).all()
+    assert solution.x.isfinite().all()
+    torch.testing.assert_close(solution.x[[0, 2]].double(), easy.solution(X_0[[0, 2]], 1.0), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", ADAPTIVE)
+def test_a_point_mass_needs_its_last_stretch_left_to_one_step(method):
+    # (point - x) / (1 - t) is 0 / 0 at t = 1; from 1 - eps one Euler step is exact.
+    problem, x_0 = PointMass(), X_0.double()
+    finished = solve(problem, x_0, method=method, tolerance=1e-3, finish=1e-3)
+    torch.testing.assert_close(finished.x, torch.full_like(x_0, 0.5), rtol=0, atol=1e-14)
+    assert finished.converged.all()
+    assert finished.evaluations.max() <= 20
+    unfinished = solve(problem, x_0, method=method, tolerance=1e-3)
+    assert not unfinished.converged.any()
+    torch.testing.assert_close(unfinished.x, torch.full_like(x_0, 0.5), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_batch_of_no_scenes_is_solved(method):
+    assert solve(Gaussian(), torch.zeros(0, 4), method=method).x.shape == (0, 4)
+
+
+def test_a_defect_of_the_network_is_raised_not_flagged():
+    def broken(t, x):
+        raise RuntimeError("out of memory")
+
+    for method in METHODS:
+        with pytest.raises(RuntimeError, match="out of memory"):
+            solve(broken, X_0, method=method)
+    with pytest.raises(ValueError, match="must have the state's shape"):
+        solve(lambda t, x: x[:, :1], X_0)

@@ -1,0 +1,173 @@
+"""What per-scene steps owe: fewer evaluations, no influence of neighbours, nothing asked outside the interval."""
+
+import math
+import statistics
+
+import pytest
+import torch
+
+from r2flow.flow.path import expand_time
+from r2flow.flow.problems import Gaussian, Mixed, RayDrop, Rotating, StiffLinear, Straight, TwoModes
+from r2flow.flow.solvers import solve
+from r2flow.noise import standard_normal
+
+ADAPTIVE = ["bosh3", "dopri5"]
+
+
+def noise(scenes, elements=256, seed=0):
+    return torch.stack([standard_normal((elements,), seed, "evaluation", scene) for scene in range(scenes)])
+
+
+def worst(x, exact):
+    return (x.double() - exact).square().mean(1).sqrt().max().item()
+
+
+def as_one_state(velocity, x_0, tolerance):
+    """torchdiffeq's dopri5 on the whole batch: its end, and its evaluations times the scenes."""
+    import torchdiffeq
+
+    calls = []
+
+    def counted(t, x):
+        calls.append(t)
+        return velocity(t, x)
+
+    end = torchdiffeq.odeint(counted, x_0, torch.tensor([0.0, 1.0]), rtol=tolerance, atol=tolerance, method="dopri5")
+    return end[-1], len(x_0) * len(calls)
+
+
+def mixed_16():
+    straight, smooth, modes, drop = Straight(), Gaussian(), TwoModes(), RayDrop()
+    return Mixed([straight] * 8 + [smooth] * 4 + [modes] * 3 + [drop])
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-5])
+def test_a_mixed_batch_takes_six_tenths_of_the_evaluations_of_one_common_step(tolerance):
+    # Four draws of the batch: one step more or less of torchdiffeq's eight moves a single one by an eighth.
+    batch, ours, theirs = mixed_16(), [], []
+    for seed in range(4):
+        x_0 = noise(16, seed=seed)
+        exact = batch.solution(x_0, 1.0)
+        solution = solve(batch, x_0, method="dopri5", tolerance=tolerance)
+        end, evaluations = as_one_state(batch, x_0, tolerance)
+        ours.append((solution.evaluations.sum().item(), worst(solution.x, exact)))
+        theirs.append((evaluations, worst(end, exact)))
+    share = sum(n for n, _ in ours) / sum(n for n, _ in theirs)
+    hardest = [statistics.median(error for _, error in found) for found in (ours, theirs)]
+    print(f"tolerance {tolerance:g}: {share:.2f} of the evaluations, hardest scene {hardest[0]:.1e} / {hardest[1]:.1e}")
+    assert share <= 0.6
+    if tolerance == 1e-3:
+        assert hardest[0] < hardest[1]
+
+
+@pytest.mark.parametrize("hard", [TwoModes(), Gaussian(std=0.01)], ids=["two modes", "narrow"])
+def test_a_hard_scene_does_not_go_under_among_easy_ones(hard):
+    easy = Straight()
+    batch, x_0 = Mixed([easy] * 255 + [hard]), noise(256, 64)
+    exact = batch.solution(x_0, 1.0)
+    ours = solve(batch, x_0, method="dopri5", tolerance=1e-3)
+    theirs, _ = as_one_state(batch, x_0, 1e-3)
+    assert worst(ours.x[255:], exact[255:]) < 5e-3
+    assert worst(theirs[255:], exact[255:]) > 5e-2
+
+
+@pytest.mark.parametrize("method", ADAPTIVE)
+def test_a_scene_s_result_is_the_same_alone_in_any_batch_and_in_any_place(method):
+    problems = [Straight(), TwoModes(), RayDrop(), Gaussian(), Gaussian(std=0.01), StiffLinear(), Rotating()]
+    x_0 = noise(len(problems), 96)
+    together = solve(Mixed(problems), x_0, method=method, tolerance=1e-4, global_error=True)
+    order = torch.tensor([3, 6, 0, 5, 1, 4, 2])
+    shuffled = solve(Mixed(problems).select(order), x_0[order], method=method, tolerance=1e-4, global_error=True)
+    assert len(set(together.evaluations.tolist())) > 3
+    for name in ("x", "evaluations", "accepted", "rejected", "stiff", "converged", "global_error"):
+        assert torch.equal(getattr(together, name)[order], getattr(shuffled, name)), name
+    for scene, problem in enumerate(problems):
+        alone = solve(problem, x_0[scene : scene + 1], method=method, tolerance=1e-4)
+        assert torch.equal(alone.x[0], together.x[scene])
+        assert alone.accepted[0] == together.accepted[scene]
+
+
+@pytest.mark.parametrize("method", ADAPTIVE)
+def test_a_scene_that_has_arrived_is_asked_no_more(method):
+    seen = []
+
+    class Watched(Mixed):
+        def select(self, scenes):
+            return Watched([self.problems[scene] for scene in scenes.tolist()])
+
+        def __call__(self, t, x):
+            seen.append(len(x))
+            return super().__call__(t, x)
+
+    solution = solve(Watched([Straight()] * 3 + [TwoModes()]), noise(4), method=method, tolerance=1e-4)
+    assert seen == sorted(seen, reverse=True)
+    assert seen[-1] == 1
+    # Rows seen by the network are what is counted, and nothing else is.
+    assert sum(seen) == solution.evaluations.sum().item()
+
+
+@pytest.mark.parametrize("method", ["heun2", "rk4", *ADAPTIVE])
+@pytest.mark.parametrize(("t_0", "t_1"), [(0.0, 1.0), (1.0, 0.0), (0.2, 0.7), (0.1, 0.3000001)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_nothing_is_evaluated_outside_the_interval(method, t_0, t_1, dtype):
+    asked = []
+
+    def velocity(t, x):
+        asked.append(t.clone())
+        return Gaussian(std=0.05)(t, x)
+
+    start = noise(5).to(dtype)
+    solution = solve(velocity, start, t_0, t_1, method=method, steps=7, tolerance=1e-4)
+    ends = torch.tensor([t_0, t_1], dtype=torch.float64).to(dtype)
+    for t in asked:
+        assert t.dtype == dtype
+        assert (t >= ends.min()).all()
+        assert (t <= ends.max()).all()
+    assert any((t == ends[1]).any() for t in asked)
+    assert solution.converged.all()
+
+
+@pytest.mark.parametrize("method", ADAPTIVE)
+def test_evaluations_are_two_to_begin_with_and_the_stages_of_every_step(method):
+    # The last stage is the next step's first: 3 and 6 a step.
+    solution = solve(TwoModes(), noise(3), method=method, tolerance=1e-5)
+    steps = solution.accepted + solution.rejected
+    assert torch.equal(solution.evaluations, 2 + {"bosh3": 3, "dopri5": 6}[method] * steps)
+
+
+@pytest.mark.parametrize("method", ADAPTIVE)
+def test_a_tolerance_buys_accuracy(method):
+    x_0 = noise(4).double()
+    problem = Rotating()
+    errors = [
+        worst(solve(problem, x_0, method=method, tolerance=10.0**-n).x, problem.solution(x_0, 1.0)) for n in (3, 5, 7)
+    ]
+    assert errors[1] < errors[0] / 20
+    assert errors[2] < errors[1] / 20
+
+
+@pytest.mark.parametrize("method", ADAPTIVE)
+def test_what_is_stiff_is_flagged_and_what_is_smooth_is_not(method):
+    problems = [StiffLinear(1e4), StiffLinear(1e6), Straight(), Gaussian(), Gaussian(std=0.01), TwoModes(), RayDrop()]
+    solution = solve(Mixed(problems), noise(7).double(), method=method, tolerance=1e-3, max_evaluations=3000)
+    assert solution.stiff.tolist() == [True, True, False, False, False, False, False]
+
+
+def test_moderate_stiffness_is_flagged_where_stability_holds_the_steps_short():
+    solution = solve(StiffLinear(1e2), noise(2).double(), method="dopri5", tolerance=1e-3)
+    assert solution.stiff.all()
+    assert solution.converged.all()
+
+
+def test_a_limit_on_the_step_finds_what_a_long_step_passes_over():
+    # A kick of 1 at t = .5003 within 2e-3: x(1) = x_0 + 1.
+    def kick(t, x):
+        z = (expand_time(t, x) - 0.5003) / 2e-3
+        return torch.exp(-0.5 * z**2) / (2e-3 * math.sqrt(2 * math.pi)) + 0 * x
+
+    x_0 = torch.zeros(1, 4, dtype=torch.float64)
+    passed = solve(kick, x_0, method="dopri5", tolerance=1e-3)
+    found = solve(kick, x_0, method="dopri5", tolerance=1e-3, max_step=1 / 128)
+    assert passed.x.abs().max() < 1e-6
+    assert (found.x - 1).abs().max() < 1e-2
+    assert found.evaluations > passed.evaluations
