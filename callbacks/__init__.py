@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
+from callbacks.curvature import Curvature
 from callbacks.ema import EMA
 from callbacks.pictures import SamplePictures
 from callbacks.progress import Progress
@@ -59,7 +60,9 @@ def keep_checkpoints(folder: Path, every: int = 1000) -> list[Callback]:
         "monitor": "step",  # the largest step is the best: keeps the newest
         "mode": "max",
     }
-    regular = ModelCheckpoint(every_n_train_steps=every, save_top_k=2, **common)
+    # Without the last argument it would leave the run's last step to a validation that may not come, and a third
+    # checkpoint would stay.
+    regular = ModelCheckpoint(every_n_train_steps=every, save_top_k=2, save_on_train_epoch_end=True, **common)
     final = ModelCheckpoint(every_n_epochs=1, save_on_train_epoch_end=True, save_top_k=1, **common)
     return [regular, final]
 
@@ -72,6 +75,7 @@ CALLBACKS = Registry(
         SamplePictures,
         lambda config, parts: (Path(config["run_dir"], "pictures"), parts.sensor, parts.encoding, config["seed"]),
     ),
+    curvature=Entry(Curvature, lambda config, parts: ((parts.encoding.channels, *parts.sensor.shape), config["seed"])),
     checkpoint=Entry(keep_checkpoints, lambda config, parts: (Path(config["run_dir"], FOLDER),)),
     progress=Entry(Progress),
 )
@@ -95,4 +99,12 @@ def build_loggers(names: Sequence[str] | None, run_dir: Path) -> list[Logger]:
     return [LOGGERS[name](run_dir) for name in names or []]
 
 
-__all__ = ["EMA", "Progress", "SamplePictures", "build_callbacks", "build_loggers", "keep_checkpoints"]
+__all__ = [
+    "EMA",
+    "Curvature",
+    "Progress",
+    "SamplePictures",
+    "build_callbacks",
+    "build_loggers",
+    "keep_checkpoints",
+]

@@ -1,12 +1,17 @@
 """Verbs for trained flows and their backbones."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.options import CheckpointOption, OutOption, SensorOption, SizeOption, build_sized, choose_device
+from r2flow.errors import InputError
+
+if TYPE_CHECKING:
+    from r2flow.checkpoints import Checkpoint
+    from r2flow.lidar.region import Region
 
 
 @app.command(epilog="Example: r2flow sample --checkpoint runs/simulated-hdit_tiny --num 16 --steps 64 --out scans")
@@ -14,22 +19,38 @@ def sample(
     checkpoint: CheckpointOption,
     out: OutOption,
     num: Annotated[int, typer.Option(min=1, help="Number of scans.")] = 4,
-    steps: Annotated[int, typer.Option(min=1, help="Equal steps from noise to data.")] = 32,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Equal steps from noise to data; 32, or k of a k-TD flow, if left out.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0,
-    solver: Annotated[str, typer.Option(help="euler, midpoint, heun2, heun3, rk4, torchdiffeq:dopri5, ...")] = "euler",
+    solver: Annotated[
+        str, typer.Option(help="euler, midpoint, heun2, heun3, rk4, ab2; adaptive: dopri5, bosh3, torchdiffeq:NAME.")
+    ] = "euler",
     tolerance: Annotated[float, typer.Option(help="Of an adaptive solver.")] = 1e-5,
     format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture.")] = 8,
+    sector: Annotated[
+        str | None, typer.Option(help="Azimuths in degrees, as -45,45 for the quarter ahead: generate no more.")
+    ] = None,
+    rows: Annotated[str | None, typer.Option(help="Rows of the image, as 0-31 for the upper half of 64.")] = None,
+    channels: Annotated[str, typer.Option(help="both, range, or reflectance: what is decoded and written.")] = "both",
+    straight_first: Annotated[
+        bool, typer.Option("--straight-first", help="One step for the scenes that are straight, --solver for others.")
+    ] = False,
     batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto",
 ) -> None:
     """Draw scans from a trained flow: point clouds, range images and pictures."""
     from r2flow.checkpoints import load_checkpoint
-    from r2flow.reports.outputs import FORMATS, write_samples
+    from r2flow.reports.outputs import formats_of, write_samples
 
     loaded = load_checkpoint(checkpoint, device=choose_device(device))
-    formats = format.split(",") if format else [f for f in FORMATS if loaded.encoding.reflectance or f != "bin"]
-    write_samples(loaded, out, num, steps, seed, solver, formats, pictures, batch_size, tolerance)
+    steps = steps or loaded.distilled_steps or 32
+    formats = format.split(",") if format else formats_of(loaded, channels)
+    part = choose_region(loaded, sector, rows) if sector or rows else None
+    write_samples(
+        loaded, out, num, steps, seed, solver, formats, pictures, batch_size, tolerance, part, channels, straight_first
+    )
     seen = f", pictures in {out / 'samples.png'}" if pictures else ""
     print(f"{num} scans ({', '.join(formats)}) in {out}{seen}")
 
@@ -89,3 +110,25 @@ def backbones(
         print(encoder.dumps(measured, indent=2))
     else:
         print_costs(measured, chosen, where)
+
+
+def choose_region(checkpoint: "Checkpoint", sector: str | None, rows: str | None) -> "Region":
+    """The region of --sector and --rows; says what is generated where that is more than was asked for."""
+    from r2flow.lidar.region import region
+    from r2flow.sampling import evaluated_region
+
+    angles = None if sector is None else _pair("--sector", sector, ",", float, "two azimuths in degrees, as -45,45")
+    limits = None if rows is None else _pair("--rows", rows, "-", int, "the first and the last row, as 0-31")
+    wanted = region(checkpoint.sensor.shape, angles, limits)
+    seen = evaluated_region(checkpoint, wanted)
+    rounded = "" if seen == wanted else f", rounded outward from {wanted}"
+    print(f"generating {seen}{rounded}: {seen.share:.0%} of the image")
+    return wanted
+
+
+def _pair(option: str, text: str, between: str, kind: type, meaning: str) -> tuple[Any, Any]:
+    try:
+        first, second = (kind(part) for part in text.split(between))
+    except ValueError:
+        raise InputError(f"{option} must be {meaning}; found {text!r}.") from None
+    return first, second

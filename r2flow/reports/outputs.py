@@ -1,9 +1,13 @@
 """Generated scans as files and pictures."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
+import torch
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -20,12 +24,22 @@ from torch import Tensor
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.flow.solvers import SOLVERS
+from r2flow.flow.solvers import SOLVERS, adapts, check_method
 from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.region import Region
 from r2flow.lidar.scan_files import write_points
-from r2flow.sampling import batches, sample
+from r2flow.sampling import batches, check_channels, sample
+
+log = logging.getLogger(__name__)
 
 FORMATS = ("ply", "bin", "npy")
+
+
+def formats_of(checkpoint: Checkpoint, channels: str = "both") -> list[str]:
+    """The output formats that can hold what there will be: a .bin needs reflectance, a point needs its range."""
+    if channels == "reflectance":
+        return ["npy"]
+    return [name for name in FORMATS if name != "bin" or (channels == "both" and checkpoint.encoding.reflectance)]
 
 
 def write_samples(
@@ -39,6 +53,9 @@ def write_samples(
     pictures: int = 8,
     batch_size: int = 1,
     tolerance: float = 1e-5,
+    region: Region | None = None,
+    channels: str = "both",
+    straight_first: bool = False,
 ) -> list[np.ndarray]:
     """Draw scans and write each as `out/NNNNNN.FORMAT`, with a page and a contact sheet of the first ones.
 
@@ -46,42 +63,108 @@ def write_samples(
 
     Args:
         formats: `ply` and `bin` are points in metres with reflectance, `npy` the range image,
-            float32 (2 or 1, H, W) in metres and reflectance.
+            float32 (2 or 1, H, W) in metres and reflectance; reflectance alone is `NNNNNN.reflectance.npy`.
         pictures: How many scans get a page of their own; the contact sheet shows at most 8 of them.
+        region, channels, straight_first: See `r2flow.sampling.sample`. Pictures show the region alone, files are
+            of the sensor's shape, 0 outside.
 
     Returns:
         The images drawn as pictures.
 
     Raises:
-        InputError: an unknown format, `bin` from a model without reflectance, or nothing to draw.
+        InputError: an unknown format, one that cannot hold what is asked for, or nothing to draw.
     """
     if num < 1 or steps < 1 or batch_size < 1:
         raise InputError(f"needs at least one scan, step and scan a batch; found {num}, {steps} and {batch_size}.")
+    check_channels(checkpoint, channels)
+    check_formats(checkpoint, formats, channels)
+    check_method(method)
+    if straight_first and not adapts(method):
+        raise InputError(f"scenes that are not straight need an adaptive solver, dopri5 or bosh3; found {method!r}.")
+    out, rays = Path(out), checkpoint.sensor.rays()
+    shown: list[np.ndarray] = []
+    with ScanBar("sampling", num, batches(num, batch_size) * evaluations_of(method, steps)) as bar:
+        for drawn in sample(
+            checkpoint, num, steps, seed, method, tolerance, batch_size,
+            progress=bar.evaluated, region=region, channels=channels, straight_first=straight_first,
+        ):  # fmt: skip
+            lost = [drawn.first + offset for offset, solved in enumerate(drawn.converged.tolist()) if not solved]
+            if lost:
+                log.warning("not solved, and no scans of this flow: %s; try another solver.", ", ".join(map(str, lost)))
+            for offset, image in enumerate(drawn.images.numpy()):
+                name = f"{drawn.first + offset:06d}"
+                if channels == "reflectance":
+                    _save(image, out / f"{name}.reflectance.npy")
+                else:
+                    write_scan(image, rays, out, name, formats)
+                if len(shown) < pictures:
+                    shown.append(image)
+            bar.finished(min(drawn.first + batch_size, num))
+    if shown:
+        parts = shown if region is None else [region.crop(torch.from_numpy(image)).numpy() for image in shown]
+        if channels == "reflectance":
+            draw_reflectances(parts[:8], out)
+        else:
+            draw_pages(parts, rays if region is None else region.crop(rays), out)
+    return shown
+
+
+def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str) -> None:
+    """Know the formats before there is anything to write.
+
+    Raises:
+        InputError: an unknown one, or one that cannot hold what is asked for.
+    """
+    fitting = formats_of(checkpoint, channels)
     for name in formats:
         if name not in FORMATS:
             raise InputError(f"no output format named {name!r}; known: {', '.join(FORMATS)}.")
-    if not checkpoint.encoding.reflectance and "bin" in formats:
-        raise InputError("a KITTI .bin holds reflectance and this model has none; use --format ply,npy.")
-    out, rays = Path(out), checkpoint.sensor.rays()
-    shown: list[np.ndarray] = []
-    # Between two finished scans the bar moves with the evaluations, whose number a fixed-step method knows.
-    per_step = SOLVERS[method].evaluations if method in SOLVERS else 0
-    share = num / (per_step * steps * batches(num, batch_size)) if per_step else 0.0
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("scans"), ScansPerSecond(), TimeRemainingColumn())
-    with Progress(TextColumn("sampling"), *columns) as bar:
-        task = bar.add_task("scans", total=num)
-        for drawn in sample(
-            checkpoint, num, steps, seed, method, tolerance, batch_size,
-            progress=lambda: bar.advance(task, share),
-        ):  # fmt: skip
-            for offset, image in enumerate(drawn.images.numpy()):
-                write_scan(image, rays, out, f"{drawn.first + offset:06d}", formats)
-                if len(shown) < pictures:
-                    shown.append(image)
-            bar.update(task, completed=min(drawn.first + batch_size, num))
-    if shown:
-        draw_pages(shown, rays, out)
-    return shown
+        if name not in fitting:
+            held = "points, which need a range," if channels == "reflectance" else "reflectance"
+            whose = "this model has none" if channels == "both" else f"--channels {channels} leaves it out"
+            raise InputError(f"a .{name} holds {held} and {whose}; use --format {','.join(fitting)}.")
+
+
+def evaluations_of(method: str, steps: int) -> int:
+    """Network evaluations of a solution; 0 where they depend on the scene."""
+    return steps * (SOLVERS[method].evaluations or 0) if method in SOLVERS else 0
+
+
+class ScanBar:
+    """A progress bar of scans with their rate and the time left, which moves with the evaluations between two scans.
+
+    Args:
+        what: What is done to them.
+        num: Scans in all.
+        evaluations: Network evaluations in all, batches counted as one; 0 where nobody knows: then a batch is taken
+            to need as many as the one before it.
+    """
+
+    def __init__(self, what: str, num: int, evaluations: int = 0) -> None:
+        columns = BarColumn(), MofNCompleteColumn(), TextColumn("scans"), ScansPerSecond(), TimeRemainingColumn()
+        self._bar = Progress(TextColumn(what), *columns, TextColumn("{task.fields[spent]} evaluations"))
+        self._task = self._bar.add_task(what, total=num, spent=0)
+        self._num, self._share = num, num / evaluations if evaluations else 0.0
+        self._spent = self._done = self._spent_before = 0
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._bar.stop()
+
+    def evaluated(self) -> None:
+        """One more evaluation of the network."""
+        self._spent += 1
+        self._bar.update(self._task, advance=self._share, spent=self._spent)
+
+    def finished(self, done: int) -> None:
+        """So many scans are done by now."""
+        if self._spent > self._spent_before:
+            self._share = (done - self._done) / (self._spent - self._spent_before)
+        self._done, self._spent_before = done, self._spent
+        self._bar.update(self._task, completed=done)
 
 
 class ScansPerSecond(ProgressColumn):
@@ -98,8 +181,7 @@ def write_scan(image: np.ndarray, rays: Tensor, out: Path, name: str, formats: S
     for ending in formats:
         path = out / f"{name}.{ending}"
         if ending == "npy":
-            with atomic_write(path) as file:
-                np.save(file, image)
+            _save(image, path)
         else:
             write_points(path, xyz, reflectance if len(image) > 1 else None)
 
@@ -112,3 +194,23 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path) -> Path:
     for index, image in track(numbered, "drawing", disable=len(numbered) < 3, transient=True):
         save_figure(scan_figure(image, rays, f"sample {index}"), out / f"{index:06d}.png")
     return save_figure(contact_sheet(images[:8], rays), out / "samples.png")
+
+
+def draw_reflectances(images: Sequence[np.ndarray], out: Path) -> Path:
+    """`samples.png` of scans without a range, (1, h, w) each: their reflectance, one under the other."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from r2flow.reports.pictures import BACKGROUND, draw_reflectance, save_figure
+
+    figure = Figure(figsize=(13, 1.2 * len(images) + 0.3), facecolor=BACKGROUND, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes: Any = figure.subplots(len(images), 1, squeeze=False)[:, 0]
+    for row, (image, place) in enumerate(zip(images, axes, strict=True)):
+        draw_reflectance(place, np.concatenate([image, image]), label=row == 0)  # a ray without any was dropped
+    return save_figure(figure, out / "samples.png")
+
+
+def _save(image: np.ndarray, path: Path) -> None:
+    with atomic_write(path) as file:
+        np.save(file, image)

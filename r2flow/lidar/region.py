@@ -1,0 +1,115 @@
+"""A part of the image: an azimuth sector, a block of rows. Pure geometry."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+
+Rectangle = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Region:
+    """A rectangle of an image whose columns are a ring.
+
+    Attributes:
+        shape: Rows and columns (H, W) of the whole image.
+        top: First row.
+        height: Number of rows.
+        left: First column.
+        width: Number of columns from there on, round the ring where they pass its end.
+    """
+
+    shape: tuple[int, int]
+    top: int
+    height: int
+    left: int
+    width: int
+
+    @property
+    def rows(self) -> Tensor:
+        """Numbers of the rows, (height,)."""
+        return torch.arange(self.top, self.top + self.height)
+
+    @property
+    def columns(self) -> Tensor:
+        """Numbers of the columns, (width,)."""
+        return torch.arange(self.left, self.left + self.width) % self.shape[1]
+
+    @property
+    def share(self) -> float:
+        """Part of the image's pixels, 0 to 1."""
+        return self.height * self.width / math.prod(self.shape)
+
+    def crop(self, image: Tensor) -> Tensor:
+        """(..., H, W) to (..., height, width)."""
+        rows, columns = self.rows.to(image.device), self.columns.to(image.device)
+        return image.index_select(-2, rows).index_select(-1, columns)
+
+    def place(self, part: Tensor) -> Tensor:
+        """(..., height, width) in an image of zeros, (..., H, W)."""
+        image = part.new_zeros(*part.shape[:-2], *self.shape)
+        rows, columns = self.rows.to(part.device), self.columns.to(part.device)
+        image[..., rows[:, None], columns] = part
+        return image
+
+    def rounded(self, unit: tuple[int, int]) -> "Region":
+        """The smallest region around this one that whole units of so many rows and columns make up.
+
+        Raises:
+            InputError: the image itself is not made up of them.
+        """
+        if any(size % step for size, step in zip(self.shape, unit, strict=True)):
+            raise InputError(f"an image of {self.shape} is not made up of units of {unit} pixels.")
+        top, height = _outward(self.top, self.height, unit[0])
+        left, width = _outward(self.left, self.width, unit[1])
+        if width >= self.shape[1]:  # a unit at the seam may be met from both sides
+            left, width = 0, self.shape[1]
+        return Region(self.shape, top, height, left, width)
+
+    def __str__(self) -> str:
+        last_row, last_column = self.top + self.height - 1, (self.left + self.width - 1) % self.shape[1]
+        return f"rows {self.top}-{last_row}, columns {self.left}-{last_column}"
+
+
+def _outward(first: int, count: int, unit: int) -> tuple[int, int]:
+    begin = first // unit * unit
+    return begin, -(-(first + count) // unit) * unit - begin
+
+
+def region(
+    shape: tuple[int, int], sector: tuple[float, float] | None = None, rows: tuple[int, int] | None = None
+) -> Region:
+    """The pixels that look into an azimuth sector and belong to a block of rows.
+
+    Args:
+        shape: Rows and columns (H, W) of the image; column 0 begins at +180 degrees and azimuth falls with w.
+        sector: Azimuths in degrees, from the first counter-clockwise to the second: (-45, 45) is the quarter
+            ahead, (135, -135) the one behind. A pixel that the sector touches belongs to it. None for all.
+        rows: First and last row, both included, 0 at the top. None for all.
+
+    Raises:
+        InputError: an empty sector, angles that are no angles, or rows that the image has not.
+    """
+    height, width = shape
+    first_row, last_row = rows or (0, height - 1)
+    if not 0 <= first_row <= last_row < height:
+        raise InputError(f"rows must be FIRST-LAST within 0-{height - 1}, found {first_row}-{last_row}.")
+    left, count = _columns(width, sector) if sector is not None else (0, width)
+    return Region(shape, first_row, last_row - first_row + 1, left, count)
+
+
+def _columns(width: int, sector: tuple[float, float]) -> tuple[int, int]:
+    begin, end = sector
+    if not all(math.isfinite(a) and abs(a) <= 360 for a in sector):
+        raise InputError(f"a sector needs two azimuths in degrees within -360 to 360, found {begin:g},{end:g}.")
+    if begin == end:
+        raise InputError(f"the sector {begin:g},{end:g} is empty; -180,180 is the full turn.")
+    turn = 360.0 if end - begin >= 360 else (end - begin) % 360
+    fuzz = 1e-9 * width  # an edge that falls between two pixels belongs to one of them, whatever the rounding
+    left = math.floor((180 - (begin + turn)) / 360 * width + fuzz)
+    right = math.ceil((180 - begin) / 360 * width - fuzz)
+    return (0, width) if right - left >= width else (left % width, right - left)

@@ -1,0 +1,240 @@
+"""How a report writes itself: figures, a CSV, a JSON and a page of Markdown, each with where it comes from."""
+
+import csv
+import io
+import json
+import math
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+import r2flow
+from r2flow.errors import InputError
+from r2flow.files import atomic_write
+
+Row = Mapping[str, Any]
+
+# Told apart without colour: every line of a figure has a marker, a dash and a grey of its own.
+STYLES: tuple[dict[str, Any], ...] = tuple(
+    {"marker": marker, "linestyle": dash, "color": colour}
+    for marker, dash, colour in (
+        ("o", "-", "#000000"),
+        ("s", "--", "#1f6fb4"),
+        ("^", "-.", "#b5301c"),
+        ("D", ":", "#3d7d3a"),
+        ("v", (0, (5, 1, 1, 1, 1, 1)), "#8c4fb0"),
+        ("P", (0, (7, 2)), "#c77c11"),
+        ("X", (0, (1, 1)), "#c2185b"),
+        ("*", "-", "#0e6f6f"),
+        ("<", "--", "#8f8f8f"),
+        (">", "-.", "#d06a9e"),
+        ("h", ":", "#7a5a2a"),
+        ("p", "-", "#b9b936"),
+    )
+)
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a report has to say, before it is written.
+
+    Attributes:
+        name: Of its files, as `work_precision`.
+        title: Of its page.
+        text: Paragraphs and tables of Markdown.
+        rows: One for each measurement: the CSV, and the `rows` of the JSON.
+        figures: By name; the PNG is `NAME.png`.
+        seeds: Every seed that a number depends on, by what it is for.
+        command: What makes the page again.
+        device: What the networks ran on.
+        more: Further lists for the JSON, by name.
+    """
+
+    name: str
+    title: str
+    text: Sequence[str]
+    rows: Sequence[Row]
+    figures: Mapping[str, Figure]
+    command: str
+    seeds: Mapping[str, int] = field(default_factory=dict)
+    device: str = "cpu"
+    more: Mapping[str, Sequence[Row]] = field(default_factory=dict)
+
+
+def write_page(page: Page, out: str | Path) -> list[Path]:
+    """Write `out/NAME.png ...`, `NAME.csv`, `NAME.json` and `NAME.md`, each whole or not at all, in this order.
+
+    Returns:
+        The files, the page last.
+    """
+    out = Path(out)
+    origin = provenance(page)
+    written = [_write_figure(figure, out / f"{name}.png", origin) for name, figure in page.figures.items()]
+    contents = {
+        "csv": _csv(page.rows, origin),
+        "json": _json({"origin": origin, "rows": page.rows, **page.more}),
+        "md": _markdown(page, origin),
+    }
+    for ending, content in contents.items():
+        path = out / f"{page.name}.{ending}"
+        with atomic_write(path, "w") as file:
+            file.write(content)
+        written.append(path)
+    return written
+
+
+def prepare_folder(out: str | Path) -> Path:
+    """Make the folder now: whether it can be written is better known before the measuring than after it.
+
+    Raises:
+        InputError: something that is no folder is in the way, or it cannot be written to.
+    """
+    out = Path(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out} cannot be a folder to write to: {error.strerror or error}.") from None
+    if not os.access(out, os.W_OK):
+        raise InputError(f"{out} cannot be written to; give another --out.")
+    return out
+
+
+def provenance(page: Page) -> dict[str, Any]:
+    """The machine, the versions, the seeds, the date and the command of a page. No paths but the command's."""
+    machine: dict[str, Any] = {
+        "cpu": _cpu_name(),
+        "cores": _cores(),
+        "threads": torch.get_num_threads(),
+        "load": round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None,
+        "system": f"{platform.system()} {platform.machine()}",
+    }
+    if page.device.startswith("cuda"):
+        machine["gpu"] = torch.cuda.get_device_name(page.device)
+    return {
+        "report": page.title,
+        "command": page.command,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": machine,
+        "versions": {"r2flow": r2flow.__version__, "torch": torch.__version__, "python": platform.python_version()},
+        "seeds": dict(page.seeds),
+        "device": page.device,
+    }
+
+
+def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
+    """Rows as a Markdown table.
+
+    Args:
+        columns: Key -> heading, in order; numbers are printed to three digits.
+    """
+    lines = ["| " + " | ".join(columns.values()) + " |", "|" + "---|" * len(columns)]
+    lines += ["| " + " | ".join(shown(row.get(key)).replace("|", "\\|") for key in columns) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def shown(value: Any) -> str:
+    """A value for a reader: 0.00123, 1.2e-05, 128, '' for nothing."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if not isinstance(value, float):
+        return str(value)
+    if math.isnan(value):
+        return "-"
+    return f"{value:.3g}" if value == 0 or 1e-3 <= abs(value) < 1e4 else f"{value:.1e}"
+
+
+def blank_figure(width: float, height: float, title: str = "") -> Figure:
+    """A white page of inches, its parts laid out so that nothing overlaps."""
+    figure = Figure(figsize=(width, height), facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    if title:
+        figure.suptitle(title, fontsize=11)
+    return figure
+
+
+def _write_figure(figure: Figure, path: Path, origin: Mapping[str, Any]) -> Path:
+    from PIL import Image, PngImagePlugin  # what matplotlib writes with
+
+    canvas = figure.canvas
+    assert isinstance(canvas, FigureCanvasAgg)
+    canvas.draw()
+    # A palette makes it a third of the size, and figures go into repositories.
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()).quantize(128)
+    notes = PngImagePlugin.PngInfo()  # figures travel without their page
+    for name, text in (("Title", origin["report"]), ("Source", origin["command"]), ("Description", json.dumps(origin))):
+        notes.add_itxt(name, str(text))
+    with atomic_write(path) as file:
+        image.save(file, format="png", optimize=True, pnginfo=notes)
+    return path
+
+
+def _csv(rows: Sequence[Row], origin: Mapping[str, Any]) -> str:
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    text = io.StringIO()
+    # A comment for each line of origin: pandas reads such a file with comment="#".
+    text.writelines(f"# {key}: {_one_line(value)}\n" for key, value in origin.items())
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _json(contents: Mapping[str, Any]) -> str:
+    """Strict JSON with a line for each row."""
+    parts = []
+    for name, value in contents.items():
+        rows = [
+            json.dumps(_plain(item), allow_nan=False) for item in ([value] if isinstance(value, Mapping) else value)
+        ]
+        joined = rows[0] if isinstance(value, Mapping) else "[\n" + ",\n".join(rows) + "\n]"
+        parts.append(f"{json.dumps(name)}: {joined}")
+    return "{\n" + ",\n".join(parts) + "\n}\n"
+
+
+def _markdown(page: Page, origin: Mapping[str, Any]) -> str:
+    pictures = [f"![{name.replace('_', ' ')}]({name}.png)" for name in page.figures]
+    notes = "\n".join(
+        f"- {key}: {_one_line(value)}" for key, value in origin.items() if key not in ("report", "command")
+    )
+    again = f"Made with\n\n```\n{page.command}\n```\n\n{notes}"
+    return "\n\n".join([f"# {page.title}", *pictures, *page.text, "## Where this comes from", again]) + "\n"
+
+
+def _one_line(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {item}" for key, item in value.items()) or "none"
+    return str(value)
+
+
+def _plain(value: Any) -> Any:
+    """For JSON, which has neither NaN nor infinity."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _cpu_name() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or "unknown"
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or "unknown"
+
+
+def _cores() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,279 @@
+"""What a scene need not cost: evaluations and seconds saved, and the error that is paid for it."""
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from r2flow.checkpoints import Checkpoint
+from r2flow.flow.problems import PROBLEMS, Mixed, Problem
+from r2flow.flow.solvers import Velocity, solve
+from r2flow.flow.straight_exit import probes, solve_straight_first
+from r2flow.lidar.region import Region, region
+from r2flow.reports.outputs import formats_of, write_scan
+from r2flow.sampling import decode, evaluated_region, noise_of, part_of
+
+Row = dict[str, Any]
+Progress = Callable[[], None]
+
+# Scenes of the mixed batch by kind: their number and their problem.
+MIXED = {"straight": 8, "gaussian": 4, "two_modes": 3, "ray_drop": 1}
+LONE = {"straight": 255, "ray_drop": 1}
+ELEMENTS = 256  # of an exact scene
+FIXED = 32  # steps of the fixed-step rows
+REPEATS = 3  # of every timing
+TOLERANCES = (1e-3, 1e-5)
+
+EULER, AB2 = f"euler, {FIXED} steps", f"ab2, {FIXED} steps"
+ONE_STATE = "dopri5, the batch as one state (torchdiffeq)"
+STAYING = "dopri5, own steps, the finished stay"
+LEAVING = "dopri5, own steps, the finished leave"
+STRAIGHT = "the same, and one step for the straight"
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Ends of all scenes, (B, ...), their evaluations, (B,), and the seconds of it all."""
+
+    x: Tensor
+    evaluations: Tensor
+    seconds: float
+
+
+def one_state(velocity: Velocity, x: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+    """torchdiffeq's dopri5 as it is usually called: one step and one error norm for the whole batch."""
+    import torchdiffeq
+
+    calls = 0
+
+    def counted(t: Tensor, state: Tensor) -> Tensor:
+        nonlocal calls
+        calls += 1
+        return velocity(t, state).to(state.dtype)
+
+    span = torch.tensor([0.0, 1.0], dtype=x.dtype, device=x.device)
+    end = torchdiffeq.odeint(counted, x, span, rtol=tolerance, atol=tolerance, method="dopri5")[-1]
+    return end, torch.full((len(x),), calls)
+
+
+def _steps(method: str) -> Callable[[Velocity, Tensor, float], tuple[Tensor, Tensor]]:
+    def way(velocity: Velocity, x: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+        end = solve(velocity, x, method=method, steps=FIXED, tolerance=tolerance)
+        return end.x, end.evaluations
+
+    return way
+
+
+def _straight_first(velocity: Velocity, x: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+    end = solve_straight_first(velocity, x, tolerance)
+    return end.x, end.evaluations
+
+
+WAYS: dict[str, Callable[[Velocity, Tensor, float], tuple[Tensor, Tensor]]] = {
+    EULER: _steps("euler"),
+    AB2: _steps("ab2"),
+    ONE_STATE: one_state,
+    LEAVING: _steps("dopri5"),
+    STRAIGHT: _straight_first,
+}
+
+
+def solve_in_all_ways(velocity: Velocity, x: Tensor, tolerance: float, repeats: int = REPEATS) -> dict[str, Solved]:
+    """Every row of the scenes' table, in its order; seconds are medians of `repeats`."""
+    ends: dict[str, tuple[Tensor, Tensor]] = {}
+    seconds: dict[str, list[float]] = {name: [] for name in WAYS}
+    for _ in range(repeats):
+        for name, way in WAYS.items():
+            begin = time.perf_counter()
+            ends[name] = way(velocity, x, tolerance)
+            _wait(x)
+            seconds[name].append(time.perf_counter() - begin)
+    found = {}
+    for name, (end, evaluations) in ends.items():
+        if name == LEAVING:  # what per-scene solvers that keep the batch whole spend (torchode): same ends
+            found[STAYING] = Solved(end, torch.full_like(evaluations, int(evaluations.max())), float("nan"))
+        found[name] = Solved(end, evaluations, median(seconds[name]))
+    return found
+
+
+def exact_rows(kinds: Mapping[str, int], batch: str, tolerances: Sequence[float], seed: int) -> list[Row]:
+    """Scenes whose ends are known: evaluations and errors by kind, a row for each way and tolerance."""
+    problems: list[Problem] = []
+    places: dict[str, slice] = {}
+    for kind, count in kinds.items():
+        places[kind] = slice(len(problems), len(problems) + count)
+        problems += [PROBLEMS[kind]()] * count
+    # float64: the solver's error, not rounding, is what we measure
+    x_0 = noise_of(range(len(problems)), (ELEMENTS,), seed).double()
+    velocity = Mixed(problems)
+    truth = velocity.solution(x_0, 1.0)
+    rows = []
+    for tolerance in tolerances:
+        for way, solved in solve_in_all_ways(velocity, x_0, tolerance).items():
+            errors = (solved.x - truth).square().mean(1).sqrt()
+            row: Row = {"part": batch, "way": way, "tolerance": None if way in (EULER, AB2) else tolerance}
+            row |= {"evaluations": int(solved.evaluations.sum()), "seconds": solved.seconds}
+            row["worst_error"] = float(errors.max())
+            for kind, scenes in places.items():
+                row[f"evaluations_{kind}"] = float(solved.evaluations[scenes].double().mean())
+                row[f"error_{kind}"] = float(errors[scenes].max())
+            rows.append(row)
+    return [row for i, row in enumerate(rows) if row["tolerance"] or i < len(WAYS)]  # fixed steps: once
+
+
+def scene_rows(checkpoint: Checkpoint, num: int, tolerance: float, seed: int, advance: Progress) -> list[Row]:
+    """The same ways on scenes of a trained flow, held against its own tight solution."""
+    model = checkpoint.model
+    x_0 = noise_of(range(num), (checkpoint.encoding.channels, *checkpoint.sensor.shape), seed).to(_device(model))
+    counted = _Counted(model, advance)
+    with torch.inference_mode():
+        truth = solve(counted, x_0, method="dopri5", tolerance=1e-6).x
+        found = solve_in_all_ways(counted, x_0, tolerance, repeats=1)
+    rows = []
+    for way, solved in found.items():
+        errors = (solved.x - truth).double().square().flatten(1).mean(1).sqrt()
+        row: Row = {"part": "scenes of the flow", "way": way, "tolerance": None if way in (EULER, AB2) else tolerance}
+        row |= {"evaluations": int(solved.evaluations.sum()), "seconds": solved.seconds}
+        row["straight"] = int((solved.evaluations == 1 + len(probes(tolerance))).sum()) if way == STRAIGHT else None
+        rows.append({**row, "worst_error": float(errors.max()), "median_error": float(errors.median())})
+    return rows
+
+
+def regions_to_measure(shape: tuple[int, int]) -> dict[str, tuple[Region, Region]]:
+    """What is asked for and what is generated for it, before rounding, by name."""
+    ahead, half = region(shape, (-45, 45)), region(shape, (-90, 90))
+    upper = region(shape, None, (0, shape[0] // 2 - 1))
+    quarter = region(shape, None, (shape[0] // 4, shape[0] // 2 - 1))
+    corner = region(shape, (-45, 45), (0, shape[0] // 2 - 1))
+    return {
+        "sector of 180 degrees": (half, half),
+        "sector of 90 degrees": (ahead, ahead),
+        "90 degrees out of 180 generated": (ahead, half),
+        "upper half of the rows": (upper, upper),
+        "a quarter of the rows": (quarter, quarter),
+        "90 degrees, upper half of the rows": (corner, corner),
+    }
+
+
+def region_rows(checkpoint: Checkpoint, num: int, steps: int, seed: int, advance: Progress) -> list[Row]:
+    """Parts of the image against the same pixels of the whole one, from the same noise and in the same steps."""
+    x_0 = noise_of(range(num), (checkpoint.encoding.channels, *checkpoint.sensor.shape), seed)
+    wanted = regions_to_measure(checkpoint.sensor.shape)
+    regions = {"the whole image": region(checkpoint.sensor.shape)}
+    regions |= {name: evaluated_region(checkpoint, generated) for name, (_, generated) in wanted.items()}
+    models = {name: part_of(checkpoint.model, seen) for name, seen in regions.items()}
+    ends = {name: _sampled(models[name], seen.crop(x_0), steps, advance) for name, seen in regions.items()}
+    t, first = torch.tensor(0.5), x_0[:1]
+    calls = {
+        name: partial(models[name], t, seen.crop(first).to(_device(models[name]))) for name, seen in regions.items()
+    }
+    seconds = _in_turns(calls, 1.0)
+    whole = ends["the whole image"]
+    rows: list[Row] = []
+    for name, seen in regions.items():
+        row: Row = {"part": "regions", "way": name, "share": seen.share, "seconds": steps * seconds[name]}
+        row["time"] = seconds[name] / seconds["the whole image"]
+        if name in wanted:
+            asked, _ = wanted[name]
+            truth = asked.crop(whole)
+            row |= _apart(checkpoint, asked.crop(seen.place(ends[name])), truth)
+            # how far it would be if the noise told nothing of the scene
+            row["unrelated"] = _rms(truth, truth.roll(1, 0)) if num > 1 else None
+        rows.append(row)
+    return rows
+
+
+def channel_rows(checkpoint: Checkpoint, budget: float = 1.0) -> list[Row]:
+    """Seconds of one evaluation, of decoding and of writing a scan, with both channels and with the range alone."""
+    from r2flow.backbones import build_backbone
+
+    if not checkpoint.encoding.reflectance:
+        return []
+    ranges, t = checkpoint.encoding.format.channels, torch.tensor(0.5)
+    x = noise_of(range(1), (ranges + 1, *checkpoint.sensor.shape), seed=0)
+    rays = checkpoint.model.get_buffer("coords")[0].cpu()
+    alone = build_backbone(checkpoint.config["backbone"], rays, ranges).eval().to(_device(checkpoint.model))
+    on = x.to(_device(checkpoint.model))
+    network = _in_turns({"both": partial(checkpoint.model, t, on), "range": partial(alone, t, on[:, :ranges])}, budget)
+    decoding = _in_turns({name: partial(decode, checkpoint, x, name) for name in network}, budget)
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as folder:
+        writers = {}
+        for name in network:
+            image = decode(checkpoint, x, name)[0].numpy()
+            formats = [ending for ending in formats_of(checkpoint, name) if ending != "bin"]
+            writers[name] = partial(write_scan, image, checkpoint.sensor.rays(), Path(folder, name), "scan", formats)
+        writing = _in_turns(writers, budget)
+        for name in network:
+            size = sum(path.stat().st_size for path in Path(folder, name).iterdir())
+            row: Row = {"part": "channels", "way": name, "network": network[name], "decoding": decoding[name]}
+            rows.append({**row, "writing": writing[name], "bytes": size})
+    return rows
+
+
+class _Counted(nn.Module):
+    """A network that tells of its evaluations."""
+
+    def __init__(self, model: nn.Module, advance: Progress) -> None:
+        super().__init__()
+        self.model, self.advance = model, advance
+
+    def forward(self, t: Tensor, x: Tensor) -> Tensor:
+        self.advance()
+        return self.model(t, x)
+
+
+def _sampled(model: nn.Module, x_0: Tensor, steps: int, advance: Progress) -> Tensor:
+    """Scenes one by one, (B, ...) on the CPU."""
+    with torch.inference_mode():
+        ends = [
+            solve(model, scene.to(_device(model)), method="ab2", steps=steps, progress=advance).x.cpu()
+            for scene in x_0.split(1)
+        ]
+    return torch.cat(ends)
+
+
+def _in_turns(calls: Mapping[str, Callable[[], Any]], budget: float) -> dict[str, float]:
+    """Seconds of each call: the least of 3 to 40, as many as fit into a budget of seconds, after one to warm up.
+
+    In turns, and the least: what else the machine does slows all of them alike, and can only add.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    rounds = 1 + 40
+    with torch.inference_mode():
+        while len(next(iter(seconds.values()))) < rounds:
+            for name, call in calls.items():
+                begin = time.perf_counter()
+                _wait(call())
+                seconds[name].append(time.perf_counter() - begin)
+            longest = max(values[-1] for values in seconds.values())
+            rounds = min(rounds, 1 + max(3, int(budget / longest)))
+    return {name: min(values[1:]) for name, values in seconds.items()}
+
+
+def _wait(result: Any) -> None:
+    if isinstance(result, Tensor) and result.is_cuda:
+        torch.cuda.synchronize(result.device)
+
+
+def _device(model: nn.Module) -> torch.device:
+    return next(model.parameters()).device
+
+
+def _rms(a: Tensor, b: Tensor) -> float:
+    return float((a - b).double().square().mean().sqrt())
+
+
+def _apart(checkpoint: Checkpoint, mine: Tensor, truth: Tensor) -> Row:
+    """Root mean square in model space, median metres where both return, share of rays lost or gained."""
+    a, b = (checkpoint.encoding.decode(x)[:, 0].double() for x in (mine, truth))
+    both = (a > 0) & (b > 0)
+    metres = float((a - b).abs()[both].median()) if both.any() else float("nan")
+    return {"error": _rms(mine, truth), "median_m": metres, "dropped": float(((a > 0) != (b > 0)).double().mean())}

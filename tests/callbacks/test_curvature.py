@@ -1,0 +1,116 @@
+import csv
+import math
+
+import lightning as L
+import pytest
+import torch
+from lightning.pytorch.loggers import CSVLogger
+from torch import nn
+
+from callbacks.curvature import Curvature
+from callbacks.ema import EMA
+from r2flow.errors import InputError
+from r2flow.noise import standard_normal
+from r2flow.reports.training import read_curves
+
+SHAPE = (2, 4, 8)
+
+
+class Shrinking(nn.Module):
+    """v = -a x, whose Euler path is x_0 (1 - a / n)^k; dropout would show in training mode."""
+
+    def __init__(self, a: float) -> None:
+        super().__init__()
+        self.a = nn.Parameter(torch.tensor(a))
+        self.dropout = nn.Dropout(0.5)
+
+    def forward(self, t, x):
+        return -self.a * self.dropout(x)
+
+
+class Stage(L.LightningModule):
+    """Its parameter a takes the values 1, 2, 3, ... step by step."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.velocity = Shrinking(0.0)
+        self.warmup_steps = 0
+        self.draws = []
+
+    def training_step(self, batch, batch_idx):
+        self.draws.append(torch.rand(()).item())
+        assert self.velocity.dropout.training
+        loss = 0.0 * self.velocity.a + batch.mean() * 0.0
+        self.log("train/loss", loss + 1.0)
+        return loss
+
+    def optimizer_step(self, epoch, batch_idx, optimizer, closure):
+        optimizer.step(closure)
+        with torch.no_grad():
+            self.velocity.a.add_(1.0)
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.0)
+
+
+def fit(tmp_path, callbacks, steps=6, **options):
+    torch.manual_seed(3)
+    stage = Stage()
+    loader = torch.utils.data.DataLoader(torch.zeros(64, 1), batch_size=1)
+    L.Trainer(
+        max_steps=steps, max_epochs=-1, accelerator="cpu", callbacks=callbacks, enable_model_summary=False,
+        enable_checkpointing=False, enable_progress_bar=False, logger=CSVLogger(tmp_path, name="metrics"),
+        log_every_n_steps=1, **options,
+    ).fit(stage, loader)  # fmt: skip
+    return stage
+
+
+def exact(a: float, n: int) -> tuple[float, float]:
+    """(int s dt, the same over |d|^2) of Euler's n steps: v_k = -a x_0 (1 - a/n)^k, mean over two scans."""
+    factors = [-a * (1 - a / n) ** k for k in range(n)]
+    mean = sum(factors) / n
+    variance = sum((f - mean) ** 2 for f in factors) / n
+    norms = [standard_normal(SHAPE, 7, "evaluation", i).double().square().sum().item() for i in range(2)]
+    return variance * sum(norms) / 2, variance / mean**2
+
+
+@pytest.mark.filterwarnings("ignore:.*")
+def test_the_logged_values_are_those_of_the_averaged_weights(tmp_path):
+    ema = EMA(decay=0.5, every=1, warmup_steps=0)
+    fit(tmp_path, [ema, Curvature(SHAPE, seed=7, every=2, num=2, steps=4)], steps=3)
+    curves = read_curves(tmp_path, ("curvature/s", "curvature/s_normalised", "train/loss"))
+    assert curves["curvature/s"][0].tolist() == [2, 3]  # every second step, and the last
+    assert curves["train/loss"][0].tolist() == [1, 2, 3]
+    # By hand: the average copies 1, then takes 1 - 2^(-2/3) = 0.370 of it and 0.630 of 2, then half of 3.
+    second = 1 + 2 ** (-2 / 3)
+    for index, a in enumerate((second, (second + 3) / 2)):
+        s, normalised = exact(a, 4)
+        assert curves["curvature/s"][1][index] == pytest.approx(s, rel=1e-4)
+        assert curves["curvature/s_normalised"][1][index] == pytest.approx(normalised, rel=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:.*")
+def test_training_does_not_notice(tmp_path):
+    plain = fit(tmp_path / "plain", [])
+    measured = fit(tmp_path / "measured", [Curvature(SHAPE, seed=0, every=2)])
+    assert plain.draws == measured.draws  # torch's generator stands where it stood
+    assert torch.equal(plain.velocity.a, measured.velocity.a)
+
+
+@pytest.mark.filterwarnings("ignore:.*")
+def test_a_step_of_several_batches_is_measured_once(tmp_path):
+    fit(tmp_path, [Curvature(SHAPE, seed=0, every=2)], steps=4, accumulate_grad_batches=3)
+    with (tmp_path / "metrics" / "version_0" / "metrics.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row.get("curvature/s")]
+    assert [int(row["step"]) for row in rows] == [1, 3]
+    assert all(math.isfinite(float(row["curvature/s_normalised"])) for row in rows)
+
+
+def test_it_can_be_left_out(tmp_path):
+    fit(tmp_path, [Curvature(SHAPE, seed=0, every=0)], steps=2)
+    assert read_curves(tmp_path, ("curvature/s",)) == {}
+
+
+def test_bad_options_are_refused():
+    with pytest.raises(InputError, match=r"found 5, 0 and 16"):
+        Curvature(SHAPE, 0, every=5, num=0)

@@ -1,0 +1,75 @@
+import math
+
+import pytest
+import torch
+
+from r2flow.errors import InputError
+from r2flow.lidar.region import Region, region
+from r2flow.lidar.sensors import SENSORS
+
+SENSOR = SENSORS["hdl64e"].resized(16, 72)  # columns of 5 degrees
+
+
+@pytest.mark.parametrize("sector", [(-45, 45), (135, -135), (0, 90), (-178, 20), (170, 190), (-190, -170), (-90, 89.9)])
+def test_the_columns_are_those_that_the_sector_touches(sector):
+    chosen = set(region(SENSOR.shape, sector).columns.tolist())
+    begin, width = sector[0], (sector[1] - sector[0]) % 360
+    for column in range(72):
+        # by the definition of a column: it spans the azimuths 180 - 5 w down to 175 - 5 w
+        touched = any(
+            (azimuth - begin) % 360 < width
+            for azimuth in (180 - 5 * (column + share / 100) for share in range(1, 100))
+        )  # fmt: skip
+        assert (column in chosen) == touched
+
+
+def test_columns_run_from_left_to_right_through_the_seam():
+    behind = region(SENSOR.shape, (170, -170))
+    assert behind.columns.tolist() == [70, 71, 0, 1]
+    azimuth = SENSOR.rays()[1, 0]
+    ahead = azimuth[region(SENSOR.shape, (-45, 45)).columns]
+    assert ahead.abs().max() < math.radians(45)
+    assert len(ahead) == 18
+
+
+def test_cropping_and_placing_are_inverse():
+    part = region(SENSOR.shape, (150, -120), (3, 9))
+    image = torch.arange(2.0 * 16 * 72).view(2, 16, 72) + 1
+    crop = part.crop(image)
+    assert crop.shape == (2, 7, part.width)
+    assert crop[0, 0, 0] == image[0, 3, part.left]
+    placed = part.place(crop)
+    assert torch.equal(part.crop(placed), crop)
+    assert (placed != 0).sum() == crop.numel()
+    assert torch.equal(placed[placed != 0], image[placed != 0])
+
+
+def test_rounding_goes_outward_to_whole_units():
+    part = Region((16, 72), 3, 2, 70, 4)  # over the seam
+    outer = part.rounded((4, 8))
+    assert (outer.top, outer.height, outer.left, outer.width) == (0, 8, 64, 16)
+    assert set(part.columns.tolist()) <= set(outer.columns.tolist())
+    assert outer.rounded((4, 8)) == outer
+    nearly_all = Region((16, 72), 0, 16, 4, 70).rounded((4, 8))
+    assert (nearly_all.left, nearly_all.width, nearly_all.share) == (0, 72, 1)
+
+
+def test_everything_is_the_image_in_its_own_order():
+    for whole in (region((16, 72)), region((16, 72), (-180, 180), (0, 15)), region((16, 72), (0, 360))):
+        assert whole == Region((16, 72), 0, 16, 0, 72)
+
+
+@pytest.mark.parametrize(
+    ("sector", "rows", "words"),
+    [
+        ((10, 10), None, "is empty"),
+        ((math.nan, 10), None, "degrees"),
+        ((0, 720), None, "within -360 to 360"),
+        (None, (5, 4), "FIRST-LAST within 0-15, found 5-4"),
+        (None, (0, 16), "found 0-16"),
+        (None, (-1, 3), "found -1-3"),
+    ],
+)
+def test_what_is_no_region_is_refused(sector, rows, words):
+    with pytest.raises(InputError, match=words):
+        region(SENSOR.shape, sector, rows)

@@ -1,0 +1,128 @@
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from r2flow.checkpoints import Checkpoint
+from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.sensors import SENSORS
+from r2flow.reports.curvature import curvature_page, curvature_rows, measure_paths, summary
+from r2flow.sampling import noise_of
+from tests.test_checkpoints import saved  # noqa: F401  a fixture
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+
+SENSOR = SENSORS["hdl64e"].resized(4, 16)
+STEPS = 16
+
+
+class Falling(nn.Module):
+    """v = -a (x + 1) t: every pixel is drawn to -1, the dropped ray, the faster the later."""
+
+    def __init__(self, a: float = 3.0) -> None:
+        super().__init__()
+        self.a = nn.Parameter(torch.tensor(a), requires_grad=False)
+
+    def forward(self, t, x):
+        return -self.a * (x + 1) * t
+
+
+def checkpoint(model: nn.Module) -> Checkpoint:
+    return Checkpoint(model, SENSOR, Encoding(SENSOR), {}, 0, None, "r2flow")  # type: ignore[arg-type]
+
+
+def by_hand(a: float, num: int) -> tuple[np.ndarray, np.ndarray]:
+    """Every state and velocity of Euler's path, (num, n + 1, elements) and (num, n, elements), in numpy."""
+    x = noise_of(range(num), (2, *SENSOR.shape), 5).double().numpy().reshape(num, -1)
+    states, velocities = [x], []
+    for k in range(STEPS):
+        velocities.append(-a * (states[-1] + 1) * k / STEPS)
+        states.append(states[-1] + velocities[-1] / STEPS)
+    return np.stack(states, 1), np.stack(velocities, 1)
+
+
+@pytest.mark.parametrize("batch_size", [1, 2, 3])
+def test_the_figures_are_those_of_paths_kept_whole(batch_size):
+    found = measure_paths(checkpoint(Falling()), "falling", 3, STEPS, 5, batch_size, most_curved=7)
+    x, v = by_hand(3.0, 3)
+    d = x[:, -1] - x[:, 0]
+    np.testing.assert_allclose(found.s, ((d[:, None] - v) ** 2).sum(-1), rtol=1e-4)
+    np.testing.assert_allclose(found.squared_length, (d**2).sum(-1), rtol=1e-5)
+    bends = ((d[:, None] - v) ** 2).mean(1)
+    most = np.argsort(-bends.ravel())[:7]
+    np.testing.assert_allclose(found.bends, bends.ravel()[most], rtol=1e-4)
+    paths = x.transpose(0, 2, 1).reshape(-1, STEPS + 1)[most]
+    np.testing.assert_allclose(found.trajectories, paths, atol=1e-5)
+    # A ray has ended as dropped where its range decodes to less than the sensor's least, 1.45 m, or above its most.
+    range_image = x[:, -1].reshape(3, 2, -1)[:, :1]
+    least = 2 * math.log2(1.45 + 1) / math.log2(80 + 1) - 1
+    dropped = np.broadcast_to((range_image < least) | (range_image > 1), (3, 2, 64)).reshape(3, -1)
+    assert found.dropped.tolist() == dropped.ravel()[most].tolist()
+    assert found.dropped_share == pytest.approx(dropped.mean())
+    assert found.dropped_bend == pytest.approx(bends[dropped].sum() / bends.sum(), rel=1e-4)
+
+
+def test_the_summary_and_the_rows_are_of_the_mean_over_scenes():
+    found = measure_paths(checkpoint(Falling()), "falling", 2, STEPS, 5)
+    x, v = by_hand(3.0, 2)
+    s = (((x[:, -1] - x[:, 0])[:, None] - v) ** 2).sum(-1)
+    row = summary(found)
+    assert row["integral"] == pytest.approx(s.mean(), rel=1e-4)
+    assert row["t_of_most"] == s.mean(0).argmax() / STEPS
+    assert row["last_tenth"] == pytest.approx(s[:, 15].sum() / s.sum(), rel=1e-4)  # of 16 steps, one begins after .9
+    assert row["paths_share"] == 200 / 256  # of the elements of two scenes
+    rows = curvature_rows([found])
+    assert [r["t"] for r in rows] == [k / STEPS for k in range(STEPS)]
+    assert rows[3]["s"] == pytest.approx(s[:, 3].mean(), rel=1e-4)
+    assert rows[3]["s_most"] == pytest.approx(s[:, 3].max(), rel=1e-4)
+
+
+def test_the_straightest_for_its_length_is_named():
+    flows = [measure_paths(checkpoint(Falling(a)), name, 1, STEPS, 5) for name, a in (("slow", 0.5), ("fast", 4.0))]
+    page = curvature_page(flows, 5, "r2flow report curvature")
+    said = " ".join(page.text)
+    # s / |d|^2 does not change when a straight-line velocity is scaled; here the slower one is nearer to v = c t,
+    # whose variance over squared mean is (1/12) / (1/4) = 1/3.
+    assert 0.9 / 3 < summary(flows[0])["integral_normalised"] < 1.2 / 3
+    straightest = min(flows, key=lambda flow: summary(flow)["integral_normalised"])
+    assert f"**{straightest.label}** is the straightest" in said
+    assert len(page.figures["curvature"].axes) == 2
+    assert len(page.figures["trajectories"].axes) == 2
+
+
+def test_a_flow_that_goes_nowhere_is_drawn_and_not_praised():
+    flow = measure_paths(checkpoint(Falling(0.0)), "still", 1, 4, 5)
+    page = curvature_page([flow], 5, "")
+    assert math.isnan(summary(flow)["integral_normalised"])
+    assert "straightest" not in " ".join(page.text)
+
+
+def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
+    path, out = saved[0], tmp_path / "reports"
+    copy = path.with_name("step-00000009.ckpt")
+    copy.write_bytes(path.read_bytes())
+    code, said, _ = r2flow("report", "curvature", path, copy, "-o", out, "--steps", 4, "--num", 2, "--most-curved", 9)
+    assert code == 0
+    names = {"curvature.png", "trajectories.png", "curvature.csv", "curvature.json", "curvature.md"}
+    assert {file.name for file in out.iterdir()} == names
+    assert str(out / "curvature.md") in said
+    content = json.loads((out / "curvature.json").read_text())
+    assert len(content["rows"]) == 2 * 4
+    assert len(content["trajectories"]) == 2 * 9
+    assert {row["checkpoint"] for row in content["summary"]} == {str(path), str(copy)}
+    assert content["origin"]["command"].startswith(f"r2flow report curvature {path}")
+
+
+def test_bad_input_is_one_line(r2flow, saved, tmp_path):  # noqa: F811
+    for arguments, words in (
+        ((tmp_path / "none", "-o", tmp_path / "o"), "no checkpoint"),
+        ((saved[0], "-o", tmp_path / "o", "--steps", 0), "--steps"),
+        ((saved[0], "-o", saved[0] / "o"), "cannot be a folder"),
+    ):
+        code, _, err = r2flow("report", "curvature", *arguments)
+        assert code == 2
+        assert words in err
+        assert len([line for line in err.splitlines() if not line.startswith("WARNING")]) == 1
+        assert not (tmp_path / "o").exists()

@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+import torch
+
+from r2flow.errors import InputError
+from r2flow.lidar.sensors import SENSORS
+from r2flow.reports.interpolation import interpolation, interpolation_figure
+from r2flow.reports.inversion import errors_of, invert_scans, print_rows, scan_of, unique_names
+from r2flow.reports.pictures import figure_pixels
+from r2flow.sampling import invert
+from tests.test_sampling import SENSOR, flow, scans
+
+
+def frames(count: int, channels: int = 2) -> np.ndarray:
+    images = scans(2)[:, :channels]
+    return torch.stack([images[i % 2] for i in range(count)]).numpy()
+
+
+@pytest.mark.parametrize(("count", "channels"), [(2, 2), (5, 1), (20, 2)])
+def test_the_figure_has_a_column_for_each_frame_between_the_real_scans(count, channels):
+    weights = np.linspace(0, 1, count).tolist()
+    figure = interpolation_figure(frames(2, channels), frames(count, channels), weights, SENSOR.rays(), ["a", "b"])
+    titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
+    assert titles[0] == "real: a"
+    assert titles[-1] == "real: b"
+    assert titles[1] == titles[-2] == "there and back"
+    assert len(titles) == min(count, 8) + 2
+    assert len(figure.axes) == len(titles) * (2 + channels)
+    between = [float(title.removeprefix("w = ")) for title in titles[2:-2]]
+    assert between == sorted(between)
+    assert figure_pixels(figure, dpi=40).max() > 150
+
+
+def test_extreme_scans_are_drawn_too():
+    empty = np.zeros((2, 2, 8, 64), np.float32)
+    figure_pixels(interpolation_figure(empty, empty, [0.0, 1.0], SENSOR.rays(), ["a", "b"]), dpi=40)
+
+
+def test_a_page_says_what_was_measured(tmp_path):
+    paths = [tmp_path / "one.npy", tmp_path / "two.npy"]
+    for path, image in zip(paths, scans(2).numpy(), strict=True):
+        np.save(path, image)
+    page = interpolation(flow(), paths, 3, tmp_path / "o", tolerance=1e-4, batch_size=2)
+    assert [row["frame"] for row in page.rows] == [0, 1, 2]
+    assert page.rows[1]["evaluations"] < page.rows[0]["evaluations"]
+    assert "one" in page.text[1]
+    middle = np.load(tmp_path / "o" / "frames" / "001.npy")
+    assert page.rows[1]["returns"] == (middle[0] > 0).sum()
+
+
+def test_a_scan_that_is_not_solved_is_said_to_be(tmp_path, capsys):
+    images = scans(2)
+    images[0, 0, 0, 0] = torch.nan
+    rows = errors_of(flow(), invert(flow(), images), ["bad", "good"], images)
+    assert [row["converged"] for row in rows] == [False, True]
+    print_rows(rows)
+    assert "not solved, and their noise is NaN: bad." in capsys.readouterr().out
+
+
+def test_inversion_refuses_before_it_writes(tmp_path):
+    np.save(tmp_path / "scan.npy", scans(1)[0].numpy())
+    with pytest.raises(InputError, match="Did you mean 'dopri5'"):
+        invert_scans(flow(), [tmp_path / "scan.npy"], tmp_path / "o", "dopri")
+    with pytest.raises(InputError, match="does not exist"):
+        invert_scans(flow(), [tmp_path / "scan.npy", tmp_path / "none.bin"], tmp_path / "o")
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_range_image_is_held_to_the_sensor_s_limits(tmp_path):
+    image = np.array([[1.0, 1.45, 40, 80, 81, np.inf, np.nan, -3], [2, 0.5, -1, 1, 1, 1, 1, 1]], np.float32)
+    sensor = SENSORS["hdl64e"].resized(2, 4)
+    np.save(tmp_path / "image.npy", image.reshape(2, 2, 4))
+    checkpoint = flow()
+    object.__setattr__(checkpoint, "sensor", sensor)
+    seen = scan_of(tmp_path / "image.npy", checkpoint)
+    np.testing.assert_allclose(seen[0].flatten(), [0, 1.45, 40, 80, 0, 0, 0, 0])
+    np.testing.assert_allclose(seen[1].flatten(), [0, 0.5, 0, 1, 0, 0, 0, 0])
+
+
+def test_files_of_one_name_do_not_overwrite_each_other(tmp_path):
+    paths = [tmp_path / "a" / "000.bin", tmp_path / "b" / "000.bin", tmp_path / "b" / "001.pcd.bin"]
+    assert unique_names(paths) == ["000_1", "000_2", "001"]

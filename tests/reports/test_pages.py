@@ -1,0 +1,142 @@
+import csv
+import json
+import math
+import struct
+
+import pytest
+import torch
+
+import r2flow
+from r2flow.errors import InputError
+from r2flow.reports.pages import STYLES, Page, blank_figure, prepare_folder, shown, table, write_page
+from tests.test_cli import r2flow as verb  # noqa: F401  a fixture
+
+ROWS = [
+    {"solver": "euler", "evaluations": 4, "error": 0.5},
+    {"solver": "a|b, c", "evaluations": 8, "error": math.nan, "note": "late"},
+]
+
+
+def page(**changes) -> Page:
+    figure = blank_figure(3, 2, "title")
+    figure.add_subplot().plot([0, 1], [0, 1], **STYLES[0])
+    given = {
+        "name": "speed", "title": "How fast", "text": ["First.", table(ROWS, {"solver": "solver", "error": "RMS"})],
+        "rows": ROWS, "figures": {"speed": figure}, "command": "r2flow report speed 'a b'", "seeds": {"scenes": 3},
+    }  # fmt: skip
+    return Page(**{**given, **changes})
+
+
+def test_a_page_is_a_figure_a_csv_a_json_and_markdown(tmp_path):
+    written = write_page(page(), tmp_path / "new")
+    assert [path.name for path in written] == ["speed.png", "speed.csv", "speed.json", "speed.md"]
+    assert sorted(tmp_path.joinpath("new").iterdir()) == sorted(written)  # no temporary file stays
+    png = written[0].read_bytes()
+    assert png.startswith(b"\x89PNG")
+    assert struct.unpack(">II", png[16:24]) == (300, 200)
+
+
+def test_every_file_says_where_it_comes_from(tmp_path):
+    for path in write_page(page(), tmp_path):
+        content = path.read_bytes().decode("latin-1")
+        for words in ("r2flow report speed 'a b'", torch.__version__, r2flow.__version__, "threads", "scenes"):
+            assert words in content, (path.name, words)
+        assert str(tmp_path) not in content  # nor any other path of the machine
+
+
+def test_the_csv_reads_back(tmp_path):
+    write_page(page(), tmp_path)
+    lines = (tmp_path / "speed.csv").read_text().splitlines()
+    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
+    assert rows[0] == {"solver": "euler", "evaluations": "4", "error": "0.5", "note": ""}
+    assert rows[1]["solver"] == "a|b, c"
+
+
+def test_the_json_is_strict_and_whole(tmp_path):
+    write_page(page(more={"paths": [{"values": [1.0, math.inf]}]}), tmp_path)
+
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    content = json.loads((tmp_path / "speed.json").read_text(), parse_constant=refuse)
+    assert content["rows"] == [ROWS[0], {**ROWS[1], "error": None}]
+    assert content["paths"] == [{"values": [1.0, None]}]
+    assert content["origin"]["seeds"] == {"scenes": 3}
+    assert content["origin"]["machine"]["cores"] >= 1
+
+
+def test_the_markdown_shows_the_figure_the_text_and_the_command(tmp_path):
+    write_page(page(), tmp_path)
+    text = (tmp_path / "speed.md").read_text()
+    for words in (
+        "# How fast\n",
+        "![speed](speed.png)",
+        "First.",
+        "| a\\|b, c | - |",
+        "```\nr2flow report speed 'a b'\n",
+    ):
+        assert words in text
+
+
+def test_a_page_that_fails_leaves_the_old_one(tmp_path):
+    write_page(page(), tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir() if path.suffix != ".png"}
+    with pytest.raises(TypeError):
+        write_page(page(rows=[{"solver": object()}]), tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir() if path.suffix != ".png"} == before
+
+
+def test_styles_differ_without_colour():
+    assert len({str((style["marker"], style["linestyle"])) for style in STYLES}) == len(STYLES)
+    assert len({style["marker"] for style in STYLES}) == len(STYLES)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0123456, "0.0123"), (1.5e-7, "1.5e-07"), (0.0, "0"), (128, "128"), (True, "yes"), (None, ""), ("x", "x"),
+     (12345.6, "1.2e+04"), (math.nan, "-"), (math.inf, "inf")],
+)  # fmt: skip
+def test_values_are_short(value, text):
+    assert shown(value) == text
+
+
+def test_a_folder_that_cannot_be_one_is_refused_before_anything_is_measured(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(InputError, match=r"file/reports cannot be a folder"):
+        prepare_folder(tmp_path / "file" / "reports")
+    assert prepare_folder(tmp_path / "a" / "b").is_dir()
+
+
+@pytest.mark.parametrize("name", ["curvature", "work-precision", "stability"])
+def test_every_report_has_help_with_an_example(verb, name):  # noqa: F811
+    code, said, _ = verb("report", name, "--help")
+    assert code == 0
+    assert f"Example: r2flow report {name}" in " ".join(said.split())
+
+
+def test_stability_is_a_page_like_the_others(verb, tmp_path):  # noqa: F811
+    code, said, _ = verb(
+        "report", "stability", "-o", tmp_path / "s", "--problems", "gaussian", "--solvers", "euler,dopri5",
+        "--tolerances", "1e-2", "--scenes", 2,
+    )  # fmt: skip
+    assert code == 0
+    assert {path.name for path in (tmp_path / "s").iterdir()} == {
+        f"stability.{e}" for e in ("png", "csv", "json", "md")
+    }
+    assert "say so" in said
+    rows = json.loads((tmp_path / "s" / "stability.json").read_text())["rows"]
+    assert {row["solver"] for row in rows} == {"euler", "dopri5"}
+    assert len(rows) == 4 * 2  # precisions and solvers
+
+
+def test_bad_input_to_stability_is_one_line(verb, tmp_path):  # noqa: F811
+    for arguments, words in (
+        (("--problems", "gausian"), "Did you mean 'gaussian'?"),
+        (("--solvers", "eulr"), "Did you mean 'euler'?"),
+        (("--tolerances", "0"), "--tolerances must be positive numbers"),
+    ):
+        code, _, err = verb("report", "stability", *arguments, "-o", tmp_path / "s")
+        assert code == 2
+        assert words in err
+        assert len(err.splitlines()) == 1
+        assert not (tmp_path / "s").exists()

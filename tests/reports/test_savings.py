@@ -1,0 +1,113 @@
+"""The issue's figures for own steps, and rows that add up."""
+
+import math
+
+import pytest
+import torch
+
+from r2flow.reports import savings
+from r2flow.reports.pages import write_page
+from r2flow.reports.savings import (
+    EULER,
+    LEAVING,
+    LONE,
+    MIXED,
+    ONE_STATE,
+    STAYING,
+    STRAIGHT,
+    channel_rows,
+    exact_rows,
+    region_rows,
+    regions_to_measure,
+    scene_rows,
+)
+from r2flow.reports.savings_page import savings_page
+from tests.test_sampling import flow, network
+
+
+@pytest.fixture(autouse=True)
+def _one_timing(monkeypatch):
+    monkeypatch.setattr(savings, "REPEATS", 1)
+
+
+def by_way(rows: list, tolerance: float | None = None) -> dict:
+    return {row["way"]: row for row in rows if tolerance is None or row["tolerance"] in (tolerance, None)}
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_own_steps_take_at_most_six_tenths_of_one_state_s_evaluations(seed):
+    rows = exact_rows(MIXED, "mixed", (1e-3, 1e-5), seed)
+    for tolerance in (1e-3, 1e-5):
+        ways = by_way(rows, tolerance)
+        assert ways[LEAVING]["evaluations"] <= 0.6 * ways[ONE_STATE]["evaluations"]
+        assert ways[STRAIGHT]["evaluations"] < ways[LEAVING]["evaluations"]
+        assert ways[STAYING]["evaluations"] > ways[LEAVING]["evaluations"]
+        assert ways[STRAIGHT]["error_straight"] < 1e-12
+        # the others are solved as before
+        for kind in ("gaussian", "two_modes", "ray_drop"):
+            assert ways[STRAIGHT][f"error_{kind}"] == ways[LEAVING][f"error_{kind}"]
+    hardest = by_way(rows, 1e-3)
+    assert hardest[LEAVING]["worst_error"] < hardest[ONE_STATE]["worst_error"]
+    assert ways[EULER]["evaluations"] == 16 * 32
+
+
+def test_the_lone_hard_scene_is_not_hidden_by_the_easy_ones():
+    ways = by_way(exact_rows(LONE, "lone", (1e-3,), seed=0))
+    assert ways[LEAVING]["error_ray_drop"] < 0.05 < ways[ONE_STATE]["error_ray_drop"]
+    assert ways[STRAIGHT]["evaluations"] < 0.3 * ways[ONE_STATE]["evaluations"]
+
+
+def test_scenes_of_a_flow_are_held_against_its_tight_solution():
+    calls: list[int] = []
+    ways = by_way(scene_rows(flow(), 2, 1e-3, seed=0, advance=lambda: calls.append(1)))
+    # the exact flow of a Gaussian: a solution at 1e-6 is the truth to that
+    assert ways[LEAVING]["worst_error"] < 1e-2
+    assert ways[EULER]["worst_error"] > ways[LEAVING]["median_error"]
+    assert ways[STRAIGHT]["straight"] == 0
+    assert ways[STRAIGHT]["evaluations"] == ways[LEAVING]["evaluations"] + 2  # one probe each
+    assert len(calls) > 0
+
+
+def test_regions_cost_their_share_and_are_measured_where_they_were_asked_for():
+    rows = region_rows(network(), 2, steps=2, seed=0, advance=lambda: None)
+    whole, *parts = rows
+    assert (whole["share"], whole["time"]) == (1.0, 1.0)
+    assert {row["way"] for row in parts} == set(regions_to_measure((8, 64)))
+    for row in parts:
+        assert 0 < row["share"] < 1
+        assert row["error"] > 0
+        assert 0 <= row["dropped"] <= 1
+        assert row["unrelated"] > 0
+    by_name = {row["way"]: row for row in parts}
+    assert by_name["sector of 180 degrees"]["share"] == 0.5
+    assert by_name["sector of 90 degrees"]["share"] == 0.25
+
+
+def test_a_field_that_looks_at_no_neighbour_loses_nothing_by_a_cut(monkeypatch):
+    # the exact Gaussian flow acts on each pixel by itself: any region of it is that of the whole
+    monkeypatch.setattr(savings, "evaluated_region", lambda checkpoint, region: region)
+    monkeypatch.setattr(savings, "part_of", lambda model, region: model)
+    for row in region_rows(flow(), 2, steps=4, seed=0, advance=lambda: None)[1:]:
+        assert row["error"] == pytest.approx(0, abs=1e-6)
+        assert row["median_m"] == pytest.approx(0, abs=1e-4)
+
+
+def test_channels_share_the_network_and_not_the_bytes():
+    both, alone = channel_rows(network(), budget=0.01)
+    assert both["bytes"] > alone["bytes"]
+    # PLY: 12 of 16 bytes a point; image: one of two channels
+    assert alone["bytes"] / both["bytes"] > 0.5
+    assert channel_rows(network(reflectance=False)) == []
+
+
+def test_the_page_is_written_with_and_without_a_checkpoint(tmp_path):
+    page = savings_page(network(), num=1, steps=1, tolerance=1e-1, command="r2flow report savings run")
+    written = {path.name for path in write_page(page, tmp_path)}
+    assert written == {
+        "savings_scenes.png", "savings_regions.png", "savings.csv", "savings.json", "savings.md"
+    }  # fmt: skip
+    text = (tmp_path / "savings.md").read_text()
+    for words in ("One hard scene among 255", "A part of the image", "One channel", "r2flow report savings run"):
+        assert words in text
+    assert not any(math.isnan(row.get("evaluations", 0)) for row in page.rows)
+    torch.manual_seed(0)

@@ -1,0 +1,56 @@
+"""No failure is silent but the jet's; the table, its words and its figure say the same."""
+
+import json
+
+import pytest
+
+from r2flow.flow.problems import PROBLEMS
+from r2flow.reports.stability import figure, jet_probe, markdown, stability, summary
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return stability(scenes=4, elements=32, max_evaluations=1000)
+
+
+def test_no_failure_is_silent_but_the_jet_s(rows):
+    told = summary(rows)
+    print(f"{told['covered']} of {told['failed']} failing cells of {told['cells']} say so; jets: {told['silent_jets']}")
+    assert told["silent"] == []
+    assert told["share"] == 1
+    assert told["failed"] > 40
+    assert told["silent_jets"] > 0
+
+
+def test_every_problem_solver_and_precision_has_its_cells(rows):
+    # 13 problems and the finished point mass, 4 precisions, 6 fixed and 2 adaptive solvers at 2 tolerances.
+    assert len(rows) == (len(PROBLEMS) + 1) * 4 * (6 + 2 * 2)
+    fixed = [row for row in rows if row["tolerance"] is None]
+    assert {row["verdict"] for row in fixed} == {"no estimate"}
+    assert all(row["estimate"] is None for row in fixed)
+
+
+def test_smooth_problems_are_solved_without_a_flag(rows):
+    for row in rows:
+        if row["tolerance"] is not None and row["problem"] in ("straight", "gaussian", "two_modes", "rotating"):
+            assert row["stiff"] == 0
+            assert row["converged"] == 1
+
+
+def test_rows_are_plain_values_and_the_page_has_one_line_each(rows):
+    json.dumps(rows, allow_nan=False)
+    page = markdown(rows, jet_probe(scenes=4, shares=(1.0, 1 / 64)))
+    assert sum(line.startswith("| ") and "| verdict |" not in line for line in page.splitlines()) == len(rows) + 4 + 1
+    assert "no estimate" in page
+    assert "100%" in page
+
+
+def test_a_shorter_step_finds_more_jets_and_costs_more():
+    for before, after in zip(*(jet_probe(scenes=16, shares=(share,)) for share in (1.0, 1 / 64)), strict=True):
+        assert after["found"] >= 0.8 > 0.3 >= before["found"]
+        assert after["evaluations"] > before["evaluations"]
+
+
+def test_the_figure_can_be_drawn(rows, tmp_path):
+    figure(rows).savefig(tmp_path / "stability.png", dpi=40)
+    assert (tmp_path / "stability.png").stat().st_size > 0

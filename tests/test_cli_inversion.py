@@ -1,0 +1,199 @@
+"""r2flow invert, interpolate, sample of a part, report savings: as a user types them."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.checkpoints import AtomicCheckpointIO
+from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.scan_files import read_points, write_points
+from r2flow.lidar.sensors import SENSORS
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.test_sampling import network, scans
+
+SENSOR = SENSORS["hdl64e"].resized(8, 64)
+
+
+def write_checkpoint(path: Path, reflectance: bool = True) -> Path:
+    """A run folder with a flow of small random weights."""
+    flow = network(reflectance)
+    weights = {f"velocity.{name}": 0.3 * value for name, value in flow.model.state_dict().items()}
+    weights |= {
+        f"velocity.{name}": value for name, value in flow.model.named_buffers() if f"velocity.{name}" in weights
+    }
+    content = {"state_dict": weights, "config": {**flow.config, "stage": {"name": "rectify"}}, "global_step": 7}
+    AtomicCheckpointIO().save_checkpoint(content, path / "checkpoints" / "step-00000007.ckpt")
+    return path
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return write_checkpoint(tmp_path / "run")
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> list[Path]:
+    """Two scans, as .bin and .ply."""
+    paths = [tmp_path / "scans" / "one.bin", tmp_path / "scans" / "two.ply"]
+    for path, image in zip(paths, scans(2).numpy(), strict=True):
+        write_points(path, *image_to_points(image, SENSOR.rays()))
+    return paths
+
+
+def test_invert_writes_the_noise_and_the_errors(r2flow, run, files, tmp_path):  # noqa: F811
+    code, said, _ = r2flow("invert", files[0].parent, "-c", run, "--out", tmp_path / "o", "--tolerance", "1e-4")
+    assert code == 0
+    rows = json.loads((tmp_path / "o" / "invert.json").read_text())["rows"]
+    assert [row["scan"] for row in rows] == ["one", "two"]
+    for row, image in zip(rows, scans(2), strict=True):
+        assert row["returns"] == int((image[0] > 0).sum())
+        assert row["converged"]
+        assert row["rms"] < 1e-2
+        x_0 = np.load(tmp_path / "o" / f"{row['scan']}.x_0.npy")
+        assert (x_0.shape, x_0.dtype) == ((2, 8, 64), np.float32)
+        assert x_0.std() == pytest.approx(row["noise_std"], rel=1e-3)
+        assert row["scan"] in said
+    assert (tmp_path / "o" / "invert.png").read_bytes().startswith(b"\x89PNG")
+    assert "r2flow invert" in (tmp_path / "o" / "invert.md").read_text()
+
+
+def test_a_range_image_is_a_scan_like_any_other(r2flow, run, files, tmp_path):  # noqa: F811
+    image = scans(1)[0].numpy()
+    image[0, 0, 0] = 500  # beyond the sensor's reach: a dropped ray
+    image[0, 0, 1] = np.nan
+    np.save(tmp_path / "image.npy", image)
+    code, _, _ = r2flow("invert", tmp_path / "image.npy", "-c", run, "-o", tmp_path / "o", "--solver", "rk4")
+    assert code == 0
+    (row,) = json.loads((tmp_path / "o" / "invert.json").read_text())["rows"]
+    assert row["returns"] == int((scans(1)[0, 0].flatten()[2:] > 0).sum())
+    assert row["evaluations"] == 2 * 4 * 32
+
+
+def test_interpolate_writes_every_frame(r2flow, run, files, tmp_path):  # noqa: F811
+    out = tmp_path / "between"
+    code, said, _ = r2flow("interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--solver", "rk4", "--steps", 8)
+    assert code == 0
+    assert [path.name for path in sorted((out / "frames").glob("*.ply"))] == [f"{i:03d}.ply" for i in range(4)]
+    for index in range(4):
+        image = np.load(out / "frames" / f"{index:03d}.npy")
+        assert len(read_points(out / "frames" / f"{index:03d}.ply").xyz) == (image[0] > 0).sum()
+    rows = json.loads((out / "interpolation.json").read_text())["rows"]
+    assert [row["weight"] for row in rows] == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    assert [row["evaluations"] for row in rows] == [64, 32, 32, 64]  # the ends go there and back
+    assert "4 scans" in said
+
+
+def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):  # noqa: F811
+    code, said, _ = r2flow(
+        "sample", "-c", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "-o", tmp_path / "o"
+    )
+    assert code == 0
+    assert "generating rows 0-3, columns 24-39, rounded outward from rows 0-2, columns 24-39: 12% of the image" in said
+    image = np.load(tmp_path / "o" / "000000.npy")
+    assert image.shape == (2, 8, 64)
+    inside = np.zeros((8, 64), bool)
+    inside[:3, 24:40] = True
+    assert (image[0][inside] > 0).any()
+    assert (image[:, ~inside] == 0).all()
+    xyz = read_points(tmp_path / "o" / "000000.ply").xyz
+    assert (np.abs(np.arctan2(xyz[:, 1], xyz[:, 0])) < np.pi / 4).all()
+
+
+def test_one_channel_is_written_alone(r2flow, run, tmp_path):  # noqa: F811
+    for channels in ("both", "range", "reflectance"):
+        out = tmp_path / channels
+        assert r2flow("sample", "-c", run, "--num", 1, "--steps", 2, "--channels", channels, "-o", out)[0] == 0
+    both = np.load(tmp_path / "both" / "000000.npy")
+    np.testing.assert_array_equal(np.load(tmp_path / "range" / "000000.npy"), both[:1])
+    np.testing.assert_array_equal(np.load(tmp_path / "reflectance" / "000000.reflectance.npy"), both[1:])
+    assert read_points(tmp_path / "range" / "000000.ply").reflectance is None
+    assert not list((tmp_path / "range").glob("*.bin"))
+    assert [path.suffix for path in sorted((tmp_path / "reflectance").iterdir())] == [".npy", ".png"]
+
+
+def test_savings_of_exact_problems_need_no_checkpoint(r2flow, tmp_path):  # noqa: F811
+    code, said, _ = r2flow("report", "savings", "--out", tmp_path)
+    assert code == 0
+    assert "8 straight, 4 smooth, 3 two modes, 1 ray-drop" in said
+    assert {path.suffix for path in tmp_path.glob("savings*")} == {".png", ".csv", ".json", ".md"}
+
+
+@pytest.mark.parametrize("verb", ["invert", "interpolate", "report savings"])
+def test_every_verb_has_help_with_an_example(r2flow, verb):  # noqa: F811
+    code, said, _ = r2flow(*verb.split(), "--help")
+    assert code == 0
+    assert f"Example: r2flow {verb}" in " ".join(said.split())
+
+
+class TestBadInput:
+    """One clear line, exit code 2, nothing written."""
+
+    def check(self, result, out: Path, *words: str) -> None:
+        code, _, err = result
+        lines = [line for line in err.splitlines() if not line.startswith("WARNING")]
+        assert (code, len(lines)) == (2, 1), err
+        assert lines[0].startswith("error: ")
+        for word in words:
+            assert word in lines[0]
+        assert not out.exists()
+
+    def test_of_inversion(self, r2flow, run, files, tmp_path):  # noqa: F811
+        out = tmp_path / "o"
+        with_run = ("-c", run, "-o", out)
+        np.save(tmp_path / "wide.npy", np.ones((2, 8, 128), np.float32))
+        np.save(tmp_path / "range.npy", np.full((1, 8, 64), 9, np.float32))
+        (tmp_path / "bad.bin").write_bytes(b"\0" * 30)
+        self.check(r2flow("invert", tmp_path / "no.bin", *with_run), out, "no.bin")
+        self.check(r2flow("invert", tmp_path / "bad.bin", *with_run), out, "bad.bin", "14 bytes more")
+        self.check(r2flow("invert", files[0], tmp_path / "wide.npy", *with_run), out, "8x128", "8x64")
+        self.check(r2flow("invert", tmp_path / "range.npy", *with_run), out, "has no reflectance")
+        self.check(r2flow("invert", files[0], *with_run, "--solver", "dopri6"), out, "Did you mean 'dopri5'?")
+        self.check(r2flow("invert", files[0], *with_run, "--tolerance", 0), out, "must be positive")
+        self.check(r2flow("interpolate", *files, *with_run, "--frames", 1), out, "--frames")
+        self.check(r2flow("interpolate", files[0], tmp_path / "no.ply", *with_run), out, "no.ply")
+        self.check(r2flow("report", "savings", tmp_path / "none", "-o", out), out, "no checkpoint")
+
+    def test_of_regions_and_channels(self, r2flow, run, tmp_path):  # noqa: F811
+        out = tmp_path / "o"
+        options = ("sample", "-c", run, "-o", out)
+        self.check(r2flow(*options, "--sector", "north"), out, "--sector", "-45,45", "'north'")
+        self.check(r2flow(*options, "--sector", "5,5"), out, "is empty")
+        self.check(r2flow(*options, "--rows", "0-8"), out, "0-7", "found 0-8")
+        self.check(r2flow(*options, "--rows", "1,2"), out, "--rows", "as 0-31")
+        self.check(r2flow(*options, "--channels", "depth"), out, "both, range or reflectance", "'depth'")
+        self.check(r2flow(*options, "--channels", "range", "--format", "bin"), out, "leaves it out", "ply,npy")
+        self.check(r2flow(*options, "--channels", "reflectance", "--format", "ply"), out, "need a range")
+        self.check(r2flow(*options, "--straight-first"), out, "adaptive solver", "'euler'")
+        alone = write_checkpoint(tmp_path / "range", reflectance=False)
+        self.check(r2flow("sample", "-c", alone, "-o", out, "--channels", "reflectance"), out, "range alone")
+
+
+def test_what_is_not_asked_for_is_not_imported():
+    shown = "print([m for m in ({}) if m in sys.modules]); "
+    code = "import r2flow.flow.straight_exit, r2flow.flow.problems, r2flow.lidar.region, r2flow.backbones.crop, sys; "
+    code += shown.format("'lightning', 'matplotlib', 'torchdiffeq', 'r2flow.simulator'")
+    code += "import r2flow.sampling, r2flow.reports.inversion, r2flow.reports.interpolation, r2flow.reports.savings; "
+    code += shown.format("'r2flow.simulator', 'tensorboard', 'torchdiffeq', 'plotly', 'natten'")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n") == ["[]", "[]", ""]
+
+
+def test_a_model_of_range_alone_has_no_reflectance_to_compute(r2flow, tmp_path):  # noqa: F811
+    alone = write_checkpoint(tmp_path / "range", reflectance=False)
+    assert r2flow("sample", "-c", alone, "--num", 1, "--steps", 2, "-o", tmp_path / "o")[0] == 0
+    assert np.load(tmp_path / "o" / "000000.npy").shape == (1, 8, 64)
+    assert read_points(tmp_path / "o" / "000000.ply").reflectance is None
+
+
+def test_a_real_scan_goes_there_and_back(r2flow, run, shared, tmp_path):  # noqa: F811
+    scan = next(iter(sorted((shared / "real" / "object" / "training" / "velodyne").glob("*.bin"))))
+    code, _, _ = r2flow("invert", scan, "-c", run, "-o", tmp_path / "o", "--tolerance", "1e-4")
+    assert code == 0
+    (row,) = json.loads((tmp_path / "o" / "invert.json").read_text())["rows"]
+    assert row["rms"] < 1e-2
+    assert torch.from_numpy(np.load(tmp_path / "o" / f"{scan.stem}.x_0.npy")).isfinite().all()

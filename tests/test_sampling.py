@@ -1,0 +1,282 @@
+"""Flows whose noise is known: x_1 = M + S x_0, element by element, and a network with random weights."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from r2flow.checkpoints import Checkpoint
+from r2flow.errors import InputError
+from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.region import region
+from r2flow.lidar.sensors import SENSORS
+from r2flow.reports.outputs import write_samples
+from r2flow.sampling import (
+    evaluated_region,
+    interpolate_scans,
+    invert,
+    noise_of,
+    part_of,
+    round_trip,
+    sample,
+    slerp,
+)
+from r2flow.stages import build_parts
+from tests.test_checkpoints import CONFIG
+
+SENSOR = SENSORS["hdl64e"].resized(8, 64)
+M, S = 0.2, 0.4
+
+
+class GaussianFlow(nn.Module):
+    """v of x_0 ~ N(0, 1) and x_1 ~ N(M, S^2), independent: the path of a point is t M + S_t x_0."""
+
+    def __init__(self, scale: float = 1.0) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.tensor(scale))
+
+    def forward(self, t: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        t = t.view(-1, 1, 1, 1) if t.ndim else t
+        return self.scale * (M + (t * S**2 - (1 - t)) / ((1 - t) ** 2 + (t * S) ** 2) * (x - t * M))
+
+
+def flow(model: nn.Module | None = None, **encoding) -> Checkpoint:
+    model = model or GaussianFlow()
+    return Checkpoint(model.requires_grad_(False), SENSOR, Encoding(SENSOR, **encoding), {}, 0, Path("none"), "r2flow")
+
+
+def network(reflectance: bool = True) -> Checkpoint:
+    """An HDiT with random weights."""
+    config = {**CONFIG, "encoding": {"format": "logscale", "reflectance": reflectance}}
+    parts = build_parts(config)
+    torch.manual_seed(4)
+    model = parts.backbone.eval().requires_grad_(False)
+    for parameter in model.parameters():
+        parameter.copy_(0.2 * torch.randn_like(parameter))
+    return Checkpoint(model, parts.sensor, parts.encoding, config, 0, Path("none"), "r2flow")
+
+
+def scans(count: int = 2) -> torch.Tensor:
+    """Walls with holes, (B, 2, 8, 64)."""
+    draw = torch.Generator().manual_seed(7)
+    r = 3 + 60 * torch.rand(count, 1, 8, 64, generator=draw)
+    r = r * (torch.rand(r.shape, generator=draw) > 0.2)
+    return torch.cat([r, torch.rand(r.shape, generator=draw) * (r > 0)], 1)
+
+
+@pytest.mark.parametrize(("method", "apart"), [("dopri5", 1e-4), ("bosh3", 1e-3), ("rk4", 1e-4), ("euler", 0.2)])
+def test_inversion_finds_the_noise(method, apart):
+    found = invert(flow(), scans(), method, steps=64, tolerance=1e-6)
+    expected = (flow().encoding.encode(scans()) - M) / S
+    assert (found.x_0 - expected).abs().max() < apart
+    assert found.converged.all()
+    errors = round_trip(flow(), found)
+    assert errors.rms.max() < apart
+    torch.testing.assert_close(errors.noise_std, expected.double().flatten(1).std(1), rtol=apart, atol=0)
+    if method != "euler":
+        assert errors.median_m.max() < 1e-2
+        assert errors.dropped.max() < 0.01
+
+
+def test_round_trip_errors_are_what_they_say():
+    checkpoint, images = flow(), scans(1)
+    found = invert(checkpoint, images, "rk4", steps=8)
+    changed = images.clone()
+    changed[0, :, 0, :16] = 0  # 16 columns of the first row lost
+    changed[0, 0, 1, :] += 0.5 * (images[0, 0, 1] > 0)
+    x = checkpoint.encoding.encode(changed)
+    errors = round_trip(checkpoint, replace(found, again=x))
+    lost = (images[0, 0, 0, :16] > 0).sum() / (8 * 64)
+    moved, kept = (images[0, 0, 1] > 0).sum(), (changed[0, 0] > 0).sum()
+    assert errors.dropped.item() == pytest.approx(lost.item())
+    assert errors.median_m.item() == pytest.approx(0, abs=1e-5)
+    assert errors.rms_m.item() == pytest.approx(0.5 * (moved / kept).sqrt().item(), rel=1e-3)
+    assert errors.rms.item() == pytest.approx((x - found.x_1).square().mean().sqrt().item(), rel=1e-6)
+
+
+EXTREMES = {
+    "all dropped": torch.zeros(1, 2, 8, 64),
+    "one return": torch.nn.functional.pad(torch.tensor([[[[12.0]], [[0.5]]]]), (40, 23, 3, 4)),
+    "all nearest": torch.full((1, 2, 8, 64), SENSOR.min_range),
+    "all farthest": torch.full((1, 2, 8, 64), SENSOR.max_range),
+    "saturated": torch.cat([torch.full((1, 1, 8, 64), 20.0), torch.ones(1, 1, 8, 64)], 1),
+}
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extreme_scans_go_there_and_back(name):
+    image = EXTREMES[name].clone()
+    image[:, 1] = image[:, 1].clamp(0, 1)
+    found = invert(flow(), image, "dopri5", tolerance=1e-6)
+    errors = round_trip(flow(), found)
+    assert found.converged.all()
+    assert errors.rms.item() < 1e-4
+    if name == "all dropped":
+        assert errors.median_m.isnan().all()  # no ray returns: there is nothing to measure in metres
+    else:
+        assert errors.median_m.item() < 0.05
+    # a dropped ray, or one at the very limit, stays what it is only as exactly as the solver goes
+    assert errors.dropped.item() == 0 or name in ("all nearest", "all farthest")
+    assert found.x_0.isfinite().all()
+
+
+def test_a_scene_with_nan_is_flagged_and_its_neighbours_are_right():
+    images = scans(3)
+    images[1, 0, 2, 5] = math.nan
+    found, alone = invert(flow(), images), invert(flow(), images[::2])
+    assert found.converged.tolist() == [True, False, True]
+    assert found.x_0[1].isnan().all()
+    assert torch.equal(found.x_0[::2], alone.x_0)
+    assert torch.equal(found.again[::2], alone.again)
+    errors = round_trip(flow(), found)
+    for values in (errors.rms, errors.rms_m, errors.dropped):
+        assert values.isnan().tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("scale", [1e3, 1e30])
+def test_weights_scaled_beyond_reason_raise_nothing_and_are_flagged(scale):
+    # v a thousand times too large goes nowhere near data; too large for float32 it is not solved at all.
+    found = invert(flow(GaussianFlow(scale)), scans(1), "dopri5", tolerance=1e-3)
+    assert not found.converged.any() or (found.again - found.x_1).abs().max() < 1
+    assert found.x_0.isnan().all() == (not found.converged.any())
+
+
+def test_a_network_with_its_weights_a_thousand_times_larger_is_sampled_or_flagged():
+    checkpoint = network()
+    for parameter in checkpoint.model.parameters():
+        parameter.mul_(1e3)
+    (drawn,) = sample(checkpoint, 1, steps=4)
+    assert drawn.images.isfinite().all()
+    inside = (drawn.images[:, 0] == 0) | ((drawn.images[:, 0] >= 1.45) & (drawn.images[:, 0] <= 80))
+    assert inside.all()
+
+
+def test_slerp_follows_the_circle():
+    # e_1 to e_2 over 90 degrees: (cos, sin) of the angle, by the definition of a circle
+    x, y = torch.tensor([3.0, 0, 0]), torch.tensor([0, 3.0, 0])
+    w = torch.linspace(0, 1, 7)
+    angle = w * math.pi / 2
+    torch.testing.assert_close(slerp(x, y, w), 3 * torch.stack([angle.cos(), angle.sin(), 0 * w], 1))
+
+
+def test_slerp_keeps_the_length_of_noise_and_the_ends_exactly():
+    x, y = torch.randn(2, 2, 32, 64)
+    way = slerp(x, y, torch.linspace(0, 1, 9))
+    assert torch.equal(way[0], x)
+    assert torch.equal(way[-1], y)
+    assert (way.flatten(1).std(1) - 1).abs().max() < 0.02
+    assert ((x + y) / 2).std() < 0.75  # the straight mean does not
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-8, 1e-5])
+def test_slerp_between_nearly_parallel_ends_is_the_straight_mean(angle):
+    x = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    y = torch.tensor([math.cos(angle), math.sin(angle)], dtype=torch.float64)
+    w = torch.tensor([0.25, 0.5])
+    torch.testing.assert_close(slerp(x, y, w)[:, 1], w.double() * angle, rtol=1e-6, atol=1e-18)
+    assert slerp(x, x, w).tolist() == [[1, 0], [1, 0]]
+
+
+def test_slerp_refuses_ends_without_a_way():
+    with pytest.raises(InputError, match="opposite"):
+        slerp(torch.ones(4), -torch.ones(4), torch.tensor([0.5]))
+    with pytest.raises(InputError, match="is zero"):
+        slerp(torch.ones(4), torch.zeros(4), torch.tensor([0.5]))
+
+
+def test_frames_lie_between_the_scans():
+    a, b = scans(2)
+    found = interpolate_scans(flow(), torch.stack([a, b]), 5, "dopri5", tolerance=1e-6, batch_size=2)
+    assert found.images.shape == (5, 2, 8, 64)
+    for frame, scan in ((found.images[0], a), (found.images[-1], b)):
+        both = (frame[0] > 0) & (scan[0] > 0)
+        torch.testing.assert_close(frame[0][both], scan[0][both], rtol=1e-2, atol=0)
+    x_0 = (flow().encoding.encode(torch.stack([a, b])) - M) / S
+    middle = flow().encoding.decode(M + S * slerp(*x_0, torch.tensor([0.5])))
+    torch.testing.assert_close(found.images[2], middle[0], rtol=1e-2, atol=1e-2)
+    assert (found.evaluations > 0).all()
+    arrived = []
+    interpolate_scans(flow(), torch.stack([a, b]), 5, "euler", batch_size=2, arrived=arrived.append)
+    assert arrived == [1, 2, 4, 5]
+    with pytest.raises(InputError, match="two frames"):
+        interpolate_scans(flow(), torch.stack([a, b]), 1)
+
+
+def test_a_region_is_generated_from_the_whole_image_s_noise():
+    checkpoint = network()
+    wanted = region(SENSOR.shape, (-30, 40), (2, 5))
+    seen = evaluated_region(checkpoint, wanted)
+    (drawn,) = sample(checkpoint, 2, steps=3, batch_size=2, seed=9, region=wanted)
+    shapes = []
+    part = part_of(checkpoint.model, seen)
+    x = seen.crop(noise_of(range(2), (2, 8, 64), 9))
+    for step in range(3):  # three Euler steps, written out
+        shapes.append(tuple(x.shape[2:]))
+        x = x + part(torch.tensor(step / 3), x) / 3
+    assert set(shapes) == {(seen.height, seen.width)}
+    whole = seen.place(checkpoint.encoding.decode(x))
+    torch.testing.assert_close(wanted.crop(drawn.images), wanted.crop(whole), rtol=1e-5, atol=1e-4)
+    outside = drawn.images - wanted.place(wanted.crop(drawn.images))
+    assert (outside == 0).all()
+
+
+class Lost(GaussianFlow):
+    def forward(self, t, x):
+        lost = torch.arange(len(x)).view(-1, 1, 1, 1) == 1
+        return torch.where(lost, math.nan, super().forward(t, x))
+
+
+def test_a_scan_that_is_not_solved_is_flagged_and_said(tmp_path, caplog):
+    (drawn,) = sample(flow(Lost()), 3, steps=4, batch_size=3)
+    assert drawn.converged.tolist() == [True, False, True]
+    (others,) = sample(flow(), 3, steps=4, batch_size=3)
+    assert torch.equal(drawn.images[::2], others.images[::2])
+    write_samples(flow(Lost()), tmp_path, 3, 4, seed=0, pictures=0, batch_size=3)
+    assert "not solved, and no scans of this flow: 1" in caplog.text
+
+
+def test_the_region_that_is_all_changes_nothing():
+    checkpoint = network()
+    (part,) = sample(checkpoint, 1, steps=2, region=region(SENSOR.shape))
+    (whole,) = sample(checkpoint, 1, steps=2)
+    assert torch.equal(part.images, whole.images)
+
+
+def test_one_channel_is_that_of_both():
+    checkpoint = network()
+    (both,) = sample(checkpoint, 1, steps=2)
+    for index, channels in enumerate(("range", "reflectance")):
+        (one,) = sample(checkpoint, 1, steps=2, channels=channels)
+        assert torch.equal(one.images, both.images[:, index : index + 1])
+    alone = network(reflectance=False)
+    (ranges,) = sample(alone, 1, steps=2, channels="range")
+    assert ranges.images.shape == (1, 1, 8, 64)
+    assert alone.model.in_channels == 1  # it never computes any reflectance
+    with pytest.raises(InputError, match="range alone"):
+        next(sample(alone, 1, channels="reflectance"))
+    with pytest.raises(InputError, match="found 'depth'"):
+        next(sample(checkpoint, 1, channels="depth"))
+
+
+def test_range_alone_decodes_no_reflectance(monkeypatch):
+    checkpoint = network()
+    widths = []
+    decode = Encoding.decode
+    monkeypatch.setattr(Encoding, "decode", lambda self, x: widths.append(x.shape[1]) or decode(self, x))
+    next(sample(checkpoint, 1, steps=1, channels="range"))
+    assert widths == [1]
+
+
+def test_straight_scenes_take_one_step():
+    class Straight(GaussianFlow):
+        def forward(self, t, x):
+            return torch.full_like(x, 0.1) * self.scale
+
+    (drawn,) = sample(flow(Straight()), 2, method="dopri5", tolerance=1e-3, batch_size=2, straight_first=True)
+    assert drawn.evaluations.tolist() == [3, 3]
+    (bent,) = sample(flow(), 1, method="dopri5", tolerance=1e-3, straight_first=True)
+    (alone,) = sample(flow(), 1, method="dopri5", tolerance=1e-3)
+    assert torch.equal(bent.images, alone.images)
