@@ -1,20 +1,26 @@
-"""Compose the config, build what it names, fit. With no arguments: the demo on simulated scans.
+"""Compose the config, build what it names, fit. With no arguments: the demo, `experiment=demo`.
 
     python train.py
     python train.py data=kitti_raw data.root=FOLDER backbone=hdit_small
     python train.py experiment=r2flow_1rf data.root=KITTI-360 trainer=ddp
+    python train.py experiment=r2flow_2rf stage.init=runs/r2flow_1rf trainer=ddp
+    python train.py experiment=r2flow data.root=KITTI-360 trainer=ddp
     python train.py -m backbone=hdit_tiny,hdit_small seed=1,2,3
 
 The same command again goes on from the run's last checkpoint.
 """
 
+import functools
 import hashlib
 import logging
 import os
 import re
+import signal
 import subprocess
 import sys
 import warnings
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -32,20 +38,21 @@ log = logging.getLogger("r2flow")
 CONF = Path(__file__).resolve().parent / "conf"
 
 
-def job_folder(overrides: str) -> str:
+def job_folder(arguments: Sequence[str], overrides: str) -> str:
     """A folder name for a job of a sweep: the values that are swept, and a hash of all overrides."""
-    given = [argument.partition("=") for argument in sys.argv[1:]]
+    given = [argument.partition("=") for argument in arguments]
     swept = {key.lstrip("+~") for key, _, value in given if "," in value}
     parts = [part for part in overrides.split(",") if part.partition("=")[0].lstrip("+~") in swept]
     readable = re.sub(r"[^\w.=+-]+", "_", ",".join(parts) or "job")[:80]
     return f"{readable}-{hashlib.sha256(overrides.encode()).hexdigest()[:6]}"
 
 
-OmegaConf.register_new_resolver("job_folder", job_folder, replace=True)
+def fit(config: dict[str, Any], asked: list[str]) -> None:
+    """Train the stage that a plain config describes, in its run folder, from where it stopped.
 
-
-def fit(config: dict[str, Any]) -> None:
-    """Train the stage that a plain config describes, in its run folder, from where it stopped."""
+    Args:
+        asked: The keys that the command line gave.
+    """
     # Imported here: a misspelt config should answer at once, not after torch has loaded.
     import lightning as L
     import torch
@@ -54,10 +61,11 @@ def fit(config: dict[str, Any]) -> None:
     from callbacks import build_callbacks, build_loggers
     from r2flow.checkpoints import AtomicCheckpointIO, checkpoints_of
     from r2flow.data.datamodule import ScanDataModule
+    from r2flow.lineage import inherit
     from r2flow.noise import seed_torch
     from r2flow.registry import check_options
     from r2flow.reports.training import check_samples, finish
-    from r2flow.runs import open_run
+    from r2flow.runs import open_run, run_lock
     from r2flow.stages import build_parts, build_stage
 
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
@@ -73,8 +81,12 @@ def fit(config: dict[str, Any]) -> None:
     check_samples(**config["samples"])
     if not (isinstance(config["seed"], int) and 0 <= config["seed"] < 2**63):
         raise InputError(f"seed must be a whole number of at least 0, found {config['seed']!r}.")
+    config, parent = inherit(config, asked)
     seed_torch(config["seed"], "weights")
     parts = build_parts(config)
+    if parent is not None:
+        parts.backbone.load_state_dict(parent.model.state_dict())
+        del parent
     check_options("data", ScanDataModule, config["data"], given=3)
     data = ScanDataModule(parts.sensor, parts.encoding, config["seed"], **config["data"])
     data.setup()
@@ -87,18 +99,24 @@ def fit(config: dict[str, Any]) -> None:
     except (TypeError, ValueError, MisconfigurationException) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None
     data.check_run(trainer.world_size, trainer.accumulate_grad_batches, trainer.max_steps)
-    last = None if trainer_options["fast_dev_run"] else open_run(run_dir, config)
-    if last is not None:
-        log.info("going on from %s", last)
-    try:
-        trainer.fit(stage, data, ckpt_path=last, weights_only=True)
-    except SystemExit:  # how Lightning ends a run on Ctrl-C
-        kept = "goes on from the last checkpoint" if checkpoints_of(run_dir) else "starts it again: no checkpoint yet"
-        print(f"stopped at step {trainer.global_step}; the same command {kept}", flush=True)
-        raise SystemExit(130) from None
-    if trainer.is_global_zero and not trainer_options["fast_dev_run"]:
-        device = "cuda" if torch.cuda.is_available() and trainer_options["accelerator"] != "cpu" else "cpu"
-        finish(run_dir, config["samples"], config["seed"], device, trainer.max_steps)
+    if trainer_options["fast_dev_run"]:
+        trainer.fit(stage, data)
+        return
+    with run_lock(run_dir) if trainer.is_global_zero else nullcontext():
+        last = open_run(run_dir, config)
+        if last is not None:
+            log.info("going on from %s", last)
+        try:
+            trainer.fit(stage, data, ckpt_path=last, weights_only=True)
+        except SystemExit as stop:  # 1: how Lightning ends a run on Ctrl-C; else callbacks.requeue
+            kept = (
+                "goes on from the last checkpoint" if checkpoints_of(run_dir) else "starts it again: no checkpoint yet"
+            )
+            print(f"stopped at step {trainer.global_step}; the same command {kept}", flush=True)
+            raise SystemExit(130 if stop.code == 1 else stop.code) from None
+        if trainer.is_global_zero:
+            device = "cuda" if torch.cuda.is_available() and trainer_options["accelerator"] != "cpu" else "cpu"
+            finish(run_dir, config["samples"], config["seed"], device, trainer.max_steps)
 
 
 def check_trainer(options: dict[str, Any]) -> None:
@@ -125,8 +143,32 @@ def sweep_job(config: DictConfig) -> int:
     return subprocess.run(command, check=False).returncode
 
 
+def chain(config: dict[str, Any], given: list[str]) -> int:
+    """The runs that a config's `chain` names, and the report on them."""
+    from r2flow.chain import links_of, run_chain
+
+    folder = Path(config["run_dir"])
+    links = links_of(config["chain"], folder, given)
+    code, ran = run_chain(links, Path(__file__))
+    if code:
+        return code
+    page = folder / "report" / "chain.md"
+    if page.is_file() and not ran:
+        print(f"report: finished before, {page}")
+        return 0
+    from r2flow.reports.chain import report
+
+    report({link.name: link.run_dir for link in links}, page.parent)
+    return 0
+
+
+class JobFailed(RuntimeError):
+    """A job of a sweep ended badly; its own lines have said why."""
+
+
 failed_jobs: list[str] = []
 mistakes: list[str] = []
+chain_codes: list[int] = []
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
@@ -134,11 +176,17 @@ def run(config: DictConfig) -> None:
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         if sweep_job(config):
             failed_jobs.append(" ".join(HydraConfig.get().overrides.task))
+            raise JobFailed(failed_jobs[-1])  # Hydra runs the other jobs first
         return
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
+    settings = {str(key): value for key, value in plain.items()}
+    given = list(HydraConfig.get().overrides.task)
     try:
-        fit({str(key): value for key, value in plain.items()})
+        if settings["chain"]:
+            chain_codes.append(chain(settings, given))
+        else:
+            fit(settings, [one.lstrip("+~").partition("=")[0] for one in given])
     except (InputError, OSError) as error:  # Hydra would print its own lines around it
         mistakes.append(explain_mistake(error))
 
@@ -147,10 +195,20 @@ def main() -> int:
     """Run, and turn what the user can mend into one line and exit code 2."""
     # Otherwise Hydra prints composition errors itself, over many lines, and exits with 1.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    mistakes.clear()
-    failed_jobs.clear()
+    if "SLURM_JOB_ID" in os.environ:  # It signals every process of a job: a run answers, a chain waits for it.
+        signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+    for kept in (mistakes, failed_jobs, chain_codes):
+        kept.clear()
+    if len(sys.argv) == 1:
+        sys.argv.append("experiment=demo")
+    # Taken now: in a launcher's process sys.argv is the launcher's.
+    OmegaConf.register_new_resolver("job_folder", functools.partial(job_folder, tuple(sys.argv[1:])), replace=True)
     try:
         run()
+    except JobFailed as error:
+        failed = failed_jobs or [f"{error}, the first of them"]  # of other processes only the first is heard
+        print(f"error: {len(failed_jobs) or 'some'} of the sweep's jobs failed: {'; '.join(failed)}", file=sys.stderr)
+        return 2
     except (HydraException, OmegaConfBaseException) as error:
         print(f"error: {explain(error)}", file=sys.stderr)
         return 2
@@ -160,10 +218,7 @@ def main() -> int:
     if mistakes:
         print(f"error: {mistakes[0]}", file=sys.stderr)
         return 2
-    if failed_jobs:
-        print(f"error: {len(failed_jobs)} of the sweep's jobs failed: {'; '.join(failed_jobs)}", file=sys.stderr)
-        return 2
-    return 0
+    return max(chain_codes, default=0)
 
 
 def explain(error: Exception) -> str:
@@ -176,6 +231,8 @@ def explain(error: Exception) -> str:
     if unknown:
         key = unknown.group(1)
         return f"the config has no key '{key}'.{did_you_mean(key, known_keys())} See --cfg job for all of them."
+    if "Could not find 'hydra/launcher/submitit" in text:
+        return "this launcher needs an extra of the project: python -m pip install -e '.[slurm]'"
     choice = re.search(r"Could not find '([^/']+)/([^']+)'", text)
     if choice:
         group, name = choice.groups()

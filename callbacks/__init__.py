@@ -9,8 +9,11 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 from callbacks.curvature import Curvature
 from callbacks.ema import EMA
+from callbacks.guard import Guard
 from callbacks.pictures import SamplePictures
 from callbacks.progress import Progress
+from callbacks.reflow_pairs import ReflowPairs
+from callbacks.requeue import Requeue
 from r2flow.checkpoints import FOLDER
 from r2flow.errors import InputError
 from r2flow.registry import Registry, check_options
@@ -70,12 +73,15 @@ def keep_checkpoints(folder: Path, every: int = 1000) -> list[Callback]:
 # In the order in which they act.
 CALLBACKS = Registry(
     "callback",
+    reflow_pairs=Entry(ReflowPairs, lambda config, parts: (config["stage"].get("init"),)),
     ema=Entry(EMA),
     pictures=Entry(
         SamplePictures,
         lambda config, parts: (Path(config["run_dir"], "pictures"), parts.sensor, parts.encoding, config["seed"]),
     ),
     curvature=Entry(Curvature, lambda config, parts: ((parts.encoding.channels, *parts.sensor.shape), config["seed"])),
+    guard=Entry(Guard, lambda config, parts: (config["run_dir"],)),
+    requeue=Entry(Requeue, lambda config, parts: (config["run_dir"],)),
     checkpoint=Entry(keep_checkpoints, lambda config, parts: (Path(config["run_dir"], FOLDER),)),
     progress=Entry(Progress),
 )
@@ -102,7 +108,10 @@ def build_loggers(names: Sequence[str] | None, run_dir: Path) -> list[Logger]:
 __all__ = [
     "EMA",
     "Curvature",
+    "Guard",
     "Progress",
+    "ReflowPairs",
+    "Requeue",
     "SamplePictures",
     "build_callbacks",
     "build_loggers",

@@ -1,5 +1,6 @@
 """Checkpoints: written whole, read without running code, and turned into models."""
 
+import hashlib
 import json
 import os
 import pickle
@@ -45,6 +46,12 @@ class Checkpoint:
     step: int
     path: Path
     format: str
+
+    @property
+    def distilled_steps(self) -> int | None:
+        """k of a k-TD flow, which takes k steps; None of the others."""
+        stage = self.config.get("stage") or {}
+        return int(stage["steps"]) if stage.get("name") == "distill" else None
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -166,6 +173,16 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     if "published" in config and config["data"]["projection"] == "unfolding":
         sensor = published_rings(sensor, weights["coords"])
     return Checkpoint(model, sensor, parts.encoding, config, step, path, kind)
+
+
+def weights_hash(checkpoint: Checkpoint) -> str:
+    """What a flow is, in 16 hex digits: its averaged weights and what its images mean, whatever file they came from."""
+    meaning = {key: checkpoint.config[key] for key in ("sensor", "encoding")}
+    digest = hashlib.sha256(json.dumps(meaning, sort_keys=True).encode())
+    for name, value in sorted(checkpoint.model.state_dict().items()):
+        digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()[:16]
 
 
 def read_safetensors(path: Path) -> dict[str, Any]:

@@ -87,9 +87,7 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
         InputError: an option that `constructor` does not take by keyword, one that it cannot do without, or a value
             that its annotation does not allow.
     """
-    parameters = list(inspect.signature(constructor).parameters.values())
-    if parameters and parameters[0].name == "self":  # a decorated __init__
-        parameters = parameters[1:]
+    parameters = _parameters(constructor)
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return
     known = {p.name: p for p in parameters[given:] if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)}
@@ -103,6 +101,19 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
     for key, parameter in known.items():
         if parameter.default is parameter.empty and key not in options:
             raise InputError(f"{what} needs the option {key!r}.")
+
+
+def _parameters(constructor: Callable[..., Any]) -> list[inspect.Parameter]:
+    """A constructor's parameters; where a class takes `**options` for its base class, those of the base too."""
+    parameters = list(inspect.signature(constructor).parameters.values())
+    if parameters and parameters[0].name == "self":  # a decorated __init__
+        parameters = parameters[1:]
+    passes_on = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    if passes_on and inspect.isclass(constructor) and constructor.__bases__[0] is not object:
+        own = [p for p in parameters if p.kind is not p.VAR_KEYWORD]
+        names = {p.name for p in own}
+        return own + [p for p in _parameters(constructor.__bases__[0]) if p.name not in names]
+    return parameters
 
 
 Check = tuple[str, Callable[[Any], bool]]

@@ -1,7 +1,11 @@
 """A run's folder: what it holds, and whether a command may go on in it."""
 
 import logging
+import os
+import platform
+import time
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +28,15 @@ FREE = (
     "callbacks.pictures",
     "callbacks.progress",
     "callbacks.checkpoint",
+    "callbacks.curvature",
+    "callbacks.guard",
+    "callbacks.reflow_pairs",
+    "callbacks.requeue",
     "data.root",
     "data.validation.data.root",
+    "stage.init",
+    "parent.path",
+    "chain",
     "data.workers",
     "data.memory_gib",
     "trainer.accelerator",
@@ -63,6 +74,40 @@ def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
         for key in sorted(before.keys() | now.keys())
         if before.get(key) != now.get(key) and not _is_free(key)
     ]
+
+
+@contextmanager
+def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
+    """One process at a time in a run's folder; the lock goes with its holder, however that ends.
+
+    Raises:
+        InputError: another process still trains there after `patience` seconds.
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows has no flock
+        yield
+        return
+    path = Path(run, ".lock")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+", encoding="utf-8") as file:
+        until = time.monotonic() + patience
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > until:
+                    file.seek(0)
+                    holder = file.read().strip() or "unknown"
+                    raise InputError(
+                        f"{run} is being trained by another process ({holder}). Wait for it, or give name=OTHER."
+                    ) from None
+                time.sleep(0.2)
+        file.truncate(0)
+        file.write(f"pid {os.getpid()} on {platform.node()}")
+        file.flush()
+        yield
 
 
 def read_config(run: str | Path) -> dict[str, Any] | None:

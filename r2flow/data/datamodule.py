@@ -9,10 +9,12 @@ from typing import Any
 
 import lightning as L
 import torch
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 
 from r2flow.data.layouts import find_drives
 from r2flow.data.loader import FixedSampler, FlowDataset, Item, RunLoader, RunSampler
+from r2flow.data.pairs import PairDataset, PairOptions, PairSource
+from r2flow.data.shards import PairStore
 from r2flow.data.sources import (
     InMemory,
     ScanFiles,
@@ -29,17 +31,18 @@ from r2flow.registry import check_options, did_you_mean
 log = logging.getLogger(__name__)
 
 SIMULATED = "simulated"
+PAIRS = "pairs"
 
 
 class ScanDataModule(L.LightningDataModule):
-    """Projected scans with their noise, for training and validation.
+    """Projected scans with their noise, or pairs that a flow has drawn, for training and validation.
 
     Args:
         sensor: What the scans are projected through.
         encoding: Metres to model space.
         seed: Run seed; noise, times and order derive from it (`r2flow.noise`).
-        name: `simulated`, or a layout of `r2flow.data.layouts.LAYOUTS`.
-        root: Folder of the data set.
+        name: `simulated`, `pairs`, or a layout of `r2flow.data.layouts.LAYOUTS`.
+        root: Folder of the data set, or of the pairs.
         split: Part of the layout's standard split; None takes all.
         drives: Drives to take; None takes all.
         scenes: Number of simulated training scenes.
@@ -53,6 +56,7 @@ class ScanDataModule(L.LightningDataModule):
         memory_gib: Training scans are kept in memory where they fit into this, else read when needed.
         validation: `{share, scans, data}`: the share of the scans held out as one contiguous block, the most
             scans to validate on, or `data`, another data config (name, root, split, drives, ...) to hold out instead.
+        pairs: Options of `r2flow.data.pairs.PairOptions`, where the data are pairs.
     """
 
     def __init__(
@@ -74,6 +78,7 @@ class ScanDataModule(L.LightningDataModule):
         workers: int = 0,
         memory_gib: float = 2.0,
         validation: Mapping[str, Any] | None = None,
+        pairs: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
         if batch_size < 1 or workers < 0 or scenes < 1:
@@ -92,30 +97,57 @@ class ScanDataModule(L.LightningDataModule):
         self.validation = dict(validation or {})
         check_options("data.validation", _validation_options, self.validation)
         self.names: list[str] = []
-        self.training_source: ScanSource | None = None
-        self.validation_source: ScanSource | None = None
+        self.training_source: ScanSource | PairSource | None = None
+        self.validation_source: ScanSource | PairSource | None = None
+        self.pairs = self._pair_options(pairs or {}) if name == PAIRS else None
+
+    def _pair_options(self, options: Mapping[str, Any]) -> PairOptions:
+        check_options("data.pairs", PairOptions, options)
+        if self.flip:
+            raise InputError("data.flip mirrors scans; a mirrored pair is none of the flow's. Leave it out with pairs.")
+        if self.validation.get("data") is not None:
+            raise InputError("data.validation.data cannot be held out from pairs; leave it out.")
+        if self.options["root"] is None:
+            raise InputError("data=pairs needs the flow that draws them, stage.init=RUN, or their folder, data.root=.")
+        return PairOptions(**options)
+
+    @property
+    def pair_store(self) -> PairStore:
+        """The folder of the run's pairs, whatever it holds yet."""
+        assert self.pairs is not None
+        shape = (self.encoding.channels, *self.sensor.shape)
+        return PairStore(str(self.options["root"]), self.pairs.recipe(shape))
 
     def setup(self, stage: str | None = None) -> None:
         if self.training_source is not None:
             return
-        source = self._source(self.options)
+        if self.pairs is not None:
+            self.pair_store  # noqa: B018  (other pairs in its folder are refused now; missing ones are made later)
+            return
+        training, held = self.sources()
+        self.training_source = self._kept(training, "training scans")
+        self.validation_source = self._kept(held, "validation scans")
+
+    def sources(self) -> tuple[ScanSource, ScanSource]:
+        """The scans to train on and those held out, none of them read yet."""
         share, most, other = _validation_options(**self.validation)
+        source = self._source(self.options)
         if other is not None:
             for key in other:
                 if key not in self.options:
                     hint = did_you_mean(key, self.options)
                     known = ", ".join(self.options)
                     raise InputError(f"data.validation.data has no option {key!r}; it knows: {known}.{hint}")
-            held: ScanSource = self._source({**self.options, "split": None, "drives": None, **other}, held_out=True)
-            training = source
+            held = self._source({**self.options, "split": None, "drives": None, **other}, held_out=True)
         else:
             first, last = holdout_block(len(source), share)
-            training, held = source.subset(first), source.subset(last)
-        self.training_source = self._kept(training, "training scans")
-        self.validation_source = self._kept(held.subset(spread(len(held), most)), "validation scans")
+            source, held = source.subset(first), source.subset(last)
+        return source, held.subset(spread(len(held), most))
 
     def fingerprint(self) -> str:
         """What is trained on, wherever it lies: a run goes on only with the same scans in the same order."""
+        if self.pairs is not None:
+            return f"{self.pairs.num} pairs, {self.pair_store.recipe.digest}"
         assert self.training_source is not None
         names = hashlib.sha256("\n".join(self.names).encode()).hexdigest()[:12]
         return f"{len(self.training_source)} of {len(self.names)} scans, {names}"
@@ -179,6 +211,7 @@ class ScanDataModule(L.LightningDataModule):
 
     def train_dataloader(self) -> RunLoader:
         """The rest of the run: from the trainer's step on, to max_steps."""
+        self._ready()
         assert self.training_source is not None
         assert self.trainer is not None
         rank, ranks = self._ranks()
@@ -193,10 +226,29 @@ class ScanDataModule(L.LightningDataModule):
             ranks,
         )
         sampler.first_batch = self.trainer.global_step * accumulated
-        dataset = FlowDataset(self.training_source, self.encoding, self.seed, "training", self.flip)
-        return RunLoader(dataset, sampler, **self._loader_options())
+        return RunLoader(self._dataset(self.training_source, "training"), sampler, **self._loader_options())
+
+    def _ready(self) -> None:
+        """Open what is there by now: pairs are made after `setup`.
+
+        Raises:
+            InputError: some pairs are missing still.
+        """
+        self.setup()
+        if self.pairs is not None and self.training_source is None:
+            share, most, _ = _validation_options(**self.validation)
+            pairs = PairSource(self.pair_store, self.pairs.num)
+            first, last = holdout_block(len(pairs), share)
+            self.training_source = pairs.subset(first)
+            self.validation_source = pairs.subset([last[i] for i in spread(len(last), most)])
+
+    def _dataset(self, source: ScanSource | PairSource, purpose: str) -> Dataset[Item]:
+        if isinstance(source, PairSource):
+            return PairDataset(source, self.seed, purpose)
+        return FlowDataset(source, self.encoding, self.seed, purpose, self.flip and purpose == "training")
 
     def val_dataloader(self) -> DataLoader[Item] | list[Any]:
+        self._ready()
         assert self.validation_source is not None
         if len(self.validation_source) == 0:
             return []
@@ -207,7 +259,7 @@ class ScanDataModule(L.LightningDataModule):
         if scans < ranks:
             rank, ranks = 0, 1
         sampler = FixedSampler(scans - scans % ranks, batch_size, rank, ranks)
-        dataset = FlowDataset(self.validation_source, self.encoding, self.seed, "validation")
+        dataset = self._dataset(self.validation_source, "validation")
         return DataLoader(dataset, batch_sampler=sampler, **self._loader_options())
 
     def _loader_options(self) -> dict[str, Any]:

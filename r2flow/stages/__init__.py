@@ -12,8 +12,9 @@ from r2flow.lidar.encoding import Encoding, build_encoding
 from r2flow.lidar.sensors import Convention, Sensor, build_sensor
 from r2flow.registry import Registry, check_options
 from r2flow.stages.rectify import RectifiedFlow
+from r2flow.stages.reflow import Distill, Reflow
 
-STAGES = Registry("stage", rectify=RectifiedFlow)
+STAGES: Registry[type[RectifiedFlow]] = Registry("stage", rectify=RectifiedFlow, reflow=Reflow, distill=Distill)
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,12 @@ def build_parts(config: Mapping[str, Any]) -> Parts:
 def build_stage(config: Mapping[str, Any], backbone: nn.Module) -> RectifiedFlow:
     """The LightningModule of a config's `stage`, around a backbone; it carries the config into its checkpoints."""
     options = {"batch_size": config["data"]["batch_size"], "seed": config["seed"], **config["stage"]}
+    options.pop("init", None)  # the backbone has its weights already
     stage = STAGES.build(options, backbone)
+    on_pairs = config["data"]["name"] == "pairs"
+    if stage.needs_pairs and not on_pairs:
+        raise InputError(f"stage={options['name']} learns from pairs: give data=pairs, found {config['data']['name']}.")
+    if on_pairs and not stage.needs_pairs:
+        raise InputError(f"stage={options['name']} learns from scans, and data=pairs has none; give stage=reflow.")
     stage.config = dict(config)
     return stage

@@ -33,6 +33,8 @@ class RectifiedFlow(L.LightningModule):
         seed: Run seed.
     """
 
+    needs_pairs = False  # a batch's x_0 and x_1 are independent
+
     def __init__(
         self,
         velocity: nn.Module,
@@ -55,7 +57,7 @@ class RectifiedFlow(L.LightningModule):
         self.config: dict[str, Any] = {}
 
     def coupling(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """(x_0, x_1): independent, the noise of image k drawn from k alone."""
+        """(x_0, x_1) as the data bring them: independent noise of image k, or the pair's own."""
         return batch["x_0"], batch["x_1"]
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -63,7 +65,7 @@ class RectifiedFlow(L.LightningModule):
         t = self.time(batch["u"])
         x_t, u_t = interpolate(x_0, x_1, t)
         loss = self.loss(self.velocity(t, x_t), u_t).mean()
-        self.log("train/loss", loss, prog_bar=True)
+        self.log("train/loss", loss, prog_bar=True, sync_dist=True)
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:

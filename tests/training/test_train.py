@@ -1,6 +1,7 @@
 """train.py as a user runs it: in a process, from a folder, with overrides."""
 
 import os
+import random
 import shutil
 import signal
 import subprocess
@@ -13,7 +14,7 @@ import torch
 import yaml
 
 from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint
-from tests.training.conftest import ROOT, TINY, Run
+from tests.training.conftest import ROOT, TINY, Run, run_train
 
 
 def weights(run: Path) -> tuple[dict, dict]:
@@ -77,6 +78,24 @@ def test_a_killed_run_ends_as_the_one_left_alone(
     assert_bit_equal(alone[0], killed)
 
 
+@pytest.mark.slow
+def test_a_run_killed_at_ten_random_moments_ends_as_the_one_left_alone(
+    alone: tuple[Path, str], scans: Path, tmp_path: Path
+):
+    draw = random.Random(2)
+    command = [sys.executable, str(ROOT / "train.py"), *TINY, f"data.root={scans}", "name=killed"]
+    for _ in range(10):
+        process = subprocess.Popen(
+            command, cwd=tmp_path, env={**os.environ, "OMP_NUM_THREADS": "1"}, start_new_session=True,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        time.sleep(draw.uniform(4, 8))
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    run_train(tmp_path, scans, "name=killed")
+    assert_bit_equal(alone[0], tmp_path / "runs" / "killed")
+
+
 def test_ctrl_c_says_how_to_go_on(train: Run, scans: Path, tmp_path: Path):
     run = tmp_path / "runs" / "stopped"
     code, said = stop_when(run, 2, scans, tmp_path, "name=stopped", "trainer.max_steps=500", by=signal.SIGINT)
@@ -106,23 +125,6 @@ def test_another_config_in_the_same_folder_is_refused(train: Run, copied: Path):
     assert done.returncode == 2
     assert done.stderr.strip().splitlines()[-1].startswith("error: runs/copied holds a run of another config: seed=0")
     assert (copied / "config.yaml").read_text() == before
-
-
-def test_accumulated_batches_are_the_whole_batch(train: Run, tmp_path: Path):
-    # No dropout: its masks are drawn per device batch. Clipping sees the mean gradient in both.
-    train("name=whole", "backbone.dropout=0")
-    train("name=parts", "backbone.dropout=0", "trainer.accumulate_grad_batches=2", "trainer.val_check_interval=6")
-    whole, parts = (weights(tmp_path / "runs" / name)[0] for name in ("whole", "parts"))
-    for name in whole:
-        torch.testing.assert_close(whole[name], parts[name], rtol=0, atol=2e-4)
-
-
-def test_two_processes_are_one(train: Run, tmp_path: Path):
-    train("name=one", "backbone.dropout=0")
-    train("name=two", "backbone.dropout=0", "trainer.devices=2", "trainer.strategy=ddp")
-    one, two = (weights(tmp_path / "runs" / name)[0] for name in ("one", "two"))
-    for name in one:
-        torch.testing.assert_close(one[name], two[name], rtol=0, atol=2e-4)
 
 
 def test_a_folder_that_now_holds_other_scans_is_refused(train: Run, copied: Path, scans: Path, tmp_path: Path):

@@ -1,0 +1,166 @@
+"""Numbers that are no numbers: steps that are skipped, and a run that stops before it is spoilt."""
+
+import copy
+import logging
+import os
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from torch import Tensor
+from torch.nn.utils import get_total_norm
+
+from r2flow.checkpoints import checkpoints_of
+from r2flow.errors import InputError
+
+log = logging.getLogger(__name__)
+
+
+class Guard(L.Callback):
+    """A step whose loss or gradients are not finite changes nothing; too many of them end the run.
+
+    The weights and AdamW's averages stay as they were, the learning rate and the data move on. The decision is made
+    on the gradients that all devices share, so all of them make the same one. Under 16-mixed, gradients beyond
+    half precision are how the loss scale finds its place: such a step is skipped too, but it is no defect unless
+    the scale falls below `lowest_scale` or it goes on for `skips` steps.
+
+    A checkpoint with weights that are not finite is not written: the run ends there.
+
+    Args:
+        run_dir: The run's folder, where the last good checkpoint is looked for.
+        skips: Steps skipped in a row after which the run ends.
+        lowest_scale: Smallest loss scale of 16-mixed that is still a scale.
+
+    Attributes:
+        in_a_row: Steps skipped since the last that was taken.
+        total: Steps skipped in the run, those left out that only moved the loss scale.
+
+    Raises:
+        InputError: `skips` is below 1.
+    """
+
+    def __init__(self, run_dir: str | Path, skips: int = 10, lowest_scale: float = 1.0) -> None:
+        if skips < 1:
+            raise InputError(f"callbacks.guard.skips must be at least 1, found {skips}.")
+        self.run_dir, self.skips, self.lowest_scale = Path(run_dir), skips, lowest_scale
+        self.in_a_row = self.total = 0
+        self._losses: list[Tensor] = []
+
+    def on_before_backward(self, trainer: L.Trainer, pl_module: L.LightningModule, loss: Tensor) -> None:
+        value = loss.detach()
+        self._losses.append(value)
+        # A loss can overflow where its gradient does not, and on one device only. x - x is 0 or NaN: this adds
+        # nothing, or makes every gradient NaN, which the devices' shared sum then tells all of them.
+        loss.register_hook(lambda gradient: gradient + (value - value))
+
+    def on_before_optimizer_step(self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: Any) -> None:
+        gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
+        if bool(torch.isfinite(get_total_norm(gradients))):  # the one wait for the device
+            self.in_a_row = 0
+        else:
+            self._skip(trainer, pl_module)
+        self._losses.clear()
+
+    def _skip(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        scaler = getattr(trainer.precision_plugin, "scaler", None)
+        scale = None if scaler is None else float(scaler.get_scale())
+        loss = float(trainer.strategy.reduce(torch.stack(self._losses).sum(), reduce_op="mean")) / (scale or 1.0)
+        overflow = scale is not None and loss - loss == 0
+        self.in_a_row += 1
+        self.total += not overflow
+        if self.in_a_row >= self.skips or (scale is not None and scale < self.lowest_scale):
+            raise self._stop(trainer, pl_module, loss, scale)
+        if trainer.is_global_zero and not overflow:
+            what = "gradients" if loss - loss == 0 else f"loss {loss}"
+            log.warning(
+                "step %d skipped: non-finite %s (%d in a row; the run ends at %d)",
+                trainer.global_step + 1, what, self.in_a_row, self.skips,
+            )  # fmt: skip
+        for parameter in pl_module.parameters():
+            parameter.grad = None  # which AdamW passes over, its averages untouched
+
+    def _stop(self, trainer: L.Trainer, pl_module: L.LightningModule, loss: float, scale: float | None) -> InputError:
+        what = f"{self.in_a_row} steps in a row were" if self.in_a_row > 1 else "the step was"
+        scaled = f"loss scale {scale:g}" if scale is not None else f"no loss scale in {trainer.precision}"
+        full = "" if trainer.precision == "32-true" else "try trainer.precision=32-true; "
+        error = InputError(
+            f"stopped at step {trainer.global_step + 1}: {what} skipped for a non-finite loss or gradient, "
+            f"{self.total} in the run. Loss {loss:g}; {describe_gradients(pl_module)}; {scaled}; "
+            f"{describe_batch(trainer)}. {self._last_good()} Look at these scans; {full}try, in a run of another name, "
+            "a lower stage.learning_rate."
+        )
+        if not trainer.is_global_zero:
+            _let_rank_zero_speak()
+        return error
+
+    def on_save_checkpoint(self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
+        learned = [name for name, _ in pl_module.named_parameters()]
+        for key in ("current_model_state", "state_dict"):
+            state = checkpoint.get(key, {})
+            broken = _not_finite((name, state[name]) for name in learned if name in state)
+            if broken:
+                what = "averaged weights" if key == "state_dict" and "current_model_state" in checkpoint else "weights"
+                error = InputError(
+                    f"stopped at step {trainer.global_step}: the {what} are no longer finite ({broken[0]} first, "
+                    f"{len(broken)} of {len(learned)}), so no checkpoint was written. {self._last_good()} "
+                    "Start under another name with a lower stage.learning_rate."
+                )
+                if not trainer.is_global_zero:
+                    _let_rank_zero_speak()
+                raise error
+
+    def _last_good(self) -> str:
+        newest = next(iter(checkpoints_of(self.run_dir)), None)
+        if newest is None:
+            return "There is no checkpoint to go on from yet."
+        return f"The last good checkpoint is {newest}, from which the same command goes on."
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"in_a_row": self.in_a_row, "total": self.total}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.in_a_row, self.total = state_dict["in_a_row"], state_dict["total"]
+
+
+def describe_gradients(module: torch.nn.Module) -> str:
+    """The first parameter, in the module's order, with a non-finite gradient, and the largest finite one."""
+    gradients = [(name, p.grad) for name, p in module.named_parameters() if p.grad is not None]
+    broken = set(_not_finite(gradients))
+    finite = [(float(g.norm()), name) for name, g in gradients if name not in broken]
+    first = next((name for name, _ in gradients if name in broken), None)
+    said = f"gradient of {first} non-finite first, {len(broken)} of {len(gradients)}" if first else "gradients finite"
+    norm, largest = max(finite, default=(0.0, ""))
+    return f"{said}, largest finite norm " + (f"{norm:.3g} ({largest})" if finite else "none")
+
+
+def describe_batch(trainer: L.Trainer) -> str:
+    """The images of the step being taken, on all devices and in all accumulated batches, and their scans."""
+    sampler = getattr(trainer.train_dataloader, "run_sampler", None)
+    if sampler is None:
+        return "images unknown to the loader"
+    whole = copy.copy(sampler)
+    whole.rank, whole.ranks = 0, 1
+    whole.first_batch = trainer.global_step * trainer.accumulate_grad_batches
+    batches = iter(whole)
+    keys = [key for _ in range(trainer.accumulate_grad_batches) for key in next(batches, [])]
+    scans = ", ".join(str(scan) for _, scan in keys[:16]) + (", ..." if len(keys) > 16 else "")
+    return f"images k = {keys[0][0]} to {keys[-1][0]}, scans {scans}" if keys else "no images"
+
+
+def _not_finite(tensors: Iterable[tuple[str, Tensor]]) -> list[str]:
+    """The names of the tensors with a NaN or an infinity, with one wait for the device."""
+    named = list(tensors)
+    if not named:
+        return []
+    finite = torch.stack([torch.isfinite(value).all() for _, value in named]).tolist()
+    return [name for (name, _), whole in zip(named, finite, strict=True) if not whole]
+
+
+def _let_rank_zero_speak(seconds: float = 10.0) -> None:
+    """Wait for the launching process to end: Lightning kills it, unheard, once it sees a child that has failed."""
+    parent, begin = os.getppid(), time.monotonic()
+    while os.getppid() == parent and time.monotonic() - begin < seconds:
+        time.sleep(0.1)

@@ -1,0 +1,39 @@
+"""`r2flow compare`: runs side by side."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from r2flow.cli.app import app
+from r2flow.cli.options import choose_device
+
+
+@app.command(epilog="Example: r2flow compare runs/sweep --group --out reports")
+def compare(
+    runs: Annotated[list[Path], typer.Argument(help="Run folders, or folders of them: a sweep's, a chain's.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for compare.md, .csv, .json and .png.")
+    ] = None,
+    group: Annotated[
+        bool, typer.Option("--group", help="Several seeds of one configuration as mean ± spread.")
+    ] = False,
+    repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each backbone; 0 leaves them out.")] = 0,
+    device: Annotated[str, typer.Option(help="Of these: auto, cpu, cuda, ...")] = "cpu",
+) -> None:
+    """Set runs side by side: loss, straightness, fidelity, parameters, cost."""
+    from r2flow.reports.compare import Group, compare_page, group_runs, print_comparison, read_runs
+    from r2flow.reports.pages import prepare_folder, write_page
+
+    where = choose_device(device)
+    if out is not None:
+        prepare_folder(out)
+    found = read_runs(runs, repeats, where)
+    groups = group_runs(found) if group else [Group(run.label, (run,)) for run in found]
+    print_comparison(groups)
+    if out is not None:
+        page = compare_page(groups, shlex.join(["r2flow", *sys.argv[1:]]), where)
+        for path in write_page(page, out):
+            print(path)

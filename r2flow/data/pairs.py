@@ -1,0 +1,230 @@
+"""Reflow pairs (x_0, x_1): noise and where a flow carries it."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from r2flow import noise
+from r2flow.data.loader import Item
+from r2flow.data.shards import Block, PairStore, Recipe, read_notes
+from r2flow.errors import InputError
+from r2flow.flow.solvers import Velocity, check_method, solve
+
+MIB = 2**20
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """The choices behind a set of pairs (`data.pairs`).
+
+    Attributes:
+        num: Pairs in all.
+        method, steps, tolerance: The solver's (`r2flow.flow.solvers.solve`); the paper takes dopri5 at 1e-5.
+        batch_size: Pairs solved at once. It is part of what a pair is, in its last bits.
+        shard_mib: Size of a shard.
+        seed: Of the noise. Not the run's: runs of several seeds can share one set of pairs.
+        first: Index of the first pair; None takes the one behind the pairs that the flow itself was trained on.
+        parent: Hash of the flow; filled in by the run.
+    """
+
+    num: int = 1_000_000
+    method: str = "dopri5"
+    steps: int = 32
+    tolerance: float = 1e-5
+    batch_size: int = 16
+    shard_mib: float = 256.0
+    seed: int = 0
+    first: int | None = None
+    parent: str | None = None
+
+    def recipe(self, shape: tuple[int, int, int]) -> Recipe:
+        """What the pairs of a flow with scans of this shape are a function of.
+
+        Raises:
+            InputError: a number out of its range or an unknown solver.
+        """
+        if min(self.num, self.batch_size, self.steps) < 1 or not self.shard_mib > 0:
+            raise InputError(
+                "data.pairs: num, batch_size, steps must be at least 1 and shard_mib positive; "
+                f"found {self.num}, {self.batch_size}, {self.steps} and {self.shard_mib}."
+            )
+        if not 0 <= self.seed < 2**63:
+            raise InputError(f"data.pairs.seed must be a whole number of at least 0, found {self.seed}.")
+        if not (self.tolerance > 0 and math.isfinite(self.tolerance)):
+            raise InputError(f"data.pairs.tolerance must be positive, found {self.tolerance}.")
+        check_method(self.method)
+        batch_bytes = self.batch_size * 2 * int(np.prod(shape))
+        return Recipe(
+            parent=self.parent or "",
+            shape=shape,
+            seed=self.seed,
+            first=self.first or 0,
+            method=self.method,
+            steps=self.steps,
+            tolerance=self.tolerance,
+            batch_size=self.batch_size,
+            shard_batches=max(round(self.shard_mib * MIB / batch_bytes), 1),
+        )
+
+
+def pair_noise(recipe: Recipe, index: int) -> Tensor:
+    """x_0 of a pair, (C, H, W), drawn again from its index."""
+    return noise.standard_normal(recipe.shape, recipe.seed, "pairs", index)
+
+
+@dataclass
+class Made:
+    """What one process has done: batches and pairs made, their evaluations, and the seconds of it."""
+
+    pairs: int = 0
+    evaluations: int = 0
+    unusable: int = 0
+    seconds: float = 0.0
+    writing: float = 0.0
+
+
+def make_pairs(
+    store: PairStore,
+    velocity: Velocity,
+    num: int,
+    rank: int = 0,
+    ranks: int = 1,
+    device: torch.device | str = "cpu",
+    progress: Callable[[Made], None] = lambda made: None,
+    evaluated: Callable[[], None] | None = None,
+) -> Made:
+    """Make those of the first `num` pairs that are missing or damaged, as one of `ranks` processes.
+
+    x_1 is where the flow carries x_0 = `pair_noise`, neither clamped nor snapped, in half precision. Rank r owns the
+    batches r, r + R, ... and talks to no other; a batch is computed alike whoever owns it, so the shards are the same,
+    byte for byte, for every R. What is there already, from any earlier process, is kept.
+
+    Args:
+        progress: Called after each batch that is on the disk.
+        evaluated: Called after each evaluation of the velocity.
+
+    Raises:
+        InputError: no pair of a batch is usable: the flow is broken, or the tolerance out of its reach.
+    """
+    store.begin()
+    made, start = Made(), time.monotonic()
+    # Shards are checked by turns; who finds one damaged makes its batches, which the others hold to be there.
+    shards = store.shards(num)
+    lost = [batch for shard in shards[rank::ranks] for batch in store.check(shard, num)]
+    own = sorted({*store.batches(num)[rank::ranks], *lost})
+    for batch in own:
+        if store.has(batch):
+            continue
+        block = solve_batch(store.recipe, velocity, batch, device, evaluated)
+        written = time.monotonic()
+        store.commit(batch, block)
+        store.seal(batch // store.recipe.shard_batches, num)
+        made.writing += time.monotonic() - written
+        made.pairs += len(block.usable)
+        made.evaluations += int(block.evaluations.sum())
+        made.unusable += int((~block.usable).sum())
+        made.seconds = time.monotonic() - start
+        progress(made)
+    for shard in shards:  # whose last batch came from a process that was killed before it could seal
+        store.seal(shard, num)
+    made.seconds = time.monotonic() - start
+    return made
+
+
+def solve_batch(
+    recipe: Recipe,
+    velocity: Velocity,
+    batch: int,
+    device: torch.device | str = "cpu",
+    evaluated: Callable[[], None] | None = None,
+) -> Block:
+    """One batch of pairs.
+
+    Raises:
+        InputError: none of them is usable.
+    """
+    first = recipe.first + batch * recipe.batch_size
+    x_0 = torch.stack([pair_noise(recipe, index) for index in range(first, first + recipe.batch_size)])
+    with torch.inference_mode():
+        end = solve(
+            velocity, x_0.to(device), 0.0, 1.0, recipe.method, recipe.steps, recipe.tolerance, progress=evaluated
+        )
+    x_1 = end.x.to(torch.float16).cpu()
+    usable = end.converged.cpu() & x_1.isfinite().flatten(1).all(1)
+    if not usable.any():
+        raise InputError(
+            f"none of the pairs {first} to {first + recipe.batch_size - 1} came to an end with {recipe.method} at "
+            f"tolerance {recipe.tolerance:g}: the flow is broken, or the tolerance out of its reach."
+        )
+    return Block(x_1.numpy(), end.evaluations.cpu().numpy().astype(np.int32), usable.numpy())
+
+
+class PairSource:
+    """The usable ones of a store's first `num` pairs, each (x_0, x_1), both (C, H, W) float32 in model space.
+
+    Raises:
+        InputError: some have yet to be made.
+    """
+
+    def __init__(self, store: PairStore, num: int, indices: np.ndarray | None = None) -> None:
+        self.store, self.num = store, num
+        if not store.is_whole(num):
+            lacking = len(store.missing(num)) * store.recipe.batch_size
+            raise InputError(f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
+        if indices is None:
+            flags = [read_notes(store.shard_path(shard))["usable"] for shard in store.shards(num)]
+            usable = np.concatenate([np.array(one, dtype=bool) for one in flags])[:num]
+            indices = np.flatnonzero(usable)
+        self.indices = indices
+        self._opened: dict[int, Any] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_opened": {}}  # memory maps stay in their process
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def subset(self, indices: Sequence[int]) -> "PairSource":
+        return PairSource(self.store, self.num, self.indices[np.asarray(indices, dtype=np.int64)])
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
+        from safetensors import safe_open
+
+        recipe = self.store.recipe
+        number = int(self.indices[index])
+        shard, offset = divmod(number, recipe.shard_batches * recipe.batch_size)
+        if shard not in self._opened:
+            self._opened[shard] = safe_open(self.store.shard_path(shard), framework="pt").get_slice("x_1")
+        x_1 = self._opened[shard][offset : offset + 1][0].float()
+        return pair_noise(recipe, recipe.first + number), x_1
+
+
+class PairDataset(Dataset[Item]):
+    """Pair as a training item: {x_1, x_0, u, k}; u is drawn by (seed, purpose, k) alone, as in `FlowDataset`."""
+
+    def __init__(self, source: PairSource, seed: int, purpose: str) -> None:
+        self.source, self.seed, self.purpose = source, seed, purpose
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def __getitem__(self, key: tuple[int, int]) -> Item:
+        k, index = key
+        x_0, x_1 = self.source[index]
+        u = torch.tensor(noise.generator(self.seed, self.purpose, k).random(dtype=np.float32))
+        return {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
+
+
+def default_folder(checkpoint: Path) -> Path:
+    """Where the pairs of a flow lie unless told otherwise: `pairs` in its run's folder, or beside its file."""
+    if checkpoint.parent.name == "checkpoints":
+        return checkpoint.parent.parent / "pairs"
+    return checkpoint.with_name(f"{checkpoint.stem}-pairs")

@@ -1,0 +1,280 @@
+"""Pairs on disk: batches as they are made, shards when a row of them is whole."""
+
+import hashlib
+import json
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from r2flow.errors import InputError
+from r2flow.files import atomic_write
+
+log = logging.getLogger(__name__)
+
+MANIFEST = "manifest.json"
+STALE = 3600  # seconds after which a temporary file has no writer any more
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a pair is a function of, beside its index: two folders of one recipe hold the same bytes.
+
+    Attributes:
+        parent: Hash of the flow's weights and of what they mean.
+        shape: (C, H, W) of a scan in model space.
+        seed: x_0 of index i is the noise of (seed, "pairs", i); it is never stored.
+        first: Index of the first pair.
+        method, steps, tolerance: The solver's.
+        batch_size: Consecutive indices that are solved together.
+        shard_batches: Batches a shard.
+    """
+
+    parent: str
+    shape: tuple[int, int, int]
+    seed: int
+    first: int
+    method: str
+    steps: int
+    tolerance: float
+    batch_size: int
+    shard_batches: int
+
+    @cached_property
+    def digest(self) -> str:
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
+
+
+class Block(NamedTuple):
+    """Consecutive pairs: x_1 float16 (n, C, H, W), evaluations int32 (n,), usable bool (n,)."""
+
+    x_1: np.ndarray
+    evaluations: np.ndarray
+    usable: np.ndarray
+
+
+class Damaged(Exception):
+    """A file of pairs that is not what was written."""
+
+
+class PairStore:
+    """A folder of pairs: `manifest.json`, shards, and the batches of shards that are not whole yet.
+
+    Batch b holds indices first + [b B, (b + 1) B), shard s holds batches [s S, (s + 1) S). Every file is written under
+    a temporary name, flushed and renamed, and carries the checksum of its tensors and the digest of its recipe. Any
+    number of processes may write into one folder: what two of them write under one name are the same bytes.
+    """
+
+    def __init__(self, folder: str | Path, recipe: Recipe) -> None:
+        self.folder, self.recipe = Path(folder).expanduser(), recipe
+        self._check_manifest()
+
+    def _check_manifest(self) -> None:
+        path = self.folder / MANIFEST
+        if not path.is_file():
+            return
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))["recipe"]
+        except (ValueError, KeyError, TypeError):
+            raise InputError(f"{path} is damaged. Delete it; pairs of the same recipe are found again.") from None
+        for key, value in asdict(self.recipe).items():
+            there = tuple(found.get(key)) if key == "shape" and found.get(key) else found.get(key)
+            if there != value:
+                raise InputError(
+                    f"{self.folder} holds other pairs: {key} is {there} there, {value} here. "
+                    "Give the same settings, or another folder by data.root=FOLDER (r2flow pairs --out FOLDER)."
+                )
+
+    def begin(self) -> None:
+        """Write the manifest where there is none, and clear away what killed writers left."""
+        if not (self.folder / MANIFEST).is_file():
+            content = {"format": "r2flow pairs 1", "recipe": asdict(self.recipe), "digest": self.recipe.digest}
+            with atomic_write(self.folder / MANIFEST, "w") as file:
+                json.dump(content, file, indent=2)
+        for leftover in (*self.folder.glob(".*.part"), *self._staging.glob(".*.part")):
+            with suppress(FileNotFoundError):
+                if time.time() - leftover.stat().st_mtime > STALE:  # another process may be writing it
+                    leftover.unlink()
+
+    @property
+    def _staging(self) -> Path:
+        return self.folder / "batches"
+
+    def shard_path(self, shard: int) -> Path:
+        return self.folder / f"pairs-{shard:06d}.safetensors"
+
+    def batch_path(self, batch: int) -> Path:
+        return self._staging / f"{batch:09d}.safetensors"
+
+    def batches(self, num: int) -> range:
+        """The batches that hold the first `num` pairs; the last one is made whole."""
+        return range(-(-num // self.recipe.batch_size))
+
+    def shards(self, num: int) -> range:
+        return range(-(-len(self.batches(num)) // self.recipe.shard_batches))
+
+    def batches_of(self, shard: int, num: int) -> range:
+        """The batches of one shard."""
+        size = self.recipe.shard_batches
+        return range(shard * size, min((shard + 1) * size, len(self.batches(num))))
+
+    def has(self, batch: int) -> bool:
+        """Whether a batch is there, by itself or in its shard; its bytes are not read."""
+        if self.batch_path(batch).is_file():
+            return True
+        shard, offset = divmod(batch, self.recipe.shard_batches)
+        try:
+            return offset < len(read_notes(self.shard_path(shard))["usable"]) // self.recipe.batch_size
+        except (Damaged, FileNotFoundError):
+            return False
+
+    def missing(self, num: int) -> list[int]:
+        """The batches that have yet to be made."""
+        return [batch for shard in self.shards(num) for batch in self._missing_of(shard, num)]
+
+    def _missing_of(self, shard: int, num: int) -> Iterator[int]:
+        held = 0
+        with suppress(Damaged, FileNotFoundError):
+            held = len(read_notes(self.shard_path(shard))["usable"]) // self.recipe.batch_size
+        for offset, batch in enumerate(self.batches_of(shard, num)):
+            if offset >= held and not self.batch_path(batch).is_file():
+                yield batch
+
+    def is_sealed(self, shard: int, num: int) -> bool:
+        """Whether a shard holds all that the first `num` pairs ask of it."""
+        with suppress(Damaged, FileNotFoundError):
+            held = len(read_notes(self.shard_path(shard))["usable"]) // self.recipe.batch_size
+            return held >= len(self.batches_of(shard, num))
+        return False
+
+    def is_whole(self, num: int) -> bool:
+        return all(self.is_sealed(shard, num) for shard in self.shards(num))
+
+    def check(self, shard: int, num: int) -> list[int]:
+        """Read every byte of one shard and its loose batches; the batches that were damaged, now removed."""
+        lost = []
+        path = self.shard_path(shard)
+        try:
+            self._read(path, shard * self.recipe.shard_batches)
+        except FileNotFoundError:
+            pass
+        except Damaged as error:
+            log.warning("%s is damaged (%s): it is made again.", path, error)
+            path.unlink(missing_ok=True)
+            lost += list(self.batches_of(shard, num))
+        for batch in self.batches_of(shard, num):
+            try:
+                self._read(self.batch_path(batch), batch)
+            except FileNotFoundError:
+                continue
+            except Damaged as error:
+                log.warning("%s is damaged (%s): it is made again.", self.batch_path(batch), error)
+                self.batch_path(batch).unlink(missing_ok=True)
+                lost.append(batch)
+        return sorted({batch for batch in lost if not self.has(batch)})
+
+    def commit(self, batch: int, block: Block) -> None:
+        """Keep a batch: from here on it is not made again."""
+        self._write(self.batch_path(batch), batch, block)
+
+    def seal(self, shard: int, num: int) -> bool:
+        """Turn the batches of a shard into its one file, once all are there."""
+        if self.is_sealed(shard, num):
+            self._clear(shard, num)
+            return True
+        batches = self.batches_of(shard, num)
+        if any(True for _ in self._missing_of(shard, num)):
+            return False
+        try:
+            blocks = self._gather(shard, batches)
+        except FileNotFoundError:  # another process sealed it in between
+            return self.is_sealed(shard, num)
+        except Damaged:
+            self.check(shard, num)
+            return False
+        whole = Block(*(np.concatenate(part) for part in zip(*blocks, strict=True)))
+        self._write(self.shard_path(shard), batches[0], whole)
+        self._clear(shard, num)
+        return True
+
+    def _gather(self, shard: int, batches: range) -> list[Block]:
+        held: list[Block] = []
+        if self.shard_path(shard).is_file():  # shorter: fewer pairs were asked for then
+            block, size = self._read(self.shard_path(shard), batches[0]), self.recipe.batch_size
+            held = [Block(*(part[i : i + size] for part in block)) for i in range(0, len(block.usable), size)]
+        return held + [self._read(self.batch_path(batch), batch) for batch in batches[len(held) :]]
+
+    def _clear(self, shard: int, num: int) -> None:
+        for batch in self.batches_of(shard, num):
+            self.batch_path(batch).unlink(missing_ok=True)
+        with suppress(OSError):
+            self._staging.rmdir()
+
+    def _write(self, path: Path, batch: int, block: Block) -> None:
+        from safetensors.numpy import save
+
+        tensors = {"evaluations": block.evaluations, "x_1": block.x_1}
+        # One key: several would come in an order that changes from process to process.
+        notes = {
+            "recipe": self.recipe.digest,
+            "first": self.recipe.first + batch * self.recipe.batch_size,
+            "usable": [int(one) for one in block.usable],
+            "sha256": _checksum(tensors, block.usable),
+        }
+        data = save(tensors, metadata={"pairs": json.dumps(notes)})
+        with atomic_write(path) as file:
+            file.write(data)
+
+    def _read(self, path: Path, batch: int) -> Block:
+        """A file, every byte of it checked."""
+        from safetensors import SafetensorError, safe_open
+
+        notes = read_notes(path)
+        try:
+            with safe_open(path, framework="numpy") as file:
+                tensors = {name: file.get_tensor(name) for name in ("evaluations", "x_1")}
+        except (SafetensorError, OSError, ValueError, KeyError) as error:
+            raise Damaged(str(error)) from None
+        if notes["recipe"] != self.recipe.digest:
+            raise Damaged("of another recipe")
+        if notes["first"] != self.recipe.first + batch * self.recipe.batch_size:
+            raise Damaged(f"it begins with pair {notes['first']}")
+        usable = np.array(notes["usable"], dtype=bool)
+        if notes["sha256"] != _checksum(tensors, usable) or len(usable) != len(tensors["x_1"]):
+            raise Damaged("its checksum differs")
+        return Block(tensors["x_1"], tensors["evaluations"], usable)
+
+
+def read_notes(path: Path) -> dict[str, Any]:
+    """What a file says of itself: recipe, first, usable, sha256. Only its head is read, and its length held to it.
+
+    Raises:
+        FileNotFoundError: no such file.
+        Damaged: not a file of pairs, or not whole.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise FileNotFoundError(path)
+    try:
+        with safe_open(path, framework="numpy") as file:
+            notes: dict[str, Any] = json.loads((file.metadata() or {})["pairs"])
+            notes["recipe"], notes["first"], notes["usable"], notes["sha256"]
+            return notes
+    except FileNotFoundError:
+        raise
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+        raise Damaged(str(error)) from None
+
+
+def _checksum(tensors: dict[str, np.ndarray], usable: np.ndarray) -> str:
+    digest = hashlib.sha256(usable.astype(bool).tobytes())
+    for name in sorted(tensors):
+        digest.update(np.ascontiguousarray(tensors[name]).data)
+    return digest.hexdigest()

@@ -1,0 +1,166 @@
+"""What straightening and distilling did: every flow of a chain at few and at many steps, from the same noise."""
+
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from rich.progress import track
+
+from r2flow.checkpoints import Checkpoint, load_checkpoint
+from r2flow.data.datamodule import ScanDataModule
+from r2flow.flow.straightness import curvature
+from r2flow.metrics.fidelity import distances, panel
+from r2flow.reports.outputs import draw_pages, write_scan
+from r2flow.reports.pages import Page, table, write_page
+from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
+from r2flow.sampling import noise_of, sample
+
+MANY = 32  # steps that stand for "as many as one likes"
+
+
+def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu") -> Path:
+    """Sample every flow, set the samples beside held-out scans, and write figure, table and scans.
+
+    Args:
+        runs: Run folders by name, the first one trained on scans.
+        num: Scans a flow and number of steps.
+
+    Returns:
+        The page.
+    """
+    out = Path(out)
+    flows = {name: load_checkpoint(run, device) for name, run in runs.items()}
+    first = next(iter(flows.values()))
+    real = held_out(first)
+    truth = panel(real, first.sensor)
+    cells = [(name, steps) for name, flow in flows.items() for steps in steps_of(flow, flows.values())]
+    rows, drawn = [], {}
+    bends = {name: bend(flow, num) for name, flow in flows.items()}
+    for name, steps in track(cells, "sampling every flow", transient=True):
+        start = time.perf_counter()
+        images = np.concatenate([one.images.numpy() for one in sample(flows[name], num, steps, seed=0)])
+        seconds = (time.perf_counter() - start) / num
+        found = distances(truth, panel(images, first.sensor))
+        rows.append({
+            "flow": name, "steps": steps, "seconds": seconds, "bend": bends[name],
+            "mean": float(np.mean(list(found.values()))), **found,
+        })  # fmt: skip
+        drawn[name, steps] = images
+    last = cells[-1]
+    rays = first.sensor.rays()
+    for index, image in enumerate(drawn[last][:4]):
+        write_scan(image, rays, out, f"{index:06d}", ("ply", "npy"))
+    draw_pages(list(drawn[last][:4]), rays, out)
+    page = Page(
+        name="chain",
+        title="From many steps to few",
+        text=[
+            explanation(num, len(real)),
+            table(rows, COLUMNS),
+            "Line by line:",
+            table(rows, {"flow": "flow", "steps": "steps", **{n: n for n in truth}}),
+        ],
+        rows=rows,
+        figures={"chain": figure(drawn, list(flows))},
+        command="python train.py  # the chain's command; this page is its last link",
+        seeds={"evaluation": 0},
+        device=device,
+    )
+    written = write_page(page, out)[-1]
+    tell(rows, runs, out, written)
+    return written
+
+
+COLUMNS = {
+    "flow": "flow", "steps": "Euler steps", "seconds": "seconds a scan", "bend": "bend", "mean": "distance to held-out",
+}  # fmt: skip
+
+
+def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
+    """A distilled flow has its own number of steps; the others are shown at all of these and at many."""
+    if flow.distilled_steps is not None:
+        return [flow.distilled_steps]
+    return sorted({1, *(steps for other in flows if (steps := other.distilled_steps) is not None), MANY})
+
+
+def held_out(flow: Checkpoint) -> np.ndarray:
+    """The scans that a flow was validated on, (N, 2 or 1, H, W) in metres and reflectance."""
+    data = ScanDataModule(flow.sensor, flow.encoding, flow.config["seed"], **flow.config["data"])
+    _, held = data.sources()
+    numbers = range(len(held))
+    return np.stack([held[i] for i in track(numbers, "held-out scans", transient=True)])
+
+
+def bend(flow: Checkpoint, num: int) -> float:
+    """int s(t) dt over |x_1 - x_0|^2, median over scenes: 0 is straight."""
+    x_0 = noise_of(range(num), (flow.encoding.channels, *flow.sensor.shape), 0)
+    x_0 = x_0.to(next(flow.model.parameters()).device)
+    with torch.inference_mode():
+        return float(curvature(flow.model, x_0, MANY).normalised.median())
+
+
+def explanation(num: int, real: int) -> str:
+    return (
+        f"{num} scans of each flow and number of Euler steps, all from the same noise, against {real} held-out scans. "
+        "*Bend* is the integral of the paper's s(t) over the squared length of the path (median over scans, 0 is "
+        "straight); an untrained flow is straight too, so read it beside the *distance*: the mean of the fidelity "
+        "panel's lines, 0 is equal."
+    )
+
+
+def figure(drawn: Mapping[tuple[str, int], np.ndarray], names: list[str]) -> Figure:
+    """One scene through every flow (rows) at every number of steps (columns)."""
+    columns = sorted({steps for _, steps in drawn})
+    sheet = Figure(figsize=(5.2 * len(columns), 1.35 * len(names) + 0.4), facecolor=BACKGROUND)
+    FigureCanvasAgg(sheet)
+    axes = sheet.subplots(len(names), len(columns), squeeze=False)
+    for row, name in enumerate(names):
+        for column, steps in enumerate(columns):
+            cell = axes[row][column]
+            cell.set_facecolor(BACKGROUND)
+            if (name, steps) in drawn:
+                draw_range(cell, drawn[name, steps][0], label=False)
+            else:
+                cell.axis("off")
+            if row == 0:
+                cell.set_title(f"{steps} step{'s' * (steps > 1)}", color=FOREGROUND, fontsize=11)
+            if column == 0:
+                cell.axis("on")
+                cell.set_ylabel(name, color=FOREGROUND, fontsize=11)
+                cell.set_xticks([])
+                cell.set_yticks([])
+                for side in cell.spines.values():
+                    side.set_visible(False)
+    sheet.subplots_adjust(left=0.05, right=0.99, top=0.88, bottom=0.02, wspace=0.03, hspace=0.08)
+    return sheet
+
+
+def tell(rows: list[dict[str, Any]], runs: Mapping[str, Path], out: Path, page: Path) -> None:
+    """The table on the terminal, and where everything lies."""
+    from rich.console import Console
+    from rich.table import Table
+
+    shown = Table("flow", "Euler steps", "seconds a scan", "bend", "distance to held-out scans")
+    for row in rows:
+        numbers = (f"{row['seconds']:.3f}", f"{row['bend']:.4f}", f"{row['mean']:.3f}")
+        shown.add_row(row["flow"], str(row["steps"]), *numbers)
+    Console().print(shown)
+    last, folder = list(runs.items())[-1]
+    print(
+        f"""
+pictures      {out / "chain.png"} (every flow, few and many steps), {out / "samples.png"} ({last})
+point clouds  {out / "000000.ply"} ...
+table         {page}
+flows         {", ".join(str(run) for run in runs.values())}
+
+next
+  r2flow sample --checkpoint {folder} --num 16 --seed 1 --out {out.parent / "more"}
+  r2flow show {out / "000000.ply"} --out {out.parent / "views"}
+  python train.py data=kitti_raw data.root=FOLDER backbone=hdit_small""",
+        flush=True,
+    )

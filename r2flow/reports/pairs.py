@@ -1,0 +1,86 @@
+"""Pairs made under the eyes of the user: how many, how fast, how long still."""
+
+import os
+import sys
+import time
+from collections.abc import Mapping
+
+import torch
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from r2flow.checkpoints import Checkpoint
+from r2flow.data.pairs import Made, make_pairs
+from r2flow.data.shards import PairStore
+
+
+def make_and_tell(
+    store: PairStore,
+    checkpoint: Checkpoint,
+    num: int,
+    rank: int = 0,
+    ranks: int = 1,
+    device: torch.device | str = "cpu",
+    seconds: float = 15.0,
+) -> Made:
+    """`make_pairs` with a bar, or a line every `seconds` where no one watches or several work."""
+    model = checkpoint.model.to(device)
+    own = [batch for batch in store.missing(num) if batch % ranks == rank]
+    who = f"process {rank + 1} of {ranks}: " if ranks > 1 else ""
+    teller = _Teller(who, len(own) * store.recipe.batch_size, seconds, watched=sys.stdout.isatty() and ranks == 1)
+    with teller.bar:
+        made = make_pairs(store, model, num, rank, ranks, device, teller)
+    if made.pairs:
+        share = made.writing / max(made.seconds, 1e-9)
+        unusable = f", {made.unusable} did not come to an end and are left out" if made.unusable else ""
+        print(f"{who}{made.pairs} pairs, {rate(made)}, {share:.1%} of the time for writing{unusable}", flush=True)
+    return made
+
+
+def rate(made: Made) -> str:
+    """Pairs a second, evaluations a pair."""
+    return f"{made.pairs / made.seconds:.2f} pairs/s, {made.evaluations / made.pairs:.1f} evaluations a pair"
+
+
+class _Teller:
+    """Moves a bar on a terminal and prints lines elsewhere."""
+
+    def __init__(self, who: str, total: int, seconds: float, watched: bool) -> None:
+        self.who, self.total, self.seconds, self.watched = who, total, seconds, watched
+        columns = (TextColumn("drawing pairs"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"))
+        self.bar = Progress(*columns, TimeRemainingColumn(), disable=not watched)
+        self.task = self.bar.add_task("pairs", total=total, rate="")
+        self.last = time.monotonic()
+
+    def __call__(self, made: Made) -> None:
+        self.bar.update(self.task, completed=made.pairs, rate=rate(made))
+        now = time.monotonic()
+        if self.watched or now - self.last < self.seconds:
+            return
+        self.last = now
+        left = max(self.total - made.pairs, 0) * made.seconds / made.pairs
+        print(f"{self.who}pair {made.pairs}/{self.total}  {rate(made)}  {left:.0f} s left", flush=True)
+
+
+def wait_for_others(store: PairStore, num: int, pause: float = 2.0) -> None:
+    """Until the other processes' pairs are there too: no collective call, which would time out after a while."""
+    while not store.is_whole(num):
+        time.sleep(pause)
+        for shard in store.shards(num):
+            store.seal(shard, num)
+
+
+def place(environment: Mapping[str, str] = os.environ) -> tuple[int, int, int]:
+    """(rank, processes, rank on this machine) as torchrun or SLURM tell it, arrays included; (0, 1, 0) elsewhere."""
+
+    def number(name: str, default: int) -> int:
+        return int(environment.get(name, default))
+
+    if "RANK" in environment and "WORLD_SIZE" in environment:
+        return number("RANK", 0), number("WORLD_SIZE", 1), number("LOCAL_RANK", 0)
+    # Of a step, not of the job: in the batch script itself, outside srun, there is one process however many were asked.
+    tasks = number("SLURM_STEP_NUM_TASKS", 1)
+    task = number("SLURM_PROCID", 0) if tasks > 1 else 0
+    jobs = number("SLURM_ARRAY_TASK_COUNT", 1)
+    job = number("SLURM_ARRAY_TASK_ID", 0) - number("SLURM_ARRAY_TASK_MIN", 0)
+    step = number("SLURM_ARRAY_TASK_STEP", 1)
+    return job // step * tasks + task, jobs * tasks, number("SLURM_LOCALID", 0)

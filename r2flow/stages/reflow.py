@@ -1,0 +1,42 @@
+"""k-RF and k-TD: the same regression, on pairs that an earlier flow has drawn."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from torch import nn
+
+from r2flow.errors import InputError
+from r2flow.stages.rectify import RectifiedFlow
+
+
+class Reflow(RectifiedFlow):
+    """k-RF: regress v(t, x_t) onto x_1 - x_0 for x_1 the end of the earlier flow from x_0 (paper, eq. 3).
+
+    It starts from the earlier flow's averaged weights. The pairs come from the data (`data=pairs`); a batch's x_0 and
+    x_1 belong together, which is all that straightens the flow.
+    """
+
+    needs_pairs = True
+
+    def __init__(
+        self, velocity: nn.Module, loss: str = "pseudo_huber", time: Mapping[str, Any] | None = None, **options: Any
+    ) -> None:
+        super().__init__(velocity, loss, time or {"name": "u_shaped", "a": 4.0}, **options)
+
+
+class Distill(Reflow):
+    """k-TD: the reflow regression at t in {0, 1/k, ..., (k-1)/k}, the times that k Euler steps visit.
+
+    Args:
+        steps: k, the steps that the flow is to be sampled with.
+    """
+
+    def __init__(self, velocity: nn.Module, steps: int = 1, loss: str = "pseudo_huber", **options: Any) -> None:
+        if steps < 1:
+            raise InputError(f"stage.steps must be at least 1, found {steps}: a distilled flow takes k steps.")
+        if options.pop("time", None) is not None:
+            raise InputError(
+                f"a distilled flow trains at the {steps} times that its steps visit; leave stage.time out."
+            )
+        super().__init__(velocity, loss, {"name": "grid", "k": steps}, **options)
+        self.steps = steps

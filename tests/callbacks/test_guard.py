@@ -1,0 +1,209 @@
+"""Non-finite numbers: what is skipped, what stops, and what is never written."""
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch.plugins import MixedPrecision
+from torch import nn
+from torch.utils.data import DataLoader, Dataset
+
+from callbacks.ema import EMA
+from callbacks.guard import Guard
+from r2flow import noise
+from r2flow.checkpoints import AtomicCheckpointIO, checkpoints_of
+from r2flow.data.loader import RunLoader, RunSampler
+from r2flow.errors import InputError
+
+NAN, INF = float("nan"), float("inf")
+
+
+class Line(L.LightningModule):
+    """Fits y = a x + b; `offset` is added to the loss and has no part in the gradient."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.inner = nn.Linear(1, 4)
+        self.outer = nn.Linear(4, 1)
+        self.warmup_steps = 0
+
+    def training_step(self, batch, batch_idx):
+        x, offset = batch
+        return (self.outer(self.inner(x)) - 3 * x).square().mean() + offset.mean()
+
+    def configure_optimizers(self):
+        return torch.optim.AdamW(self.parameters(), lr=0.05, betas=(0.9, 0.99))
+
+
+def batches(*values: float, offset: dict[int, float] | None = None) -> DataLoader:
+    """One number a step, in order; `offset` by step."""
+    return DataLoader([(torch.tensor([x]), torch.tensor((offset or {}).get(i, 0.0))) for i, x in enumerate(values)])
+
+
+def fit(module: L.LightningModule, loader, tmp_path, *callbacks: L.Callback, **options) -> L.Trainer:
+    options = {"max_steps": 100, "max_epochs": 1, **options}
+    trainer = L.Trainer(
+        accelerator="cpu", callbacks=list(callbacks), default_root_dir=tmp_path, logger=False, gradient_clip_val=1.0,
+        enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
+        use_distributed_sampler=False, plugins=[AtomicCheckpointIO(), *options.pop("plugins", [])], **options,
+    )  # fmt: skip
+    trainer.fit(module, loader)
+    return trainer
+
+
+def assert_equal_weights(first: nn.Module, second: nn.Module) -> None:
+    for (name, a), b in zip(first.named_parameters(), second.parameters(), strict=True):
+        assert torch.equal(a, b), name
+
+
+@pytest.mark.parametrize("broken", [NAN, INF])
+def test_a_skipped_step_is_as_if_it_had_never_been(tmp_path, broken: float):
+    # AdamW at a constant rate counts its own steps: without the broken one the same weights come out.
+    skipped, without = Line(), Line()
+    guard = Guard(tmp_path)
+    fit(skipped, batches(1.0, 2.0, broken, -1.0, 0.5), tmp_path, guard)
+    fit(without, batches(1.0, 2.0, -1.0, 0.5), tmp_path)
+    assert_equal_weights(skipped, without)
+    assert (guard.total, guard.in_a_row) == (1, 0)
+
+
+def test_an_infinite_loss_with_a_finite_gradient_is_skipped(tmp_path):
+    skipped, without = Line(), Line()
+    fit(skipped, batches(1.0, 2.0, -1.0, offset={1: INF}), tmp_path, Guard(tmp_path))
+    fit(without, batches(1.0, -1.0), tmp_path)
+    assert_equal_weights(skipped, without)
+
+
+def test_the_guard_changes_nothing_where_all_is_well(tmp_path):
+    guarded, free = Line(), Line()
+    values = [float(v) for v in np.random.default_rng(0).standard_normal(30)]
+    fit(guarded, batches(*values), tmp_path, Guard(tmp_path), accumulate_grad_batches=2)
+    fit(free, batches(*values), tmp_path, accumulate_grad_batches=2)
+    assert_equal_weights(guarded, free)
+
+
+def test_only_steps_in_a_row_end_a_run(tmp_path):
+    guard = Guard(tmp_path, skips=3)
+    fit(Line(), batches(1.0, NAN, NAN, 1.0, NAN, NAN, 1.0), tmp_path, guard)
+    assert guard.total == 4
+    with pytest.raises(InputError, match="stopped at step 4: 3 steps in a row were skipped"):
+        fit(Line(), batches(1.0, NAN, NAN, NAN, 1.0), tmp_path, Guard(tmp_path, skips=3))
+
+
+def test_the_count_survives_a_resumption(tmp_path):
+    guard = Guard(tmp_path)
+    guard.load_state_dict({"in_a_row": 9, "total": 9})
+    assert guard.state_dict() == {"in_a_row": 9, "total": 9}
+    with pytest.raises(InputError, match="10 steps in a row"):
+        fit(Line(), batches(NAN), tmp_path, guard)
+
+
+class Numbered(Dataset):
+    """x of scan i is 1, of the broken ones NaN."""
+
+    def __init__(self, broken: set[int]) -> None:
+        self.broken = broken
+
+    def __len__(self) -> int:
+        return 6
+
+    def __getitem__(self, key: tuple[int, int]):
+        return torch.tensor([NAN if key[1] in self.broken else 1.0]), torch.tensor(0.0)
+
+
+def test_the_line_names_everything_needed_to_look_further(tmp_path):
+    # Two accumulated batches of 2: the first step takes images 0 to 3, the second 4 to 7.
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "step-00000001.ckpt").touch()
+    order = [int(s) for epoch in range(2) for s in noise.generator(0, "shuffle", epoch).permutation(6)]
+    loader = RunLoader(Numbered({order[5]} - set(order[:4])), RunSampler(6, 2, 20, seed=0))
+    with pytest.raises(InputError) as caught:
+        fit(Line(), loader, tmp_path, Guard(tmp_path, skips=1), accumulate_grad_batches=2)
+    said = str(caught.value)
+    assert "\n" not in said
+    for words in (
+        "stopped at step 2: the step was skipped",
+        "Loss nan",
+        "gradient of inner.weight non-finite first, 4 of 4, largest finite norm none",
+        "no loss scale in 32-true",
+        "images k = 4 to 7, scans " + ", ".join(map(str, order[4:8])),
+        f"last good checkpoint is {tmp_path}/checkpoints/step-00000001.ckpt",
+    ):
+        assert words in said, (words, said)
+
+
+class Poisoned(Line):
+    """One parameter's gradient is infinite; the others are as they are."""
+
+    def on_after_backward(self):
+        self.outer.weight.grad[0, 0] = INF
+
+
+def test_the_first_broken_gradient_and_the_largest_whole_one_are_named(tmp_path):
+    module = Poisoned()
+    with pytest.raises(InputError) as caught:
+        fit(module, batches(1.0), tmp_path, Guard(tmp_path, skips=1))
+    reference = Line()
+    reference.training_step((torch.tensor([[1.0]]), torch.tensor([0.0])), 0).backward()
+    norms = {n: p.grad.norm().item() for n, p in reference.named_parameters() if n != "outer.weight"}
+    largest = max(norms, key=norms.__getitem__)
+    said = str(caught.value)
+    assert "gradient of outer.weight non-finite first, 1 of 4" in said
+    assert f"largest finite norm {norms[largest]:.3g} ({largest})" in said
+
+
+def half(scale: float) -> MixedPrecision:
+    """16-mixed, which Lightning has on GPUs only, with a scale to start from."""
+    return MixedPrecision("16-mixed", "cpu", torch.amp.GradScaler("cpu", init_scale=scale, growth_interval=1000))
+
+
+def test_a_loss_scale_that_finds_its_place_is_no_defect(tmp_path):
+    # Half precision ends at 65504 < 2^16: gradients of size one overflow until the scale is well below that.
+    plugin, guard = half(2.0**20), Guard(tmp_path)
+    fit(Line(), batches(*[1.0] * 20), tmp_path, guard, plugins=[plugin])
+    assert plugin.scaler.get_scale() < 2.0**17
+    assert (guard.total, guard.in_a_row) == (0, 0)
+
+
+def test_a_loss_scale_that_finds_no_place_ends_the_run(tmp_path):
+    with pytest.raises(InputError, match=r"3 steps in a row were .* 0 in the run.* loss scale 262144"):
+        fit(Line(), batches(*[1.0] * 20), tmp_path, Guard(tmp_path, skips=3), plugins=[half(2.0**20)])
+    with pytest.raises(InputError, match=r"the step was skipped .* loss scale 1.04858e\+06"):
+        fit(Line(), batches(1.0), tmp_path, Guard(tmp_path, lowest_scale=2.0**21), plugins=[half(2.0**20)])
+
+
+def test_a_loss_that_is_no_number_is_a_defect_whatever_the_scale(tmp_path):
+    guard = Guard(tmp_path)
+    fit(Line(), batches(1.0, NAN, 1.0), tmp_path, guard, plugins=[half(2.0**8)])
+    assert guard.total == 1
+
+
+class Spoil(L.Callback):
+    """Writes a NaN into the weights after a step, then saves."""
+
+    def __init__(self, at: int) -> None:
+        self.at = at
+
+    def on_train_batch_end(self, trainer, pl_module, *rest):
+        step = trainer.global_step
+        if step == self.at:
+            with torch.no_grad():
+                pl_module.inner.bias[0] = NAN
+        trainer.save_checkpoint(trainer.default_root_dir + f"/checkpoints/step-{step:08d}.ckpt")
+
+
+@pytest.mark.parametrize("averaged", [False, True])
+def test_broken_weights_are_never_written(tmp_path, averaged: bool):
+    callbacks = [EMA(every=1)] if averaged else []
+    with pytest.raises(InputError) as caught:
+        fit(Line(), batches(*[1.0] * 9), tmp_path, *callbacks, Guard(tmp_path), Spoil(at=3))
+    said = str(caught.value)
+    assert "stopped at step 3: the weights are no longer finite (inner.bias first, 1 of 4)" in said
+    assert "step-00000002.ckpt, from which the same command goes on" in said
+    assert [p.name for p in checkpoints_of(tmp_path)] == ["step-00000002.ckpt", "step-00000001.ckpt"]
+
+
+def test_a_limit_below_one_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"callbacks.guard.skips must be at least 1, found 0"):
+        Guard(tmp_path, skips=0)

@@ -1,0 +1,272 @@
+"""Pairs, their store and their makers. The flow is dx/dt = x, which carries x_0 to e x_0."""
+
+import json
+import math
+import os
+import random
+import resource
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.data.pairs import PairDataset, PairOptions, PairSource, default_folder, make_pairs, pair_noise
+from r2flow.data.shards import PairStore
+from r2flow.errors import InputError
+from r2flow.noise import standard_normal
+
+SHAPE = (2, 4, 8)
+OPTIONS = {"num": 50, "tolerance": 1e-6, "batch_size": 4, "shard_mib": 3 * 4 * 2 * 64 / 2**20, "parent": "abc"}
+
+
+def store_in(folder: Path, **options) -> PairStore:
+    return PairStore(folder, PairOptions(**{**OPTIONS, **options}).recipe(SHAPE))
+
+
+def grow(t, x):
+    return x
+
+
+class Counted:
+    """dx/dt = x, counting the scenes it is asked for at t = 0: those that are begun."""
+
+    def __init__(self) -> None:
+        self.begun = 0
+
+    def __call__(self, t, x):
+        if float(t.reshape(-1)[0]) == 0:
+            self.begun = max(self.begun, 0) + len(x)
+        return x
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_a_pair_is_its_noise_and_where_the_flow_carries_it(tmp_path: Path):
+    store = store_in(tmp_path)
+    make_pairs(store, grow, 50)
+    source = PairSource(store, 50)
+    assert len(source) == 50
+    for index in (0, 17, 49):
+        x_0, x_1 = source[index]
+        assert torch.equal(x_0, standard_normal(SHAPE, 0, "pairs", index))
+        # Half precision keeps 11 bits.
+        torch.testing.assert_close(x_1, math.e * x_0, rtol=2**-11, atol=2e-5)
+        assert x_1.dtype == torch.float32
+    assert x_1.abs().max() > 1  # nothing is clamped
+
+
+def test_shards_of_three_batches_and_nothing_else_stay(tmp_path: Path):
+    make_pairs(store_in(tmp_path), grow, 50)
+    # 50 pairs are 13 whole batches of 4, these 5 shards of 3.
+    assert list(files(tmp_path)) == ["manifest.json", *(f"pairs-{i:06d}.safetensors" for i in range(5))]
+    assert json.loads((tmp_path / "manifest.json").read_text())["recipe"]["parent"] == "abc"
+
+
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_any_number_of_processes_writes_the_same_bytes(tmp_path: Path, ranks: int):
+    make_pairs(store_in(tmp_path / "one"), grow, 50)
+    for rank in reversed(range(ranks)):
+        store = store_in(tmp_path / "many")
+        assert not store.is_whole(50)
+        make_pairs(store, grow, 50, rank, ranks)
+    assert files(tmp_path / "one") == files(tmp_path / "many")
+
+
+def in_process(folder: Path, rank: int = 0, ranks: int = 1, delay: float = 0.0, num: int = 50) -> int:
+    """make_pairs in a child of its own, with a flow that takes its time: its process id."""
+    child = os.fork()
+    if child == 0:
+        try:
+            torch.set_num_threads(1)  # a forked OpenMP pool hangs
+            make_pairs(store_in(folder), lambda t, x: time.sleep(delay) or x, num, rank, ranks)
+        finally:
+            os._exit(0)
+    return child
+
+
+def test_processes_at_once_write_the_same_bytes(tmp_path: Path):
+    torch.set_num_threads(1)
+    make_pairs(store_in(tmp_path / "one"), grow, 50)
+    # Two of them are the same process started twice by mistake.
+    children = [in_process(tmp_path / "many", rank, 3) for rank in (0, 1, 2, 2)]
+    for child in children:
+        os.waitpid(child, 0)
+    assert files(tmp_path / "one") == files(tmp_path / "many")
+
+
+def test_killed_at_ten_random_moments_the_same_command_ends_alike(tmp_path: Path):
+    torch.set_num_threads(1)
+    make_pairs(store_in(tmp_path / "one"), grow, 50)
+    draw = random.Random(0)
+    killed = 0
+    for _ in range(10):
+        child = in_process(tmp_path / "killed", delay=2e-3)
+        time.sleep(draw.uniform(0.02, 0.25))
+        os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+        killed += os.WIFSIGNALED(status)
+    assert killed >= 3  # the others had come to their end
+    make_pairs(store_in(tmp_path / "killed"), grow, 50)
+    kept = {name: data for name, data in files(tmp_path / "killed").items() if not name.endswith(".part")}
+    assert kept == files(tmp_path / "one")
+
+
+def test_nothing_is_made_twice(tmp_path: Path):
+    make_pairs(store_in(tmp_path), grow, 20)
+    flow = Counted()
+    made = make_pairs(store_in(tmp_path), flow, 20)
+    assert (made.pairs, flow.begun) == (0, 0)
+    made = make_pairs(store_in(tmp_path), grow, 50)  # five batches are there, 13 are wanted
+    assert made.pairs == 8 * 4
+
+
+def test_more_pairs_later_are_those_of_one_command(tmp_path: Path):
+    make_pairs(store_in(tmp_path / "one"), grow, 50)
+    for num in (3, 20, 50):
+        make_pairs(store_in(tmp_path / "grown"), grow, num)
+        assert len(PairSource(store_in(tmp_path / "grown"), num)) == num
+    assert files(tmp_path / "one") == files(tmp_path / "grown")
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def _empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def _text(path: Path) -> None:
+    path.write_text("not a shard")
+
+
+def _flip_a_value(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[-33] ^= 4
+    path.write_bytes(data)
+
+
+def _flip_a_flag(path: Path) -> None:
+    data = path.read_bytes()
+    assert data.count(rb"\"usable\": [1, ") == 1
+    path.write_bytes(data.replace(rb"\"usable\": [1, ", rb"\"usable\": [0, "))
+
+
+@pytest.mark.parametrize("harm", [_cut, _empty, _text, _flip_a_value, _flip_a_flag, Path.unlink])
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_damaged_shard_is_found_and_made_again_and_no_other(tmp_path: Path, harm, ranks: int, caplog):
+    make_pairs(store_in(tmp_path), grow, 50)
+    before = files(tmp_path)
+    harm(tmp_path / "pairs-000001.safetensors")
+    made = sum(make_pairs(store_in(tmp_path), grow, 50, rank, ranks).pairs for rank in range(ranks))
+    assert made == 12
+    assert files(tmp_path) == before
+    assert harm is Path.unlink or "pairs-000001.safetensors is damaged" in caplog.text
+
+
+def test_a_damaged_batch_is_made_again(tmp_path: Path):
+    store = store_in(tmp_path / "one")
+    make_pairs(store, grow, 50)
+    other = store_in(tmp_path / "two")
+    make_pairs(other, grow, 50, 0, 3)  # batches 0, 3, 6, ... alone
+    _flip_a_value(other.batch_path(3))
+    make_pairs(other, grow, 50)
+    assert files(tmp_path / "one") == files(tmp_path / "two")
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("parent", "abd"), ("seed", 1), ("method", "bosh3"), ("tolerance", 1e-3), ("batch_size", 8)]
+)
+def test_other_pairs_in_the_folder_are_refused(tmp_path: Path, option: str, value):
+    make_pairs(store_in(tmp_path), grow, 8)
+    with pytest.raises(InputError, match=f"holds other pairs: {option} is"):
+        store_in(tmp_path, **{option: value})
+
+
+def test_a_damaged_manifest_says_what_to_do(tmp_path: Path):
+    make_pairs(store_in(tmp_path), grow, 8)
+    (tmp_path / "manifest.json").write_text("{")
+    with pytest.raises(InputError, match="Delete it"):
+        store_in(tmp_path)
+
+
+def test_a_pair_that_does_not_come_to_an_end_is_left_out(tmp_path: Path):
+    bad = pair_noise(store_in(tmp_path).recipe, 5)
+
+    def broken(t, x):
+        # The fifth scene starts where no other does, and stays there until it breaks.
+        hit = (x - bad).abs().amax((1, 2, 3), keepdim=True) < 1e-6
+        return torch.where(hit, torch.nan, 0.0) * x
+
+    made = make_pairs(store_in(tmp_path), broken, 8)
+    assert made.unusable == 1
+    source = PairSource(store_in(tmp_path), 8)
+    assert source.indices.tolist() == [0, 1, 2, 3, 4, 6, 7]
+    assert all(source[i][1].isfinite().all() for i in range(7))
+
+
+def test_a_flow_that_is_broken_is_said_to_be(tmp_path: Path):
+    with pytest.raises(InputError, match="none of the pairs 0 to 3 came to an end"):
+        make_pairs(store_in(tmp_path), lambda t, x: x * math.nan, 8)
+
+
+def test_missing_pairs_are_named(tmp_path: Path):
+    make_pairs(store_in(tmp_path), grow, 8)
+    with pytest.raises(InputError, match="lacks about 12 of 20 pairs"):
+        PairSource(store_in(tmp_path), 20)
+
+
+def test_an_item_has_the_pair_s_noise_and_the_run_s_time(tmp_path: Path):
+    import pickle
+
+    store = store_in(tmp_path)
+    make_pairs(store, grow, 12)
+    source = PairSource(store, 12)
+    dataset = PairDataset(source, seed=3, purpose="training")
+    item = dataset[(70, 11)]
+    assert torch.equal(item["x_0"], pair_noise(store.recipe, 11))
+    assert item["k"] == 70
+    assert 0 <= float(item["u"]) < 1
+    assert float(item["u"]) != float(dataset[(71, 11)]["u"])
+    again = pickle.loads(pickle.dumps(dataset))  # as a loader's worker has it
+    assert all(torch.equal(again[(70, 11)][key], item[key]) for key in item)
+
+
+def test_a_full_disk_loses_nothing(tmp_path: Path):
+    make_pairs(store_in(tmp_path), grow, 12)
+    before = files(tmp_path)
+    child = os.fork()
+    if child == 0:
+        torch.set_num_threads(1)
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (512, 512))
+        try:
+            make_pairs(store_in(tmp_path), grow, 50)
+        except OSError:
+            os._exit(7)
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert os.WEXITSTATUS(status) == 7
+    assert files(tmp_path) == before
+
+
+def test_noise_of_pairs_is_that_of_no_other_purpose():
+    for purpose in ("training", "evaluation", "validation"):
+        assert not torch.equal(standard_normal(SHAPE, 0, "pairs", 3), standard_normal(SHAPE, 0, purpose, 3))
+
+
+def test_the_folder_is_in_the_run_s():
+    assert default_folder(Path("runs/a/checkpoints/step-00000010.ckpt")) == Path("runs/a/pairs")
+    assert default_folder(Path("models/flow.pth")) == Path("models/flow-pairs")
+
+
+def test_a_pair_takes_two_bytes_an_element(tmp_path: Path):
+    store = store_in(tmp_path, shard_mib=1)
+    make_pairs(store, grow, 400)
+    size = sum(len(data) for data in files(tmp_path).values())
+    assert size < 400 * (2 * np.prod(SHAPE) + 4) * 1.1

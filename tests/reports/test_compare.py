@@ -1,0 +1,240 @@
+"""Runs side by side, from folders whose every number is known."""
+
+import copy
+import csv
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+from tensorboard.compat.proto.event_pb2 import Event
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.summary.writer.record_writer import RecordWriter
+
+from r2flow.cli import main
+from r2flow.errors import InputError
+from r2flow.reports.compare import (
+    Group,
+    cell,
+    compare_page,
+    find_runs,
+    group_runs,
+    labels,
+    read_runs,
+    rows_of,
+    same_but_seed,
+    smooth,
+)
+from r2flow.reports.pages import write_page
+
+CONFIG: dict[str, Any] = {
+    "name": "small",
+    "seed": 0,
+    "sensor": {"name": "hdl64e", "rows": 8, "columns": 64},
+    "encoding": {"format": "logscale"},
+    "backbone": {
+        "name": "hdit", "base_channels": 8, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16, "patch": [1, 4],
+    },
+    "data": {"name": "simulated", "batch_size": 4, "scenes": 8},
+    "stage": {"name": "rectify", "learning_rate": 1e-3},
+    "trainer": {"max_steps": 40},
+    "scans": "8 of 8 scans, abc",
+}  # fmt: skip
+
+
+def make_run(
+    folder: Path,
+    change: dict[str, Any] | None = None,
+    train: list[float] | None = None,
+    val: list[float] | None = None,
+    curvature: list[float] | None = None,
+    seconds: tuple[tuple[float, float], ...] = (),
+    fidelity: dict[str, float] | None = None,
+    checkpoint: int | None = None,
+) -> Path:
+    """A folder as train.py leaves it: Lightning logs step s under the number s - 1."""
+    config = copy.deepcopy(CONFIG)
+    for key, value in (change or {}).items():
+        group, _, name = key.rpartition(".")
+        (config.setdefault(group, {}) if group else config)[name] = value
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    rows = [{"step": i, "train/loss": v} for i, v in enumerate(train or [])]
+    rows += [{"step": 10 * i + 9, "val/loss": v} for i, v in enumerate(val or [])]
+    rows += [{"step": 20 * i + 19, "curvature/s_normalised": v, "curvature/s": 2 * v} for i, v in
+             enumerate(curvature or [])]  # fmt: skip
+    if rows:
+        logs = folder / "metrics" / "version_0" / "metrics.csv"
+        logs.parent.mkdir(parents=True)
+        with logs.open("w", newline="") as file:
+            writer = csv.DictWriter(file, ["step", "train/loss", "val/loss", "curvature/s", "curvature/s_normalised"])
+            writer.writeheader()
+            writer.writerows(rows)
+    for number, times in enumerate(seconds):
+        (folder / "tensorboard").mkdir(exist_ok=True)
+        with (folder / "tensorboard" / f"events.out.tfevents.{number}").open("wb") as file:
+            records = RecordWriter(file)
+            records.write(Event(wall_time=0.0, file_version="brain.Event:2").SerializeToString())
+            for when in times:
+                summary = Summary(value=[Summary.Value(tag="train/loss", simple_value=1.0)])
+                records.write(Event(wall_time=when, step=1, summary=summary).SerializeToString())
+    if fidelity:
+        (folder / "samples").mkdir()
+        result = {"sets": {"other": fidelity, "noise": dict.fromkeys(fidelity, 1.0)}}
+        (folder / "samples" / "fidelity.json").write_text(json.dumps(result))
+    if checkpoint is not None:
+        (folder / "checkpoints").mkdir()
+        (folder / "checkpoints" / f"step-{checkpoint:08d}.ckpt").touch()
+    return folder
+
+
+def single(folder: Path) -> dict[str, Any]:
+    run = read_runs([folder])[0]
+    return {**run.values, "fidelity": run.fidelity, "label": run.label}
+
+
+def test_every_number_is_the_folder_s(tmp_path):
+    found = single(make_run(
+        tmp_path / "run", train=[1.0] * 36 + [0.5, 0.3, 0.2, 0.2], val=[0.9, 0.4, 0.6], curvature=[0.2, 0.05],
+        seconds=((100.0, 130.0, 160.0), (1000.0, 1005.0)), fidelity={"range histogram": 0.25}, checkpoint=38,
+    ))  # fmt: skip
+    assert found["stage"] == "rectify"
+    assert found["backbone"] == "hdit"
+    assert found["steps"] == 38  # of the newest checkpoint
+    assert found["images"] == 38 * 4
+    assert found["train_loss"] == pytest.approx((0.5 + 0.3 + 0.2 + 0.2) / 4)  # the last tenth of 40
+    assert found["val_best"] == 0.4
+    assert found["val_last"] == 0.6
+    assert found["straightness"] == 0.05
+    assert found["seconds"] == 65.0  # 60 in the first start and 5 in the second
+    assert found["fidelity"] == {"range histogram": 0.25}
+    assert found["label"] == "run"
+
+
+def test_what_a_folder_does_not_say_is_not_made_up(tmp_path):
+    run = read_runs([make_run(tmp_path / "bare")])
+    row = rows_of([Group("bare", tuple(run))])[0]
+    for column in ("steps", "images", "train_loss", "val_best", "val_last", "straightness", "seconds", "latency_ms"):
+        assert row[column] is None
+        assert cell(row, column) == "-"
+    assert row["parameters"] > 0  # which the config says
+
+
+def test_cost_is_a_constant_and_a_share_of_the_columns(tmp_path):
+    # The time's mapping costs the same at any width, all else by the column; so does the table of positions.
+    found = [single(make_run(tmp_path / f"{columns}", {"sensor.columns": columns})) for columns in (64, 128, 256)]
+    for key, exactly in (("parameters", 8 * 8 * (256 - 128) // 4), ("gmac", None)):
+        first, second = (found[i + 1][key] - found[i][key] for i in (0, 1))
+        assert second == pytest.approx(2 * first, rel=1e-9)
+        assert exactly is None or second == exactly
+    assert found[0]["latency_ms"] is None
+    assert read_runs([tmp_path / "64"], repeats=1)[0].values["latency_ms"] > 0
+
+
+def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
+    values = [0.2, 0.4, 0.9]
+    for seed, value in enumerate(values):
+        make_run(tmp_path / f"net-seed={seed}", {"seed": seed}, val=[value], checkpoint=40)
+    make_run(tmp_path / "other", {"stage.learning_rate": 2e-3}, val=[0.1], checkpoint=40)
+    groups = group_runs(read_runs([tmp_path]))
+    assert [(g.label, len(g.runs)) for g in groups] == [("net", 3), ("other", 1)]
+    rows = rows_of(groups)
+    assert rows[0]["val_last"] == pytest.approx(0.5)
+    assert rows[0]["val_last_spread"] == pytest.approx(math.sqrt((0.09 + 0.01 + 0.16) / 2))
+    assert cell(rows[0], "val_last") == "0.5 ± 0.361"
+    assert cell(rows[1], "val_last") == "0.1"
+    assert rows[0]["n"] == 3
+
+
+def test_children_of_several_seeds_are_one_configuration_and_of_other_parents_another(tmp_path):
+    def child(parent: Path, weights: str, **change: Any) -> dict[str, Any]:
+        config = copy.deepcopy(CONFIG)
+        config["data"] = {"name": "pairs", "batch_size": 4, "pairs": {"num": 8, "parent": weights}}
+        config["parent"] = {"path": str(parent / "checkpoints" / "step-00000040.ckpt"), "weights": weights}
+        return config | {"scans": f"8 pairs, {weights}"} | change
+
+    first = child(make_run(tmp_path / "a", {"seed": 0}), "aaa")
+    same = child(make_run(tmp_path / "b", {"seed": 1}), "bbb", seed=1)
+    other = child(make_run(tmp_path / "c", {"stage.learning_rate": 2e-3}), "ccc", seed=2)
+    gone = child(tmp_path / "nowhere", "ddd", seed=3)
+    assert same_but_seed(first, same)
+    assert not same_but_seed(first, other)
+    assert not same_but_seed(first, gone)
+    assert not same_but_seed(first, CONFIG)
+    assert not same_but_seed(CONFIG, {**CONFIG, "scans": "8 of 8 scans, another data set"})
+
+
+def test_a_folder_of_runs_stands_for_its_runs(tmp_path):
+    for name in ("b", "a"):
+        make_run(tmp_path / "sweep" / name)
+    (tmp_path / "sweep" / "multirun.yaml").touch()
+    assert [p.name for p in find_runs([tmp_path / "sweep", tmp_path / "sweep" / "a"])] == ["a", "b"]
+
+
+def test_names_take_as_many_parents_as_they_need():
+    paths = [Path("/x/one/rf"), Path("/x/two/rf"), Path("/x/two/td")]
+    assert labels(paths) == ["one/rf", "two/rf", "two/td"]
+    assert labels(paths[1:]) == ["rf", "td"]
+
+
+def test_a_curve_s_running_mean_of_a_straight_line_is_the_line():
+    steps = np.arange(100.0)
+    x, y = smooth(steps, 3 * steps + 1)
+    np.testing.assert_allclose(y, 3 * x + 1)
+    assert len(x) == 96
+
+
+def test_the_page_is_written_with_its_picture(tmp_path):
+    make_run(tmp_path / "runs" / "full", train=list(np.geomspace(2, 0.2, 40)), val=[0.9, 0.4], curvature=[0.1],
+             fidelity={"run lengths": 0.3}, checkpoint=40)  # fmt: skip
+    make_run(tmp_path / "runs" / "bare", {"stage.learning_rate": 2e-3})
+    groups = group_runs(read_runs([tmp_path / "runs"]))
+    written = {path.name: path for path in write_page(compare_page(groups, "r2flow compare runs"), tmp_path / "out")}
+    assert set(written) == {"compare.md", "compare.csv", "compare.json", "compare.png"}
+    said = written["compare.md"].read_text()
+    for words in (
+        "| bare | rectify | hdit |",
+        "| run lengths |",
+        "| full | 0.3 |",
+        "| bare | - |",
+        "r2flow compare runs",
+    ):
+        assert words in said, words
+    rows = json.loads(written["compare.json"].read_text())["rows"]
+    assert [row["name"] for row in rows] == ["bare", "full"]
+    assert rows[0]["val_best"] is None
+    assert rows[1]["val_best"] == 0.4
+    assert Image.open(written["compare.png"]).size[0] > 900
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty", "file", "other yaml", "broken panel"])
+def test_a_folder_that_is_no_run_is_one_line(tmp_path, monkeypatch, capsys, kind: str):
+    path = tmp_path / "thing"
+    if kind == "empty":
+        path.mkdir()
+    elif kind == "file":
+        path.touch()
+    elif kind == "other yaml":
+        path.mkdir()
+        (path / "config.yaml").write_text("a: 1\n")
+    elif kind == "broken panel":
+        make_run(path)
+        (path / "fidelity.json").write_text("[]")
+    monkeypatch.setattr("sys.argv", ["r2flow", "compare", str(path)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert said[0].startswith("error: ")
+    assert "thing" in said[0]
+
+
+def test_a_broken_config_is_no_run(tmp_path):
+    (tmp_path / "config.yaml").write_text("stage: [unclosed\n")
+    with pytest.raises(InputError, match=r"config.yaml cannot be read"):
+        read_runs([tmp_path])

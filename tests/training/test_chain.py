@@ -1,0 +1,209 @@
+"""1-RF, pairs, 2-RF, pairs, k-TD, report: as one command, and link by link."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+import train as train_script
+from r2flow.chain import links_of, override
+from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
+from r2flow.errors import InputError
+from tests.training.conftest import ROOT, TINY, Run, run_train
+
+CHAIN = ["experiment=demo", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8", "data.pairs.batch_size=4"]
+LINKS = ("rf1", "rf2", "td2")
+SCANS_ALONE = ("data=", "sensor", "backbone", "data.root")
+
+
+def of_a_child(*overrides: str) -> list[str]:
+    """The tiny run's overrides without what a child takes from its parent."""
+    return [one for one in TINY if not one.startswith(SCANS_ALONE)] + list(overrides)
+
+
+def train_child(cwd: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(ROOT / "train.py"), *of_a_child(*overrides)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.fixture(scope="session")
+def chained(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """(folder, what it printed) of the tiny chain that nobody disturbed."""
+    cwd = tmp_path_factory.mktemp("chained")
+    done = run_train(cwd, scans, *CHAIN)
+    return cwd / "runs" / "demo", done.stdout
+
+
+def state(run: Path) -> dict[str, object]:
+    """Everything that a chain is to end with: weights, raw and averaged, and the pairs' bytes."""
+    found: dict[str, object] = {}
+    for link in LINKS:
+        content = read_checkpoint(checkpoints_of(run / link)[0])
+        for kind in ("current_model_state", "state_dict"):
+            found |= {f"{link} {kind} {name}": value for name, value in content[kind].items()}
+        for path in sorted((run / link / "pairs").glob("*.safetensors")):
+            found[f"{link} {path.name}"] = path.read_bytes()
+    return found
+
+
+def assert_alike(first: Path, second: Path) -> None:
+    a, b = state(first), state(second)
+    assert a.keys() == b.keys()
+    for name, value in a.items():
+        assert torch.equal(value, b[name]) if isinstance(value, torch.Tensor) else value == b[name], name
+
+
+def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
+    run, said = chained
+    for name in ("report/chain.png", "report/chain.md", "report/chain.csv", "report/chain.json", "report/000000.ply"):
+        assert (run / name).is_file(), name
+    for words in ("[1/3] rf1", "[2/3] rf2", "[3/3] td2", "8 pairs", "evaluations a pair", "pairs/s", "r2flow sample"):
+        assert words in said
+    first, second, third = (load_checkpoint(run / link) for link in LINKS)
+    assert [flow.config["stage"]["name"] for flow in (first, second, third)] == ["rectify", "reflow", "distill"]
+    assert second.config["parent"]["weights"] == weights_hash(first)
+    assert third.config["parent"]["weights"] == weights_hash(second)
+    assert second.config["backbone"] == first.config["backbone"]
+    assert (first.distilled_steps, third.distilled_steps) == (None, 2)
+    # The noise that 2-TD learns from is none of that which 2-RF has learned from.
+    assert (second.config["data"]["pairs"]["first"], third.config["data"]["pairs"]["first"]) == (0, 8)
+
+
+def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Path):
+    run, _ = chained
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*.ckpt")}
+    done = run_train(run.parent.parent, scans, *CHAIN)
+    assert done.stdout.count("finished before") == 4  # the report too
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*.ckpt")} == before
+
+
+def _killed_at(moments: list[float], scans: Path, cwd: Path) -> int:
+    """Start the chain and kill it, once for each number of seconds; how often it was still alive."""
+    killed = 0
+    command = [sys.executable, str(ROOT / "train.py"), *TINY, f"data.root={scans}", *CHAIN]
+    for number, moment in enumerate(moments):
+        process = subprocess.Popen(
+            command, cwd=cwd, env={**os.environ, "OMP_NUM_THREADS": "1"}, start_new_session=True,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        time.sleep(moment)
+        killed += process.poll() is None
+        # By turns the whole group, as a lost machine is, and the chain alone, as `kill -9 PID` does.
+        if number % 2:
+            os.kill(process.pid, signal.SIGKILL)
+        else:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    return killed
+
+
+def test_a_killed_chain_ends_as_the_one_left_alone(chained: tuple[Path, str], scans: Path, tmp_path: Path):
+    assert _killed_at([9.0, 9.0], scans, tmp_path) == 2
+    run_train(tmp_path, scans, *CHAIN)
+    assert_alike(chained[0], tmp_path / "runs" / "demo")
+
+
+@pytest.mark.slow
+def test_a_chain_killed_at_ten_random_moments_ends_as_the_one_left_alone(
+    chained: tuple[Path, str], scans: Path, tmp_path: Path
+):
+    draw = random.Random(1)
+    assert _killed_at([draw.uniform(5, 16) for _ in range(10)], scans, tmp_path) >= 5
+    run_train(tmp_path, scans, *CHAIN)
+    assert_alike(chained[0], tmp_path / "runs" / "demo")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["experiment=reflow"], "stage=reflow starts from a trained flow: give stage.init=RUN"),
+        (["experiment=reflow", "stage.init=nowhere"], "no checkpoint at nowhere"),
+        (
+            ["experiment=reflow", "stage.init=RF1", "backbone.depths=[1,2]"],
+            "is [1, 2] here, but [1, 1] in",
+        ),
+        (["experiment=reflow", "stage.init=RF1", "sensor=vlp16"], "the sensor is the parent's"),
+        (["experiment=reflow", "stage.init=RF1", "data.flip=true"], "data.flip mirrors scans"),
+        (["experiment=reflow", "stage.init=RF1", "data.pairs.num=0"], "num, batch_size, steps must be at least 1"),
+        (["experiment=reflow", "stage.init=RF1", "data.pairs.method=dopri"], "Did you mean 'dopri5'"),
+        (["experiment=reflow", "stage.init=RF1"], "holds other pairs: method is midpoint there, dopri5 here"),
+        (["experiment=distill", "stage.init=RF1", "stage.steps=0", "data.root=x"], "stage.steps must be at least 1"),
+    ],
+)
+def test_a_child_that_cannot_be_is_refused_in_one_line(
+    chained: tuple[Path, str], tmp_path: Path, monkeypatch, capfd, overrides: list[str], message: str
+):
+    overrides = [one.replace("RF1", str(chained[0] / "rf1")) for one in overrides]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.py", *of_a_child(*overrides)])
+    assert train_script.main() == 2
+    said = capfd.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert message in said[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unfinished_parent_is_refused_and_its_checkpoint_taken(chained: tuple[Path, str], tmp_path: Path):
+    import shutil
+
+    parent = Path(shutil.copytree(chained[0] / "rf1", tmp_path / "parent"))
+    shutil.rmtree(parent / "pairs")
+    last, before = checkpoints_of(parent)
+    last.unlink()
+    overrides = ["experiment=reflow", "data.pairs.num=4", "data.pairs.batch_size=4", "trainer.max_steps=2"]
+    done = train_child(tmp_path, *overrides, f"stage.init={parent}")
+    assert done.returncode == 2
+    assert "has stopped at step 10 of 12: finish it, or name the checkpoint" in done.stderr
+    done = train_child(tmp_path, *overrides, f"stage.init={before}")
+    assert done.returncode == 0, done.stderr
+    assert (parent / "pairs" / "manifest.json").is_file()
+
+
+def test_two_processes_make_the_pairs_that_one_makes(chained: tuple[Path, str], train: Run, tmp_path: Path):
+    done = train_child(
+        tmp_path, "experiment=reflow", f"stage.init={chained[0] / 'rf1'}", "trainer.strategy=ddp", "trainer.devices=2",
+        f"data.root={tmp_path / 'pairs'}", "data.pairs.num=8", "data.pairs.batch_size=4", "data.pairs.method=midpoint",
+        "data.pairs.steps=8", "trainer.max_steps=2",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    for name in ("manifest.json", "pairs-000000.safetensors"):
+        assert (tmp_path / "pairs" / name).read_bytes() == (chained[0] / "rf1" / "pairs" / name).read_bytes()
+
+
+def test_links_take_what_concerns_them():
+    chain = {
+        "rf1": {"experiment": None, "trainer": {"max_steps": 5}},
+        "rf2": {"experiment": "reflow", "init": "rf1", "stage": {"loss": "mse"}},
+    }
+    given = ["experiment=demo", "name=x", "chain.rf1.trainer.max_steps=5", "data=folder", "data.root='a b'", "seed=3",
+             "data.pairs.num=9", "data.batch_size=2", "+trainer.x=1", "backbone.depths=[1]"]  # fmt: skip
+    first, second = links_of(chain, "runs/x", given)
+    assert first.overrides == (
+        "trainer.max_steps=5", "data=folder", "data.root='a b'", "seed=3", "data.batch_size=2", "+trainer.x=1",
+        "backbone.depths=[1]", "run_dir='runs/x/rf1'",
+    )  # fmt: skip
+    assert second.overrides == (
+        "experiment=reflow", "stage.loss=mse", "stage.init='runs/x/rf1'", "seed=3", "data.pairs.num=9",
+        "data.batch_size=2", "+trainer.x=1", "run_dir='runs/x/rf2'",
+    )  # fmt: skip
+
+
+def test_a_link_without_its_parent_is_refused():
+    with pytest.raises(InputError, match="chain.b.init=c: no link of that name comes before it"):
+        links_of({"a": {}, "b": {"init": "c"}}, "runs", [])
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(3, "k=3"), (1e-3, "k=0.001"), (None, "k=null"), (True, "k=true"), ("word", "k=word"), ([1, 2], "k=[1,2]"),
+     ("a b's", "k='a b\\'s'")],
+)  # fmt: skip
+def test_values_are_written_as_hydra_reads_them(value, text: str):
+    assert override("k", value) == text

@@ -1,0 +1,245 @@
+"""Many processes, half precision, SLURM and sweeps on a cluster: the same run, however it is spread."""
+
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import train as train_script
+from callbacks.requeue import LEFT, slurm_job
+from r2flow.checkpoints import checkpoints_of, read_checkpoint
+from tests.training.conftest import ROOT, TINY, Run
+from tests.training.test_train import assert_bit_equal, weights
+
+STEPS = 20
+EXACT = [f"trainer.max_steps={STEPS}", "backbone.dropout=0"]  # dropout's masks are drawn per device batch
+TWO = ["trainer.devices=2", "trainer.strategy=ddp"]
+
+
+def recorded(
+    cwd: Path, scans: Path, record: Path, *overrides: str, code: int = 0, broken: tuple[int, ...] = ()
+) -> subprocess.CompletedProcess[str]:
+    """train.py with `recorder.py` looking on, into the folder `record`."""
+    recorder = str(Path(__file__).with_name("recorder.py"))
+    command = [sys.executable, recorder, *TINY, f"data.root={scans}", *overrides, "+callbacks.recorder={}"]
+    environment = {
+        **os.environ, "OMP_NUM_THREADS": "1", "R2FLOW_RECORD": str(record), "R2FLOW_BROKEN": json.dumps(broken),
+    }  # fmt: skip
+    record.mkdir(exist_ok=True)
+    done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == code, f"{done.stdout}\n{done.stderr}"
+    return done
+
+
+def losses(record: Path) -> dict[int, float]:
+    """The global batch's loss by step: the mean over ranks, whose shares are of one size."""
+    ranks = [json.loads(path.read_text()) for path in sorted(record.glob("losses-*.json"))]
+    assert len({tuple(rank) for rank in ranks}) == 1
+    return {int(step): float(np.mean([rank[step] for rank in ranks])) for step in ranks[0]}
+
+
+@pytest.fixture(scope="module")
+def one(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run in one process, with what was recorded in `record`."""
+    cwd = tmp_path_factory.mktemp("one")
+    recorded(cwd, scans, cwd / "record", "name=one", *EXACT)
+    return cwd
+
+
+@pytest.fixture(scope="module")
+def two(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same in two processes."""
+    cwd = tmp_path_factory.mktemp("two")
+    recorded(cwd, scans, cwd / "record", "name=two", *EXACT, *TWO)
+    return cwd
+
+
+def test_two_processes_have_the_losses_of_one(one: Path, two: Path):
+    alone, together = losses(one / "record"), losses(two / "record")
+    assert list(alone) == list(together) == list(range(1, STEPS + 1))
+    worst = max(abs(alone[step] - together[step]) for step in alone)
+    assert worst < 1e-5
+    # Both learn: otherwise equal losses would say little.
+    assert np.mean([alone[s] for s in range(16, 21)]) < np.mean([alone[s] for s in range(1, 6)])
+
+
+def test_two_processes_share_one_average_and_one_writes(one: Path, two: Path):
+    average = [json.loads((two / "record" / f"average-{rank}.json").read_text()) for rank in (0, 1)]
+    assert average[0] == average[1]
+    writers = {path.name.split("-")[1] for path in (two / "record").glob("wrote-*")}
+    assert writers == {"0"}
+    assert [p.name for p in checkpoints_of(two / "runs" / "two")] == ["step-00000020.ckpt", "step-00000018.ckpt"]
+    for a, b in zip(weights(one / "runs" / "one"), weights(two / "runs" / "two"), strict=True):
+        for name in a:
+            torch.testing.assert_close(a[name], b[name], rtol=0, atol=1e-4)
+
+
+def test_a_run_goes_on_in_more_processes(one: Path, scans: Path, tmp_path: Path):
+    # Killed at the end of step 18 in one process; steps 19 and 20 in two.
+    shutil.copytree(one / "runs", tmp_path / "runs")
+    checkpoints_of(tmp_path / "runs" / "one")[0].unlink()
+    recorded(tmp_path, scans, tmp_path / "record", "name=one", *EXACT, *TWO)
+    alone, resumed = losses(one / "record"), losses(tmp_path / "record")
+    assert list(resumed) == [19, 20]
+    assert all(abs(alone[step] - resumed[step]) < 1e-5 for step in resumed)
+    for a, b in zip(weights(one / "runs" / "one"), weights(tmp_path / "runs" / "one"), strict=True):
+        for name in a:
+            torch.testing.assert_close(a[name], b[name], rtol=0, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_defect_on_one_device_is_skipped_and_ends_on_all(scans: Path, tmp_path: Path):
+    # Batches of 4 over two ranks: odd images are rank 1's. Images 9, 13 and 17 break steps 3, 4 and 5.
+    done = recorded(tmp_path, scans, tmp_path, "name=broken", *EXACT, *TWO, "callbacks.guard.skips=3",
+                    code=2, broken=(9, 13, 17))  # fmt: skip
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error:")]
+    assert "stopped at step 5: 3 steps in a row were skipped" in errors[0]
+    assert "images k = 16 to 19" in errors[0]
+    assert len(set(errors)) == 1
+    states = [read_checkpoint(path) for path in checkpoints_of(tmp_path / "runs" / "broken")]
+    assert [state["global_step"] for state in states] == [4, 2]
+    # Steps 3 and 4 changed nothing.
+    for name, value in states[0]["current_model_state"].items():
+        assert torch.equal(value, states[1]["current_model_state"][name])
+
+
+def test_accumulated_batches_have_the_losses_of_the_whole(one: Path, scans: Path, tmp_path: Path):
+    recorded(tmp_path, scans, tmp_path, "name=parts", *EXACT, "trainer.accumulate_grad_batches=2",
+             "trainer.val_check_interval=20")  # fmt: skip
+    whole, parts = losses(one / "record"), losses(tmp_path)
+    assert whole.keys() == parts.keys()
+    assert max(abs(whole[step] - parts[step]) for step in whole) < 1e-5
+
+
+def srun(
+    cwd: Path, scans: Path, *overrides: str, tasks: int = 1, leave_after: Path | None = None
+) -> list[tuple[int, str]]:
+    """The tiny run as srun starts it on one node, with a `scontrol` that writes down what it was asked.
+
+    Args:
+        leave_after: The last task is sent SIGUSR1 when this file is there.
+
+    Returns:
+        (exit code, output) of every task.
+    """
+    scontrol = cwd / "bin" / "scontrol"
+    scontrol.parent.mkdir(exist_ok=True)
+    scontrol.write_text(f'#!/bin/sh\necho "$@" >> {cwd}/scontrol.log\n')
+    scontrol.chmod(scontrol.stat().st_mode | stat.S_IXUSR)
+    with socket.socket() as free:
+        free.bind(("", 0))
+        port = free.getsockname()[1]
+    environment = {
+        **os.environ, "OMP_NUM_THREADS": "1", "PATH": f"{cwd}/bin:{os.environ['PATH']}", "MASTER_PORT": str(port),
+        "SLURM_JOB_ID": "4711", "SLURM_JOB_NAME": "flow", "SLURM_NODEID": "0", "SLURM_NNODES": "1",
+        "SLURM_NODELIST": "localhost", "SLURM_NTASKS": str(tasks), "SLURM_NTASKS_PER_NODE": str(tasks),
+    }  # fmt: skip
+    command = [sys.executable, str(ROOT / "train.py"), *TINY, f"data.root={scans}", *overrides]
+    started = [
+        subprocess.Popen(
+            command, cwd=cwd, env={**environment, "SLURM_PROCID": str(task), "SLURM_LOCALID": str(task)},
+            start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        )
+        for task in range(tasks)
+    ]  # fmt: skip
+    begin = time.monotonic()
+    while leave_after and not leave_after.exists():
+        assert started[-1].poll() is None, started[-1].communicate()[0].decode()
+        assert time.monotonic() - begin < 200
+        time.sleep(0.005)
+    if leave_after:
+        os.killpg(started[-1].pid, signal.SIGUSR1)  # its loader's workers get it too, as from SLURM
+    said = [process.communicate(timeout=200)[0].decode() for process in started]
+    return [(process.returncode, words) for process, words in zip(started, said, strict=True)]
+
+
+def test_a_job_told_to_leave_is_queued_again_and_ends_as_the_one_left_alone(
+    alone: tuple[Path, str], scans: Path, tmp_path: Path
+):
+    run = tmp_path / "runs" / "queued"
+    command = ["name=queued", "data.workers=1"]
+    [(code, said)] = srun(tmp_path, scans, *command, leave_after=run / "checkpoints" / "step-00000002.ckpt")
+    assert code == LEFT, said
+    assert (tmp_path / "scontrol.log").read_text() == "requeue 4711\n"
+    left = [read_checkpoint(path)["global_step"] for path in checkpoints_of(run)]
+    assert 2 <= left[0] < 12
+    assert len(left) == 2
+    assert f"stopped at step {left[0]}; the same command goes on" in said
+    assert not list(run.rglob("hpc_ckpt*"))  # Lightning's own, which nothing would remove or read
+    [(code, said)] = srun(tmp_path, scans, *command)
+    assert code == 0, said
+    assert f"step-{left[0]:08d}.ckpt" in said[said.index("going on from") :].splitlines()[0]
+    assert_bit_equal(alone[0], run)
+    assert [p.name for p in checkpoints_of(run)] == ["step-00000012.ckpt", "step-00000010.ckpt"]
+
+
+@pytest.mark.slow
+def test_two_tasks_leave_together_when_one_is_told_to(one: Path, scans: Path, tmp_path: Path):
+    run = tmp_path / "runs" / "queued"
+    command = ["name=queued", *EXACT, *TWO, "callbacks.requeue.every=2"]
+    first = run / "checkpoints" / "step-00000002.ckpt"
+    for code, said in srun(tmp_path, scans, *command, tasks=2, leave_after=first):
+        assert code == LEFT, said
+    assert (tmp_path / "scontrol.log").read_text() == "requeue 4711\n"
+    assert len(checkpoints_of(run)) == 2
+    assert read_checkpoint(checkpoints_of(run)[0])["global_step"] < STEPS
+    for code, said in srun(tmp_path, scans, *command, tasks=2):
+        assert code == 0, said
+    for a, b in zip(weights(one / "runs" / "one"), weights(run), strict=True):
+        for name in a:
+            torch.testing.assert_close(a[name], b[name], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("variables", "job"),
+    [
+        ({}, None),
+        ({"SLURM_JOB_ID": "12"}, "12"),
+        ({"SLURM_JOB_ID": "15", "SLURM_ARRAY_JOB_ID": "12", "SLURM_ARRAY_TASK_ID": "3"}, "12_3"),
+        ({"SLURM_JOB_ID": "12", "SLURM_JOB_NAME": "bash"}, None),
+        ({"SLURM_JOB_ID": "12", "SLURM_JOB_NAME": "interactive"}, None),
+    ],
+)
+def test_what_is_queued_again_is_named_as_scontrol_names_it(monkeypatch, variables: dict[str, str], job: str | None):
+    for name in list(os.environ):
+        if name.startswith("SLURM_"):
+            monkeypatch.delenv(name)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert slurm_job() == job
+
+
+def test_a_launcher_that_is_not_installed_says_how_to_get_it(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.py", "-m", "hydra/launcher=submitit_of_tomorrow", "seed=1,2"])
+    assert train_script.main() == 2
+    said = capfd.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert "pip install -e '.[slurm]'" in said[0]
+
+
+@pytest.mark.slow
+def test_a_sweep_through_submitit_runs_every_job_and_reports_a_failed_one(train: Run, tmp_path: Path):
+    if importlib.util.find_spec("hydra_plugins.hydra_submitit_launcher") is None:
+        pytest.skip("needs the extra 'slurm' (hydra-submitit-launcher)")
+    launcher: list[Any] = ["hydra/launcher=submitit_local", "trainer.max_steps=2"]
+    done = train(*launcher, "stage.loss=mse,nonsense", check=False, flags=("-m",))
+    assert done.returncode == 2
+    assert "of the sweep's jobs failed" in done.stderr
+    assert "stage.loss=nonsense" in done.stderr
+    finished = [path.parent.name for path in (tmp_path / "runs" / "sweep").glob("*/samples")]
+    assert len(finished) == 1
+    assert "stage.loss=mse" in finished[0]  # named by what is swept although another process made it
+    assert train(*launcher, "stage.loss=mse", flags=("-m",)).returncode == 0
