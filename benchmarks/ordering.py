@@ -43,8 +43,8 @@ PLANE_BATCH, PLANE_PAIRS, PLANE_SAMPLES = 512, 40_000, 8192
 # The scans: simulated, 16 x 128, a quarter of the demo's pixels, so that more of them are seen in the same time.
 SCAN_RUN = [
     "experiment=demo", "sensor.rows=16", "sensor.columns=128", "data.batch_size=8", "data.scenes=1024",
-    "chain.rf1.trainer.max_steps=3000", "chain.rf2.trainer.max_steps=2000", "chain.td2.trainer.max_steps=1000",
-    "chain.rf2.data.pairs.num=1500", "chain.td2.data.pairs.num=1500", "trainer.val_check_interval=1000",
+    "chain.rf1.trainer.max_steps=2000", "chain.rf2.trainer.max_steps=1200", "chain.td2.trainer.max_steps=800",
+    "chain.rf2.data.pairs.num=1000", "chain.td2.data.pairs.num=1000", "trainer.val_check_interval=400",
     "callbacks.pictures=null", "callbacks.curvature=null", "loggers=[csv]",
 ]  # fmt: skip
 SCAN_SAMPLES = 64

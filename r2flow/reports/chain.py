@@ -1,5 +1,7 @@
 """What straightening and distilling did: every flow of a chain at few and at many steps, from the same noise."""
 
+import json
+import sys
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -13,6 +15,7 @@ from rich.progress import track
 
 from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
+from r2flow.files import atomic_write
 from r2flow.flow.straightness import curvature
 from r2flow.metrics.fidelity import distances, panel
 from r2flow.reports.outputs import draw_pages, write_scan
@@ -25,6 +28,8 @@ MANY = 32  # steps that stand for "as many as one likes"
 
 def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu") -> Path:
     """Sample every flow, set the samples beside held-out scans, and write figure, table and scans.
+
+    Each run's folder gets its `fidelity.json`, which `r2flow compare` reads.
 
     Args:
         runs: Run folders by name, the first one trained on scans.
@@ -41,7 +46,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     cells = [(name, steps) for name, flow in flows.items() for steps in steps_of(flow, flows.values())]
     rows, drawn = [], {}
     bends = {name: bend(flow, num) for name, flow in flows.items()}
-    for name, steps in track(cells, "sampling every flow", transient=True):
+    for name, steps in track(cells, "sampling every flow", transient=True, disable=not sys.stdout.isatty()):
         start = time.perf_counter()
         images = np.concatenate([one.images.numpy() for one in sample(flows[name], num, steps, seed=0)])
         seconds = (time.perf_counter() - start) / num
@@ -51,6 +56,9 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
             "mean": float(np.mean(list(found.values()))), **found,
         })  # fmt: skip
         drawn[name, steps] = images
+        # A flow's last number of steps is the one that it is meant for.
+        with atomic_write(runs[name] / "fidelity.json", "w") as file:
+            json.dump({"sets": {"other": found}, "samples": num, "steps": steps}, file, indent=2)
     last = cells[-1]
     rays = first.sensor.rays()
     for index, image in enumerate(drawn[last][:4]):
@@ -92,8 +100,8 @@ def held_out(flow: Checkpoint) -> np.ndarray:
     """The scans that a flow was validated on, (N, 2 or 1, H, W) in metres and reflectance."""
     data = ScanDataModule(flow.sensor, flow.encoding, flow.config["seed"], **flow.config["data"])
     _, held = data.sources()
-    numbers = range(len(held))
-    return np.stack([held[i] for i in track(numbers, "held-out scans", transient=True)])
+    numbers = track(range(len(held)), "held-out scans", transient=True, disable=not sys.stdout.isatty())
+    return np.stack([held[i] for i in numbers])
 
 
 def bend(flow: Checkpoint, num: int) -> float:

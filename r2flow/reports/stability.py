@@ -282,4 +282,4 @@ def _draw_verdicts(axes: Any, rows: Sequence[Row]) -> None:
     axes.invert_yaxis()
     axes.set(xlabel="cells")
     axes.set_title("What became of the cells (silent: the narrow jet, or see the table)", fontsize=10)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5, frameon=False)
