@@ -59,7 +59,7 @@ def fit(config: dict[str, Any], asked: list[str]) -> None:
     from lightning.fabric.utilities.exceptions import MisconfigurationException
 
     from callbacks import build_callbacks, build_loggers
-    from r2flow.checkpoints import AtomicCheckpointIO, checkpoints_of
+    from r2flow.checkpoints import AtomicCheckpointIO, checkpoints_of, step_of
     from r2flow.data.datamodule import ScanDataModule
     from r2flow.lineage import inherit
     from r2flow.noise import seed_torch
@@ -104,10 +104,11 @@ def fit(config: dict[str, Any], asked: list[str]) -> None:
         return
     with run_lock(run_dir) if trainer.is_global_zero else nullcontext():
         last = open_run(run_dir, config)
-        if last is not None:
-            log.info("going on from %s", last)
         try:
-            trainer.fit(stage, data, ckpt_path=last, weights_only=True)
+            if last is None or step_of(last) < trainer.max_steps:  # else nothing is left to do, nor pairs to make
+                if last is not None:
+                    log.info("going on from %s", last)
+                trainer.fit(stage, data, ckpt_path=last, weights_only=True)
         except SystemExit as stop:  # 1: how Lightning ends a run on Ctrl-C; else callbacks.requeue
             kept = (
                 "goes on from the last checkpoint" if checkpoints_of(run_dir) else "starts it again: no checkpoint yet"
@@ -136,29 +137,42 @@ def check_trainer(options: dict[str, Any]) -> None:
 
 def sweep_job(config: DictConfig) -> int:
     """One job of a sweep, as its own process: its failure or its DDP relaunch touches no other job."""
+    from r2flow.chain import override
+
     overrides = list(HydraConfig.get().overrides.task)
     run_dir = HydraConfig.get().runtime.output_dir
-    command = [sys.executable, __file__, *overrides, f"run_dir='{run_dir}'"]
+    command = [sys.executable, __file__, *overrides, override("run_dir", str(run_dir))]
     log.info("job %s: %s", HydraConfig.get().job.num, " ".join(overrides))
     return subprocess.run(command, check=False).returncode
 
 
 def chain(config: dict[str, Any], given: list[str]) -> int:
     """The runs that a config's `chain` names, and the report on them."""
-    from r2flow.chain import links_of, run_chain
+    from r2flow.chain import is_reported, links_of, record_report, run_chain
 
+    if config["trainer"]["fast_dev_run"]:
+        raise InputError("a chain's links start from the runs before them, and trainer.fast_dev_run leaves none.")
     folder = Path(config["run_dir"])
     links = links_of(config["chain"], folder, given)
+    for link in links:  # what a link cannot compose is better known now than after the links before it
+        try:
+            hydra.compose("train", list(link.overrides))
+        except HydraException as error:
+            raise InputError(f"chain.{link.name}: {explain(error)}") from None
     code, ran = run_chain(links, Path(__file__))
     if code:
         return code
-    page = folder / "report" / "chain.md"
-    if page.is_file() and not ran:
-        print(f"report: finished before, {page}")
+    out = folder / "report"
+    if not ran and is_reported(links, out):
+        print(f"report: finished before, {out / 'chain.md'}")
         return 0
+    import torch
+
     from r2flow.reports.chain import report
 
-    report({link.name: link.run_dir for link in links}, page.parent)
+    device = "cuda" if torch.cuda.is_available() and config["trainer"]["accelerator"] != "cpu" else "cpu"
+    report({link.name: link.run_dir for link in links}, out, device=device, command=" ".join(["python", *sys.argv]))
+    record_report(links, out)
     return 0
 
 

@@ -11,7 +11,7 @@ class ReflowPairs(L.Callback):
     """When a run begins, makes the pairs that its data name and that are missing or damaged, over all its devices.
 
     Args:
-        init: The flow that draws them (`stage.init`).
+        init: The flow that draws them (`stage.init`); None where the run starts from no other.
     """
 
     def __init__(self, init: str | None) -> None:
@@ -22,7 +22,8 @@ class ReflowPairs(L.Callback):
         if not isinstance(data, ScanDataModule) or data.pairs is None or self.init is None:
             return
         store, num = data.pair_store, data.pairs.num
-        device = trainer.strategy.root_device
-        make_and_tell(store, load_checkpoint(self.init), num, trainer.global_rank, trainer.world_size, device)
+        device, flow = trainer.strategy.root_device, load_checkpoint(self.init)
+        make_and_tell(store, flow, num, trainer.global_rank, trainer.world_size, device)
         # Files, not a barrier: a collective call gives up after half an hour, and a slow rank may take longer.
-        wait_for_others(store, num)
+        while not wait_for_others(store, num, launched=trainer.global_rank > 0):
+            make_and_tell(store, flow, num, device=device)  # whoever was to make them is not going to

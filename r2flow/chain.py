@@ -53,8 +53,10 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
         given: What the user gave on the command line. It goes to every link that it concerns, after the link's own.
 
     Raises:
-        InputError: a link starts from one that does not come before it.
+        InputError: a link starts from one that does not come before it, or the command line says where all do.
     """
+    if any(one.lstrip("+~").partition("=")[0] == "stage.init" for one in given):
+        raise InputError("stage.init is each link's own: give +chain.LINK.stage.init=RUN to one of them.")
     links: list[Link] = []
     for name, difference in chain.items():
         own, parent = dict(difference), difference.get("init")
@@ -64,7 +66,12 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
             if parent not in [link.name for link in links]:
                 raise InputError(f"chain.{name}.init={parent}: no link of that name comes before it.")
             overrides.append(override("stage.init", str(Path(folder, parent))))
-        overrides += [one for one in given if _concerns(one, reads_scans=parent is None)]
+        reads_scans = parent is None and (own.get("stage") or {}).get("init") is None
+        overrides += [one for one in given if _concerns(one, reads_scans)]
+        # What the user gave to this link alone comes last, for it is what the link's own has become.
+        mine = f"chain.{name}."
+        alone = [one.lstrip("+").removeprefix(mine) for one in given if one.lstrip("+").startswith(mine)]
+        overrides += [one for one in alone if not one.startswith("init=")]
         run_dir = Path(folder, name)
         links.append(Link(name, run_dir, (*overrides, override("run_dir", str(run_dir)))))
     return links
@@ -111,10 +118,11 @@ def run_chain(links: Sequence[Link], train: Path) -> tuple[int, bool]:
         print(f"[{number}/{len(links)}] {link.name}: {link.run_dir}", flush=True)
         code = _run(link, train)
         if code:
-            print(f"the chain stopped in {link.name}; the same command goes on there", file=sys.stderr, flush=True)
+            if code != 2:  # which is the user's to mend, and has been said
+                print(f"the chain stopped in {link.name}; the same command goes on there", file=sys.stderr, flush=True)
             return code, True
         with atomic_write(link.run_dir / RECORD, "w") as file:
-            json.dump({"overrides": link.overrides}, file, indent=2)
+            json.dump(_record(link), file, indent=2)
     return 0, not skipping
 
 
@@ -124,7 +132,27 @@ def is_finished(link: Link) -> bool:
         record = json.loads((link.run_dir / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
-    return record == {"overrides": list(link.overrides)} and bool(checkpoints_of(link.run_dir))
+    return record == _record(link) and record["checkpoint"] is not None
+
+
+def _record(link: Link) -> dict[str, Any]:
+    """What a finished link leaves: its command line, and its last checkpoint's name and size."""
+    last = next(iter(checkpoints_of(link.run_dir)), None)
+    return {"overrides": list(link.overrides), "checkpoint": last and [last.name, last.stat().st_size]}
+
+
+def record_report(links: Sequence[Link], out: Path) -> None:
+    """Note beside the report what it is of."""
+    with atomic_write(out / RECORD, "w") as file:
+        json.dump([_record(link) for link in links], file, indent=2)
+
+
+def is_reported(links: Sequence[Link], out: Path) -> bool:
+    """Whether the report on just these links is there."""
+    try:
+        return bool(json.loads((out / RECORD).read_text(encoding="utf-8")) == [_record(link) for link in links])
+    except (OSError, ValueError):
+        return False
 
 
 def _run(link: Link, train: Path) -> int:

@@ -36,15 +36,21 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str]) -> tuple[dict[str, 
             raise InputError(f"stage={config['stage']['name']} starts from a trained flow: give stage.init=RUN.")
         return config, None
     parent = load_checkpoint(init)
-    _check_finished(Path(init), parent)
+    check_finished(Path(init), parent)
+    if "published" in parent.config and parent.config["data"]["projection"] == "unfolding":
+        raise InputError(
+            f"{init} was trained on unfolded scans, whose rings a new run's sensor does not carry; "
+            "start from a flow trained on spherical images."
+        )
     for key in asked:
         _check_agrees(key, config, parent)
     for group in INHERITED:
         own = {key: value for key, value in flatten({group: config[group]}) if key in OWN and key in asked}
         config[group] = {**parent.config[group], **{key.partition(".")[2]: value for key, value in own.items()}}
+    weights = weights_hash(parent)
     config["parent"] = {
         "path": str(parent.path),
-        "weights": weights_hash(parent),
+        "weights": weights,
         "step": parent.step,
         "stage": parent.config.get("stage", {}).get("name", "rectify"),
     }
@@ -65,13 +71,17 @@ def pairs_of(parent: Checkpoint, options: Mapping[str, Any]) -> dict[str, Any]:
     return {**options, "parent": weights_hash(parent), "first": first}
 
 
-def _check_finished(init: Path, parent: Checkpoint) -> None:
-    """A run folder means its end; a checkpoint in the middle is taken when it is named."""
+def check_finished(init: Path, parent: Checkpoint) -> None:
+    """A run folder means its end; a checkpoint in the middle is taken when it is named.
+
+    Raises:
+        InputError: the run in a folder has not come to its end.
+    """
     wanted = parent.config.get("trainer", {}).get("max_steps", 0)
     if init.expanduser().is_dir() and parent.step < wanted:
         raise InputError(
             f"{init} has stopped at step {parent.step} of {wanted}: finish it, or name the checkpoint to start from, "
-            f"stage.init={parent.path}."
+            f"{parent.path}."
         )
 
 
@@ -82,8 +92,10 @@ def _check_agrees(key: str, config: Mapping[str, Any], parent: Checkpoint) -> No
     there = dict(flatten({group: parent.config[group]}))
     for leaf, value in flatten({group: config[group]}):
         asked = leaf == key or leaf.startswith(f"{key}.")
-        if asked and leaf not in OWN and leaf in there and there[leaf] != value:
+        unknown = leaf not in there and leaf == key
+        if asked and leaf not in OWN and (unknown or there.get(leaf, value) != value):
             raise InputError(
-                f"{leaf} is {value} here, but {there[leaf]} in {parent.path}, whose weights this run starts from. "
+                f"{leaf} is {value} here, but {there.get(leaf, 'not known')} in {parent.path}, whose weights this run "
+                "starts from. "
                 f"Leave {key} out: the {group} is the parent's."
             )

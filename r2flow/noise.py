@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.errors import InputError
+
 PURPOSES = ("training", "validation", "pairs", "evaluation", "simulator", "shuffle", "dropout", "weights")
 
 
@@ -23,12 +25,15 @@ def generator(seed: int, purpose: str, index: int) -> np.random.Generator:
         index: Number of the image, scene or epoch, 0 <= index < 2^64.
 
     Raises:
-        ValueError: an unknown purpose, or a seed or index outside its range.
+        InputError: a seed outside its range, which is the user's to choose.
+        ValueError: an unknown purpose, or an index outside its range.
     """
     if purpose not in PURPOSES:
         raise ValueError(f"no purpose named {purpose!r}; known: {', '.join(PURPOSES)}.")
-    if not (0 <= seed < 2**64 and 0 <= index < 2**64):
-        raise ValueError(f"seed and index must lie in [0, 2^64); found {seed} and {index}.")
+    if not 0 <= seed < 2**64:
+        raise InputError(f"a seed must lie in [0, 2^64), found {seed}.")
+    if not 0 <= index < 2**64:
+        raise ValueError(f"an index must lie in [0, 2^64), found {index}.")
     # Philox4x64 has a 128-bit key and a 256-bit counter that counts blocks of four draws in its low
     # words: the index goes into the highest word, which leaves 2^192 blocks to each index.
     key = np.array([seed, zlib.crc32(purpose.encode())], dtype=np.uint64)

@@ -1,19 +1,35 @@
 """From a checkpoint to scans in metres, from scans back to their noise, and from one scan to another."""
 
 import copy
+import json
+import logging
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from r2flow.checkpoints import Checkpoint
+from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.errors import InputError
-from r2flow.flow.solvers import Solution, solve
+from r2flow.files import atomic_write
+from r2flow.flow.solvers import (
+    GRIDS,
+    SOLVERS,
+    TORCHDIFFEQ,
+    FixedStep,
+    Solution,
+    adapts,
+    calibrated_grid,
+    check_method,
+    solve,
+)
 from r2flow.flow.straight_exit import solve_straight_first
 from r2flow.lidar.region import Region
 from r2flow.noise import standard_normal
+
+log = logging.getLogger(__name__)
 
 Progress = Callable[[], None] | None
 
@@ -55,12 +71,14 @@ def sample(
     region: Region | None = None,
     channels: str = "both",
     straight_first: bool = False,
+    grid: str | Tensor = "uniform",
 ) -> Iterator[Samples]:
     """Draw scans 0 to num - 1 of a seed, batch by batch.
 
     Args:
-        steps: Equal steps from noise to data.
+        steps: Steps from noise to data, of a method of fixed steps on a named grid.
         method: A solver's name (`r2flow.flow.solvers.solve`).
+        tolerance: Of an adaptive method.
         batch_size: Scans at once. It does not change a fixed-step result beyond rounding.
         progress: Called after every network evaluation of a batch.
         region: The part of the image that is asked for. The model is evaluated on `evaluated_region` alone, from
@@ -68,14 +86,22 @@ def sample(
         channels: `range` or `reflectance` leaves the other one's decoding out; `both` takes what the model has.
         straight_first: Whether a scene that is straight to the tolerance takes one step, and the adaptive `method`
             the others (`r2flow.flow.straight_exit`).
+        grid: Where fixed steps fall, a name or the times themselves.
 
     Raises:
         InputError: num or batch_size below 1; a channel that the model has not; a backbone that cannot be cut; a
-            solver's own complaints.
+            grid for a method that chooses its own steps, or straight_first with one that does not; a solver's own
+            complaints.
     """
     if num < 1 or batch_size < 1:
         raise InputError(f"needs at least one scan and a batch of at least one; found {num} and {batch_size}.")
     check_channels(checkpoint, channels)
+    check_method(method)
+    check_tolerance(tolerance)
+    if straight_first and not adapts(method):
+        raise InputError(f"scenes that are not straight need an adaptive solver, dopri5 or bosh3; found {method!r}.")
+    if adapts(method) and not (isinstance(grid, str) and grid == "uniform"):
+        raise InputError(f"a time grid is for a solver of fixed steps; {method} chooses its own.")
     model, seen = checkpoint.model, None
     if region is not None:
         seen = evaluated_region(checkpoint, region)
@@ -88,7 +114,7 @@ def sample(
             with torch.inference_mode():
                 end = solve_straight_first(model, x_0.to(_device(model)), tolerance, method, progress)
         else:
-            end = _solve(model, x_0, 0.0, 1.0, method, steps, tolerance, progress)
+            end = _solve(model, x_0, 0.0, 1.0, method, steps, tolerance, progress, grid)
         images = decode(checkpoint, end.x.cpu(), channels)
         if region is not None and seen is not None:
             images = region.place(region.crop(seen.place(images)))
@@ -140,12 +166,119 @@ def decode(checkpoint: Checkpoint, x: Tensor, channels: str = "both") -> Tensor:
     return image[:, 1:] if channels == "reflectance" else image
 
 
+def check_tolerance(tolerance: float) -> None:
+    """Know a tolerance before it is needed.
+
+    Raises:
+        InputError: it is not positive and finite.
+    """
+    if not 0 < tolerance < math.inf:
+        raise InputError(f"a solver's tolerance must be positive and finite, found {tolerance:g}.")
+
+
+def calibrate(
+    checkpoint: Checkpoint, steps: int, method: str = "euler", num: int = 4, progress: Progress = None
+) -> Tensor:
+    """Times that suit a flow better than equal steps (`r2flow.flow.solvers.calibrated_grid`), (steps + 1,) float64.
+
+    The scenes it is found on are none that `sample` draws.
+
+    Args:
+        method: One of ours of fixed steps; its order says how steps weigh.
+        num: Scenes.
+        progress: Called after every evaluation (`evaluations_of_calibration`).
+
+    Raises:
+        InputError: another method, or fewer than one step or scene.
+    """
+    solver = check_grid_solver(method)
+    if num < 1:
+        raise InputError(f"a time grid is found on at least one scene, found {num}.")
+    shape = (checkpoint.encoding.channels, *checkpoint.sensor.shape)
+    x_0 = noise_of(range(num), shape, seed=0, purpose="validation").to(_device(checkpoint.model))
+
+    def velocity(t: Tensor, x: Tensor) -> Tensor:
+        v: Tensor = checkpoint.model(t, x)
+        if progress is not None:
+            progress()
+        return v
+
+    with torch.no_grad():
+        return calibrated_grid(velocity, x_0, steps, order=solver.order, fine=evaluations_of_calibration(steps))
+
+
+def check_grid_solver(method: str) -> FixedStep:
+    """The solver that a grid can be found for.
+
+    Raises:
+        InputError: it is none of ours, or chooses its own steps.
+    """
+    check_method(method)
+    solver = None if method.startswith(TORCHDIFFEQ) else SOLVERS[method]
+    if not isinstance(solver, FixedStep):
+        raise InputError(f"a time grid is for one of our solvers of fixed steps, euler, ab2, rk4; found {method!r}.")
+    return solver
+
+
+def evaluations_of_calibration(steps: int) -> int:
+    """How many evaluations `calibrate` takes."""
+    return max(256, 8 * steps)
+
+
+def write_grid(path: str | Path, times: Tensor, checkpoint: Checkpoint, method: str) -> None:
+    """Times as JSON, with what they were found on and for."""
+    content = {"steps": len(times) - 1, "times": times.tolist()}
+    content |= {"method": method, "checkpoint": weights_hash(checkpoint)}
+    with atomic_write(Path(path), "w") as file:
+        file.write(json.dumps(content, indent=2) + "\n")
+
+
+def read_grid(path: str | Path, checkpoint: Checkpoint) -> Tensor:
+    """Times that `write_grid` has written, (N + 1,) float64; warns where they were found on another flow.
+
+    Raises:
+        InputError: a file that holds something else.
+    """
+    try:
+        content = json.loads(Path(path).read_text("utf-8"))
+        times = torch.tensor([float(t) for t in content["times"]], dtype=torch.float64)
+        steps, owner = content["steps"], content["checkpoint"]
+    except (ValueError, KeyError, TypeError, OverflowError):
+        raise InputError(f"{path} is no time grid; 'r2flow calibrate' makes one.") from None
+    rises = len(times) > 1 and bool((times.diff() > 0).all()) and times[0] == 0 and times[-1] == 1
+    if not rises or steps != len(times) - 1:
+        raise InputError(f"{path} is no time grid: its {len(times)} times must rise from 0 to 1 in {steps} steps.")
+    if owner != weights_hash(checkpoint):
+        log.warning("%s was calibrated on another flow than %s.", path, checkpoint.path)
+    return times
+
+
+def grid_of(text: str, checkpoint: Checkpoint) -> str | Tensor:
+    """A grid by its name, or the times in a file of `write_grid`.
+
+    Raises:
+        InputError: neither.
+    """
+    if text in GRIDS or not (text.endswith(".json") or Path(text).exists()):
+        GRIDS[text]
+        return text
+    return read_grid(text, checkpoint)
+
+
 def _solve(
-    model: nn.Module, x: Tensor, t_0: float, t_1: float, method: str, steps: int, tolerance: float, progress: Progress
+    model: nn.Module,
+    x: Tensor,
+    t_0: float,
+    t_1: float,
+    method: str,
+    steps: int,
+    tolerance: float,
+    progress: Progress,
+    grid: str | Tensor = "uniform",
 ) -> Solution:
     """A solution of the flow from x, on the CPU."""
     with torch.inference_mode():
-        end = solve(model, x.to(_device(model)), t_0, t_1, method, steps, tolerance, progress)
+        end = solve(model, x.to(_device(model)), t_0, t_1, method, steps, tolerance, progress, grid=grid)
     return replace(end, x=end.x.cpu())
 
 
@@ -276,12 +409,14 @@ class Interpolation:
         weights: Where each frame lies, (N,), from 0 to 1.
         images: Range in metres and reflectance, (N, 2 or 1, H, W); the first and the last are the ends' round trips.
         evaluations: Network evaluations of each frame, (N,); the ends' are those of their inversion.
+        converged: Whether each is solved, (N,) bool; what is not is no scan of the flow. The ends always are.
     """
 
     ends: Inversion
     weights: Tensor
     images: Tensor
     evaluations: Tensor
+    converged: Tensor
 
 
 def interpolate_scans(
@@ -305,14 +440,19 @@ def interpolate_scans(
         arrived: Called with the number of frames that are done, the ends first.
 
     Raises:
-        InputError: fewer than two frames, or what `invert` and `slerp` refuse.
+        InputError: fewer than two frames, an end that is not solved, or what `invert` and `slerp` refuse.
     """
     if frames < 2 or batch_size < 1:
         raise InputError(f"needs at least two frames and a batch of at least one; found {frames} and {batch_size}.")
     arrived = arrived or (lambda done: None)
     inverted = []
-    for scan in pair:
+    for scan, which in zip(pair, ("first", "last"), strict=True):
         inverted.append(invert(checkpoint, scan[None], method, steps, tolerance, progress))
+        if not inverted[-1].converged.all():
+            raise InputError(
+                f"the {which} scan cannot be carried to its noise and back by {method}: try another solver, "
+                "a larger tolerance or more steps."
+            )
         arrived(len(inverted))
     ends = Inversion(*(torch.cat([getattr(end, name) for end in inverted]) for name in Inversion.__annotations__))
     weights = torch.linspace(0, 1, frames, dtype=torch.float64)
@@ -323,4 +463,5 @@ def interpolate_scans(
             arrived(2 + sum(len(end.x) for end in found))
     x_1 = torch.cat([ends.again[:1], *(end.x for end in found), ends.again[1:]])
     evaluations = torch.cat([ends.evaluations[:1], *(end.evaluations for end in found), ends.evaluations[1:]])
-    return Interpolation(ends, weights, checkpoint.encoding.decode(x_1), evaluations)
+    converged = torch.cat([ends.converged[:1], *(end.converged for end in found), ends.converged[1:]])
+    return Interpolation(ends, weights, checkpoint.encoding.decode(x_1), evaluations, converged)

@@ -10,11 +10,13 @@ import pytest
 import torch
 
 from r2flow.checkpoints import AtomicCheckpointIO
+from r2flow.errors import InputError
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
+from r2flow.reports.savings import scene_rows
 from tests.test_cli import r2flow  # noqa: F401  a fixture
-from tests.test_sampling import network, scans
+from tests.test_sampling import Lost, flow, network, scans
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
 
@@ -116,6 +118,21 @@ def test_one_channel_is_written_alone(r2flow, run, tmp_path):  # noqa: F811
     assert [path.suffix for path in sorted((tmp_path / "reflectance").iterdir())] == [".npy", ".png"]
 
 
+def test_a_grid_is_calibrated_and_sampled_on(r2flow, run, tmp_path):  # noqa: F811
+    path = tmp_path / "grids" / "grid.json"
+    code, said, _ = r2flow("calibrate", run, "--steps", 3, "--solver", "ab2", "--num", 2, "--out", path)
+    assert (code, "3 steps of ab2 at t = 0, " in said) == (0, True)
+    content = json.loads(path.read_text())
+    assert (content["steps"], content["method"], len(content["times"])) == (3, "ab2", 4)
+    for grid in (path, "quadratic", "uniform"):
+        out = tmp_path / f"scans-{Path(grid).stem}"
+        steps = () if grid == path else ("--steps", 3)
+        assert r2flow("sample", "-c", run, "--num", 1, "--solver", "ab2", *steps, "--grid", grid, "-o", out)[0] == 0
+    images = [np.load(tmp_path / f"scans-{name}" / "000000.npy") for name in ("grid", "quadratic", "uniform")]
+    assert not np.array_equal(images[0], images[2])
+    assert not np.array_equal(images[1], images[2])
+
+
 def test_savings_of_exact_problems_need_no_checkpoint(r2flow, tmp_path):  # noqa: F811
     code, said, _ = r2flow("report", "savings", "--out", tmp_path)
     assert code == 0
@@ -123,7 +140,12 @@ def test_savings_of_exact_problems_need_no_checkpoint(r2flow, tmp_path):  # noqa
     assert {path.suffix for path in tmp_path.glob("savings*")} == {".png", ".csv", ".json", ".md"}
 
 
-@pytest.mark.parametrize("verb", ["invert", "interpolate", "report savings"])
+def test_savings_need_a_flow_that_can_be_solved():
+    with pytest.raises(InputError, match="does not solve scene 1 of this flow"):
+        scene_rows(flow(Lost()), 2, 1e-3, seed=0, advance=lambda: None)
+
+
+@pytest.mark.parametrize("verb", ["invert", "interpolate", "calibrate", "report savings"])
 def test_every_verb_has_help_with_an_example(r2flow, verb):  # noqa: F811
     code, said, _ = r2flow(*verb.split(), "--help")
     assert code == 0
@@ -158,11 +180,34 @@ class TestBadInput:
         self.check(r2flow("interpolate", files[0], tmp_path / "no.ply", *with_run), out, "no.ply")
         self.check(r2flow("report", "savings", tmp_path / "none", "-o", out), out, "no checkpoint")
 
+    def test_of_grids(self, r2flow, run, tmp_path):  # noqa: F811
+        out, bad = tmp_path / "o", tmp_path / "bad.json"
+        bad.write_text("{}")
+        good = tmp_path / "good.json"
+        assert r2flow("calibrate", run, "--steps", 2, "--num", 1, "--out", good)[0] == 0
+        options = ("sample", "-c", run, "-o", out)
+        self.check(r2flow(*options, "--grid", "cubic"), out, "no time grid named 'cubic'")
+        self.check(r2flow(*options, "--grid", bad), out, "bad.json is no time grid", "r2flow calibrate")
+        self.check(r2flow(*options, "--grid", tmp_path / "no.json"), out, "no.json")
+        self.check(r2flow(*options, "--grid", good, "--steps", 3), out, "a grid of 2 steps, found --steps 3")
+        self.check(r2flow(*options, "--grid", good, "--solver", "dopri5"), out, "dopri5 chooses its own")
+        self.check(r2flow("calibrate", run, "--out", out), out, "ends in .json")
+        self.check(r2flow("calibrate", run, "--out", out / "a.json", "--solver", "bosh3"), out, "fixed steps")
+
+    def test_of_seeds_and_tolerances(self, r2flow, run, files, tmp_path):  # noqa: F811
+        out = tmp_path / "o"
+        self.check(r2flow("sample", "-c", run, "-o", out, "--seed", 2**64), out, "[0, 2^64)", str(2**64))
+        self.check(r2flow("report", "savings", "--tolerance", "inf", "-o", out), out, "positive and finite")
+        self.check(r2flow("invert", *files, "-c", run, "-o", out, "--tolerance", "inf"), out, "positive and finite")
+        code, _, err = r2flow("report", "stability", "--problems", "straight", "--seed", 2**64, "-o", out)
+        assert (code, err.splitlines()[-1]) == (2, f"error: a seed must lie in [0, 2^64), found {2**64}.")
+
     def test_of_regions_and_channels(self, r2flow, run, tmp_path):  # noqa: F811
         out = tmp_path / "o"
         options = ("sample", "-c", run, "-o", out)
         self.check(r2flow(*options, "--sector", "north"), out, "--sector", "-45,45", "'north'")
         self.check(r2flow(*options, "--sector", "5,5"), out, "is empty")
+        self.check(r2flow(*options, "--sector", "10,10.0000001"), out, "narrower than a column")
         self.check(r2flow(*options, "--rows", "0-8"), out, "0-7", "found 0-8")
         self.check(r2flow(*options, "--rows", "1,2"), out, "--rows", "as 0-31")
         self.check(r2flow(*options, "--channels", "depth"), out, "both, range or reflectance", "'depth'")

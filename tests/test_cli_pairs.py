@@ -34,6 +34,19 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):  # noqa: F811
     assert "pairs/s" not in said  # nothing was left to make
 
 
+def test_an_unfinished_run_draws_no_pairs(r2flow, saved):  # noqa: F811
+    from r2flow.checkpoints import AtomicCheckpointIO, read_checkpoint
+
+    path, _ = saved
+    content = read_checkpoint(path)
+    content["config"] = {**content["config"], "trainer": {"max_steps": content["global_step"] + 1}}
+    AtomicCheckpointIO().save_checkpoint(content, path)
+    code, _, said = r2flow("pairs", path.parent.parent, *QUICK)
+    assert code == 2
+    assert "finish it, or name the checkpoint to start from" in said
+    assert r2flow("pairs", path, *QUICK)[0] == 0
+
+
 def test_three_processes_of_torchrun_and_a_slurm_array_make_the_shards_of_one(saved, tmp_path: Path):  # noqa: F811
     path, _ = saved
 
@@ -43,7 +56,7 @@ def test_three_processes_of_torchrun_and_a_slurm_array_make_the_shards_of_one(sa
         return subprocess.Popen([str(one) for one in command], env=full, stdout=subprocess.PIPE, text=True)
 
     jobs = [make(tmp_path / "one")]
-    jobs += [make(tmp_path / "torchrun", RANK=str(i), WORLD_SIZE="3", LOCAL_RANK=str(i)) for i in range(3)]
+    jobs += [make(tmp_path / "torchrun", RANK=str(i), WORLD_SIZE="3", LOCAL_RANK=str(i)) for i in (2, 0, 1)]
     array = {"SLURM_ARRAY_TASK_COUNT": "2", "SLURM_ARRAY_TASK_MIN": "5"}
     jobs += [make(tmp_path / "array", SLURM_ARRAY_TASK_ID=str(i), **array) for i in (5, 6)]
     for job in jobs:
@@ -70,6 +83,12 @@ def test_three_processes_of_torchrun_and_a_slurm_array_make_the_shards_of_one(sa
              "SLURM_PROCID": "1", "SLURM_STEP_NUM_TASKS": "2", "SLURM_LOCALID": "1"},
             (5, 8, 1),
         ),
+        # torchrun with 2 processes in each job of an array of 3.
+        (
+            {"SLURM_ARRAY_TASK_ID": "1", "SLURM_ARRAY_TASK_COUNT": "3", "SLURM_ARRAY_TASK_MIN": "0",
+             "RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1"},
+            (3, 6, 1),
+        ),
         # --array=0-6:2
         ({"SLURM_ARRAY_TASK_ID": "4", "SLURM_ARRAY_TASK_COUNT": "4", "SLURM_ARRAY_TASK_STEP": "2"}, (2, 4, 0)),
     ],
@@ -82,7 +101,7 @@ def test_where_a_process_stands(environment: dict[str, str], expected: tuple[int
     ("options", "message"),
     [
         (["--rank", 1], "--rank and --ranks belong together"),
-        (["--rank", 2, "--ranks", 2], "ranks count from 0"),
+        (["--rank", 2, "--ranks", 2], "process 2 of 2: they count from 0"),
         (["--solver", "eulr"], "Did you mean 'euler'"),
         (["--tolerance", -1], "tolerance"),
         (["--out", "/proc/nowhere"], "/proc/nowhere"),

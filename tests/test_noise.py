@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from r2flow.errors import InputError
 from r2flow.noise import PURPOSES, generator, standard_normal
 
 
@@ -51,3 +52,9 @@ def test_the_noise_is_standard_normal():
 def test_what_cannot_be_a_key_is_refused(seed, purpose, index):
     with pytest.raises(ValueError, match=r"must lie in|no purpose"):
         generator(seed, purpose, index)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**64])
+def test_a_seed_out_of_range_is_the_user_s_to_mend(seed):
+    with pytest.raises(InputError, match=f"found {seed}"):
+        generator(seed, "evaluation", 0)

@@ -8,21 +8,27 @@ import pytest
 import torch
 from torch import nn
 
+from r2flow import sampling
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
-from r2flow.lidar.region import region
+from r2flow.lidar.region import Region, region
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.outputs import write_samples
 from r2flow.sampling import (
+    calibrate,
     evaluated_region,
+    evaluations_of_calibration,
+    grid_of,
     interpolate_scans,
     invert,
     noise_of,
     part_of,
+    read_grid,
     round_trip,
     sample,
     slerp,
+    write_grid,
 )
 from r2flow.stages import build_parts
 from tests.test_checkpoints import CONFIG
@@ -245,6 +251,11 @@ def test_the_region_that_is_all_changes_nothing():
     assert torch.equal(part.images, whole.images)
 
 
+def test_a_part_of_nothing_is_refused():
+    with pytest.raises(InputError, match="needs columns"):
+        part_of(network().model, Region((8, 64), 0, 8, 0, 0))
+
+
 def test_one_channel_is_that_of_both():
     checkpoint = network()
     (both,) = sample(checkpoint, 1, steps=2)
@@ -268,6 +279,70 @@ def test_range_alone_decodes_no_reflectance(monkeypatch):
     monkeypatch.setattr(Encoding, "decode", lambda self, x: widths.append(x.shape[1]) or decode(self, x))
     next(sample(checkpoint, 1, steps=1, channels="range"))
     assert widths == [1]
+
+
+class Turning(GaussianFlow):
+    """v = 8 exp(-8 t), known to t = 1: nearly all of the way lies near t = 0."""
+
+    def forward(self, t, x):
+        return 8 * torch.exp(-8 * t) * torch.ones_like(x) * self.scale
+
+
+def test_a_calibrated_grid_is_written_read_and_sampled_on(tmp_path, caplog):
+    checkpoint = replace(flow(Turning()), config={"sensor": {}, "encoding": {}})
+    calls: list[int] = []
+    times = calibrate(checkpoint, 4, "euler", 2, lambda: calls.append(1))
+    assert len(calls) == evaluations_of_calibration(4)
+    assert times.diff().argmax() == 3  # the longest step is where nothing turns any more
+    path = tmp_path / "grid.json"
+    write_grid(path, times, checkpoint, "euler")
+    read = grid_of(str(path), checkpoint)
+    assert torch.equal(read, times)
+
+    def moved(grid, steps=4):
+        x_0 = sampling.noise_of(range(1), (2, *SENSOR.shape), 0)
+        return (sampling._solve(checkpoint.model, x_0, 0, 1, "euler", steps, 1e-5, None, grid).x - x_0).mean()
+
+    exact = 1 - math.exp(-8)
+    assert abs(moved(read) - exact) < 0.6 * abs(moved("uniform") - exact)
+    (drawn,) = sample(checkpoint, 1, steps=99, grid=read)
+    (same,) = sample(checkpoint, 1, steps=4, grid=read)
+    (uniform,) = sample(checkpoint, 1, steps=4)
+    assert torch.equal(drawn.images, same.images)
+    assert drawn.evaluations.tolist() == [4]
+    assert not torch.equal(drawn.images, uniform.images)
+    assert "another flow" not in caplog.text
+    read_grid(path, replace(checkpoint, model=Turning(2.0)))
+    assert "calibrated on another flow" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "", "[]", "{}", '{"steps": 1, "times": 3, "checkpoint": "a"}', '{"steps": 2, "times": [0], "checkpoint": ""}',
+        '{"steps": 2, "times": [0, NaN, 1], "checkpoint": "a"}', '{"steps": 0, "times": [], "checkpoint": "a"}',
+        '{"steps": 2, "times": [0, 0.5, 0.9], "checkpoint": "a"}', '{"steps": 2, "times": ["a", 1], "checkpoint": ""}',
+        '{"steps": 1, "times": [0, [1]], "checkpoint": "a"}', '{"steps": 2, "times": [0, 0, 1], "checkpoint": "a"}',
+    ],
+)  # fmt: skip
+def test_what_is_no_grid_is_refused(tmp_path, content):
+    (tmp_path / "grid.json").write_text(content)
+    with pytest.raises(InputError, match=r"grid\.json is no time grid"):
+        read_grid(tmp_path / "grid.json", network())
+
+
+def test_grids_and_straight_exits_are_refused_where_they_do_not_fit():
+    with pytest.raises(InputError, match="needs? an adaptive solver"):
+        next(sample(flow(), 1, straight_first=True))
+    with pytest.raises(InputError, match="dopri5 chooses its own"):
+        next(sample(flow(), 1, method="dopri5", grid="quadratic"))
+    with pytest.raises(InputError, match="positive and finite"):
+        next(sample(flow(), 1, method="dopri5", tolerance=math.inf, straight_first=True))
+    with pytest.raises(InputError, match="Did you mean 'quadratic'"):
+        grid_of("quadratik", flow())
+    for method in ("dopri5", "torchdiffeq:euler"):
+        with pytest.raises(InputError, match="solvers of fixed steps"):
+            calibrate(flow(), 4, method)
 
 
 def test_straight_scenes_take_one_step():

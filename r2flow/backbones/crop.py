@@ -43,7 +43,9 @@ def cropped(backbone: nn.Module, rows: Tensor, columns: Tensor) -> Backbone:
     """
     units = unit_of(backbone)
     for what, numbers, unit in zip(("rows", "columns"), (rows, columns), units, strict=True):
-        if len(numbers) == 0 or len(numbers) % unit or int(numbers[0]) % unit:
+        if len(numbers) == 0:
+            raise InputError(f"a part of the image needs {what}, at least a unit of {unit}; found none.")
+        if len(numbers) % unit or int(numbers[0]) % unit:
             raise InputError(f"{what} from {int(numbers[0])}, {len(numbers)} of them, are not whole units of {unit}.")
     assert isinstance(backbone, Backbone)
     part = copy.deepcopy(backbone, {id(parameter): parameter for parameter in backbone.parameters()})

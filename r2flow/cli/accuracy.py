@@ -71,10 +71,12 @@ def work_precision(
     from r2flow.reports import work_precision as measuring
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.work_precision_page import work_precision_page
+    from r2flow.sampling import check_tolerance
 
     where = choose_device(device)
     names = methods.split(",") if methods else measuring.METHODS
-    chosen = measuring.configurations(names, numbers("budgets", budgets, int), numbers("tolerances", tolerances))
+    asked = numbers("budgets", budgets, int)
+    chosen = measuring.configurations(names, asked, numbers("tolerances", tolerances))
     if not chosen:
         raise InputError(f"--budgets {budgets} leaves no solver a step; give more evaluations.")
     wanted = [] if problems == "none" else problems.split(",") if problems else list(measuring.PROBLEMS)
@@ -82,6 +84,7 @@ def work_precision(
     loaded = None if checkpoint is None else load_checkpoint(checkpoint, where)
     if loaded is None and not subjects:
         raise InputError("nothing to measure: give a checkpoint, or leave --problems none out.")
+    check_tolerance(reference_tolerance)
     prepare_folder(out)
     found = None
     with only_errors():
@@ -94,7 +97,7 @@ def work_precision(
             rows = measuring.measure(subjects, chosen, repeats, advance)
     seeds = {"scenes": seed, "exact problems": measuring.PROBLEM_SEED}
     name = None if checkpoint is None else str(checkpoint)
-    finish(work_precision_page(rows, name, found, seeds, command(), where), out)
+    finish(work_precision_page(rows, name, found, seeds, command(), where, asked), out)
 
 
 @report.command(epilog="Example: r2flow report stability --problems stiff_1e4,narrow_jet --out reports")

@@ -13,7 +13,7 @@ from r2flow.cli.options import choose_device
 
 @app.command(epilog="Example: r2flow compare runs/sweep --group --out reports")
 def compare(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders, or folders of them: a sweep's, a chain's.")],
+    runs: Annotated[list[Path], typer.Argument(help="Run folders, or folders of them: a chain's, a sweep's.")],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for compare.md, .csv, .json and .png.")
     ] = None,

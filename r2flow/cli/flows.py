@@ -20,13 +20,16 @@ def sample(
     out: OutOption,
     num: Annotated[int, typer.Option(min=1, help="Number of scans.")] = 4,
     steps: Annotated[
-        int | None, typer.Option(min=1, help="Equal steps from noise to data; 32, or k of a k-TD flow, if left out.")
+        int | None, typer.Option(min=1, help="Steps from noise to data; 32, or k of a k-TD flow, if left out.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0,
     solver: Annotated[
         str, typer.Option(help="euler, midpoint, heun2, heun3, rk4, ab2; adaptive: dopri5, bosh3, torchdiffeq:NAME.")
     ] = "euler",
     tolerance: Annotated[float, typer.Option(help="Of an adaptive solver.")] = 1e-5,
+    grid: Annotated[
+        str, typer.Option(help="Where fixed steps fall: uniform, quadratic, or a file of 'r2flow calibrate'.")
+    ] = "uniform",
     format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture.")] = 8,
     sector: Annotated[
@@ -43,16 +46,50 @@ def sample(
     """Draw scans from a trained flow: point clouds, range images and pictures."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.reports.outputs import formats_of, write_samples
+    from r2flow.sampling import grid_of
 
     loaded = load_checkpoint(checkpoint, device=choose_device(device))
+    times = grid_of(grid, loaded)
+    if not isinstance(times, str):
+        if steps not in (None, len(times) - 1):
+            raise InputError(f"{grid} is a grid of {len(times) - 1} steps, found --steps {steps}.")
+        steps = len(times) - 1
     steps = steps or loaded.distilled_steps or 32
     formats = format.split(",") if format else formats_of(loaded, channels)
     part = choose_region(loaded, sector, rows) if sector or rows else None
     write_samples(
-        loaded, out, num, steps, seed, solver, formats, pictures, batch_size, tolerance, part, channels, straight_first
-    )
+        loaded, out, num, steps, seed, solver, formats, pictures, batch_size, tolerance, part, channels,
+        straight_first, times,
+    )  # fmt: skip
     seen = f", pictures in {out / 'samples.png'}" if pictures else ""
     print(f"{num} scans ({', '.join(formats)}) in {out}{seen}")
+
+
+@app.command(epilog="Example: r2flow calibrate runs/NAME --steps 8 --out grid.json")
+def calibrate(
+    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file or a run folder.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write, .json.", show_default=False)],
+    steps: Annotated[int, typer.Option(min=1, help="Steps of the grid.")] = 8,
+    solver: Annotated[str, typer.Option(help="That will use it: euler, ab2, midpoint, heun2, heun3, rk4.")] = "euler",
+    num: Annotated[int, typer.Option(min=1, help="Scenes to find it on.")] = 4,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto",
+) -> None:
+    """Find where a flow's steps should fall so that their errors are equal: a grid for `r2flow sample --grid`."""
+    from r2flow.checkpoints import load_checkpoint
+    from r2flow.cli.accuracy import bar
+    from r2flow.reports.pages import prepare_folder
+    from r2flow.sampling import calibrate as find_grid
+    from r2flow.sampling import check_grid_solver, evaluations_of_calibration, write_grid
+
+    if out.suffix != ".json" or out.is_dir():
+        raise InputError(f"--out must be a file that ends in .json, found {out}.")
+    check_grid_solver(solver)
+    loaded = load_checkpoint(checkpoint, choose_device(device))
+    prepare_folder(out.parent)
+    with bar("evaluations", evaluations_of_calibration(steps)) as advance:
+        times = find_grid(loaded, steps, solver, num, advance)
+    write_grid(out, times, loaded, solver)
+    print(f"{steps} steps of {solver} at t = {', '.join(f'{t:.3g}' for t in times.tolist())} in {out}")
 
 
 @app.command(epilog="Example: r2flow info runs/simulated-hdit_tiny")

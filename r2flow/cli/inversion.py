@@ -90,12 +90,11 @@ def savings(
     """What a scene need not cost: own steps, leaving early, one step for the straight, regions, single channels."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.accuracy import bar, command, finish
-    from r2flow.errors import InputError
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.savings_page import evaluations_of_page, savings_page
+    from r2flow.sampling import check_tolerance
 
-    if not tolerance > 0:
-        raise InputError(f"--tolerance must be positive, found {tolerance:g}.")
+    check_tolerance(tolerance)
     loaded = None if checkpoint is None else load_checkpoint(checkpoint, choose_device(device))
     prepare_folder(out)
     with bar("evaluations", evaluations_of_page(num, steps) if loaded else 0) as advance:

@@ -40,19 +40,25 @@ def pairs(
     from r2flow.checkpoints import load_checkpoint
     from r2flow.data.pairs import PairOptions, default_folder
     from r2flow.data.shards import PairStore
-    from r2flow.lineage import pairs_of
+    from r2flow.lineage import check_finished, pairs_of
     from r2flow.reports.pairs import make_and_tell, place
 
     found_rank, found_ranks, local = place()
     if (rank is None) != (ranks is None):
         raise InputError("--rank and --ranks belong together; give both or neither.")
     rank, ranks = (found_rank, found_ranks) if rank is None or ranks is None else (rank, ranks)
-    if rank >= ranks:
-        raise InputError(f"--rank {rank} of --ranks {ranks}: ranks count from 0.")
+    if not 0 <= rank < ranks:
+        raise InputError(
+            f"process {rank} of {ranks}: they count from 0. Some elements of a SLURM array alone cannot be told from "
+            "a smaller array; give --rank and --ranks."
+        )
     where = choose_device(device)
     if where == "cuda" and found_ranks > 1:
-        where = f"cuda:{local}"
+        import torch
+
+        where = f"cuda:{local % torch.cuda.device_count()}"  # SLURM may show each task one GPU alone
     flow = load_checkpoint(checkpoint)
+    check_finished(checkpoint, flow)
     options = {
         "num": num, "method": solver, "steps": steps, "tolerance": tolerance, "batch_size": batch_size,
         "shard_mib": shard_mib, "seed": seed, "first": first,

@@ -108,7 +108,7 @@ class ScanDataModule(L.LightningDataModule):
         if self.validation.get("data") is not None:
             raise InputError("data.validation.data cannot be held out from pairs; leave it out.")
         if self.options["root"] is None:
-            raise InputError("data=pairs needs the flow that draws them, stage.init=RUN, or their folder, data.root=.")
+            raise InputError("data=pairs needs the flow that draws them: stage.init=RUN.")
         return PairOptions(**options)
 
     @property

@@ -1,6 +1,9 @@
 """Reflow pairs (x_0, x_1): noise and where a flow carries it."""
 
 import math
+import os
+import platform
+import random
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -51,13 +54,14 @@ class PairOptions:
         Raises:
             InputError: a number out of its range or an unknown solver.
         """
-        if min(self.num, self.batch_size, self.steps) < 1 or not self.shard_mib > 0:
+        if min(self.num, self.batch_size, self.steps) < 1 or not 0 < self.shard_mib < math.inf:
             raise InputError(
                 "data.pairs: num, batch_size, steps must be at least 1 and shard_mib positive; "
                 f"found {self.num}, {self.batch_size}, {self.steps} and {self.shard_mib}."
             )
-        if not 0 <= self.seed < 2**63:
-            raise InputError(f"data.pairs.seed must be a whole number of at least 0, found {self.seed}.")
+        first = self.first or 0
+        if not (0 <= self.seed < 2**63 and 0 <= first < 2**63):
+            raise InputError(f"data.pairs: seed and first must be at least 0, found {self.seed} and {first}.")
         if not (self.tolerance > 0 and math.isfinite(self.tolerance)):
             raise InputError(f"data.pairs.tolerance must be positive, found {self.tolerance}.")
         check_method(self.method)
@@ -66,10 +70,10 @@ class PairOptions:
             parent=self.parent or "",
             shape=shape,
             seed=self.seed,
-            first=self.first or 0,
+            first=first,
             method=self.method,
             steps=self.steps,
-            tolerance=self.tolerance,
+            tolerance=float(self.tolerance),  # 1 and 1.0 are one recipe
             batch_size=self.batch_size,
             shard_batches=max(round(self.shard_mib * MIB / batch_bytes), 1),
         )
@@ -82,13 +86,18 @@ def pair_noise(recipe: Recipe, index: int) -> Tensor:
 
 @dataclass
 class Made:
-    """What one process has done: batches and pairs made, their evaluations, and the seconds of it."""
+    """What one process has done: pairs, those left out, their evaluations, the seconds and those spent on writing."""
 
     pairs: int = 0
     evaluations: int = 0
     unusable: int = 0
     seconds: float = 0.0
     writing: float = 0.0
+
+    def add(self, block: Block) -> None:
+        self.pairs += len(block.usable)
+        self.evaluations += int(block.evaluations.sum())
+        self.unusable += int((~block.usable).sum())
 
 
 def make_pairs(
@@ -112,31 +121,58 @@ def make_pairs(
         evaluated: Called after each evaluation of the velocity.
 
     Raises:
-        InputError: no pair of a batch is usable: the flow is broken, or the tolerance out of its reach.
+        InputError: no pair is usable: the flow is broken, or the tolerance out of its reach; or the folder cannot be
+            written, or holds other pairs.
     """
     store.begin()
-    made, start = Made(), time.monotonic()
     # Shards are checked by turns; who finds one damaged makes its batches, which the others hold to be there.
     shards = store.shards(num)
     lost = [batch for shard in shards[rank::ranks] for batch in store.check(shard, num)]
-    own = sorted({*store.batches(num)[rank::ranks], *lost})
+    own = _in_own_order({*store.batches(num)[rank::ranks], *lost}, store.recipe.shard_batches)
+    made, start = Made(), time.monotonic()
+    kept: list[tuple[int, Block]] = []
     for batch in own:
         if store.has(batch):
             continue
         block = solve_batch(store.recipe, velocity, batch, device, evaluated)
+        made.add(block)
+        kept.append((batch, block))
+        _check_usable(made, store.recipe)
+        if made.unusable == made.pairs:
+            continue  # not to be kept before it is known that the flow can do better
         written = time.monotonic()
-        store.commit(batch, block)
-        store.seal(batch // store.recipe.shard_batches, num)
+        for number, solved in kept:
+            store.commit(number, solved)
+            store.seal(number // store.recipe.shard_batches, num)
+        kept = []
         made.writing += time.monotonic() - written
-        made.pairs += len(block.usable)
-        made.evaluations += int(block.evaluations.sum())
-        made.unusable += int((~block.usable).sum())
         made.seconds = time.monotonic() - start
         progress(made)
+    if kept:
+        _check_usable(made, store.recipe, patience=0)
     for shard in shards:  # whose last batch came from a process that was killed before it could seal
         store.seal(shard, num)
     made.seconds = time.monotonic() - start
     return made
+
+
+def _in_own_order(batches: set[int], shard_batches: int) -> list[int]:
+    """Shard by shard, in an order that no other process has.
+
+    Processes that make the same pairs at once, each for a run of its own, would else go in lock-step and make all of
+    them twice; so they find most of what they come to made.
+    """
+    draw = random.Random(f"{platform.node()} {os.getpid()}")
+    turn = {shard: draw.random() for shard in sorted({batch // shard_batches for batch in batches})}
+    return sorted(sorted(batches), key=lambda batch: (turn[batch // shard_batches], draw.random()))
+
+
+def _check_usable(made: Made, recipe: Recipe, patience: int = 64) -> None:
+    if made.unusable == made.pairs > patience:
+        raise InputError(
+            f"none of {made.pairs} pairs came to an end with {recipe.method} at tolerance {recipe.tolerance:g}: "
+            "the flow is broken, or the tolerance out of its reach."
+        )
 
 
 def solve_batch(
@@ -146,11 +182,7 @@ def solve_batch(
     device: torch.device | str = "cpu",
     evaluated: Callable[[], None] | None = None,
 ) -> Block:
-    """One batch of pairs.
-
-    Raises:
-        InputError: none of them is usable.
-    """
+    """One batch of pairs."""
     first = recipe.first + batch * recipe.batch_size
     x_0 = torch.stack([pair_noise(recipe, index) for index in range(first, first + recipe.batch_size)])
     with torch.inference_mode():
@@ -159,11 +191,6 @@ def solve_batch(
         )
     x_1 = end.x.to(torch.float16).cpu()
     usable = end.converged.cpu() & x_1.isfinite().flatten(1).all(1)
-    if not usable.any():
-        raise InputError(
-            f"none of the pairs {first} to {first + recipe.batch_size - 1} came to an end with {recipe.method} at "
-            f"tolerance {recipe.tolerance:g}: the flow is broken, or the tolerance out of its reach."
-        )
     return Block(x_1.numpy(), end.evaluations.cpu().numpy().astype(np.int32), usable.numpy())
 
 
@@ -196,14 +223,20 @@ class PairSource:
         return PairSource(self.store, self.num, self.indices[np.asarray(indices, dtype=np.int64)])
 
     def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
-        from safetensors import safe_open
+        from safetensors import SafetensorError, safe_open
 
         recipe = self.store.recipe
         number = int(self.indices[index])
         shard, offset = divmod(number, recipe.shard_batches * recipe.batch_size)
-        if shard not in self._opened:
-            self._opened[shard] = safe_open(self.store.shard_path(shard), framework="pt").get_slice("x_1")
-        x_1 = self._opened[shard][offset : offset + 1][0].float()
+        try:
+            if shard not in self._opened:
+                self._opened[shard] = safe_open(self.store.shard_path(shard), framework="pt").get_slice("x_1")
+            x_1 = self._opened[shard][offset : offset + 1][0].float()
+        except (SafetensorError, OSError, IndexError) as error:
+            raise InputError(
+                f"{self.store.shard_path(shard)} was lost or damaged while it was in use ({error}). "
+                "The same command makes it again and goes on."
+            ) from None
         return pair_noise(recipe, recipe.first + number), x_1
 
 

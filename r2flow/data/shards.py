@@ -4,7 +4,7 @@ import hashlib
 import json
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -63,6 +63,10 @@ class Damaged(Exception):
     """A file of pairs that is not what was written."""
 
 
+class _Unwanted(Exception):
+    """What was about to be written is there already."""
+
+
 class PairStore:
     """A folder of pairs: `manifest.json`, shards, and the batches of shards that are not whole yet.
 
@@ -82,7 +86,7 @@ class PairStore:
         try:
             found = json.loads(path.read_text(encoding="utf-8"))["recipe"]
         except (ValueError, KeyError, TypeError):
-            raise InputError(f"{path} is damaged. Delete it; pairs of the same recipe are found again.") from None
+            raise InputError(f"{path} is damaged. Delete it: the shards beside it know their recipe.") from None
         for key, value in asdict(self.recipe).items():
             there = tuple(found.get(key)) if key == "shape" and found.get(key) else found.get(key)
             if there != value:
@@ -92,11 +96,22 @@ class PairStore:
                 )
 
     def begin(self) -> None:
-        """Write the manifest where there is none, and clear away what killed writers left."""
-        if not (self.folder / MANIFEST).is_file():
-            content = {"format": "r2flow pairs 1", "recipe": asdict(self.recipe), "digest": self.recipe.digest}
-            with atomic_write(self.folder / MANIFEST, "w") as file:
-                json.dump(content, file, indent=2)
+        """Write the manifest where there is none, and clear away what killed writers left.
+
+        Raises:
+            InputError: the folder cannot be written, or another process has begun other pairs in it.
+        """
+        content = {"format": "r2flow pairs 1", "recipe": asdict(self.recipe), "digest": self.recipe.digest}
+        try:
+            if not (self.folder / MANIFEST).is_file():
+                with atomic_write(self.folder / MANIFEST, "w") as file:
+                    json.dump(content, file, indent=2)
+        except PermissionError:
+            raise InputError(
+                f"{self.folder} cannot be written to; give another folder by data.root=FOLDER "
+                "(r2flow pairs --out FOLDER)."
+            ) from None
+        self._check_manifest()
         for leftover in (*self.folder.glob(".*.part"), *self._staging.glob(".*.part")):
             with suppress(FileNotFoundError):
                 if time.time() - leftover.stat().st_mtime > STALE:  # another process may be writing it
@@ -124,34 +139,35 @@ class PairStore:
         size = self.recipe.shard_batches
         return range(shard * size, min((shard + 1) * size, len(self.batches(num))))
 
+    def held(self, shard: int) -> int:
+        """How many batches a shard's file holds; only its head is read.
+
+        Raises:
+            InputError: it is a whole shard of other pairs.
+        """
+        try:
+            notes = read_notes(self.shard_path(shard))
+        except (Damaged, FileNotFoundError):
+            return 0
+        self._check_recipe(self.shard_path(shard), notes)
+        return len(notes["usable"]) // self.recipe.batch_size
+
     def has(self, batch: int) -> bool:
         """Whether a batch is there, by itself or in its shard; its bytes are not read."""
-        if self.batch_path(batch).is_file():
-            return True
         shard, offset = divmod(batch, self.recipe.shard_batches)
-        try:
-            return offset < len(read_notes(self.shard_path(shard))["usable"]) // self.recipe.batch_size
-        except (Damaged, FileNotFoundError):
-            return False
+        return self.batch_path(batch).is_file() or offset < self.held(shard)
 
     def missing(self, num: int) -> list[int]:
         """The batches that have yet to be made."""
         return [batch for shard in self.shards(num) for batch in self._missing_of(shard, num)]
 
-    def _missing_of(self, shard: int, num: int) -> Iterator[int]:
-        held = 0
-        with suppress(Damaged, FileNotFoundError):
-            held = len(read_notes(self.shard_path(shard))["usable"]) // self.recipe.batch_size
-        for offset, batch in enumerate(self.batches_of(shard, num)):
-            if offset >= held and not self.batch_path(batch).is_file():
-                yield batch
+    def _missing_of(self, shard: int, num: int) -> list[int]:
+        rest = self.batches_of(shard, num)[self.held(shard) :]
+        return [batch for batch in rest if not self.batch_path(batch).is_file()]
 
     def is_sealed(self, shard: int, num: int) -> bool:
-        """Whether a shard holds all that the first `num` pairs ask of it."""
-        with suppress(Damaged, FileNotFoundError):
-            held = len(read_notes(self.shard_path(shard))["usable"]) // self.recipe.batch_size
-            return held >= len(self.batches_of(shard, num))
-        return False
+        """Whether a shard's file holds all that the first `num` pairs ask of it."""
+        return self.held(shard) >= len(self.batches_of(shard, num))
 
     def is_whole(self, num: int) -> bool:
         return all(self.is_sealed(shard, num) for shard in self.shards(num))
@@ -189,7 +205,7 @@ class PairStore:
             self._clear(shard, num)
             return True
         batches = self.batches_of(shard, num)
-        if any(True for _ in self._missing_of(shard, num)):
+        if self._missing_of(shard, num):
             return False
         try:
             blocks = self._gather(shard, batches)
@@ -199,7 +215,8 @@ class PairStore:
             self.check(shard, num)
             return False
         whole = Block(*(np.concatenate(part) for part in zip(*blocks, strict=True)))
-        self._write(self.shard_path(shard), batches[0], whole)
+        # A process that was asked for more pairs may have sealed a longer one meanwhile.
+        self._write(self.shard_path(shard), batches[0], whole, unless=lambda: self.is_sealed(shard, num))
         self._clear(shard, num)
         return True
 
@@ -216,7 +233,7 @@ class PairStore:
         with suppress(OSError):
             self._staging.rmdir()
 
-    def _write(self, path: Path, batch: int, block: Block) -> None:
+    def _write(self, path: Path, batch: int, block: Block, unless: Callable[[], bool] = lambda: False) -> None:
         from safetensors.numpy import save
 
         tensors = {"evaluations": block.evaluations, "x_1": block.x_1}
@@ -228,8 +245,17 @@ class PairStore:
             "sha256": _checksum(tensors, block.usable),
         }
         data = save(tensors, metadata={"pairs": json.dumps(notes)})
-        with atomic_write(path) as file:
+        with suppress(_Unwanted), atomic_write(path) as file:
             file.write(data)
+            if unless():
+                raise _Unwanted
+
+    def _check_recipe(self, path: Path, notes: Mapping[str, Any]) -> None:
+        if notes["recipe"] != self.recipe.digest:
+            raise InputError(
+                f"{path} holds pairs of another recipe. Give the settings that they were made with, or another folder "
+                "by data.root=FOLDER (r2flow pairs --out FOLDER)."
+            )
 
     def _read(self, path: Path, batch: int) -> Block:
         """A file, every byte of it checked."""
@@ -239,10 +265,11 @@ class PairStore:
         try:
             with safe_open(path, framework="numpy") as file:
                 tensors = {name: file.get_tensor(name) for name in ("evaluations", "x_1")}
+        except FileNotFoundError:
+            raise
         except (SafetensorError, OSError, ValueError, KeyError) as error:
             raise Damaged(str(error)) from None
-        if notes["recipe"] != self.recipe.digest:
-            raise Damaged("of another recipe")
+        self._check_recipe(path, notes)
         if notes["first"] != self.recipe.first + batch * self.recipe.batch_size:
             raise Damaged(f"it begins with pair {notes['first']}")
         usable = np.array(notes["usable"], dtype=bool)

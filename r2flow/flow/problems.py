@@ -1,7 +1,9 @@
 """Flows whose solution is known: what a solver gives is held against mathematics, not against another solver.
 
-All act on states of any shape (B, ...). The marginals of noise and data are those of rectified flow: x_0 ~ N(0, 1)
-and x_1 drawn independently of it, so that v(t, x) = E[x_1 - x_0 | x_t = x].
+All act on states of any shape (B, ...). `Gaussian`, `Anisotropic`, the mixtures and `PointMass` are rectified flows:
+x_0 ~ N(0, 1), x_1 drawn independently of it, v(t, x) = E[x_1 - x_0 | x_t = x]. `Straight` is such a flow reflowed, x_0
+and x_1 a pair. `Rotating`, `StiffLinear`, `Discontinuous` and `NarrowJet` carry no data: equations that are hard on a
+solver, each in a way of its own.
 """
 
 import functools
@@ -29,7 +31,7 @@ class Problem:
 
     def straightness(self, x_0: Tensor, t: Tensor | float) -> Tensor:
         """s(t) = |(x_1 - x_0) - v(t, x_t)|^2 (paper, eq. 5), exact, per scene, (B,) float64."""
-        x_0, t = x_0.double(), torch.as_tensor(t, dtype=torch.float64)
+        x_0, t = x_0.double(), torch.as_tensor(t, dtype=torch.float64, device=x_0.device)
         chord = self.solution(x_0, 1.0) - x_0
         return (chord - self(t, self.solution(x_0, t))).square().flatten(1).sum(1)
 
@@ -218,7 +220,7 @@ class NarrowJet(Problem):
     def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
         x_0, t = _exact(x_0, t)
         w = self.width
-        passed = torch.special.ndtr((t - self.at) / w - w) - torch.special.ndtr(torch.as_tensor(-self.at / w - w))
+        passed = torch.special.ndtr((t - self.at) / w - w) - torch.special.ndtr(t.new_tensor(-self.at / w - w))
         return x_0 * (-t).exp() + (self.at - t + w**2 / 2).exp() * passed
 
 

@@ -49,11 +49,16 @@ def solve_straight_first(
         tolerance: Absolute and relative tolerance, of the decision as of the solver.
         method: An adaptive solver for the scenes that are not straight; v(0, x) is not evaluated for it again.
         progress: Called after every evaluation.
-        options: Further keywords of `solve`.
+        options: Further keywords of `solve`, except `global_error`: the step of a straight scene has no estimate.
 
     Returns:
         As of `solve`; the probes are among the evaluations, and a straight scene has taken one step.
+
+    Raises:
+        InputError: as of `solve`, or `global_error` asked for.
     """
+    if options.get("global_error"):
+        raise InputError("straight scenes are found by probes that give no estimate: ask `solve` for a global error.")
     if not tolerance > 0:
         raise InputError(f"a solver's tolerance must be positive, found {tolerance}.")
     x = x if x.dtype == torch.float64 else x.float()
@@ -64,11 +69,12 @@ def solve_straight_first(
     bent = torch.nonzero(~straight).flatten()
     if len(bent) == 0:
         return found
-    rest = _Rest(velocity, bent, x[bent], k[bent])
+    rest = _Rest(velocity, bent, x[bent], k[bent], v.precision)
     end = solve(rest, x[bent], method=method, tolerance=tolerance, progress=progress, **options)
     return _merge(found, end, bent, rest.answered)
 
 
+@torch.no_grad()
 def straight_scenes(v: Evaluations, x: Tensor, k: Tensor, tolerance: float) -> Tensor:
     """Which scenes keep the direction k = v(0, x) all the way, (B,) bool.
 
@@ -98,10 +104,14 @@ def straight_scenes(v: Evaluations, x: Tensor, k: Tensor, tolerance: float) -> T
 
 
 class _Rest:
-    """The velocity of the scenes that go on, which knows its first answer already."""
+    """The velocity of the scenes that go on, which knows its first answer already, in the state's type.
 
-    def __init__(self, velocity: Velocity, scenes: Tensor, start: Tensor, k: Tensor) -> None:
-        self.velocity, self.scenes, self.answered = velocity, scenes, 0
+    Args:
+        precision: What that answer was computed in.
+    """
+
+    def __init__(self, velocity: Velocity, scenes: Tensor, start: Tensor, k: Tensor, precision: torch.dtype) -> None:
+        self.velocity, self.scenes, self.answered, self.precision = velocity, scenes, 0, precision
         self._known: tuple[Tensor, Tensor] | None = (start, k)
         choose = getattr(velocity, "select", None)
         self._own = velocity if choose is None else choose(scenes.cpu())

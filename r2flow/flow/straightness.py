@@ -10,6 +10,7 @@ keeping n images, twice the evaluations for a memory that does not grow with n.
 An untrained flow that answers 0 is perfectly straight and goes nowhere: read s beside s / |d|^2.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -59,7 +60,8 @@ class Straightness:
         t: The times 0, 1/n, ..., (n - 1)/n, (n,), float64.
         s: s(t), (B, n), float64.
         curvature: What the first pass told.
-        pixels: Which elements of the flattened batch bend most, the most bent first, (k,).
+        pixels: Which elements of the flattened batch bend most, the most bent first, (k,); none of a path that is
+            not finite, unless there are too few others.
         trajectories: Their values at 0, 1/n, ..., 1, (k, n + 1).
     """
 
@@ -123,7 +125,8 @@ def straightness(
     """
     found = curvature(velocity, x_0, steps, progress)
     d = found.x_1 - found.x_0
-    pixels = found.per_pixel.flatten().topk(min(most_curved, found.per_pixel.numel())).indices
+    bends = found.per_pixel.flatten().nan_to_num(-math.inf, -math.inf)
+    pixels = bends.topk(min(most_curved, len(bends))).indices
     s, trajectories = [], []
 
     def watch(t: Tensor, x: Tensor, v: Tensor) -> None:

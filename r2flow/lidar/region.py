@@ -88,11 +88,13 @@ def region(
     Args:
         shape: Rows and columns (H, W) of the image; column 0 begins at +180 degrees and azimuth falls with w.
         sector: Azimuths in degrees, from the first counter-clockwise to the second: (-45, 45) is the quarter
-            ahead, (135, -135) the one behind. A pixel that the sector touches belongs to it. None for all.
+            ahead, (135, -135) the one behind. A pixel that the sector touches belongs to it. Two azimuths that are
+            whole turns apart, as (180, -180), are the full turn. None for all.
         rows: First and last row, both included, 0 at the top. None for all.
 
     Raises:
-        InputError: an empty sector, angles that are no angles, or rows that the image has not.
+        InputError: an empty sector, or one narrower than a column; angles that are no angles, or rows that the
+            image has not.
     """
     height, width = shape
     first_row, last_row = rows or (0, height - 1)
@@ -108,7 +110,11 @@ def _columns(width: int, sector: tuple[float, float]) -> tuple[int, int]:
         raise InputError(f"a sector needs two azimuths in degrees within -360 to 360, found {begin:g},{end:g}.")
     if begin == end:
         raise InputError(f"the sector {begin:g},{end:g} is empty; -180,180 is the full turn.")
-    turn = 360.0 if end - begin >= 360 else (end - begin) % 360
+    turn = 360.0 if end - begin >= 360 else (end - begin) % 360 or 360.0
+    if turn * width < 360 * (1 - 1e-9):
+        raise InputError(
+            f"the sector {begin:.15g},{end:.15g} is narrower than a column, {360 / width:g} degrees; make it wider."
+        )
     fuzz = 1e-9 * width  # an edge that falls between two pixels belongs to one of them, whatever the rounding
     left = math.floor((180 - (begin + turn)) / 360 * width + fuzz)
     right = math.ceil((180 - begin) / 360 * width - fuzz)

@@ -21,12 +21,13 @@ from r2flow.metrics.fidelity import distances, panel
 from r2flow.reports.outputs import draw_pages, write_scan
 from r2flow.reports.pages import Page, table, write_page
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
+from r2flow.runs import read_config
 from r2flow.sampling import noise_of, sample
 
 MANY = 32  # steps that stand for "as many as one likes"
 
 
-def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu") -> Path:
+def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu", command: str = "") -> Path:
     """Sample every flow, set the samples beside held-out scans, and write figure, table and scans.
 
     Each run's folder gets its `fidelity.json`, which `r2flow compare` reads.
@@ -34,6 +35,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     Args:
         runs: Run folders by name, the first one trained on scans.
         num: Scans a flow and number of steps.
+        command: What makes the page again.
 
     Returns:
         The page.
@@ -41,7 +43,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     out = Path(out)
     flows = {name: load_checkpoint(run, device) for name, run in runs.items()}
     first = next(iter(flows.values()))
-    real = held_out(first)
+    real = held_out(first, next(iter(runs.values())))
     truth = panel(real, first.sensor)
     cells = [(name, steps) for name, flow in flows.items() for steps in steps_of(flow, flows.values())]
     rows, drawn = [], {}
@@ -75,7 +77,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
         ],
         rows=rows,
         figures={"chain": figure(drawn, list(flows))},
-        command="python train.py  # the chain's command; this page is its last link",
+        command=command,
         seeds={"evaluation": 0},
         device=device,
     )
@@ -96,9 +98,10 @@ def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
     return sorted({1, *(steps for other in flows if (steps := other.distilled_steps) is not None), MANY})
 
 
-def held_out(flow: Checkpoint) -> np.ndarray:
-    """The scans that a flow was validated on, (N, 2 or 1, H, W) in metres and reflectance."""
-    data = ScanDataModule(flow.sensor, flow.encoding, flow.config["seed"], **flow.config["data"])
+def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
+    """The scans that a run's flow was validated on, (N, 2 or 1, H, W) in metres and reflectance."""
+    config = read_config(run) or flow.config  # the folder's own knows where the scans have moved
+    data = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **config["data"])
     _, held = data.sources()
     numbers = track(range(len(held)), "held-out scans", transient=True, disable=not sys.stdout.isatty())
     return np.stack([held[i] for i in numbers])

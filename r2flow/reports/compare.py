@@ -1,6 +1,7 @@
 """Runs side by side: what each is, what it learned, how straight it is and what it costs."""
 
 import json
+import logging
 import math
 import os
 import re
@@ -24,6 +25,8 @@ from r2flow.reports.pages import STYLES, Page, blank_figure, shown
 from r2flow.reports.training import Curve, read_curves
 from r2flow.runs import CONFIG, contradictions, flatten, read_config
 from r2flow.stages import build_parts
+
+log = logging.getLogger(__name__)
 
 LOSSES = ("train/loss", "val/loss")
 CURVATURE = ("curvature/s_normalised", "curvature/s")
@@ -69,21 +72,37 @@ class Run:
 
 
 def find_runs(paths: Sequence[Path]) -> list[Path]:
-    """Run folders: those given, and for a folder of runs (a sweep's, a chain's) those in it.
+    """Run folders: those given, and for a folder of runs (a chain's, a sweep's, a sweep's of chains) those in it.
+
+    What is neither is passed over where others are, as `runs/sweep/*` brings: a folder with a warning.
 
     Raises:
-        InputError: a path is neither.
+        InputError: a path that does not exist, or not one of them a run.
     """
     found: list[Path] = []
+    others: list[Path] = []
     for path in paths:
-        if (path / CONFIG).is_file():
-            found.append(path)
-            continue
-        inside = sorted(config.parent for config in path.glob(f"*/{CONFIG}")) if path.is_dir() else []
-        if not inside:
-            raise InputError(f"{path} is no run: it has no {CONFIG}. Give folders that train.py has written.")
+        if not path.exists():
+            raise InputError(f"{path} does not exist.")
+        inside = _runs_in(path, levels=2)
         found += inside
+        others += [] if inside else [path]
+    if others and not found:
+        raise InputError(f"{others[0]} is no run: it has no {CONFIG}. Give folders that train.py has written.")
+    for path in others:
+        if path.is_dir():
+            log.warning("%s holds no run and is passed over.", path)
     return list(dict.fromkeys(found))
+
+
+def _runs_in(path: Path, levels: int) -> list[Path]:
+    """The folder itself where it is a run; else those in it, down to so many levels, hidden folders left out."""
+    if (path / CONFIG).is_file():
+        return [path]
+    if not levels or not path.is_dir():
+        return []
+    folders = sorted(folder for folder in path.iterdir() if folder.is_dir() and not folder.name.startswith("."))
+    return [run for folder in folders for run in _runs_in(folder, levels - 1)]
 
 
 def read_runs(paths: Sequence[Path], repeats: int = 0, device: str = "cpu") -> list[Run]:

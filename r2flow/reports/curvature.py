@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -221,7 +222,7 @@ def trajectories_figure(flows: Sequence[Paths]) -> Figure:
     """The paths of the pixels that bend most, a panel for each checkpoint: the paper's figure 8 (b)."""
     columns = min(len(flows), 3)
     rows = math.ceil(len(flows) / columns)
-    figure = blank_figure(1 + 4.2 * columns, 3.9 * rows)
+    figure, titles = blank_figure(1 + 4.2 * columns, 4.2 * rows), short_labels([flow.label for flow in flows])
     first = None
     for index, flow in enumerate(flows):
         axes = first = figure.add_subplot(rows, columns, index + 1, sharey=first)
@@ -235,12 +236,22 @@ def trajectories_figure(flows: Sequence[Paths]) -> Figure:
             axes.scatter(np.ones(len(chosen)), [p[-1] for p in chosen], s=9, marker="x" if dropped else "o",
                          lw=0.7, color=style["color"], clip_on=False, zorder=3)  # fmt: skip
         axes.set(xlabel="t  (0 noise, 1 data)", xlim=(0, 1))
-        axes.set_title(flow.label, fontsize=9)
+        axes.set_title(titles[index], fontsize=9)
         if index % columns == 0:
             axes.set_ylabel("value in model space (dotted: -1, ray-drop)")
         axes.axhline(-1, color="black", lw=0.9, ls=":", zorder=4)
-        axes.legend(fontsize=8, loc="upper right", framealpha=0.9)
+        # Below the panel: paths are everywhere in it.
+        axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False)
     return figure
+
+
+def short_labels(labels: Sequence[str]) -> list[str]:
+    """The last two parts of each path, or as many as tell them apart."""
+    parts = [Path(label).parts for label in labels]
+    depth = 2
+    while depth < max(map(len, parts)) and len({p[-depth:] for p in parts}) < len(set(parts)):
+        depth += 1
+    return [str(Path(*p[-depth:])) for p in parts]
 
 
 def curvature_page(flows: Sequence[Paths], seed: int, command: str, device: str = "cpu") -> Page:

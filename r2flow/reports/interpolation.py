@@ -1,5 +1,6 @@
 """From one real scan to another through the noise: the paper's figure 3, and a point cloud for every frame."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from r2flow.reports.inversion import check_solver, errors_of, scan_of, unique_na
 from r2flow.reports.outputs import ScanBar, evaluations_of, formats_of, write_scan
 from r2flow.reports.pages import Page, prepare_folder, table
 from r2flow.sampling import interpolate_scans
+
+log = logging.getLogger(__name__)
 
 MOST = 8  # frames in the figure, evenly chosen
 
@@ -35,7 +38,7 @@ def interpolation(
         The page with the figure, still to be written.
 
     Raises:
-        InputError: a scan or a solver that cannot be used, before anything is written.
+        InputError: a scan or a solver that cannot be used, before anything is written; a scan without its noise.
     """
     check_solver(method, tolerance)
     pair = torch.stack([scan_of(path, checkpoint, reflectance_scale) for path in paths])
@@ -47,13 +50,17 @@ def interpolation(
         found = interpolate_scans(
             checkpoint, pair, frames, method, steps, tolerance, batch_size, bar.evaluated, bar.finished
         )
+    lost = [number for number, solved in enumerate(found.converged.tolist()) if not solved]
+    if lost:
+        log.warning("not solved, and no scans of this flow: %s; try another solver.", ", ".join(map(str, lost)))
     images = found.images.nan_to_num(0.0).numpy()
     rows = []
     for number, (weight, image) in enumerate(zip(found.weights.tolist(), images, strict=True)):
         write_scan(image, rays, Path(out, "frames"), f"{number:03d}", [f for f in formats_of(checkpoint) if f != "bin"])
         returns = int((image[0] > 0).sum())
         evaluations = int(found.evaluations[number])
-        rows.append({"frame": number, "weight": weight, "returns": returns, "evaluations": evaluations})
+        row = {"frame": number, "weight": weight, "returns": returns, "evaluations": evaluations}
+        rows.append({**row, "converged": bool(found.converged[number])})
     ends = errors_of(checkpoint, found.ends, names, pair)
     figure = interpolation_figure(pair.numpy(), images, found.weights.tolist(), rays, names)
     return _page(checkpoint, rows, ends, figure, command)
@@ -145,7 +152,7 @@ def _line(x: Sequence[float], y: Sequence[float], colour: str) -> Any:
 def _page(
     checkpoint: Checkpoint, rows: Sequence[dict[str, Any]], ends: Sequence[dict[str, Any]], figure: Any, command: str
 ) -> Page:
-    between = {"frame": "frame", "weight": "w", "returns": "returns", "evaluations": "evaluations"}
+    between = {"frame": "frame", "weight": "w"} | {key: key for key in ("returns", "evaluations", "converged")}
     of_ends = {"scan": "scan", "rms": "RMS, model space", "median_m": "median, m", "dropped": "rays lost or gained"}
     text = (
         f"Both scans were carried to their noise by the flow of {checkpoint.path.name}, step {checkpoint.step}; frames "

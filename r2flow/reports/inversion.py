@@ -16,7 +16,7 @@ from r2flow.flow.solvers import check_method
 from r2flow.reports.outputs import ScanBar, evaluations_of
 from r2flow.reports.pages import Page, prepare_folder, table
 from r2flow.reports.views import range_image
-from r2flow.sampling import Inversion, invert, round_trip
+from r2flow.sampling import Inversion, check_tolerance, invert, round_trip
 
 COLUMNS = {
     "scan": "scan",
@@ -119,11 +119,10 @@ def check_solver(method: str, tolerance: float) -> None:
     """Know a solver and its tolerance before they are needed.
 
     Raises:
-        InputError: an unknown method, or a tolerance that is not positive.
+        InputError: an unknown method, or a tolerance that is not positive and finite.
     """
     check_method(method)
-    if not tolerance > 0:
-        raise InputError(f"a solver's tolerance must be positive, found {tolerance:g}.")
+    check_tolerance(tolerance)
 
 
 def unique_names(paths: Sequence[Path]) -> list[str]:

@@ -56,6 +56,7 @@ def write_samples(
     region: Region | None = None,
     channels: str = "both",
     straight_first: bool = False,
+    grid: str | Tensor = "uniform",
 ) -> list[np.ndarray]:
     """Draw scans and write each as `out/NNNNNN.FORMAT`, with a page and a contact sheet of the first ones.
 
@@ -65,7 +66,7 @@ def write_samples(
         formats: `ply` and `bin` are points in metres with reflectance, `npy` the range image,
             float32 (2 or 1, H, W) in metres and reflectance; reflectance alone is `NNNNNN.reflectance.npy`.
         pictures: How many scans get a page of their own; the contact sheet shows at most 8 of them.
-        region, channels, straight_first: See `r2flow.sampling.sample`. Pictures show the region alone, files are
+        region, channels, straight_first, grid: See `r2flow.sampling.sample`. Pictures show the region alone, files are
             of the sensor's shape, 0 outside.
 
     Returns:
@@ -86,7 +87,7 @@ def write_samples(
     with ScanBar("sampling", num, batches(num, batch_size) * evaluations_of(method, steps)) as bar:
         for drawn in sample(
             checkpoint, num, steps, seed, method, tolerance, batch_size,
-            progress=bar.evaluated, region=region, channels=channels, straight_first=straight_first,
+            progress=bar.evaluated, region=region, channels=channels, straight_first=straight_first, grid=grid,
         ):  # fmt: skip
             lost = [drawn.first + offset for offset, solved in enumerate(drawn.converged.tolist()) if not solved]
             if lost:

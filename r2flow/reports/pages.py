@@ -23,7 +23,7 @@ from r2flow.files import atomic_write
 
 Row = Mapping[str, Any]
 
-# Told apart without colour: every line of a figure has a marker, a dash and a grey of its own.
+# Told apart without colour: every line of a figure has a marker and a dash of its own.
 STYLES: tuple[dict[str, Any], ...] = tuple(
     {"marker": marker, "linestyle": dash, "color": colour}
     for marker, dash, colour in (

@@ -24,6 +24,9 @@ def make_and_tell(
 ) -> Made:
     """`make_pairs` with a bar, or a line every `seconds` where no one watches or several work."""
     model = checkpoint.model.to(device)
+    there = sum(store.shard_path(shard).is_file() for shard in store.shards(num))
+    if there > 4 and rank == 0:
+        print(f"checking {there} shards of pairs", flush=True)
     own = [batch for batch in store.missing(num) if batch % ranks == rank]
     who = f"process {rank + 1} of {ranks}: " if ranks > 1 else ""
     teller = _Teller(who, len(own) * store.recipe.batch_size, seconds, watched=sys.stdout.isatty() and ranks == 1)
@@ -61,12 +64,30 @@ class _Teller:
         print(f"{self.who}pair {made.pairs}/{self.total}  {rate(made)}  {left:.0f} s left", flush=True)
 
 
-def wait_for_others(store: PairStore, num: int, pause: float = 2.0) -> None:
-    """Until the other processes' pairs are there too: no collective call, which would time out after a while."""
+def wait_for_others(
+    store: PairStore, num: int, launched: bool = False, pause: float = 2.0, patience: float = 120.0
+) -> bool:
+    """Until the other processes' pairs are there too: no collective call, which would time out after a while.
+
+    Args:
+        launched: This process was started by one of the others, and is of no use when that is gone.
+
+    Returns:
+        Whether all are there; False when none has come for `patience` seconds: what is missing is anyone's to make.
+    """
+    parent, lacking, since = os.getppid(), len(store.missing(num)), time.monotonic()
     while not store.is_whole(num):
         time.sleep(pause)
         for shard in store.shards(num):
             store.seal(shard, num)
+        now = len(store.missing(num))
+        if now != lacking:
+            lacking, since = now, time.monotonic()
+        elif time.monotonic() - since > patience:
+            return False
+        if launched and os.getppid() != parent:
+            raise SystemExit("the process that started this one is gone")
+    return True
 
 
 def place(environment: Mapping[str, str] = os.environ) -> tuple[int, int, int]:
@@ -75,12 +96,14 @@ def place(environment: Mapping[str, str] = os.environ) -> tuple[int, int, int]:
     def number(name: str, default: int) -> int:
         return int(environment.get(name, default))
 
-    if "RANK" in environment and "WORLD_SIZE" in environment:
-        return number("RANK", 0), number("WORLD_SIZE", 1), number("LOCAL_RANK", 0)
     # Of a step, not of the job: in the batch script itself, outside srun, there is one process however many were asked.
     tasks = number("SLURM_STEP_NUM_TASKS", 1)
     task = number("SLURM_PROCID", 0) if tasks > 1 else 0
     jobs = number("SLURM_ARRAY_TASK_COUNT", 1)
     job = number("SLURM_ARRAY_TASK_ID", 0) - number("SLURM_ARRAY_TASK_MIN", 0)
     step = number("SLURM_ARRAY_TASK_STEP", 1)
-    return job // step * tasks + task, jobs * tasks, number("SLURM_LOCALID", 0)
+    job //= step
+    if "RANK" in environment and "WORLD_SIZE" in environment:
+        rank, ranks, local = number("RANK", 0), number("WORLD_SIZE", 1), number("LOCAL_RANK", 0)
+        return job * ranks + rank, jobs * ranks, local
+    return job * tasks + task, jobs * tasks, number("SLURM_LOCALID", 0)

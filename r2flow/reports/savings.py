@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.checkpoints import Checkpoint
+from r2flow.errors import InputError
 from r2flow.flow.problems import PROBLEMS, Mixed, Problem
 from r2flow.flow.solvers import Velocity, solve
 from r2flow.flow.straight_exit import probes, solve_straight_first
@@ -30,6 +31,7 @@ ELEMENTS = 256  # of an exact scene
 FIXED = 32  # steps of the fixed-step rows
 REPEATS = 3  # of every timing
 TOLERANCES = (1e-3, 1e-5)
+TIGHT = 1e-6  # tolerance of the solution that a trained flow is held against
 
 EULER, AB2 = f"euler, {FIXED} steps", f"ab2, {FIXED} steps"
 ONE_STATE = "dopri5, the batch as one state (torchdiffeq)"
@@ -129,12 +131,23 @@ def exact_rows(kinds: Mapping[str, int], batch: str, tolerances: Sequence[float]
 
 
 def scene_rows(checkpoint: Checkpoint, num: int, tolerance: float, seed: int, advance: Progress) -> list[Row]:
-    """The same ways on scenes of a trained flow, held against its own tight solution."""
+    """The same ways on scenes of a trained flow, held against its own tight solution.
+
+    Raises:
+        InputError: the flow has none.
+    """
     model = checkpoint.model
     x_0 = noise_of(range(num), (checkpoint.encoding.channels, *checkpoint.sensor.shape), seed).to(_device(model))
     counted = _Counted(model, advance)
     with torch.inference_mode():
-        truth = solve(counted, x_0, method="dopri5", tolerance=1e-6).x
+        tight = solve(counted, x_0, method="dopri5", tolerance=TIGHT)
+        if not tight.converged.all():
+            lost = ", ".join(str(scene) for scene in (~tight.converged).nonzero()[:, 0].tolist())
+            raise InputError(
+                f"dopri5 at {TIGHT:g} does not solve scene {lost} of this flow: there is nothing to hold its scenes "
+                "against. Leave the checkpoint out for the exact problems alone."
+            )
+        truth = tight.x
         found = solve_in_all_ways(counted, x_0, tolerance, repeats=1)
     rows = []
     for way, solved in found.items():

@@ -75,6 +75,7 @@ def finish(run: str | Path, samples: Mapping[str, Any], seed: int, device: str, 
     for name, (steps, values) in curves.items():
         tenth = max(len(values) // 10, 1)
         print(f"{name}: {values[:tenth].mean():.4f} at the start, {values[-tenth:].mean():.4f} at step {steps[-1]}")
+    advice = "" if checkpoint.distilled_steps else " --steps 64"  # a distilled flow has its own
     print(
         f"""
 checkpoint    {path}
@@ -83,7 +84,7 @@ point clouds  {out / "000000.ply"} ...
 loss curve    {run / "loss.png"}; tensorboard --logdir {run / "tensorboard"}
 
 next
-  r2flow sample --checkpoint {run} --num 16 --steps 64 --seed 1 --out {run / "more"}
+  r2flow sample --checkpoint {run} --num 16{advice} --seed 1 --out {run / "more"}
   r2flow show {out / "000000.ply"} --out {run / "views"}
   python train.py data=kitti_raw data.root=FOLDER backbone=hdit_small""",
         flush=True,

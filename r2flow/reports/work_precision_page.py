@@ -27,27 +27,29 @@ def work_precision_page(
     seeds: Mapping[str, int],
     command: str,
     device: str = "cpu",
+    budgets: Sequence[int] = BUDGETS,
 ) -> Page:
     """The report, of a checkpoint, of exact problems or of both.
 
     Args:
         name: The checkpoint's, as in its rows; None where there is none.
         found: What it was judged against.
+        budgets: Evaluations that were asked for.
     """
     of_checkpoint = [row for row in rows if row["problem"] == name]
     of_problems = [row for row in rows if row["problem"] != name]
     text, figures = [], {}
     if name is not None and found is not None:
-        text += checkpoint_text(of_checkpoint, name, found)
+        text += checkpoint_text(of_checkpoint, name, found, budgets)
         figures["work_precision"] = checkpoint_figure(of_checkpoint, name)
     if of_problems:
-        text += problems_text(of_problems)
+        text += problems_text(of_problems, budgets)
         figures["exact_problems"] = problems_figure(of_problems, EVALUATIONS)
         figures["exact_problems_time"] = problems_figure(of_problems, SECONDS)
     return Page("work_precision", "Error against work", text, rows, figures, command, seeds, device)
 
 
-def checkpoint_text(rows: Sequence[Row], name: str, found: Reference) -> list[str]:
+def checkpoint_text(rows: Sequence[Row], name: str, found: Reference, budgets: Sequence[int] = BUDGETS) -> list[str]:
     """Which solver for which budget on a checkpoint, and how far that can be trusted."""
     scenes = rows[0]["scenes"]
     intro = (
@@ -62,10 +64,9 @@ def checkpoint_text(rows: Sequence[Row], name: str, found: Reference) -> list[st
     trust += closer if below else ", and all are."
     # The upper quartile: as many evaluations of another solver fit into it, whatever the clock's noise.
     euler = {row["steps"]: row["seconds_three_quarters"] for row in rows if row["method"] == "euler"}
-    budgets = sorted(euler) or list(BUDGETS)
     said = [f"{intro} {trust}", sentence(f"On **{name}**, by evaluations a scene:", rows, budgets, "evaluations")]
     if euler:
-        times = {euler[steps]: f"the time of {steps} Euler steps ({shown(euler[steps])} s)" for steps in budgets}
+        times = {euler[steps]: f"the time of {steps} Euler steps ({shown(euler[steps])} s)" for steps in sorted(euler)}
         said.append(sentence(f"On **{name}**, by time a scene:", rows, list(times), "seconds", times))
     columns = {
         "label": "configuration", "evaluations": "evaluations", "seconds": "seconds", "seconds_quarter": "quartile",
@@ -103,20 +104,21 @@ def sentence(
     return f"{begin} {'; '.join(parts)}." if parts else f"{begin} no solver arrives within any budget."
 
 
-def problems_text(rows: Sequence[Row]) -> list[str]:
+def problems_text(rows: Sequence[Row], budgets: Sequence[int] = BUDGETS) -> list[str]:
     """The winner of every exact problem and budget, and which solver is nearest to the winners throughout."""
-    problems = list(dict.fromkeys(row["problem"] for row in rows))
+    problems, budgets = list(dict.fromkeys(row["problem"] for row in rows)), sorted(set(budgets))
     wins = []
     for problem in problems:
         own = [row for row in rows if row["problem"] == problem]
         line: dict[str, Any] = {"problem": problem}
-        for budget in BUDGETS:
+        for budget in budgets:
             line[str(budget)] = _winner(own, budget)
         wins.append(line)
     parts = []
-    for method, budgets in groupby(BUDGETS, key=lambda budget: steadiest(rows, budget)):
-        of = list(budgets)
-        parts.append(f"{of[0]:g}" + (f" to {of[-1]:g}" if len(of) > 1 else "") + f" evaluations **{method}**")
+    for method, group in groupby(budgets, key=lambda budget: steadiest(rows, budget)):
+        of = list(group)
+        within = f"{of[0]:g}" + (f" to {of[-1]:g}" if len(of) > 1 else "")
+        parts.append(f"{within} evaluations " + ("no solver arrives" if method is None else f"**{method}**"))
     scenes = rows[0]["scenes"]
     said = (
         f"On {len(problems)} exact problems, {scenes} scenes each, in float64. Nearest to the best solver of every "
@@ -125,7 +127,7 @@ def problems_text(rows: Sequence[Row]) -> list[str]:
     lost = Counter(row["problem"] for row in rows if row["converged"] < row["scenes"])
     trouble = ", ".join(f"{problem} ({count})" for problem, count in lost.items())
     note = f"Configurations that left a scene unsolved, by problem: {trouble}." if lost else "Every scene was solved."
-    columns = {"problem": "problem", **{str(budget): f"within {budget}" for budget in BUDGETS}}
+    columns = {"problem": "problem", **{str(budget): f"within {budget}" for budget in budgets}}
     heading = "The most accurate within a number of evaluations, and its median error; none where x_0 is as near:"
     clock = f"Seconds are those of {scenes} scenes solved together, over their number; torchdiffeq takes one at a time."
     return [said, f"{heading}\n\n{table(wins, columns)}", f"{note} {clock}"]
@@ -141,22 +143,24 @@ def _winner(rows: Sequence[Row], budget: float) -> str:
     return f"{best['method']} {shown(reached(best))}"
 
 
-def steadiest(rows: Sequence[Row], budget: float) -> str:
+def steadiest(rows: Sequence[Row], budget: float) -> str | None:
     """The method whose error is nearest to that of each problem's best, within a budget of evaluations.
 
     By the geometric mean over problems of (its error / the best error); where it does not get nearer than x_0, its
-    error is that of x_0.
+    error is that of x_0. None where no method solves any problem within the budget.
     """
     problems = {row["problem"]: [r for r in rows if r["problem"] == row["problem"]] for row in rows}
     regret: dict[str, float] = {}
     for method in dict.fromkeys(row["method"] for row in rows):
-        ratios = []
+        ratios, arrives = [], False
         for own in problems.values():
             best, mine = best_within(own, budget), best_within([r for r in own if r["method"] == method], budget)
             if best is not None:
+                arrives |= mine is not None
                 ratios.append(math.log((best["length"] if mine is None else reached(mine)) / reached(best)))
-        regret[method] = sum(ratios) / max(len(ratios), 1)
-    return min(regret, key=lambda method: regret[method])
+        if arrives:
+            regret[method] = sum(ratios) / len(ratios)
+    return min(regret, key=lambda method: regret[method], default=None)
 
 
 def _front(row: Row) -> str:
@@ -251,7 +255,9 @@ def _legend(figure: Figure, rows: Sequence[Row], title: str) -> None:
     handles = [Line2D([], [], **_style(method), ms=5, lw=1.1, label=method) for method in methods]
     ring: dict[str, Any] = {"marker": "o", "ls": "", "mfc": "none", "mec": "black", "ms": 9}
     handles.append(Line2D([], [], **ring, label="Pareto front"))
-    handles.append(Line2D([], [], color="0.4", lw=0.8, label="up to the worst scene; quartiles of time"))
+    handles.append(
+        Line2D([], [], color="0.4", lw=0.8, label="in the solver's colour: to the worst scene; quartiles of time")
+    )
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=11)
 

@@ -13,10 +13,19 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.data.pairs import PairDataset, PairOptions, PairSource, default_folder, make_pairs, pair_noise
+from r2flow.data.pairs import (
+    PairDataset,
+    PairOptions,
+    PairSource,
+    default_folder,
+    make_pairs,
+    pair_noise,
+    solve_batch,
+)
 from r2flow.data.shards import PairStore
 from r2flow.errors import InputError
 from r2flow.noise import standard_normal
+from r2flow.reports.pairs import wait_for_others
 
 SHAPE = (2, 4, 8)
 OPTIONS = {"num": 50, "tolerance": 1e-6, "batch_size": 4, "shard_mib": 3 * 4 * 2 * 64 / 2**20, "parent": "abc"}
@@ -38,7 +47,7 @@ class Counted:
 
     def __call__(self, t, x):
         if float(t.reshape(-1)[0]) == 0:
-            self.begun = max(self.begun, 0) + len(x)
+            self.begun += len(x)
         return x
 
 
@@ -188,6 +197,97 @@ def test_other_pairs_in_the_folder_are_refused(tmp_path: Path, option: str, valu
         store_in(tmp_path, **{option: value})
 
 
+def test_whole_shards_of_other_pairs_are_never_taken_for_damaged_ones(tmp_path: Path):
+    make_pairs(store_in(tmp_path), grow, 50)
+    (tmp_path / "manifest.json").unlink()
+    before = files(tmp_path)
+    with pytest.raises(InputError, match="holds pairs of another recipe"):
+        make_pairs(store_in(tmp_path, tolerance=1e-3), grow, 50)
+    (tmp_path / "manifest.json").unlink()
+    with pytest.raises(InputError, match="holds pairs of another recipe"):
+        PairSource(store_in(tmp_path, tolerance=1e-3), 50)
+    assert files(tmp_path) == before
+
+
+def test_of_two_recipes_begun_at_once_one_is_refused(tmp_path: Path):
+    first, second = store_in(tmp_path), store_in(tmp_path, tolerance=1e-3)
+    make_pairs(first, grow, 8)
+    with pytest.raises(InputError, match="holds other pairs: tolerance is"):
+        make_pairs(second, grow, 8)
+
+
+def test_one_and_one_point_nought_are_one_tolerance():
+    assert PairOptions(tolerance=1).recipe(SHAPE).digest == PairOptions(tolerance=1.0).recipe(SHAPE).digest
+
+
+@pytest.mark.parametrize(("option", "value"), [("first", -5), ("seed", -1), ("shard_mib", math.inf), ("tolerance", 0)])
+def test_numbers_out_of_range_are_refused(option: str, value):
+    with pytest.raises(InputError, match=option):
+        PairOptions(**{option: value}).recipe(SHAPE)
+
+
+def test_a_shorter_shard_never_replaces_a_longer_one(tmp_path: Path, monkeypatch):
+    store = store_in(tmp_path / "both")
+    for batch in range(3):
+        store.commit(batch, solve_batch(store.recipe, grow, batch))
+    gather = store._gather
+
+    def late(shard: int, batches: range) -> list:
+        blocks = gather(shard, batches)
+        store_in(tmp_path / "both").seal(0, 12)  # meanwhile, by a process that was asked for more
+        return blocks
+
+    monkeypatch.setattr(store, "_gather", late)
+    store.begin()
+    store.seal(0, 8)
+    make_pairs(store_in(tmp_path / "one"), grow, 12)
+    assert files(tmp_path / "both") == files(tmp_path / "one")
+
+
+def test_runs_that_share_pairs_share_the_work(tmp_path: Path):
+    torch.set_num_threads(1)
+    begun = tmp_path / "begun"
+
+    def slow(t, x):
+        if float(t.reshape(-1)[0]) == 0:
+            with begun.open("a") as file:
+                file.write(".")
+        time.sleep(2e-3)
+        return x
+
+    children = []
+    for _ in range(2):
+        child = os.fork()
+        if child == 0:
+            make_pairs(store_in(tmp_path / "pairs"), slow, 200)
+            os._exit(0)
+        children.append(child)
+    for child in children:
+        os.waitpid(child, 0)
+    # 50 batches: a few are made twice where the two meet, not all of them.
+    assert 50 <= begun.stat().st_size <= 75
+    assert len(PairSource(store_in(tmp_path / "pairs"), 200)) == 200
+
+
+def test_what_others_do_not_make_is_waited_for_no_longer_than_patience(tmp_path: Path):
+    store = store_in(tmp_path)
+    make_pairs(store, grow, 50, 0, 2)
+    assert not wait_for_others(store, 50, pause=0.01, patience=0.05)
+    make_pairs(store, grow, 50)
+    assert wait_for_others(store, 50, pause=0.01, patience=0.05)
+
+
+def test_a_shard_lost_in_use_says_how_to_go_on(tmp_path: Path):
+    make_pairs(store_in(tmp_path), grow, 50)
+    source = PairSource(store_in(tmp_path), 50)
+    (tmp_path / "pairs-000001.safetensors").unlink()
+    _cut(tmp_path / "pairs-000002.safetensors")
+    assert source[0][1].isfinite().all()
+    for index in (13, 25):
+        with pytest.raises(InputError, match="The same command makes it again"):
+            source[index]
+
+
 def test_a_damaged_manifest_says_what_to_do(tmp_path: Path):
     make_pairs(store_in(tmp_path), grow, 8)
     (tmp_path / "manifest.json").write_text("{")
@@ -211,7 +311,7 @@ def test_a_pair_that_does_not_come_to_an_end_is_left_out(tmp_path: Path):
 
 
 def test_a_flow_that_is_broken_is_said_to_be(tmp_path: Path):
-    with pytest.raises(InputError, match="none of the pairs 0 to 3 came to an end"):
+    with pytest.raises(InputError, match="none of 8 pairs came to an end"):
         make_pairs(store_in(tmp_path), lambda t, x: x * math.nan, 8)
 
 

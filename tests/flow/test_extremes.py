@@ -9,7 +9,8 @@ import torch
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, Mixed, PointMass, Rotating, StiffLinear, Straight
-from r2flow.flow.solvers import FLOOR, SOLVERS, adaptive, solve
+from r2flow.flow.solvers import FLOOR, SOLVERS, solve
+from r2flow.flow.straight_exit import solve_straight_first
 
 METHODS = [*SOLVERS, "torchdiffeq:dopri5", "torchdiffeq:rk4"]
 ADAPTIVE = ["bosh3", "dopri5"]
@@ -109,7 +110,7 @@ def test_no_steps_no_budget_and_no_time_are_refused():
         ({"tolerance": math.nan}, "must be positive"),
         ({"finish": 1.0}, "shorter than the whole way"),
         ({"finish": -1e-3}, "shorter than the whole way"),
-        ({"max_evaluations": 0}, "at least 1 evaluation"),
+        ({"max_evaluations": 1}, "at least 2 evaluations, found 1"),
         ({"max_step": 0.0}, "a share of the interval"),
         ({"t_1": math.inf}, "needs two times"),
     ]:
@@ -118,14 +119,12 @@ def test_no_steps_no_budget_and_no_time_are_refused():
 
 
 @pytest.mark.parametrize("method", [*ADAPTIVE, "torchdiffeq:dopri5"])
-def test_a_tolerance_that_float32_cannot_hold_is_floored_and_said_so_once(method, caplog):
-    adaptive._warned.clear()
+def test_a_tolerance_that_float32_cannot_hold_is_floored_and_every_call_says_so(method, caplog):
     with caplog.at_level(logging.WARNING):
         floored = solve(Gaussian(), X_0, method=method, tolerance=1e-12)
-        solve(Gaussian(), X_0, method=method, tolerance=1e-12)
-    assert [record.message for record in caplog.records] == [
-        "a tolerance of 1e-12 is below what float32 can hold: 1e-07 is used."
-    ]
+        solve(Gaussian(), X_0, method=method, tolerance=1e-12, global_error=True)
+    said = "a tolerance of 1e-12 is below what float32 can hold: 1e-07 is used."
+    assert [record.message for record in caplog.records] == [said, said]
     at_floor = solve(Gaussian(), X_0, method=method, tolerance=FLOOR[torch.float32])
     assert torch.equal(floored.x, at_floor.x)
     assert floored.converged.all()
@@ -134,7 +133,6 @@ def test_a_tolerance_that_float32_cannot_hold_is_floored_and_said_so_once(method
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_a_tolerance_below_the_noise_of_a_half_precision_network_is_floored(dtype, caplog):
-    adaptive._warned.clear()
     problem = Rotating()
 
     def network(t, x):
@@ -151,12 +149,72 @@ def test_a_tolerance_below_the_noise_of_a_half_precision_network_is_floored(dtyp
 
 
 def test_autocast_around_the_network_counts_as_its_precision(caplog):
-    adaptive._warned.clear()
     weight = torch.eye(16)
     with torch.autocast("cpu", dtype=torch.bfloat16), caplog.at_level(logging.WARNING):
         solution = solve(lambda t, x: (x @ weight).float(), X_0, method="dopri5", tolerance=1e-6)
     assert "below what bfloat16 can hold" in caplog.text
     torch.testing.assert_close(solution.x, math.e * X_0, rtol=2e-2, atol=2e-2)
+
+
+class Polite(torch.nn.Module):
+    """A network in half precision that answers in the type it was asked in, as our backbones do."""
+
+    def __init__(self, dtype):
+        super().__init__()
+        self.weight = torch.nn.Parameter(0.5 * torch.eye(16, dtype=dtype), requires_grad=False)
+
+    def forward(self, t, x):
+        return (x.to(self.weight.dtype) @ self.weight).to(x.dtype)
+
+
+@pytest.mark.parametrize("method", [*ADAPTIVE, "torchdiffeq:dopri5"])
+def test_a_network_s_weights_tell_its_precision_where_its_answer_does_not(method, caplog):
+    network = Polite(torch.bfloat16)
+    with caplog.at_level(logging.WARNING):
+        floored = solve(network, X_0, method=method, tolerance=1e-6)
+        by_method = solve(network.forward, X_0, method=method, tolerance=1e-6)
+    assert [record.message for record in caplog.records] == [
+        "a tolerance of 1e-06 is below what bfloat16 can hold: 0.0001 is used."
+    ] * 2
+    assert torch.equal(floored.x, by_method.x)
+    exact = solve(Polite(torch.float32), X_0, method=method, tolerance=1e-4)
+    assert floored.evaluations.max() <= 3 * exact.evaluations.max()
+    torch.testing.assert_close(floored.x, math.exp(0.5) * X_0, rtol=2e-2, atol=2e-2)
+
+
+@pytest.mark.parametrize(
+    "network", [Polite(torch.bfloat16), lambda t, x: 0.5 * x.bfloat16()], ids=["weights", "answer"]
+)
+def test_scenes_that_are_not_straight_keep_the_network_s_precision(network, caplog):
+    # what is known of v(0, x) is in the state's type by then
+    with caplog.at_level(logging.WARNING):
+        solve_straight_first(network, X_0, 1e-6)
+    assert "below what bfloat16 can hold" in caplog.text
+
+
+@pytest.mark.parametrize("method", ADAPTIVE)
+def test_an_untrained_network_that_answers_0_is_one_step(method):
+    solution = solve(lambda t, x: 0 * x, X_0, method=method, tolerance=1e-3)
+    assert solution.accepted.tolist() == [1] * 4
+    assert torch.equal(solution.x, X_0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_network_that_is_being_trained_can_be_solved(method):
+    # x' = W x: the end is exp(W) x_0, its sum's gradient is not zero
+    network = torch.nn.Linear(16, 16, bias=False)
+    exact = X_0 @ torch.matrix_exp(network.weight.detach().T)
+    solution = solve(lambda t, x: network(x), X_0, method=method, steps=256, tolerance=1e-5, global_error=True)
+    torch.testing.assert_close(solution.x.detach(), exact, rtol=0, atol=2e-2 if method == "euler" else 1e-3)
+    assert not solution.global_error.requires_grad
+    solution.x.sum().backward()
+    assert network.weight.grad.abs().max() > 0
+
+
+def test_a_network_that_is_being_trained_can_be_solved_straight_first():
+    network = torch.nn.Linear(16, 16, bias=False)
+    alone = solve(lambda t, x: network(x), X_0, method="dopri5", tolerance=1e-3)
+    assert torch.equal(solve_straight_first(lambda t, x: network(x), X_0, 1e-3).x, alone.x)
 
 
 @pytest.mark.parametrize("method", [*ADAPTIVE, "torchdiffeq:dopri5"])

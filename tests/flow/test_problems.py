@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.flow.problems import PROBLEMS, Gaussian, Mixed, PointMass, RayDrop, Rotating, Straight, TwoModes
+from r2flow.flow.problems import PROBLEMS, Gaussian, Mixed, NarrowJet, PointMass, RayDrop, Rotating, Straight, TwoModes
+from r2flow.flow.solvers import solve
 
 X_0 = torch.randn(3, 8, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
 
@@ -86,6 +87,14 @@ def test_a_half_turn_negates():
     torch.testing.assert_close(Rotating(turns=0.5).solution(X_0, 1.0), -X_0)
     with pytest.raises(InputError, match="an odd number"):
         Rotating()(torch.tensor(0.0), torch.zeros(1, 3))
+
+
+def test_a_wide_jet_is_solved_to_the_last_digits():
+    # Where the jet is wide, the error function at its start is not that of -infinity.
+    problem = NarrowJet(width=0.3, at=0.3)
+    assert (problem.solution(X_0, 0.0) - X_0).abs().max() < 1e-14
+    end = solve(problem, X_0, method="dopri5", tolerance=1e-13).x
+    torch.testing.assert_close(end, problem.solution(X_0, 1.0), rtol=0, atol=1e-11)
 
 
 def test_scenes_of_a_mixed_batch_follow_their_own_problem():

@@ -7,7 +7,9 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
+from r2flow.flow.problems import Gaussian, RayDrop
 from r2flow.flow.solvers import GRIDS, SOLVERS, FixedStep, Pair, calibrated_grid, solve
+from r2flow.flow.solvers.external import is_fixed, torchdiffeq_methods
 
 
 def logistic(t, x):
@@ -45,13 +47,16 @@ def test_an_adaptive_method_of_equal_steps_has_its_order(method):
     assert math.log2(error(32) / error(64)) == pytest.approx(SOLVERS[method].order, abs=0.35)
 
 
-@pytest.mark.parametrize(("method", "order"), [("euler", 1), ("midpoint", 2), ("heun2", 2), ("heun3", 3), ("rk4", 4)])
-def test_torchdiffeq_s_methods_have_their_order_through_our_call(method, order):
+THEIR_FIXED = [name for name in torchdiffeq_methods() if is_fixed(name)]
+
+
+@pytest.mark.parametrize("method", THEIR_FIXED)
+def test_torchdiffeq_s_methods_have_their_order_through_our_call(method):
     def error(steps):
         end = solve(logistic, X_0, method=f"torchdiffeq:{method}", steps=steps).x
         return (end - logistic_solution(X_0, 1)).abs().max().item()
 
-    assert math.log2(error(16) / error(32)) == pytest.approx(order, abs=0.25)
+    assert math.log2(error(16) / error(32)) == pytest.approx(torchdiffeq_methods()[method].order, abs=0.25)
 
 
 @pytest.mark.parametrize("method", FIXED)
@@ -115,6 +120,27 @@ def test_the_global_error_is_estimated_and_its_cost_counted(method):
     assert (owned.evaluations > plain.evaluations).all()
     assert (owned.global_error > error / 5).all()
     assert (owned.global_error < error * 5).all()
+
+
+@pytest.mark.parametrize("method", ["rk4", *ADAPTIVE, "torchdiffeq:dopri5"])
+@pytest.mark.parametrize(("problem", "finish"), [
+    (Gaussian(std=1e-2), 1e-2), (Gaussian(std=1e-3), 1e-3), (Gaussian(std=1e-4), 1e-3), (RayDrop(), 1e-2),
+], ids=str)  # fmt: skip
+def test_the_estimate_sees_the_error_of_the_last_stretch(method, problem, finish):
+    # At this tolerance the one Euler step at the end makes nearly all of the error.
+    x_0 = torch.randn(3, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    end = solve(problem, x_0, method=method, steps=512, tolerance=1e-7, finish=finish, global_error=True)
+    error = (end.x - problem.solution(x_0, 1.0)).square().mean(1).sqrt()
+    assert error.min() > 1e-5
+    assert (end.global_error > error / 5).all()
+    assert (end.global_error < error * 5).all()
+
+
+def test_what_the_estimate_costs_is_told_apart():
+    for method in ("euler", "dopri5"):
+        plain, owned = (solve(logistic, X_0, method=method, finish=0.1, global_error=asked) for asked in (False, True))
+        assert plain.estimate_evaluations is None
+        assert torch.equal(owned.evaluations - owned.estimate_evaluations, plain.evaluations)
 
 
 def test_an_unknown_or_wrong_grid_is_refused():
@@ -190,5 +216,7 @@ def test_bad_requests_are_refused():
         solve(logistic, X_0, steps=0)
     with pytest.raises(InputError, match="torchdiffeq has no method 'dopri55'"):
         solve(logistic, X_0, method="torchdiffeq:dopri55")
+    with pytest.raises(InputError, match="explicit_adams is left out: its Adams methods lose their order"):
+        solve(logistic, X_0, method="torchdiffeq:explicit_adams")
     with pytest.raises(InputError, match="must be positive"):
         solve(logistic, X_0, method="torchdiffeq:dopri5", tolerance=0)

@@ -71,6 +71,18 @@ def test_a_hard_scene_does_not_go_under_among_easy_ones(hard):
     assert worst(theirs[255:], exact[255:]) > 5e-2
 
 
+def test_a_ray_drop_scene_among_easy_ones_stays_below_5e_3_in_at_least_nine_of_ten_draws():
+    # Not in all: an element that decides late between dropped and measured can fall between two probes of a step.
+    errors = []
+    for seed in range(10):
+        batch, x_0 = Mixed([Straight()] * 255 + [RayDrop()]), noise(256, 64, seed)
+        end = solve(batch, x_0, method="dopri5", tolerance=1e-3).x
+        errors.append(worst(end[255:], batch.solution(x_0, 1.0)[255:]))
+    print("ray-drop among 255 easy scenes:", ", ".join(f"{error:.1e}" for error in sorted(errors)))
+    assert sum(error < 5e-3 for error in errors) >= 9
+    assert max(errors) < 2e-2
+
+
 @pytest.mark.parametrize("method", ADAPTIVE)
 def test_a_scene_s_result_is_the_same_alone_in_any_batch_and_in_any_place(method):
     problems = [Straight(), TwoModes(), RayDrop(), Gaussian(), Gaussian(std=0.01), StiffLinear(), Rotating()]

@@ -132,3 +132,8 @@ def test_probes_come_as_near_to_the_end_as_the_tolerance_asks():
     assert probes(1.0) == pytest.approx([0.5, 0.95])
     with pytest.raises(InputError, match="must be positive"):
         solve_straight_first(straight, X_0, 0)
+
+
+def test_an_estimate_is_refused_not_dropped():
+    with pytest.raises(InputError, match="ask `solve` for a global error"):
+        solve_straight_first(straight, X_0, 1e-3, global_error=True)

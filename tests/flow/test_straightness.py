@@ -120,3 +120,14 @@ def test_a_path_without_length_has_no_normalised_straightness():
 def test_no_steps_are_refused():
     with pytest.raises(InputError, match="at least 1 step"):
         straightness(gaussian, X_0, steps=0)
+
+
+def test_a_path_that_is_not_finite_is_not_the_most_curved():
+    def velocity(t, x):
+        spoiled = torch.tensor([False, True, False]).view(-1, 1, 1, 1)
+        return torch.where(spoiled, math.nan, rotation(t, x))
+
+    found = straightness(velocity, X_0, steps=8, most_curved=20)
+    of_scene = found.pixels // X_0[0].numel()
+    assert 1 not in of_scene.tolist()
+    assert found.trajectories.isfinite().all()

@@ -55,7 +55,8 @@ def test_rounding_goes_outward_to_whole_units():
 
 
 def test_everything_is_the_image_in_its_own_order():
-    for whole in (region((16, 72)), region((16, 72), (-180, 180), (0, 15)), region((16, 72), (0, 360))):
+    turns = [(-180, 180), (180, -180), (0, 360), (360, 0), (0, -360), (-360, 360), (10, -350)]
+    for whole in (region((16, 72)), *(region((16, 72), turn, (0, 15)) for turn in turns)):
         assert whole == Region((16, 72), 0, 16, 0, 72)
 
 
@@ -63,6 +64,8 @@ def test_everything_is_the_image_in_its_own_order():
     ("sector", "rows", "words"),
     [
         ((10, 10), None, "is empty"),
+        ((10, 10 + 1e-13), None, "10,10.0000000000001 is narrower than a column, 5 degrees"),
+        ((0, -360 + 4.9), None, "narrower than a column"),
         ((math.nan, 10), None, "degrees"),
         ((0, 720), None, "within -360 to 360"),
         (None, (5, 4), "FIRST-LAST within 0-15, found 5-4"),

@@ -175,6 +175,29 @@ def test_a_folder_of_runs_stands_for_its_runs(tmp_path):
     assert [p.name for p in find_runs([tmp_path / "sweep", tmp_path / "sweep" / "a"])] == ["a", "b"]
 
 
+def test_a_sweep_s_files_and_folders_without_a_run_are_passed_over(tmp_path, caplog):
+    make_run(tmp_path / "a")
+    (tmp_path / "multirun.yaml").touch()
+    (tmp_path / "logs").mkdir()
+    assert find_runs(sorted(tmp_path.iterdir())) == [tmp_path / "a"]
+    assert "logs holds no run" in caplog.text
+    assert "multirun" not in caplog.text
+    with pytest.raises(InputError, match="none does not exist"):
+        find_runs([tmp_path / "a", tmp_path / "none"])
+    with pytest.raises(InputError, match="logs is no run"):
+        find_runs([tmp_path / "logs", tmp_path / "multirun.yaml"])
+
+
+def test_a_sweep_of_chains_stands_for_its_runs(tmp_path):
+    for chain in ("0", "1"):
+        for stage in ("rf1", "td"):
+            make_run(tmp_path / "sweep" / chain / stage)
+        (tmp_path / "sweep" / chain / ".hydra").mkdir()
+        (tmp_path / "sweep" / chain / ".hydra" / "config.yaml").touch()  # the sweep's, of no run
+    found = find_runs([tmp_path / "sweep"])
+    assert labels(found) == ["0/rf1", "0/td", "1/rf1", "1/td"]
+
+
 def test_names_take_as_many_parents_as_they_need():
     paths = [Path("/x/one/rf"), Path("/x/two/rf"), Path("/x/two/td")]
     assert labels(paths) == ["one/rf", "two/rf", "two/td"]

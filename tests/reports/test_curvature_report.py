@@ -1,5 +1,6 @@
 import json
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,7 +10,14 @@ from torch import nn
 from r2flow.checkpoints import Checkpoint
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
-from r2flow.reports.curvature import curvature_page, curvature_rows, measure_paths, summary
+from r2flow.reports.curvature import (
+    curvature_page,
+    curvature_rows,
+    measure_paths,
+    short_labels,
+    summary,
+    trajectories_figure,
+)
 from r2flow.sampling import noise_of
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
@@ -97,6 +105,23 @@ def test_a_flow_that_goes_nowhere_is_drawn_and_not_praised():
     page = curvature_page([flow], 5, "")
     assert math.isnan(summary(flow)["integral_normalised"])
     assert "straightest" not in " ".join(page.text)
+
+
+def test_panels_are_named_by_the_end_of_their_path_and_tell_their_lines_below():
+    labels = ["/a/b/runs/x/rf1", "/a/b/runs/x/rf2", "/a/b/runs/y/rf1"]
+    assert short_labels(labels) == ["x/rf1", "x/rf2", "y/rf1"]
+    assert short_labels(["one/x/rf", "two/x/rf"]) == ["one/x/rf", "two/x/rf"]
+    assert short_labels(["rf.ckpt"]) == ["rf.ckpt"]
+    figure = trajectories_figure([measure_paths(checkpoint(Falling()), label, 1, STEPS, 0) for label in labels])
+    figure.canvas.draw()
+    assert [axes.get_title() for axes in figure.axes] == ["x/rf1", "x/rf2", "y/rf1"]
+    titles = [axes.title.get_window_extent() for axes in figure.axes]
+    assert all(left.x1 < right.x0 for left, right in pairwise(titles))
+    for axes in figure.axes:
+        legend = axes.get_legend().get_window_extent()
+        assert legend.y1 < axes.get_window_extent().y0
+        assert legend.y0 >= 0
+        assert legend.y1 < axes.xaxis.label.get_window_extent().y0
 
 
 def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811

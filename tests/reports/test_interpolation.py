@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -7,8 +9,8 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.interpolation import interpolation, interpolation_figure
 from r2flow.reports.inversion import errors_of, invert_scans, print_rows, scan_of, unique_names
 from r2flow.reports.pictures import figure_pixels
-from r2flow.sampling import invert
-from tests.test_sampling import SENSOR, flow, scans
+from r2flow.sampling import interpolate_scans, invert
+from tests.test_sampling import SENSOR, GaussianFlow, flow, scans
 
 
 def frames(count: int, channels: int = 2) -> np.ndarray:
@@ -46,6 +48,33 @@ def test_a_page_says_what_was_measured(tmp_path):
     assert "one" in page.text[1]
     middle = np.load(tmp_path / "o" / "frames" / "001.npy")
     assert page.rows[1]["returns"] == (middle[0] > 0).sum()
+
+
+class LostBetween(GaussianFlow):
+    """Lost wherever two scenes are solved at once, as the frames between the ends are here."""
+
+    def forward(self, t, x):
+        v = super().forward(t, x)
+        return v if len(x) == 1 else torch.full_like(v, math.nan)
+
+
+def test_a_frame_that_is_not_solved_is_said_to_be(tmp_path, caplog):
+    paths = [tmp_path / "one.npy", tmp_path / "two.npy"]
+    for path, image in zip(paths, scans(2).numpy(), strict=True):
+        np.save(path, image)
+    page = interpolation(flow(LostBetween()), paths, 4, tmp_path / "o", "rk4", steps=4, batch_size=2)
+    assert [row["converged"] for row in page.rows] == [True, False, False, True]
+    assert "not solved, and no scans of this flow: 1, 2;" in caplog.text
+    assert "| no |" in page.text[2]
+
+
+def test_an_end_without_its_noise_is_refused(tmp_path):
+    bad = scans(2)
+    bad[1, 0, 0, 0] = math.nan
+    with pytest.raises(InputError, match="the last scan cannot be carried to its noise"):
+        interpolate_scans(flow(), bad, 3, "rk4", steps=4)
+    with pytest.raises(InputError, match="the first scan cannot be carried to its noise"):
+        interpolate_scans(flow(), bad.flip(0), 3, "dopri5")
 
 
 def test_a_scan_that_is_not_solved_is_said_to_be(tmp_path, capsys):

@@ -53,7 +53,7 @@ def test_own_steps_take_at_most_six_tenths_of_one_state_s_evaluations(seed):
 
 def test_the_lone_hard_scene_is_not_hidden_by_the_easy_ones():
     ways = by_way(exact_rows(LONE, "lone", (1e-3,), seed=0))
-    assert ways[LEAVING]["error_ray_drop"] < 0.05 < ways[ONE_STATE]["error_ray_drop"]
+    assert ways[LEAVING]["error_ray_drop"] < 5e-3 < ways[ONE_STATE]["error_ray_drop"]
     assert ways[STRAIGHT]["evaluations"] < 0.3 * ways[ONE_STATE]["evaluations"]
 
 

@@ -152,6 +152,18 @@ def test_the_steadiest_solver_is_good_everywhere():
     # Ratios to the best: special 1 and 10^4, steady 10^2 and 1; `never` costs more than the budget.
     assert steadiest(rows, 8) == "steady"
     assert steadiest(rows[:1], 8) == "special"
+    assert steadiest(rows, 4) is None
+
+
+def test_the_sentence_is_about_the_budgets_asked_for():
+    rows = [row("a", 6, 0.1), row("b", 12, 0.01), row("lost", 3, math.inf)]
+    said = problems_text(rows, [12, 6, 3])
+    assert "within 3 evaluations no solver arrives; 6 evaluations **a**; 12 evaluations **b**." in said[0]
+    assert "| problem | within 3 | within 6 | within 12 |" in said[1]
+    marked = [{**r, "pareto_evaluations": True, "pareto_seconds": False, "seconds_quarter": 1.0} for r in rows]
+    marked = [{**r, "seconds_three_quarters": 1.0} for r in marked]
+    page = work_precision_page(marked, None, None, {}, "", budgets=[6])
+    assert "within 6 evaluations **a**." in page.text[0]
 
 
 def test_the_exact_problems_are_reported_with_what_was_not_solved():
@@ -201,6 +213,7 @@ def test_bad_input_is_one_line(r2flow, saved, tmp_path):  # noqa: F811
         (("--budgets", "4,x"), "--budgets must be positive numbers"),
         (("--tolerances", "-1"), "--tolerances must be positive numbers"),
         (("--budgets", "1", "--methods", "rk4"), "leaves no solver a step"),
+        (("--reference-tolerance", "inf"), "must be positive and finite"),
         (("--problems", "none"), "nothing to measure"),
         (("--problems", "gausian"), "Did you mean 'gaussian'?"),
         ((tmp_path / "none",), "no checkpoint"),

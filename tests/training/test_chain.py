@@ -1,5 +1,6 @@
 """1-RF, pairs, 2-RF, pairs, k-TD, report: as one command, and link by link."""
 
+import json
 import os
 import random
 import signal
@@ -12,7 +13,7 @@ import pytest
 import torch
 
 import train as train_script
-from r2flow.chain import links_of, override
+from r2flow.chain import Link, is_finished, links_of, override
 from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
 from r2flow.errors import InputError
 from tests.training.conftest import ROOT, TINY, Run, run_train
@@ -84,38 +85,47 @@ def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Pat
     assert {path: path.stat().st_mtime_ns for path in run.rglob("*.ckpt")} == before
 
 
-def _killed_at(moments: list[float], scans: Path, cwd: Path) -> int:
-    """Start the chain and kill it, once for each number of seconds; how often it was still alive."""
-    killed = 0
+def start(scans: Path, cwd: Path) -> subprocess.Popen:
     command = [sys.executable, str(ROOT / "train.py"), *TINY, f"data.root={scans}", *CHAIN]
-    for number, moment in enumerate(moments):
-        process = subprocess.Popen(
-            command, cwd=cwd, env={**os.environ, "OMP_NUM_THREADS": "1"}, start_new_session=True,
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
-        time.sleep(moment)
-        killed += process.poll() is None
-        # By turns the whole group, as a lost machine is, and the chain alone, as `kill -9 PID` does.
-        if number % 2:
-            os.kill(process.pid, signal.SIGKILL)
-        else:
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-    return killed
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        command, cwd=cwd, env=environment, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+
+
+def kill(process: subprocess.Popen, all_of_it: bool) -> None:
+    """The whole group, as a lost machine does, or the chain alone, as `kill -9 PID` does."""
+    if all_of_it:
+        os.killpg(process.pid, signal.SIGKILL)
+    else:
+        os.kill(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 def test_a_killed_chain_ends_as_the_one_left_alone(chained: tuple[Path, str], scans: Path, tmp_path: Path):
-    assert _killed_at([9.0, 9.0], scans, tmp_path) == 2
+    run = tmp_path / "runs" / "demo"
+    process, begin = start(scans, tmp_path), time.monotonic()
+    while not (run / "rf2" / "checkpoints" / "step-00000006.ckpt").exists():
+        assert process.poll() is None
+        assert time.monotonic() - begin < 200
+        time.sleep(0.005)
+    kill(process, all_of_it=False)
     run_train(tmp_path, scans, *CHAIN)
-    assert_alike(chained[0], tmp_path / "runs" / "demo")
+    assert_alike(chained[0], run)
 
 
 @pytest.mark.slow
 def test_a_chain_killed_at_ten_random_moments_ends_as_the_one_left_alone(
     chained: tuple[Path, str], scans: Path, tmp_path: Path
 ):
-    draw = random.Random(1)
-    assert _killed_at([draw.uniform(5, 16) for _ in range(10)], scans, tmp_path) >= 5
+    draw, killed = random.Random(1), 0
+    for number in range(10):
+        process = start(scans, tmp_path)
+        time.sleep(draw.uniform(5, 16))
+        if process.poll() is None:
+            killed += 1
+            kill(process, all_of_it=number % 2 == 0)
+    assert killed >= 3  # the others had come to their end
     run_train(tmp_path, scans, *CHAIN)
     assert_alike(chained[0], tmp_path / "runs" / "demo")
 
@@ -166,7 +176,8 @@ def test_an_unfinished_parent_is_refused_and_its_checkpoint_taken(chained: tuple
     assert (parent / "pairs" / "manifest.json").is_file()
 
 
-def test_two_processes_make_the_pairs_that_one_makes(chained: tuple[Path, str], train: Run, tmp_path: Path):
+@pytest.mark.slow
+def test_two_devices_make_the_pairs_that_one_makes(chained: tuple[Path, str], train: Run, tmp_path: Path):
     done = train_child(
         tmp_path, "experiment=reflow", f"stage.init={chained[0] / 'rf1'}", "trainer.strategy=ddp", "trainer.devices=2",
         f"data.root={tmp_path / 'pairs'}", "data.pairs.num=8", "data.pairs.batch_size=4", "data.pairs.method=midpoint",
@@ -187,12 +198,60 @@ def test_links_take_what_concerns_them():
     first, second = links_of(chain, "runs/x", given)
     assert first.overrides == (
         "trainer.max_steps=5", "data=folder", "data.root='a b'", "seed=3", "data.batch_size=2", "+trainer.x=1",
-        "backbone.depths=[1]", "run_dir='runs/x/rf1'",
+        "backbone.depths=[1]", "trainer.max_steps=5", "run_dir='runs/x/rf1'",
     )  # fmt: skip
     assert second.overrides == (
         "experiment=reflow", "stage.loss=mse", "stage.init='runs/x/rf1'", "seed=3", "data.pairs.num=9",
         "data.batch_size=2", "+trainer.x=1", "run_dir='runs/x/rf2'",
     )  # fmt: skip
+
+
+def test_what_is_given_to_one_link_wins_over_what_is_given_to_all():
+    given = ["chain.rf1.trainer.max_steps=5", "trainer.max_steps=9", "+chain.rf2.seed=2"]
+    first, second = links_of({"rf1": {"trainer": {"max_steps": 5}}, "rf2": {"init": "rf1", "seed": 2}}, "runs", given)
+    assert first.overrides[:3] == ("trainer.max_steps=5", "trainer.max_steps=9", "trainer.max_steps=5")
+    assert second.overrides[-2:] == ("seed=2", "run_dir='runs/rf2'")
+
+
+def test_a_chain_can_begin_at_a_flow_that_is_there():
+    chain = {"rf2": {"experiment": "reflow", "stage": {"init": "runs/old"}}}
+    (link,) = links_of(chain, "runs/x", ["data.pairs.num=5", "data.root=scans"])
+    assert "data.pairs.num=5" in link.overrides
+    assert "data.root=scans" not in link.overrides
+
+
+def test_the_command_line_cannot_bypass_a_link():
+    with pytest.raises(InputError, match="stage.init is each link's own"):
+        links_of({"rf1": {}, "rf2": {"init": "rf1"}}, "runs", ["stage.init=runs/old"])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["+chain.td2.trainer.max_step=5"], "no key 'trainer.max_step'. Did you mean 'trainer.max_steps'?"),
+        (["trainer.fast_dev_run=true"], "fast_dev_run leaves none"),
+        (["stage.init=x"], "stage.init is each link's own"),
+    ],
+)
+def test_a_chain_that_cannot_run_is_refused_before_its_first_link(tmp_path, monkeypatch, capfd, overrides, message):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.py", "experiment=demo", *overrides])
+    assert train_script.main() == 2
+    said = capfd.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert message in said[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_link_that_lost_its_last_checkpoint_is_not_finished(chained: tuple[Path, str], tmp_path: Path):
+    import shutil
+
+    run = Path(shutil.copytree(chained[0] / "rf1", tmp_path / "rf1"))
+    record = json.loads((run / "link.json").read_text())
+    link = Link("rf1", run, tuple(record["overrides"]))
+    assert is_finished(link)
+    checkpoints_of(run)[0].unlink()
+    assert not is_finished(link)
 
 
 def test_a_link_without_its_parent_is_refused():

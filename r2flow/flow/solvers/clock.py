@@ -10,10 +10,7 @@ from torch import Tensor
 from r2flow.flow.solvers.pairs import Pair
 from r2flow.flow.solvers.solution import Solution
 
-# dopri5.f lets steps grow by 10 and aims at 0.9 of what the last error allows. In a flow that turns late and looks
-# straight before, such steps go too far: these cost as much on the mixed batch of benchmarks/solvers.py and err half
-# as much.
-SAFETY, SHRINK, GROW = 0.7, 0.2, 3.0
+SHRINK = 0.2  # the least share of a step that the next one is
 MEMORY = 0.04  # weight of the previous error in the step's choice, its "beta": steadier steps at a stability limit
 STIFF_AFTER, SMOOTH_AFTER = 15, 6  # Hairer: so many stiff steps, not interrupted by so many others, are no accident
 
@@ -53,7 +50,7 @@ class Clock:
         self.eps = eps
         self.scenes, self.places = scenes, np.arange(len(scenes))
         of = len(scenes)
-        self.reached, self.h, self.grow = np.zeros(of), np.full(of, self.length), np.full(of, GROW)
+        self.reached, self.h, self.grow = np.zeros(of), np.full(of, self.length), np.full(of, pair.grow)
         self.last_error = np.full(of, 1e-4)  # dopri5.f
         self.stiff_run, self.smooth_run = np.zeros(of, int), np.zeros(of, int)
         self.arrived, self.leaving = np.zeros(of, bool), np.zeros(of, bool)
@@ -87,6 +84,7 @@ class Clock:
             steepest = np.fmax(slope, change / self.h)
             h = np.where(steepest <= 1e-15, 1e3 * self.h, (0.01 / steepest) ** (1 / self.pair.order))
         h = np.where(np.isfinite(h), np.minimum(100 * self.h, h), self.h)
+        h = np.where(steepest == 0, self.longest, h)  # an untrained network's 0
         self.h = np.maximum(h, self.shortest()).astype(np.float32).astype(np.float64)
         self.leaving = ~np.isfinite(slope) | self._spent(evaluations)
 
@@ -115,7 +113,7 @@ class Clock:
         tried = self.h
         self.reached = np.where(good, self.following, self.reached)
         self.h = tried * self._factors(good, finite, error)
-        self.grow = np.where(good, GROW, 1.0)
+        self.grow = np.where(good, self.pair.grow, 1.0)
         self.last_error = np.where(good, np.maximum(error, 1e-4), self.last_error)
         self.arrived = good & (self.reached >= self.length)
         stuck = (self.h < self.shortest()) & ~good
@@ -126,11 +124,13 @@ class Clock:
         return evaluations + self.pair.stages > self.limits.max_evaluations
 
     def _factors(self, good: np.ndarray, finite: np.ndarray, error: np.ndarray) -> np.ndarray:
-        """The controller of dopri5.f, h_new / h = S err^-(1/q - 3/4 beta) err_before^beta; 1/5 where not finite."""
+        """The controller of dopri5.f, h_new / h = S err^-(1/q - 3/4 beta) err_before^beta with S the pair's safety;
+        1/5 where not finite.
+        """
         error = np.where(finite, np.maximum(error, 1e-10), np.inf)
         q = 1 / self.pair.order
-        steady = SAFETY * error ** -(q - 0.75 * MEMORY) * self.last_error**MEMORY
-        retry = SAFETY * error ** -(q - 0.75 * MEMORY)
+        steady = self.pair.safety * error ** -(q - 0.75 * MEMORY) * self.last_error**MEMORY
+        retry = self.pair.safety * error ** -(q - 0.75 * MEMORY)
         factors = np.where(good, np.clip(steady, SHRINK, self.grow), np.clip(retry, SHRINK, 1.0))
         # as in `_norms`: one ulp more or less must not be carried on
         return factors.astype(np.float32).astype(np.float64)

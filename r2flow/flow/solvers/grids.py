@@ -58,6 +58,15 @@ def halved(times: Tensor) -> Tensor:
     return finer
 
 
+def extended(times: Tensor, t_1: float, closing: float) -> Tensor:
+    """The times and further ones that halve the way to t_1, up to `closing` (with its sign) before it."""
+    left = [t_1 - float(times[-1])]
+    while abs(left[-1]) > 2 * abs(closing):
+        left.append(left[-1] / 2)
+    further = [t_1 - way for way in left[1:]] + ([t_1 - closing] if abs(left[-1]) > 1.01 * abs(closing) else [])
+    return torch.cat([times, times.new_tensor(further)])
+
+
 def calibrated_grid(
     velocity: Velocity,
     x_0: Tensor,

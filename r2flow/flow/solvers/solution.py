@@ -25,6 +25,7 @@ class Solution:
         converged: Scenes that reached t_1 with finite values, (B,) bool.
         global_error: Estimated root mean square error over a scene's elements, (B,) float64; inf where no estimate
             could be had; None when not asked for.
+        estimate_evaluations: What the estimate cost of these evaluations, (B,) int64; None when not asked for.
     """
 
     x: Tensor
@@ -34,6 +35,7 @@ class Solution:
     stiff: Tensor
     converged: Tensor
     global_error: Tensor | None = None
+    estimate_evaluations: Tensor | None = None
 
     @classmethod
     def build(cls, x: Tensor, evaluations: np.ndarray, accepted: Any, rejected: Any, stiff: Any, converged: Any):  # type: ignore[no-untyped-def]
@@ -54,6 +56,9 @@ class Evaluations:
     A velocity that treats every scene in a way of its own has a method `select(scenes)`, which returns the velocity
     of these scenes alone, int64 indices into the batch that it was made for. It is called when scenes leave.
 
+    What it was computed in is the coarsest of its type, the autocast around it, the parameters of a module (whose
+    answer may come in x's type) and, where it has one, its attribute `precision`.
+
     Args:
         velocity: v(t, x) with x of shape (B, ...) and t of shape () or (B,).
         scenes: Size of the batch.
@@ -70,7 +75,8 @@ class Evaluations:
         self._progress = progress
         self.counts = np.zeros(scenes, dtype=np.int64)
         self.scenes = np.arange(scenes)
-        self.precision = torch.float32
+        self._own_types = _own_types(velocity)
+        self.precision = torch.float64
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
         self.counts[self.scenes] += 1
@@ -80,10 +86,16 @@ class Evaluations:
                 f"the velocity of a state {tuple(x.shape)} at times {tuple(t.shape)} must have the state's shape, "
                 f"found {tuple(v.shape)}. Does it expand t, one time for each scene?"
             )
-        self.precision = _precision(v, x)
+        self.precision = self.coarsest(v, x)
         if self._progress is not None:
             self._progress()
         return v.to(x.dtype)
+
+    def coarsest(self, *tensors: Tensor) -> torch.dtype:
+        """The type with the fewest digits, among those of the tensors and of what is at work behind the velocity."""
+        kind = tensors[0].device.type
+        around = [torch.get_autocast_dtype(kind)] if torch.is_autocast_enabled(kind) else []
+        return max([*(x.dtype for x in tensors), *around, *self._own_types], key=lambda dtype: torch.finfo(dtype).eps)
 
     def only(self, scenes: np.ndarray) -> None:
         """From now on the state holds these scenes, indices into the original batch."""
@@ -93,12 +105,14 @@ class Evaluations:
             self._velocity = select(torch.from_numpy(scenes))
 
 
-def _precision(v: Tensor, x: Tensor) -> torch.dtype:
-    """What the velocity was computed in, as far as it shows: by its type, or by autocast around it."""
-    kind = x.device.type
-    if v.dtype == x.dtype and torch.is_autocast_enabled(kind):
-        return torch.get_autocast_dtype(kind)
-    return v.dtype
+def _own_types(velocity: Velocity) -> set[torch.dtype]:
+    """The types that a velocity shows without being asked: of a module's parameters, and what it says itself."""
+    said = getattr(velocity, "precision", None)
+    types = {said} if isinstance(said, torch.dtype) else set()
+    module = velocity if isinstance(velocity, torch.nn.Module) else getattr(velocity, "__self__", None)
+    if isinstance(module, torch.nn.Module):
+        types |= {parameter.dtype for parameter in module.parameters() if parameter.is_floating_point()}
+    return types
 
 
 def finite(x: Tensor) -> Tensor:
