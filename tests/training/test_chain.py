@@ -121,11 +121,11 @@ def test_a_chain_killed_at_ten_random_moments_ends_as_the_one_left_alone(
     draw, killed = random.Random(1), 0
     for number in range(10):
         process = start(scans, tmp_path)
-        time.sleep(draw.uniform(5, 16))
+        time.sleep(draw.uniform(4, 8.5))
         if process.poll() is None:
             killed += 1
             kill(process, all_of_it=number % 2 == 0)
-    assert killed >= 3  # the others had come to their end
+    assert killed >= 8  # else it had come to its end before
     run_train(tmp_path, scans, *CHAIN)
     assert_alike(chained[0], tmp_path / "runs" / "demo")
 
