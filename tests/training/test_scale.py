@@ -86,6 +86,7 @@ def test_two_processes_share_one_average_and_one_writes(one: Path, two: Path):
             torch.testing.assert_close(a[name], b[name], rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_in_more_processes(one: Path, scans: Path, tmp_path: Path):
     # Killed at the end of step 18 in one process; steps 19 and 20 in two.
     shutil.copytree(one / "runs", tmp_path / "runs")

@@ -68,7 +68,7 @@ def stop_when(
     return process.returncode, said.decode()
 
 
-@pytest.mark.parametrize(("step", "workers"), [(2, 0), (6, 2)])
+@pytest.mark.parametrize(("step", "workers"), [pytest.param(2, 0, marks=pytest.mark.slow), (6, 2)])
 def test_a_killed_run_ends_as_the_one_left_alone(
     train: Run, alone: tuple[Path, str], scans: Path, tmp_path: Path, step: int, workers: int
 ):
