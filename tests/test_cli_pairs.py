@@ -47,6 +47,7 @@ def test_an_unfinished_run_draws_no_pairs(r2flow, saved):  # noqa: F811
     assert r2flow("pairs", path, *QUICK)[0] == 0
 
 
+@pytest.mark.slow
 def test_three_processes_of_torchrun_and_a_slurm_array_make_the_shards_of_one(saved, tmp_path: Path):  # noqa: F811
     path, _ = saved
 
