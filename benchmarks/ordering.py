@@ -193,7 +193,7 @@ def scans(seed: int, folder: Path) -> dict[str, float]:
     }
     known = np.stack([training[i] for i in range(SCAN_SAMPLES, 2 * SCAN_SAMPLES)])
     extra["floor"] = mean_of(distances(truth, panel(known, first.sensor)))
-    x_0 = noise_of(range(SCAN_SAMPLES), (first.encoding.channels, *first.sensor.shape), seed)
+    x_0 = noise_of(range(SCAN_SAMPLES), first.encoding.shape, seed)
     return measure({name: flow.model for name, flow in flows.items()}, x_0, judge(first, truth), extra)
 
 

@@ -79,7 +79,7 @@ CALLBACKS = Registry(
         SamplePictures,
         lambda config, parts: (Path(config["run_dir"], "pictures"), parts.sensor, parts.encoding, config["seed"]),
     ),
-    curvature=Entry(Curvature, lambda config, parts: ((parts.encoding.channels, *parts.sensor.shape), config["seed"])),
+    curvature=Entry(Curvature, lambda config, parts: (parts.encoding.shape, config["seed"])),
     guard=Entry(Guard, lambda config, parts: (config["run_dir"],)),
     requeue=Entry(Requeue, lambda config, parts: (config["run_dir"],)),
     checkpoint=Entry(keep_checkpoints, lambda config, parts: (Path(config["run_dir"], FOLDER),)),

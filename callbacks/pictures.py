@@ -52,7 +52,7 @@ class SamplePictures(L.Callback):
     def _draw(self, trainer: L.Trainer, pl_module: L.LightningModule, path: Path) -> None:
         from r2flow.reports.pictures import contact_sheet, figure_pixels, save_figure
 
-        shape = (self.encoding.channels, *self.sensor.shape)
+        shape = self.encoding.shape
         x_0 = noise_of(range(self.num), shape, self.seed).to(pl_module.device)
         training = pl_module.training
         with averaged_weights(trainer, pl_module), torch.no_grad():

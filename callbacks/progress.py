@@ -7,6 +7,8 @@ from typing import Any
 import lightning as L
 from lightning.pytorch.callbacks import RichProgressBar
 
+from r2flow.reports.clock import duration
+
 
 class Progress(RichProgressBar):
     """Lightning's rich bar with scans per second; where no one watches, a line every `seconds` instead."""
@@ -62,10 +64,3 @@ class Progress(RichProgressBar):
             f"  {rate * self._scans_per_step(trainer):.1f} scans/s  {duration(left)} left",
             flush=True,
         )
-
-
-def duration(seconds: float) -> str:
-    """75 -> '1:15', 3700 -> '1:01:40'."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

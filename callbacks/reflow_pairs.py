@@ -23,7 +23,9 @@ class ReflowPairs(L.Callback):
             return
         store, num = data.pair_store, data.pairs.num
         device, flow = trainer.strategy.root_device, load_checkpoint(self.init)
-        make_and_tell(store, flow, num, trainer.global_rank, trainer.world_size, device)
+        made = make_and_tell(store, flow, num, trainer.global_rank, trainer.world_size, device)
+        # Another device is given up only after several times what a batch has taken here.
+        patience = max(120.0, 5 * store.recipe.batch_size * made.seconds / max(made.pairs, 1))
         # Files, not a barrier: a collective call gives up after half an hour, and a slow rank may take longer.
-        while not wait_for_others(store, num, launched=trainer.global_rank > 0):
+        while not wait_for_others(store, num, trainer.global_rank > 0, patience=patience):
             make_and_tell(store, flow, num, device=device)  # whoever was to make them is not going to

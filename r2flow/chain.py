@@ -2,7 +2,6 @@
 
 import ctypes
 import json
-import logging
 import signal
 import subprocess
 import sys
@@ -15,8 +14,6 @@ from r2flow.checkpoints import checkpoints_of
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.runs import flatten
-
-log = logging.getLogger(__name__)
 
 RECORD = "link.json"
 

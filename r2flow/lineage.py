@@ -57,18 +57,18 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str]) -> tuple[dict[str, 
     data = config["data"]
     if data["name"] == "pairs":
         data["root"] = data["root"] or str(default_folder(parent.path))
-        data["pairs"] = pairs_of(parent, data["pairs"] or {})
+        data["pairs"] = pairs_of(parent, data["pairs"] or {}, weights)
     return config, parent
 
 
-def pairs_of(parent: Checkpoint, options: Mapping[str, Any]) -> dict[str, Any]:
-    """`data.pairs` for a parent: its hash, and noise that the parent has not been trained on itself."""
+def pairs_of(parent: Checkpoint, options: Mapping[str, Any], weights: str) -> dict[str, Any]:
+    """`data.pairs` for a parent of this `weights_hash`, and noise that it has not been trained on itself."""
     check_options("data.pairs", PairOptions, options)
     first = options.get("first")
     if first is None:
         data = parent.config.get("data", {})
         first = data["pairs"]["first"] + data["pairs"]["num"] if data.get("name") == "pairs" else 0
-    return {**options, "parent": weights_hash(parent), "first": first}
+    return {**options, "parent": weights, "first": first}
 
 
 def check_finished(init: Path, parent: Checkpoint) -> None:

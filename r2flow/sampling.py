@@ -1,35 +1,19 @@
 """From a checkpoint to scans in metres, from scans back to their noise, and from one scan to another."""
 
 import copy
-import json
-import logging
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from r2flow.checkpoints import Checkpoint, weights_hash
+from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
-from r2flow.flow.solvers import (
-    GRIDS,
-    SOLVERS,
-    TORCHDIFFEQ,
-    FixedStep,
-    Solution,
-    adapts,
-    calibrated_grid,
-    check_method,
-    solve,
-)
+from r2flow.flow.solvers import Solution, adapts, check_method, check_tolerance, solve
 from r2flow.flow.straight_exit import solve_straight_first
 from r2flow.lidar.region import Region
 from r2flow.noise import standard_normal
-
-log = logging.getLogger(__name__)
 
 Progress = Callable[[], None] | None
 
@@ -106,7 +90,7 @@ def sample(
     if region is not None:
         seen = evaluated_region(checkpoint, region)
         model = part_of(model, seen)
-    shape = (checkpoint.encoding.channels, *checkpoint.sensor.shape)
+    shape = checkpoint.encoding.shape
     for first in range(0, num, batch_size):
         x_0 = noise_of(range(first, min(first + batch_size, num)), shape, seed)
         x_0 = x_0 if seen is None else seen.crop(x_0)
@@ -164,105 +148,6 @@ def decode(checkpoint: Checkpoint, x: Tensor, channels: str = "both") -> Tensor:
         x = x[:, : encoding.channels]
     image = encoding.decode(x)
     return image[:, 1:] if channels == "reflectance" else image
-
-
-def check_tolerance(tolerance: float) -> None:
-    """Know a tolerance before it is needed.
-
-    Raises:
-        InputError: it is not positive and finite.
-    """
-    if not 0 < tolerance < math.inf:
-        raise InputError(f"a solver's tolerance must be positive and finite, found {tolerance:g}.")
-
-
-def calibrate(
-    checkpoint: Checkpoint, steps: int, method: str = "euler", num: int = 4, progress: Progress = None
-) -> Tensor:
-    """Times that suit a flow better than equal steps (`r2flow.flow.solvers.calibrated_grid`), (steps + 1,) float64.
-
-    The scenes it is found on are none that `sample` draws.
-
-    Args:
-        method: One of ours of fixed steps; its order says how steps weigh.
-        num: Scenes.
-        progress: Called after every evaluation (`evaluations_of_calibration`).
-
-    Raises:
-        InputError: another method, or fewer than one step or scene.
-    """
-    solver = check_grid_solver(method)
-    if num < 1:
-        raise InputError(f"a time grid is found on at least one scene, found {num}.")
-    shape = (checkpoint.encoding.channels, *checkpoint.sensor.shape)
-    x_0 = noise_of(range(num), shape, seed=0, purpose="validation").to(_device(checkpoint.model))
-
-    def velocity(t: Tensor, x: Tensor) -> Tensor:
-        v: Tensor = checkpoint.model(t, x)
-        if progress is not None:
-            progress()
-        return v
-
-    with torch.no_grad():
-        return calibrated_grid(velocity, x_0, steps, order=solver.order, fine=evaluations_of_calibration(steps))
-
-
-def check_grid_solver(method: str) -> FixedStep:
-    """The solver that a grid can be found for.
-
-    Raises:
-        InputError: it is none of ours, or chooses its own steps.
-    """
-    check_method(method)
-    solver = None if method.startswith(TORCHDIFFEQ) else SOLVERS[method]
-    if not isinstance(solver, FixedStep):
-        raise InputError(f"a time grid is for one of our solvers of fixed steps, euler, ab2, rk4; found {method!r}.")
-    return solver
-
-
-def evaluations_of_calibration(steps: int) -> int:
-    """How many evaluations `calibrate` takes."""
-    return max(256, 8 * steps)
-
-
-def write_grid(path: str | Path, times: Tensor, checkpoint: Checkpoint, method: str) -> None:
-    """Times as JSON, with what they were found on and for."""
-    content = {"steps": len(times) - 1, "times": times.tolist()}
-    content |= {"method": method, "checkpoint": weights_hash(checkpoint)}
-    with atomic_write(Path(path), "w") as file:
-        file.write(json.dumps(content, indent=2) + "\n")
-
-
-def read_grid(path: str | Path, checkpoint: Checkpoint) -> Tensor:
-    """Times that `write_grid` has written, (N + 1,) float64; warns where they were found on another flow.
-
-    Raises:
-        InputError: a file that holds something else.
-    """
-    try:
-        content = json.loads(Path(path).read_text("utf-8"))
-        times = torch.tensor([float(t) for t in content["times"]], dtype=torch.float64)
-        steps, owner = content["steps"], content["checkpoint"]
-    except (ValueError, KeyError, TypeError, OverflowError):
-        raise InputError(f"{path} is no time grid; 'r2flow calibrate' makes one.") from None
-    rises = len(times) > 1 and bool((times.diff() > 0).all()) and times[0] == 0 and times[-1] == 1
-    if not rises or steps != len(times) - 1:
-        raise InputError(f"{path} is no time grid: its {len(times)} times must rise from 0 to 1 in {steps} steps.")
-    if owner != weights_hash(checkpoint):
-        log.warning("%s was calibrated on another flow than %s.", path, checkpoint.path)
-    return times
-
-
-def grid_of(text: str, checkpoint: Checkpoint) -> str | Tensor:
-    """A grid by its name, or the times in a file of `write_grid`.
-
-    Raises:
-        InputError: neither.
-    """
-    if text in GRIDS or not (text.endswith(".json") or Path(text).exists()):
-        GRIDS[text]
-        return text
-    return read_grid(text, checkpoint)
 
 
 def _solve(

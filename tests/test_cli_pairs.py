@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from r2flow.checkpoints import load_checkpoint
+from r2flow.checkpoints import load_checkpoint, weights_hash
 from r2flow.data.pairs import PairOptions, PairSource
 from r2flow.data.shards import PairStore
 from r2flow.lineage import pairs_of
@@ -27,7 +27,7 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):  # noqa: F811
         assert words in said
     flow = load_checkpoint(path)
     options = {"num": 10, "method": "euler", "steps": 2, "batch_size": 4}
-    recipe = PairOptions(**pairs_of(flow, options)).recipe((flow.encoding.channels, *flow.sensor.shape))
+    recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(flow.encoding.shape)
     assert len(PairSource(PairStore(folder, recipe), 10)) == 10
     code, said, _ = r2flow("pairs", path, *QUICK)
     assert code == 0

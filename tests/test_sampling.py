@@ -15,22 +15,9 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.region import Region, region
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.outputs import write_samples
-from r2flow.sampling import (
-    calibrate,
-    evaluated_region,
-    evaluations_of_calibration,
-    grid_of,
-    interpolate_scans,
-    invert,
-    noise_of,
-    part_of,
-    read_grid,
-    round_trip,
-    sample,
-    slerp,
-    write_grid,
-)
+from r2flow.sampling import evaluated_region, interpolate_scans, invert, noise_of, part_of, round_trip, sample, slerp
 from r2flow.stages import build_parts
+from r2flow.time_grids import calibrate, evaluations_of_calibration, grid_of, read_grid, write_grid
 from tests.test_checkpoints import CONFIG
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)

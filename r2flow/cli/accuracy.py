@@ -68,10 +68,10 @@ def work_precision(
 ) -> None:
     """Error of every solver against evaluations and time, on exact problems and on a checkpoint."""
     from r2flow.checkpoints import load_checkpoint
+    from r2flow.flow.solvers import check_tolerance
     from r2flow.reports import work_precision as measuring
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.work_precision_page import work_precision_page
-    from r2flow.sampling import check_tolerance
 
     where = choose_device(device)
     names = methods.split(",") if methods else measuring.METHODS

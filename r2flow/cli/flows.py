@@ -46,7 +46,7 @@ def sample(
     """Draw scans from a trained flow: point clouds, range images and pictures."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.reports.outputs import formats_of, write_samples
-    from r2flow.sampling import grid_of
+    from r2flow.time_grids import grid_of
 
     loaded = load_checkpoint(checkpoint, device=choose_device(device))
     times = grid_of(grid, loaded)
@@ -78,8 +78,8 @@ def calibrate(
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.accuracy import bar
     from r2flow.reports.pages import prepare_folder
-    from r2flow.sampling import calibrate as find_grid
-    from r2flow.sampling import check_grid_solver, evaluations_of_calibration, write_grid
+    from r2flow.time_grids import calibrate as find_grid
+    from r2flow.time_grids import check_grid_solver, evaluations_of_calibration, write_grid
 
     if out.suffix != ".json" or out.is_dir():
         raise InputError(f"--out must be a file that ends in .json, found {out}.")

@@ -90,9 +90,9 @@ def savings(
     """What a scene need not cost: own steps, leaving early, one step for the straight, regions, single channels."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.accuracy import bar, command, finish
+    from r2flow.flow.solvers import check_tolerance
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.savings_page import evaluations_of_page, savings_page
-    from r2flow.sampling import check_tolerance
 
     check_tolerance(tolerance)
     loaded = None if checkpoint is None else load_checkpoint(checkpoint, choose_device(device))

@@ -37,7 +37,7 @@ def pairs(
     `python train.py experiment=reflow stage.init=RUN` makes them itself; this makes them alone, under torchrun or as a
     SLURM array, with the settings of `data.pairs`.
     """
-    from r2flow.checkpoints import load_checkpoint
+    from r2flow.checkpoints import load_checkpoint, weights_hash
     from r2flow.data.pairs import PairOptions, default_folder
     from r2flow.data.shards import PairStore
     from r2flow.lineage import check_finished, pairs_of
@@ -63,7 +63,7 @@ def pairs(
         "num": num, "method": solver, "steps": steps, "tolerance": tolerance, "batch_size": batch_size,
         "shard_mib": shard_mib, "seed": seed, "first": first,
     }  # fmt: skip
-    recipe = PairOptions(**pairs_of(flow, options)).recipe((flow.encoding.channels, *flow.sensor.shape))
+    recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(flow.encoding.shape)
     store = PairStore(out or default_folder(flow.path), recipe)
     make_and_tell(store, flow, num, rank, ranks, where)
     lacking = len(store.missing(num))

@@ -115,14 +115,14 @@ class ScanDataModule(L.LightningDataModule):
     def pair_store(self) -> PairStore:
         """The folder of the run's pairs, whatever it holds yet."""
         assert self.pairs is not None
-        shape = (self.encoding.channels, *self.sensor.shape)
+        shape = self.encoding.shape
         return PairStore(str(self.options["root"]), self.pairs.recipe(shape))
 
     def setup(self, stage: str | None = None) -> None:
         if self.training_source is not None:
             return
         if self.pairs is not None:
-            self.pair_store  # noqa: B018  (other pairs in its folder are refused now; missing ones are made later)
+            _ = self.pair_store  # other pairs in its folder are refused now; missing ones are made later
             return
         training, held = self.sources()
         self.training_source = self._kept(training, "training scans")

@@ -35,7 +35,7 @@ class FlowDataset(Dataset[Item]):
 
     def __getitem__(self, key: tuple[int, int]) -> Item:
         k, index = key
-        shape = (self.encoding.channels, *self.encoding.sensor.shape)
+        shape = self.encoding.shape
         draw = noise.generator(self.seed, self.purpose, k)
         x_0 = torch.from_numpy(draw.standard_normal(shape, dtype=np.float32))
         u = torch.tensor(draw.random(dtype=np.float32))

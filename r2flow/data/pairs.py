@@ -1,5 +1,6 @@
 """Reflow pairs (x_0, x_1): noise and where a flow carries it."""
 
+import copy
 import math
 import os
 import platform
@@ -19,7 +20,7 @@ from r2flow import noise
 from r2flow.data.loader import Item
 from r2flow.data.shards import Block, PairStore, Recipe, read_notes
 from r2flow.errors import InputError
-from r2flow.flow.solvers import Velocity, check_method, solve
+from r2flow.flow.solvers import Velocity, check_method, check_tolerance, solve
 
 MIB = 2**20
 
@@ -62,8 +63,7 @@ class PairOptions:
         first = self.first or 0
         if not (0 <= self.seed < 2**63 and 0 <= first < 2**63):
             raise InputError(f"data.pairs: seed and first must be at least 0, found {self.seed} and {first}.")
-        if not (self.tolerance > 0 and math.isfinite(self.tolerance)):
-            raise InputError(f"data.pairs.tolerance must be positive, found {self.tolerance}.")
+        check_tolerance(self.tolerance)
         check_method(self.method)
         batch_bytes = self.batch_size * 2 * int(np.prod(shape))
         return Recipe(
@@ -108,7 +108,6 @@ def make_pairs(
     ranks: int = 1,
     device: torch.device | str = "cpu",
     progress: Callable[[Made], None] = lambda made: None,
-    evaluated: Callable[[], None] | None = None,
 ) -> Made:
     """Make those of the first `num` pairs that are missing or damaged, as one of `ranks` processes.
 
@@ -118,7 +117,6 @@ def make_pairs(
 
     Args:
         progress: Called after each batch that is on the disk.
-        evaluated: Called after each evaluation of the velocity.
 
     Raises:
         InputError: no pair is usable: the flow is broken, or the tolerance out of its reach; or the folder cannot be
@@ -134,7 +132,7 @@ def make_pairs(
     for batch in own:
         if store.has(batch):
             continue
-        block = solve_batch(store.recipe, velocity, batch, device, evaluated)
+        block = solve_batch(store.recipe, velocity, batch, device)
         made.add(block)
         kept.append((batch, block))
         _check_usable(made, store.recipe)
@@ -175,20 +173,12 @@ def _check_usable(made: Made, recipe: Recipe, patience: int = 64) -> None:
         )
 
 
-def solve_batch(
-    recipe: Recipe,
-    velocity: Velocity,
-    batch: int,
-    device: torch.device | str = "cpu",
-    evaluated: Callable[[], None] | None = None,
-) -> Block:
-    """One batch of pairs."""
+def solve_batch(recipe: Recipe, velocity: Velocity, batch: int, device: torch.device | str = "cpu") -> Block:
+    """The pairs first + [b B, (b + 1) B) of batch b."""
     first = recipe.first + batch * recipe.batch_size
     x_0 = torch.stack([pair_noise(recipe, index) for index in range(first, first + recipe.batch_size)])
     with torch.inference_mode():
-        end = solve(
-            velocity, x_0.to(device), 0.0, 1.0, recipe.method, recipe.steps, recipe.tolerance, progress=evaluated
-        )
+        end = solve(velocity, x_0.to(device), 0.0, 1.0, recipe.method, recipe.steps, recipe.tolerance)
     x_1 = end.x.to(torch.float16).cpu()
     usable = end.converged.cpu() & x_1.isfinite().flatten(1).all(1)
     return Block(x_1.numpy(), end.evaluations.cpu().numpy().astype(np.int32), usable.numpy())
@@ -201,16 +191,13 @@ class PairSource:
         InputError: some have yet to be made.
     """
 
-    def __init__(self, store: PairStore, num: int, indices: np.ndarray | None = None) -> None:
-        self.store, self.num = store, num
+    def __init__(self, store: PairStore, num: int) -> None:
+        self.store = store
         if not store.is_whole(num):
             lacking = len(store.missing(num)) * store.recipe.batch_size
             raise InputError(f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
-        if indices is None:
-            flags = [read_notes(store.shard_path(shard))["usable"] for shard in store.shards(num)]
-            usable = np.concatenate([np.array(one, dtype=bool) for one in flags])[:num]
-            indices = np.flatnonzero(usable)
-        self.indices = indices
+        flags = [read_notes(store.shard_path(shard))["usable"] for shard in store.shards(num)]
+        self.indices = np.flatnonzero(np.concatenate([np.array(one, dtype=bool) for one in flags])[:num])
         self._opened: dict[int, Any] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -220,7 +207,9 @@ class PairSource:
         return len(self.indices)
 
     def subset(self, indices: Sequence[int]) -> "PairSource":
-        return PairSource(self.store, self.num, self.indices[np.asarray(indices, dtype=np.int64)])
+        part = copy.copy(self)
+        part.indices, part._opened = self.indices[np.asarray(indices, dtype=np.int64)], {}
+        return part
 
     def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
         from safetensors import SafetensorError, safe_open

@@ -98,6 +98,11 @@ class Encoding:
     def channels(self) -> int:
         return self.format.channels + int(self.reflectance)
 
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(C, H, W) of a scan in model space."""
+        return self.channels, *self.sensor.shape
+
     def encode(self, image: Tensor) -> Tensor:
         """(..., 2 or 1, H, W) in metres and reflectance of [0, 1] -> (..., channels, H, W).
 

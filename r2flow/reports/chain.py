@@ -109,7 +109,7 @@ def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
 
 def bend(flow: Checkpoint, num: int) -> float:
     """int s(t) dt over |x_1 - x_0|^2, median over scenes: 0 is straight."""
-    x_0 = noise_of(range(num), (flow.encoding.channels, *flow.sensor.shape), 0)
+    x_0 = noise_of(range(num), flow.encoding.shape, 0)
     x_0 = x_0.to(next(flow.model.parameters()).device)
     with torch.inference_mode():
         return float(curvature(flow.model, x_0, MANY).normalised.median())

@@ -75,7 +75,7 @@ def measure_paths(
     Raises:
         InputError: fewer than one step.
     """
-    shape = (checkpoint.encoding.channels, *checkpoint.sensor.shape)
+    shape = checkpoint.encoding.shape
     device = next(checkpoint.model.parameters()).device
     batches: list[Paths] = []
     for first in range(0, num, batch_size):

@@ -12,11 +12,11 @@ from r2flow.checkpoints import Checkpoint
 from r2flow.data.sources import read_scan
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.flow.solvers import check_method
+from r2flow.flow.solvers import check_method, check_tolerance
 from r2flow.reports.outputs import ScanBar, evaluations_of
 from r2flow.reports.pages import Page, prepare_folder, table
 from r2flow.reports.views import range_image
-from r2flow.sampling import Inversion, check_tolerance, invert, round_trip
+from r2flow.sampling import Inversion, invert, round_trip
 
 COLUMNS = {
     "scan": "scan",

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from r2flow.checkpoints import Checkpoint
 from r2flow.data.pairs import Made, make_pairs
 from r2flow.data.shards import PairStore
+from r2flow.reports.clock import duration
 
 
 def make_and_tell(
@@ -61,7 +62,7 @@ class _Teller:
             return
         self.last = now
         left = max(self.total - made.pairs, 0) * made.seconds / made.pairs
-        print(f"{self.who}pair {made.pairs}/{self.total}  {rate(made)}  {left:.0f} s left", flush=True)
+        print(f"{self.who}pair {made.pairs}/{self.total}  {rate(made)}  {duration(left)} left", flush=True)
 
 
 def wait_for_others(

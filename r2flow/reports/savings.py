@@ -137,7 +137,7 @@ def scene_rows(checkpoint: Checkpoint, num: int, tolerance: float, seed: int, ad
         InputError: the flow has none.
     """
     model = checkpoint.model
-    x_0 = noise_of(range(num), (checkpoint.encoding.channels, *checkpoint.sensor.shape), seed).to(_device(model))
+    x_0 = noise_of(range(num), checkpoint.encoding.shape, seed).to(_device(model))
     counted = _Counted(model, advance)
     with torch.inference_mode():
         tight = solve(counted, x_0, method="dopri5", tolerance=TIGHT)
@@ -177,7 +177,7 @@ def regions_to_measure(shape: tuple[int, int]) -> dict[str, tuple[Region, Region
 
 def region_rows(checkpoint: Checkpoint, num: int, steps: int, seed: int, advance: Progress) -> list[Row]:
     """Parts of the image against the same pixels of the whole one, from the same noise and in the same steps."""
-    x_0 = noise_of(range(num), (checkpoint.encoding.channels, *checkpoint.sensor.shape), seed)
+    x_0 = noise_of(range(num), checkpoint.encoding.shape, seed)
     wanted = regions_to_measure(checkpoint.sensor.shape)
     regions = {"the whole image": region(checkpoint.sensor.shape)}
     regions |= {name: evaluated_region(checkpoint, generated) for name, (_, generated) in wanted.items()}

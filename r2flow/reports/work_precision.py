@@ -154,7 +154,7 @@ def checkpoint_subject(
 
 def starts(checkpoint: Checkpoint, num: int, seed: int) -> Tensor:
     """x_0 of scenes 0 to num - 1 of a seed, on the model's device."""
-    shape = (checkpoint.encoding.channels, *checkpoint.sensor.shape)
+    shape = checkpoint.encoding.shape
     return noise_of(range(num), shape, seed).to(next(checkpoint.model.parameters()).device)
 
 

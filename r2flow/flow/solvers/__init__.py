@@ -26,7 +26,7 @@ from r2flow.registry import Registry
 
 __all__ = [
     "FLOOR", "GRIDS", "SOLVERS", "TORCHDIFFEQ", "FixedStep", "Pair", "Solution", "Velocity",
-    "adapts", "calibrated_grid", "check_method", "solve",
+    "adapts", "calibrated_grid", "check_method", "check_tolerance", "solve",
 ]  # fmt: skip
 
 SOLVERS: Registry[FixedStep | Pair] = Registry(
@@ -146,6 +146,16 @@ def check_method(method: str) -> None:
         SOLVERS[method]
 
 
+def check_tolerance(tolerance: float) -> None:
+    """Know a tolerance before it is needed.
+
+    Raises:
+        InputError: it is not positive and finite.
+    """
+    if not 0 < tolerance < math.inf:
+        raise InputError(f"a solver's tolerance must be positive and finite, found {tolerance:g}.")
+
+
 def adapts(method: str) -> bool:
     """Whether a method chooses its steps by a tolerance."""
     if method.startswith(TORCHDIFFEQ):
@@ -186,8 +196,7 @@ def _check_numbers(
         raise InputError(f"a solution needs two times, found {t_0} and {t_1}.")
     if steps < 1:
         raise InputError(f"a solver needs at least 1 step, found {steps}.")
-    if not (tolerance > 0 and math.isfinite(tolerance)):
-        raise InputError(f"a solver's tolerance must be positive, found {tolerance}.")
+    check_tolerance(tolerance)
     if not (finish == 0 or 0 < finish < abs(t_1 - t_0)):
         raise InputError(f"the last stretch must be shorter than the whole way from {t_0} to {t_1}, found {finish}.")
     if max_evaluations < 2:
