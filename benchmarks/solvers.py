@@ -21,26 +21,12 @@ from r2flow.flow.problems import Gaussian, Mixed, Problem, RayDrop, Straight, Tw
 from r2flow.flow.solvers import Velocity, solve
 from r2flow.lidar.sensors import build_sensor
 from r2flow.noise import standard_normal
+from r2flow.reports.savings import one_state
 
 
 def noise(scenes: int, elements: int, seed: int) -> Tensor:
     """x_0, (scenes, elements)."""
     return torch.stack([standard_normal((elements,), seed, "evaluation", scene) for scene in range(scenes)])
-
-
-def as_one_state(velocity: Velocity, x_0: Tensor, tolerance: float) -> tuple[Tensor, int]:
-    """End and evaluations, times the scenes, of torchdiffeq's dopri5 on the whole batch."""
-    import torchdiffeq
-
-    count = 0
-
-    def counted(t: Tensor, x: Tensor) -> Tensor:
-        nonlocal count
-        count += 1
-        return velocity(t, x)
-
-    end = torchdiffeq.odeint(counted, x_0, torch.tensor([0.0, 1.0]), rtol=tolerance, atol=tolerance, method="dopri5")
-    return end[-1], count * len(x_0)
 
 
 def errors(x: Tensor, exact: Tensor) -> Tensor:
@@ -60,8 +46,8 @@ def mixed_batch(seeds: int, elements: int) -> None:
                 x_0 = noise(16, elements, seed)
                 exact = batch.solution(x_0, 1.0)
                 solution = solve(batch, x_0, method=method, tolerance=tolerance)
-                end, evaluations = as_one_state(batch, x_0, tolerance)
-                shares.append(solution.evaluations.sum().item() / evaluations)
+                end, evaluations = one_state(batch, x_0, tolerance)
+                shares.append(int(solution.evaluations.sum()) / int(evaluations.sum()))
                 ours.append(errors(solution.x, exact).max().item())
                 theirs.append(errors(end, exact).max().item())
             lower = sum(a < b for a, b in zip(ours, theirs, strict=True))
@@ -84,7 +70,7 @@ def hard_among_easy(elements: int) -> None:
             x_0 = noise(size, elements, 0)
             exact = batch.solution(x_0, 1.0)
             ours = errors(solve(batch, x_0, method="dopri5", tolerance=1e-3).x, exact)[0]
-            theirs = errors(as_one_state(batch, x_0, 1e-3)[0], exact)[0]
+            theirs = errors(one_state(batch, x_0, 1e-3)[0], exact)[0]
             found.append(f"{ours:.1e} / {theirs:.1e}")
         print(f"  {name:10s}" + "   ".join(found))
 
