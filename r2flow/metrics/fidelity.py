@@ -13,6 +13,7 @@ import numpy as np
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor
+from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
 from r2flow.noise import generator, standard_normal
 
 Statistic = Callable[[np.ndarray, Sensor], np.ndarray]
@@ -67,13 +68,6 @@ def height_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     return np.histogram(z[images[:, 0] > 0], np.linspace(-3.5, 4, 31))[0]
 
 
-def birds_eye_histogram(xyz: np.ndarray) -> np.ndarray:
-    """Points (N, 3) from above, counted in 100 x 100 bins over +-80 m where 3 m < r < 70 m, (100, 100)."""
-    r = np.linalg.norm(xyz, axis=1)
-    x, y, _ = xyz[(r > 3) & (r < 70)].T
-    return np.histogram2d(x, y, bins=100, range=[[-80, 80], [-80, 80]])[0]
-
-
 def birds_eye(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     """The bird's-eye histograms of all scans, added: what the field's JSD compares."""
     rays = sensor.rays()
@@ -83,23 +77,6 @@ def birds_eye(images: np.ndarray, sensor: Sensor) -> np.ndarray:
 def mean_difference(a: np.ndarray, b: np.ndarray) -> float:
     """Mean |a - b| over the rows."""
     return float(np.abs(a - b).mean())
-
-
-def js_distance(a: np.ndarray, b: np.ndarray) -> float:
-    """sqrt of the Jensen-Shannon divergence, natural logarithm: 0 for equal, sqrt(ln 2) = 0.833 for disjoint.
-
-    An empty histogram, a set without any return, is as far as can be from any other.
-    """
-    if a.sum() == 0 or b.sum() == 0:
-        return 0.0 if a.sum() == b.sum() else float(np.sqrt(np.log(2)))
-    p, q = a.ravel() / a.sum(), b.ravel() / b.sum()
-    m = (p + q) / 2
-
-    def divergence(x: np.ndarray) -> float:
-        held = x > 0
-        return float((x[held] * np.log(x[held] / m[held])).sum())
-
-    return float(np.sqrt(max(divergence(p) + divergence(q), 0.0) / 2))
 
 
 PANEL: dict[str, tuple[Statistic, Callable[[np.ndarray, np.ndarray], float]]] = {

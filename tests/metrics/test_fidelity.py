@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from r2flow.lidar.sensors import SENSORS
-from r2flow.metrics.fidelity import PANEL, birds_eye_histogram, controls, distances, js_distance, nearest, panel
+from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
+from r2flow.metrics.fidelity import PANEL, controls, distances, nearest, panel
 from r2flow.reports.fidelity import fidelity, markdown
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
