@@ -1,5 +1,7 @@
 """How fast the simulator is: scans per second on one core (it uses no more), and where the time goes.
 
+Times are the process's own, so that what else runs on the machine counts for little.
+
 python benchmarks/simulator.py --scans 40
 """
 
@@ -19,13 +21,13 @@ from r2flow.simulator.returns import report
 
 
 def milliseconds(work: Callable[[int], object], times: int) -> float:
-    """Median time of work(0), work(1), ... after one unmeasured call."""
+    """Median processor time of work(0), work(1), ... after one unmeasured call."""
     work(0)
     taken = []
     for index in range(times):
-        start = time.perf_counter()
+        start = time.process_time()
         work(index)
-        taken.append(time.perf_counter() - start)
+        taken.append(time.process_time() - start)
     return 1e3 * float(np.median(taken))
 
 
@@ -47,15 +49,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scans", type=int, default=40, help="scans per measurement")
     times = parser.parse_args().scans
-    hdl64e = SENSORS["hdl64e"]
-    sensors = [hdl64e, hdl64e.resized(32, 256), SENSORS["hdl32e"], SENSORS["vlp16"]]
-    print(f"{'sensor':10s} {'size':>10s} {'ms':>7s} {'scans/s':>8s}   scene   rays  returns (ms)")
+    sensors = [sensor for _, sensor in SENSORS.items()]
+    sensors.insert(1, SENSORS["hdl64e"].resized(32, 256))
+    print(f"{'sensor':12s} {'size':>10s} {'ms':>7s} {'scans/s':>8s}   scene   rays  returns (ms)")
     for sensor in sensors:
         whole = milliseconds(lambda index, sensor=sensor: simulate(sensor, 0, index), times)
         share = parts(sensor, times)
         size = "x".join(map(str, sensor.shape))
         print(
-            f"{sensor.name:10s} {size:>10s} {whole:7.1f} {1e3 / whole:8.1f} "
+            f"{sensor.name:12s} {size:>10s} {whole:7.1f} {1e3 / whole:8.1f} "
             f"{share['scene']:7.1f} {share['rays']:6.1f} {share['returns']:8.1f}"
         )
 

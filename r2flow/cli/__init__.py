@@ -7,7 +7,16 @@ from typing import Any
 
 import typer
 
-from r2flow.cli import accuracy, compare, flows, inversion, measure, pairs, scans  # noqa: F401 (each enters its verbs)
+from r2flow.cli import (  # noqa: F401 (each enters its verbs)
+    accuracy,
+    compare,
+    flows,
+    inversion,
+    measure,
+    pairs,
+    scans,
+    simulate,
+)
 from r2flow.cli.app import app
 from r2flow.errors import InputError, explain_mistake
 

@@ -1,12 +1,12 @@
 """How far one set of scans lies from another, line by line: statistics that need no trained network.
 
 Each member of the panel turns a set of range images into a histogram (or a profile over rows) and compares
-two sets by Jensen-Shannon distance (or the mean absolute difference). One member alone can be fooled: pixels
-shuffled across scans have nearly the right bird's-eye view, and no gradients at all. Read them together, and
-next to the controls, which know nothing of scenes.
+two sets by Jensen-Shannon distance (or the mean absolute difference). Every member looks at more than one pixel
+at a time: what counts pixels one by one, `PER_PIXEL`, cannot tell a real drive from pixels shuffled across the
+scans of another, and judges nothing. Read them together, and next to the controls, which know nothing of scenes.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
@@ -14,29 +14,19 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
+from r2flow.metrics.surfaces import bridged, drop_rate, normals
 from r2flow.noise import generator, standard_normal
 
 Statistic = Callable[[np.ndarray, Sensor], np.ndarray]
+Member = tuple[Statistic, Callable[[np.ndarray, np.ndarray], float]]
 
 GRADIENTS = np.concatenate([[0], np.geomspace(0.01, 80, 24)])  # metres
 RUNS = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 256, 512, 1025, 4097])  # pixels
-
-
-def fill_row(images: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Share of each row's rays that returned, (H,)."""
-    return (images[:, 0] > 0).mean((0, 2))
-
-
-def range_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Ranges in 32 bins of equal logarithmic width."""
-    r = images[:, 0][images[:, 0] > 0]
-    edges = np.linspace(np.log(sensor.min_range), np.log(sensor.max_range), 33)
-    return np.histogram(np.log(r), edges)[0]
-
-
-def reflectance_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Reflectance in 25 bins."""
-    return np.histogram(images[:, 1][images[:, 0] > 0], np.linspace(0, 1.0001, 26))[0]
+REFLECTANCES = np.linspace(0, 1.0001, 26)
+INCIDENCES = np.cos(np.linspace(np.pi / 2, 0, 11))  # cosines, in steps of 9 degrees
+DENSITIES = np.array([0.5, 1.5, 2.5, 4.5, 8.5, 16.5, 32.5, 64.5, 128.5, 256.5, np.inf])  # points
+APART = 128, 512  # parts of a turn between the two pixels of a pair: of ranges, of reflectances
+AT_ONCE = 32  # scans: normals of a thousand at once would fill the memory
 
 
 def gradient_azimuth(images: np.ndarray, sensor: Sensor) -> np.ndarray:
@@ -62,6 +52,96 @@ def run_lengths(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     return np.histogram(length, RUNS, weights=length)[0]
 
 
+def changes_row(images: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Share of each row's neighbours of which one returned and the other did not, (H,)."""
+    returned = images[:, 0] > 0
+    return (returned != np.roll(returned, -1, axis=-1)).mean((0, 2))
+
+
+def drop_range(images: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Share of rays lost in each of 12 logarithmic bins of range from 3 m on, (12,); 0 where a bin has no rays.
+
+    The range of a lost ray is the mean of its neighbours' in the row; gaps of more than 16 columns are no losses.
+    """
+    r = images[:, 0]
+    return _share(drop_rate(bridged(r, r > 0), r == 0, range_bins(sensor)))
+
+
+def range_bins(sensor: Sensor) -> np.ndarray:
+    """Edges of the bins of `drop_range` in metres, (13,); nearer than 3 m there is little but the own car."""
+    return np.geomspace(3.0, sensor.max_range, 13)
+
+
+def drop_incidence(images: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Share of rays lost in each of 10 bins of the angle of incidence, (10,); where it is as in `drop_range`."""
+    counts = np.zeros((2, len(INCIDENCES) - 1))
+    for r in _chunks(images):
+        _, cosine = normals(r, sensor)
+        counts += drop_rate(bridged(cosine, np.isfinite(cosine)), r == 0, INCIDENCES)
+    return _share(counts)
+
+
+def _share(counts: np.ndarray) -> np.ndarray:
+    return counts[0] / np.maximum(counts[1], 1)
+
+
+def surface_normals(images: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Upward parts n_z of the surfaces' normals, -1 to 1, in 20 bins."""
+    found = [np.histogram(normals(r, sensor)[0], np.linspace(-1, 1, 21))[0] for r in _chunks(images)]
+    return np.sum(found, axis=0)
+
+
+def incidence(images: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Cosines of the angle at which rays meet surfaces, in 20 bins."""
+    found = [np.histogram(normals(r, sensor)[1], np.linspace(0, 1, 21))[0] for r in _chunks(images)]
+    return np.sum(found, axis=0)
+
+
+def _chunks(images: np.ndarray) -> Iterator[np.ndarray]:
+    for start in range(0, len(images), AT_ONCE):
+        yield images[start : start + AT_ONCE, 0]
+
+
+def range_pairs(images: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Ranges of pixels 2.8 degrees of azimuth apart, in 16 x 16 bins of equal logarithmic width."""
+    edges = np.geomspace(sensor.min_range, sensor.max_range, 17)
+    return _pairs(images[:, 0], images[:, 0] > 0, edges, APART[0])
+
+
+def reflectance_pairs(images: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Reflectances of pixels 0.7 degrees of azimuth apart, in 13 x 13 bins."""
+    return _pairs(images[:, 1], images[:, 0] > 0, np.linspace(0, 1.0001, 14), APART[1])
+
+
+def _pairs(x: np.ndarray, known: np.ndarray, edges: np.ndarray, parts: int) -> np.ndarray:
+    by = -max(x.shape[-1] // parts, 1)
+    both = known & np.roll(known, by, axis=-1)
+    return np.histogram2d(x[both], np.roll(x, by, axis=-1)[both], [edges, edges])[0]
+
+
+def birds_eye_density(images: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """How many others of its scan share a point's 1.6 m cell of the bird's-eye view, in 10 bins."""
+    counts = [_from_above(image, sensor) for image in images]
+    return np.sum([np.histogram(count, DENSITIES, weights=count)[0] for count in counts], axis=0)
+
+
+def fill_row(images: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Share of each row's rays that returned, (H,)."""
+    return (images[:, 0] > 0).mean((0, 2))
+
+
+def range_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Ranges in 32 bins of equal logarithmic width."""
+    r = images[:, 0][images[:, 0] > 0]
+    edges = np.linspace(np.log(sensor.min_range), np.log(sensor.max_range), 33)
+    return np.histogram(np.log(r), edges)[0]
+
+
+def reflectance_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Reflectance in 25 bins."""
+    return np.histogram(images[:, 1][images[:, 0] > 0], REFLECTANCES)[0]
+
+
 def height_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Heights z of the points from 3.5 m below the sensor to 4 m above, in 25 cm bins."""
     z = images[:, 0] * np.sin(sensor.rays()[0].numpy())
@@ -70,36 +150,54 @@ def height_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 def birds_eye(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     """The bird's-eye histograms of all scans, added: what the field's JSD compares."""
-    rays = sensor.rays()
-    return np.sum([birds_eye_histogram(image_to_points(image, rays)[0]) for image in images], axis=0)
+    return np.sum([_from_above(image, sensor) for image in images], axis=0)
+
+
+def _from_above(image: np.ndarray, sensor: Sensor) -> np.ndarray:
+    return birds_eye_histogram(image_to_points(image, sensor.rays())[0])
 
 
 def mean_difference(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean |a - b| over the rows."""
+    """Mean |a - b| over the rows or bins."""
     return float(np.abs(a - b).mean())
 
 
-PANEL: dict[str, tuple[Statistic, Callable[[np.ndarray, np.ndarray], float]]] = {
-    "fill per row": (fill_row, mean_difference),
-    "range histogram": (range_histogram, js_distance),
-    "reflectance histogram": (reflectance_histogram, js_distance),
+PANEL: dict[str, Member] = {
     "gradient, azimuth": (gradient_azimuth, js_distance),
     "gradient, elevation": (gradient_elevation, js_distance),
     "run lengths": (run_lengths, js_distance),
+    "changes per row": (changes_row, mean_difference),
+    "drop rate by range": (drop_range, mean_difference),
+    "drop rate by incidence": (drop_incidence, mean_difference),
+    "surface normals": (surface_normals, js_distance),
+    "incidence": (incidence, js_distance),
+    "range pairs": (range_pairs, js_distance),
+    "reflectance pairs": (reflectance_pairs, js_distance),
+    "bird's-eye density": (birds_eye_density, js_distance),
+}
+
+# Dropped from the panel: sums over pixels one by one, which pixels shuffled across real scans have as real ones do.
+PER_PIXEL: dict[str, Member] = {
+    "fill per row": (fill_row, mean_difference),
+    "range histogram": (range_histogram, js_distance),
+    "reflectance histogram": (reflectance_histogram, js_distance),
     "height histogram": (height_histogram, js_distance),
     "bird's-eye JSD": (birds_eye, js_distance),
 }
 
+_OF_REFLECTANCE = ("reflectance pairs", "reflectance histogram")
 
-def panel(images: np.ndarray, sensor: Sensor) -> dict[str, np.ndarray]:
+
+def panel(images: np.ndarray, sensor: Sensor, members: Mapping[str, Member] = PANEL) -> dict[str, np.ndarray]:
     """Every statistic of a set of range images, (N, 2 or 1, H, W); reflectance only where there is some."""
-    chosen = {n: s for n, (s, _) in PANEL.items() if images.shape[1] > 1 or s is not reflectance_histogram}
+    chosen = {n: s for n, (s, _) in members.items() if images.shape[1] > 1 or n not in _OF_REFLECTANCE}
     return {name: statistic(images, sensor) for name, statistic in chosen.items()}
 
 
-def distances(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> dict[str, float]:
-    """Line by line, the distance between two sets' panels; 0 is equal."""
-    return {name: PANEL[name][1](a[name], b[name]) for name in a if name in b}
+def distances(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Line by line, the distance between two sets' statistics; 0 is equal."""
+    known = PANEL | PER_PIXEL
+    return {name: known[name][1](a[name], b[name]) for name in a if name in b}
 
 
 def controls(training: np.ndarray, sensor: Sensor, num: int, seed: int = 0) -> dict[str, np.ndarray]:

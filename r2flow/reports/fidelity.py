@@ -1,5 +1,7 @@
-"""One set of scans beside another and beside controls, as a table."""
+"""One set of scans beside real ones: next to other real drives, and next to controls that know nothing of scenes."""
 
+from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +12,16 @@ from r2flow.errors import InputError
 from r2flow.lidar.projection import Projection
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import Sensor
-from r2flow.metrics.fidelity import controls, distances, nearest, panel
+from r2flow.metrics.fidelity import PANEL, PER_PIXEL, controls, distances, nearest, panel
 from r2flow.reports.views import range_image, scans_of
+
+Statistics = Mapping[str, np.ndarray]
+Distances = Mapping[str, Mapping[str, float]]
+
+MEMBERS = PANEL | PER_PIXEL
+DRIVE = 4  # scans: fewer are no drive that another can be compared to
+CLEARLY = 0.5  # a member tells controls from real scans where the floor is below this share of the nearest control
+WITHIN = 2.0  # floors: as near to the real scans as can be asked of scans of other places
 
 
 def load_images(
@@ -42,37 +52,75 @@ def load_images(
             found, wanted = ("x".join(map(str, shape)) for shape in (image.shape[1:], sensor.shape))
             raise InputError(f"{file} is a range image of {found}, the sensor's is {wanted}; give --size {found}.")
         images.append(image)
-    channels = min(len(image) for image in images)
-    return np.stack([image[:channels] for image in images])
+    return joined(images)
+
+
+def joined(sets: Sequence[np.ndarray]) -> np.ndarray:
+    """Images, or sets of them, as one set; with reflectance where all have it."""
+    sets = [s[None] if s.ndim == 3 else s for s in sets]
+    channels = min(s.shape[1] for s in sets)
+    return np.concatenate([s[:, :channels] for s in sets])
+
+
+def drives_of(path: str | Path, most: int = 1000) -> list[str]:
+    """The drive of each scan that `load_images` reads: the folder that the file lies in."""
+    return [str(file.parent) for file in scans_of(Path(path), most)]
 
 
 def fidelity(
-    real: np.ndarray, other: np.ndarray, sensor: Sensor, training: np.ndarray | None = None, seed: int = 0
+    real: np.ndarray,
+    other: np.ndarray,
+    sensor: Sensor,
+    training: np.ndarray | None = None,
+    seed: int = 0,
+    floor: np.ndarray | None = None,
+    drives: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Distances from `real` of `other`, of the training scans where given, and of four controls.
+    """Distances from `real` of `other`, of other real scans where there are any, and of four controls.
 
-    The controls are made of the training scans; without these, of the real ones, which flatters them.
+    The controls are made of the training scans; without these of the floor's; without these of the real ones, which
+    flatters them. The floor, what a set of real scans of other places comes to, is the distance of the floor's
+    scans; without these of the training scans; without these the mean distance of two of the real drives.
+
+    Args:
+        floor: Further real scans, of other places than `real`.
+        drives: For each real scan the name of its drive; drives of fewer than 4 scans are not compared.
 
     Returns:
-        `{sets: {name: {line: distance}}, won: [line], lost: [line], nearest: {name: (median, least)}}`; a line
-        is won where `other` is nearer to `real` than every control.
+        `{sets: {name: {line: distance}}, floor: {line: distance}, floor_is: name, blind: [line], won: [line],
+        lost: [line], beyond: [line], per_pixel: {name: {line: distance}}, nearest: {name: (median, least)}}`.
+        A line is won where `other` is nearer to `real` than every control, and beyond where it is more than twice
+        the floor away; lines that do not tell this floor from the controls are blind and neither won nor lost.
     """
-    channels = min(s.shape[1] for s in (real, other, training) if s is not None)
-    real, other = real[:, :channels], other[:, :channels]
-    training = None if training is None else training[:, :channels]
-    truth = panel(real, sensor)
-    base = real if training is None else training
-    sets = {"other": other}
-    if training is not None:
-        sets["training scans"] = training
-    made = controls(base, sensor, max(len(other), 8), seed)
-    table = {name: distances(panel(images, sensor), truth) for name, images in {**sets, **made}.items()}
-    won = [line for line in table["other"] if table["other"][line] < min(table[name][line] for name in made)]
+    return compare_sets(real, other, sensor, training, seed, floor, drives)[0]
+
+
+def compare_sets(
+    real: np.ndarray,
+    other: np.ndarray,
+    sensor: Sensor,
+    training: np.ndarray | None = None,
+    seed: int = 0,
+    floor: np.ndarray | None = None,
+    drives: Sequence[str] = (),
+) -> tuple[dict[str, Any], dict[str, Statistics]]:
+    """What `fidelity` returns, and the statistics of every set that it comes from."""
+    given = {"real": real, "other": other, "other real scans": floor, "training scans": training}
+    sets = {name: images for name, images in given.items() if images is not None}
+    channels = min(images.shape[1] for images in sets.values())
+    sets = {name: images[:, :channels] for name, images in sets.items()}
+    made = controls(_base(sets), sensor, max(len(other), 8), seed)
+    statistics: dict[str, Statistics] = {
+        name: panel(images, sensor, MEMBERS) for name, images in {**sets, **made}.items()
+    }
+    table = {name: distances(found, statistics["real"]) for name, found in statistics.items() if name != "real"}
+    if between := _between_drives(sets["real"], drives, sensor):
+        table = {"other": table.pop("other"), "drive against drive": between, **table}
     result: dict[str, Any] = {
-        "sizes": {"real": len(real), "other": len(other), "training": 0 if training is None else len(training)},
-        "sets": table,
-        "won": won,
-        "lost": [line for line in table["other"] if line not in won],
+        "sizes": {name.removesuffix(" scans"): len(images) for name, images in sets.items()},
+        "sets": _members(table, PANEL),
+        **_verdicts(_members(table, PANEL), list(made)),
+        "per_pixel": _members(table, PER_PIXEL),
     }
     if training is not None:
         compared = {
@@ -82,23 +130,87 @@ def fidelity(
             **{name: nearest(images, training, sensor) for name, images in made.items()},
         }
         result["nearest"] = {name: (float(np.median(d)), float(d.min())) for name, d in compared.items()}
-    return result
+    return result, statistics
+
+
+def _members(table: Distances, members: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    return {name: {line: value for line, value in d.items() if line in members} for name, d in table.items()}
+
+
+def _verdicts(table: Distances, made: Sequence[str]) -> dict[str, Any]:
+    """The floor, and the lines that are blind, won, lost and beyond it."""
+    floor_is = next((n for n in ("other real scans", "training scans", "drive against drive") if n in table), None)
+    found, floor = table["other"], dict(table[floor_is]) if floor_is else {}
+    least = {line: min(table[name][line] for name in made) for line in found}
+    blind = [line for line in floor if floor[line] > CLEARLY * least[line]]
+    seeing = [line for line in found if line not in blind]
+    return {
+        "floor_is": floor_is,
+        "floor": floor,
+        "blind": blind,
+        "won": [line for line in seeing if found[line] < least[line]],
+        "lost": [line for line in seeing if found[line] >= least[line]],
+        "beyond": [line for line in seeing if floor and found[line] > WITHIN * floor[line]],
+    }
+
+
+def _base(sets: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The scans that controls are made of: real ones, if possible not those that they are held against."""
+    return next(sets[name] for name in ("training scans", "other real scans", "real") if name in sets)
+
+
+def _between_drives(real: np.ndarray, drives: Sequence[str], sensor: Sensor) -> dict[str, float]:
+    """The mean distance of two drives, over all pairs of them; empty where there are not two."""
+    names = [name for name in dict.fromkeys(drives) if drives.count(name) >= DRIVE]
+    found = [panel(real[[d == name for d in drives]], sensor, MEMBERS) for name in names]
+    pairs = [distances(a, b) for a, b in combinations(found, 2)]
+    return {line: float(np.mean([pair[line] for pair in pairs])) for line in pairs[0]} if pairs else {}
 
 
 def markdown(result: dict[str, Any], name: str = "other") -> str:
     """The result as Markdown tables; `name` stands for the set that was judged."""
     sets = {(name if key == "other" else key): value for key, value in result["sets"].items()}
-    lines = ["| distance to the real scans | " + " | ".join(sets) + " |", "|---" * (len(sets) + 1) + "|"]
+    ratio = bool(result["floor"])
+    heading = [*sets, f"{name} / floor"] if ratio else [*sets]
+    lines = ["| distance to the real scans | " + " | ".join(heading) + " |", "|---" * (len(heading) + 1) + "|"]
     for line in result["sets"]["other"]:
-        values = " | ".join(
-            f"**{v[line]:.3f}**" if n == name and line in result["won"] else f"{v[line]:.3f}" for n, v in sets.items()
-        )
-        lines.append(f"| {line} | {values} |")
+        cells = [f"{v[line]:.4f}" for v in sets.values()]
+        if line in result["won"]:
+            cells[0] = f"**{cells[0]}**"
+        if ratio:
+            cells.append(f"{result['sets']['other'][line] / max(result['floor'][line], 1e-9):.2f}")
+        lines.append(f"| {line} | " + " | ".join(cells) + " |")
     lines += ["", f"Nearer to the real scans than every control (bold): {', '.join(result['won']) or 'nowhere'}."]
     lines += [f"Not yet: {', '.join(result['lost']) or 'nowhere'}."]
+    lines += ["", *_about_the_floor(result)]
     if "nearest" in result:
         lines += ["", "| distance to the nearest training scan | median | least |", "|---|---|---|"]
         for key, (median, least) in result["nearest"].items():
             lines.append(f"| {name if key == 'other' else key} | {median:.3f} | {least:.3f} |")
     sizes = ", ".join(f"{count} {key}" for key, count in result["sizes"].items() if count)
     return "\n".join([*lines, "", f"Scans: {sizes}."])
+
+
+def _about_the_floor(result: dict[str, Any]) -> list[str]:
+    if not result["floor"]:
+        return ["No floor: give --floor OTHER_REAL, or real scans of several drives, to see what real scans come to."]
+    meant = {
+        "other real scans": "the distance of the real scans given as --floor",
+        "training scans": "the distance of the training scans",
+        "drive against drive": "the mean distance of two of the real drives",
+    }[result["floor_is"]]
+    lines = [f"The floor is {meant}. Farther than twice the floor: {', '.join(result['beyond']) or 'nowhere'}."]
+    if result["blind"]:
+        lines.append(f"Not judged, as they hardly tell this floor from the controls: {', '.join(result['blind'])}.")
+    return lines
+
+
+def per_pixel_table(result: dict[str, Any], name: str = "other") -> str:
+    """The statistics of single pixels, which judge nothing, as a Markdown table."""
+    sets = {(name if key == "other" else key): value for key, value in result["per_pixel"].items()}
+    lines = ["| distance to the real scans | " + " | ".join(sets) + " |", "|---" * (len(sets) + 1) + "|"]
+    lines += [
+        f"| {line} | " + " | ".join(f"{v[line]:.4f}" for v in sets.values()) + " |"
+        for line in result["per_pixel"]["other"]
+    ]
+    return "\n".join(lines)

@@ -16,6 +16,8 @@ from r2flow.simulator.returns import report
 from r2flow.simulator.scene import Scene
 from r2flow.simulator.streets import draw_scene
 
+REVISION = 2  # of what is drawn: another number for every change after which a seed gives other scans
+
 
 @dataclass(frozen=True)
 class SimulatedScan:
@@ -46,4 +48,4 @@ def observe(scene: Scene, sensor: Sensor, rng: np.random.Generator) -> Simulated
     return SimulatedScan(image, labels)
 
 
-__all__ = ["Scene", "SimulatedScan", "draw_scene", "observe", "simulate"]
+__all__ = ["REVISION", "Scene", "SimulatedScan", "draw_scene", "observe", "simulate"]

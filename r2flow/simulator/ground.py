@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from r2flow.simulator.exact import sine
 from r2flow.simulator.labels import LABELS
 from r2flow.simulator.materials import INDEX, column
 from r2flow.simulator.rays import Rays
@@ -19,7 +20,7 @@ Where = Any
 
 
 def _sin(x: Where) -> Where:
-    return math.sin(x) if isinstance(x, float) else np.sin(x)  # numpy takes ten times as long for a number
+    return math.sin(x) if isinstance(x, float) else sine(x)  # numpy takes ten times as long for a number
 
 
 def _larger(x: Where, y: Where) -> Where:
@@ -101,6 +102,7 @@ class Ground:
         drop: How much lower than usual the ground lies below the sensor, in metres.
         streets: The streets; without any the ground is a plain surface of the verge.
         kerb: Height of the kerb in metres.
+        tufts: Height in metres of what grows or lies about beyond the pavements.
         banks: Rise beside the first street, left and right, in metres.
         corner: Radius of the kerb where streets meet, in metres.
         verge: (label, material) of what lies beyond the pavements.
@@ -113,6 +115,7 @@ class Ground:
     drop: float = 0.0
     streets: tuple[Street, ...] = ()
     kerb: float = 0.0
+    tufts: float = 0.0
     banks: tuple[float, float] = (0.0, 0.0)
     corner: float = 4.0
     verge: tuple[int, int] = (LABELS["terrain"], INDEX["grass"])
@@ -164,7 +167,7 @@ class Ground:
             painted = self._painted(x, y)
             label[painted], material[painted] = LABELS["lane-marking"], INDEX["marking"]
         # repairs, wear and damp: a reading that wanders over a few metres
-        stains = 0.03 * np.sin(1.1 * x + 0.4 * y) * np.sin(0.5 * x - 1.3 * y) + 0.02 * np.sin(0.23 * x + 0.31 * y)
+        stains = 0.03 * sine(1.1 * x + 0.4 * y) * sine(0.5 * x - 1.3 * y) + 0.02 * sine(0.23 * x + 0.31 * y)
         return label, material, self.albedo[material] + stains
 
     def _painted(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -198,6 +201,8 @@ class Ground:
         cosine = approach / np.sqrt((1 + rays.slope[:, None] ** 2) * (1 + steepness**2))
         if self.kerb > 0 and self.streets:
             distance, cosine = self._step_up(rays, distance, approach, cosine)
+        if self.tufts > 0:
+            distance = self._overgrown(rays, distance, approach)
         return GroundHit(distance, cosine)
 
     def _step_up(
@@ -218,6 +223,21 @@ class Ground:
         out[met] = np.where(d_high > 0, s_high, np.where(face, s_high + share * (s_low - s_high), s_low))
         facing[met] = np.where(face, np.maximum(cosine[met], 0.6), cosine[met])
         return out, facing
+
+    def _overgrown(self, rays: Rays, distance: np.ndarray, approach: np.ndarray) -> np.ndarray:
+        """Bring the verge nearer where grass and rubble stand up from it: h / approach before the ground."""
+        met = np.isfinite(distance)
+        s, c, sine_ = (np.broadcast_to(q, met.shape)[met] for q in (distance, rays.cos, rays.sin))
+        x, y = s * c, s * sine_
+        if self.streets:
+            beyond = self.off_street(x, y) - max(street.pavement for street in self.streets)
+            share = np.clip(beyond * 2, 0, 1)  # grows over half a metre
+        else:
+            share = np.float32(1)
+        h = 0.25 * (2 + sine(2.3 * x + 1.1 * y) * sine(0.7 * x - 2.9 * y) + sine(4.1 * x - 3.3 * y)) * self.tufts
+        out = distance.copy()
+        out[met] = np.maximum(s - share * h / np.maximum(approach[met], np.float32(0.02)), np.float32(0.5) * s)
+        return out
 
 
 def _meet_profile(s: np.ndarray, z: np.ndarray, slope: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

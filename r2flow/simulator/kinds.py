@@ -30,6 +30,7 @@ class Kind(NamedTuple):
         fences: Share of fronts with a fence or wall.
         people: Mean number of people.
         traffic: Mean number of moving vehicles.
+        paved: Probability that what lies between pavement and houses is paved too, and no lawn.
         crossing: Probability of a crossing street.
     """
 
@@ -46,25 +47,27 @@ class Kind(NamedTuple):
     fences: float
     people: float
     traffic: float
+    paved: float
     crossing: float
 
 
 KINDS = {
     "residential": Kind(
-        share=0.45, half_width=(2.5, 4.0), pavement=(1.2, 2.4), setback=(1.0, 6.5), gap=6.0, storeys=(2, 3),
-        built=0.64, parked=0.28, plants=5.0, hedges=0.50, fences=0.30, people=0.8, traffic=0.8, crossing=0.75,
+        share=0.45, half_width=(2.3, 3.5), pavement=(1.0, 2.0), setback=(0.5, 4.5), gap=6.0, storeys=(2, 3),
+        built=0.64, parked=0.48, plants=7.0, hedges=0.60, fences=0.30, people=1.5, traffic=1.3,
+        paved=0.4, crossing=0.75,
     ),
     "urban": Kind(
         share=0.22, half_width=(3.2, 5.5), pavement=(1.8, 4.0), setback=(0.0, 3.0), gap=5.0, storeys=(3, 5),
-        built=0.74, parked=0.35, plants=2.5, hedges=0.08, fences=0.10, people=5.0, traffic=2.2, crossing=0.8,
+        built=0.74, parked=0.52, plants=4.0, hedges=0.08, fences=0.10, people=5.0, traffic=2.7, paved=1.0, crossing=0.8,
     ),
     "suburb": Kind(
-        share=0.25, half_width=(2.5, 3.8), pavement=(0.0, 2.0), setback=(3.0, 10.0), gap=12.0, storeys=(1, 2),
-        built=0.55, parked=0.12, plants=6.0, hedges=0.55, fences=0.22, people=0.4, traffic=0.6, crossing=0.6,
+        share=0.25, half_width=(2.3, 3.4), pavement=(0.0, 2.0), setback=(2.0, 7.0), gap=12.0, storeys=(1, 2),
+        built=0.55, parked=0.30, plants=8.0, hedges=0.60, fences=0.22, people=0.6, traffic=1.0, paved=0.2, crossing=0.6,
     ),
     "highway": Kind(
         share=0.08, half_width=(6.0, 9.0), pavement=(0.0, 0.0), setback=(14.0, 30.0), gap=30.0, storeys=(1, 4),
-        built=0.40, parked=0.0, plants=5.0, hedges=0.0, fences=0.0, people=0.0, traffic=5.0, crossing=0.0,
+        built=0.40, parked=0.0, plants=5.0, hedges=0.0, fences=0.0, people=0.0, traffic=5.0, paved=0.0, crossing=0.0,
     ),
 }  # fmt: skip
 
@@ -76,21 +79,24 @@ def draw_ground(draws: Draws, name: str) -> Ground:
     main = streets[0]
     steep = 0.7 if kind.setback[1] > 10 else 0.3
     bank_left, bank_right = (draws.normal(0.3, 0.8) if draws.chance(steep) else 0.0 for _ in range(2))
-    paved = kind.setback[1] < 4
+    paved = draws.chance(kind.paved)
     verge = (LABELS["other-ground"], INDEX["paving"]) if paved else (LABELS["terrain"], INDEX["grass"])
     albedo = [min(max(draws.normal(m.albedo, m.spread), 0.01), 0.99) for m in MATERIALS]
     return Ground(
         waves=tuple(_wave(draws, *wave) for wave in _WAVES),
-        lean=(draws.normal(0.009, 0.007), draws.normal(0, 0.018)),
-        drop=draws.normal(0.01, 0.03),
+        lean=(draws.normal(0.013, 0.005), draws.normal(-0.003, 0.018)),
+        drop=draws.normal(0.05, 0.02),
         streets=streets,
         kerb=draws.uniform(0.05, 0.14) if main.pavement > 0 else 0.0,
+        tufts=0.0 if paved else draws.uniform(*TUFTS),
         banks=(bank_left, bank_right),
         verge=verge,
         patches=_drives(draws, main) if main.pavement > 0 else (),
         albedo=np.array(albedo, dtype=np.float32),
     )
 
+
+TUFTS = 0.02, 0.18  # metres: how high verges are overgrown, from and to
 
 # Length and height in metres of the waves that the ground is made of.
 _WAVES = ((7.0, 0.012), (16.0, 0.03), (38.0, 0.07), (80.0, 0.20), (170.0, 0.40))

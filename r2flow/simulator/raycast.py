@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from r2flow.simulator.exact import cosine, sine
 from r2flow.simulator.facades import divided, relief
 from r2flow.simulator.rays import Rays
 from r2flow.simulator.scene import Scene, Surface
@@ -61,7 +62,10 @@ def _visible(shape: Shape, surface: Surface, rays: Rays, limit: np.ndarray, rng:
     fragments = Fragments(*(q[keep] for q in fragments))
     if (surface.closed == 1).all():
         return fragments
-    keep = rng.random(len(fragments.solid), dtype=np.float32) < surface.closed[fragments.solid]
+    # Slats stand upright: a column passes or stops at all heights.
+    lots = rng.random(1 << 16, dtype=np.float32)
+    slat = (fragments.pixel % rays.columns + fragments.solid.astype(np.int64) * 7919) & 0xFFFF
+    keep = lots[slat] < surface.closed[fragments.solid]
     return Fragments(*(q[keep] for q in fragments))
 
 
@@ -87,7 +91,7 @@ def _on_solid(hits: Hits, rays: Rays, shape: Shape, surface: Surface, fragments:
     hits.cosine[pixel] = np.abs(ahead) / np.sqrt(1 + rays.slope[b] ** 2)
     hits.label[pixel] = surface.label[k]
     hits.material[pixel], hits.albedo[pixel] = divided(surface, k, normal, z)
-    moved = s + relief(surface, k, normal, z) / np.maximum(np.abs(ahead), 0.3)
+    moved = s + relief(surface, k, normal, z) / np.maximum(np.abs(ahead), 0.5)
     if not rays.beams.straight:
         moved = moved * _between_columns(rays, b, w, normal, ahead)
     hits.distance[pixel] = moved
@@ -102,6 +106,6 @@ def _between_columns(rays: Rays, b: np.ndarray, w: np.ndarray, normal: Normal, a
     firing = (rays.beams.phase[b] + DRIFT * w) % 1
     across = normal.y * rays.cos[w] - normal.x * rays.sin[w]  # d(n . d) / da
     turn = np.where(across * ahead > 0, firing, firing - 1) * (np.pi / rays.columns)
-    other = ahead * np.cos(turn) + across * np.sin(turn)
+    other = ahead * cosine(turn) + across * sine(turn)
     factor = ahead / np.where(np.abs(other) < 1e-3, ahead, other)
     return np.where(normal.flat, np.clip(factor, 0.93, 1.0), 1).astype(np.float32)

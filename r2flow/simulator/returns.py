@@ -1,10 +1,13 @@
 """From what rays meet to what a sensor reports: noise, lost pulses, reflectance, the image."""
 
+from functools import cache
+
 import numpy as np
 
 from r2flow.lidar.sensors import Sensor
 from r2flow.simulator.beams import rows_of
 from r2flow.simulator.ego import hidden
+from r2flow.simulator.exact import exponentials, logistic, normals
 from r2flow.simulator.materials import column
 from r2flow.simulator.raycast import Hits
 from r2flow.simulator.rays import Rays
@@ -13,10 +16,20 @@ NOISE = 0.006  # metres, scale of the noise of range near by
 NOISE_FAR = 0.0002  # and what each metre of range adds to it
 RANGE_STEP = 0.002  # metres: the unit in which ranges are reported
 LEVELS = 100  # reflectance is reported in steps of 1 / LEVELS
-CALIBRATED = 18.0  # metres up to which the head makes up for distance
-FADE = 0.005  # reading lost per metre beyond
+# How wide each of the levels from 0.02 to 0.69 is, in steps: the head counts in other steps, some of which share
+# a hundredth while others have none. Shares of the levels in three drives, over what their neighbours have.
+_WIDTHS = (
+    0.16, 0.58, 1.98, 1.58, 0.30, 0.71, 0.80, 1.14, 0.98, 1.25, 1.00, 0.48, 0.76, 0.59, 1.29, 0.93, 1.66, 1.02, 1.12,
+    0.91, 0.58, 0.99, 0.64, 1.03, 0.73, 1.15, 0.93, 1.55, 1.38, 0.89, 1.24, 0.76, 1.14, 0.80, 1.21, 0.76, 1.17, 1.06,
+    0.71, 1.08, 0.67, 1.10, 0.63, 1.15, 1.00, 0.75, 1.16, 0.71, 1.12, 0.72, 1.30, 0.84, 1.11, 1.20, 0.67, 1.05, 0.83,
+    1.12, 0.68, 1.05, 1.10, 0.69, 1.06, 0.65, 1.09, 0.75, 1.10, 0.76,
+)  # fmt: skip
+CALIBRATED = 16.0  # metres up to which the head makes up for distance
+FADE = 0.0068  # reading lost per metre beyond
 FLOOR = 0.13  # readings below a threshold drawn up to this are reported as 0
-FAINT = -0.02  # what would read less than this is mostly not seen as a return at all, where it is far
+SOFT = 0.02  # how gradually, in the unit of readings
+PATCH = 3  # columns that are lost together: dark and slanting things are wider than a bin
+FAINT = -0.10  # what would read less than this is mostly not seen as a return at all, where it is far
 LOST = 0.012, 8.0  # share of faint returns lost for each metre of range beyond so many metres
 
 TEXTURE, GLOSS, SWALLOW, DEPTH = (column(name) for name in ("texture", "gloss", "swallow", "depth"))
@@ -38,10 +51,10 @@ def report(
         image (2, H, W), float32: range in metres and reflectance; labels (H, W), uint16; 0 where missing.
     """
     slope, rise = rays.slope[:, None], rays.height[:, None] - np.float32(rays.ground)
-    noise = rng.standard_normal((2, *rays.shape), dtype=np.float32)
+    noise = normals(rng, (2, *rays.shape))
     noise *= 0.6 + 0.2 * noise**2  # heavier tails than a Gaussian, as real scans have
-    uniforms = rng.random(rays.shape, dtype=np.float32)
-    depth = DEPTH[hits.material] * rng.standard_exponential(rays.shape, dtype=np.float32)
+    uniforms = _in_patches(rays, rng)
+    depth = DEPTH[hits.material] * exponentials(rng, rays.shape)
     s = np.where(np.isfinite(hits.distance), hits.distance, 0) + depth
     r = np.sqrt(s**2 + (rise + s * slope) ** 2)
     r += (NOISE + NOISE_FAR * r) * noise[0] + rays.beams.bias.astype(np.float32)[:, None]
@@ -52,8 +65,24 @@ def report(
     if rig is not None:
         seen &= ~hidden(rays.beams, rays.columns, rig)
     reading[reading < FLOOR * rng.random(rays.shape, dtype=np.float32)] = 0
-    reading = np.round(np.clip(reading, 0, 1 - 1 / LEVELS) * LEVELS) / np.float32(LEVELS)
+    reading = in_levels(reading)
     return _sorted_into_rows(sensor, rays, s, r, reading, hits.label, seen)
+
+
+@cache
+def _levels() -> np.ndarray:
+    """The reported reflectance for readings of 0, 1/2000, 2/2000, ... 1, (2001,), float32."""
+    first, last = 2, 1 + len(_WIDTHS)
+    edges = (first - 0.5 + np.cumsum(_WIDTHS) * (len(_WIDTHS) / sum(_WIDTHS))) / LEVELS  # upper ones
+    reading = np.arange(2001) / 2000
+    level = np.where(reading < (first - 0.5) / LEVELS, 0, first + np.searchsorted(edges, reading, side="right"))
+    level = np.where(reading > (last + 0.5) / LEVELS, np.rint(reading * LEVELS), level)
+    return (np.minimum(level, LEVELS - 1) / LEVELS).astype(np.float32)
+
+
+def in_levels(reading: np.ndarray) -> np.ndarray:
+    """Readings as they are reported: clipped to [0, 0.99], in hundredths."""
+    return _levels()[np.rint(np.clip(reading, 0, 1) * 2000).astype(np.int32)]
 
 
 def _reading(hits: Hits, r: np.ndarray, normal: np.ndarray, rays: Rays) -> np.ndarray:
@@ -67,9 +96,17 @@ def _reading(hits: Hits, r: np.ndarray, normal: np.ndarray, rays: Rays) -> np.nd
 
 def _lost(hits: Hits, r: np.ndarray, reading: np.ndarray) -> np.ndarray:
     """Probability that no return is reported: swallowed, or too faint, the more so the farther."""
-    faint = 1 / (1 + np.exp(np.clip((reading - FAINT) / np.float32(0.02), -30, 30)))
+    faint = logistic((FAINT - reading) / np.float32(SOFT))
     swallow = SWALLOW[hits.material]
     return swallow + (1 - swallow) * faint * np.clip(LOST[0] * (r - LOST[1]), 0, 1)
+
+
+def _in_patches(rays: Rays, rng: np.random.Generator) -> np.ndarray:
+    """Uniform draws that PATCH neighbouring columns of a laser share, (B, W)."""
+    b, w = rays.shape
+    patches = rng.random((b, w // PATCH + 2), dtype=np.float32)
+    start = rng.integers(0, PATCH, (b, 1))
+    return np.take_along_axis(patches, (np.arange(w) + start) // PATCH, axis=1)
 
 
 def _sorted_into_rows(

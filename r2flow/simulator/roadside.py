@@ -20,7 +20,7 @@ def _driven(b: SceneBuilder, x: float, y: float) -> bool:
     """Whether a place is where the own car has driven or will."""
     main = b.ground.streets[0]
     u, lateral = main.locate(x, y)
-    return abs(lateral + main.offset) < 2.1 and abs(u) < 30
+    return abs(lateral + main.offset) < 2.6 and abs(u) < 30
 
 
 def park(b: SceneBuilder, kind: Kind, street: Street, side: int) -> None:
@@ -79,7 +79,7 @@ def _clutter(b: SceneBuilder, street: Street, side: int, edge: float) -> None:
             x, y, _ = street.place(start + 2.2 * step, side * (edge - 0.1))
             if _clear(b, street, x, y, 0.5):
                 props.bollard(b, x, y)
-    for _ in range(draws.poisson(0.8)):
+    for _ in range(draws.poisson(2.0)):
         x, y, heading = street.place(draws.uniform(-40, 40), side * (edge + street.pavement - 0.4))
         if _clear(b, street, x, y, 0.5):
             draws.pick((props.bin_, vehicles.bicycle, props.cabinet), (0.5, 0.25, 0.25))(b, x, y, heading)

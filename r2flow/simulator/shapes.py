@@ -9,12 +9,15 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from r2flow.simulator.exact import cosine, exponential_quantiles, hypotenuse, sine
 from r2flow.simulator.rays import Rays, column_windows, row_windows
 
 # A field of all solids of a table, (P,) float32; of a single one, on its way into a table, a number.
 Column = Any
 
 NEAR = 0.05  # metres: nothing is looked for nearer than this
+LEAF = 3  # columns over which leaves let all pulses through or none
+EDGE = 1e-6  # radians by which windows are wider than things, so that rounding in arctan and arcsin decides nothing
 
 
 class Fragments(NamedTuple):
@@ -160,7 +163,7 @@ class Cylinders(NamedTuple):
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
         """Away from the axis, or up or down on the ends."""
         u, v = x - self.x[k], y - self.y[k]
-        away = np.hypot(u, v)
+        away = hypotenuse(u, v)
         on_top = z - self.top[k] > away - self.radius[k]
         below = self.bottom[k] - z > away - self.radius[k]
         side = np.where(on_top | below, 0, 1 / np.maximum(away, 1e-6))
@@ -199,7 +202,7 @@ class Blobs(NamedTuple):
         root = np.sqrt(np.maximum(d, 0))
         distance = (h - root) / a
         path = self.path[k]
-        distance += path * rng.standard_exponential(len(k), dtype=np.float32)
+        distance += path * _depths(k, b, w, rng)
         hit = (d > 0) & ((path == 0) | (distance < (h + root) / a))
         return Fragments((b * rays.columns + w)[hit], distance[hit], k[hit])
 
@@ -211,6 +214,15 @@ class Blobs(NamedTuple):
         return _round(u * norm, v * norm, t * norm)
 
 
+def _depths(k: np.ndarray, b: np.ndarray, w: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draws from Exp(1), one for each solid and LEAF neighbouring columns of a laser: leaves hang in clusters."""
+    cell = (w + b * 7) // LEAF
+    mixed = k * np.int64(73856093) ^ b * np.int64(19349663) ^ cell * np.int64(83492791)
+    mixed = (mixed + int(rng.integers(1 << 31))) * 2654435761 & 0xFFFFFFFF
+    quantiles = exponential_quantiles()
+    return quantiles[(mixed >> 8) % len(quantiles)]
+
+
 def _round(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
     """A normal of something without faces."""
     return Normal(x, y, z, np.zeros_like(x), np.zeros(len(x), bool), np.zeros(len(x), bool))
@@ -218,7 +230,7 @@ def _round(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
 
 def _into(solids: "Boxes | Frusta", k: np.ndarray, x: Column, y: Column) -> tuple[np.ndarray, ...]:
     """The points in the solids' own axes, and cos and sin of their yaw: (u, v, c, s), (N,) each."""
-    c, s = np.cos(solids.yaw)[k], np.sin(solids.yaw)[k]
+    c, s = cosine(solids.yaw)[k], sine(solids.yaw)[k]
     dx, dy = x - solids.x[k], y - solids.y[k]
     return dx * c + dy * s, dy * c - dx * s, c, s
 
@@ -238,7 +250,7 @@ def _box_spans(solids: "Boxes | Frusta", rays: Rays) -> tuple[np.ndarray, ...]:
     turn = np.arctan2(corner_y, corner_x) - middle
     half = np.abs((turn + np.pi) % (2 * np.pi) - np.pi).max(0)
     half[(np.abs(u) <= a) & (np.abs(v) <= b)] = np.pi  # the sensor's axis is inside
-    k, w = column_windows(middle, half + 1e-6, rays.columns)
+    k, w = column_windows(middle, half + EDGE, rays.columns)
     u, v, c, s, a, b = (q[k] for q in (u, v, c, s, a, b))
     du, dv = rays.cos[w] * c + rays.sin[w] * s, rays.sin[w] * c - rays.cos[w] * s
     near, far = np.full(len(k), NEAR, np.float32), np.full(len(k), np.inf, np.float32)
@@ -255,10 +267,10 @@ _CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 
 def _chords(x: np.ndarray, y: np.ndarray, radius: np.ndarray, rays: Rays) -> tuple[np.ndarray, ...]:
     """Where each column crosses circles seen from above: solid k, column w, middle and half of the chord."""
-    distance = np.hypot(x, y)
+    distance = hypotenuse(x, y)
     inside = distance <= radius
     half = np.where(inside, np.pi, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-6), 1)))
-    k, w = column_windows(np.arctan2(y, x).astype(np.float64), half.astype(np.float64), rays.columns)
+    k, w = column_windows(np.arctan2(y, x).astype(np.float64), half.astype(np.float64) + EDGE, rays.columns)
     middle = x[k] * rays.cos[w] + y[k] * rays.sin[w]
     across = y[k] * rays.cos[w] - x[k] * rays.sin[w]
     square = radius[k] ** 2 - across**2

@@ -6,8 +6,11 @@ import torch
 
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
-from r2flow.metrics.fidelity import PANEL, controls, distances, nearest, panel
-from r2flow.reports.fidelity import fidelity, markdown
+from r2flow.metrics.fidelity import PANEL, PER_PIXEL, controls, distances, nearest, panel
+from r2flow.reports.compare import read_fidelity
+from r2flow.reports.fidelity import compare_sets, drives_of, fidelity, load_images, markdown
+from r2flow.reports.fidelity_page import fidelity_page
+from r2flow.reports.pages import write_page
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 
@@ -56,12 +59,90 @@ def test_a_set_is_at_no_distance_from_itself_and_its_order_does_not_matter():
 def test_scenes_of_the_same_sort_beat_every_control():
     training = walls(40, 1)
     result = fidelity(walls(40, 2), walls(40, 3), SENSOR, training)
-    # Shuffled pixels keep every per-pixel statistic, so only lines that look at neighbours must be won.
-    for line in ("gradient, azimuth", "gradient, elevation"):
-        assert line in result["won"]
+    # Losses and reflectances are independent from pixel to pixel here, as the shuffled ones are.
+    alike = {"changes per row", "run lengths", "drop rate by range", "drop rate by incidence", "reflectance pairs"}
+    assert set(result["won"]) >= set(PANEL) - alike
     assert "| gradient, azimuth | **" in markdown(result)
     for name in ("noise", "flat ground", "mean scan"):
-        assert all(result["sets"][name][line] > result["sets"]["other"][line] for line in PANEL)
+        assert all(result["sets"][name][line] > result["sets"]["other"][line] for line in result["won"])
+
+
+def test_pixels_shuffled_across_scans_have_what_counts_single_pixels():
+    training = walls(40, 1)
+    truth = panel(training, SENSOR, PANEL | PER_PIXEL)
+    shuffled = panel(controls(training, SENSOR, 40)["shuffled pixels"], SENSOR, PANEL | PER_PIXEL)
+    other = panel(walls(40, 2), SENSOR, PANEL | PER_PIXEL)
+    to_shuffled, to_other = distances(shuffled, truth), distances(other, truth)
+    for line in PER_PIXEL:
+        assert to_shuffled[line] <= to_other[line] + 0.005
+    for line in ("gradient, azimuth", "gradient, elevation", "surface normals", "range pairs", "bird's-eye density"):
+        assert to_shuffled[line] > 2 * to_other[line]
+
+
+@pytest.mark.slow
+def test_every_member_tells_real_drives_from_controls_and_no_other_statistic_does(shared):
+    sensor, real = SENSORS["hdl64e"], shared / "real"
+    raw, odometry = real / "raw" / "2011_09_26", real / "odometry" / "sequences"
+    halves = (
+        [real / "kitti360", raw / "2011_09_26_drive_0048_sync", odometry / "08"],
+        [odometry / "00", raw / "2011_09_26_drive_0005_sync", real / "object"],
+    )
+    one, other = (np.concatenate([load_images(path, sensor) for path in half]) for half in halves)
+    result = fidelity(one, other, sensor, floor=other)
+    assert result["blind"] == []
+    per_pixel = result["per_pixel"]
+    for line in PER_PIXEL:
+        nearest_control = min(v[line] for name, v in per_pixel.items() if name not in ("other", "other real scans"))
+        assert per_pixel["other real scans"][line] > 0.5 * nearest_control
+
+
+def test_the_floor_is_what_real_scans_come_to():
+    real, other, elsewhere = walls(24, 2), walls(24, 3), walls(24, 4)
+    given = fidelity(real, other, SENSOR, floor=elsewhere)
+    assert given["floor_is"] == "other real scans"
+    assert given["floor"] == distances(panel(elsewhere, SENSOR), panel(real, SENSOR))
+    assert given["beyond"] == [line for line in PANEL if line not in given["blind"]
+                               and given["sets"]["other"][line] > 2 * given["floor"][line]]  # fmt: skip
+    # three drives, one of them of three scans, which is left out: the mean over pairs is that of one pair
+    drives = ["a"] * 12 + ["b"] * 9 + ["c"] * 3
+    split = fidelity(real, other, SENSOR, drives=drives)
+    assert split["floor_is"] == "drive against drive"
+    assert split["floor"] == distances(panel(real[:12], SENSOR), panel(real[12:21], SENSOR))
+    alone = fidelity(real, other, SENSOR, drives=["a"] * 24)
+    assert alone["floor"] == {}
+    assert alone["floor_is"] is None
+    assert "No floor" in markdown(alone)
+
+
+def test_a_member_that_does_not_tell_the_floor_from_controls_judges_nothing():
+    real = walls(16, 2)
+    rng = np.random.default_rng(0)
+    result = fidelity(real, walls(16, 3), SENSOR, floor=(real * rng.permuted(real > 0, axis=-1)).astype(np.float32))
+    assert "run lengths" in result["blind"]
+    assert not set(result["blind"]) & {*result["won"], *result["lost"], *result["beyond"]}
+    assert "Not judged" in markdown(result)
+
+
+def test_drives_are_the_folders_of_the_scans(tmp_path):
+    for name in ("one/data/0.npy", "one/data/1.npy", "two/data/0.npy"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        np.save(tmp_path / name, walls(1, 0)[0])
+    found = drives_of(tmp_path)
+    assert found == [str(tmp_path / "one/data")] * 2 + [str(tmp_path / "two/data")]
+    assert len(found) == len(load_images(tmp_path, SENSOR))
+
+
+def test_the_page_holds_the_table_and_is_read_by_compare(tmp_path):
+    real, other = walls(8, 2), walls(8, 3)
+    result, statistics = compare_sets(real, other, SENSOR, floor=walls(8, 4))
+    page = fidelity_page(result, statistics, real, other, SENSOR, "mine", "r2flow report fidelity a b")
+    written = {path.name for path in write_page(page, tmp_path)}
+    assert written == {"fidelity.png", "fidelity_histograms.png", "fidelity_scans.png", "fidelity.csv",
+                       "fidelity.json", "fidelity.md"}  # fmt: skip
+    assert read_fidelity(tmp_path) == result["sets"]["other"]
+    text = (tmp_path / "fidelity.md").read_text("utf-8")
+    for words in ("| mine / floor |", "range histogram", "Dropped from the panel"):
+        assert words in text
 
 
 def test_the_controls_are_what_they_say():
@@ -88,5 +169,7 @@ def test_a_copy_is_seen():
 
 def test_range_alone_leaves_reflectance_out():
     images = walls(4, 0)[:, :1]
-    assert "reflectance histogram" not in panel(images, SENSOR)
-    assert "reflectance histogram" not in fidelity(images, images, SENSOR)["sets"]["noise"]
+    assert "reflectance pairs" not in panel(images, SENSOR)
+    result = fidelity(images, images, SENSOR)
+    assert "reflectance pairs" not in result["sets"]["noise"]
+    assert "reflectance histogram" not in result["per_pixel"]["noise"]

@@ -1,0 +1,38 @@
+"""The verb that makes scans out of nothing."""
+
+import os
+from typing import Annotated
+
+import typer
+
+from r2flow.cli.app import app
+from r2flow.cli.options import OutOption, SensorOption, SizeOption, build_sized
+
+
+@app.command(epilog="Example: r2flow simulate --num 1000 --sensor os1_64 --seed 1 --out scans --labels")
+def simulate(
+    out: OutOption,
+    num: Annotated[int, typer.Option(min=1, help="Number of scans.")] = 100,
+    sensor: SensorOption = "hdl64e",
+    size: SizeOption = None,
+    seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0,
+    first: Annotated[int, typer.Option(min=0, help="Number of the first scan.")] = 0,
+    format: Annotated[
+        str, typer.Option(help="Any of bin,ply,pcd, or npy: the range image, (2, H, W) float32.")
+    ] = "bin",
+    labels: Annotated[bool, typer.Option("--labels", help="SemanticKITTI's .label files beside them.")] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes; one a core if left out.", show_default=False)
+    ] = None,
+) -> None:
+    """Simulate scans of streets, as many as asked for. Stopped or killed, the same command goes on."""
+    from r2flow.cli.accuracy import bar
+    from r2flow.simulator.folder import SimulatedFolder, write_folder
+
+    formats = tuple(dict.fromkeys(format.split(",")))
+    folder = SimulatedFolder(out, build_sized(sensor, size), seed, formats, labels)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with bar("scans", num) as advance:
+        made = write_folder(folder, range(first, first + num), workers or cores, advance)
+    kept = f", {num - made} were there" if made < num else ""
+    print(f"{made} scans ({', '.join(formats)}{', labels' if labels else ''}) in {out}{kept}")

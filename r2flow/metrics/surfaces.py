@@ -1,0 +1,70 @@
+"""What a range image alone tells of the surfaces in it: how they lie, and how often a pulse on them is lost."""
+
+import numpy as np
+
+from r2flow.lidar.sensors import Sensor
+
+SPAN = 2  # columns to either side over which a surface's direction is taken: over one it is lost in the noise of range
+STEP = 0.15  # of the range: neighbours farther apart than that lie on different things
+GAP = 16  # columns: what is missing for longer is sky, or hidden, and not a lost pulse
+
+
+def normals(r: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals n ~ (p(h - 1, w) - p(h + 1, w)) x (p(h, w - 2) - p(h, w + 2)), p = r d, towards the sensor.
+
+    Args:
+        r: Ranges in metres, (N, H, W); 0 where missing.
+        sensor: Whose image it is.
+
+    Returns:
+        n_z, the upward part, and |n . d| = cos i, i the angle of incidence, (N, H, W) float32 each; NaN where one
+        of the five pixels is missing or more than 15 % nearer or farther than the middle one.
+    """
+    e, a = sensor.rays().numpy()
+    d = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    p = r[:, None] * d
+    left, right = np.roll(p, SPAN, axis=-1), np.roll(p, -SPAN, axis=-1)  # azimuth falls with w
+    n = np.cross(_below(p, -1) - _below(p, 1), left - right, axis=1)
+    size = np.sqrt((n**2).sum(1))
+    usable = (r > 0) & (size > 0)
+    for other in (_below(r, -1), _below(r, 1), np.roll(r, SPAN, -1), np.roll(r, -SPAN, -1)):
+        usable &= (other > 0) & (np.abs(other - r) < STEP * r)
+    n = n / np.where(usable, size, np.nan)[:, None]
+    return n[:, 2], np.abs((n * d).sum(1))
+
+
+def _below(x: np.ndarray, by: int) -> np.ndarray:
+    """Each pixel's neighbour `by` = 1 row below, or -1: above; 0 beyond the image."""
+    out = np.zeros_like(x)
+    if by > 0:
+        out[..., :-1, :] = x[..., 1:, :]
+    else:
+        out[..., 1:, :] = x[..., :-1, :]
+    return out
+
+
+def bridged(x: np.ndarray, known: np.ndarray, gap: int = GAP) -> np.ndarray:
+    """Unknown values as the mean of the nearest known ones to their left and right; NaN in long gaps.
+
+    Args:
+        x: (..., W), a ring in W.
+        known: Where x is known, (..., W), bool.
+        gap: Unknown stretches of more columns than this stay unknown.
+    """
+    width = x.shape[-1]
+    gap = min(gap, width - 1)
+    turn = np.arange(-gap - 1, width + gap + 1) % width  # the ring closes
+    wide, held = x[..., turn], known[..., turn]
+    place = np.arange(len(turn))
+    before = np.maximum.accumulate(np.where(held, place, -width), axis=-1)
+    after = np.minimum.accumulate(np.where(held, place, 3 * width)[..., ::-1], axis=-1)[..., ::-1]
+    short = after - before - 1 <= gap
+    low, high = (np.take_along_axis(wide, np.where(short, end, 0), -1) for end in (before, after))
+    mean = np.where(short, (low + high) / 2, np.nan)
+    return np.where(known, x, mean[..., gap + 1 : gap + 1 + width])
+
+
+def drop_rate(value: np.ndarray, missing: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Rays that are missing and rays at all in each bin of a value, (2, bins); unknown values (NaN) are left out."""
+    known = np.isfinite(value)
+    return np.stack([np.histogram(value[known & who], edges)[0] for who in (missing, np.ones_like(missing))])

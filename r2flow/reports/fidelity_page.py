@@ -1,0 +1,172 @@
+"""The page of `r2flow report fidelity`: distances against the floor, histograms, scans side by side."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from r2flow.lidar.sensors import Sensor
+from r2flow.metrics.fidelity import GRADIENTS, RUNS, range_bins
+from r2flow.reports.fidelity import WITHIN, Statistics, markdown, per_pixel_table
+from r2flow.reports.pages import STYLES, Page, blank_figure
+from r2flow.reports.pictures import draw_range, draw_reflectance
+
+SIDE_BY_SIDE = 6  # scans of each set in the picture
+LEAST = 1e-4  # a distance of nothing, on a logarithmic axis
+
+
+def fidelity_page(
+    result: Mapping[str, Any],
+    statistics: Mapping[str, Statistics],
+    real: np.ndarray,
+    other: np.ndarray,
+    sensor: Sensor,
+    name: str,
+    command: str,
+    seed: int = 0,
+) -> Page:
+    """Everything on a page.
+
+    Args:
+        result: Of `compare_sets`, with its statistics.
+        real: The images that were compared, (N, 2 or 1, H, W); a few of them are drawn.
+        name: What the judged set is called.
+    """
+    rows = [
+        {"member": line, "judged": judged, "set": name if key == "other" else key, "distance": value}
+        for judged, sets in ((True, result["sets"]), (False, result["per_pixel"]))
+        for key, lines in sets.items()
+        for line, value in lines.items()
+    ]
+    apart = (
+        "Dropped from the panel, shown for comparison with other work: statistics of single pixels. Pixels shuffled "
+        "across real scans have them as real scans do."
+    )
+    figures = {
+        "fidelity": distance_figure(result, name),
+        "fidelity_histograms": histogram_figure(statistics, sensor, name),
+        "fidelity_scans": scans_figure(real, other, name),
+    }
+    kept = {key: value for key, value in result.items() if key != "per_pixel"}
+    more: dict[str, Any] = {**kept, "per_pixel": result["per_pixel"]}
+    more = {key: [value] if isinstance(value, str | None) else value for key, value in more.items()}
+    return Page(
+        "fidelity", f"Fidelity of {name}", [markdown(dict(result), name), apart, per_pixel_table(dict(result), name)],
+        rows, figures, command, {"controls": seed}, more=more,
+    )  # fmt: skip
+
+
+def distance_figure(result: Mapping[str, Any], name: str) -> Figure:
+    """Every member's distances, in units of the floor where there is one."""
+    lines = list(result["sets"]["other"])
+    figure = blank_figure(9, 0.42 * len(lines) + 1.6, "Distance to the real scans")
+    axes = figure.add_subplot()
+    y = np.arange(len(lines))[::-1]
+    unit = np.array([max(result["floor"].get(line, 1.0), LEAST) if result["floor"] else 1.0 for line in lines])
+    if result["floor"]:
+        axes.axvspan(0, WITHIN, color="#e8f0e4", zorder=0, label="within twice the floor")
+        axes.axvline(1, color="#3d7d3a", lw=1.5, label=f"floor: {result['floor_is']}")
+    for style, (key, found) in zip(STYLES, result["sets"].items(), strict=False):
+        if key == result["floor_is"]:
+            continue  # the line at 1
+        values = np.array([max(found[line], LEAST) for line in lines]) / unit
+        big = key == "other"
+        axes.plot(
+            values, y, linestyle="", marker=style["marker"], color=style["color"], ms=9 if big else 6,
+            label=name if big else key, zorder=3 if big else 2, alpha=1 if big else 0.85,
+        )  # fmt: skip
+    shown = [f"{line} (not judged)" if line in result["blind"] else line for line in lines]
+    axes.set(xscale="log", yticks=y, ylim=(-0.7, len(lines) - 0.3))
+    axes.set_yticklabels(shown)
+    axes.set_xlabel("distance / floor" if result["floor"] else "distance")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.grid(alpha=0.3, axis="both", which="major")
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+    return figure
+
+
+def histogram_figure(statistics: Mapping[str, Statistics], sensor: Sensor, name: str) -> Figure:
+    """The statistics of one dimension: real, judged, and a further real set or the shuffled pixels beside them."""
+    drawn = [line for line, value in statistics["real"].items() if value.ndim == 1]
+    sets = ["real", "other", *(s for s in ("other real scans", "training scans", "shuffled pixels") if s in statistics)]
+    columns = 4
+    figure = blank_figure(14, 2.5 * -(-len(drawn) // columns), "")
+    for index, line in enumerate(drawn):
+        axes = figure.add_subplot(-(-len(drawn) // columns), columns, index + 1)
+        for style, key in zip(STYLES, sets, strict=False):
+            value = np.asarray(statistics[key][line], dtype=float)
+            profile = line in ("fill per row", "changes per row") or line.startswith("drop rate")
+            value = value if profile else value / max(value.sum(), 1)
+            axes.plot(
+                _places(line, len(value), sensor), value, color=style["color"], linestyle=style["linestyle"], lw=1.3,
+                label=name if key == "other" else key,
+            )  # fmt: skip
+        axes.set_title(line, fontsize=9)
+        axes.tick_params(labelsize=7)
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.25)
+        axes.set_xlabel(_LABELS.get(line, "bin"), fontsize=7)
+        if line.startswith("gradient") or line in ("run lengths", "drop rate by range", "range histogram"):
+            axes.set_xscale("log")
+            axes.xaxis.set_minor_formatter("")
+            axes.xaxis.set_major_formatter("{x:g}")
+        if line in ("drop rate by range", "range histogram"):
+            axes.set_xticks([2, 5, 10, 20, 50, 100])
+            axes.set_xlim(sensor.min_range, sensor.max_range)
+        if index == 0:
+            axes.legend(fontsize=7)
+    return figure
+
+
+_LABELS = {
+    "gradient, azimuth": "metres", "gradient, elevation": "metres", "run lengths": "pixels", "changes per row": "row",
+    "fill per row": "row", "drop rate by range": "metres", "drop rate by incidence": "degrees",
+    "surface normals": "upward part of the normal", "incidence": "cosine", "range histogram": "metres",
+    "bird's-eye density": "bin of points in a cell, 1 to over 256", "reflectance histogram": "reflectance",
+    "height histogram": "metres above the sensor",
+}  # fmt: skip
+
+
+def _places(line: str, bins: int, sensor: Sensor) -> np.ndarray:
+    """Where the bins of a statistic lie: their middles, in the unit of its label."""
+    edges: Sequence[float] | np.ndarray = np.arange(bins + 1) - 0.5
+    if line.startswith("gradient"):
+        return np.sqrt(GRADIENTS[1:] * np.maximum(GRADIENTS[:-1], 0.005))
+    if line == "run lengths":
+        return np.sqrt(RUNS[1:] * RUNS[:-1])
+    if line == "drop rate by range":
+        edges = range_bins(sensor)
+    elif line == "range histogram":
+        edges = np.geomspace(sensor.min_range, sensor.max_range, bins + 1)
+    elif line == "drop rate by incidence":
+        edges = np.linspace(90, 0, bins + 1)
+    elif line == "surface normals":
+        edges = np.linspace(-1, 1, bins + 1)
+    elif line == "height histogram":
+        edges = np.linspace(-3.5, 4, bins + 1)
+    elif line in ("incidence", "reflectance histogram"):
+        edges = np.linspace(0, 1, bins + 1)
+    edges = np.asarray(edges)
+    return (edges[1:] + edges[:-1]) / 2
+
+
+def scans_figure(real: np.ndarray, other: np.ndarray, name: str) -> Figure:
+    """Up to six scans of each set, the half ahead: real on the left, judged on the right; range over reflectance."""
+    chosen = [s[np.linspace(0, len(s) - 1, min(SIDE_BY_SIDE, len(s))).round().astype(int)] for s in (real, other)]
+    rows, strips = max(map(len, chosen)), min(s.shape[1] for s in chosen)
+    figure = blank_figure(14, 0.62 * rows * strips + 0.5, "")
+    figure.set_layout_engine("none")
+    top = 1 - 0.3 / (0.62 * rows * strips + 0.5)
+    grid = figure.add_gridspec(rows, 2, left=0.005, right=0.995, bottom=0.01, top=top, hspace=0.06, wspace=0.01)
+    for column, (title, images) in enumerate(zip(("real", name), chosen, strict=True)):
+        quarter = images.shape[-1] // 4
+        for row, image in enumerate(images[..., quarter : images.shape[-1] - quarter]):
+            parts = grid[row, column].subgridspec(strips, 1, hspace=0.05)
+            axes = figure.add_subplot(parts[0])
+            draw_range(axes, image, label=False)
+            if strips > 1:
+                draw_reflectance(figure.add_subplot(parts[1]), image, label=False)
+            if row == 0:
+                axes.set_title(title, fontsize=10, loc="left", pad=3)
+    return figure

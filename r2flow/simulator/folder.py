@@ -1,0 +1,181 @@
+"""A folder of simulated scans: one file a scan, made again by the same command where one is missing."""
+
+import json
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r2flow.errors import InputError
+from r2flow.files import atomic_write
+from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.sensors import Sensor
+from r2flow.simulator import REVISION, simulate
+
+FORMATS = ("bin", "pcd", "ply", "npy")  # npy is the range image itself
+MANIFEST = "simulated.json"
+_BATCH = 4  # scans that a worker makes between two reports of progress
+
+
+@dataclass(frozen=True)
+class SimulatedFolder:
+    """What is in a folder of simulated scans.
+
+    Attributes:
+        path: The folder.
+        sensor: Whose scans they are.
+        seed: Scan i is a function of the sensor, the seed and i alone.
+        formats: Endings of the files of a scan, some of `FORMATS`.
+        labels: Whether each has a SemanticKITTI .label file, uint32 for each point in the order of the points.
+    """
+
+    path: Path
+    sensor: Sensor
+    seed: int
+    formats: tuple[str, ...] = ("bin",)
+    labels: bool = False
+
+    def __post_init__(self) -> None:
+        for name in self.formats:
+            if name not in FORMATS:
+                raise InputError(f"no format named {name!r} for simulated scans; known: {', '.join(FORMATS)}.")
+        if self.labels and self.formats == ("npy",):
+            raise InputError("labels are one for each point, and a range image has none; add another format, as bin.")
+
+    def files(self, index: int) -> list[Path]:
+        """The files of a scan."""
+        endings = [*self.formats, *(["label"] if self.labels else [])]
+        return [self.path / f"{index:06d}.{ending}" for ending in endings]
+
+    def missing(self, indices: Sequence[int]) -> list[int]:
+        """Scans of which a file is not there. Files are written whole or not at all."""
+        return [index for index in indices if not all(file.is_file() for file in self.files(index))]
+
+    def begin(self) -> None:
+        """Make the folder, and leave a note of whose scans it holds.
+
+        Raises:
+            InputError: it holds scans of another seed, sensor or revision of the simulator, or of nobody knows what.
+        """
+        ours, note = _note(self.sensor, self.seed), self.path / MANIFEST
+        if note.exists():
+            found = _read_note(note)
+            wrong = [key for key in ours if found.get(key) != ours[key]]
+            if wrong:
+                key = wrong[0]
+                raise InputError(
+                    f"{self.path} holds simulated scans with {key} {_short(found.get(key))}, asked for is "
+                    f"{_short(ours[key])}; choose another folder, or the same {key}."
+                )
+            return
+        taken = [file for name in FORMATS for file in self.path.glob(f"*.{name}")] if self.path.is_dir() else []
+        if taken:
+            raise InputError(f"{self.path} holds scans already ({taken[0].name}) and no {MANIFEST}; choose another.")
+        with atomic_write(note, "w") as file:
+            json.dump(ours, file, indent=2)
+
+    def write(self, index: int) -> None:
+        """Make one scan and write what of it is missing."""
+        scan = simulate(self.sensor, self.seed, index)
+        rays = self.sensor.rays()
+        xyz, reflectance = image_to_points(scan.image, rays)
+        for path in self.files(index):
+            if path.suffix == ".npy":
+                with atomic_write(path) as file:
+                    np.save(file, scan.image)
+            elif path.suffix == ".label":
+                # The points' own way through the image: ids are exact in float32.
+                _, labels = image_to_points(np.stack([scan.image[0], scan.labels.astype(np.float32)]), rays)
+                with atomic_write(path) as file:
+                    file.write(labels.astype("<u4").tobytes())
+            else:
+                write_points(path, xyz, reflectance)
+
+
+def write_folder(
+    folder: SimulatedFolder, indices: Sequence[int], workers: int, advance: Callable[[], None] = lambda: None
+) -> int:
+    """Make the scans that are missing, in so many processes; returns how many those were.
+
+    Args:
+        advance: Called once for each scan when it is there, and for those that were there.
+
+    Raises:
+        InputError: what `SimulatedFolder.begin` raises, or a process was killed.
+    """
+    folder.begin()
+    missing = folder.missing(indices)
+    for _ in range(len(indices) - len(missing)):
+        advance()
+    if workers == 1 or len(missing) <= _BATCH:
+        for index in missing:
+            folder.write(index)
+            advance()
+        return len(missing)
+    batches = [missing[start : start + _BATCH] for start in range(0, len(missing), _BATCH)]
+    # Spawned, not forked: torch's threads do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(min(workers, len(batches)), context, _begin_worker)
+    try:
+        for done in as_completed([pool.submit(_write_batch, folder, batch) for batch in batches]):
+            for _ in range(done.result()):
+                advance()
+    except BrokenProcessPool:
+        raise InputError(
+            f"a process that wrote {folder.path} was killed; is there memory for {workers} of them? "
+            "The same command goes on."
+        ) from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return len(missing)
+
+
+def _begin_worker() -> None:
+    """Leave Ctrl-C to the parent, and end when it ends: a pool's processes would wait for a killed one for ever."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _write_batch(folder: SimulatedFolder, indices: Sequence[int]) -> int:
+    for index in indices:
+        folder.write(index)
+    return len(indices)
+
+
+def _note(sensor: Sensor, seed: int) -> dict[str, Any]:
+    described = json.loads(json.dumps(asdict(sensor)))  # tuples as lists, as they come back
+    return {"simulator": REVISION, "seed": seed, "sensor": described}
+
+
+def _read_note(path: Path) -> dict[str, Any]:
+    try:
+        note = json.loads(path.read_text("utf-8"))
+    except ValueError:
+        note = None
+    if not isinstance(note, dict):
+        raise InputError(f"{path} is damaged; remove it together with the scans beside it, or choose another folder.")
+    return note
+
+
+def _short(value: Any) -> str:
+    """A seed or a revision as it is; of a sensor what people tell it by."""
+    if isinstance(value, dict):
+        rows = len(value.get("elevations", ()))
+        return f"{value.get('name')} {rows}x{value.get('columns')}, {value.get('min_range')}-{value.get('max_range')} m"
+    return str(value)

@@ -1,0 +1,95 @@
+"""Normals and losses of images whose surfaces are known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from r2flow.lidar.sensors import SENSORS
+from r2flow.metrics.fidelity import drop_incidence, drop_range, range_bins, surface_normals
+from r2flow.metrics.surfaces import bridged, drop_rate, normals
+
+SENSOR = SENSORS["hdl64e"].resized(32, 512)
+E, A = SENSOR.rays().numpy().astype(np.float64)
+
+
+def ground(lean_x: float = 0.0) -> np.ndarray:
+    """Ranges of the plane z = -1.73 + lean x: r = -1.73 / (sin e - lean cos e cos a)."""
+    closing = np.sin(E) - lean_x * np.cos(E) * np.cos(A)
+    r = np.where(closing < -0.03, -1.73 / np.minimum(closing, -0.03), 0)
+    return r.astype(np.float32)
+
+
+def inner(r: np.ndarray) -> np.ndarray:
+    """Pixels with all they need around them."""
+    seen = r > 0
+    for by, axis in ((1, 0), (-1, 0), (2, 1), (-2, 1)):
+        seen = seen & np.roll(r > 0, by, axis)
+    seen[[0, -1]] = False
+    return seen
+
+
+def test_the_normal_of_flat_ground_is_upright_and_its_incidence_is_the_elevation():
+    r = ground()
+    up, cosine = (q[0] for q in normals(r[None], SENSOR))
+    near = inner(r) & (r < 12)  # farther away rows lie more than 15 % apart
+    np.testing.assert_allclose(up[near], 1, atol=1e-4)
+    np.testing.assert_allclose(cosine[near], np.sin(-E[near]), atol=1e-3)
+    assert np.isnan(up[r == 0]).all()
+
+
+def test_the_normal_of_a_slope_leans_by_its_angle():
+    r = ground(lean_x=0.2)
+    near = inner(r) & (r < 7)
+    assert near.sum() > 1000
+    np.testing.assert_allclose(normals(r[None], SENSOR)[0][0][near], math.cos(math.atan(0.2)), atol=1e-3)
+
+
+def test_the_normal_of_a_wall_is_level_and_its_incidence_is_the_angle_to_it():
+    ahead = np.abs(A) < 0.6
+    r = np.where(ahead, 10 / (np.cos(E) * np.where(ahead, np.cos(A), 1)), 0).astype(np.float32)
+    up, cosine = (q[0] for q in normals(r[None], SENSOR))
+    on = inner(r)
+    np.testing.assert_allclose(up[on], 0, atol=1e-3)
+    np.testing.assert_allclose(cosine[on], (np.cos(E) * np.cos(A))[on], atol=1e-3)
+
+
+def test_edges_have_no_normal():
+    r = np.full((1, *SENSOR.shape), 10, np.float32)
+    r[..., 256:] = 20
+    up = normals(r, SENSOR)[0][0]
+    assert np.isnan(up[:, 254:258]).all()
+    assert np.isfinite(up[1:-1, 4:254]).all()
+
+
+def test_gaps_are_bridged_by_the_mean_of_their_ends_around_the_ring():
+    x = np.array([[1.0, 0, 0, 4, 5, 0, 0, 0]])
+    found = bridged(x, x > 0, gap=2)
+    np.testing.assert_array_equal(found, [[1, 2.5, 2.5, 4, 5, np.nan, np.nan, np.nan]])
+    np.testing.assert_array_equal(bridged(x, x > 0, gap=3)[0, 5:], [3, 3, 3])  # between 5 and, around, 1
+    assert np.isnan(bridged(np.zeros((2, 8)), np.zeros((2, 8), bool))).all()
+
+
+def test_the_drop_rate_is_the_share_that_a_mask_takes():
+    rng = np.random.default_rng(0)
+    near, far = 5.0, 50.0
+    r = np.where(np.arange(512) < 256, near, far) * np.ones((4, *SENSOR.shape))
+    lost = rng.random(r.shape) < np.where(r == near, 0.05, 0.25)
+    images = np.where(lost, 0, r)[:, None].astype(np.float32)
+    rate = drop_range(images, SENSOR)
+    bin_of = np.searchsorted(range_bins(SENSOR), [near, far]) - 1
+    assert rate[bin_of] == pytest.approx([0.05, 0.25], abs=0.01)  # deviations of 32,768 draws: 0.0012 and 0.0024
+    # between them there are but gaps across the edge, at 27.5 m: nothing that is not lost
+    assert rate.sum() == pytest.approx(0.05 + 0.25 + 1, abs=0.01)
+    counts = drop_rate(np.array([1.0, 2, 3, np.nan]), np.array([True, False, True, True]), np.array([0.0, 2.5, 5]))
+    np.testing.assert_array_equal(counts, [[1, 1], [2, 1]])
+
+
+def test_losses_on_flat_ground_fall_into_the_bins_of_its_elevations():
+    r = ground()
+    rng = np.random.default_rng(1)
+    images = np.stack([np.where(rng.random(r.shape) < 0.02, 0, r)[None] for _ in range(8)]).astype(np.float32)
+    rate = drop_incidence(images, SENSOR)  # bins of 9 degrees, from 90 down: 63 to 90 is what -27 to 0 looks like
+    assert (rate[3:] == 0).all()
+    assert rate[1] == pytest.approx(0.02, abs=0.01)
+    assert surface_normals(images, SENSOR)[-1] == surface_normals(images, SENSOR).sum()

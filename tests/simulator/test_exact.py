@@ -1,0 +1,40 @@
+"""Sines, quantiles and lots that are the same on all machines, against the usual ones."""
+
+import math
+
+import numpy as np
+import pytest
+
+from r2flow.simulator.exact import cosine, exponentials, hypotenuse, logistic, normals, sine
+
+N = 40_000
+
+
+def test_sine_and_cosine_are_those_of_the_library():
+    x = np.linspace(-200, 200, 20001)
+    np.testing.assert_allclose(sine(x), np.sin(x), atol=2e-9)
+    np.testing.assert_allclose(cosine(x), np.cos(x), atol=2e-9)
+    small = np.linspace(-7, 7, 5001, dtype=np.float32)
+    assert sine(small).dtype == np.float32
+    np.testing.assert_allclose(sine(small), np.sin(small.astype(np.float64)), atol=2e-6)
+    np.testing.assert_array_equal(hypotenuse(np.array([3.0, -5.0]), np.array([4.0, 12.0])), [5, 13])
+
+
+@pytest.mark.parametrize(
+    ("draw", "mean", "deviation", "fourth"),
+    [(normals, 0.0, 1.0, 3.0), (exponentials, 1.0, 1.0, 9.0)],
+    ids=["normal", "exponential"],
+)
+def test_lots_have_the_moments_of_their_law(draw, mean, deviation, fourth):
+    x = draw(np.random.default_rng(0), (N,)).astype(np.float64)
+    assert x.mean() == pytest.approx(mean, abs=5 * deviation / math.sqrt(N))
+    assert x.std() == pytest.approx(deviation, rel=0.02)
+    # tails end at the outermost of 8192 quantiles, which takes a few hundredths off the fourth moment
+    assert (((x - x.mean()) / x.std()) ** 4).mean() == pytest.approx(fourth, rel=0.15)
+
+
+def test_the_smooth_step_rises_from_0_to_1_like_a_logistic():
+    x = np.array([-3.0, 0.0, 3.0])
+    np.testing.assert_array_equal(logistic(x), [0, 0.5, 1])
+    slope = (logistic(np.array([1e-4])) - logistic(np.array([-1e-4]))) / 2e-4
+    assert slope[0] == pytest.approx(0.25, abs=1e-6)

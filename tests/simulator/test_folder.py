@@ -1,0 +1,110 @@
+"""r2flow simulate: files that agree with each other and with the simulator, whoever writes them and when."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r2flow import cli
+from r2flow.errors import InputError
+from r2flow.lidar.projection import project
+from r2flow.lidar.scan_files import read_points
+from r2flow.lidar.sensors import SENSORS
+from r2flow.simulator import simulate
+from r2flow.simulator.folder import SimulatedFolder, write_folder
+
+SMALL = SENSORS["hdl64e"].resized(16, 128)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def test_files_hold_what_the_simulator_draws(tmp_path):
+    folder = SimulatedFolder(tmp_path / "a", SMALL, 3, ("bin", "npy"), labels=True)
+    assert write_folder(folder, range(5, 7), workers=1) == 2
+    names = {f"{index:06d}.{ending}" for index in (5, 6) for ending in ("bin", "npy", "label")}
+    assert set(contents(folder.path)) == {*names, "simulated.json"}
+    scan = simulate(SMALL, 3, 6)
+    np.testing.assert_array_equal(np.load(folder.path / "000006.npy"), scan.image)
+    points = read_points(folder.path / "000006.bin")
+    labels = np.fromfile(folder.path / "000006.label", "<u4")
+    assert len(labels) == len(points.xyz) == (scan.image[0] > 0).sum()
+    np.testing.assert_allclose(project(points.xyz, points.reflectance, SMALL), scan.image, atol=1e-5)
+    back = project(points.xyz, labels.astype(np.float32), SMALL)[1]
+    np.testing.assert_array_equal(back, scan.labels)
+
+
+def test_what_is_there_is_kept_and_what_is_missing_made_again(tmp_path):
+    folder = SimulatedFolder(tmp_path, SMALL, 0)
+    write_folder(folder, range(4), workers=1)
+    whole, kept = contents(tmp_path), (tmp_path / "000001.bin").stat().st_mtime_ns
+    (tmp_path / "000002.bin").unlink()
+    steps = []
+    assert write_folder(folder, range(4), workers=1, advance=lambda: steps.append(1)) == 1
+    assert len(steps) == 4
+    assert contents(tmp_path) == whole
+    assert (tmp_path / "000001.bin").stat().st_mtime_ns == kept
+
+
+def test_a_scan_does_not_depend_on_which_others_are_made(tmp_path):
+    write_folder(SimulatedFolder(tmp_path / "all", SMALL, 1), range(4), workers=1)
+    for index in (3, 1):
+        write_folder(SimulatedFolder(tmp_path / "some", SMALL, 1), [index], workers=1)
+    everything = contents(tmp_path / "all")
+    assert {name: everything[name] for name in contents(tmp_path / "some")} == contents(tmp_path / "some")
+
+
+@pytest.mark.slow
+def test_two_processes_write_what_one_writes(tmp_path):
+    for workers in (1, 2):
+        write_folder(SimulatedFolder(tmp_path / str(workers), SMALL, 1, labels=True), range(12), workers)
+    assert contents(tmp_path / "1") == contents(tmp_path / "2")
+
+
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        (SimulatedFolder(Path(), SMALL, 1), "seed 0, asked for is 1"),
+        (SimulatedFolder(Path(), SENSORS["vlp16"], 0), "sensor hdl64e 16x128"),
+    ],
+    ids=["seed", "sensor"],
+)
+def test_a_folder_of_another_seed_or_sensor_is_refused(tmp_path, other, words):
+    write_folder(SimulatedFolder(tmp_path, SMALL, 0), range(1), workers=1)
+    before = contents(tmp_path)
+    with pytest.raises(InputError, match=words):
+        write_folder(SimulatedFolder(tmp_path, other.sensor, other.seed), range(2), workers=1)
+    assert contents(tmp_path) == before
+
+
+def test_other_peoples_scans_and_damaged_notes_are_left_alone(tmp_path):
+    (tmp_path / "000000.bin").write_bytes(b"a real scan")
+    with pytest.raises(InputError, match="holds scans already"):
+        write_folder(SimulatedFolder(tmp_path, SMALL, 0), range(1), workers=1)
+    (tmp_path / "simulated.json").write_text("{", "utf-8")
+    with pytest.raises(InputError, match="damaged"):
+        write_folder(SimulatedFolder(tmp_path, SMALL, 0), range(1), workers=1)
+    assert (tmp_path / "000000.bin").read_bytes() == b"a real scan"
+
+
+@pytest.mark.parametrize(
+    ("formats", "labels", "words"), [(("las",), False, "no format named 'las'"), (("npy",), True, "labels are one")]
+)
+def test_formats_that_cannot_be_written_are_named(tmp_path, formats, labels, words):
+    with pytest.raises(InputError, match=words):
+        SimulatedFolder(tmp_path, SMALL, 0, formats, labels)
+
+
+def test_the_verb_writes_the_scans_of_any_sensor(tmp_path, monkeypatch, capsys, sensor):
+    command = ["r2flow", "simulate", "--num", "1", "--first", "2", "--sensor", sensor.name, "--seed", "4"]
+    monkeypatch.setattr(sys, "argv", [*command, "--format", "npy,ply", "--size", "16x64", "--out", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 0
+    assert "1 scans (npy, ply)" in capsys.readouterr().out
+    image = np.load(tmp_path / "000002.npy")
+    np.testing.assert_array_equal(image, simulate(sensor.resized(16, 64), 4, 2).image)
+    assert json.loads((tmp_path / "simulated.json").read_text("utf-8"))["sensor"]["name"] == sensor.name
