@@ -15,6 +15,7 @@ from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     measure,
     pairs,
     scans,
+    sensors,
     simulate,
 )
 from r2flow.cli.app import app

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Convention, Sensor
+from r2flow.lidar.unfolding import unfolded_rows
 
 Projection = Literal["spherical", "unfolding"]
 PROJECTIONS = ("spherical", "unfolding")
@@ -25,8 +26,8 @@ def project(
 ) -> np.ndarray:
     """The range image of a scan: in every pixel the nearest return that falls into it.
 
-    `spherical` chooses the row by elevation asin(z / r); `unfolding` by the order in which the sensor
-    fired (`rings_from_order`), or by `ring` where the file tells. The column is floor(W (1 - a / pi) / 2)
+    `spherical` chooses the row by elevation asin(z / r); `unfolding` by the laser that fired, where `ring` or
+    the order of the points tells it (`unfolded_rows`). The column is floor(W (1 - a / pi) / 2)
     of the azimuth a = atan2(y, x): column 0 begins at +180 degrees and azimuth falls with w.
 
     `centre` keeps a return only where min_range <= r <= max_range and the field of view holds it.
@@ -38,7 +39,8 @@ def project(
         xyz: Points in metres, (N, 3), sensor frame: x ahead, y left, z up.
         reflectance: (N,), or None where the scan has none.
         sensor: Rows, columns and range limits.
-        ring: Ring number of each point, (N,), in any numbering that rises or falls with elevation.
+        ring: Ring number of each point, (N,), counted from 0 or 1, that rises or falls with elevation or is the
+            laser's in the sensor's firing order.
 
     Returns:
         Range in metres and reflectance, (2, H, W) float32; 0 where no return was kept.
@@ -47,31 +49,43 @@ def project(
         InputError: an unknown projection or convention; or a scan that does not unfold into the
             sensor's rings.
     """
+    image = np.zeros((2, math.prod(sensor.shape)), dtype=np.float32)
+    hit, chosen, r = project_indices(xyz, sensor, projection, convention, ring)
+    image[0, hit] = r
+    if reflectance is not None:
+        image[1, hit] = reflectance[chosen]
+    return image.reshape(2, *sensor.shape)
+
+
+def project_indices(
+    xyz: np.ndarray,
+    sensor: Sensor,
+    projection: Projection = "spherical",
+    convention: Convention = "centre",
+    ring: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which return each pixel keeps, see `project`.
+
+    Returns:
+        The pixels that keep one, h W + w, ascending; the index of its point in `xyz`; its range in metres: (M,) each.
+    """
     if convention not in CONVENTIONS:
         raise InputError(f"no projection convention named {convention!r}; known: {', '.join(CONVENTIONS)}.")
     xyz = np.asarray(xyz, dtype=np.float32)
     rows, columns = sensor.shape
     r = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
     row = _rows(xyz, r, sensor, projection, convention, ring)
-    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
-    column = np.floor(((1 - azimuth / np.float32(math.pi)) / 2 % 1) * columns).astype(np.int64)
-    np.minimum(column, columns - 1, out=column)  # float32 may round the last bin up to W
-
-    pixel = row * columns + column
+    pixel = row * columns
+    pixel += _columns(xyz, columns)
     within = (r >= sensor.min_range) & (r <= sensor.max_range)
     if convention == "reference":
         hit, chosen = _nearest_by_sorting(pixel, r)
         hit, chosen = hit[within[chosen]], chosen[within[chosen]]
     else:
-        keep = np.flatnonzero((row >= 0) & (row < rows) & within)
-        hit, chosen = _nearest(pixel[keep], r[keep], rows * columns)
-        chosen = keep[chosen]
-
-    image = np.zeros((2, rows * columns), dtype=np.float32)
-    image[0, hit] = r[chosen]
-    if reflectance is not None:
-        image[1, hit] = reflectance[chosen]
-    return image.reshape(2, rows, columns)
+        # What is left out shares one pixel behind the last: cheaper than taking the others out of every array.
+        pixel[(row < 0) | (row >= rows) | ~within] = rows * columns
+        hit, chosen = _nearest(pixel, r, rows * columns)
+    return hit, chosen, r[chosen]
 
 
 def _rows(
@@ -79,71 +93,48 @@ def _rows(
     r: np.ndarray,
     sensor: Sensor,
     projection: str,
-    convention: str,
+    convention: Convention,
     ring: np.ndarray | None,
 ) -> np.ndarray:
     """Row of every point, (N,) int64; outside [0, H) where the view does not hold it."""
-    rows = sensor.shape[0]
     if projection == "unfolding":
-        order = rings_from_field(xyz, ring) if ring is not None else rings_from_order(xyz)
-        # Aligned at the bottom: rings that see only sky are missing at the top.
-        row = order - (order.max(initial=0) + 1) + rows
-        found = len(np.unique(order[order >= 0]))
-        if convention == "centre" and not rows / 2 <= found <= rows + 1:
-            raise InputError(
-                f"the scan unfolds into {found} rings, but sensor '{sensor.name}' has {rows}. "
-                "Are its points in firing order, ring after ring? If not, use the spherical projection."
-            )
-        return np.maximum(row, 0) if convention == "reference" else row
+        return unfolded_rows(xyz, sensor, convention, ring)
     if projection != "spherical":
         raise InputError(f"no projection named {projection!r}; known: {', '.join(PROJECTIONS)}.")
+    rows = sensor.shape[0]
     elevation = np.arcsin(xyz[:, 2] / np.maximum(r, np.float32(1e-12)))
     edges = np.deg2rad(sensor.row_edges)
     step = np.diff(edges)
     if np.allclose(step, step[0], rtol=1e-6):  # evenly spaced: an affine map instead of a search
-        row = np.floor((edges[0] - elevation) / (edges[0] - edges[-1]) * rows).astype(np.int64)
+        place = edges[0] - elevation
+        place /= edges[0] - edges[-1]
+        place *= rows
+        row = np.floor(place, out=place).astype(np.int64)
     else:
         row = np.searchsorted(-edges, -elevation, side="right") - 1
     return np.clip(row, 0, rows - 1) if convention == "reference" else row
 
 
-def rings_from_order(xyz: np.ndarray) -> np.ndarray:
-    """Ring of every point from the firing order, (N,) int64, 0 for the first ring fired.
-
-    A spinning sensor stored ring after ring sweeps azimuth upwards from 0; a new ring starts where it
-    passes from the 4th to the 1st quadrant. Points at the origin are rays without return (-1).
-    """
-    x, y = xyz[:, 0], xyz[:, 1]
-    returned = np.flatnonzero((x != 0) | (y != 0))
-    ring = np.full(len(xyz), -1, dtype=np.int64)
-    if len(returned) == 0:
-        return ring
-    x, y = x[returned], y[returned]
-    first = (x >= 0) & (y >= 0)
-    fourth = (x >= 0) & (y < 0)
-    starts = first & np.roll(fourth, 1)
-    starts[0] = True
-    ring[returned] = np.cumsum(starts) - 1
-    return ring
-
-
-def rings_from_field(xyz: np.ndarray, ring: np.ndarray) -> np.ndarray:
-    """The file's own ring numbers, turned so that 0 is the highest ring, (N,) int64."""
-    ring = np.asarray(ring, dtype=np.int64)
-    elevation = np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))
-    rising = np.cov(ring, elevation)[0, 1] > 0
-    return ring.max() - ring if rising else ring - ring.min()
+def _columns(xyz: np.ndarray, columns: int) -> np.ndarray:
+    """Column of every point, (N,) int64."""
+    turn = (1 - np.arctan2(xyz[:, 1], xyz[:, 0]) / np.float32(math.pi)) / 2  # of [0, 1], 1 at exactly -180 degrees
+    column = (turn * np.float32(columns)).astype(np.int64)
+    np.minimum(column, columns - 1, out=column)  # float32 may round the last bin up to W
+    column[turn == 1] = 0
+    return column
 
 
 def _nearest(pixel: np.ndarray, r: np.ndarray, pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    """The occupied pixels and the index of the nearest point in each; of equals, the first."""
+    """The occupied ones of the first `pixels` and the index of the nearest point in each; of equals, the first."""
     # A positive float32 orders like its bits: with (bits of r, index) in one integer the nearest point
     # is the minimum, found in one pass without sorting 120,000 points.
-    key = (r.view(np.uint32).astype(np.uint64) << np.uint64(32)) | np.arange(len(r), dtype=np.uint64)
+    key = r.view(np.uint32).astype(np.uint64)
+    key <<= np.uint64(32)
+    key |= np.arange(len(r), dtype=np.uint64)
     empty = np.uint64(2**64 - 1)
-    best = np.full(pixels, empty, dtype=np.uint64)
+    best = np.full(pixels + 1, empty, dtype=np.uint64)
     np.minimum.at(best, pixel, key)
-    hit = np.flatnonzero(best != empty)
+    hit = np.flatnonzero(best[:pixels] != empty)
     return hit, (best[hit] & np.uint64(2**32 - 1)).astype(np.int64)
 
 

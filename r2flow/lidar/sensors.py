@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import pairwise
-from typing import Literal
+from itertools import chain, pairwise
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,6 +15,8 @@ from r2flow.errors import InputError
 from r2flow.registry import Registry
 
 Convention = Literal["centre", "reference"]
+
+MOST_PIXELS = 1 << 24  # of an image, 128 x 131,072: beyond any sensor, and what memory still holds
 
 
 @dataclass(frozen=True)
@@ -28,10 +30,13 @@ class Sensor:
         min_range: Nearest valid range in metres.
         max_range: Farthest valid range in metres.
         height: Usual height of the sensor above the ground in metres.
+        firing: Row of laser 0, 1, ... in the order in which the sensor's packets list them, where that is neither
+            from the top row down nor from the bottom up; None where it is. Scan unfolding needs it.
 
     Raises:
-        InputError: fewer than two rows or one column, elevations that do not fall or leave
-            (-90, 90) degrees, or range limits that are not 0 < min_range < max_range.
+        InputError: fewer than two rows or one column, more than `MOST_PIXELS`, elevations that do not fall or leave
+            (-90, 90) degrees, range limits that are not 0 < min_range < max_range, a height that is not finite,
+            or a firing order that does not name every row once.
     """
 
     name: str
@@ -40,20 +45,33 @@ class Sensor:
     min_range: float = 1.45
     max_range: float = 80.0
     height: float = 1.73
+    firing: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         e = self.elevations
-        if len(e) < 2 or any(b >= a for a, b in pairwise(e)) or e[0] >= 90 or e[-1] <= -90:
+        # Written so that NaN, which compares false, is refused too.
+        if len(e) < 2 or not all(a > b for a, b in pairwise(e)) or not (e[0] < 90 and e[-1] > -90):
             raise InputError(
                 f"sensor {self.name!r}: elevations must be two or more, fall from the top row down and lie "
                 f"within (-90, 90) degrees; found {len(e)} of them, {list(e)[:4]}..."
             )
         if self.columns < 1:
             raise InputError(f"sensor {self.name!r}: columns must be at least 1, found {self.columns}.")
+        if len(e) * self.columns > MOST_PIXELS:
+            raise InputError(
+                f"sensor {self.name!r}: an image has at most {MOST_PIXELS:,} pixels, found {len(e)} x {self.columns}."
+            )
         if not (0 < self.min_range < self.max_range < math.inf):
             raise InputError(
                 f"sensor {self.name!r}: needs 0 < min_range < max_range, "
                 f"found {self.min_range} and {self.max_range} metres."
+            )
+        if not math.isfinite(self.height):
+            raise InputError(f"sensor {self.name!r}: height must be in metres, found {self.height}.")
+        if self.firing is not None and sorted(self.firing) != list(range(len(e))):
+            raise InputError(
+                f"sensor {self.name!r}: firing must name each of the rows 0 to {len(e) - 1} once, one for each laser; "
+                f"found {len(self.firing)} of them, {list(self.firing)[:4]}..."
             )
 
     @property
@@ -98,11 +116,14 @@ class Sensor:
         old = len(self.elevations)
         if rows is None or rows == old:
             return sensor
-        if rows < 2:
-            raise InputError(f"sensor {self.name!r}: an image needs at least 2 rows, found {rows}.")
+        most = MOST_PIXELS // sensor.columns
+        if not 2 <= rows <= most:
+            raise InputError(
+                f"sensor {self.name!r}: an image of {sensor.columns} columns has 2 to {most:,} rows, found {rows}."
+            )
         edges = np.interp(np.linspace(0, old, rows + 1), np.arange(old + 1), self.row_edges)
         middle = (edges[:-1] + edges[1:]) / 2
-        return replace(sensor, elevations=tuple(middle.tolist()))
+        return replace(sensor, elevations=tuple(middle.tolist()), firing=None)  # rows are no lasers any more
 
 
 def evenly_spaced(top: float, bottom: float, rows: int) -> tuple[float, ...]:
@@ -113,6 +134,18 @@ def evenly_spaced(top: float, bottom: float, rows: int) -> tuple[float, ...]:
 
 def _beams(top: float, step: float, count: int) -> Sequence[float]:
     return tuple(top - step * beam for beam in range(count))
+
+
+def _halves_in_turn(rows: int) -> tuple[int, ...]:
+    """Firing order of Velodyne's 16 and 32 evenly spaced lasers: a lower and an upper half in turn, both upwards."""
+    middle = rows // 2
+    return tuple(chain.from_iterable(zip(range(rows - 1, middle - 1, -1), range(middle - 1, -1, -1), strict=True)))
+
+
+def _by_laser(elevations: Sequence[float]) -> dict[str, Any]:
+    """Elevations and firing order of a sensor whose manual lists its lasers in another order than from the top."""
+    order = sorted(range(len(elevations)), key=lambda laser: -elevations[laser])
+    return {"elevations": tuple(elevations[laser] for laser in order), "firing": tuple(np.argsort(order).tolist())}
 
 
 # Median elevations of the 64 rings of an HDL-64E, measured on unfolded KITTI scans; another car's lie within 0.2
@@ -126,20 +159,62 @@ HDL64E_RINGS = (
     -19.57, -20.08, -20.67, -21.16, -21.56, -22.00, -22.64, -23.16, -23.64,
 )  # fmt: skip
 
-# hdl64e is the image of the paper: 64 equal bins between +3 and -25 degrees, 1.45 to 80 m.
+# VLP-32C User Manual 63-9325 (Velodyne), tables 9-2 and 9-6: elevation of laser 0, 1, ..., 31.
+VLP32C_LASERS = (
+    -25.0, -1.0, -1.667, -15.639, -11.31, 0.0, -0.667, -8.843, -7.254, 0.333, -0.333,
+    -6.148, -5.333, 1.333, 0.667, -4.0, -4.667, 1.667, 1.0, -3.667, -3.333, 3.333,
+    2.333, -2.667, -3.0, 7.0, 4.667, -2.333, -2.0, 15.0, 10.333, -1.333,
+)  # fmt: skip
+
+# Pandar64, from the correction table of the maker's open driver (Hesai): elevation of channel 1, 2, ..., 64, the top
+# one first. A unit's own calibration file departs from it by some hundredths of a degree.
+PANDAR64_CHANNELS = (
+    14.882, 11.032, 8.059, 5.057, 3.04, 2.028, 1.86, 1.688, 1.522, 1.351, 1.184,
+    1.013, 0.846, 0.675, 0.508, 0.337, 0.169, 0.0, -0.169, -0.337, -0.508, -0.675,
+    -0.845, -1.013, -1.184, -1.351, -1.522, -1.688, -1.86, -2.028, -2.198, -2.365, -2.536,
+    -2.7, -2.873, -3.04, -3.21, -3.375, -3.548, -3.712, -3.884, -4.05, -4.221, -4.385,
+    -4.558, -4.72, -4.892, -5.057, -5.229, -5.391, -5.565, -5.726, -5.898, -6.061, -7.063,
+    -8.059, -9.06, -9.885, -11.032, -12.006, -12.974, -13.93, -18.889, -24.897,
+)  # fmt: skip
+
+# Ranges and beams by the manuals: HDL-32E 63-9113, VLP-16 63-9243, VLP-32C 63-9325 (Velodyne); OS1 datasheet of its
+# first generation, whose 64 beams span +-16.6 degrees and whose 128 span +-22.5 (Ouster); Pandar64 640-en (Hesai).
+# An OS1's beams are calibrated unit by unit, up to half a degree off these: `r2flow sensor` finds a unit's own.
+# hdl64e is the image of the paper: 64 equal bins between +3 and -25 degrees, 1.45 to 80 m. Its lasers have no firing
+# order here: packets list them by laser number, whose elevation every unit's calibration tells anew.
 SENSORS: Registry[Sensor] = Registry(
     "sensor",
     hdl64e=Sensor("hdl64e", evenly_spaced(3.0, -25.0, 64)),
     hdl64e_rings=Sensor("hdl64e_rings", HDL64E_RINGS),
-    hdl32e=Sensor("hdl32e", tuple(_beams(32 / 3, 4 / 3, 32)), min_range=1.0, max_range=100.0, height=1.84),
-    vlp16=Sensor("vlp16", tuple(_beams(15.0, 2.0, 16)), min_range=0.5, max_range=100.0),
+    hdl32e=Sensor(
+        "hdl32e",
+        tuple(_beams(32 / 3, 4 / 3, 32)),
+        min_range=1.0,
+        max_range=100.0,
+        height=1.84,
+        firing=_halves_in_turn(32),
+    ),
+    vlp16=Sensor("vlp16", tuple(_beams(15.0, 2.0, 16)), min_range=0.5, max_range=100.0, firing=_halves_in_turn(16)),
+    vlp32c=Sensor("vlp32c", **_by_laser(VLP32C_LASERS), min_range=0.5, max_range=200.0),
+    os1_64=Sensor("os1_64", tuple(_beams(16.6, 33.2 / 63, 64)), min_range=0.8, max_range=120.0),
+    os1_128=Sensor("os1_128", tuple(_beams(22.5, 45 / 127, 128)), min_range=0.8, max_range=120.0),
+    pandar64=Sensor("pandar64", PANDAR64_CHANNELS, min_range=0.3, max_range=200.0),
 )
 
 
 @lru_cache(maxsize=32)
-def _build(name: str, rows: int | None, columns: int | None, changes: tuple[tuple[str, float], ...]) -> Sensor:
-    sensor = SENSORS[name].resized(rows, columns)
-    return replace(sensor, **dict(changes)) if changes else sensor  # type: ignore[arg-type]
+def _build(
+    name: str,
+    elevations: tuple[float, ...] | None,
+    firing: tuple[int, ...] | None,
+    rows: int | None,
+    columns: int | None,
+    changes: tuple[tuple[str, float], ...],
+) -> Sensor:
+    sensor = SENSORS[name] if elevations is None else Sensor(name, elevations)
+    if firing is not None:
+        sensor = replace(sensor, firing=firing)
+    return replace(sensor.resized(rows, columns), **dict(changes))  # type: ignore[arg-type]
 
 
 def build_sensor(
@@ -149,7 +224,26 @@ def build_sensor(
     min_range: float | None = None,
     max_range: float | None = None,
     height: float | None = None,
+    elevations: Sequence[float] | None = None,
+    firing: Sequence[int] | None = None,
 ) -> Sensor:
-    """A sensor of the table at an image size, its limits overridden where given."""
+    """A sensor at an image size, its limits overridden where given: one of the table, or one's own by `elevations`.
+
+    Raises:
+        InputError: no such name in the table; a name of the table with elevations of its own; or no possible sensor.
+    """
+    if elevations is not None and name in SENSORS:
+        raise InputError(f"the name {name!r} is {name}'s of the table; give a sensor of your own another one.")
+    beams = None if elevations is None else tuple(map(float, _numbers(name, "elevations", elevations, int | float)))
+    lasers = None if firing is None else _numbers(name, "firing", firing, int)
     changes = {"min_range": min_range, "max_range": max_range, "height": height}
-    return _build(name, rows, columns, tuple((k, float(v)) for k, v in changes.items() if v is not None))
+    given = tuple((key, float(value)) for key, value in changes.items() if value is not None)
+    return _build(name, beams, lasers, rows, columns, given)
+
+
+def _numbers(name: str, key: str, values: Sequence[Any], kind: Any) -> tuple[Any, ...]:
+    for value in values:
+        if not isinstance(value, kind) or isinstance(value, bool):
+            what = "whole numbers" if kind is int else "numbers"
+            raise InputError(f"sensor {name!r}: {key} must be a list of {what}, found {value!r} in it.")
+    return tuple(values)

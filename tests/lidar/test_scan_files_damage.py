@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from r2flow.data.sources import read_scan
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import Points, read_points, write_points
+from r2flow.lidar.sensors import SENSORS
 
 # A reader that warns has met something it was not made for.
 pytestmark = pytest.mark.filterwarnings("error")
@@ -137,6 +139,38 @@ def test_flipped_bits_in_the_body_cost_their_own_points_at_most(tmp_path, origin
         assert len(points.xyz) + points.dropped == COUNT
         known = {tuple(row) for row in XYZ.tolist()}
         assert sum(tuple(row) not in known for row in points.xyz.tolist()) <= 2
+
+
+@pytest.mark.parametrize(("name", "columns"), [("bin", 4), ("pcd.bin", 5)])
+def test_what_a_flipped_bit_in_a_number_leaves_is_a_value_that_lidars_measure(tmp_path, originals, name, columns):
+    # These formats have no checksum: a coordinate that becomes another coordinate cannot be told from the right one.
+    # What no LiDAR measures can, and costs its own point or the file.
+    whole = originals[name]
+    dropped = refused = changed = 0
+    for bit in range(0, 8 * len(whole), 53):  # 53 has no factor in common with 32: bits of all places in turn
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        points = read_bytes(tmp_path, name, bytes(damaged))
+        row, column = divmod(bit // 32, columns)
+        value = np.frombuffer(bytes(damaged), "<f4")[bit // 32]
+        if points is None:
+            refused += 1
+            assert column == 4
+        elif points.dropped:
+            dropped += 1
+            assert not abs(value) <= 1e4
+            np.testing.assert_array_equal(points.xyz, np.delete(XYZ, row, 0))
+            np.testing.assert_array_equal(points.kept, np.delete(np.arange(COUNT), row))
+        elif column < 3:
+            changed += 1
+            assert abs(value) <= 1e4
+            np.testing.assert_array_equal(np.delete(points.xyz, row, 0), np.delete(XYZ, row, 0))
+        elif column == 3 and not 0 <= value <= 1.001:  # what means full reflectance is known to who asks for it
+            (tmp_path / "damaged").mkdir(exist_ok=True)
+            with pytest.raises(InputError, match="reflectance must lie in"):
+                read_scan(tmp_path / f"damaged.{name}", SENSORS["hdl64e"].resized(8, 32))
+    assert min(dropped, changed) > 5
+    assert (refused > 10) == (name == "pcd.bin")  # a ring that is none
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -1,11 +1,16 @@
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from r2flow.errors import InputError
+from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor, evenly_spaced
+
+CONF = Path(__file__).resolve().parents[2] / "conf" / "sensor"
 
 
 def test_hdl64e_is_the_paper_s_image():
@@ -52,5 +57,101 @@ def test_impossible_sensors_are_refused():
         Sensor("s", (1.0, 0.0), min_range=5, max_range=4)
     with pytest.raises(InputError, match="columns"):
         Sensor("s", (1.0, 0.0), columns=0)
+    # Sizes that no memory holds are refused before anything is allocated.
+    with pytest.raises(InputError, match="at most 16,777,216 pixels, found 2 x 10000000000000"):
+        Sensor("s", (1.0, 0.0), columns=10**13)
+    with pytest.raises(InputError, match="has 2 to 16,384 rows, found 10000000000000"):
+        build_sensor("hdl64e", 10**13)
     with pytest.raises(InputError, match="Did you mean 'hdl64e'"):
         build_sensor("hdl64")
+
+
+@pytest.mark.parametrize(
+    ("name", "lasers"),
+    [
+        # Laser (in the order of the packets): elevation in degrees, as the manuals print them.
+        ("hdl32e", {0: -30.67, 1: -9.33, 2: -29.33, 9: -4.0, 15: 0.0, 30: -10.67, 31: 10.67}),
+        ("vlp16", {0: -15, 1: 1, 2: -13, 7: 7, 8: -7, 14: -1, 15: 15}),
+        ("vlp32c", {0: -25, 1: -1, 3: -15.639, 5: 0, 12: -5.333, 25: 7, 29: 15, 30: 10.333, 31: -1.333}),
+    ],
+)
+def test_lasers_fire_in_the_order_of_the_manual(name, lasers):
+    sensor = SENSORS[name]
+    for laser, elevation in lasers.items():
+        assert sensor.elevations[sensor.firing[laser]] == pytest.approx(elevation, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("name", "beams", "top", "bottom", "finest"),
+    [
+        ("hdl32e", 32, 10.67, -30.67, 1.333),
+        ("vlp16", 16, 15, -15, 2),
+        ("vlp32c", 32, 15, -25, 0.333),
+        ("os1_64", 64, 16.6, -16.6, 0.527),
+        ("os1_128", 128, 22.5, -22.5, 0.354),
+        ("pandar64", 64, 14.882, -24.897, 1 / 6),
+    ],
+)
+def test_fields_of_view_are_the_manuals(name, beams, top, bottom, finest):
+    e = np.array(SENSORS[name].elevations)
+    assert len(e) == beams
+    assert (e[0], e[-1]) == pytest.approx((top, bottom), abs=0.005)
+    assert -np.diff(e).max() == pytest.approx(finest, abs=0.01)
+
+
+def test_the_beams_of_a_vlp_32c_are_those_of_a_real_one(shared):
+    (path,) = (shared / "real" / "other_sensors" / "rellis_vlp32c").glob("*.bin")
+    xyz = read_points(path).xyz.astype(np.float64)
+    e = np.rad2deg(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
+    measured, count = np.unique(e.round(3), return_counts=True)
+    np.testing.assert_allclose(measured[count > 100][::-1], SENSORS["vlp32c"].elevations, atol=0.0015)
+
+
+def test_every_sensor_has_a_config_and_every_config_builds():
+    built = []
+    for path in CONF.glob("*.yaml"):
+        options = yaml.safe_load(path.read_text())
+        base = options.pop("defaults", None)
+        if base:
+            options = {**yaml.safe_load((CONF / f"{base[0]}.yaml").read_text()), **options}
+        assert options.pop("rays") == "centre"
+        sensor = build_sensor(**options)
+        built.append(options["name"])
+        if options["rows"] == len(SENSORS[options["name"]].elevations):
+            assert sensor.elevations == SENSORS[options["name"]].elevations
+    assert set(built) == set(SENSORS)
+
+
+def test_a_sensor_of_one_s_own():
+    mine = build_sensor("mine", elevations=[2, 1.5, -1, -8], firing=[3, 1, 0, 2], columns=64, max_range=30, height=1)
+    assert mine == Sensor("mine", (2.0, 1.5, -1.0, -8.0), 64, max_range=30.0, height=1.0, firing=(3, 1, 0, 2))
+    assert build_sensor("mine", elevations=[2, 1.5, -1, -8], columns=64).rays()[0, :, 0].rad2deg().tolist() == (
+        pytest.approx([2, 1.5, -1, -8])
+    )
+    smaller = build_sensor("mine", rows=2, columns=32, elevations=[2, 1, 0, -1], firing=[3, 1, 0, 2])
+    assert smaller.elevations == (1.5, -0.5)  # two rows of two beams each
+    assert smaller.shape == (2, 32)
+    assert smaller.firing is None
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"elevations": [2, "a"]}, "elevations must be a list of numbers, found 'a'"),
+        ({"elevations": [2, True]}, "elevations must be a list of numbers, found True"),
+        ({"elevations": [1, 2]}, "fall from the top"),
+        ({"elevations": [2, math.nan]}, "fall from the top"),
+        ({"elevations": [90, 2]}, "within (-90, 90)"),
+        ({"elevations": [2, 1], "firing": [0, 0]}, "firing must name each of the rows 0 to 1 once"),
+        ({"elevations": [2, 1], "firing": [0, 1.0]}, "firing must be a list of whole numbers, found 1.0"),
+        ({"elevations": [2, 1], "height": math.inf}, "height must be in metres"),
+        ({"elevations": [2, 1], "max_range": math.nan}, "min_range < max_range"),
+        ({"name": "vlp16", "elevations": [2, 1]}, "another one"),
+        ({}, "no sensor named 'mine'"),
+    ],
+)
+def test_an_impossible_sensor_of_one_s_own_is_refused(options, words):
+    with pytest.raises(InputError) as error:
+        build_sensor(**{"name": "mine", **options})
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)

@@ -1,6 +1,6 @@
 """Points as a scan file gave them, and the checks that tell a scan from something else."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +24,16 @@ class Points:
         xyz: Coordinates in metres, (N, 3), float32, sensor frame: x ahead, y left, z up.
         reflectance: As stored, (N,), float32, not rescaled; None when the file has none.
         ring: Number of the beam, (N,), uint16; None when the file has none.
-        dropped: Rows that were left out because a coordinate or the reflectance was NaN or infinite.
+        dropped: Rows that were left out because a coordinate or the reflectance was NaN or infinite, or a coordinate
+            beyond `FARTHEST`.
+        kept: Index in the file of each row that is left, (N,); None when all are.
     """
 
     xyz: np.ndarray
     reflectance: np.ndarray | None = None
     ring: np.ndarray | None = None
     dropped: int = 0
+    kept: np.ndarray | None = None
 
 
 def checked_points(
@@ -40,7 +43,7 @@ def checked_points(
     ring: np.ndarray | None = None,
     layout: str | None = None,
 ) -> Points:
-    """Drop what is not finite, refuse what is not a scan.
+    """Drop what is not finite or no LiDAR reaches, refuse what is not a scan.
 
     Args:
         path: The file, for messages.
@@ -60,22 +63,30 @@ def checked_points(
         # Copied, since these may be views of a file's bytes, which cannot be written to.
         xyz = np.array(xyz, dtype=np.float32, order="C")
         reflectance = None if reflectance is None else np.array(reflectance, dtype=np.float32)
+    points = Points(xyz, reflectance, ring)
     if not (_all_finite(xyz) and (reflectance is None or _all_finite(reflectance))):
-        keep = np.isfinite(xyz).all(axis=1)
-        keep &= True if reflectance is None else np.isfinite(reflectance)
-        xyz = xyz[keep]
-        reflectance = None if reflectance is None else reflectance[keep]
-        ring = None if ring is None else ring[keep]
-    if not len(xyz):
+        finite = np.isfinite(xyz).all(axis=1)
+        finite &= True if reflectance is None else np.isfinite(reflectance)
+        points = _only(points, finite)
+    if not len(points.xyz):
         raise InputError(
             f"{path} holds no finite point: each of its {total} rows has a coordinate or reflectance that "
             "is NaN or infinite; was it written by something that failed?"
         )
-    dropped = total - len(xyz)
-    _refuse_implausible(path, xyz, layout)
+    _refuse_implausible(path, points.xyz, layout)
     if layout is not None:
-        _refuse_wrong_layout(path, reflectance, dropped, total, layout)
-    return Points(xyz, reflectance, None if ring is None else _whole_rings(path, ring), dropped)
+        _refuse_wrong_layout(path, points.reflectance, points.dropped, total, layout)
+    if max(points.xyz.max(), -points.xyz.min()) > FARTHEST:
+        points = _only(points, np.abs(points.xyz).max(axis=1) <= FARTHEST)
+    return points if points.ring is None else replace(points, ring=_whole_rings(path, points.ring))
+
+
+def _only(points: Points, keep: np.ndarray) -> Points:
+    """The rows where `keep`, (N,) bool, holds."""
+    kept = np.flatnonzero(keep) if points.kept is None else points.kept[keep]
+    reflectance = None if points.reflectance is None else points.reflectance[keep]
+    ring = None if points.ring is None else points.ring[keep]
+    return Points(points.xyz[keep], reflectance, ring, points.dropped + int((~keep).sum()), kept)
 
 
 def _all_finite(values: np.ndarray) -> bool:
@@ -95,7 +106,7 @@ def _refuse_implausible(path: Path, xyz: np.ndarray, layout: str | None) -> None
     returns = len(largest)
     far = np.count_nonzero(largest > FARTHEST)
     near = np.count_nonzero(largest < NEAREST)
-    # A twentieth, not one: a few flipped bits must not cost the scan, and the projection drops them.
+    # A twentieth, not one: a few flipped bits must not cost the scan, only their own points.
     # A file of float64 read as float32 has a third of its rows out there, so the margin is wide.
     if far <= returns / 20 and near <= returns / 2:
         return

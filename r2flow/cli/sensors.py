@@ -1,0 +1,99 @@
+"""`r2flow sensor`: a user's own sensor, estimated from scans."""
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from r2flow.cli.app import app
+from r2flow.errors import InputError
+
+if TYPE_CHECKING:
+    from r2flow.lidar.beams import Beams
+    from r2flow.lidar.calibration import Estimate
+
+
+@app.command(epilog="Example: r2flow sensor my/scans --out conf/sensor/mine.yaml")
+def sensor(
+    scans: Annotated[list[Path], typer.Argument(help="Scan files, or folders of them, of one sensor.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The .yaml to write; none is written if left out.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="The sensor's name; by default that of the file.")] = None,
+    most: Annotated[int, typer.Option(min=1, help="The most scans to look at of a folder.")] = 8,
+) -> None:
+    """Estimate a sensor from scans: beams, resolution, limits, height, reflectance; write it as YAML.
+
+    The YAML is a sensor for the verbs (--sensor mine.yaml) and, in conf/sensor/, for train.py (sensor=mine).
+    """
+    from rich.progress import track
+
+    from r2flow.lidar.calibration import estimate_sensor
+    from r2flow.lidar.scan_files import read_points
+    from r2flow.lidar.sensor_files import ENDINGS, write_sensor
+    from r2flow.lidar.sensors import SENSORS
+    from r2flow.reports.views import scans_of
+
+    if out is not None and (out.suffix.lower() not in ENDINGS or out.is_dir()):
+        raise InputError(f"--out must be a .yaml file, by which --sensor knows it; found {out}.")
+    name = name or (out.stem if out is not None else "mine")
+    if name in SENSORS or not re.fullmatch(r"[A-Za-z]\w*", name):
+        raise InputError(f"--name must be letters, digits and _, and no sensor's of the table; found {name!r}.")
+    paths = [path for scan in scans for path in scans_of(scan, most)]
+    points = [read_points(path) for path in track(paths, "reading scans", disable=len(paths) < 16)]
+    estimate = estimate_sensor(points)
+    found = estimate.sensor(name)
+    _print(estimate)
+    if out is not None:
+        comment = (
+            f"Estimated from {estimate.scans} scan(s) with {estimate.returns:,} returns, stored {estimate.beams.order}."
+        )
+        write_sensor(found, out, f"{comment}\nBeams: {_sureness(estimate.beams)}.")
+        print(out)
+
+
+def _print(estimate: "Estimate") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    beams, (near, far) = estimate.beams, estimate.ranges
+    table = Table(box=None, show_header=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column()
+    e, middle = beams.elevations, len(beams.elevations) // 2
+    shown = [*e[:2], None, *e[middle - 1 : middle + 1], None, *e[-2:]]
+    table.add_row("beams", f"{len(e)}, {_sureness(beams)}")
+    table.add_row("elevations", " ".join("..." if one is None else f"{one:+.2f}" for one in shown) + " degrees")
+    if (known := estimate.nearest_known()) is not None:
+        table.add_row("", f"of the table {known[0]} is nearest, {known[1]:.2f} degrees off in the median")
+    table.add_row("resolution", f"{estimate.steps:,.0f} steps a turn; images of {estimate.columns} columns")
+    table.add_row("range", f"{near:.2f} to {far:.2f} m")
+    if estimate.near_share > 0.05:
+        share = f"{estimate.near_share:.0%} of the returns lie within 1 m"
+        table.add_row("", f"{share}: the vehicle itself? Then raise min_range in the YAML.")
+    if estimate.height is None:
+        table.add_row("height", "no ground found; the usual 1.73 m is taken")
+    else:
+        table.add_row(
+            "height", f"{estimate.height:.2f} m above the ground, where {estimate.ground_share:.0%} of them lie"
+        )
+    if (found := estimate.reflectance) is None:
+        table.add_row("reflectance", "none: encoding.reflectance=false")
+    else:
+        values = f"{found.levels} values up to {found.highest:.4g}"
+        table.add_row("reflectance", f"{values}: data.reflectance_scale={found.scale:g}")
+    table.add_row("storage", beams.order)
+    Console().print(table)
+
+
+def _sureness(beams: "Beams") -> str:
+    """How well the beams are known, in words."""
+    worst = int(beams.residuals.argmax())
+    spread = (
+        f"median residual {sorted(beams.residuals)[len(beams.residuals) // 2]:.3f} degrees, "
+        f"worst {beams.residuals[worst]:.3f} (row {worst})"
+    )
+    if beams.stable is None:
+        return f"told by the files; {spread}"
+    return f"told by their elevations alone, the same number over {beams.stable:.1f}-fold bandwidths; {spread}"

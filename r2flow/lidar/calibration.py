@@ -1,0 +1,177 @@
+"""A sensor estimated from its scans: beams, resolution, limits, height, and what its reflectance means."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from r2flow.errors import InputError
+from r2flow.lidar.beams import Beams, find_beams
+from r2flow.lidar.scan_files import Points
+from r2flow.lidar.sensors import SENSORS, Sensor
+
+FEWEST_RETURNS = 200
+COLUMNS = 64  # an image's width is a multiple of it, so that every backbone can halve it
+FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # values in use for it
+
+
+@dataclass(frozen=True)
+class Reflectance:
+    """What a file's reflectances look like.
+
+    Attributes:
+        highest: The highest value found.
+        levels: How many values were found.
+        scale: The value that means full reflectance, as far as these scans tell.
+    """
+
+    highest: float
+    levels: int
+    scale: float
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What scans tell of their sensor.
+
+    Attributes:
+        beams: Its beams.
+        steps: Azimuth steps of a full turn, not rounded.
+        ranges: Nearest and farthest range in metres, but for one return in ten thousand at either end.
+        near_share: Share of the returns that lie within a metre: often the vehicle itself.
+        height: Height above the ground in metres; None where no ground was found.
+        ground_share: Share of the returns that lie on that ground.
+        reflectance: None where the files have none.
+        scans: How many scans were looked at.
+        returns: How many returns they hold.
+    """
+
+    beams: Beams
+    steps: float
+    ranges: tuple[float, float]
+    near_share: float
+    height: float | None
+    ground_share: float
+    reflectance: Reflectance | None
+    scans: int
+    returns: int
+
+    @property
+    def columns(self) -> int:
+        """Columns of an image that no return needs to share: the largest multiple of 64 within the steps."""
+        return max(int((self.steps + 0.5) // COLUMNS), 1) * COLUMNS
+
+    def sensor(self, name: str) -> Sensor:
+        """The sensor itself, its limits rounded outwards."""
+        near, far = self.ranges
+        return Sensor(
+            name,
+            _falling(self.beams.elevations.round(3).tolist()),
+            self.columns,
+            max(math.floor(near * 10) / 10, 0.1),
+            float(math.ceil(far)),
+            Sensor.height if self.height is None else round(self.height, 2),
+            self.beams.firing,
+        )
+
+    def nearest_known(self) -> tuple[str, float] | None:
+        """The sensor of the table with as many beams that these are nearest to, and the median distance in degrees."""
+        found = [
+            (float(np.median(np.abs(np.asarray(sensor.elevations) - self.beams.elevations))), name)
+            for name, sensor in SENSORS.items()
+            if len(sensor.elevations) == len(self.beams.elevations)
+        ]
+        return min(found)[::-1] if found else None
+
+
+def estimate_sensor(scans: Sequence[Points]) -> Estimate:
+    """What scans of one sensor, in its own frame, tell of it.
+
+    Raises:
+        InputError: too few returns, or no beams in them.
+    """
+    ranges = [np.linalg.norm(scan.xyz, axis=1) for scan in scans]
+    r = np.concatenate([one[one > 0] for one in ranges])
+    if len(r) < FEWEST_RETURNS:
+        raise InputError(
+            f"{len(scans)} scan{'s' * (len(scans) != 1)} with {len(r)} returns in all tell too little of a sensor: "
+            f"it takes {FEWEST_RETURNS}, and better several whole scans."
+        )
+    beams = find_beams(scans)
+    height, ground_share = _height(np.concatenate([scan.xyz for scan in scans]))
+    return Estimate(
+        beams,
+        steps_of_a_turn(scans, beams),
+        (float(np.quantile(r, 1e-4, method="lower")), float(np.quantile(r, 1 - 1e-4, method="higher"))),
+        float((r < 1).mean()),
+        height,
+        ground_share,
+        _reflectance(scans),
+        len(scans),
+        len(r),
+    )
+
+
+def _falling(elevations: list[float]) -> tuple[float, ...]:
+    """Elevations as a `Sensor` has them; two that rounding made equal are set a thousandth of a degree apart."""
+    for row, (above, below) in enumerate(pairwise(elevations)):
+        if below >= above:
+            elevations[row + 1] = round(above - 1e-3, 3)
+    return tuple(elevations)
+
+
+def steps_of_a_turn(scans: Sequence[Points], beams: Beams) -> float:
+    """Azimuth steps of a full turn, 360 / step.
+
+    A first guess is the 30th percentile of the gaps between neighbouring returns of one beam, since most rays next to
+    a return have one too; then the sum of all gaps of up to three steps over the number of steps in them.
+    """
+    gaps = []
+    for scan, row in zip(scans, beams.of_point, strict=True):
+        azimuth = np.rad2deg(np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]).astype(np.float64))
+        order = np.lexsort((azimuth, row))
+        order = order[row[order] >= 0]
+        gaps.append(np.diff(azimuth[order])[np.diff(row[order]) == 0])
+    gap = np.concatenate(gaps)
+    apart = gap[gap > 1e-2]  # two returns of one ray lie at one azimuth
+    if not len(apart):
+        raise InputError("no beam returned at two azimuths in these scans. Are they whole?")
+    step = float(np.quantile(apart, 0.3))
+    for _ in range(3):
+        near = gap[gap < 3.5 * step]
+        step = float(near.sum() / (near / step).round().sum())
+    return 360 / step
+
+
+def _height(xyz: np.ndarray) -> tuple[float | None, float]:
+    """Height above the ground, a plane fitted to the most frequent height between 3 and 20 m away; its share."""
+    distance = np.hypot(xyz[:, 0], xyz[:, 1])
+    around = xyz[(distance > 3) & (distance < 20) & (xyz[:, 2] < -0.2)].astype(np.float64)
+    if len(around) < FEWEST_RETURNS / 4:
+        return None, 0.0
+    counts, edges = np.histogram(around[:, 2], np.arange(-6, 0.1, 0.1))
+    plane = np.array([0.0, 0.0, edges[np.argmax(np.convolve(counts, np.ones(3), "same"))] + 0.05])
+    design = np.column_stack([around[:, 0], around[:, 1], np.ones(len(around))])
+    for within in (0.3, 0.2, 0.15, 0.15):
+        on = np.abs(around[:, 2] - design @ plane) < within
+        if on.sum() < FEWEST_RETURNS / 4:
+            return None, 0.0
+        plane = np.linalg.lstsq(design[on], around[on, 2], rcond=None)[0]
+    height, share = -plane[2] / math.sqrt(1 + plane[0] ** 2 + plane[1] ** 2), on.sum() / len(xyz)
+    return (float(height), float(share)) if height > 0.1 and share > 0.03 else (None, float(share))
+
+
+def _reflectance(scans: Sequence[Points]) -> Reflectance | None:
+    """None where a file has no reflectance, or the same one everywhere."""
+    if any(scan.reflectance is None for scan in scans):
+        return None
+    values = np.unique(np.concatenate([scan.reflectance for scan in scans]))
+    highest = float(values[-1])
+    if len(values) < 2 or highest <= 0:
+        return None
+    scale = next((full for full in FULL_REFLECTANCE if highest <= full * (1 + 1e-3)), highest)
+    if highest < 0.1:  # else the values would fill less than a tenth of the scale
+        scale = float(f"{highest:.1g}") if float(f"{highest:.1g}") >= highest else float(f"{highest * 1.05:.2g}")
+    return Reflectance(highest, len(values), scale)

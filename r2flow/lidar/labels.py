@@ -1,0 +1,77 @@
+"""Semantic labels beside scans: SemanticKITTI's `.label` files, and what their ids mean."""
+
+from pathlib import Path
+
+import numpy as np
+
+from r2flow.errors import InputError
+from r2flow.lidar.scan_files import Points, read_points
+
+# SemanticKITTI's ids: name, and the colour that a picture gives it (ground grey to violet, vehicles blue, people red,
+# plants green, buildings and fences brown; moving things take the colour of standing ones).
+CLASSES = {
+    0: ("unlabelled", "#6b727c"), 1: ("outlier", "#454b54"),
+    10: ("car", "#3f8efc"), 11: ("bicycle", "#7fd1ff"), 13: ("bus", "#2a5bd7"), 15: ("motorcycle", "#58b4e8"),
+    16: ("on-rails", "#1b3a9e"), 18: ("truck", "#5c7cfa"), 20: ("other vehicle", "#8aa2ff"),
+    30: ("person", "#ff4d4d"), 31: ("bicyclist", "#ff8787"), 32: ("motorcyclist", "#d6336c"),
+    40: ("road", "#9a86c9"), 44: ("parking", "#c3a6e8"), 48: ("sidewalk", "#d9b8d9"), 49: ("other ground", "#a07f8f"),
+    50: ("building", "#d9a441"), 51: ("fence", "#b5713c"), 52: ("other structure", "#8f6a3a"),
+    60: ("lane marking", "#f4ecff"), 70: ("vegetation", "#37a046"), 71: ("trunk", "#7a5a2f"),
+    72: ("terrain", "#a8cf6a"), 80: ("pole", "#ffe066"), 81: ("traffic sign", "#ff922b"), 
+    99: ("other object", "#5fd3bc"),
+    252: ("moving car", "#3f8efc"), 253: ("moving bicyclist", "#ff8787"), 254: ("moving person", "#ff4d4d"),
+    255: ("moving motorcyclist", "#d6336c"), 256: ("moving on-rails", "#1b3a9e"), 257: ("moving bus", "#2a5bd7"),
+    258: ("moving truck", "#5c7cfa"), 259: ("moving other vehicle", "#8aa2ff"),
+}  # fmt: skip
+
+# No data set in use counts its classes beyond this (SemanticKITTI: 259); other bytes read as labels do.
+LARGEST_CLASS = 1023
+
+LAYOUT = "labels of little-endian uint32, one a point"
+
+
+def labels_beside(scan: str | Path) -> Path | None:
+    """The label file of a scan: `labels/000000.label` for `velodyne/000000.bin`, or `000000.label` beside it."""
+    scan = Path(scan)
+    name = f"{scan.stem}.label"
+    for path in (scan.parent.parent / "labels" / name, scan.with_name(name)):
+        if path.exists() or path.is_symlink():  # a dangling link was meant to be one: reading it says so
+            return path
+    return None
+
+
+def read_labels(path: str | Path, scan: str | Path, points: Points | None = None) -> np.ndarray:
+    """The semantic id of each point of a scan, (N,) uint16, in the order of `read_points`, also where it drops rows.
+
+    Args:
+        path: A `.label` file: uint32 for each row of the scan's file, the id in its low 16 bits, an instance above.
+        scan: The scan that it belongs to.
+        points: That scan, where it has been read already.
+
+    Raises:
+        InputError: a file that is missing or cannot be read, is no label file, or that of another scan.
+    """
+    path = Path(path)
+    points = read_points(scan) if points is None else points
+    rows = len(points.xyz) + points.dropped
+    if path.is_symlink() and not path.exists():
+        raise InputError(f"{path} is a link to {path.readlink()}, which does not exist.")
+    if not path.is_file():
+        raise InputError(f"{path} is not a file of labels.")
+    size = path.stat().st_size  # looked at first: a file of the wrong length is never loaded
+    if size != 4 * rows:
+        raise InputError(
+            f"{path} holds {size} bytes, but {scan} has {rows} points, which need {4 * rows}. "
+            f"Is it whole, {LAYOUT}, and of this scan?"
+        )
+    try:
+        labels = np.fromfile(path, dtype="<u4")
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
+    ids = (labels & 0xFFFF).astype(np.uint16)
+    # Big-endian integers and floats keep their digits in the high bits: instances, without a class, everywhere.
+    instances = int(np.count_nonzero((ids == 0) & (labels > 0)))
+    if ids.max(initial=0) > LARGEST_CLASS or instances > rows / 2:
+        found = f"classes up to {ids.max()}, {instances} of {rows} points an instance of no class"
+        raise InputError(f"{path} does not look like {LAYOUT}: {found}. Is it damaged, big-endian or of floats?")
+    return ids if points.kept is None else ids[points.kept]

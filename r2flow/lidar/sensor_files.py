@@ -1,0 +1,77 @@
+"""A sensor of one's own as a dozen lines of YAML: read by the verbs, composed by train.py as conf/sensor/NAME.yaml."""
+
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+
+from r2flow.errors import InputError
+from r2flow.files import atomic_write
+from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
+from r2flow.registry import check_options
+
+ENDINGS = (".yaml", ".yml")
+LARGEST_FILE = 1 << 20  # bytes; a sensor is a dozen lines
+
+
+def read_sensor(path: str | Path, rows: int | None = None, columns: int | None = None) -> Sensor:
+    """A sensor out of a YAML file with the options of `build_sensor`.
+
+    Args:
+        rows, columns: Another image size than the file's.
+
+    Raises:
+        InputError: the file is missing or no such YAML, or describes no possible sensor.
+    """
+    import yaml
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path} is not a file. A sensor is a name ({', '.join(SENSORS)}) or a YAML file of your own.")
+    if path.stat().st_size > LARGEST_FILE:
+        raise InputError(f"{path} has {path.stat().st_size} bytes, too many for a sensor's YAML. Is it another file?")
+    try:
+        options = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: not UTF-8, or a date of month 13
+        raise InputError(f"{path} is not readable YAML: {' '.join(str(error).split())[:160]}") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
+    if not isinstance(options, dict) or not all(isinstance(key, str) for key in options):
+        raise InputError(f"{path} is no sensor: it needs lines as `name: mine` and `elevations: [15.0, 13.0, ...]`.")
+    options.pop("rays", None)  # the rays of a model, which training chooses
+    sized = {"rows": rows, "columns": columns}
+    options.update({key: value for key, value in sized.items() if value is not None})
+    check_options(str(path), build_sensor, options)
+    try:
+        return build_sensor(**options)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
+    """Write such a file, whole or not at all.
+
+    Args:
+        comment: What stands above it: where the numbers come from.
+    """
+    lines = [
+        *(f"# {line}" for line in comment.splitlines()),
+        f"name: {sensor.name}",
+        *_listed("elevations", sensor.elevations, "degrees, the top row first"),
+        "rows: null # null: one for each elevation",
+        f"columns: {sensor.columns} # of an image, a full turn",
+        "rays: centre",
+        f"min_range: {sensor.min_range} # metres",
+        f"max_range: {sensor.max_range}",
+        f"height: {sensor.height} # above the ground",
+    ]
+    if sensor.firing is not None:
+        lines += _listed("firing", sensor.firing, "row of laser 0, 1, ... in the order of the files")
+    with atomic_write(path, "w") as file:
+        file.write("\n".join(lines) + "\n")
+
+
+def _listed(key: str, values: Sequence[float], comment: str) -> list[str]:
+    return [
+        f"{key}: # {comment}",
+        *textwrap.wrap(f"[{', '.join(map(str, values))}]", 100, initial_indent="  ", subsequent_indent="  "),
+    ]

@@ -1,0 +1,151 @@
+"""Scan unfolding: the row of a point by the laser that fired it, told by the file rather than by its elevation."""
+
+import numpy as np
+
+from r2flow.errors import InputError
+from r2flow.lidar.sensors import Convention, Sensor
+
+SAMPLE = 256  # firings that are looked at to tell their order
+SURE = 0.9  # share of neighbouring lasers whose elevations must fall in the order taken
+
+
+def unfolded_rows(xyz: np.ndarray, sensor: Sensor, convention: Convention, ring: np.ndarray | None) -> np.ndarray:
+    """Row of every point, (N,) int64; outside [0, H) where the image does not hold it.
+
+    A file tells its lasers in one of three ways, tried in this order: a ring number at each point; whole firings,
+    H points after H points with rays without return kept, each firing in one order of the lasers; or ring after ring
+    (`rings_from_order`), aligned at the bottom because rings that see only sky are missing at the top. `reference`
+    knows the last alone.
+
+    Raises:
+        InputError: the file tells them in none of these ways, or of other lasers than the sensor's.
+    """
+    rows = sensor.shape[0]
+    if ring is not None:
+        return rows_from_field(xyz, np.asarray(ring, dtype=np.int64), sensor)
+    if convention == "centre" and (row := rows_from_firings(xyz, sensor)) is not None:
+        return row
+    order = rings_from_order(xyz)
+    row = order - (order.max(initial=0) + 1) + rows
+    if convention == "reference":
+        return np.maximum(row, 0)
+    found = int(order.max(initial=-1)) + 1
+    if not rows / 2 <= found <= rows + 1:
+        raise InputError(
+            f"the scan unfolds into {found} rings, but sensor '{sensor.name}' has {rows}: it has no ring numbers and "
+            f"is stored neither ring after ring nor in whole firings of {rows}. Use the spherical projection, which "
+            "finds rows by elevation."
+        )
+    return row
+
+
+def rings_from_order(xyz: np.ndarray) -> np.ndarray:
+    """Ring of every point from the order of storage, (N,) int64, 0 for the first ring stored.
+
+    A spinning sensor stored ring after ring sweeps azimuth upwards from 0; a new ring starts where it
+    passes from the 4th to the 1st quadrant. Points at the origin are rays without return (-1).
+    """
+    x, y = xyz[:, 0], xyz[:, 1]
+    returned = np.flatnonzero((x != 0) | (y != 0))
+    ring = np.full(len(xyz), -1, dtype=np.int64)
+    if len(returned) == 0:
+        return ring
+    x, y = x[returned], y[returned]
+    first = (x >= 0) & (y >= 0)
+    fourth = (x >= 0) & (y < 0)
+    starts = first & np.roll(fourth, 1)
+    starts[0] = True
+    ring[returned] = np.cumsum(starts) - 1
+    return ring
+
+
+def rows_from_field(xyz: np.ndarray, ring: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """The rows of a file's own ring numbers, (N,) int64: counted from 0 or 1, from the top, the bottom or by laser."""
+    rows = sensor.shape[0]
+    if len(ring) and ring.min() > 0 and ring.max() == rows:
+        ring = ring - 1
+    lasers = int(ring.max(initial=0)) + 1
+    if not rows / 2 <= lasers <= rows:
+        raise InputError(
+            f"the scan has ring numbers up to {lasers - 1}, but sensor '{sensor.name}' has {rows} rows. Is it this "
+            "sensor's? If so, use the spherical projection, which finds rows by elevation."
+        )
+    elevation = elevations_of(xyz)
+    seen = np.isfinite(elevation)
+    count = np.bincount(ring[seen], minlength=rows)
+    total = np.bincount(ring[seen], elevation[seen], minlength=rows)
+    with np.errstate(invalid="ignore"):
+        order, share = best_order(total / count, sensor)
+    if share < SURE:
+        raise InputError(
+            f"the scan's ring numbers follow neither the elevations of its points nor the firing order of sensor "
+            f"'{sensor.name}'. Give the sensor its `firing`, or use the spherical projection."
+        )
+    return order[ring]
+
+
+def rows_from_firings(xyz: np.ndarray, sensor: Sensor) -> np.ndarray | None:
+    """The rows of a file of whole firings, (N,) int64; None where it is no such file."""
+    rows = sensor.shape[0]
+    firings = len(xyz) // rows
+    if len(xyz) % rows or firings < 8:
+        return None
+    some = np.linspace(0, firings - 1, min(firings, SAMPLE)).astype(np.int64)
+    elevation = elevations_of(xyz.reshape(firings, rows, 3)[some].reshape(-1, 3)).reshape(-1, rows)
+    middle, scatter = scatter_of(elevation)
+    if not scatter < 0.25:
+        return None
+    order, share = best_order(middle, sensor)
+    return np.tile(order, firings) if share >= SURE else None
+
+
+def elevations_of(xyz: np.ndarray) -> np.ndarray:
+    """Elevation in degrees of every point, (N,); NaN for a ray without return at the origin."""
+    r = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.rad2deg(np.arcsin(xyz[:, 2] / r))
+
+
+def scatter_of(elevation: np.ndarray) -> tuple[np.ndarray, float]:
+    """Median elevation of each column of firings (firings, lasers), NaN without return; and the columns' scatter.
+
+    The scatter is the median distance from a column's median over that from the median of all: near 0 where each
+    column is one laser, near 1 where it is not. Medians, since returns from the vehicle itself lie anywhere.
+    """
+    middle = median_of_seen(elevation)
+    about = np.abs(elevation - middle)
+    about_all = np.abs(elevation - median_of_seen(elevation.reshape(-1, 1)))
+    within, overall = (float(median_of_seen(distance.reshape(-1, 1))[0]) for distance in (about, about_all))
+    return middle, within / overall if overall > 0 else 1.0
+
+
+def median_of_seen(values: np.ndarray) -> np.ndarray:
+    """Median (the upper of two) of each column of what is not NaN, (W,); NaN where nothing is."""
+    ordered = np.sort(values, axis=0)  # NaN last
+    seen = np.isfinite(values).sum(axis=0)
+    middle = ordered[np.minimum(seen // 2, len(values) - 1), np.arange(values.shape[1])]
+    return np.where(seen > 0, middle, np.nan)
+
+
+def best_order(elevation: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, float]:
+    """Row of each laser by the order that suits their elevations best, and how well it does.
+
+    From the top row down, from the bottom up, or the sensor's own firing order.
+
+    Args:
+        elevation: Of laser 0, 1, ..., (H,); NaN for one without returns.
+
+    Returns:
+        (H,) int64, and the share of neighbouring lasers, in that order, whose elevations fall.
+    """
+    rows = len(elevation)
+    orders = [np.arange(rows), np.arange(rows)[::-1]]
+    if sensor.firing is not None:
+        orders.append(np.asarray(sensor.firing))
+    shares = []
+    for order in orders:
+        falling = elevation[np.argsort(order)]
+        steps = np.diff(falling[np.isfinite(falling)])
+        shares.append(float((steps < 0).mean()) if len(steps) else 1.0)
+    best = int(np.argmax(shares))
+    return orders[best].astype(np.int64), shares[best]

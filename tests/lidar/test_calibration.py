@@ -1,0 +1,181 @@
+import math
+
+import numpy as np
+import pytest
+
+from r2flow.errors import InputError
+from r2flow.lidar.beams import FIRINGS, LOSSY_FIRINGS, RING_AFTER_RING, RINGS, UNORDERED
+from r2flow.lidar.calibration import estimate_sensor
+from r2flow.lidar.projection import image_to_points, project
+from r2flow.lidar.scan_files import Points, read_points
+from r2flow.lidar.sensors import HDL64E_RINGS, SENSORS, Sensor
+
+HEIGHT, WALL = 1.6, 25.0
+STORED = {
+    RINGS: "by ring number, shuffled",
+    FIRINGS: "whole firings",
+    RING_AFTER_RING: "ring after ring",
+    LOSSY_FIRINGS: "firings without lost rays",
+    UNORDERED: "shuffled",
+}
+
+
+def street(sensor: Sensor, seed: int) -> np.ndarray:
+    """Ground HEIGHT below the sensor and a round wall about it, with holes: range and reflectance, (2, H, W)."""
+    draw = np.random.default_rng(seed)
+    e = sensor.rays().numpy().astype(np.float64)[0]
+    ground = np.where(e < 0, HEIGHT / np.sin(np.maximum(-e, 1e-9)), np.inf)
+    r = np.minimum(ground, WALL / np.cos(e)) * (draw.random(e.shape) < 0.8)
+    return np.stack([r, np.where(r > 0, draw.random(e.shape), 0)]).astype(np.float32)
+
+
+def scan(sensor: Sensor, how: str, seed: int = 0) -> Points:
+    image = street(sensor, seed)
+    if how == RING_AFTER_RING:
+        return Points(*image_to_points(image, sensor.rays()))
+    e, a = sensor.rays().numpy().astype(np.float64)
+    rows = np.arange(len(e)) if sensor.firing is None else np.array(sensor.firing)
+    direction = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    xyz = (image[0] * direction)[:, rows].transpose(2, 1, 0).reshape(-1, 3).astype(np.float32)
+    reflectance, ring = image[1][rows].T.ravel(), np.tile(rows, sensor.columns)
+    if how == FIRINGS:
+        return Points(xyz, reflectance)
+    kept = np.flatnonzero(xyz.any(axis=1))
+    if how in (RINGS, UNORDERED):
+        kept = np.random.default_rng(seed).permutation(kept)
+    return Points(xyz[kept], reflectance[kept], ring[kept].astype(np.uint16) if how == RINGS else None)
+
+
+@pytest.mark.parametrize("how", list(STORED), ids=list(STORED.values()))
+@pytest.mark.parametrize("name", ["vlp16", "hdl32e", "vlp32c", "os1_64", "pandar64"])
+def test_a_known_sensor_is_found_again(name, how):
+    sensor = SENSORS[name].resized(columns=192)
+    found = estimate_sensor([scan(sensor, how, seed) for seed in range(2)])
+    assert found.beams.order == how
+    assert len(found.beams.elevations) == len(sensor.elevations)
+    np.testing.assert_allclose(found.beams.elevations, sensor.elevations, atol=1e-3)
+    assert found.beams.residuals.max() < 1e-3
+    assert found.steps == pytest.approx(192, rel=1e-4)
+    assert found.columns == 192
+    assert found.height == pytest.approx(HEIGHT, abs=0.01)
+    assert found.nearest_known() == (name, pytest.approx(0, abs=1e-4))
+    assert found.beams.firing == (sensor.firing if how == FIRINGS else None)
+
+
+def test_what_is_found_projects_its_scans_as_the_sensor_itself_does():
+    sensor = SENSORS["vlp32c"].resized(columns=192)
+    points = scan(sensor, FIRINGS)
+    mine = estimate_sensor([points]).sensor("mine")
+    for projection in ("spherical", "unfolding"):
+        expected = project(points.xyz, points.reflectance, sensor, projection)
+        np.testing.assert_array_equal(project(points.xyz, points.reflectance, mine, projection), expected)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_ring_numbers_by_laser_tell_the_firing_order(first):
+    sensor = SENSORS["vlp16"].resized(columns=192)
+    whole = scan(sensor, FIRINGS)
+    laser = np.tile(np.arange(16) + first, sensor.columns).astype(np.uint16)
+    returned = whole.xyz.any(axis=1)
+    points = Points(whole.xyz[returned], whole.reflectance[returned], laser[returned])
+    mine = estimate_sensor([points]).sensor("mine")
+    assert mine.firing == sensor.firing
+    image = project(points.xyz, points.reflectance, mine, "unfolding", ring=points.ring)
+    np.testing.assert_array_equal(image, project(points.xyz, points.reflectance, sensor))
+
+
+def test_beams_that_no_table_has():
+    own = Sensor("own", (21.0, 12.5, 3.0, 2.0, 1.25, -0.5, -4.0, -9.0, -17.5), columns=128)
+    found = estimate_sensor([scan(own, UNORDERED)])
+    np.testing.assert_allclose(found.beams.elevations, own.elevations, atol=1e-3)
+    assert found.nearest_known() is None
+
+
+@pytest.mark.parametrize(
+    ("values", "scale"),
+    [
+        (np.arange(100) / 100, 1),  # KITTI
+        (np.arange(256) / 256, 1),  # KITTI-360
+        (np.arange(101), 100),
+        (np.arange(236), 255),
+        (np.arange(257), 256),
+        (np.arange(3000), 65535),
+        (np.linspace(0, 0.0115, 50), 0.012),
+        (np.zeros(5), None),
+    ],
+)
+def test_what_full_reflectance_is(values, scale):
+    points = scan(SENSORS["vlp16"].resized(columns=192), RING_AFTER_RING)
+    found = estimate_sensor([Points(points.xyz, np.resize(values, len(points.xyz)).astype(np.float32))]).reflectance
+    assert (None if found is None else found.scale) == scale
+    assert estimate_sensor([Points(points.xyz)]).reflectance is None
+
+
+def test_limits_hold_all_but_stray_returns():
+    sensor = SENSORS["vlp16"].resized(columns=1024)
+    points = scan(sensor, RING_AFTER_RING)
+    r = np.linalg.norm(points.xyz, axis=1)
+    xyz = np.concatenate([points.xyz, [[900, 0, 0]]]).astype(np.float32)  # one bad return of 13,000
+    mine = estimate_sensor([Points(xyz)]).sensor("mine")
+    assert mine.min_range <= r.min() < mine.min_range + 0.1
+    assert r.max() <= mine.max_range < r.max() + 1
+
+
+def test_too_little_is_refused():
+    with pytest.raises(InputError, match=r"1 scan with 1 returns in all tell too little of a sensor: it takes 200"):
+        estimate_sensor([Points(np.ones((1, 3), np.float32))])
+    with pytest.raises(InputError, match="run into each other"):
+        estimate_sensor([Points(np.random.default_rng(0).normal(size=(5000, 3)).astype(np.float32))])
+
+
+def real(shared, pattern: str, step: int = 1) -> list[Points]:
+    return [read_points(path) for path in sorted((shared / "real").glob(pattern))[::step]]
+
+
+@pytest.mark.parametrize(("scans", "step"), [("kitti360/**/*.bin", 5), ("raw/**/*.bin", 10), ("odometry/**/*.bin", 1)])
+def test_the_rings_of_real_kitti_scans(shared, scans, step):
+    # Another car each; the table's rings were measured on one of them.
+    found = estimate_sensor(real(shared, scans, step))
+    assert found.beams.order == RING_AFTER_RING
+    assert len(found.beams.elevations) == 64
+    np.testing.assert_allclose(found.beams.elevations, HDL64E_RINGS, atol=0.25)
+    assert 2000 < found.steps < 2200  # 1.3 million shots a second of 64 lasers at 10 turns a second: 2,083
+    assert found.height == pytest.approx(1.73, abs=0.1)  # KITTI's own figure
+    assert found.reflectance.scale == 1
+
+
+@pytest.mark.parametrize(
+    ("scans", "name", "order", "off", "steps"),
+    [
+        ("nuscenes_hdl32e/*.bin", "hdl32e", RINGS, 0.1, 1084),  # 34,688 points of 32 lasers
+        ("rellis_os1_64/*.bin", "os1_64", FIRINGS, 0.5, 2048),  # a unit's own beams lie off the design's
+        ("rellis_vlp32c/*.bin", "vlp32c", LOSSY_FIRINGS, 0.001, 1800),  # 0.2 degrees
+        ("vlp16/*.pcd", "vlp16", LOSSY_FIRINGS, 0.01, 1809),  # a firing each 55.296 microseconds, 10 turns a second
+    ],
+)
+def test_the_beams_of_other_real_sensors(shared, scans, name, order, off, steps):
+    points = real(shared, f"other_sensors/{scans}")
+    found = estimate_sensor(points)
+    assert found.beams.order == order
+    assert found.nearest_known()[0] == name
+    np.testing.assert_allclose(found.beams.elevations, SENSORS[name].elevations, atol=off)
+    assert found.steps == pytest.approx(steps, rel=0.01)
+    for one in points:
+        mine, table = found.sensor("mine"), SENSORS[name].resized(columns=found.columns)
+        filled = [(project(one.xyz, None, sensor)[0] > 0).sum() for sensor in (mine, table)]
+        assert filled[0] >= 0.99 * filled[1] > 0.2 * math.prod(mine.shape)
+
+
+def test_the_beams_of_a_real_unit_do_not_share_rows(shared):
+    (points,) = real(shared, "other_sensors/rellis_os1_64/*.bin")
+    mine = estimate_sensor([points]).sensor("mine")
+    rows = lambda sensor: (project(points.xyz, None, sensor)[0] > 0).any(axis=1).sum()  # noqa: E731
+    assert rows(mine) == 64
+    assert rows(SENSORS["os1_64"]) < 64  # the design's beams miss this unit's: some rows stay empty
+
+
+def test_real_scans_whose_order_was_lost_are_refused_not_guessed(shared):
+    (points,) = real(shared, "kitti360/**/*.bin", 15)
+    shuffled = np.random.default_rng(0).permutation(len(points.xyz))
+    with pytest.raises(InputError, match="run into each other"):
+        estimate_sensor([Points(points.xyz[shuffled])])

@@ -1,0 +1,173 @@
+"""Label files: the class of each pixel's return, and no damaged or foreign file taken for labels."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r2flow.data.sources import read_labelled_scan
+from r2flow.errors import InputError
+from r2flow.lidar.labels import CLASSES, labels_beside, read_labels
+from r2flow.lidar.scan_files import read_points, write_points
+from r2flow.lidar.sensors import SENSORS
+from r2flow.simulator.labels import LABELS
+
+SENSOR = SENSORS["hdl64e"].resized(8, 16)
+COUNT = 200
+RNG = np.random.default_rng(3)
+XYZ = np.column_stack([RNG.uniform(5, 40, (COUNT, 1)) * [1, 0, 0], np.zeros((COUNT, 1))])[:, :3].astype(np.float32)
+XYZ[:, 1], XYZ[:, 2] = RNG.uniform(-30, 30, COUNT), RNG.uniform(-2, 0, COUNT)
+IDS = RNG.choice([0, 10, 40, 70, 252], COUNT).astype(np.uint32)
+INSTANCES = np.where(IDS == 10, RNG.integers(1, 300, COUNT), 0).astype(np.uint32)
+WHOLE = (IDS | INSTANCES << 16).astype("<u4").tobytes()
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    path = tmp_path / "sequences/00/velodyne/000000.bin"
+    path.parent.mkdir(parents=True)
+    write_points(path, XYZ, np.full(COUNT, 0.5, np.float32))
+    return path
+
+
+@pytest.fixture
+def label(scan: Path) -> Path:
+    path = scan.parent.parent / "labels/000000.label"
+    path.parent.mkdir()
+    path.write_bytes(WHOLE)
+    return path
+
+
+def test_they_are_found_in_the_folder_of_labels_and_beside_the_scan(scan: Path, tmp_path: Path):
+    assert labels_beside(scan) is None
+    beside = scan.with_name("000000.label")
+    beside.write_bytes(WHOLE)
+    assert labels_beside(scan) == beside
+    np.testing.assert_array_equal(read_labels(beside, scan), IDS)
+
+
+def test_each_pixel_has_the_label_of_its_nearest_return(scan: Path, label: Path):
+    image, labels = read_labelled_scan(scan, SENSOR)
+    r = np.linalg.norm(XYZ, axis=1)
+    edges = np.linspace(3, -25, 9)
+    elevation, azimuth = np.rad2deg(np.arcsin(XYZ[:, 2] / r)), np.rad2deg(np.arctan2(XYZ[:, 1], XYZ[:, 0]))
+    seen = 0
+    for row in range(8):
+        for column in range(16):
+            high, left = edges[row], 180 - 22.5 * column
+            inside = (elevation <= high) & (elevation > edges[row + 1]) & (azimuth <= left) & (azimuth > left - 22.5)
+            inside &= r <= 80
+            nearest = np.flatnonzero(inside)[np.argmin(r[inside])] if inside.any() else None
+            assert labels[row, column] == (0 if nearest is None else IDS[nearest])
+            seen += nearest is not None
+    assert seen > 10
+    assert labels.dtype == np.uint16
+    assert (labels[image[0] == 0] == 0).all()
+
+
+def test_a_row_that_is_dropped_takes_its_label_along(scan: Path, label: Path):
+    rows = np.fromfile(scan, "<f4").reshape(-1, 4)
+    rows[17, 0], rows[90, 2] = np.nan, 1e30
+    rows.tofile(scan)
+    np.testing.assert_array_equal(read_labels(label, scan), np.delete(IDS, [17, 90]))
+
+
+def test_without_labels_there_are_none(scan: Path):
+    image, labels = read_labelled_scan(scan, SENSOR, reflectance=False)
+    assert image.shape == (1, 8, 16)
+    assert labels is None
+
+
+def refused(label: Path, scan: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        read_labels(label, scan)
+    line = str(caught.value)
+    assert str(label) in line
+    assert "\n" not in line
+    return line
+
+
+def test_a_cut_or_a_longer_file_is_refused(scan: Path, label: Path):
+    points = read_points(scan)
+    for length in [*range(0, len(WHOLE), 7), *range(788, 800), len(WHOLE) + 1, len(WHOLE) + 4, 2 * len(WHOLE)]:
+        label.write_bytes((WHOLE * 2)[:length])
+        with pytest.raises(InputError, match=f"holds {length} bytes.*has 200 points, which need 800"):
+            read_labels(label, scan, points)
+
+
+FOREIGN = {
+    "big-endian": (IDS | INSTANCES << 16).astype(">u4").tobytes(),
+    "uint16": IDS.astype("<u2").tobytes(),
+    "int64": IDS.astype("<i8").tobytes(),
+    "float32": np.maximum(IDS, 1).astype("<f4").tobytes(),
+    "float64": IDS.astype("<f8").tobytes(),
+    "NaN": np.full(COUNT, np.nan, "<f4").tobytes(),
+    "text": (b"40 10\n70\n" * COUNT)[: 4 * COUNT],
+    "noise": RNG.bytes(4 * COUNT),
+    "ones": b"\xff" * (4 * COUNT),
+    "the scan": XYZ.tobytes()[: 4 * COUNT],
+    "empty": b"",
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_nothing_else_passes_for_labels(scan: Path, label: Path, name: str):
+    label.write_bytes(FOREIGN[name])
+    refused(label, scan)
+
+
+def test_a_flipped_bit_changes_one_label_or_is_refused(scan: Path, label: Path):
+    # The format has no checksum: a class that becomes another class cannot be told from the right one.
+    points, refusals = read_points(scan), 0
+    for bit in RNG.choice(8 * len(WHOLE), 150, replace=False):
+        damaged = bytearray(WHOLE)
+        damaged[bit // 8] ^= 1 << bit % 8
+        label.write_bytes(bytes(damaged))
+        try:
+            found = read_labels(label, scan, points)
+        except InputError:
+            refusals += 1
+            assert bit % 32 >= 10  # beyond every class there is
+            continue
+        assert bit % 32 < 10 or bit % 32 >= 16
+        assert (found != IDS).sum() == (bit % 32 < 10)
+    assert refusals > 15
+
+
+def test_what_is_no_file_is_said(scan: Path, label: Path, tmp_path: Path):
+    label.unlink()
+    assert "not a file" in refused(label, scan)
+    label.mkdir()
+    assert "not a file" in refused(label, scan)
+    label.rmdir()
+    label.symlink_to(tmp_path / "gone")
+    assert labels_beside(scan) == label  # a link to nothing was meant to be one
+    assert "link to" in refused(label, scan)
+    label.unlink()
+    os.mkfifo(label)
+    assert "not a file" in refused(label, scan)
+    label.unlink()
+    with label.open("wb") as file:
+        file.truncate(1 << 40)  # sparse: takes no disk, and is not loaded
+    assert "need 800" in refused(label, scan)
+
+
+def test_the_simulators_classes_have_names_and_colours():
+    assert set(LABELS.values()) <= set(CLASSES)
+
+
+def test_real_labels(shared: Path):
+    real = shared / "real"
+    for scan, sensor, classes in (
+        (real / "odometry/sequences/00/velodyne/000000.bin", "hdl64e", {10, 40, 50, 70}),
+        (real / "other_sensors/rellis_os1_64/000104.bin", "hdl64e", {3, 4, 19}),
+    ):
+        image, labels = read_labelled_scan(scan, SENSORS[sensor])
+        assert classes <= set(np.unique(labels[image[0] > 0]).tolist())
+    image, labels = read_labelled_scan(real / "odometry/sequences/08/velodyne/000000.bin", SENSORS["hdl64e"])
+    r, road, building = image[0], labels == 40, labels == 50
+    elevation = SENSORS["hdl64e"].rays()[0].numpy()
+    height = 1.73 + r * np.sin(elevation)  # of what is seen, above the ground that the car stands on
+    assert abs(np.median(height[road])) < 0.3
+    assert np.median(height[building]) > 1

@@ -1,0 +1,90 @@
+from pathlib import Path
+
+import pytest
+import yaml
+
+from r2flow.errors import InputError
+from r2flow.lidar.sensor_files import read_sensor, write_sensor
+from r2flow.lidar.sensors import SENSORS, Sensor
+
+MINE = "name: mine\nelevations: [10, 4.5, -3, -20]\n"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "mine.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_what_is_written_is_read_again(sensor, tmp_path):
+    mine = Sensor(**{**vars(sensor), "name": "mine"})
+    write_sensor(mine, tmp_path / "mine.yaml", "two\nlines")
+    assert read_sensor(tmp_path / "mine.yaml") == mine
+    assert read_sensor(tmp_path / "mine.yaml", 8, 64) == mine.resized(8, 64)
+
+
+def test_two_lines_are_enough(tmp_path):
+    assert read_sensor(written(tmp_path, MINE)) == Sensor("mine", (10.0, 4.5, -3.0, -20.0))
+
+
+def test_all_that_can_be_written(tmp_path):
+    text = MINE + "rays: centre\nrows: 2\ncolumns: 64\nmin_range: 1\nmax_range: 50\nheight: 2\nfiring: [3, 1, 2, 0]\n"
+    sensor = read_sensor(written(tmp_path, text))
+    assert sensor == Sensor("mine", sensor.elevations, 64, 1.0, 50.0, 2.0)
+    assert sensor.shape == (2, 64)
+
+
+def test_a_config_of_the_table_is_such_a_file():
+    conf = Path(__file__).resolve().parents[2] / "conf" / "sensor"
+    assert read_sensor(conf / "vlp32c.yaml") == SENSORS["vlp32c"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "is no sensor"),
+        ("just text", "is no sensor"),
+        ("- 1\n- 2", "is no sensor"),
+        ("1: 2", "is no sensor"),
+        ("name: [", "not readable YAML"),
+        ("name: \x00", "not readable YAML"),
+        ("name: !!python/object/apply:os.system [ls]", "not readable YAML"),
+        ("name: 2001-13-45", "not readable YAML"),
+        ("name: 0b_", "not readable YAML"),
+        ("elevations: [2, 1]", "needs the option 'name'"),
+        ("name: 12\nelevations: [2, 1]", "name must be a word"),
+        (MINE + "colums: 3", "Did you mean 'columns'?"),
+        (MINE + "columns: wide", "columns must be a whole number"),
+        (MINE + "firing: [0, 1]", "firing must name each of the rows 0 to 3"),
+        ("name: mine\nelevations: 5", "elevations must be a list"),
+        ("name: mine\nelevations: [1, 2]", "fall from the top"),
+        ("name: mine", "no sensor named 'mine'"),
+    ],
+)
+def test_a_wrong_file_is_named_in_one_line(tmp_path, text, words):
+    with pytest.raises(InputError) as error:
+        read_sensor(written(tmp_path, text))
+    assert words in str(error.value)
+    assert "mine.yaml" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_no_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"is not a file\. A sensor is a name \(hdl64e"):
+        read_sensor(tmp_path / "none.yaml")
+    with pytest.raises(InputError, match="is not a file"):
+        read_sensor(tmp_path)
+    (tmp_path / "binary.yaml").write_bytes(bytes(range(128, 256)))
+    with pytest.raises(InputError, match="not readable YAML"):
+        read_sensor(tmp_path / "binary.yaml")
+    (tmp_path / "large.yaml").write_bytes(b"#" * (2 << 20))
+    with pytest.raises(InputError, match="too many"):
+        read_sensor(tmp_path / "large.yaml")
+
+
+def test_it_is_yaml_that_others_read(tmp_path):
+    write_sensor(SENSORS["vlp32c"], tmp_path / "x.yaml", "a comment")
+    options = yaml.safe_load((tmp_path / "x.yaml").read_text())
+    assert options["elevations"] == list(SENSORS["vlp32c"].elevations)
+    assert options["firing"] == list(SENSORS["vlp32c"].firing)
+    assert options["rows"] is None

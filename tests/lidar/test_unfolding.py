@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+
+from r2flow.errors import InputError
+from r2flow.lidar.projection import project
+from r2flow.lidar.scan_files import read_points
+from r2flow.lidar.sensors import SENSORS, Sensor
+
+FIRED = ["hdl32e", "vlp16", "vlp32c", "os1_64", "pandar64"]
+
+
+def cloud(sensor: Sensor, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a random image, (W, H, 3), a firing after the other, each from the top; a fifth without return."""
+    draw = np.random.default_rng(seed)
+    image = draw.uniform(sensor.min_range * 1.01, sensor.max_range * 0.99, sensor.shape).astype(np.float32)
+    image *= draw.random(sensor.shape) < 0.8
+    e, a = sensor.rays().numpy()
+    xyz = np.stack([image * np.cos(e) * np.cos(a), image * np.cos(e) * np.sin(a), image * np.sin(e)])
+    return xyz.transpose(2, 1, 0), image
+
+
+def packet_order(sensor: Sensor, how: str) -> np.ndarray:
+    """Row of laser 0, 1, ... of a file."""
+    rows = np.arange(len(sensor.elevations))
+    firing = rows if sensor.firing is None else np.array(sensor.firing)
+    return {"top": rows, "bottom": rows[::-1], "firing": firing}[how]
+
+
+@pytest.mark.parametrize("how", ["top", "bottom", "firing"])
+@pytest.mark.parametrize("name", FIRED)
+def test_whole_firings_unfold_whatever_their_order(name, how):
+    sensor = SENSORS[name].resized(columns=48)
+    firings, image = cloud(sensor)
+    xyz = firings[:, packet_order(sensor, how)].reshape(-1, 3)
+    np.testing.assert_allclose(project(xyz, None, sensor, "unfolding")[0], image, rtol=1e-6)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("how", ["top", "bottom", "firing"])
+def test_ring_numbers_unfold_whatever_they_count(how, first):
+    sensor = SENSORS["vlp32c"].resized(columns=48)
+    firings, image = cloud(sensor)
+    xyz = firings[:, packet_order(sensor, how)].reshape(-1, 3)
+    ring = np.tile(np.arange(32), 48) + first
+    shuffled = np.random.default_rng(1).permutation(len(xyz))
+    again = project(xyz[shuffled], None, sensor, "unfolding", ring=ring[shuffled].astype(np.uint16))
+    np.testing.assert_allclose(again[0], image, rtol=1e-6)
+
+
+def test_a_ring_without_a_return_leaves_its_row_empty():
+    sensor = SENSORS["vlp16"].resized(columns=48)
+    firings, image = cloud(sensor)
+    for missing in (0, 7, 15):
+        xyz, ring = firings.reshape(-1, 3), np.tile(np.arange(16), 48)
+        kept = (ring != missing) & xyz.any(axis=1)
+        again = project(xyz[kept], None, sensor, "unfolding", ring=ring[kept])
+        expected = image.copy()
+        expected[missing] = 0
+        np.testing.assert_allclose(again[0], expected, rtol=1e-6)
+
+
+def test_what_does_not_tell_its_lasers_is_refused_in_one_line():
+    sensor = SENSORS["vlp32c"].resized(columns=64)
+    xyz = cloud(sensor)[0][:, np.array(sensor.firing)].reshape(-1, 3)
+    with pytest.raises(InputError, match=r"neither ring after ring nor in whole firings of 32.*spherical") as error:
+        project(xyz[xyz.any(axis=1)], None, sensor, "unfolding")
+    assert "\n" not in str(error.value)
+    for ring, words in (
+        (np.tile(np.arange(64), 32), r"ring numbers up to 63, but sensor 'vlp32c' has 32 rows"),
+        (np.tile(np.arange(32) // 4, 64), r"ring numbers up to 7, but sensor 'vlp32c' has 32 rows"),
+        (np.random.default_rng(0).integers(0, 32, 2048), "follow neither the elevations"),
+    ):
+        with pytest.raises(InputError, match=words):
+            project(xyz, None, sensor, "unfolding", ring=ring)
+
+
+def test_a_real_scan_of_whole_firings(shared):
+    # 64 x 2048 in order: the row of a point is its number modulo 64.
+    (path,) = (shared / "real" / "other_sensors" / "rellis_os1_64").glob("*.bin")
+    xyz = read_points(path).xyz
+    sensor = SENSORS["os1_64"].resized(columns=2048)
+    r = np.linalg.norm(xyz, axis=1)
+    image = project(xyz, r, sensor, "unfolding")
+    counted = np.bincount(np.arange(len(xyz))[(r >= 0.8) & (r <= 120)] % 64, minlength=64)
+    filled = (image[0] > 0).sum(axis=1)
+    assert (filled <= counted).all()
+    assert filled.sum() > 0.98 * counted.sum()  # a few share a column with a neighbour
+    for row in (5, 20, 40, 63):
+        assert set(image[1, row][image[0, row] > 0].tolist()) <= set(r[row::64].astype(np.float32).tolist())
+
+
+def test_a_real_scan_unfolds_by_ring_and_by_firing_alike(shared):
+    (path,) = (shared / "real" / "other_sensors" / "nuscenes_hdl32e").glob("*.bin")
+    points = read_points(path)
+    by_ring, by_firing = (
+        project(points.xyz, None, SENSORS["hdl32e"], "unfolding", ring=ring) for ring in (points.ring, None)
+    )
+    np.testing.assert_array_equal(by_firing, by_ring)
+    # The file counts its rings from the lowest up.
+    within = (np.linalg.norm(points.xyz, axis=1) >= 1) & (points.ring == 31)
+    assert (by_ring[0, 0] > 0).sum() <= within.sum() < 1.8 * (by_ring[0, 0] > 0).sum()

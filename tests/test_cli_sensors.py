@@ -1,0 +1,105 @@
+"""`r2flow sensor` and sensors of one's own, as a user types them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.sensors import SENSORS, Sensor
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+
+MINE = Sensor("mine", (12.0, 5.0, 1.0, 0.0, -1.5, -4.0, -9.0, -20.0), columns=128)
+
+
+@pytest.fixture
+def scans(tmp_path: Path) -> Path:
+    """Three scans of a sensor of one's own, of ground 1.5 m below and a wall 40 m away; reflectance up to 255."""
+    folder = tmp_path / "scans"
+    for index in range(3):
+        draw = np.random.default_rng(index)
+        e = MINE.rays().numpy()[0]
+        r = np.minimum(np.where(e < 0, 1.5 / np.sin(np.maximum(-e, 1e-9)), np.inf), 40 / np.cos(e))
+        image = np.stack([r, draw.integers(0, 256, r.shape)]) * (draw.random(r.shape) < 0.9)
+        write_points(folder / f"{index:06d}.bin", *image_to_points(image.astype(np.float32), MINE.rays()))
+    return folder
+
+
+def test_scans_become_a_sensor_that_the_verbs_take(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
+    out = tmp_path / "conf" / "mine.yaml"
+    code, printed, error = r2flow("sensor", scans, "--out", out)
+    assert (code, error) == (0, "")
+    printed = " ".join(printed.split())
+    for words in (
+        "8, told by the files",
+        "128 steps a turn",
+        "reflectance_scale=255",
+        "1.50 m above",
+        "ring after ring",
+    ):
+        assert words in printed
+    options = yaml.safe_load(out.read_text())
+    assert options["name"] == "mine"
+    assert options["columns"] == 128
+    np.testing.assert_allclose(options["elevations"], MINE.elevations, atol=1e-3)
+    assert sorted(path.name for path in out.parent.iterdir()) == ["mine.yaml"]
+
+    image = tmp_path / "image.npy"
+    code, printed, _ = r2flow("project", scans / "000000.bin", "--sensor", out, "--reflectance-scale", 255, "-o", image)
+    assert code == 0
+    assert "8 x 128" in printed
+    assert (np.load(image)[0] > 0).mean() == pytest.approx(0.9, abs=0.03)
+    code, printed, _ = r2flow("project", scans / "000000.bin", "--sensor", out, "--reflectance-scale", 255,
+                              "--size", "4x64", "-o", image)  # fmt: skip
+    assert np.load(image).shape == (2, 4, 64)
+    code, _, _ = r2flow("show", scans / "000000.bin", "--sensor", out, "--out", tmp_path / "views")
+    assert code == 0
+    assert (tmp_path / "views" / "000000.png").stat().st_size > 10_000
+
+
+def test_without_out_nothing_is_written(r2flow, scans: Path, tmp_path: Path, monkeypatch):  # noqa: F811
+    monkeypatch.chdir(tmp_path)
+    before = set(tmp_path.rglob("*"))
+    code, printed, _ = r2flow("sensor", scans / "000000.bin", scans / "000001.bin")
+    assert code == 0
+    assert "elevations" in printed
+    assert set(tmp_path.rglob("*")) == before
+
+
+def test_what_cannot_be_a_sensor_is_one_line(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
+    np.array([[1, 2, 3, 0.5]], np.float32).tofile(tmp_path / "one.bin")
+    (tmp_path / "text.bin").write_text("one two three four, and so on for a while\n")
+    (tmp_path / "notes.txt").write_text("text")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "folder.yaml").mkdir()
+    (tmp_path / "wrong.yaml").write_text("name: mine\nelevations: [1, 2]\n")
+    for arguments, words in (
+        ([tmp_path / "one.bin"], "1 returns in all tell too little"),
+        ([tmp_path / "text.bin"], "is text"),
+        ([tmp_path / "notes.txt"], "no ending of a scan file"),
+        ([tmp_path / "empty"], "holds no scan"),
+        ([tmp_path / "missing"], "does not exist"),
+        ([scans, "--out", tmp_path / "mine.txt"], "--out must be a .yaml"),
+        ([scans, "--out", tmp_path / "folder.yaml"], "--out must be a .yaml file"),
+        ([scans, "--name", "vlp16"], "no sensor's of the table; found 'vlp16'"),
+        ([scans, "--name", "my sensor: 1"], "letters, digits and _"),
+    ):
+        code, _, error = r2flow("sensor", *arguments)
+        assert code == 2
+        assert words in error
+        assert error.count("\n") == 1
+    for sensor, words in ((tmp_path / "wrong.yaml", "fall from the top"), (tmp_path / "none.yaml", "is not a file")):
+        code, _, error = r2flow("project", scans / "000000.bin", "--sensor", sensor, "-o", tmp_path / "x.npy")
+        assert code == 2
+        assert words in error
+        assert error.count("\n") == 1
+
+
+def test_the_table_s_sensors_stay_names(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
+    for name in ("vlp32c", "os1_128"):
+        out = tmp_path / f"{name}.npy"
+        code, _, _ = r2flow("project", scans / "000000.bin", "--sensor", name, "--reflectance-scale", 255, "-o", out)
+        assert code == 0
+        assert np.load(out).shape == (2, *SENSORS[name].shape)
