@@ -61,14 +61,16 @@ def fit(config: dict[str, Any], asked: list[str]) -> None:
     from callbacks import build_callbacks, build_loggers
     from r2flow.checkpoints import AtomicCheckpointIO, checkpoints_of, step_of
     from r2flow.data.datamodule import ScanDataModule
+    from r2flow.data.opening import AUTO, resolve_reflectance
     from r2flow.lineage import inherit
     from r2flow.noise import seed_torch
     from r2flow.registry import check_options
     from r2flow.reports.training import check_samples, finish
     from r2flow.runs import open_run, run_lock
-    from r2flow.stages import build_parts, build_stage
+    from r2flow.stages import build_parts, build_stage, check_roll
 
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    warnings.filterwarnings("ignore", message="Total length of .list. across ranks is zero.*")
     warnings.filterwarnings("ignore", message=".*smaller than the logging interval.*")
     warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty.*")
     warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")
@@ -82,13 +84,16 @@ def fit(config: dict[str, Any], asked: list[str]) -> None:
     if not (isinstance(config["seed"], int) and 0 <= config["seed"] < 2**63):
         raise InputError(f"seed must be a whole number of at least 0, found {config['seed']!r}.")
     config, parent = inherit(config, asked)
+    check_options("data", ScanDataModule, config["data"], given=3)
+    encoding = config["encoding"]
+    encoding["reflectance"] = resolve_reflectance(encoding.get("reflectance", AUTO), config["data"])
     seed_torch(config["seed"], "weights")
     parts = build_parts(config)
     if parent is not None:
         parts.backbone.load_state_dict(parent.model.state_dict())
         del parent
-    check_options("data", ScanDataModule, config["data"], given=3)
     data = ScanDataModule(parts.sensor, parts.encoding, config["seed"], **config["data"])
+    check_roll(data.augment, parts.backbone)
     data.setup()
     config["scans"] = data.fingerprint()
     stage = build_stage(config, parts.backbone)

@@ -21,8 +21,8 @@ RECORD = "link.json"
 CHAIN_KEYS = ("experiment", "name", "run_dir", "chain", "hydra")
 SCAN_KEYS = (
     "backbone", "sensor", "encoding", "data", "data.root", "data.split", "data.drives", "data.scenes",
-    "data.projection", "data.convention", "data.reflectance_scale", "data.on_bad_scan", "data.flip",
-    "data.validation.data",
+    "data.projection", "data.convention", "data.reflectance_scale", "data.on_bad_scan",
+    "data.augment", "data.parts", "data.validation.data",
 )  # fmt: skip
 
 

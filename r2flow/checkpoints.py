@@ -14,6 +14,7 @@ import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor, nn
 
+from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.lidar.encoding import Encoding
@@ -158,7 +159,9 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
         config, weights = published_config(content["cfg"], path), content["weights"]
         step, kind = published_step(content), "published"
     elif "config" in content and "state_dict" in content:
-        config, step, kind = content["config"], int(content.get("global_step", 0)), "r2flow"
+        config, step, kind = dict(content["config"]), int(content.get("global_step", 0)), "r2flow"
+        if "data" in config:
+            config["data"] = upgraded(config["data"])
         state = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
         weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
     else:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.checkpoints import Checkpoint, load_checkpoint, weights_hash
+from r2flow.data.opening import AUTO
 from r2flow.data.pairs import PairOptions, default_folder
 from r2flow.errors import InputError
 from r2flow.registry import check_options
@@ -92,6 +93,8 @@ def _check_agrees(key: str, config: Mapping[str, Any], parent: Checkpoint) -> No
     there = dict(flatten({group: parent.config[group]}))
     for leaf, value in flatten({group: config[group]}):
         asked = leaf == key or leaf.startswith(f"{key}.")
+        if leaf == "encoding.reflectance" and value == AUTO:
+            continue
         unknown = leaf not in there and leaf == key
         if asked and leaf not in OWN and (unknown or there.get(leaf, value) != value):
             raise InputError(

@@ -13,7 +13,10 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 
-PURPOSES = ("training", "validation", "pairs", "evaluation", "simulator", "shuffle", "dropout", "weights")
+PURPOSES = (
+    "training", "validation", "pairs", "evaluation", "simulator", "shuffle", "mixture", "augmentation", "dropout",
+    "weights",
+)  # fmt: skip
 
 
 def generator(seed: int, purpose: str, index: int) -> np.random.Generator:

@@ -3,8 +3,9 @@
 import logging
 import os
 import platform
+import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import yaml
 
 from r2flow.checkpoints import FOLDER, checkpoints_of, read_checkpoint
+from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 
@@ -33,6 +35,7 @@ FREE = (
     "callbacks.reflow_pairs",
     "callbacks.requeue",
     "data.root",
+    "data.parts.*.root",
     "data.validation.data.root",
     "stage.init",
     "parent.path",
@@ -54,8 +57,10 @@ FREE = (
 
 
 def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """('a.b', value) for every leaf of a nested mapping."""
+    """('a.b', value) for every leaf of a nested mapping; a list of groups counts them, 'a.0.b'."""
     for key, value in config.items():
+        if isinstance(value, Sequence) and value and all(isinstance(one, Mapping) for one in value):
+            value = dict(enumerate(value))
         if isinstance(value, Mapping):
             yield from flatten(value, f"{prefix}{key}.")
         else:
@@ -63,6 +68,7 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def _is_free(key: str) -> bool:
+    key = re.sub(r"\.\d+\.", ".*.", key)
     return any(key == free or key.startswith(f"{free}.") for free in FREE)
 
 
@@ -113,7 +119,10 @@ def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
 def read_config(run: str | Path) -> dict[str, Any] | None:
     """The config that a run folder was begun with, or None."""
     path = Path(run, CONFIG)
-    return yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
+    if not path.is_file():
+        return None
+    config = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return {**config, "data": upgraded(config["data"])} if "data" in config else config
 
 
 def write_config(run: str | Path, config: Mapping[str, Any]) -> None:

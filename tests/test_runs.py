@@ -5,7 +5,7 @@ import torch
 
 from r2flow.checkpoints import AtomicCheckpointIO
 from r2flow.errors import InputError
-from r2flow.runs import contradictions, open_run, read_config
+from r2flow.runs import contradictions, open_run, read_config, write_config
 
 CONFIG = {"seed": 0, "data": {"root": "a", "batch_size": 4}, "trainer": {"devices": 1, "max_steps": 10}}
 
@@ -49,6 +49,26 @@ def test_where_it_computes_may_change_and_what_may_not(tmp_path: Path):
     with pytest.raises(InputError, match=r"data.batch_size=4 there, 8 here.*name=OTHER"):
         open_run(tmp_path, changed(data__batch_size=8))
     assert read_config(tmp_path) == changed(trainer__devices=4)  # what runs now, and not what was refused
+
+
+def test_each_part_of_a_mixture_may_move_and_must_stay_what_it_is():
+    def parts(root: str, weight: float) -> dict:
+        return {
+            "data": {"parts": [{"name": "folder", "root": "a"}, {"name": "folder", "root": root, "weight": weight}]}
+        }
+
+    assert contradictions(parts("b", 1), parts("moved", 1)) == []
+    assert contradictions(parts("b", 1), parts("b", 2)) == ["data.parts.1.weight=1 there, 2 here"]
+
+
+def test_a_run_begun_before_augmentation_had_a_group_goes_on(tmp_path: Path):
+    write_config(tmp_path, {"data": {"name": "folder", "flip": True}})
+    off = {"roll": False, "beam_dropout": 0.0, "ray_dropout": 0.0}
+    old = read_config(tmp_path)
+    assert contradictions(old, {"data": {"name": "folder", "parts": None, "augment": {"flip": True, **off}}}) == []
+    assert contradictions(old, {"data": {"name": "folder", "augment": {"flip": False, **off}}}) == [
+        "data.augment.flip=True there, False here"
+    ]
 
 
 def test_a_folder_in_which_nothing_was_learned_is_free(tmp_path: Path):

@@ -14,6 +14,7 @@ from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     inversion,
     measure,
     pairs,
+    prepare,
     scans,
     sensors,
     simulate,

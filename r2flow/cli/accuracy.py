@@ -169,7 +169,7 @@ def only_errors() -> Iterator[None]:
 
 
 @contextmanager
-def bar(unit: str, total: int) -> Iterator[Callable[[], None]]:
+def bar(unit: str, total: int, doing: str = "measuring") -> Iterator[Callable[[], None]]:
     """A progress bar with rate and time left; yields what advances it by one."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
@@ -183,7 +183,7 @@ def bar(unit: str, total: int) -> Iterator[Callable[[], None]]:
 
     columns = (BarColumn(), MofNCompleteColumn(), TextColumn(unit), Rate(), TimeLeft())
     # On standard error: what is printed about the result may be piped.
-    with Progress(TextColumn("measuring"), *columns, console=Console(stderr=True), transient=True) as progress:
+    with Progress(TextColumn(doing), *columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(unit, total=total)
         yield lambda: progress.advance(task)
 

@@ -28,10 +28,11 @@ def show(
         float | None, typer.Option(help="Value in the file that means full reflectance; guessed if left out.")
     ] = None,
     most: Annotated[int, typer.Option(min=1, help="The most scans to draw of a folder.")] = 16,
+    labels: Annotated[bool, typer.Option("--labels", help="Draw the classes of .label files, too.")] = False,
 ) -> None:
     """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each."""
     from r2flow.reports.pictures import save_figure, scan_figure
-    from r2flow.reports.views import open_view, scans_of
+    from r2flow.reports.views import label_view, open_view, scans_of
 
     if projection == "unfolding" and sensor == "hdl64e":
         sensor = "hdl64e_rings"  # rows are rings then, and these are not evenly spaced
@@ -39,7 +40,8 @@ def show(
     paths = [path for file in files for path in scans_of(file, most)]
     for path in paths:
         image, rays = open_view(path, chosen, projection, reflectance_scale)
-        written = save_figure(scan_figure(image, rays, path.name), out / f"{unique_stem(path, paths)}.png")
+        classes = label_view(path, chosen, projection) if labels else None
+        written = save_figure(scan_figure(image, rays, path.name, classes), out / f"{unique_stem(path, paths)}.png")
         print(written)
 
 

@@ -3,34 +3,35 @@
 import hashlib
 import logging
 import math
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import lightning as L
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from r2flow.data.layouts import find_drives
-from r2flow.data.loader import FixedSampler, FlowDataset, Item, RunLoader, RunSampler
+from r2flow.data.augment import Augmentation
+from r2flow.data.loader import FixedSampler, FlowDataset, Item, Order, Permutations, RunLoader, RunSampler
+from r2flow.data.mixture import MixedOrder, Mixture, refuse_shared_scans, scan_places
+from r2flow.data.opening import (
+    MIXED,
+    SIMULATED,
+    PartOptions,
+    SourceOptions,
+    open_source,
+    split_parts,
+    validation_source,
+)
 from r2flow.data.pairs import PairDataset, PairOptions, PairSource
 from r2flow.data.shards import PairStore
-from r2flow.data.sources import (
-    InMemory,
-    ScanFiles,
-    ScanSource,
-    SimulatedScans,
-    holdout_block,
-    spread,
-)
+from r2flow.data.sources import InMemory, ScanFiles, ScanSource, SimulatedScans, holdout_block, spread
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
-from r2flow.registry import check_options, did_you_mean
+from r2flow.registry import check_options
 
 log = logging.getLogger(__name__)
 
-SIMULATED = "simulated"
 PAIRS = "pairs"
 
 
@@ -41,7 +42,8 @@ class ScanDataModule(L.LightningDataModule):
         sensor: What the scans are projected through.
         encoding: Metres to model space.
         seed: Run seed; noise, times and order derive from it (`r2flow.noise`).
-        name: `simulated`, `pairs`, or a layout of `r2flow.data.layouts.LAYOUTS`.
+        name: `simulated`, `pairs`, `prepared` (what `r2flow prepare` wrote), `mixed`, or a layout of
+            `r2flow.data.layouts.LAYOUTS`.
         root: Folder of the data set, or of the pairs.
         split: Part of the layout's standard split; None takes all.
         drives: Drives to take; None takes all.
@@ -50,7 +52,9 @@ class ScanDataModule(L.LightningDataModule):
         convention: `centre` or `reference`.
         reflectance_scale: The value in the files that means full reflectance.
         on_bad_scan: `error` or `skip`.
-        flip: Mirror every other training scan, left for right.
+        parts: Of `mixed`: its data sets, each `{name, root, split, drives, ..., weight}`. The weights are the shares of
+            the run's images; without any, all scans are one set.
+        augment: Options of `r2flow.data.augment.Augmentation`, done to training scans.
         batch_size: Images in one optimiser step, over all devices and accumulated batches.
         workers: Loader processes a device.
         memory_gib: Training scans are kept in memory where they fit into this, else read when needed.
@@ -73,7 +77,8 @@ class ScanDataModule(L.LightningDataModule):
         convention: str = "centre",
         reflectance_scale: float = 1.0,
         on_bad_scan: str = "error",
-        flip: bool = False,
+        parts: Sequence[Mapping[str, Any]] | None = None,
+        augment: Mapping[str, Any] | None = None,
         batch_size: int = 8,
         workers: int = 0,
         memory_gib: float = 2.0,
@@ -81,19 +86,20 @@ class ScanDataModule(L.LightningDataModule):
         pairs: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        if batch_size < 1 or workers < 0 or scenes < 1:
+        if batch_size < 1 or workers < 0:
             raise InputError(
-                "data.batch_size and data.scenes must be at least 1 and data.workers at least 0; "
-                f"found {batch_size}, {scenes} and {workers}."
+                f"data.batch_size must be at least 1 and data.workers at least 0; found {batch_size} and {workers}."
             )
         self.sensor, self.encoding, self.seed = sensor, encoding, seed
-        self.options = {
-            "name": name, "root": root, "split": split, "drives": drives, "scenes": scenes,
-            "projection": projection, "convention": convention,
-            "reflectance_scale": reflectance_scale, "on_bad_scan": on_bad_scan,
-        }  # fmt: skip
-        self.batch_size, self.workers, self.memory_gib, self.flip = batch_size, workers, memory_gib, flip
-        self.scenes = scenes
+        self.options = SourceOptions(
+            name, root, split, drives, scenes, projection, convention, reflectance_scale, on_bad_scan
+        )
+        if parts is not None and name != MIXED:
+            raise InputError(f"data.parts are those of data=mixed, found data={name}; leave them out, or give it.")
+        self.parts = split_parts(self.options, parts) if name == MIXED else [self.options]
+        self.batch_size, self.workers, self.memory_gib = batch_size, workers, memory_gib
+        check_options("data.augment", Augmentation, augment or {})
+        self.augment = Augmentation(**(augment or {}))
         self.validation = dict(validation or {})
         check_options("data.validation", _validation_options, self.validation)
         self.names: list[str] = []
@@ -103,11 +109,11 @@ class ScanDataModule(L.LightningDataModule):
 
     def _pair_options(self, options: Mapping[str, Any]) -> PairOptions:
         check_options("data.pairs", PairOptions, options)
-        if self.flip:
-            raise InputError("data.flip mirrors scans; a mirrored pair is none of the flow's. Leave it out with pairs.")
+        if self.augment:
+            raise InputError("data.augment changes scans, and a changed pair is none of the flow's; leave it out.")
         if self.validation.get("data") is not None:
             raise InputError("data.validation.data cannot be held out from pairs; leave it out.")
-        if self.options["root"] is None:
+        if self.options.root is None:
             raise InputError("data=pairs needs the flow that draws them: stage.init=RUN.")
         return PairOptions(**options)
 
@@ -116,7 +122,7 @@ class ScanDataModule(L.LightningDataModule):
         """The folder of the run's pairs, whatever it holds yet."""
         assert self.pairs is not None
         shape = self.encoding.shape
-        return PairStore(str(self.options["root"]), self.pairs.recipe(shape))
+        return PairStore(self.options.folder, self.pairs.recipe(shape))
 
     def setup(self, stage: str | None = None) -> None:
         if self.training_source is not None:
@@ -125,24 +131,56 @@ class ScanDataModule(L.LightningDataModule):
             _ = self.pair_store  # other pairs in its folder are refused now; missing ones are made later
             return
         training, held = self.sources()
+        self._order(training)  # weights that it refuses are refused before anything is read or written
         self.training_source = self._kept(training, "training scans")
         self.validation_source = self._kept(held, "validation scans")
 
     def sources(self) -> tuple[ScanSource, ScanSource]:
-        """The scans to train on and those held out, none of them read yet."""
+        """The scans to train on and those held out, none of them read yet.
+
+        Without other data to hold out, each part of a mixture holds out its own block.
+        """
         share, most, other = _validation_options(**self.validation)
-        source = self._source(self.options)
-        if other is not None:
-            for key in other:
-                if key not in self.options:
-                    hint = did_you_mean(key, self.options)
-                    known = ", ".join(self.options)
-                    raise InputError(f"data.validation.data has no option {key!r}; it knows: {known}.{hint}")
-            held = self._source({**self.options, "split": None, "drives": None, **other}, held_out=True)
+        opened = [self._open(options) for options in self.parts]
+        whole = [source for source, _ in opened]
+        if len(whole) > 1:
+            refuse_shared_scans(whole)
+        self.names = [
+            f"{label}{name}" for label, source in zip(self._labels(), whole, strict=True) for name in source.names
+        ]
+        if other is None:
+            blocks = [holdout_block(len(source), share, starts) for source, starts in opened]
+            training = [source.subset(first) for source, (first, _) in zip(whole, blocks, strict=True)]
+            held = [source.subset(last) for source, (_, last) in zip(whole, blocks, strict=True)]
         else:
-            first, last = holdout_block(len(source), share)
-            source, held = source.subset(first), source.subset(last)
-        return source, held.subset(spread(len(held), most))
+            # Scenes that are held out beside simulated training ones come after them.
+            first_scene = max((part.scenes for part in self.parts if part.name == SIMULATED), default=0)
+            training, held = whole, [self._open(validation_source(self.options, other), first_scene)[0]]
+            shared = scan_places(held[0]) & set().union(*map(scan_places, whole))
+            if shared:
+                log.warning(
+                    "data.validation.data holds %d scans that are trained on, as %s: give it its own split or drives",
+                    len(shared), min(shared),
+                )  # fmt: skip
+        validation = self._joined(held)
+        return self._joined(training), validation.subset(spread(len(validation), most))
+
+    def _open(self, options: SourceOptions, first_scene: int = 0) -> tuple[ScanSource, list[int]]:
+        return open_source(options, self.sensor, self.seed, self.encoding.reflectance, first_scene)
+
+    def _labels(self) -> list[str]:
+        """What goes before the names of each part's scans: they are told apart by it."""
+        return [f"{number}: " if len(self.parts) > 1 else "" for number in range(len(self.parts))]
+
+    def _joined(self, sources: list[ScanSource]) -> ScanSource:
+        return sources[0] if len(sources) == 1 else Mixture(sources)
+
+    def _order(self, source: ScanSource | PairSource) -> Order:
+        """Which scan is image k of the run."""
+        weights = [part.weight for part in self.parts if isinstance(part, PartOptions) and part.weight is not None]
+        if isinstance(source, Mixture) and weights:
+            return MixedOrder(source.sizes, weights, self.seed)
+        return Permutations(len(source), self.seed)
 
     def fingerprint(self) -> str:
         """What is trained on, wherever it lies: a run goes on only with the same scans in the same order."""
@@ -152,45 +190,22 @@ class ScanDataModule(L.LightningDataModule):
         names = hashlib.sha256("\n".join(self.names).encode()).hexdigest()[:12]
         return f"{len(self.training_source)} of {len(self.names)} scans, {names}"
 
-    def _source(self, options: Mapping[str, Any], held_out: bool = False) -> ScanSource:
-        reflectance = self.encoding.reflectance
-        if options["name"] == SIMULATED:
-            # Scenes that are held out beside simulated training ones come after them.
-            first = self.scenes if held_out and self.options["name"] == SIMULATED else 0
-            scenes = range(first, first + int(options["scenes"]))
-            self.names = self.names if held_out else [f"scene {scene}" for scene in scenes]
-            return SimulatedScans(self.sensor, self.seed, scenes, reflectance)
-        if options["root"] is None:
-            raise InputError(f"data={options['name']} needs the folder of its scans: data.root=FOLDER.")
-        root = str(options["root"])
-        drives = find_drives(options["name"], root, options["split"], options["drives"])
-        paths = [path for drive in drives for path in drive.scans]
-        if not held_out:
-            self.names = [str(path.relative_to(Path(root).expanduser())) for path in paths]
-        if options["projection"] == "unfolding" and self.sensor.name == "hdl64e":
-            log.warning(
-                "unfolded rows are the sensor's rings, which are not evenly spaced: sensor=hdl64e_rings has their "
-                "elevations, sensor=hdl64e is up to 6 degrees off"
-            )
-        return ScanFiles(
-            paths,
-            self.sensor,
-            options["on_bad_scan"],
-            projection=options["projection"],
-            convention=options["convention"],
-            reflectance=reflectance,
-            reflectance_scale=options["reflectance_scale"],
-        )
-
     def _kept(self, source: ScanSource, what: str) -> ScanSource:
-        """The source in memory where it fits, read with a progress bar."""
+        """The source in memory where all that is slow to get of it fits there, read with a progress bar."""
+        parts = source.parts if isinstance(source, Mixture) else [source]
         height, width = self.sensor.shape
-        size = len(source) * (1 + self.encoding.reflectance) * height * width * 4
-        if size > self.memory_gib * 2**30 or len(source) == 0:
+        scans = sum(len(part) for part in parts if isinstance(part, ScanFiles | SimulatedScans))
+        if scans * (1 + self.encoding.reflectance) * height * width * 4 > self.memory_gib * 2**30:
             return source
         from rich.progress import track
 
-        return InMemory(source, lambda numbers: track(numbers, f"reading {what}", disable=len(numbers) < 16))
+        def read(part: ScanSource) -> ScanSource:
+            # What was prepared is mapped from its files, which the system keeps in memory as it sees fit.
+            if not isinstance(part, ScanFiles | SimulatedScans) or len(part) == 0:
+                return part
+            return InMemory(part, lambda numbers: track(numbers, f"reading {what}", disable=len(numbers) < 16))
+
+        return Mixture([read(part) for part in parts]) if isinstance(source, Mixture) else read(source)
 
     def _ranks(self) -> tuple[int, int]:
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
@@ -218,10 +233,9 @@ class ScanDataModule(L.LightningDataModule):
         accumulated = self.trainer.accumulate_grad_batches
         self.check_run(ranks, accumulated, self.trainer.max_steps)
         sampler = RunSampler(
-            len(self.training_source),
+            self._order(self.training_source),
             self.batch_size // accumulated,
             self.trainer.max_steps * accumulated,
-            self.seed,
             rank,
             ranks,
         )
@@ -245,7 +259,8 @@ class ScanDataModule(L.LightningDataModule):
     def _dataset(self, source: ScanSource | PairSource, purpose: str) -> Dataset[Item]:
         if isinstance(source, PairSource):
             return PairDataset(source, self.seed, purpose)
-        return FlowDataset(source, self.encoding, self.seed, purpose, self.flip and purpose == "training")
+        augment = self.augment if purpose == "training" else None
+        return FlowDataset(source, self.encoding, self.seed, purpose, augment)
 
     def val_dataloader(self) -> DataLoader[Item] | list[Any]:
         self._ready()

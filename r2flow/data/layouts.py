@@ -1,8 +1,10 @@
 """Where the scans of a data set lie: each layout finds its drives, in order."""
 
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import SCAN_ENDINGS
@@ -14,14 +16,25 @@ ODOMETRY_SPLIT = {
     "validation": (8,),
     "test": tuple(range(11, 22)),
 }
+OBJECT_SPLIT = {"train": ("training",), "test": ("testing",)}
+
+# What a layout's `split` may be; those that are not here have no standard split.
+SPLITS: Mapping[str, Mapping[str, Sequence[int | str]]] = MappingProxyType(
+    {"kitti_360": KITTI_360_SPLIT, "odometry": ODOMETRY_SPLIT, "object": OBJECT_SPLIT}
+)
 
 
 @dataclass(frozen=True)
 class Drive:
-    """One recording: scans that follow each other."""
+    """One recording: scans that follow each other.
+
+    Attributes:
+        name: What `data.drives` may call it.
+        scans: Paths, as strings: of a hundred thousand, Path objects take seconds and ten times the memory.
+    """
 
     name: str
-    scans: tuple[Path, ...]
+    scans: tuple[str, ...]
 
 
 def kitti_360(root: Path, split: str | None = None) -> list[Drive]:
@@ -48,19 +61,44 @@ def odometry(root: Path, split: str | None = None) -> list[Drive]:
     return [_drive(folder.parent.name, folder) for folder in chosen]
 
 
+def kitti_object(root: Path, split: str | None = None) -> list[Drive]:
+    """`training/velodyne/*.bin` and `testing/velodyne/*.bin`: KITTI object, each scan another place."""
+    folders = [folder for name in ("training", "testing") if (folder := root / name / "velodyne").is_dir()]
+    chosen = _of_split(folders, split, OBJECT_SPLIT, lambda f: f.parent.name)
+    return [_drive(folder.parent.name, folder) for folder in chosen]
+
+
+def nuscenes(root: Path, split: str | None = None) -> list[Drive]:
+    """`samples/LIDAR_TOP/*.pcd.bin` and `sweeps/LIDAR_TOP/*.pcd.bin`, or such files in the folder itself.
+
+    A drive is a log, named at the head of each file: n015-2018-07-24-11-22-45+0800. Samples are the annotated scans
+    among its sweeps; here they follow each other as they were recorded.
+    """
+    _no_split("nuscenes", split)
+    logs: dict[str, list[tuple[str, str]]] = {}
+    for folder in (root / "samples" / "LIDAR_TOP", root / "sweeps" / "LIDAR_TOP", root):
+        for path in _files(folder, (".pcd.bin",)) if folder.is_dir() else ():
+            file = os.path.basename(path)
+            logs.setdefault(file.partition("__")[0], []).append((file, path))
+    return [Drive(log, tuple(path for _, path in sorted(scans))) for log, scans in sorted(logs.items())]
+
+
 def folder(root: Path, split: str | None = None) -> list[Drive]:
     """Any folder of scans; each folder below it that holds some is a drive."""
     _no_split("folder", split)
-    drives: dict[Path, list[Path]] = {}
-    for path in sorted(root.rglob("*")):
-        if path.name.lower().endswith(tuple(SCAN_ENDINGS)):
-            drives.setdefault(path.parent, []).append(path)
-    return [Drive(str(parent.relative_to(root)), tuple(scans)) for parent, scans in drives.items()]
+    below = sorted(Path(place) for place, _, _ in os.walk(root))
+    return [Drive(str(place.relative_to(root)), _files(place, SCAN_ENDINGS)) for place in below]
 
 
 Layout = Callable[[Path, str | None], list[Drive]]
 LAYOUTS: Registry[Layout] = Registry(
-    "data layout", kitti_360=kitti_360, kitti_raw=kitti_raw, odometry=odometry, folder=folder
+    "data layout",
+    kitti_360=kitti_360,
+    kitti_raw=kitti_raw,
+    odometry=odometry,
+    object=kitti_object,
+    nuscenes=nuscenes,
+    folder=folder,
 )
 
 
@@ -87,16 +125,22 @@ def find_drives(
         part = f" of its {split} split" if split else ""
         where = (find.__doc__ or "").splitlines()[0]
         raise InputError(f"data.root={root} holds no {layout} scan{part}. Looked for: {where}")
-    return found if drives is None else [_named(found, str(name)) for name in drives]
+    return found if drives is None else [named_drive(found, str(name)) for name in drives]
 
 
-def _named(drives: list[Drive], name: str) -> Drive:
+def named_drive(drives: list[Drive], name: str) -> Drive:
     matches = [d for d in drives if name == d.name or (name.isdigit() and int(name) in _numbers(d.name))]
     if len(matches) != 1:
         known = ", ".join(d.name for d in drives)
         problem = "no drive" if not matches else f"{len(matches)} drives"
         raise InputError(f"{problem} named {name!r}; known: {known}.")
     return matches[0]
+
+
+def split_of(layout: str, drive: str) -> str | None:
+    """The part of a layout's standard split that a drive belongs to, by its name; None where it is in none."""
+    names = {drive, *_numbers(drive)}
+    return next((part for part, members in SPLITS.get(layout, {}).items() if names & set(members)), None)
 
 
 def _numbers(name: str) -> set[int]:
@@ -107,11 +151,20 @@ def _numbers(name: str) -> set[int]:
 
 
 def _drive(name: str, folder: Path) -> Drive:
-    return Drive(name, tuple(sorted(folder.glob("*.bin"))))
+    return Drive(name, _files(folder, (".bin",)))
+
+
+def _files(folder: Path, endings: tuple[str, ...]) -> tuple[str, ...]:
+    """The files of a folder by their endings, in order; hidden ones (macOS leaves ._NAME beside NAME) are none."""
+    names = sorted(n for n in os.listdir(folder) if n.lower().endswith(endings) and not n.startswith("."))
+    return tuple(os.path.join(folder, name) for name in names)
 
 
 def _of_split(
-    folders: list[Path], split: str | None, parts: dict[str, tuple[int, ...]], number: Callable[[Path], int]
+    folders: list[Path],
+    split: str | None,
+    parts: Mapping[str, Sequence[int | str]],
+    number: Callable[[Path], int | str],
 ) -> list[Path]:
     if split is None:
         return folders

@@ -1,7 +1,7 @@
 """Batches that a run can leave and come back to."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -9,7 +9,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from r2flow import noise
-from r2flow.data.sources import ScanSource
+from r2flow.data.augment import Augmentation
+from r2flow.data.sources import ScanSource, encoded
 from r2flow.lidar.encoding import Encoding
 
 Item = dict[str, Tensor]
@@ -22,57 +23,82 @@ class FlowDataset(Dataset[Item]):
     noise and u depend on (seed, purpose, k) alone.
 
     Args:
-        flip: Mirror every other scan, left for right: azimuth -> -azimuth, columns reversed, exact because bins
-            lie symmetrically about straight ahead. Which ones depends on k alone.
+        augment: What is done to scan k before it is encoded.
     """
 
-    def __init__(self, source: ScanSource, encoding: Encoding, seed: int, purpose: str, flip: bool = False) -> None:
+    def __init__(
+        self,
+        source: ScanSource,
+        encoding: Encoding,
+        seed: int,
+        purpose: str,
+        augment: Augmentation | None = None,
+    ) -> None:
         self.source, self.encoding, self.seed, self.purpose = source, encoding, seed, purpose
-        self.flip = flip
+        self.augment = augment
 
     def __len__(self) -> int:
         return len(self.source)
 
     def __getitem__(self, key: tuple[int, int]) -> Item:
         k, index = key
-        shape = self.encoding.shape
         draw = noise.generator(self.seed, self.purpose, k)
-        x_0 = torch.from_numpy(draw.standard_normal(shape, dtype=np.float32))
+        x_0 = torch.from_numpy(draw.standard_normal(self.encoding.shape, dtype=np.float32))
         u = torch.tensor(draw.random(dtype=np.float32))
-        image = self.source[index]
-        if self.flip and draw.random() < 0.5:
-            image = image[..., ::-1].copy()
-        x_1 = self.encoding.encode(torch.from_numpy(image))
+        if self.augment:
+            image = self.augment(self.source[index], self.seed, k)
+            x_1 = self.encoding.encode(torch.from_numpy(image))
+        else:
+            x_1 = encoded(self.source, index, self.encoding)
         return {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
 
 
-class RunSampler(Sampler[list[tuple[int, int]]]):
-    """The batches of one rank over a whole run, from image `first` on.
+class Order(Protocol):
+    """Which scan is image k of a run, a function of k alone."""
 
-    Image k of the run is scan permutation_{k // n}[k mod n] of n; the permutations are counter-based, so
-    the order is known at every k without having drawn what came before. Global batch m holds images
-    [m B, (m + 1) B); rank r of R takes every R-th of them, from r on.
+    def __getitem__(self, k: int) -> int: ...
+
+
+class Permutations:
+    """Scan permutation_{k // n}[k mod n] of n: every scan once, in an order of its own, then every scan again.
+
+    The permutations are counter-based, so that the order is known at every k without having drawn what came before.
+
+    Args:
+        part: Which part of a mixture these are the scans of: each has permutations of its own.
     """
 
-    def __init__(self, scans: int, batch_size: int, batches: int, seed: int, rank: int = 0, ranks: int = 1) -> None:
-        self.scans, self.batch_size, self.batches = scans, batch_size, batches
-        self.seed, self.rank, self.ranks = seed, rank, ranks
+    def __init__(self, scans: int, seed: int, part: int = 0) -> None:
+        self.scans, self.seed, self.part = scans, seed, part
+        self.epoch, self.order = -1, np.empty(0, dtype=np.int64)
+
+    def __getitem__(self, k: int) -> int:
+        epoch, turn = divmod(k, self.scans)
+        if epoch != self.epoch:
+            index = (self.part << 32) + epoch
+            self.order = noise.generator(self.seed, "shuffle", index).permutation(self.scans)
+            self.epoch = epoch
+        return int(self.order[turn])
+
+
+class RunSampler(Sampler[list[tuple[int, int]]]):
+    """The batches of one rank over a whole run, (k, scan) each, from batch `first_batch` on.
+
+    Global batch m holds images [m B, (m + 1) B); rank r of R takes every R-th of them, from r on.
+    """
+
+    def __init__(self, order: Order, batch_size: int, batches: int, rank: int = 0, ranks: int = 1) -> None:
+        self.order, self.batch_size, self.batches = order, batch_size, batches
+        self.rank, self.ranks = rank, ranks
         self.first_batch = 0
 
     def __len__(self) -> int:
         return self.batches
 
     def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        epoch, order = -1, np.empty(0, dtype=np.int64)
         for batch in range(self.first_batch, self.batches):
-            keys = []
             start = batch * self.batch_size
-            for k in range(start + self.rank, start + self.batch_size, self.ranks):
-                if k // self.scans != epoch:
-                    epoch = k // self.scans
-                    order = noise.generator(self.seed, "shuffle", epoch).permutation(self.scans)
-                keys.append((k, int(order[k % self.scans])))
-            yield keys
+            yield [(k, self.order[k]) for k in range(start + self.rank, start + self.batch_size, self.ranks)]
 
 
 class RunLoader(DataLoader[Item]):

@@ -60,7 +60,7 @@ class Block(NamedTuple):
 
 
 class Damaged(Exception):
-    """A file of pairs that is not what was written."""
+    """A file that is not what was written."""
 
 
 class _Unwanted(Exception):

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from r2flow.files import atomic_write
+from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.projection import image_to_points
 
 BACKGROUND, FOREGROUND = "#101418", "#d8dee4"
@@ -18,22 +19,25 @@ VIEW = 50.0  # metres shown to each side in the bird's-eye view
 HEIGHTS = (-2.8, 3.0)  # metres over which height is coloured, sensor frame
 
 
-def scan_figure(image: np.ndarray, rays: Tensor, title: str = "") -> Figure:
+def scan_figure(image: np.ndarray, rays: Tensor, title: str = "", labels: np.ndarray | None = None) -> Figure:
     """One scan on a page.
 
     Args:
         image: Range in metres and reflectance, (2 or 1, H, W).
         rays: Elevation and azimuth in radians, (2, H, W).
+        labels: Semantic id of every pixel, (H, W), drawn as a row of its own.
     """
-    figure = _figure(13, 8.6)
-    strips = len(image)
+    figure = _figure(13, 8.6 if labels is None else 9.6)
+    strips = len(image) + (labels is not None)
     grid = figure.add_gridspec(
         strips + 1, 2, height_ratios=[1] * strips + [5.2], hspace=0.16, wspace=0.06,
         left=0.03, right=0.97, top=0.93, bottom=0.03, width_ratios=[1, 1.45],
     )  # fmt: skip
     draw_range(figure.add_subplot(grid[0, :]), image)
-    if strips > 1:
+    if len(image) > 1:
         draw_reflectance(figure.add_subplot(grid[1, :]), image)
+    if labels is not None:
+        draw_labels(figure.add_subplot(grid[strips - 1, :]), image, labels)
     xyz, _ = image_to_points(image, rays)
     draw_birds_eye(figure.add_subplot(grid[strips, 0]), xyz)
     draw_perspective(figure.add_subplot(grid[strips, 1]), xyz)
@@ -103,6 +107,35 @@ def draw_reflectance(axes: Any, image: np.ndarray, label: bool = True) -> None:
     shown = np.ma.masked_where(image[0] <= 0, np.sqrt(np.clip(image[1], 0, 1)))
     axes.imshow(shown, cmap=_colours("cividis"), vmin=0, vmax=0.9, aspect="auto", interpolation="nearest")
     _strip(axes, "reflectance" if label else "")
+
+
+def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
+    """Semantic ids, (H, W), named where SemanticKITTI knows all of them, else by number; dropped rays black."""
+    from matplotlib.colors import to_rgb
+
+    returned = image[0] > 0
+    found, counts = np.unique(labels[returned], return_counts=True)
+    named = all(int(one) in CLASSES for one in found)
+    shown = np.zeros((*labels.shape, 3))
+    entries: dict[str, Any] = {}
+    for one in found[np.argsort(-counts)]:
+        name, colour = CLASSES[int(one)] if named else (f"class {one}", _numbered_colour(int(one)))
+        shown[returned & (labels == one)] = to_rgb(colour)
+        entries.setdefault(name, colour)
+    axes.imshow(shown, aspect="auto", interpolation="nearest")
+    _strip(axes, "labels")
+    x = 0.05
+    for name, colour in list(entries.items())[:14]:  # as many as the row is wide, the commonest first
+        axes.text(x, 1.03, name, transform=axes.transAxes, color=colour, fontsize=8, va="bottom")
+        x += 0.012 + 0.0052 * len(name)
+
+
+def _numbered_colour(number: int) -> str:
+    """A colour for a number that has no name; by the golden ratio, neighbours lie far apart in hue."""
+    from matplotlib.colors import hsv_to_rgb, to_hex
+
+    red, green, blue = hsv_to_rgb((number * 0.618034 % 1, 0.45 + 0.4 * (number % 3 > 0), 1 - 0.25 * (number % 2)))
+    return to_hex((red, green, blue))
 
 
 def draw_birds_eye(axes: Any, xyz: np.ndarray, label: bool = True) -> None:

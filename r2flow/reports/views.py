@@ -1,14 +1,17 @@
 """Scans and range images from disk, ready to be drawn."""
 
+import logging
 from pathlib import Path
 
 import numpy as np
 from torch import Tensor
 
-from r2flow.data.sources import read_scan, spread
+from r2flow.data.sources import read_labelled_scan, read_scan, spread
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import SCAN_ENDINGS, read_points
 from r2flow.lidar.sensors import Sensor
+
+log = logging.getLogger(__name__)
 
 
 def scans_of(path: Path, most: int) -> list[Path]:
@@ -55,6 +58,16 @@ def open_view(
         highest = 0.0 if found is None else float(np.nan_to_num(found).max(initial=0))
         reflectance_scale = 1.0 if highest <= 1 else max(highest, 255.0)
     return project_file(path, sensor, projection, "centre", reflectance_scale), sensor.rays()
+
+
+def label_view(path: Path, sensor: Sensor, projection: str = "spherical") -> np.ndarray | None:
+    """The classes, (H, W), that `open_view` has no place for; None, with a warning, where the scan has no labels."""
+    labels = None
+    if range_image(path) is None:
+        _, labels = read_labelled_scan(path, sensor, projection=projection, reflectance=False)
+    if labels is None:
+        log.warning("%s: no .label file lies beside it", path)
+    return labels
 
 
 def range_image(path: Path) -> np.ndarray | None:

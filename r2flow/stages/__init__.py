@@ -7,6 +7,8 @@ from typing import Any
 from torch import nn
 
 from r2flow.backbones import build_backbone
+from r2flow.backbones.hdit import LearnablePosition
+from r2flow.data.augment import Augmentation
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding, build_encoding
 from r2flow.lidar.sensors import Convention, Sensor, build_sensor
@@ -42,6 +44,20 @@ def build_parts(config: Mapping[str, Any]) -> Parts:
     encoding = build_encoding(config["encoding"], sensor)
     rays = sensor.rays(convention)
     return Parts(sensor, encoding, build_backbone(config["backbone"], rays, encoding.channels))
+
+
+def check_roll(augment: Augmentation, backbone: nn.Module) -> None:
+    """Refuse turned scans for a backbone that learns a vector for each direction.
+
+    Raises:
+        InputError: both.
+    """
+    if augment.roll and any(isinstance(module, LearnablePosition) for module in backbone.modules()):
+        raise InputError(
+            "data.augment.roll makes all directions alike, and backbone.position=learnable (the paper's APE) learns a "
+            "vector of its own for each; give backbone.position=none, whose attention knows differences in azimuth "
+            "alone, or leave roll out."
+        )
 
 
 def build_stage(config: Mapping[str, Any], backbone: nn.Module) -> RectifiedFlow:

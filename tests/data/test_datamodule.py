@@ -1,3 +1,4 @@
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -5,8 +6,14 @@ import pytest
 import torch
 
 from r2flow.data.datamodule import ScanDataModule
+from r2flow.data.opening import resolve_reflectance
+from r2flow.data.plans import plan_files
+from r2flow.data.prepared import PreparedScans
+from r2flow.data.preparing import Preparation
+from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from tests.data.conftest import write_scan
 
@@ -76,3 +83,231 @@ def test_what_cannot_be_is_refused(numbered: Path):
         module(name="folder", root=str(numbered), split="train")
     with pytest.raises(InputError, match="on_bad_scan"):
         module(name="folder", root=str(numbered), on_bad_scan="ignore")
+
+
+def folder_of(folder: Path, first: int, count: int) -> Path:
+    for number in range(first, first + count):
+        write_scan(folder / f"{number:06d}.bin", number)
+    return folder
+
+
+def mixed(tmp_path: Path, weights=(3, 1), **options) -> ScanDataModule:
+    parts = [
+        {"name": "folder", "root": str(folder_of(tmp_path / "a", 0, 8))},
+        {"name": "odometry", "root": str(tmp_path / "b"), "split": "train"},
+    ]
+    folder_of(tmp_path / "b/sequences/00/velodyne", 20, 4)
+    folder_of(tmp_path / "b/sequences/08/velodyne", 30, 4)
+    for part, weight in zip(parts, weights, strict=True):
+        part |= {} if weight is None else {"weight": weight}
+    return module(name="mixed", parts=parts, **options)
+
+
+def test_each_part_of_a_mixture_holds_out_a_block_of_its_own(tmp_path: Path):
+    data = mixed(tmp_path, validation={"share": 0.25})
+    assert numbers(data.training_source) == [0, 1, 2, 3, 4, 5, 20, 21, 22]
+    assert numbers(data.validation_source) == [6, 7, 23]
+
+
+def test_a_mixture_can_hold_out_another_data_set(tmp_path: Path):
+    other = {"name": "odometry", "root": str(tmp_path / "b"), "split": "validation"}
+    data = mixed(tmp_path, validation={"data": other})
+    assert numbers(data.training_source) == [*range(8), 20, 21, 22, 23]
+    assert numbers(data.validation_source) == [30, 31, 32, 33]
+
+
+def shares(data: ScanDataModule) -> list[float]:
+    """The part of 2,000 images that each of two parts has."""
+    order = data._order(data.training_source)
+    size = data.training_source.sizes[0]
+    first = sum(order[k] < size for k in range(2000)) / 2000
+    return [first, 1 - first]
+
+
+def test_weights_are_shares_and_without_them_every_scan_counts_once(tmp_path: Path):
+    np.testing.assert_allclose(shares(mixed(tmp_path, validation={"share": 0})), [3 / 4, 1 / 4], atol=0.05)
+    data = mixed(tmp_path, weights=(None, None), validation={"share": 0})
+    order = data._order(data.training_source)
+    assert sorted(order[k] for k in range(12)) == list(range(12))
+
+
+def test_a_weight_of_nothing_is_refused_before_a_run_begins(tmp_path: Path):
+    with pytest.raises(InputError, match=r"each weight must be a positive number, found \[3, 0\]"):
+        mixed(tmp_path, weights=(3, 0))  # set up, and no loader made yet
+
+
+def test_the_fingerprint_knows_the_parts_of_a_mixture_and_not_where_they_lie(tmp_path: Path):
+    first = mixed(tmp_path / "here").fingerprint()
+    assert mixed(tmp_path / "there").fingerprint() == first
+    write_scan(tmp_path / "there/b/sequences/00/velodyne/000040.bin", 40)
+    assert mixed(tmp_path / "there").fingerprint() != first
+
+
+@pytest.mark.parametrize(
+    ("parts", "word"),
+    [
+        (None, "data=mixed needs its parts"),
+        ([{"root": "x"}], r"data.parts\[0\] needs the name"),
+        ([{"name": "folder", "rot": "x"}], r"data.parts\[0\] has no option 'rot'.*Did you mean 'root'"),
+        ([{"name": "kitti_360", "root": "x"}], "has a standard split: give split, one of train, test, or null"),
+        ([{"name": "folder", "root": "x", "weight": 1}, {"name": "folder", "root": "y"}], "every part a weight"),
+        ([{"name": "simulated"}, {"name": "simulated"}], "one simulated part"),
+        ([{"name": "folder"}], "data.root=FOLDER"),
+        (["folder"], "must be a group of keys"),
+        ([{"name": "simulated", "scenes": 0}], "data.scenes must be at least 1, found 0"),
+        ([{"name": "folder", "root": "x", "reflectance_scale": 0}], "data.reflectance_scale must be a positive number"),
+    ],
+)
+def test_parts_that_cannot_be_are_refused(parts, word: str):
+    with pytest.raises(InputError, match=word):
+        module(name="mixed", parts=parts)
+
+
+def test_parts_that_share_scans_are_refused(tmp_path: Path):
+    folder_of(tmp_path / "a", 0, 4)
+    folder_of(tmp_path / "b", 4, 4)
+    (tmp_path / "link").symlink_to(tmp_path / "b")
+    whole = {"name": "folder", "root": str(tmp_path), "drives": ["a", "b"]}
+    for other in ("b", "link"):
+        with pytest.raises(InputError, match=r"data.parts\[1\] has 4 scans that a part before it has too, as .*b/0000"):
+            module(name="mixed", parts=[whole, {"name": "folder", "root": str(tmp_path / other)}])
+    apart = module(name="mixed", parts=[{**whole, "drives": [drive]} for drive in ("a", "b")])
+    assert len(apart.names) == 8
+
+
+def test_scans_that_are_trained_on_and_held_out_are_said(numbered: Path, tmp_path: Path, caplog):
+    folder_of(tmp_path / "other", 20, 2)
+    module(name="folder", root=str(numbered), validation={"data": {"name": "folder", "root": str(tmp_path / "other")}})
+    assert caplog.text == ""
+    module(name="folder", root=str(numbered), validation={"data": {"name": "folder", "root": str(numbered)}})
+    assert "data.validation.data holds 12 scans that are trained on" in caplog.text
+
+
+def test_parts_are_those_of_a_mixture(numbered: Path):
+    with pytest.raises(InputError, match="data.parts are those of data=mixed"):
+        module(name="folder", root=str(numbered), parts=[{"name": "folder", "root": str(numbered)}])
+
+
+def test_whole_drives_are_held_out_where_they_come_near(tmp_path: Path):
+    for drive, count in (("a", 7), ("b", 9), ("c", 4)):
+        folder_of(tmp_path / drive, {"a": 0, "b": 7, "c": 16}[drive], count)
+    data = module(name="folder", root=str(tmp_path), validation={"share": 0.15})  # 3 scans, and the last drive has 4
+    assert numbers(data.validation_source) == [16, 17, 18, 19]
+    data = module(name="folder", root=str(tmp_path), validation={"share": 0.05})  # 1 scan
+    assert numbers(data.validation_source) == [19]
+
+
+def test_validation_is_never_augmented(numbered: Path):
+    options = {"name": "folder", "root": str(numbered), "validation": {"share": 0.5}}
+    plain = next(iter(module(**options).val_dataloader()))
+    augmented = next(iter(module(**options, augment={"ray_dropout": 0.9, "flip": True}).val_dataloader()))
+    assert torch.equal(plain["x_1"], augmented["x_1"])
+
+
+def test_pairs_are_not_augmented():
+    with pytest.raises(InputError, match="data.augment changes scans"):
+        module(name="pairs", root="x", augment={"flip": True})
+    with pytest.raises(InputError, match=r"data.augment has no option 'rol'.*Did you mean 'roll'"):
+        module(augment={"rol": True})
+
+
+class TestReflectance:
+    """encoding.reflectance=auto: what the scans do not have is not asked for."""
+
+    @staticmethod
+    def ply(path: Path) -> Path:
+        write_points(path, np.array([[10, 0, -1]], np.float32))
+        return path.parent
+
+    def test_scans_that_have_it_give_a_channel(self, numbered: Path, caplog):
+        with caplog.at_level("INFO"):
+            assert resolve_reflectance("auto", {"name": "folder", "root": str(numbered)})
+        assert [r.message for r in caplog.records] == ["encoding.reflectance=auto is true here: the scans have it"]
+        assert resolve_reflectance("auto", {"name": "simulated"})
+
+    def test_scans_that_lack_it_give_a_flow_of_range_alone(self, tmp_path: Path, caplog):
+        self.ply(tmp_path / "scan.ply")
+        with caplog.at_level("INFO"):
+            assert not resolve_reflectance("auto", {"name": "folder", "root": str(tmp_path)})
+        (record,) = caplog.records
+        assert "scan.ply has no reflectance" in record.message
+
+    def test_a_column_of_zeros_is_none(self, tmp_path: Path):
+        write_scan(tmp_path / "000000.bin", 0, reflectance=0.0)
+        assert not resolve_reflectance("auto", {"name": "folder", "root": str(tmp_path)})
+
+    def test_one_part_without_it_is_enough(self, numbered: Path, tmp_path: Path):
+        root = self.ply(tmp_path / "other" / "scan.ply")
+        parts = [{"name": "folder", "root": str(numbered)}, {"name": "folder", "root": str(root)}]
+        assert not resolve_reflectance("auto", {"name": "mixed", "parts": parts})
+        held = {"validation": {"data": {"name": "folder", "root": str(root)}}}
+        assert not resolve_reflectance("auto", {"name": "folder", "root": str(numbered), **held})
+
+    def test_a_bad_first_scan_is_passed_over_where_bad_scans_are(self, numbered: Path):
+        (numbered / "000000.bin").write_bytes(b"")
+        data = {"name": "folder", "root": str(numbered)}
+        assert resolve_reflectance("auto", {**data, "on_bad_scan": "skip"})
+        with pytest.raises(InputError, match=r"000000.bin is empty"):
+            resolve_reflectance("auto", data)
+
+    def test_what_is_said_is_not_asked(self):
+        nowhere = {"name": "folder", "root": "/nowhere"}
+        assert resolve_reflectance(True, nowhere)
+        assert not resolve_reflectance(False, nowhere)
+        with pytest.raises(InputError, match=r"must be true, false or auto, found 'maybe'"):
+            resolve_reflectance("maybe", nowhere)
+
+
+@pytest.fixture
+def prepared_360(kitti_360: Path, tmp_path_factory) -> Path:
+    """Drives 0, 2, 3, 4 and 10 of three scans each, prepared."""
+    folder = tmp_path_factory.mktemp("prepared")
+    work = Preparation(folder, plan_files("kitti_360", kitti_360, SENSOR))
+    work.make(work.begin())
+    return folder
+
+
+class TestPrepared:
+    """Prepared scans are a data set like others: by drives, in a mixture, held out."""
+
+    def test_they_are_the_scans_of_the_raw_files(self, kitti_360: Path, prepared_360: Path):
+        options = {"split": "train", "validation": {"share": 0.3}}
+        raw = module(name="kitti_360", root=str(kitti_360), **options)
+        prepared = module(name="prepared", root=str(prepared_360), **options)
+        assert numbers(prepared.training_source) == numbers(raw.training_source) == [9, 10, 11, 12, 13, 14]
+        assert numbers(prepared.validation_source) == numbers(raw.validation_source) == [30, 31, 32]  # a whole drive
+        assert prepared.fingerprint() == raw.fingerprint()
+        assert isinstance(prepared.training_source, PreparedScans)  # mapped, not copied
+
+    def test_they_mix_with_others(self, prepared_360: Path, numbered: Path):
+        parts = [{"name": "prepared", "root": str(prepared_360), "split": "train"},
+                 {"name": "folder", "root": str(numbered)}]  # fmt: skip
+        held = {"name": "prepared", "root": str(prepared_360), "split": "test"}
+        data = module(name="mixed", parts=parts, validation={"data": held})
+        assert [type(part) for part in data.training_source.parts] == [PreparedScans, InMemory]
+        assert numbers(data.training_source) == [9, 10, 11, 12, 13, 14, 30, 31, 32, *range(12)]
+        assert numbers(data.validation_source) == [0, 1, 2, 6, 7, 8]
+        dataset = data._dataset(data.training_source, "training")
+        for index in (0, 12):
+            expected = data.encoding.encode(torch.from_numpy(data.training_source[index]))
+            assert torch.equal(dataset[(5, index)]["x_1"], expected)
+
+    def test_test_drives_among_them_are_said(self, prepared_360: Path, caplog):
+        module(name="prepared", root=str(prepared_360), split="test")
+        assert "takes all of them" not in caplog.text
+        module(name="prepared", root=str(prepared_360))
+        assert "holds test and train drives, and data.split=null takes all of them" in caplog.text
+
+
+def test_the_index_of_a_whole_data_set_is_small(tmp_path: Path, monkeypatch):
+    for drive in (0, 2, 3, 4, 5, 6, 7, 9, 10):
+        (tmp_path / f"data_3d_raw/2013_05_28_drive_{drive:04d}_sync/velodyne_points/data").mkdir(parents=True)
+    frames = [f"{frame:010d}.bin" for frame in range(81_106 // 9)]
+    monkeypatch.setattr("os.listdir", lambda folder: frames)
+    tracemalloc.start()
+    try:
+        data = module(name="kitti_360", root=str(tmp_path), memory_gib=0)
+        assert len(data.names) == 9 * len(frames)
+        assert tracemalloc.get_traced_memory()[1] < 100 << 20
+    finally:
+        tracemalloc.stop()

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from r2flow.data.layouts import LAYOUTS, find_drives
+from r2flow.data.layouts import LAYOUTS, find_drives, split_of
 from r2flow.errors import InputError
 from tests.data.conftest import write_scan
 
@@ -43,7 +43,44 @@ def test_any_folder(tmp_path: Path):
     (tmp_path / "b/notes.txt").write_text("not a scan")
     drives = find_drives("folder", tmp_path)
     assert names(drives) == ["a/deep", "b"]
-    assert [path.name for path in drives[1].scans] == ["1.bin", "2.bin"]
+    assert [Path(path).name for path in drives[1].scans] == ["1.bin", "2.bin"]
+
+
+def test_kitti_object(tmp_path: Path):
+    for place in ("training/velodyne/000000", "training/velodyne/000001", "testing/velodyne/000000"):
+        write_scan(tmp_path / f"{place}.bin", 0)
+    assert names(find_drives("object", tmp_path)) == ["training", "testing"]
+    assert [len(drive.scans) for drive in find_drives("object", tmp_path, "train")] == [2]
+    assert names(find_drives("object", tmp_path, "test")) == ["testing"]
+
+
+def test_nuscenes_is_read_log_by_log_in_the_order_of_time(tmp_path: Path):
+    log, other = "n015-2018-07-24-11-22-45+0800", "n008-2018-08-01-15-16-36-0400"
+    files = [f"samples/LIDAR_TOP/{log}__LIDAR_TOP__1532402927647951.pcd.bin",
+             f"sweeps/LIDAR_TOP/{log}__LIDAR_TOP__1532402927597000.pcd.bin",
+             f"sweeps/LIDAR_TOP/{log}__LIDAR_TOP__1532402927697000.pcd.bin",
+             f"sweeps/LIDAR_TOP/{other}__LIDAR_TOP__1533151603547590.pcd.bin"]  # fmt: skip
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).touch()
+    drives = find_drives("nuscenes", tmp_path)
+    assert [drive.name for drive in drives] == [other, log]
+    assert drives[1].scans == tuple(str(tmp_path / files[i]) for i in (1, 0, 2))
+    assert [drive.name for drive in find_drives("nuscenes", tmp_path / "samples/LIDAR_TOP")] == [log]
+    assert find_drives("nuscenes", tmp_path, drives=[log]) == drives[1:]
+
+
+def test_what_a_mac_leaves_beside_a_scan_is_none(tmp_path: Path):
+    write_scan(tmp_path / "000000.bin", 0)
+    (tmp_path / "._000000.bin").touch()
+    assert len(find_drives("folder", tmp_path)[0].scans) == 1
+
+
+def test_a_drive_is_in_one_part_of_the_standard_split():
+    assert split_of("kitti_360", "2013_05_28_drive_0002_sync") == "test"
+    assert split_of("odometry", "08") == "validation"
+    assert split_of("object", "training") == "train"
+    assert split_of("kitti_raw", "2011_09_26_drive_0002_sync") is None
 
 
 @pytest.mark.parametrize("layout", list(LAYOUTS))
@@ -62,3 +99,5 @@ def test_the_real_layouts(shared: Path):
     assert [len(d.scans) for d in find_drives("kitti_raw", real / "raw")] == [20, 11]
     assert names(find_drives("odometry", real / "odometry")) == ["00", "08"]
     assert sum(len(d.scans) for d in find_drives("folder", real / "other_sensors")) == 6
+    assert [len(d.scans) for d in find_drives("object", real / "object", "train")] == [3]
+    assert len(find_drives("nuscenes", real / "other_sensors" / "nuscenes_hdl32e")[0].scans) == 1

@@ -95,6 +95,38 @@ def test_the_held_out_block_is_contiguous_and_last():
         holdout_block(3, 1.0)
 
 
+def test_whole_drives_are_held_out_where_they_come_within_half_of_the_share():
+    def held(share: float, starts: list[int]) -> int:
+        training, last = holdout_block(100, share, starts)
+        assert [*training, *last] == list(range(100))
+        return len(last)
+
+    assert held(0.1, [0, 50, 85, 93]) == 7  # 15 and 7 come near, 7 nearer
+    assert held(0.2, [0, 50, 85, 93]) == 15
+    assert held(0.1, [0, 50, 70]) == 10  # 30 is too much: the end of the last drive
+    assert held(0.1, [0, 98]) == 10
+    assert held(0.0, [0, 99]) == 0
+    assert held(0.9, [0, 10]) == 90
+
+
+def test_names_are_told_below_the_root(numbered: Path):
+    source = ScanFiles([str(path) for path in sorted(numbered.glob("*.bin"))], SENSOR, root=numbered.parent)
+    assert source.names[:2] == ["scans/000000.bin", "scans/000001.bin"]
+    assert source.subset([3]).names == ["scans/000003.bin"]
+
+
+def test_a_coordinate_that_no_lidar_measures_costs_its_point_and_is_said(tmp_path: Path, caplog):
+    rows = np.array([[10, 0, -1, 0.5]] + [[11, 2, -1, 0.5]] * 30, np.float32)
+    rows[0, 1] = np.frombuffer((np.float32(3.5).view(np.uint32) ^ (1 << 30)).tobytes(), np.float32)[0]  # a flipped bit
+    assert 0 < rows[0, 1] < 1e-30  # the exponent's highest bit, which was set, is gone: nothing to see in that
+    rows[1, 1] = np.frombuffer((np.float32(0.5).view(np.uint32) ^ (1 << 30)).tobytes(), np.float32)[0]
+    assert rows[1, 1] > 1e30
+    rows.tofile(tmp_path / "scan.bin")
+    with caplog.at_level(logging.WARNING):
+        read_scan(tmp_path / "scan.bin", SENSOR)
+    assert "dropped 1 points" in caplog.text
+
+
 def test_few_of_many_are_spread_evenly():
     assert spread(3, 8) == [0, 1, 2]
     assert spread(100, 4) == [12, 37, 62, 87]

@@ -52,3 +52,23 @@ def test_loss_curves_are_drawn_short_and_long():
     figure = loss_figure({"train/loss": (steps, 1 / steps), "val/loss": (steps[::100], 1 / steps[::100])})
     labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     assert labels == ["train/loss (mean of 9)", "val/loss"]
+
+
+def test_labels_are_a_row_of_their_classes_colours():
+    from r2flow.lidar.labels import CLASSES
+
+    labels = np.where(A > 0, 40, 70)
+    labels[:8] = 0
+    plain, labelled = (
+        figure_pixels(scan_figure(image(np.full_like(E, 10.0)), SENSOR.rays(), labels=given))
+        for given in (None, labels)
+    )
+
+    def shown(pixels: np.ndarray, name: int) -> int:
+        colour = np.array([int(CLASSES[name][1][i : i + 2], 16) for i in (1, 3, 5)])
+        return int((pixels == colour).all(-1).sum())
+
+    road, plants, nothing = (shown(labelled, name) for name in (40, 70, 0))
+    assert road == pytest.approx(plants, rel=0.1)
+    assert nothing == pytest.approx(road + plants, rel=0.1)
+    assert shown(plain, 40) + shown(plain, 70) + shown(plain, 0) < 20

@@ -140,7 +140,7 @@ def test_a_chain_killed_at_ten_random_moments_ends_as_the_one_left_alone(
             "is [1, 2] here, but [1, 1] in",
         ),
         (["experiment=reflow", "stage.init=RF1", "sensor=vlp16"], "the sensor is the parent's"),
-        (["experiment=reflow", "stage.init=RF1", "data.flip=true"], "data.flip mirrors scans"),
+        (["experiment=reflow", "stage.init=RF1", "data.augment.flip=true"], "data.augment changes scans"),
         (["experiment=reflow", "stage.init=RF1", "data.pairs.num=0"], "num, batch_size, steps must be at least 1"),
         (["experiment=reflow", "stage.init=RF1", "data.pairs.method=dopri"], "Did you mean 'dopri5'"),
         (["experiment=reflow", "stage.init=RF1"], "holds other pairs: method is midpoint there, dopri5 here"),

@@ -29,7 +29,7 @@ from tests.training.conftest import TINY, Run
         (["data.batch_size=many"], ["batch_size must be a whole number", "'many'"]),
         (["stage.learning_rate=fast"], ["learning_rate must be a number", "'fast'"]),
         (["encoding.format=log"], ["no range format named 'log'", "Did you mean 'logscale'?"]),
-        (["encoding.reflectance=maybe"], ["reflectance must be true or false", "'maybe'"]),
+        (["encoding.reflectance=maybe"], ["reflectance must be true, false or auto", "'maybe'"]),
         (["sensor.rows=abc"], ["rows must be a whole number or null", "'abc'"]),
         (["stage.betas=0.9"], ["betas must be a list"]),
         (["stage.time.name=grid"], ["needs the option 'k'"]),
@@ -41,6 +41,12 @@ from tests.training.conftest import TINY, Run
         (["+data.validation.data={name: folder, root: x, splt: test}"], ["no option 'splt'", "Did you mean 'split'?"]),
         (["data.root=2011"], ["data.root=2011", "is not a folder"]),
         (["loggers=csv"], ["loggers=[csv]"]),
+        (["data.augment.roll=true"], ["data.augment.roll", "backbone.position=learnable", "backbone.position=none"]),
+        (["data.augment.ray_dropout=1.5"], ["data.augment.ray_dropout must lie in [0, 1)", "1.5"]),
+        (["data.flip=true"], ["no key 'data.flip'"]),
+        (["data=mixed"], ["data=mixed needs its parts", "data.parts="]),
+        (["data=mixed", "data.parts=[{name: folder, rot: x}]"], ["data.parts[0] has no option 'rot'", "'root'"]),
+        (["data.validation.data={name: mixed}"], ["must name one data set"]),
     ],
 )
 def test_wrong_config(scans, tmp_path, monkeypatch, capfd, overrides: list[str], words: list[str]):

@@ -166,6 +166,7 @@ def srun(
     return [(process.returncode, words) for process, words in zip(started, said, strict=True)]
 
 
+@pytest.mark.slow
 def test_a_job_told_to_leave_is_queued_again_and_ends_as_the_one_left_alone(
     alone: tuple[Path, str], scans: Path, tmp_path: Path
 ):

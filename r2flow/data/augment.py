@@ -1,0 +1,67 @@
+"""Changes to training scans, drawn for each image of a run: mirrored, turned, with returns taken away."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from r2flow import noise
+from r2flow.errors import InputError
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """What may be done to a training scan (`data.augment`); all of it off by default.
+
+    Image k's draws depend on (seed, k) alone, each kind's not on which others are on, and none is shared with its noise
+    and time.
+
+    Attributes:
+        flip: Mirror every other scan, left for right: azimuth -> -azimuth, columns reversed, exact because bins lie
+            symmetrically about straight ahead.
+        roll: Turn each scan about the sensor by a whole number of columns, drawn uniformly: exact on the ring.
+        beam_dropout: Share of the rows that lose all their returns.
+        ray_dropout: Share of the returns that are lost one by one.
+
+    Raises:
+        InputError: a share outside [0, 1).
+    """
+
+    flip: bool = False
+    roll: bool = False
+    beam_dropout: float = 0.0
+    ray_dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("beam_dropout", "ray_dropout"):
+            if not 0 <= getattr(self, name) < 1:
+                raise InputError(f"data.augment.{name} must lie in [0, 1), found {getattr(self, name)}.")
+
+    def __bool__(self) -> bool:
+        return self != Augmentation()
+
+    def __call__(self, image: np.ndarray, seed: int, k: int) -> np.ndarray:
+        """Image k of a run, (2 or 1, H, W) in metres and reflectance, changed; a ray that is dropped is 0 in both."""
+        rows, columns = image.shape[-2:]
+        draw = noise.generator(seed, "augmentation", k)
+        mirrored, turn = draw.random() < 0.5, int(draw.integers(columns))
+        beams = np.greater_equal(draw.random(rows), self.beam_dropout)[:, None]
+        if self.flip and mirrored:
+            image = image[..., ::-1]
+        if self.roll:
+            image = np.roll(image, turn, axis=-1)
+        if self.beam_dropout:
+            image = image * beams.astype(image.dtype)
+        if self.ray_dropout:  # drawn last: it alone takes a number for each pixel
+            image = image * (draw.random((rows, columns), dtype=np.float32) >= self.ray_dropout).astype(image.dtype)
+        return np.ascontiguousarray(image)
+
+
+def upgraded(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The `data` of a config in today's keys: those written before `data.augment` have `flip` in its place."""
+    if "flip" not in data:
+        return dict(data)
+    kept = {key: value for key, value in data.items() if key != "flip"}
+    off = {"flip": bool(data["flip"]), "roll": False, "beam_dropout": 0.0, "ray_dropout": 0.0}
+    return {**kept, "augment": off}

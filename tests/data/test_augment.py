@@ -1,0 +1,111 @@
+"""Augmentation: exact where it is geometry, counted where it is chance, and a function of (seed, k) alone."""
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.data.augment import Augmentation, upgraded
+from r2flow.data.loader import FlowDataset
+from r2flow.errors import InputError
+from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.projection import image_to_points, project
+from r2flow.lidar.sensors import SENSORS
+
+SENSOR = SENSORS["hdl64e"].resized(8, 32)
+KINDS = {"flip": True, "roll": True, "beam_dropout": 0.25, "ray_dropout": 0.25}
+
+
+class Slope:
+    """Every pixel has a range of its own, so that it can be found again."""
+
+    names = ("slope",)
+
+    def __len__(self) -> int:
+        return 1
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        r = np.linspace(2, 70, 8 * 32, dtype=np.float32).reshape(8, 32)
+        return np.stack([r, r / 100])
+
+
+IMAGE = Slope()[0]
+
+
+def test_half_of_the_scans_are_mirrored():
+    flip = Augmentation(flip=True)
+    mirrored = 0
+    for k in range(200):
+        image = flip(IMAGE, 0, k)
+        same, mirror = np.array_equal(image, IMAGE), np.array_equal(image, IMAGE[..., ::-1])
+        assert same != mirror
+        mirrored += mirror
+    assert 70 < mirrored < 130  # 200 fair coins: 100 +- 7
+
+
+def test_a_mirrored_image_is_the_image_of_the_mirrored_scan():
+    rays = SENSOR.rays()
+    xyz, reflectance = image_to_points(IMAGE, rays)
+    mirrored = project(xyz * np.float32([1, -1, 1]), reflectance, SENSOR)
+    np.testing.assert_allclose(mirrored, IMAGE[..., ::-1], rtol=1e-5)
+    assert any(np.array_equal(Augmentation(flip=True)(IMAGE, 0, k), IMAGE[..., ::-1]) for k in range(20))
+
+
+def test_a_rolled_image_is_the_image_of_the_turned_scan():
+    xyz, reflectance = image_to_points(IMAGE, SENSOR.rays())
+    roll = Augmentation(roll=True)
+    turns = [int(np.argmin(roll(IMAGE, 0, k)[0, 0])) for k in range(400)]  # the first column is the nearest
+    np.testing.assert_array_equal(roll(IMAGE, 0, 0), np.roll(IMAGE, turns[0], -1))
+    a = -2 * np.pi / 32 * turns[0]  # columns count against azimuth
+    turned = xyz @ np.float32([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    np.testing.assert_allclose(project(turned, reflectance, SENSOR), roll(IMAGE, 0, 0), rtol=1e-5)
+    counts = np.bincount(turns, minlength=32)  # 400 draws of 32 values: 12.5 +- 3.5 each
+    assert counts.min() > 0
+    assert counts.max() < 30
+
+
+def test_dropped_beams_are_whole_rows_and_dropped_rays_single_returns():
+    rows = np.stack([Augmentation(beam_dropout=0.25)(IMAGE, 0, k)[0] > 0 for k in range(200)])
+    assert (rows.all(axis=2) | ~rows.any(axis=2)).all()
+    assert abs(1 - rows.mean() - 0.25) < 0.04  # 1,600 beams: a standard deviation of 0.011
+    rays = np.stack([Augmentation(ray_dropout=0.25)(IMAGE, 0, k) for k in range(40)])
+    assert abs((rays[:, 0] == 0).mean() - 0.25) < 0.02  # 10,240 rays: 0.0043
+    kept = rays[:, 0] > 0
+    np.testing.assert_array_equal(rays[:, 1] > 0, kept)  # a lost return has lost its reflectance too
+    np.testing.assert_array_equal(rays[kept[:, None].repeat(2, 1)], np.stack([IMAGE] * 40)[kept[:, None].repeat(2, 1)])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_switching_one_on_changes_no_other_draw(kind: str):
+    encoding = Encoding(SENSOR)
+    plain = FlowDataset(Slope(), encoding, 0, "training")[(7, 0)]
+    changed = FlowDataset(Slope(), encoding, 0, "training", Augmentation(**{kind: KINDS[kind]}))[(7, 0)]
+    assert torch.equal(plain["x_0"], changed["x_0"])
+    assert torch.equal(plain["u"], changed["u"])
+    # All of them together are this one, then the others, each with the draws that it has alone.
+    image = IMAGE
+    for one, value in KINDS.items():
+        image = Augmentation(**{one: value})(image, 0, 7)
+    np.testing.assert_array_equal(Augmentation(**KINDS)(IMAGE, 0, 7), image)
+
+
+def test_an_image_depends_on_its_number_alone_and_is_left_as_it_was():
+    before = IMAGE.copy()
+    augment = Augmentation(**KINDS)
+    first = augment(IMAGE, 3, 5)
+    augment(IMAGE, 3, 6)
+    np.testing.assert_array_equal(augment(IMAGE, 3, 5), first)
+    assert not np.array_equal(augment(IMAGE, 4, 5), first)
+    np.testing.assert_array_equal(IMAGE, before)
+
+
+def test_off_by_default():
+    assert not Augmentation()
+    assert all(Augmentation(**{kind: value}) for kind, value in KINDS.items())
+    with pytest.raises(InputError, match=r"beam_dropout must lie in \[0, 1\), found 1"):
+        Augmentation(beam_dropout=1)
+
+
+def test_a_config_of_before_is_read():
+    assert upgraded({"name": "folder", "flip": True}) == {"name": "folder", "augment": {**{
+        "flip": True, "roll": False, "beam_dropout": 0.0, "ray_dropout": 0.0}}}  # fmt: skip
+    assert upgraded({"name": "folder"}) == {"name": "folder"}

@@ -1,0 +1,715 @@
+"""Prepared scans: their codes, their making and their reading."""
+
+import errno
+import json
+import os
+import pickle
+import random
+import resource
+import signal
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.data import preparing
+from r2flow.data.datamodule import ScanDataModule
+from r2flow.data.layouts import Drive, find_drives
+from r2flow.data.manifest import MANIFEST, read_manifest
+from r2flow.data.plans import Plan, plan_files, plan_simulated
+from r2flow.data.prepared import PreparedScans, check_prepared, open_prepared
+from r2flow.data.preparing import Preparation
+from r2flow.data.quantise import RangeCodes, ReflectanceCodes, find_levels
+from r2flow.data.sources import ScanFiles, SimulatedScans
+from r2flow.errors import InputError
+from r2flow.lidar.encoding import FORMATS, Encoding
+from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.sensors import SENSORS, Sensor
+from tests.data.conftest import write_scan
+
+SMALL = SENSORS["hdl64e"].resized(4, 16)
+MILLIMETRE = 1e-3
+
+
+def write_cloud(path: Path, seed: int, levels: int | None = 256) -> None:
+    """200 returns all around, at 1 to 90 m, reflectance in n / levels; none where `levels` is None."""
+    draw = np.random.default_rng(seed)
+    azimuth, elevation = draw.uniform(-np.pi, np.pi, 200), np.deg2rad(draw.uniform(-27, 5, 200))
+    ray = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], 1)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    reflectance = None if levels is None else (draw.integers(0, levels, 200) / levels).astype(np.float32)
+    write_points(path, ray * draw.uniform(1, 90, (200, 1)), reflectance)
+
+
+@pytest.fixture(scope="module")
+def clouds(tmp_path_factory) -> Path:
+    """Ten scans in two folders."""
+    root = tmp_path_factory.mktemp("clouds")
+    for number in range(10):
+        write_cloud(root / f"drive{number // 6}" / f"{number:06d}.bin", number)
+    return root
+
+
+def plan_of(root: Path, sensor: Sensor = SMALL, **options) -> Plan:
+    return plan_files("folder", root, sensor, **{"shard_scans": 3, **options})
+
+
+def make(folder: Path, plan: Plan, **options) -> Path:
+    work = Preparation(folder, plan)
+    work.make(work.begin(), **options)
+    return folder
+
+
+def raw_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", **options) -> ScanFiles:
+    paths = [path for drive in find_drives(layout, root) for path in drive.scans]
+    return ScanFiles(paths, sensor, root=root, **options)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+# Codes
+
+
+@pytest.mark.parametrize("far", [None, 120.0, 245.0, 500.0])
+def test_ranges_are_within_a_millimetre_below_65_m(sensor: Sensor, far: float | None):
+    near, far = sensor.min_range, far or sensor.max_range
+    codes = RangeCodes(near, far)
+    r = np.concatenate([np.random.default_rng(0).uniform(near, far, 50_000), [near, 65.0, far]]).astype(np.float32)
+    r = r.clip(codes.near, codes.far)
+    decoded = codes.metres[codes.encode(r)]
+    error = np.abs(decoded.astype(np.float64) - r)
+    assert error[r < 65].max() <= MILLIMETRE
+    # Beyond, at worst half of what is left of the codes: (500 - 65) m over some 31,000 of them.
+    assert error.max() <= max(MILLIMETRE, (far - 65) / 31_000 / 2 * 1.01)
+    assert decoded.min() >= np.float32(near)
+    assert decoded.max() <= np.float32(far)
+
+
+def test_code_0_is_no_return_and_nothing_else_is(sensor: Sensor):
+    codes = RangeCodes(sensor.min_range, sensor.max_range)
+    assert codes.metres[0] == 0
+    assert codes.metres[1:].min() == np.float32(sensor.min_range)
+    assert codes.encode(np.array([0, sensor.min_range, sensor.max_range], np.float32)).tolist() == [0, 1, 65535]
+    assert (np.diff(codes.metres[1:]) > 0).all()
+
+
+@pytest.mark.parametrize("wrong", [1.0, 81.0, -2.0, np.nan, np.inf])
+def test_what_is_no_range_of_the_sensor_is_refused(wrong: float):
+    with pytest.raises(ValueError, match=r"ranges must be 0 or lie in \[1.45, 80\] m"):
+        RangeCodes(1.45, 80.0).encode(np.array([5.0, wrong], np.float32))
+
+
+@pytest.mark.parametrize("levels", [256, 100, 255])
+def test_reflectance_in_levels_is_kept_to_the_bit_and_the_levels_are_found(levels: int):
+    steps = np.arange(min(levels + 1, 256))
+    reflectance = np.array([step / levels for step in steps], dtype=np.float32)
+    assert find_levels(reflectance) == levels
+    codes = ReflectanceCodes(levels)
+    assert np.array_equal(codes.values[codes.encode(reflectance)], reflectance)
+
+
+def test_reflectance_without_levels_is_off_by_half_a_step_at_most():
+    reflectance = np.random.default_rng(0).random(10_000, dtype=np.float32)
+    assert find_levels(reflectance) == 255
+    codes = ReflectanceCodes(255)
+    assert np.abs(codes.values[codes.encode(reflectance)] - reflectance).max() <= 0.5 / 255 + 1e-7
+
+
+def test_levels_are_found_although_somebody_multiplied_by_a_hundredth():
+    reflectance = np.arange(101, dtype=np.float32) * np.float32(0.01)
+    assert (reflectance != np.arange(101, dtype=np.float32) / 100).any()
+    assert find_levels(reflectance) == 100
+
+
+def test_reflectance_that_would_lose_most_of_its_steps_is_told(tmp_path: Path, caplog):
+    draw = np.random.default_rng(0)
+    xyz = np.array([[10, 0, -1]], np.float32) + draw.random((50, 3), dtype=np.float32)
+    (tmp_path / "scans").mkdir()
+    write_points(tmp_path / "scans" / "1.bin", xyz, np.linspace(0, 0.0115, 50, dtype=np.float32))
+    plan_of(tmp_path / "scans")
+    assert "reflectance goes up to 0.0115 of 1 alone and is kept in steps of 1/255" in caplog.text
+    assert "--reflectance-scale 0.0115" in caplog.text
+    caplog.clear()
+    plan_of(tmp_path / "scans", reflectance_scale=0.0115)
+    assert caplog.text == ""
+
+
+# What is read is what was projected
+
+
+def test_prepared_scans_are_the_raw_ones_to_the_stated_quantisation(clouds: Path, tmp_path: Path):
+    raw, prepared = raw_of(clouds), open_prepared(make(tmp_path, plan_of(clouds)), SMALL)
+    assert len(prepared) == 10
+    assert prepared.names == raw.names == [f"drive{i // 6}/{i:06d}.bin" for i in range(10)]
+    for index in range(10):
+        image, other = raw[index], prepared[index]
+        assert (other.shape, other.dtype) == ((2, 4, 16), np.float32)
+        assert np.array_equal(image[0] == 0, other[0] == 0)
+        assert np.abs(image[0] - other[0]).max() <= MILLIMETRE
+        assert np.array_equal(image[1], other[1])
+    part = prepared.subset([9, 0]).subset([0])
+    assert part.names == ["drive1/000009.bin"]
+    assert np.array_equal(part[0], prepared[9])
+    assert np.array_equal(pickle.loads(pickle.dumps(part))[0], prepared[9])
+
+
+@pytest.mark.parametrize(
+    ("layout", "folder", "most"), [("kitti_360", "kitti360", 2), ("kitti_raw", "raw", 2), ("object", "object", 1)]
+)
+def test_real_scans_keep_their_reflectance_to_the_bit(
+    shared: Path, tmp_path: Path, layout: str, folder: str, most: int
+):
+    sensor = SENSORS["hdl64e"]
+    plan = plan_files(layout, shared / "real" / folder, sensor)
+    few = Plan(replace(plan.recipe, scans=most), (Drive("few", plan.drives[0].scans[:most]),), plan.source)
+    prepared = open_prepared(make(tmp_path, few), sensor)
+    assert few.recipe.levels == (256 if layout == "kitti_360" else 100)
+    raw = raw_of(shared / "real" / folder, layout=layout, sensor=sensor)
+    for index in range(most):
+        image, other = raw[index], prepared[index]
+        assert image[0].astype(bool).mean() > 0.5
+        assert np.array_equal(image[1], other[1])
+        assert np.abs(image[0] - other[0]).max() <= MILLIMETRE
+
+
+def test_training_from_shards_is_training_from_the_files(clouds: Path, tmp_path: Path):
+    make(tmp_path, plan_of(clouds))
+    encoding = Encoding(SMALL)
+    raw = ScanDataModule(SMALL, encoding, 0, "folder", str(clouds))
+    prepared = ScanDataModule(SMALL, encoding, 0, "prepared", str(tmp_path))
+    for module in (raw, prepared):
+        module.setup()
+    assert prepared.fingerprint() == raw.fingerprint()
+    for name in ("training_source", "validation_source"):
+        one, other = (module._dataset(getattr(module, name), "training") for module in (raw, prepared))
+        assert len(one) == len(other) > 0
+        for index in range(len(one)):
+            item, same = one[(7 + index, index)], other[(7 + index, index)]
+            assert set(item) == set(same)
+            for key in ("x_0", "u", "k"):
+                assert torch.equal(item[key], same[key])
+            # Model space is steepest at 1.45 m: 2 / (ln 81 (1 + 1.45)) = 0.186 a metre.
+            assert (item["x_1"] - same["x_1"]).abs().max() <= 0.186 * MILLIMETRE
+
+
+class Images:
+    """Images as a source."""
+
+    def __init__(self, images: np.ndarray) -> None:
+        self.images = images
+        self.names = [f"{i}" for i in range(len(images))]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        return self.images[index]
+
+    def subset(self, indices):
+        return Images(self.images[list(indices)])
+
+
+@pytest.mark.parametrize("format", list(FORMATS))
+@pytest.mark.parametrize("reflectance", [True, False])
+def test_encoded_is_the_encoding_of_the_decoded_bit_for_bit_in_every_code(
+    tmp_path: Path, format: str, reflectance: bool
+):
+    sensor = SENSORS["hdl64e"]
+    plan = plan_simulated(1, 0, sensor.resized(2, 4), levels=100)
+    metres = RangeCodes(sensor.min_range, sensor.max_range).metres.reshape(64, 1024)
+    values = np.random.default_rng(0).permutation(np.arange(65536) % 101).reshape(64, 1024) / np.float32(100)
+    image = np.stack([metres, np.where(metres > 0, values, 0).astype(np.float32)])
+    recipe = replace(plan.recipe, sensor={**plan.recipe.sensor, "elevations": list(sensor.elevations), "columns": 1024})
+    make(tmp_path, Plan(recipe, plan.drives, Images(image[None])))
+    source = open_prepared(tmp_path, sensor, reflectance=reflectance)
+    assert np.array_equal(source[0], image[: 1 + reflectance])
+    encoding = Encoding(sensor, format, reflectance)
+    expected = encoding.encode(torch.from_numpy(image[: 1 + reflectance]))
+    for _ in range(2):
+        assert torch.equal(source.encoded(0, encoding), expected)
+    other = Encoding(sensor, "metric", reflectance)  # another encoding after the first has its own table
+    assert torch.equal(source.encoded(0, other), other.encode(torch.from_numpy(image[: 1 + reflectance])))
+
+
+def test_simulated_scans_too(tmp_path: Path):
+    sensor = SMALL.resized(8, 32)
+    make(tmp_path, plan_simulated(5, 3, sensor, shard_scans=2))
+    prepared, raw = open_prepared(tmp_path, sensor), SimulatedScans(sensor, 3, range(5))
+    assert prepared.names == raw.names
+    for index in range(5):
+        assert np.abs(prepared[index][0] - raw[index][0]).max() <= MILLIMETRE
+        assert np.array_equal(prepared[index][1], raw[index][1])  # the simulator reports n / 100
+
+
+# What is stored
+
+
+def test_a_shard_is_three_bytes_a_pixel_and_readable_by_anybody(clouds: Path, tmp_path: Path):
+    from safetensors.numpy import load_file
+
+    make(tmp_path, plan_of(clouds))
+    assert list(files(tmp_path)) == [MANIFEST, *(f"scans-{i:06d}.safetensors" for i in range(4))]
+    tensors = load_file(tmp_path / "scans-000003.safetensors")  # ten scans by threes: one is left
+    found = {name: (tensor.dtype.name, tensor.shape) for name, tensor in tensors.items()}
+    assert found == {
+        "crc32": ("uint32", (1,)), "range": ("uint16", (1, 4, 16)), "reflectance": ("uint8", (1, 4, 16)),
+    }  # fmt: skip
+    whole = plan_simulated(1, 0, SENSORS["hdl64e"])
+    size = len(Preparation(tmp_path, whole)._serialised(0, [[np.zeros((64, 1024), np.uint16)] * 2] * 8))
+    assert 81_106 / 8 * size < 17e9
+
+
+def test_nothing_tells_where_the_files_lie(clouds: Path, tmp_path: Path):
+    import shutil
+
+    moved = tmp_path / "elsewhere"
+    shutil.copytree(clouds, moved)
+    one, other = make(tmp_path / "one", plan_of(clouds)), make(tmp_path / "other", plan_of(moved))
+    assert files(one) == files(other)
+    for content in files(one).values():
+        assert str(clouds).encode() not in content
+    manifest = json.loads((one / MANIFEST).read_text())
+    assert manifest["recipe"]["r2flow"]
+    assert manifest["recipe"]["levels"] == 256
+    assert [drive["name"] for drive in manifest["drives"]] == ["drive0", "drive1"]
+
+
+def test_scans_without_reflectance_give_shards_without_it(tmp_path: Path):
+    for number in range(2):
+        write_cloud(tmp_path / "scans" / f"{number}.ply", number, levels=None)
+    make(tmp_path / "out", plan_of(tmp_path / "scans"))
+    size = 2 * 4 * 16 * 2
+    assert size < (tmp_path / "out" / "scans-000000.safetensors").stat().st_size < size + 500
+    assert open_prepared(tmp_path / "out", SMALL, reflectance=False)[1].shape == (1, 4, 16)
+    with pytest.raises(InputError, match=r"holds scans without reflectance. Set encoding.reflectance=false"):
+        open_prepared(tmp_path / "out", SMALL)
+
+
+def test_splits_and_drives_are_those_of_the_data_set(kitti_360: Path, tmp_path: Path):
+    make(tmp_path / "out", plan_files("kitti_360", kitti_360, SMALL, shard_scans=4))
+    for options in ({"split": "train"}, {"split": "test"}, {"drives": [10, "2013_05_28_drive_0002_sync"]}, {}):
+        drives = find_drives("kitti_360", kitti_360, **options)
+        raw = ScanFiles([p for d in drives for p in d.scans], SMALL, root=kitti_360)
+        prepared = open_prepared(tmp_path / "out", SMALL, **options)
+        assert prepared.names == raw.names
+        for index in (0, len(raw) - 1):
+            assert np.abs(prepared[index][0] - raw[index][0]).max() <= MILLIMETRE
+    with pytest.raises(InputError, match=r"no split named 'best' in prepared kitti_360 scans; known: train, test"):
+        open_prepared(tmp_path / "out", SMALL, split="best")
+    with pytest.raises(InputError, match="no drive named '7'"):
+        open_prepared(tmp_path / "out", SMALL, drives=[7])
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "said"),
+    [
+        ({"max_range": 100.0}, {}, "max_range is 80.0 there, 100.0 here"),
+        ({"columns": 32}, {}, "columns is 16 there, 32 here"),
+        ({"elevations": (3.0, 1.0, -9.0, -20.0)}, {}, "elevations are others (4 values there, 4 values here)"),
+        ({}, {"projection": "unfolding"}, "projection is spherical there, unfolding here"),
+        ({}, {"convention": "reference"}, "convention is centre there, reference here"),
+    ],
+)
+def test_scans_prepared_for_other_images_are_refused(clouds, tmp_path, changes: dict, options: dict, said: str):
+    make(tmp_path, plan_of(clouds))
+    with pytest.raises(InputError) as error:
+        open_prepared(tmp_path, replace(SMALL, **changes), **options)
+    assert said in str(error.value)
+    open_prepared(tmp_path, replace(SMALL, name="mine", height=2.0))  # no pixel depends on these
+
+
+def test_another_recipe_is_refused_in_the_same_folder(clouds: Path, tmp_path: Path):
+    make(tmp_path, plan_of(clouds))
+    before = files(tmp_path)
+    with pytest.raises(InputError, match=r"holds other scans: convention is centre there, reference here"):
+        make(tmp_path, plan_of(clouds, convention="reference"))
+    with pytest.raises(InputError, match=r"holds other scans: scans is 10 there, 6 here"):
+        make(tmp_path, plan_of(clouds / "drive0"))
+    assert files(tmp_path) == before | {"making/manifest.lock": b""}
+
+
+# Scans that cannot be used
+
+
+def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(clouds: Path, tmp_path: Path, caplog):
+    import shutil
+
+    root = tmp_path / "scans"
+    shutil.copytree(clouds, root)
+    for name in ("drive0/000001.bin", "drive0/000003.bin", "drive0/000004.bin", "drive0/000005.bin"):
+        (root / name).write_bytes(b"")
+    plan = plan_of(root)
+    with pytest.raises(InputError, match=r"000001.bin is empty \(0 bytes\)"):
+        make(tmp_path / "out", plan)
+    with pytest.raises(InputError, match="is not finished: the same r2flow prepare command goes on"):
+        open_prepared(tmp_path / "out", SMALL)
+    make(tmp_path / "out", plan, on_bad_scan="skip")
+    assert caplog.text.count("left out:") == 4
+    content = json.loads((tmp_path / "out" / MANIFEST).read_text())
+    assert content["left_out"] == [f"drive0/{i:06d}.bin" for i in (1, 3, 4, 5)]
+    prepared, raw = open_prepared(tmp_path / "out", SMALL), raw_of(clouds)
+    assert prepared.names == [raw.names[i] for i in (0, 2, 6, 7, 8, 9)]  # the second shard is empty
+    for index, number in enumerate((0, 2, 6, 7, 8, 9)):
+        assert np.array_equal(prepared[index][1], raw[number][1])
+    assert open_prepared(tmp_path / "out", SMALL, drives=["drive1"]).names == raw.names[6:]
+
+
+def test_a_scan_that_has_no_reflectance_among_others_is_a_bad_one(tmp_path: Path):
+    for number in range(40):
+        write_cloud(tmp_path / "scans" / f"{number:02d}.ply", number, levels=None if number == 1 else 100)
+    with pytest.raises(InputError, match=r"01.ply has no reflectance"):
+        make(tmp_path / "out", plan_of(tmp_path / "scans"))
+
+
+def test_no_usable_scan_at_all(tmp_path: Path):
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans" / "1.bin").write_bytes(b"no scan")
+    with pytest.raises(InputError, match="all 1 scans were left out as unusable"):
+        make(tmp_path / "out", plan_of(tmp_path / "scans"), on_bad_scan="skip")
+
+
+# At any number of attempts, by any number of processes
+
+
+class Slow:
+    """The same scans, each with a pause."""
+
+    def __init__(self, source, seconds: float) -> None:
+        self.source, self.seconds = source, seconds
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        time.sleep(self.seconds)
+        return self.source[index]
+
+
+def in_process(folder: Path, plan: Plan, seconds: float = 0.0, **options) -> int:
+    """`make` in a child of its own, with scans that take their time: its process id."""
+    child = os.fork()
+    if child == 0:
+        try:
+            torch.set_num_threads(1)
+            make(folder, replace(plan, source=Slow(plan.source, seconds)), patience=0.01, **options)
+        except BaseException as error:
+            print(repr(error))
+            os._exit(1)
+        os._exit(0)
+    return child
+
+
+def test_worker_processes_make_the_same_bytes(clouds: Path, tmp_path: Path):
+    one = make(tmp_path / "one", plan_of(clouds))
+    assert files(make(tmp_path / "two", plan_of(clouds), workers=2)) == files(one)
+
+
+def test_killed_at_random_moments_the_same_command_ends_alike(clouds: Path, tmp_path: Path):
+    plan = plan_of(clouds, shard_scans=1)
+    one = files(make(tmp_path / "one", plan))
+    draw, folder = random.Random(0), tmp_path / "killed"
+    killed, kept = 0, []
+    for _ in range(8):
+        child = in_process(folder, plan, seconds=8e-3)
+        time.sleep(draw.uniform(0.005, 0.1))
+        os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+        killed += os.WIFSIGNALED(status)
+        kept.append(len(list(folder.glob("scans-*"))))
+    assert killed >= 3  # the others had come to their end
+    assert kept == sorted(kept)  # what was whole stays
+    (folder / ".scans-000002.safetensors.abc.part").write_bytes(b"half")  # as one of them may have left it
+    make(folder, plan)
+    left = {name for name in files(folder) if name not in one}
+    assert left <= {".scans-000002.safetensors.abc.part"}
+    assert {name: data for name, data in files(folder).items() if name in one} == one
+
+
+def test_what_a_killed_process_was_writing_is_cleared_away(clouds: Path, tmp_path: Path):
+    (tmp_path / ".scans-000002.safetensors.abc.part").write_bytes(b"half")
+    (tmp_path / f".{MANIFEST}.abc.part").write_bytes(b"{")
+    make(tmp_path, plan_of(clouds))
+    assert list(files(tmp_path)) == [MANIFEST, *(f"scans-{i:06d}.safetensors" for i in range(4))]
+
+
+def test_several_at_once_share_the_work(clouds: Path, tmp_path: Path):
+    plan = plan_of(clouds, shard_scans=1)
+    one = files(make(tmp_path / "one", plan))
+    start = time.monotonic()
+    children = [in_process(tmp_path / "many", plan, seconds=0.05) for _ in range(4)]
+    statuses = [os.waitpid(child, 0)[1] for child in children]
+    assert statuses == [0, 0, 0, 0]
+    assert files(tmp_path / "many") == one
+    assert time.monotonic() - start < 60  # none waits for ever
+
+
+def test_who_waits_takes_over_from_who_is_killed(clouds: Path, tmp_path: Path):
+    plan = plan_of(clouds, shard_scans=10)
+    one = files(make(tmp_path / "one", plan))
+    slow = in_process(tmp_path / "two", plan, seconds=30)
+    while not (tmp_path / "two" / "making" / "000000.lock").exists():
+        time.sleep(0.005)
+    other = in_process(tmp_path / "two", plan)
+    time.sleep(0.05)
+    os.kill(slow, signal.SIGKILL)
+    os.waitpid(slow, 0)
+    assert os.waitpid(other, 0)[1] == 0
+    assert files(tmp_path / "two") == one
+
+
+def test_each_scan_is_read_by_one_of_several_processes(clouds: Path, tmp_path: Path):
+    plan = plan_of(clouds, shard_scans=2)
+    log = tmp_path / "log"
+
+    class Told(Slow):
+        def __getitem__(self, index: int) -> np.ndarray:
+            with open(log, "a") as file:
+                file.write(f"{index}\n")
+            return super().__getitem__(index)
+
+    told = replace(plan, source=Told(plan.source, 0.02))
+    children = [in_process(tmp_path / "out", told) for _ in range(3)]
+    assert [os.waitpid(child, 0)[1] for child in children] == [0, 0, 0]
+    assert sorted(map(int, log.read_text().split())) == list(range(10))
+
+
+def test_a_full_disk_loses_nothing(clouds: Path, tmp_path: Path, monkeypatch):
+    plan = plan_of(clouds)
+    one = files(make(tmp_path / "one", plan))
+    write, written = preparing.atomic_write, []
+
+    def full(path, *mode):
+        written.append(path)
+        if len(written) > 4:
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        return write(path, *mode)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(preparing, "atomic_write", full)
+        with pytest.raises(OSError, match="No space left on device"):
+            make(tmp_path / "two", plan)
+    made = {name: data for name, data in files(tmp_path / "two").items() if name.startswith("scans")}
+    assert len(made) == 2
+    assert made.items() <= one.items()
+    assert Preparation(tmp_path / "two", plan).begin() == [2, 3]
+    assert files(make(tmp_path / "two", plan)) == one
+
+
+def test_a_file_that_cannot_grow_leaves_no_part_of_itself(clouds: Path, tmp_path: Path):
+    child = os.fork()
+    if child == 0:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+        try:
+            make(tmp_path, plan_of(clouds, SMALL.resized(8, 64)))
+        except OSError as error:
+            os._exit(7 if error.errno == errno.EFBIG else 1)
+        os._exit(0)
+    assert os.WEXITSTATUS(os.waitpid(child, 0)[1]) == 7
+    assert not [name for name in files(tmp_path) if "scans-" in name]
+
+
+# Damage
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def _cut_in_head(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:50])
+
+
+def _longer(path: Path) -> None:
+    path.write_bytes(path.read_bytes() + b"\0")
+
+
+def _huge(path: Path) -> None:
+    os.truncate(path, 1 << 40)
+
+
+def _empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def _text(path: Path) -> None:
+    path.write_text("no shard\n" * 300)
+
+
+def _text_of_its_length(path: Path) -> None:
+    path.write_bytes(b"x" * path.stat().st_size)
+
+
+def _missing(path: Path) -> None:
+    path.unlink()
+
+
+def _dangling(path: Path) -> None:
+    path.unlink()
+    path.symlink_to(path.with_name("nowhere"))
+
+
+def _folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def _wrong_type(path: Path) -> None:
+    from safetensors import safe_open
+    from safetensors.numpy import load_file, save_file
+
+    with safe_open(path, framework="numpy") as file:
+        notes = file.metadata()
+    save_file({**(tensors := load_file(path)), "range": tensors["range"].astype(np.int16)}, path, notes)
+
+
+def _wrong_order_of_bytes(path: Path) -> None:
+    from safetensors import safe_open
+    from safetensors.numpy import load_file, save_file
+
+    with safe_open(path, framework="numpy") as file:
+        notes = file.metadata()
+    save_file({**(tensors := load_file(path)), "range": tensors["range"].byteswap()}, path, notes)
+
+
+def _swapped(path: Path) -> None:
+    other = path.with_name("scans-000002.safetensors")
+    data = other.read_bytes()
+    other.write_bytes(path.read_bytes())
+    path.write_bytes(data)
+
+
+DAMAGES = [
+    _cut, _cut_in_head, _longer, _huge, _empty, _text, _text_of_its_length, _missing, _dangling, _folder, _wrong_type,
+    _wrong_order_of_bytes, _swapped,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_shard_is_refused_by_name_and_made_again(clouds: Path, tmp_path: Path, damage):
+    plan = plan_of(clouds)
+    make(tmp_path, plan)
+    whole, path = files(tmp_path), tmp_path / "scans-000001.safetensors"
+    damage(path)
+    assert path in check_prepared(tmp_path)
+    if damage is _wrong_order_of_bytes:  # in the tensors alone
+        source = open_prepared(tmp_path, SMALL)
+        with pytest.raises(InputError, match=rf"{path.name} is damaged \(the checksum of scan 1 in it differs\)"):
+            source[4]
+    else:
+        with pytest.raises(InputError, match=r"scans-000001.safetensors is damaged \(.*\). The same r2flow prepare"):
+            open_prepared(tmp_path, SMALL)
+    if damage is _folder:
+        with pytest.raises(InputError, match=r"scans-000001.safetensors is a folder where a shard belongs; remove it"):
+            make(tmp_path, plan)
+        path.rmdir()
+    made = []
+    work = Preparation(tmp_path, plan)
+    work.make(work.begin(), advance=made.append)
+    assert sum(made) == (6 if damage is _swapped else 3)  # these alone
+    assert files(tmp_path) == whole
+    assert check_prepared(tmp_path) == {}
+
+
+def outcome(work):
+    """What it gives, or the line of its InputError."""
+    try:
+        return work()
+    except InputError as error:
+        return str(error)
+
+
+def test_no_flipped_bit_of_a_shard_becomes_a_scan(clouds: Path, tmp_path: Path):
+    make(tmp_path, plan_of(clouds))
+    path = tmp_path / "scans-000001.safetensors"
+    whole, images = path.read_bytes(), [open_prepared(tmp_path, SMALL)[i].copy() for i in range(10)]
+    draw = random.Random(0)
+    for position in draw.sample(range(len(whole)), 100):
+        data = bytearray(whole)
+        data[position] ^= 1 << draw.randrange(8)
+        path.write_bytes(data)
+        assert list(check_prepared(tmp_path)) == [path]
+        source = outcome(lambda: open_prepared(tmp_path, SMALL))
+        if isinstance(source, str):
+            assert "scans-000001.safetensors is damaged" in source
+            continue
+        read = [outcome(partial(source.__getitem__, index)) for index in range(10)]
+        refused = [one for one in read if isinstance(one, str)]
+        assert len(refused) == 1
+        assert "scans-000001.safetensors is damaged" in refused[0]
+        assert all(isinstance(one, str) or np.array_equal(one, image) for one, image in zip(read, images, strict=True))
+
+
+def test_no_flipped_bit_of_the_manifest_goes_unnoticed(clouds: Path, tmp_path: Path):
+    make(tmp_path, plan_of(clouds))
+    path = tmp_path / MANIFEST
+    whole, manifest = path.read_bytes(), read_manifest(tmp_path)
+    draw = random.Random(0)
+    refused = 0
+    for position in draw.sample(range(len(whole)), 100):
+        data = bytearray(whole)
+        data[position] ^= 1 << draw.randrange(8)
+        path.write_bytes(data)
+        found = outcome(lambda: read_manifest(tmp_path))
+        if isinstance(found, str):
+            assert MANIFEST in found
+            refused += 1
+        else:
+            assert found == manifest  # the flip was in what JSON leaves free
+    assert refused > 50
+    for content in (b"", b"{}", b"[]", b"null", b"\xff", whole[:-10], b"[" * 100_000):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=rf"{MANIFEST} is damaged"):
+            open_prepared(tmp_path, SMALL)
+    path.unlink()
+    with pytest.raises(InputError, match=r"holds no prepared scans \(no manifest.json\); make them: r2flow prepare"):
+        open_prepared(tmp_path, SMALL)
+
+
+def test_a_shard_that_is_cut_while_it_is_read_is_named(clouds: Path, tmp_path: Path):
+    make(tmp_path, plan_of(clouds))
+    source = open_prepared(tmp_path, SMALL)
+    assert isinstance(source, PreparedScans)
+    source[3]
+    os.truncate(tmp_path / "scans-000001.safetensors", 100)
+    with pytest.raises(InputError, match=r"scans-000001.safetensors is damaged \(it has 100 bytes"):
+        source[4]
+    source[0]
+
+
+def test_a_damaged_shard_whose_files_have_changed_is_not_mended(tmp_path: Path):
+    for number in range(6):
+        write_scan(tmp_path / "scans" / f"{number}.bin", number)
+    make(tmp_path / "out", plan_of(tmp_path / "scans"))
+    _cut(tmp_path / "out" / "scans-000001.safetensors")
+    write_scan(tmp_path / "scans" / "4.bin", 30)
+    with pytest.raises(InputError, match=r"what it was made of has changed since: prepare all scans into another"):
+        make(tmp_path / "out", plan_of(tmp_path / "scans"))
+
+
+def test_a_damaged_note_of_an_unfinished_preparation_is_no_harm(clouds: Path, tmp_path: Path):
+    plan = plan_of(clouds)
+    one = files(make(tmp_path / "one", plan))
+    work = Preparation(tmp_path / "two", plan)
+    work.begin()
+    claims = preparing._Claims(work, [0, 1, 2])
+    work._make_claimed(claims, "error", 0, lambda scans: None)
+    claims.release()
+    (tmp_path / "two" / "making" / "000000.json").write_text('{"recipe": 1')
+    _cut(tmp_path / "two" / "scans-000001.safetensors")
+    assert Preparation(tmp_path / "two", plan).begin() == [0, 1, 3]
+    assert files(make(tmp_path / "two", plan)) == one
+
+
+def test_shards_of_another_recipe_are_not_taken_for_these(clouds: Path, tmp_path: Path):
+    one = files(make(tmp_path / "one", plan_of(clouds)))
+    other = Preparation(tmp_path / "two", plan_of(clouds, convention="reference"))
+    other.begin()
+    claims = preparing._Claims(other, [0, 1])
+    other._make_claimed(claims, "error", 0, lambda scans: None)
+    claims.release()
+    (tmp_path / "two" / MANIFEST).unlink()
+    assert files(make(tmp_path / "two", plan_of(clouds))) == one

@@ -1,0 +1,118 @@
+"""r2flow prepare as a user types it."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r2flow.data.prepared import open_prepared
+from r2flow.data.sources import read_scan
+from r2flow.lidar.sensors import SENSORS
+from tests.data.conftest import kitti_360, write_scan  # noqa: F401  a fixture
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+
+SMALL = SENSORS["hdl64e"].resized(4, 16)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_a_data_set_is_prepared_and_checked(r2flow, kitti_360, tmp_path):  # noqa: F811
+    out = tmp_path / "out"
+    typed = ("prepare", "kitti_360", kitti_360, "--out", out, "--split", "test", "--size", "4x16", "--shard-scans", 4)
+    code, said, _ = r2flow(*typed, "--workers", 1)
+    assert code == 0
+    assert f"{out}: 6 scans in 2 shards, 0.0 MiB; range within" in said
+    assert "reflectance as n/256, exactly" in said
+    source = open_prepared(out, SMALL)
+    assert len(source) == 6
+    raw = read_scan(kitti_360 / source.names[5], SMALL)
+    assert np.abs(source[5] - raw).max() <= 1e-3
+    assert r2flow("prepare", "--check", out)[:2] == (0, f"{out}: all 2 shards are what was written\n")
+
+
+def test_a_damaged_shard_is_named_and_the_same_command_makes_it_again(r2flow, kitti_360, tmp_path):  # noqa: F811
+    out = tmp_path / "out"
+    typed = ("prepare", "kitti_360", kitti_360, "--out", out, "--size", "4x16", "--shard-scans", 4, "--workers", 1)
+    r2flow(*typed)
+    whole = files(out)
+    path = out / "scans-000002.safetensors"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    code, said, error = r2flow("prepare", "--check", out)
+    assert code == 2
+    assert said == f"{path}: its checksum differs\n"
+    assert error.strip() == "error: 1 of 4 shards are damaged; the same r2flow prepare command makes these again."
+    assert r2flow(*typed)[0] == 0
+    assert files(out) == whole
+
+
+def test_simulated_scans_are_prepared_by_number_and_seed(r2flow, tmp_path):  # noqa: F811
+    code, said, _ = r2flow(
+        "prepare", "simulated", "--num", 2, "--seed", 7, "--size", "4x16", "--out", tmp_path, "--workers", 1
+    )
+    assert code == 0
+    assert "2 scans in 1 shards" in said
+    assert open_prepared(tmp_path, SMALL).names == ["scene 0", "scene 1"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["kitti_360"], "r2flow prepare needs LAYOUT ROOT --out FOLDER, or --check FOLDER."),
+        (["kitti_360", "--out", "OUT"], "r2flow prepare kitti_360 needs the folder of its scans"),
+        (["simulated", "ROOT", "--out", "OUT"], "simulated scans are no files: leave out ROOT."),
+        (["simulated", "--out", "OUT", "--split", "test"], "simulated scans are no files: leave out --split."),
+        (["folder", "ROOT", "--out", "OUT", "--num", "3"], "--num is for simulated scans"),
+        (["folders", "ROOT", "--out", "OUT"], "no data layout named 'folders'"),
+        (["folder", "ROOT", "--out", "OUT", "--reflectance-levels", "300"], "must lie in [1, 256]"),
+        (["folder", "ROOT", "--out", "OUT", "--on-bad-scan", "ignore"], "must be 'error' or 'skip', found 'ignore'"),
+        (["folder", "ROOT", "--out", "FILE/below"], "Not a directory"),
+        (["--check", "ROOT"], "holds no prepared scans (no manifest.json); make them: r2flow prepare."),
+    ],
+)
+def test_a_mistake_is_one_line(r2flow, tmp_path, arguments: list[str], said: str):  # noqa: F811
+    write_scan(tmp_path / "scans" / "1.bin", 1)
+    (tmp_path / "file").touch()
+    places = {"ROOT": tmp_path / "scans", "OUT": tmp_path / "out", "FILE/below": tmp_path / "file" / "below"}
+    code, _, error = r2flow("prepare", *(places.get(one, one) for one in arguments), *(["--workers", 1]))
+    assert code == 2
+    error = error.strip()
+    assert error.startswith("error: ")
+    assert said in error
+    assert "\n" not in error
+
+
+@pytest.mark.slow
+def test_the_command_killed_and_started_twice_ends_with_the_same_bytes(tmp_path: Path):
+    for number in range(60):
+        write_scan(tmp_path / "scans" / f"{number}.bin", number)
+
+    def start(out: str) -> subprocess.Popen:
+        typed = [sys.executable, "-m", "r2flow.cli", "prepare", "folder", tmp_path / "scans", "--out", tmp_path / out,
+                 "--size", "64x1024", "--shard-scans", "2", "--workers", "2"]  # fmt: skip
+        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        return subprocess.Popen([str(one) for one in typed], env={**os.environ, "OMP_NUM_THREADS": "1"}, **silent)
+
+    assert start("one").wait() == 0
+    one, draw, killed = files(tmp_path / "one"), random.Random(0), 0
+    for _ in range(6):
+        process = start("killed")
+        folder, before = tmp_path / "killed", len(list((tmp_path / "killed").glob("scans-*")))
+        while process.poll() is None and len(list(folder.glob("scans-*"))) == before:
+            time.sleep(0.002)
+        time.sleep(draw.uniform(0, 0.05))
+        process.send_signal(signal.SIGKILL)
+        killed += process.wait() == -signal.SIGKILL
+    assert killed >= 3
+    processes = [start("killed"), start("killed")]
+    assert [process.wait() for process in processes] == [0, 0]
+    assert files(folder) == one

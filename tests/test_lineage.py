@@ -1,0 +1,49 @@
+"""What a run takes over from the flow that it starts from."""
+
+from pathlib import Path
+
+import pytest
+
+from r2flow.checkpoints import AtomicCheckpointIO, load_checkpoint
+from r2flow.errors import InputError
+from r2flow.lineage import inherit
+from r2flow.stages import build_parts, build_stage
+
+CONFIG = {
+    "sensor": {"name": "hdl64e", "rows": 8, "columns": 64},
+    "encoding": {"format": "logscale", "reflectance": False},
+    "backbone": {"name": "hdit", "base_channels": 8, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
+    "data": {"name": "simulated", "batch_size": 4, "flip": True},
+    "stage": {"name": "rectify"},
+    "seed": 0,
+}
+
+
+@pytest.fixture
+def parent(tmp_path: Path) -> Path:
+    """A checkpoint of range alone, from before `data.augment` had a group of its own."""
+    stage = build_stage(CONFIG, build_parts(CONFIG).backbone)
+    path = tmp_path / "parent.ckpt"
+    AtomicCheckpointIO().save_checkpoint({"state_dict": stage.state_dict(), "config": CONFIG, "global_step": 7}, path)
+    return path
+
+
+def child(parent: Path, reflectance) -> dict:
+    encoding = {"format": "logscale", "reflectance": reflectance}
+    return {**CONFIG, "encoding": encoding, "stage": {"name": "rectify", "init": str(parent)}}
+
+
+@pytest.mark.parametrize("asked", [[], ["encoding"], ["encoding.reflectance"]])
+def test_auto_is_what_the_parent_is(parent: Path, asked: list[str]):
+    config, _ = inherit(child(parent, "auto"), asked)
+    assert config["encoding"] == {"format": "logscale", "reflectance": False}
+
+
+def test_a_channel_that_the_parent_lacks_is_refused(parent: Path):
+    with pytest.raises(InputError, match="reflectance is True here, but False in"):
+        inherit(child(parent, True), ["encoding.reflectance"])
+
+
+def test_a_checkpoint_of_before_is_read_in_todays_keys(parent: Path):
+    assert load_checkpoint(parent).config["data"]["augment"]["flip"] is True
+    assert "flip" not in load_checkpoint(parent).config["data"]
