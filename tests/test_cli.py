@@ -108,11 +108,20 @@ def test_info_says_what_is_in_a_checkpoint(r2flow, saved):  # noqa: F811
     assert json.loads(said)["step"] == 7
 
 
-@pytest.mark.parametrize("verb", ["sample", "show", "project", "info", "convert", "backbones", "report fidelity"])
+def verbs() -> list[str]:
+    """Every verb of the command, and of `report`."""
+    import typer.main
+
+    top = typer.main.get_command(cli.app).commands
+    names = [name for name in top if name != "report"]
+    return sorted([*names, *(f"report {name}" for name in top["report"].commands)])
+
+
+@pytest.mark.parametrize("verb", verbs())
 def test_every_verb_has_help_with_an_example(r2flow, verb):
     code, said, _ = r2flow(*verb.split(), "--help")
     assert code == 0
-    assert f"Example: r2flow {verb}" in " ".join(said.split())
+    assert f" {verb} " in " ".join(said.split()).partition("Example: ")[2]
 
 
 class TestBadInput:
@@ -152,7 +161,9 @@ class TestBadInput:
         out = tmp_path / "out"
         self.check(r2flow("project", scan, "--size", "64", "-o", out), out, "ROWSxCOLUMNS", "'64'")
         self.check(r2flow("project", scan, "--sensor", "hdl64", "-o", out), out, "Did you mean 'hdl64e'?")
-        self.check(r2flow("project", scan, "--projection", "flat", "-o", out), out, "spherical, unfolding")
+        image = tmp_path / "image.npy"
+        self.check(r2flow("project", scan, "--projection", "flat", "-o", image), image, "spherical, unfolding")
+        self.check(r2flow("project", scan, "-o", out), out, "written as .npy")
         self.check(r2flow("sample", "-c", saved[0], "--solver", "eulr", "-o", out), out, "Did you mean 'euler'?")
         self.check(r2flow("sample", "-c", saved[0], "--format", "las", "-o", out), out, "ply, bin, npy")
         self.check(r2flow("sample", "-c", saved[0], "--num", 0, "-o", out), out, "--num")

@@ -76,7 +76,7 @@ def calibrate(
 ) -> None:
     """Find where a flow's steps should fall so that their errors are equal: a grid for `r2flow sample --grid`."""
     from r2flow.checkpoints import load_checkpoint
-    from r2flow.cli.accuracy import bar
+    from r2flow.cli.output import bar
     from r2flow.reports.pages import prepare_folder
     from r2flow.time_grids import calibrate as find_grid
     from r2flow.time_grids import check_grid_solver, evaluations_of_calibration, write_grid

@@ -34,7 +34,7 @@ def invert(
 ) -> None:
     """Carry scans back to the noise that they come from, and forward again: how far from themselves they end."""
     from r2flow.checkpoints import load_checkpoint
-    from r2flow.cli.accuracy import command
+    from r2flow.cli.output import command
     from r2flow.reports.inversion import invert_scans, print_rows
     from r2flow.reports.pages import write_page
     from r2flow.reports.views import scans_of
@@ -63,7 +63,7 @@ def interpolate(
 ) -> None:
     """Go from one real scan to another through their noises: a figure and a point cloud for every frame."""
     from r2flow.checkpoints import load_checkpoint
-    from r2flow.cli.accuracy import command
+    from r2flow.cli.output import command
     from r2flow.reports.interpolation import interpolation
     from r2flow.reports.pages import write_page
 
@@ -89,7 +89,7 @@ def savings(
 ) -> None:
     """What a scene need not cost: own steps, leaving early, one step for the straight, regions, single channels."""
     from r2flow.checkpoints import load_checkpoint
-    from r2flow.cli.accuracy import bar, command, finish
+    from r2flow.cli.output import bar, command, finish
     from r2flow.flow.solvers import check_tolerance
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.savings_page import evaluations_of_page, savings_page

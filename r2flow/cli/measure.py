@@ -28,7 +28,7 @@ def fidelity(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page and its figures.")] = None,
 ) -> None:
     """Set scans against real ones, beside real drives and beside controls: noise, flat ground, mean, shuffle."""
-    from r2flow.cli.accuracy import command, finish
+    from r2flow.cli.output import command, finish
     from r2flow.reports.fidelity import compare_sets, drives_of, joined, load_images, markdown
     from r2flow.reports.fidelity_page import fidelity_page
     from r2flow.reports.pages import prepare_folder

@@ -15,6 +15,7 @@ from r2flow.cli.options import (
     SizeOption,
     build_sized,
 )
+from r2flow.errors import InputError
 
 
 @app.command(epilog="Example: r2flow show scans/000000.ply velodyne/0000000100.bin --out views")
@@ -63,7 +64,11 @@ def project(
     from r2flow.files import atomic_write
     from r2flow.reports.views import project_file
 
-    image = project_file(scan, build_sized(sensor, size), projection, convention, reflectance_scale)
+    chosen = build_sized(sensor, size)
+    if out.suffix != ".npy":
+        raise InputError(f"--out {out}: a range image is written as .npy; r2flow show draws pictures.")
+    image = project_file(scan, chosen, projection, convention, reflectance_scale)
+    image = image if len(image) > 1 else np.concatenate([image, np.zeros_like(image)])
     with atomic_write(out) as file:
         np.save(file, image)
     returns = int((image[0] > 0).sum())

@@ -2,7 +2,6 @@
 
 import logging
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -123,14 +122,14 @@ def open_source(
             "unfolded rows are the sensor's rings, which are not evenly spaced: sensor=hdl64e_rings has their "
             "elevations, sensor=hdl64e is up to 6 degrees off"
         )
-    root = options.folder
+    root = Path(options.folder).expanduser()  # as the paths begin that are found in it, however it was written
     drives = find_drives(options.name, root, options.split, options.drives)
     paths = [path for drive in drives for path in drive.scans]
     source = ScanFiles(
         paths,
         sensor,
         options.on_bad_scan,
-        os.path.expanduser(root),
+        root,
         projection=options.projection,
         convention=options.convention,
         reflectance=reflectance,

@@ -32,7 +32,7 @@ class LogScale:
 
 
 class Inverse:
-    """r_min / r, 0 where there is no return."""
+    """r_min / r, 0 where there is no return; float32 holds r to within r^2 / r_min 2^-26, 2 mm of 0.3 to 200 m."""
 
     channels = 1
 

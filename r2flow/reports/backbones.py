@@ -33,7 +33,8 @@ def backbone_costs(
             raise InputError(f"no configuration named {name!r}; known: {known}.{did_you_mean(name, CONFIGURATIONS)}")
         row: dict[str, Any] = {"name": name, "parameters": None, "gmac": None, "latency_ms": None}
         try:
-            model = build_backbone(CONFIGURATIONS[name], sensor.rays(), channels).eval()
+            with torch.device("cpu" if repeats > 0 else "meta"):  # counting needs no weights
+                model = build_backbone(CONFIGURATIONS[name], sensor.rays(), channels).eval()
         except InputError as error:
             yield {**row, "error": str(error)}
             continue

@@ -143,6 +143,19 @@ def test_the_fingerprint_knows_the_parts_of_a_mixture_and_not_where_they_lie(tmp
     assert mixed(tmp_path / "there").fingerprint() != first
 
 
+def test_the_fingerprint_does_not_know_how_the_root_was_written(numbered: Path, monkeypatch):
+    monkeypatch.chdir(numbered.parent)
+    written = [
+        str(numbered),
+        numbered.name,
+        f"./{numbered.name}",
+        f"{numbered.name}//",
+        f"../{numbered.parent.name}/{numbered.name}",
+    ]
+    prints = {module(name="folder", root=root).fingerprint() for root in written}
+    assert len(prints) == 1
+
+
 @pytest.mark.parametrize(
     ("parts", "word"),
     [

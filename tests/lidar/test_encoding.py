@@ -20,14 +20,16 @@ def ramp(sensor, reflectance=True):
 
 @pytest.mark.parametrize("format", list(FORMATS))
 @pytest.mark.parametrize("reflectance", [True, False])
-def test_encode_then_decode_is_within_a_millimetre(sensor, format, reflectance):
+def test_encode_then_decode_is_within_a_millimetre_or_what_float32_holds(sensor, format, reflectance):
     image = ramp(sensor, reflectance)
     encoding = Encoding(sensor, format, reflectance)
     x = encoding.encode(image[None])
     assert x.shape == (1, encoding.channels, *sensor.shape)
     assert x.abs().max() <= 1
     decoded = encoding.decode(x)[0]
-    assert (decoded[0] - image[0]).abs().max() < 1e-3
+    # x in float32 tells y = r_min / r apart to 2^-26, hence r to r^2 / r_min of that: 2 mm at the pandar64's 200 m.
+    held = image[0] ** 2 / sensor.min_range * 2**-26 + 1e-4 if format == "inverse" else torch.zeros(())
+    assert ((decoded[0] - image[0]).abs() < held.clamp(min=1e-3)).all()
     assert torch.equal(decoded[0] == 0, image[0] == 0)
     if reflectance:
         assert (decoded[1] - image[1]).abs().max() < 1e-6

@@ -18,9 +18,9 @@ from r2flow.files import atomic_write
 from r2flow.lidar.scan_files.arrays import read_kitti, read_npy, read_nuscenes, write_kitti, write_npy
 from r2flow.lidar.scan_files.pcd import read_pcd, write_pcd
 from r2flow.lidar.scan_files.ply import read_ply, write_ply
-from r2flow.lidar.scan_files.points import Points
+from r2flow.lidar.scan_files.points import NoPointsError, Points
 
-__all__ = ["SCAN_ENDINGS", "Points", "read_points", "write_points"]
+__all__ = ["SCAN_ENDINGS", "NoPointsError", "Points", "read_points", "write_points"]
 
 _READERS: dict[str, Callable[[Path], Points]] = {
     "pcd.bin": read_nuscenes,  # before "bin", which it ends with

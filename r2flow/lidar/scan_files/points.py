@@ -16,6 +16,10 @@ SAMPLE = 4096  # rows that are looked at
 _OTHER_LAYOUTS = "Is it big-endian, float64, text, or another row layout?"
 
 
+class NoPointsError(InputError):
+    """A scan file that is whole and has no point: an empty scan to who judges a generator, a mistake to others."""
+
+
 @dataclass(frozen=True, eq=False)
 class Points:
     """The N points of one scan, in the file's order.
@@ -54,10 +58,11 @@ def checked_points(
             also refused for a majority of rows that are not finite, or for negative reflectance.
 
     Raises:
-        InputError: no point, no finite point, or values that no LiDAR measures.
+        NoPointsError: no point.
+        InputError: no finite point, or values that no LiDAR measures.
     """
     if not len(xyz):
-        raise InputError(f"{path} is well-formed but holds no points; leave it out, or fetch it again.")
+        raise NoPointsError(f"{path} is well-formed but holds no points; leave it out, or fetch it again.")
     total = len(xyz)
     with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, and so dropped
         # Copied, since these may be views of a file's bytes, which cannot be written to.

@@ -1,0 +1,66 @@
+"""What verbs show while they work, and how they end."""
+
+import math
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from r2flow.errors import InputError
+
+if TYPE_CHECKING:
+    from r2flow.reports.pages import Page
+
+
+def numbers(option: str, text: str, kind: type = float) -> list[Any]:
+    """'4,8' as [4, 8].
+
+    Raises:
+        InputError: what is not a positive number.
+    """
+    try:
+        values = [kind(part) for part in text.split(",")]
+    except ValueError:
+        values = [0]
+    if not all(0 < value < math.inf for value in values):
+        raise InputError(f"--{option} must be positive numbers separated by commas, found {text!r}.")
+    return values
+
+
+@contextmanager
+def bar(unit: str, total: int, doing: str = "measuring") -> Iterator[Callable[[], None]]:
+    """A progress bar with rate and time left; yields what advances it by one."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
+    from rich.progress import TimeRemainingColumn as TimeLeft
+    from rich.text import Text
+
+    class Rate(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            speed = task.finished_speed or task.speed
+            return Text(f"{speed:.1f} {unit}/s" if speed else "")
+
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn(unit), Rate(), TimeLeft())
+    # On standard error: what is printed about the result may be piped.
+    with Progress(TextColumn(doing), *columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(unit, total=total)
+        yield lambda: progress.advance(task)
+
+
+def command() -> str:
+    """The command as it was typed, for a shell."""
+    return shlex.join(["r2flow", *sys.argv[1:]])
+
+
+def finish(page: "Page", out: Path, said: Sequence[str] | None = None) -> None:
+    """Write a page, and say in the terminal what its sentences say, or `said`, and where it lies."""
+    from r2flow.reports.pages import write_page
+
+    written = write_page(page, out)
+    sentences = [part for part in page.text if not part.startswith("|")] if said is None else said
+    print("\n\n".join(sentences))
+    print()
+    for path in written:
+        print(path)
