@@ -3,7 +3,8 @@
 python benchmarks/data.py
 python benchmarks/data.py --layout kitti_360 --root /data/KITTI-360 --split test
 
-Every way is measured in this one process, all of them by turns, medians: a ratio holds on a busy machine, too.
+Every way is measured in this one process, all of them by turns, medians of the processor's time (all files lie in the
+page cache): a ratio holds on a busy machine, too.
 """
 
 import argparse
@@ -20,6 +21,7 @@ import numpy as np
 import torch
 
 from r2flow.data.layouts import Drive, find_drives
+from r2flow.data.loader import FlowDataset
 from r2flow.data.manifest import Manifest, Recipe, ShardEntry, checksum, describe_sensor, shard_name, write_manifest
 from r2flow.data.plans import plan_files
 from r2flow.data.prepared import open_prepared
@@ -37,14 +39,14 @@ KITTI_360_DRIVES = {0: 11518, 2: 14607, 3: 1400, 4: 9000, 5: 6700, 6: 9900, 7: 3
 
 
 def by_turns(ways: dict[str, Callable[[int], object]], times: int, pieces: int) -> dict[str, float]:
-    """Median milliseconds of way(piece), the ways by turns, after one unmeasured round over all pieces."""
+    """Median milliseconds of way(piece) on the processor, the ways by turns, after one unmeasured round of all."""
     taken: dict[str, list[float]] = {name: [] for name in ways}
     for turn in range(-pieces, times):
         for name, way in ways.items():
-            start = time.perf_counter()
+            start = time.process_time()
             way(turn % pieces)
             if turn >= 0:
-                taken[name].append(time.perf_counter() - start)
+                taken[name].append(time.process_time() - start)
     return {name: 1e3 * float(np.median(one)) for name, one in taken.items()}
 
 
@@ -110,11 +112,14 @@ def measure_shards(paths: Sequence[Path], folder: Path, times: int) -> None:
     arrays = [folder / f"{i}.npy" for i in range(len(paths))]
     for number, path in zip(numbers, arrays, strict=True):
         np.save(path, prepared[number])
+    items = FlowDataset(prepared, encoding, 0, "training")
+
     taken = by_turns(
         {
             "prepared, encoded": lambda i: prepared.encoded(numbers[i], encoding),
             "prepared, in metres": lambda i: prepared[numbers[i]],
             "np.load and encode": lambda i: encoding.encode(torch.from_numpy(np.load(arrays[i]))),
+            "prepared, with noise to train on": lambda i: items[i, i],
         },
         10 * times,
         len(paths),

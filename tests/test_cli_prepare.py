@@ -10,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
+from r2flow.data.manifest import read_manifest
 from r2flow.data.prepared import open_prepared
 from r2flow.data.sources import read_scan
 from r2flow.lidar.sensors import SENSORS
@@ -55,12 +57,30 @@ def test_a_damaged_shard_is_named_and_the_same_command_makes_it_again(r2flow, ki
     assert files(out) == whole
 
 
+def test_nuscenes_has_its_own_sensor_and_scale(r2flow, tmp_path):  # noqa: F811
+    root = Path(__file__).parents[1]
+    config = yaml.safe_load((root / "conf" / "data" / "nuscenes.yaml").read_text())
+    r, e = np.full(3, 10.0), np.deg2rad([10.0, 0.0, -30.0])  # the first and the last out of an HDL-64E's view
+    points = np.stack([r * np.cos(e), np.zeros(3), r * np.sin(e), [0, 100, 255], [31, 23, 0]], 1)
+    path = tmp_path / "scans" / "n015-2018-07-24-11-22-45+0800__LIDAR_TOP__1532402927647951.pcd.bin"
+    path.parent.mkdir()
+    path.write_bytes(points.astype("<f4").tobytes())
+    code, _, error = r2flow("prepare", "nuscenes", path.parent, "--out", tmp_path / "out", "--workers", 1)
+    assert (code, error.split("error")[1:]) == (0, [])
+    recipe = read_manifest(tmp_path / "out").recipe
+    assert {"override /sensor@_global_.sensor": recipe.sensor["name"]} in config["defaults"]
+    assert recipe.reflectance_scale == config["reflectance_scale"]
+    image = open_prepared(tmp_path / "out", SENSORS["hdl32e"])[0]
+    assert np.count_nonzero(image[0]) == 3
+    assert np.array_equal(np.unique(image[1]), np.array([0, 100 / 255, 1], np.float32))
+
+
 def test_simulated_scans_are_prepared_by_number_and_seed(r2flow, tmp_path):  # noqa: F811
     code, said, _ = r2flow(
         "prepare", "simulated", "--num", 2, "--seed", 7, "--size", "4x16", "--out", tmp_path, "--workers", 1
     )
     assert code == 0
-    assert "2 scans in 1 shards" in said
+    assert "2 scans in 1 shard," in said
     assert open_prepared(tmp_path, SMALL).names == ["scene 0", "scene 1"]
 
 

@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.options import ConventionOption, ProjectionOption, ScaleOption, SensorOption, SizeOption, build_sized
+from r2flow.cli.options import ConventionOption, ProjectionOption, SizeOption, build_sized
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.data.manifest import Manifest
     from r2flow.data.preparing import Preparation
+
+# Of a layout, where they are not hdl64e and 1: what conf/data says for training from the files.
+SENSORS_AND_SCALES = {"nuscenes": ("hdl32e", 255.0)}
 
 
 @app.command(epilog="Example: r2flow prepare kitti_360 /data/KITTI-360 --out prepared/kitti_360")
@@ -26,13 +29,26 @@ def prepare(
     check: Annotated[
         Path | None, typer.Option(help="Only read a prepared folder and name what is damaged.", show_default=False)
     ] = None,
-    sensor: SensorOption = "hdl64e",
+    sensor: Annotated[
+        str | None,
+        typer.Option(
+            help="Name of the sensor, or the YAML file of your own; if left out hdl64e, of nuscenes hdl32e.",
+            show_default=False,
+        ),
+    ] = None,
     size: SizeOption = None,
     projection: ProjectionOption = "spherical",
     convention: ConventionOption = "centre",
     split: Annotated[str | None, typer.Option(help="A part of the layout's split; all of it if left out.")] = None,
     drives: Annotated[str | None, typer.Option(help="Names or numbers, separated by commas; all if left out.")] = None,
-    reflectance_scale: ScaleOption = 1.0,
+    reflectance_scale: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-6,
+            help="Value in the files that means full reflectance; if left out 1, of nuscenes 255.",
+            show_default=False,
+        ),
+    ] = None,
     reflectance_levels: Annotated[
         int | None, typer.Option(help="Reflectance is kept as n / LEVELS; found from the scans if left out.")
     ] = None,
@@ -63,20 +79,21 @@ def prepare(
     from r2flow.data.plans import plan_files, plan_simulated
     from r2flow.data.preparing import Preparation
 
-    chosen = build_sized(sensor, size)
+    usual_sensor, usual_scale = SENSORS_AND_SCALES.get(layout, ("hdl64e", 1.0))
+    chosen = build_sized(sensor or usual_sensor, size)
     if root is None:
         plan = plan_simulated(num or 512, seed, chosen, reflectance_levels, shard_scans)
     else:
         wanted = drives.split(",") if drives else None
         plan = plan_files(
-            layout, root, chosen, projection, convention, split, wanted, reflectance_scale, reflectance_levels,
-            shard_scans,
+            layout, root, chosen, projection, convention, split, wanted, reflectance_scale or usual_scale,
+            reflectance_levels, shard_scans,
         )  # fmt: skip
     _run(Preparation(out, plan), on_bad_scan, workers)
 
 
 def _run(work: "Preparation", on_bad_scan: str, workers: int | None) -> None:
-    from r2flow.cli.accuracy import bar
+    from r2flow.cli.output import bar
 
     recipe, workers = work.recipe, workers or _cores()
     with bar("scans", recipe.scans, "checking what is there") as advance:
@@ -107,11 +124,12 @@ def _summary(folder: Path, manifest: "Manifest") -> str:
         said += f", reflectance as n/{levels}, " + (f"at most {error:.2g} off" if error else "exactly")
     left_out = len(manifest.left_out)
     skipped = f"; {left_out} scans left out, named in manifest.json" if left_out else ""
-    return f"{folder}: {scans} scans in {len(shards)} shards, {size / 2**20:.1f} MiB; {said}{skipped}"
+    of = f"{scans} scan{'s' * (scans != 1)} in {len(shards)} shard{'s' * (len(shards) != 1)}"
+    return f"{folder}: {of}, {size / 2**20:.1f} MiB; {said}{skipped}"
 
 
 def _check(folder: Path) -> None:
-    from r2flow.cli.accuracy import bar
+    from r2flow.cli.output import bar
     from r2flow.data.manifest import read_manifest
     from r2flow.data.prepared import check_prepared
 
@@ -128,11 +146,11 @@ def _check(folder: Path) -> None:
 
 
 def _refuse_file_options(
-    root: Path | None, projection: str, convention: str, split: str | None, drives: str | None, scale: float
+    root: Path | None, projection: str, convention: str, split: str | None, drives: str | None, scale: float | None
 ) -> None:
     given = {
         "ROOT": root is not None, "--projection": projection != "spherical", "--convention": convention != "centre",
-        "--split": split is not None, "--drives": drives is not None, "--reflectance-scale": scale != 1,
+        "--split": split is not None, "--drives": drives is not None, "--reflectance-scale": scale is not None,
     }  # fmt: skip
     wrong = [option for option, is_given in given.items() if is_given]
     if wrong:

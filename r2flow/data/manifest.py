@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import r2flow
 from r2flow.data.layouts import Drive
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
@@ -22,7 +23,8 @@ class Recipe:
     """What prepared scans are a function of, beside the files themselves; nothing in it tells where these lie.
 
     Attributes:
-        r2flow: Version that projects and encodes them.
+        revision: Of what makes them, `plans.PROJECTION` or the simulator's, not of r2flow as a whole: a newer release
+            mends damaged shards of an older one.
         layout: Of the data set, or `simulated`.
         scans, names: Their number and the SHA-256 of their names.
         sensor: Every field of the `Sensor`.
@@ -34,7 +36,7 @@ class Recipe:
         seed: Of simulated scans.
     """
 
-    r2flow: str
+    revision: int
     layout: str
     scans: int
     names: str
@@ -130,6 +132,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     left_out = manifest.left_out
     content = {
         "format": FORMAT,
+        "made by": f"r2flow {r2flow.__version__}",
         "recipe": asdict(manifest.recipe),
         "left_out": [name for number, name in enumerate(manifest.names) if number in left_out],
         "shards": None if manifest.shards is None else [asdict(shard) for shard in manifest.shards],

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-import r2flow
+from r2flow import simulator
 from r2flow.data.layouts import Drive, find_drives
 from r2flow.data.manifest import Recipe, checksum, describe_sensor
 from r2flow.data.opening import SIMULATED
@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 SHARD_SCANS = 512  # 100 MB at 64 x 1024, held in memory while they are made
 PROBED = 8  # scans that tell whether a data set has reflectance, and in which steps
+
+PROJECTION = 1  # to be raised when the same files give other images, or images other codes
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,9 @@ def _recipe(
     codes = RangeCodes(sensor.min_range, sensor.max_range)
     if levels is not None:
         ReflectanceCodes(levels)
+    revision = PROJECTION if seed is None else simulator.REVISION
     return Recipe(
-        r2flow.__version__, layout, len(names), checksum(names), describe_sensor(sensor), projection, convention,
+        revision, layout, len(names), checksum(names), describe_sensor(sensor), projection, convention,
         scale, levels, codes.describe(), shard_scans, seed,
     )  # fmt: skip
 

@@ -89,19 +89,16 @@ class Preparation:
     def begin(self, advance: Callable[[int], None] = lambda scans: None) -> list[int]:
         """Take the folder, and check all that is in it; the shards that are missing or damaged.
 
+        What is finished is only read: it may lie where nothing can be written.
+
         Args:
             advance: Called with the number of scans of each shard that was looked at.
 
         Raises:
             InputError: other scans are in the folder.
         """
-        self._making.mkdir(parents=True, exist_ok=True)
-        lock = Lock(self._making / MANIFEST_LOCK, wait=True)
-        try:
-            if not (self.folder / MANIFEST).exists():
-                write_manifest(self.folder, Manifest(self.recipe, self.plan.drives))
-        finally:
-            lock.release()
+        if not self._is_taken():
+            self._take()
         self._look()
         missing = []
         for shard in range(self.recipe.shards):
@@ -109,6 +106,24 @@ class Preparation:
                 missing.append(shard)
             advance(len(self.recipe.numbers_of(shard)))
         return missing
+
+    def _take(self) -> None:
+        self._making.mkdir(parents=True, exist_ok=True)
+        lock = Lock(self._making / MANIFEST_LOCK, wait=True)
+        try:
+            if not self._is_taken():
+                write_manifest(self.folder, Manifest(self.recipe, self.plan.drives))
+        finally:
+            lock.release()
+
+    def _is_taken(self) -> bool:
+        """Whether a manifest is here that has to stay: not one of other settings by which no shard was ever made."""
+        if not (self.folder / MANIFEST).exists():
+            return False
+        there = read_manifest(self.folder)
+        if there.shards is not None or there.recipe.digest == self.recipe.digest or any(self.folder.glob("scans-*")):
+            return True
+        return not all(self._is_free(int(lock.stem)) for lock in self._making.glob("[0-9]*.lock"))
 
     def make(
         self,
@@ -279,6 +294,8 @@ class Preparation:
 
     def _finish(self) -> Manifest:
         """Turn the notes into the manifest, unless another process has, and clear away what was needed for it."""
+        if self.finished is not None and not self._making.exists():
+            return read_manifest(self.folder)
         lock = Lock(self._making / MANIFEST_LOCK, wait=True)
         try:
             self._look()

@@ -275,7 +275,7 @@ def test_nothing_tells_where_the_files_lie(clouds: Path, tmp_path: Path):
     for content in files(one).values():
         assert str(clouds).encode() not in content
     manifest = json.loads((one / MANIFEST).read_text())
-    assert manifest["recipe"]["r2flow"]
+    assert manifest["made by"].startswith("r2flow ")
     assert manifest["recipe"]["levels"] == 256
     assert [drive["name"] for drive in manifest["drives"]] == ["drive0", "drive1"]
 
@@ -331,7 +331,39 @@ def test_another_recipe_is_refused_in_the_same_folder(clouds: Path, tmp_path: Pa
         make(tmp_path, plan_of(clouds, convention="reference"))
     with pytest.raises(InputError, match=r"holds other scans: scans is 10 there, 6 here"):
         make(tmp_path, plan_of(clouds / "drive0"))
-    assert files(tmp_path) == before | {"making/manifest.lock": b""}
+    assert files(tmp_path) == before
+
+
+def test_settings_by_which_nothing_was_made_can_be_mended_in_the_same_folder(clouds: Path, tmp_path: Path):
+    wrong, right = plan_of(clouds, projection="spherial"), plan_of(clouds)
+    with pytest.raises(ValueError, match="no projection named 'spherial'"):
+        make(tmp_path / "out", wrong)
+    assert files(make(tmp_path / "out", right)) == files(make(tmp_path / "one", right))
+
+
+def test_a_folder_in_which_another_process_makes_its_first_shard_is_not_taken_from_it(clouds: Path, tmp_path: Path):
+    slow = in_process(tmp_path, plan_of(clouds), seconds=30)
+    while not (tmp_path / "making" / "000000.lock").exists():
+        time.sleep(0.005)
+    with pytest.raises(InputError, match=r"holds other scans: convention is centre there, reference here"):
+        make(tmp_path, plan_of(clouds, convention="reference"))
+    os.kill(slow, signal.SIGKILL)
+    os.waitpid(slow, 0)
+    make(tmp_path, plan_of(clouds, convention="reference"))
+    assert read_manifest(tmp_path).recipe.convention == "reference"
+
+
+def test_what_is_finished_is_only_read(clouds: Path, tmp_path: Path, monkeypatch):
+    make(tmp_path, plan_of(clouds))
+
+    def refused(*_, **__):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    for name in ("mkdir", "unlink", "rmdir"):
+        monkeypatch.setattr(Path, name, refused)
+    monkeypatch.setattr("os.replace", refused)
+    work = Preparation(tmp_path, plan_of(clouds))
+    assert work.make(work.begin()) == read_manifest(tmp_path)
 
 
 # Scans that cannot be used
