@@ -10,6 +10,7 @@ import typer
 from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     accuracy,
     compare,
+    extractor,
     flows,
     inversion,
     measure,
@@ -18,6 +19,7 @@ from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     scans,
     sensors,
     simulate,
+    weights,
 )
 from r2flow.cli.app import app
 from r2flow.errors import InputError, explain_mistake

@@ -2,12 +2,15 @@
 
 import numpy as np
 
+BINS, EXTENT, NEAR, FAR = 100, 80, 3, 70  # bins a side, over +-80 m, of returns of 3 m < r < 70 m
+PROTOCOL = {"bins": BINS, "metres": [-EXTENT, EXTENT], "range": [NEAR, FAR]}
+
 
 def birds_eye_histogram(xyz: np.ndarray) -> np.ndarray:
     """Points (N, 3) from above, counted in 100 x 100 bins over +-80 m where 3 m < r < 70 m, (100, 100)."""
     r = np.linalg.norm(xyz, axis=1)
-    x, y, _ = xyz[(r > 3) & (r < 70)].T
-    return np.histogram2d(x, y, bins=100, range=[[-80, 80], [-80, 80]])[0]
+    x, y, _ = xyz[(r > NEAR) & (r < FAR)].T
+    return np.histogram2d(x, y, bins=BINS, range=[[-EXTENT, EXTENT]] * 2)[0]
 
 
 def js_distance(a: np.ndarray, b: np.ndarray) -> float:

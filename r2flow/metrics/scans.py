@@ -9,7 +9,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Sensor
-from r2flow.metrics.birds_eye import birds_eye_histogram
+from r2flow.metrics.birds_eye import BINS, birds_eye_histogram
 
 # Metres between which the published evaluation keeps returns, on both sides and before every metric.
 MASK = (0.5, 63.0)
@@ -66,4 +66,7 @@ class Scans:
     @cached_property
     def birds_eye(self) -> np.ndarray:
         """Counts from above of each scan, (B, 100, 100), float64: see `birds_eye_histogram`."""
-        return np.stack([birds_eye_histogram(points.cpu().numpy()) for points in self.points])
+        counts = np.zeros((len(self), BINS, BINS))
+        for i, points in enumerate(self.points):
+            counts[i] = birds_eye_histogram(points.cpu().numpy())
+        return counts

@@ -1,0 +1,104 @@
+"""How sure a figure is: intervals from sets drawn again from the scans at hand."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.metrics.base import SIDES, ScanMetric, Side
+from r2flow.noise import generator
+
+DRAWS = 2**63  # index of the first draw: those from 0 on are the noise of scans
+AT_ONCE = 20  # draws that a metric is asked for together
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Where a figure lies, by bootstrap.
+
+    Attributes:
+        low: Lower end.
+        high: Upper end.
+        level: Share of resampled figures between them.
+        draws: How many there were.
+        bias: By how much they exceed the figure on average: this much was taken from both ends.
+    """
+
+    low: float
+    high: float
+    level: float
+    draws: int
+    bias: float
+
+
+def bootstrap(
+    metric: ScanMetric,
+    draws: int = 200,
+    level: float = 0.95,
+    seed: int = 0,
+    advance: Callable[[], None] | None = None,
+) -> dict[str, Interval]:
+    """Percentile intervals of a metric's figures, from resampling the scans of both sides, Efron (1979).
+
+    A draw is N scans of the N, with repetition, as weights of the kept rows: nothing is copied, and a network never
+    runs again. Nearly all these distances grow when scans are repeated, as they grow with fewer scans, so that the
+    figure itself would lie below its interval: the ends are moved by the mean excess, and never below 0 where the
+    figure is not.
+
+    Cost of a draw: JSD, beams, drop rate a product of its weights with the rows; MMD and the manifold next to nothing
+    after the kernel or the neighbours were computed, once for 20 draws; Frechet two scatter matrices and three spectra,
+    on a core 0.04 s for 256 features, 0.25 s for 512 and a minute for 4096, but 0.25 s for 4096 of 1000 scans, as then
+    nothing larger than the scans' products is decomposed.
+
+    Args:
+        metric: Made with `keep=True`, and given both sets.
+        draws: Resampled pairs of sets.
+        level: Share of them within the interval.
+        seed: Draw r depends on the seed and on r alone.
+        advance: Called after every draw.
+
+    Returns:
+        An interval for each figure that exists; none for a metric that cannot be resampled (`resamples`).
+
+    Raises:
+        InputError: a metric that keeps no rows; fewer than two draws; a level outside (0, 1).
+    """
+    if not metric.resamples:
+        return {}
+    if not metric.keeps:
+        raise InputError(f"{metric.protocol.metric} keeps nothing of single scans; build it with keep=True.")
+    if draws < 2 or not 0 < level < 1:
+        raise InputError(f"a bootstrap needs 2 draws and a level within (0, 1), found {draws} and {level}.")
+    values = {name: value for name, value in metric.compute().items() if not np.isnan(value)}
+    if not values:
+        return {}
+    found: dict[str, list[Tensor]] = {name: [] for name in values}
+    sizes = {side: len(metric.store(side)) for side in SIDES}
+    for start in range(0, draws, AT_ONCE):
+        batch = range(start, min(start + AT_ONCE, draws))
+        drawn = metric.resampled(_weights(sizes, batch, seed))
+        for name in values:
+            found[name].append(drawn[name])
+        for _ in batch:
+            if advance:
+                advance()
+    return {name: _interval(values[name], torch.cat(parts).numpy(), level) for name, parts in found.items()}
+
+
+def _weights(sizes: dict[Side, int], draws: range, seed: int) -> dict[Side, Tensor]:
+    """How often each scan was drawn, (R, N) of each side."""
+    drawn: dict[Side, list[np.ndarray]] = {side: [] for side in sizes}
+    for r in draws:
+        draw = generator(seed, "evaluation", DRAWS + r)
+        for side, n in sizes.items():
+            drawn[side].append(np.bincount(draw.integers(n, size=n), minlength=n))
+    return {side: torch.from_numpy(np.stack(rows)).double() for side, rows in drawn.items()}
+
+
+def _interval(value: float, drawn: np.ndarray, level: float) -> Interval:
+    bias = float(drawn.mean()) - value
+    low, high = np.quantile(drawn, [(1 - level) / 2, (1 + level) / 2]) - bias
+    return Interval(max(float(low), min(value, 0.0)), float(high), level, len(drawn), bias)

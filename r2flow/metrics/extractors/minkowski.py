@@ -1,0 +1,136 @@
+"""MinkowskiNet (Choy et al., CVPR 2019), a sparse U-Net on voxels of 5 cm: FSVD's feature network.
+
+Layers, widths and parameter names are those that the LiDAR generative papers evaluate with (LiDM, R2DM, R2Flow), who
+have them from 2DPASS, on torchsparse. Checked here: the convolutions against dense ones, the order of the weights
+by hand, voxels and pooling against the published evaluation's figures. Not checked, for want of the weights: that
+they load by these names, that the widths are those below (768 features of 16 sectors leave 48 for the last one,
+which 2DPASS's table of widths has at half its size; sizes are read off the weights anyway), and the features.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+
+from r2flow.errors import InputError
+from r2flow.metrics.extractors.base import Extractor
+from r2flow.metrics.extractors.sparse import Grid, Sparse, SparseConv3d, SparseNorm, SparseReLU
+from r2flow.metrics.extractors.voxels import SECTORS, mean_by_distance, voxelise
+from r2flow.metrics.scans import Scans
+
+WIDTHS = (16, 16, 32, 64, 128, 128, 64, 48, 48)  # stem, four levels down, four up
+CLASSES = 20
+
+
+def _step(channels: int, out: int, size: int, stride: int = 1, transposed: bool = False) -> list[nn.Module]:
+    return [SparseConv3d(channels, out, size, stride, transposed), SparseNorm(out), SparseReLU()]
+
+
+class Block(nn.Module):
+    """Convolution, normalisation, ReLU."""
+
+    def __init__(self, channels: int, out: int, transposed: bool = False) -> None:
+        super().__init__()
+        self.net = nn.Sequential(*_step(channels, out, size=2, stride=2, transposed=transposed))
+
+    def forward(self, x: Sparse) -> Sparse:
+        return self.net(x)
+
+
+class Residual(nn.Module):
+    """ReLU(x + f(x)), x through a matrix where the width changes."""
+
+    def __init__(self, channels: int, out: int) -> None:
+        super().__init__()
+        self.net = nn.Sequential(*_step(channels, out, 3), SparseConv3d(out, out, 3), SparseNorm(out))
+        change = [SparseConv3d(channels, out, 1), SparseNorm(out)] if channels != out else []
+        self.downsample = nn.Sequential(*change)
+
+    def forward(self, x: Sparse) -> Sparse:
+        return x.with_features(torch.relu(self.net(x).features + self.downsample(x).features))
+
+
+class MinkowskiNet(Extractor):
+    """FSVD's: the last map's mean over 16 sectors of distance.
+
+    Args:
+        widths: Of the stem, of four levels down and of four up.
+        num_classes: Of the classifier, which features are taken before.
+        channels: Of a voxel.
+    """
+
+    name = "minkowskinet"
+    layer = "last map of voxels, mean over 16 sectors of distance"
+
+    def __init__(self, widths: tuple[int, ...] = WIDTHS, num_classes: int = CLASSES, channels: int = 4) -> None:
+        super().__init__()
+        c = widths
+        self.dim = SECTORS * c[8]
+        self.stem = nn.Sequential(*_step(channels, c[0], 3), *_step(c[0], c[0], 3))
+        for level in range(1, 5):
+            down = nn.Sequential(
+                Block(c[level - 1], c[level - 1]), Residual(c[level - 1], c[level]), Residual(c[level], c[level])
+            )
+            self.add_module(f"stage{level}", down)
+        for level in range(1, 5):
+            width, kept = c[4 + level], c[4 - level]
+            blocks = nn.Sequential(Residual(width + kept, width), Residual(width, width))
+            self.add_module(f"up{level}", nn.ModuleList([Block(c[3 + level], width, transposed=True), blocks]))
+        self.classifier = nn.Sequential(nn.Linear(c[8], num_classes))
+
+    def down(self, x: Sparse) -> list[Sparse]:
+        """The maps of the four levels below x, which has the stem's width; x first."""
+        maps = [x]
+        for level in range(1, 5):
+            maps.append(self.get_submodule(f"stage{level}")(maps[-1]))
+        return maps
+
+    def up(self, level: int, x: Sparse, kept: Sparse) -> Sparse:
+        """One level up, beside the map that was kept of that level."""
+        x = self.get_submodule(f"up{level}.0")(x)
+        return self.get_submodule(f"up{level}.1")(x.with_features(torch.cat([x.features, kept.features], 1)))
+
+    def forward(self, coords: Tensor, features: Tensor) -> Tensor:
+        """The last map.
+
+        Args:
+            coords: Scan, x, y, z of each voxel, (N, 4), int64, none twice.
+            features: x, y, z in metres and -1, (N, 4).
+
+        Returns:
+            (N, 48), in the order of the voxels.
+        """
+        maps = self.down(self.stem(Sparse(features, Grid(coords))))
+        y = maps[4]
+        for level in range(1, 5):
+            y = self.up(level, y, maps[4 - level])
+        return y.features
+
+    @torch.inference_mode()
+    def features(self, scans: Scans) -> Tensor:
+        # One scan at a time: memory is that of the fullest scan, and batching gains nothing.
+        rows = [self._scan(points.to(self.device)) for points in scans.points]
+        return torch.stack(rows) if rows else torch.zeros(0, self.dim, device=self.device)
+
+    def _scan(self, points: Tensor) -> Tensor:
+        if not len(points):
+            return torch.full((self.dim,), torch.nan, device=self.device)
+        coords, features = voxelise(points)
+        return mean_by_distance(self(nn.functional.pad(coords, (1, 0)), features), coords)
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:
+        from r2flow.metrics.extractors.weights import fill
+
+        try:
+            stem = tensors["stem.0.kernel"]
+            down = [tensors[f"stage{level}.1.net.0.kernel"].shape[2] for level in range(1, 5)]
+            up = [tensors[f"up{level}.0.net.0.kernel"].shape[2] for level in range(1, 5)]
+            extractor = cls((stem.shape[2], *down, *up), len(tensors["classifier.0.bias"]), stem.shape[1])
+        except (KeyError, IndexError):
+            raise InputError(f"these are no weights of {cls.name}: it has other parameters.") from None
+        # They were saved in training: beside the network's parameters there may be those of the loss.
+        known = {name for name, _ in extractor.named_children()}
+        fill(extractor, {name: tensor for name, tensor in tensors.items() if name.split(".")[0] in known})
+        return extractor

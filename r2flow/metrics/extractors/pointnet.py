@@ -1,0 +1,104 @@
+"""PointNet (Qi et al., CVPR 2017) as a feature network: FPD's, trained on ShapeNet's 16 kinds of objects."""
+
+import torch
+from torch import Tensor, nn
+
+from r2flow.metrics.extractors.base import Extractor, nan_where_empty
+from r2flow.metrics.scans import Scans
+
+SCALE = 80.0  # metres: points are divided by it, whichever sensor they come from
+CHUNK = 16384  # points at once: 1024 channels of them take 64 MiB
+
+
+class Points(nn.Module):
+    """Three layers on each point alone, then the maximum over the points: (B, 3, N) -> (B, 1024)."""
+
+    rectified = True  # the last layer too
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv1d(3, 64, 1)
+        self.conv2 = nn.Conv1d(64, 128, 1)
+        self.conv3 = nn.Conv1d(128, 1024, 1)
+        self.bn1 = nn.BatchNorm1d(64)
+        self.bn2 = nn.BatchNorm1d(128)
+        self.bn3 = nn.BatchNorm1d(1024)
+
+    def largest(self, points: Tensor) -> Tensor:
+        chunks = points.split(max(CHUNK // len(points), 1), dim=2)
+        return torch.stack([self.each(chunk).amax(2) for chunk in chunks]).amax(0)
+
+    def each(self, points: Tensor) -> Tensor:
+        x = torch.relu(self.bn1(self.conv1(points)))
+        x = torch.relu(self.bn2(self.conv2(x)))
+        x = self.bn3(self.conv3(x))
+        return torch.relu(x) if self.rectified else x
+
+
+class Transform(Points):
+    """The 3 x 3 matrix by which the points are turned first, near the identity: (B, 3, N) -> (B, 3, 3)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(1024, 512)
+        self.fc2 = nn.Linear(512, 256)
+        self.fc3 = nn.Linear(256, 9)
+        self.bn4 = nn.BatchNorm1d(512)
+        self.bn5 = nn.BatchNorm1d(256)
+
+    def forward(self, points: Tensor) -> Tensor:
+        x = torch.relu(self.bn4(self.fc1(self.largest(points))))
+        x = torch.relu(self.bn5(self.fc2(x)))
+        return self.fc3(x).view(-1, 3, 3) + torch.eye(3, device=x.device, dtype=x.dtype)
+
+
+class Cloud(Points):
+    """One feature of the whole cloud, (B, 3, N) -> (B, 1024)."""
+
+    rectified = False
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stn = Transform()
+
+    def forward(self, points: Tensor) -> Tensor:
+        return self.largest(self.stn(points).transpose(1, 2) @ points)
+
+
+class PointNet(Extractor):
+    """FPD's: the cloud's feature and the three layers of the classifier after it, one behind the other.
+
+    Args:
+        k: Kinds of objects that the classifier tells apart.
+    """
+
+    name = "pointnet"
+    layer = "global feature and the classifier's three layers, 1024 + 512 + 256 + 16"
+
+    def __init__(self, k: int = 16) -> None:
+        super().__init__()
+        self.dim = 1024 + 512 + 256 + k
+        self.feat = Cloud()
+        self.fc1 = nn.Linear(1024, 512)
+        self.fc2 = nn.Linear(512, 256)
+        self.fc3 = nn.Linear(256, k)
+        self.bn1 = nn.BatchNorm1d(512)
+        self.bn2 = nn.BatchNorm1d(256)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """(B, 3, N), any N of at least 1, in units of 80 m -> (B, 1808)."""
+        x = self.feat(points)
+        y = torch.relu(self.bn1(self.fc1(x)))
+        z = torch.relu(self.bn2(self.fc2(y)))
+        return torch.cat([x, y, z, self.fc3(z)], 1)
+
+    @torch.inference_mode()
+    def features(self, scans: Scans) -> Tensor:
+        """As the field does, each pixel gives a point: a ray that did not come back gives the origin.
+
+        A maximum is taken over the points, so that one origin is as good as many, and a scan with no
+        ray dropped at all is the only one that lacks it.
+        """
+        if not len(scans):
+            return torch.zeros(0, self.dim, device=self.device)
+        return nan_where_empty(self(scans.xyz.flatten(2).to(self.device) / SCALE), scans)

@@ -1,0 +1,277 @@
+"""RangeNet++ (Milioto et al., IROS 2019) as a feature network: FRD's RangeNet-53 and FRID's RangeNet-21.
+
+Darknet on range images: the width is halved five times, the height never; every level is added back on the
+way up. Parameters have the names of the generative papers' evaluation, `stem.0.weight` ... `head.1.bias`;
+the names of the original release (`conv1.weight`, `enc1.residual_0.bn2.bias` ...) are translated.
+"""
+
+import math
+import random
+import re
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor, nn
+
+from r2flow.errors import InputError
+from r2flow.metrics.extractors.base import Extractor, nan_where_empty
+from r2flow.metrics.scans import Scans
+
+BLOCKS = {21: (1, 1, 2, 2, 1), 53: (1, 2, 8, 8, 4)}  # residual blocks of each level, by number of layers
+BANDS = 16
+
+# Of range, x, y, z in metres and reflectance over SemanticKITTI: what the published networks were trained with.
+MEAN = (12.12, 10.88, 0.23, -1.04, 0.21)
+STD = (12.32, 11.47, 6.91, 0.86, 0.16)
+
+
+def _convolution(convolution: nn.Module, channels: int) -> nn.Sequential:
+    return nn.Sequential(convolution, nn.BatchNorm2d(channels), nn.LeakyReLU(0.1))
+
+
+class Residual(nn.Module):
+    """x + f(x), f a bottleneck."""
+
+    def __init__(self, channels: int, inner: int) -> None:
+        super().__init__()
+        self.residual = nn.Sequential(
+            _convolution(nn.Conv2d(channels, inner, 1, bias=False), inner),
+            _convolution(nn.Conv2d(inner, channels, 3, padding=1, bias=False), channels),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.residual(x)
+
+
+class Level(nn.Module):
+    """A change of width, which halves or doubles the columns, and the residual blocks after it."""
+
+    def __init__(self, channels: int, out: int, blocks: int) -> None:
+        super().__init__()
+        change: nn.Module
+        if out > channels:
+            change = nn.Conv2d(channels, out, 3, stride=(1, 2), padding=1, bias=False)
+        else:
+            change = nn.ConvTranspose2d(channels, out, (1, 4), stride=(1, 2), padding=(0, 1))
+        self.conv = _convolution(change, out)
+        self.residual_blocks = nn.ModuleList(Residual(out, channels) for _ in range(blocks))
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.conv(x)
+        for block in self.residual_blocks:
+            x = block(x)
+        return x
+
+
+class RangeNet(Extractor):
+    """The network of either depth.
+
+    Args:
+        channels: 4 for range, x, y, z; 5 with reflectance.
+        num_classes: Of the segmentation head, or None without one: features are taken before it.
+        layers: 21 or 53.
+        mean: Of each channel, or more of them than there are channels.
+        std: The same.
+    """
+
+    layers: ClassVar[int] = 53
+    channels: ClassVar[int] = 5
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        channels: int | None = None,
+        num_classes: int | None = 20,
+        layers: int | None = None,
+        mean: tuple[float, ...] = MEAN,
+        std: tuple[float, ...] = STD,
+    ) -> None:
+        super().__init__()
+        channels = channels or self.channels
+        widths = [32 << level for level in range(6)]
+        blocks = BLOCKS[layers or self.layers]
+        self.stem = _convolution(nn.Conv2d(channels, widths[0], 3, padding=1, bias=False), widths[0])
+        for level in range(1, 6):
+            self.add_module(f"enc{level}", Level(widths[level - 1], widths[level], blocks[level - 1]))
+        for level in range(5, 0, -1):
+            self.add_module(f"dec{level}", Level(widths[level], widths[level - 1], 1))
+        self.head = (
+            nn.Sequential(nn.Identity(), nn.Conv2d(widths[0], num_classes, 3, padding=1)) if num_classes else None
+        )
+        # Not persistent: the published weights hold parameters alone.
+        self.register_buffer("mean", torch.tensor(mean[:channels]).view(-1, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(std[:channels]).view(-1, 1, 1), persistent=False)
+
+    def normalise(self, image: Tensor) -> Tensor:
+        """(image - mean) / std where the range, its first channel, is above 0, else 0; (B, 4 or 5, H, W)."""
+        return (image - self.mean) / self.std * (image[:, :1] > 0)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The decoder's last map, (B, 32, H, W), of a normalised image.
+
+        Raises:
+            InputError: a width that cannot be halved five times.
+        """
+        if x.shape[-1] % 32:
+            raise InputError(
+                f"RangeNet takes images whose width is a multiple of 32, found {x.shape[-1]} columns; "
+                "project to another size (--size)."
+            )
+        kept = [self.stem(x)]
+        for level in range(1, 6):
+            kept.append(self.get_submodule(f"enc{level}")(kept[-1]))
+        x = kept.pop()
+        for level in range(5, 0, -1):
+            x = self.get_submodule(f"dec{level}")(x) + kept.pop()
+        return x
+
+    def image(self, scans: Scans) -> Tensor:
+        """Range, x, y, z and, for a network of five channels, reflectance: (B, 4 or 5, H, W), 0 where missing.
+
+        Raises:
+            InputError: scans without the reflectance that the network looks at.
+        """
+        if self.needs_reflectance and not scans.has_reflectance:
+            raise InputError(
+                f"{self.name} looks at reflectance, and these scans have none; ask for a metric without it, as frid."
+            )
+        parts = [scans.images[:, :1], scans.xyz]
+        if self.needs_reflectance:
+            parts.append(scans.images[:, 1:])
+        return torch.cat(parts, 1).to(self.device)
+
+    @torch.inference_mode()
+    def features(self, scans: Scans) -> Tensor:
+        if not len(scans):
+            return torch.zeros(0, self.dim, device=self.device)
+        return nan_where_empty(self.pool(self(self.normalise(self.image(scans)))), scans)
+
+    def pool(self, maps: Tensor) -> Tensor:
+        """Decoder maps (B, C, H, W) to features (B, D)."""
+        raise NotImplementedError
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:
+        from r2flow.metrics.extractors.weights import fill
+
+        tensors = {translate(name): tensor for name, tensor in tensors.items()}
+        head = tensors.get("head.1.bias")
+        mean, std = _normalisation(config, cls.channels) if config else (MEAN, STD)
+        extractor = cls(num_classes=None if head is None else len(head), mean=mean, std=std)
+        fill(extractor, tensors)
+        return extractor
+
+
+class RangeNet53(RangeNet):
+    """FRD's: 4096 values of the decoder map, drawn once, over range and reflectance."""
+
+    name = "rangenet53"
+    layer = "decoder map, 4096 of its values by a fixed draw"
+    dim = 4096
+    needs_reflectance = True
+    layers = 53
+    channels = 5
+
+    def pool(self, maps: Tensor) -> Tensor:
+        return subsample(maps, self.dim)
+
+
+class RangeNet21(RangeNet):
+    """FRID's: the decoder map's mean over 16 bands of rows, over range alone."""
+
+    name = "rangenet21"
+    layer = "decoder map, mean over 16 bands of rows"
+    dim = 512
+    layers = 21
+    channels = 4
+
+    def pool(self, maps: Tensor) -> Tensor:
+        return mean_by_depth(maps)
+
+
+@lru_cache(maxsize=8)
+def _draw(size: int, num: int) -> tuple[int, ...]:
+    # The published draw is of Python's own generator; ours would make another metric of it.
+    return tuple(random.Random(0).sample(range(size), num))
+
+
+def subsample(maps: Tensor, num: int = 4096) -> Tensor:
+    """`num` values of each map (B, C, H, W), the same ones at every call: (B, num).
+
+    Raises:
+        InputError: maps of fewer values than that.
+    """
+    flat = maps.flatten(1)
+    if flat.shape[1] < num:
+        raise InputError(
+            f"the metric draws {num} values of a map of {maps.shape[1]} x {maps.shape[2]} x {maps.shape[3]}, which has "
+            f"{flat.shape[1]}; project to a larger size (--size)."
+        )
+    return flat[:, torch.tensor(_draw(flat.shape[1], num), device=maps.device)]
+
+
+def mean_by_depth(maps: Tensor, bands: int = BANDS) -> Tensor:
+    """Means over `bands` bands of rows, (B, C bands), C slowest: the published "depth".
+
+    The name is the authors'. It means elevation: rows are beams, and nothing of range is looked at.
+
+    Raises:
+        InputError: rows that do not part into as many bands.
+    """
+    return maps.unflatten(2, (_parts(maps.shape[2], bands, "rows"), -1)).mean((3, 4)).flatten(1)
+
+
+def mean_by_angle(maps: Tensor, sectors: int = BANDS) -> Tensor:
+    """Means over `sectors` sectors of columns, (B, C sectors), C slowest.
+
+    Raises:
+        InputError: columns that do not part into as many sectors.
+    """
+    return maps.unflatten(3, (_parts(maps.shape[3], sectors, "columns"), -1)).mean((2, 4)).flatten(1)
+
+
+def _parts(size: int, parts: int, what: str) -> int:
+    if size % parts:
+        raise InputError(
+            f"the metric takes means over {parts} equal parts of the {what}, found {size}; project to a multiple of "
+            f"{parts} (--size)."
+        )
+    return parts
+
+
+def _normalisation(config: Mapping[str, Any], channels: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Mean and standard deviation of each channel as the release's arch_cfg.yaml has them."""
+    try:
+        sensor = config["dataset"]["sensor"]
+        mean, std = (tuple(float(value) for value in sensor[key])[:channels] for key in ("img_means", "img_stds"))
+    except (KeyError, TypeError, ValueError):
+        mean = std = ()
+    finite = all(math.isfinite(value) for value in (*mean, *std))
+    if len(mean) < channels or len(std) < channels or not finite or not all(value > 0 for value in std):
+        raise InputError(f"arch_cfg.yaml must have {channels} finite img_means and img_stds under dataset: sensor.")
+    return mean, std
+
+
+# The original release's names, in the order in which they are tried. The head's file says "1.weight" alone.
+NAMES = [(re.compile(pattern), ours) for pattern, ours in (
+    (r"^(backbone|decoder)\.", ""),
+    (r"^1\.", "head.1."),
+    (r"^conv1\.", "stem.0."),
+    (r"^bn1\.", "stem.1."),
+    (r"^((?:enc|dec)\d)\.(?:up)?conv\.(?!\d)", r"\1.conv.0."),
+    (r"^((?:enc|dec)\d)\.bn\.", r"\1.conv.1."),
+    (r"^(dec\d)\.residual\.", r"\1.residual_0."),
+    (r"\.residual_(\d+)\.", r".residual_blocks.\1."),
+    (r"(\.residual_blocks\.\d+)\.(conv|bn)(\d)\.",
+     lambda m: f"{m[1]}.residual.{int(m[3]) - 1}.{'0' if m[2] == 'conv' else '1'}."),
+)]  # fmt: skip
+
+
+def translate(name: str) -> str:
+    """Our name of a parameter of the original release; a name of ours as it is."""
+    for pattern, ours in NAMES:
+        name = pattern.sub(ours, name)
+    return name

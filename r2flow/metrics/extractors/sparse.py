@@ -1,0 +1,202 @@
+"""Convolution on the voxels that hold something: gather, multiply, scatter; for inference, in plain PyTorch.
+
+    out(q) = sum_k W_k^T x(s q + o_k)
+
+over the voxels s q + o_k that exist, with stride s of 1 or 2 and offsets o_k. Offsets and their order are
+torchsparse's (1.4 and 2.0), so that its weights, (K, C_in, C_out), mean the same here: see `offsets`.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import Self, cast
+
+import torch
+from torch import Tensor, nn
+
+# For each offset: numbers of the input voxels and, beside them, of the output voxels that they go to. Where it is one
+# and the same tensor, every voxel goes to itself.
+KernelMap = list[tuple[Tensor, Tensor]]
+
+
+def offsets(size: int) -> list[tuple[int, int, int]]:
+    """(x, y, z) of each weight of a kernel of size^3, in torchsparse's order.
+
+    Odd kernels are centred and x runs fastest; even ones begin at the voxel itself and z runs fastest.
+    """
+    if size % 2:
+        along = range(-(size // 2), size // 2 + 1)
+        return [(x, y, z) for z, y, x in product(along, repeat=3)]
+    along = range(1 - size // 2, size // 2 + 1)
+    return [(x, y, z) for x, y, z in product(along, repeat=3)]
+
+
+class Grid:
+    """Voxels of one size: distinct integer coordinates, and which of them lie where a kernel looks.
+
+    Args:
+        coords: Scan, x, y, z of each voxel, (N, 4), int64, in voxels of this size.
+        finer: The grid of voxels half as large that this one was made from, None where it is the first.
+
+    Raises:
+        ValueError: no coordinates, some that occur twice, or some too far apart to be numbered.
+    """
+
+    def __init__(self, coords: Tensor, finer: Self | None = None) -> None:
+        if not len(coords):
+            raise ValueError("a grid needs at least one voxel.")
+        self.coords = coords
+        self.finer = finer
+        self._around: dict[int, KernelMap] = {}
+        self._box = Box(coords)
+        self.keys, self.order = self._box.keys(coords).sort()
+        if (self.keys.diff() == 0).any():
+            raise ValueError("a grid's voxels must be distinct.")
+
+    def __len__(self) -> int:
+        return len(self.coords)
+
+    def find(self, coords: Tensor) -> Tensor:
+        """Numbers of the voxels at coordinates (..., 4), -1 where there is none."""
+        key = self._box.keys(coords)
+        position = torch.searchsorted(self.keys, key).clamp_(max=len(self) - 1)
+        return torch.where(self._box.holds(coords) & (self.keys[position] == key), self.order[position], -1)
+
+    def coarser(self) -> "Grid":
+        """Voxels twice as large, each around at least one of this grid's."""
+        coords = self.coords.clone()
+        coords[:, 1:] = coords[:, 1:].div(2, rounding_mode="floor")
+        box = Box(coords)
+        return Grid(box.coords(box.keys(coords).unique()), finer=self)
+
+    def around(self, size: int) -> KernelMap:
+        """Where a kernel of size^3 and stride 1 looks on this grid."""
+        if size not in self._around:
+            self._around[size] = self._map(self, size, 1)
+        return self._around[size]
+
+    @cached_property
+    def inside(self) -> KernelMap:
+        """Which voxels of the finer grid lie in each of this one's: a kernel of 2^3 and stride 2."""
+        if self.finer is None:
+            raise ValueError("no stride was taken that could be undone.")
+        return self._map(self.finer, 2, 2)
+
+    def _map(self, inputs: "Grid", size: int, stride: int) -> KernelMap:
+        scaled = self.coords * torch.tensor([1, stride, stride, stride], device=self.coords.device)
+        entries = []
+        for offset in offsets(size):
+            if inputs is self and not any(offset):
+                every = torch.arange(len(self), device=scaled.device)
+                entries.append((every, every))
+                continue
+            found = inputs.find(scaled + torch.tensor([0, *offset], device=scaled.device))
+            outputs = (found >= 0).nonzero()[:, 0]
+            entries.append((found[outputs], outputs))
+        return entries
+
+
+class Box:
+    """The smallest box around coordinates (N, 4), whose places are numbered: the last axis runs fastest."""
+
+    def __init__(self, coords: Tensor) -> None:
+        self.low, self.high = coords.amin(0), coords.amax(0)
+        self.sizes = (self.high - self.low + 1).tolist()
+        if math.prod(self.sizes) >= 2**63:
+            raise ValueError(f"voxels over {self.sizes} (scans, x, y, z) lie too far apart to be numbered.")
+
+    def holds(self, coords: Tensor) -> Tensor:
+        return ((coords >= self.low) & (coords <= self.high)).all(-1)
+
+    def keys(self, coords: Tensor) -> Tensor:
+        scan, x, y, z = (coords - self.low).unbind(-1)
+        return ((scan * self.sizes[1] + x) * self.sizes[2] + y) * self.sizes[3] + z
+
+    def coords(self, keys: Tensor) -> Tensor:
+        parts = []
+        for size in reversed(self.sizes):
+            parts.append(keys % size)
+            keys = keys.div(size, rounding_mode="floor")
+        return torch.stack(parts[::-1], 1) + self.low
+
+
+@dataclass(frozen=True)
+class Sparse:
+    """Features (N, C) of a grid's voxels."""
+
+    features: Tensor
+    grid: Grid
+
+    def with_features(self, features: Tensor) -> "Sparse":
+        return Sparse(features, self.grid)
+
+
+class SparseConv3d(nn.Module):
+    """A convolution that looks at existing voxels alone, without bias.
+
+    Stride 1: onto the same voxels. Stride 2, with a kernel of 2: onto voxels twice as large. Transposed: back onto
+    the voxels that these were made from, with the same map read the other way. A kernel of 1 is a matrix.
+
+    Args:
+        channels: C_in.
+        out: C_out.
+        size: Voxels of the kernel along each axis.
+        stride: 1, or 2 with a kernel of 2.
+        transposed: Undo a stride.
+
+    Raises:
+        ValueError: another stride.
+    """
+
+    def __init__(self, channels: int, out: int, size: int = 3, stride: int = 1, transposed: bool = False) -> None:
+        super().__init__()
+        if (size, stride) != (2, 2) and (stride != 1 or transposed):
+            raise ValueError(f"a sparse convolution has the stride 1, or 2 with a kernel of 2; found {stride}, {size}.")
+        self.size, self.stride, self.transposed = size, stride, transposed
+        shape = (channels, out) if size == 1 else (size**3, channels, out)
+        bound = ((out if transposed else channels) * size**3) ** -0.5
+        self.kernel = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
+
+    def forward(self, x: Sparse) -> Sparse:
+        if self.size == 1:
+            return x.with_features(x.features @ self.kernel)
+        if self.transposed:
+            reverse = [(outputs, inputs) for inputs, outputs in x.grid.inside]
+            finer = cast(Grid, x.grid.finer)
+            return Sparse(convolve(x.features, self.kernel, reverse, len(finer)), finer)
+        if self.stride > 1:
+            coarser = x.grid.coarser()
+            return Sparse(convolve(x.features, self.kernel, coarser.inside, len(coarser)), coarser)
+        return x.with_features(convolve(x.features, self.kernel, x.grid.around(self.size), len(x.grid)))
+
+    def extra_repr(self) -> str:
+        return f"kernel {tuple(self.kernel.shape)}, stride={self.stride}, transposed={self.transposed}"
+
+
+def convolve(features: Tensor, kernel: Tensor, where: KernelMap, num: int) -> Tensor:
+    """Features (N, C_in) through weights (K, C_in, C_out) onto `num` voxels, (num, C_out)."""
+    out = features.new_zeros(num, kernel.shape[2])
+    for weight, (inputs, outputs) in zip(kernel, where, strict=True):
+        if inputs is outputs:  # a kernel's own voxel: nothing to gather or scatter
+            out.addmm_(features, weight)
+            continue
+        # An output occurs once for each offset at most: reading and writing back is sure to add, and is the
+        # same at every run, which index_add_ is not on a GPU.
+        part = torch.addmm(out.index_select(0, outputs), features.index_select(0, inputs), weight)
+        out.index_copy_(0, outputs, part)
+    return out
+
+
+class SparseNorm(nn.BatchNorm1d):
+    """Batch normalisation of the voxels' features."""
+
+    def forward(self, x: Sparse) -> Sparse:  # type: ignore[override]
+        return x.with_features(super().forward(x.features))
+
+
+class SparseReLU(nn.Module):
+    """max(0, x) of the voxels' features."""
+
+    def forward(self, x: Sparse) -> Sparse:
+        return x.with_features(torch.relu(x.features))

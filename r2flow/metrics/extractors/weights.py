@@ -1,0 +1,367 @@
+"""Weights of the published feature networks: where the field gets them, and how they come to this machine.
+
+Nothing is fetched here. A file from disk is read as tensors alone, held against its network, and kept as
+safetensors in a folder of ours, from where `Extractor.trained` reads it.
+"""
+
+import gzip
+import hashlib
+import io
+import json
+import os
+import pickle
+import re
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import IO, Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.files import atomic_write
+from r2flow.metrics.extractors import extractor_class
+from r2flow.metrics.extractors.base import Extractor
+from r2flow.registry import Registry
+
+E = TypeVar("E", bound=Extractor)
+
+
+@dataclass(frozen=True)
+class Source:
+    """A published file of weights.
+
+    Attributes:
+        metric: The distance that is taken on its features.
+        file: Its name.
+        page: Where its authors offer it.
+        size: Bytes, None where not known.
+        sha256: None where not known.
+        git_blob: Its id in the git repository that it lies in, which is the SHA-1 of a short header and the file.
+    """
+
+    metric: str
+    file: str
+    page: str
+    size: int | None = None
+    sha256: str | None = None
+    git_blob: str | None = None
+
+
+BONN = "http://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models/"
+R2FLOW = "https://github.com/kazuto1011/r2flow/releases/download/weights/"
+
+SOURCES: Registry[Source] = Registry(
+    "network with published weights",
+    rangenet53=Source("FRD", "darknet53-1024.tar.gz", f"{BONN}darknet53-1024.tar.gz"),
+    rangenet21=Source("FRID", "rangenet21_lidm.tar.gz", f"{R2FLOW}rangenet21_lidm.tar.gz"),
+    pointnet=Source(
+        "FPD",
+        "cls_model_39.pth",
+        "https://github.com/microsoft/SpareNet/raw/main/Frechet/cls_model_39.pth",
+        git_blob="c9e80093a093d5667e9aa705d87d923df50f1c25",
+    ),
+    minkowskinet=Source("FSVD", "minkowskinet_lidm.tar.gz", f"{R2FLOW}minkowskinet_lidm.tar.gz"),
+    spvcnn=Source("FPVD", "spvcnn_lidm.tar.gz", f"{R2FLOW}spvcnn_lidm.tar.gz"),
+)
+
+# Files of an archive that hold parameters, and the one that says what they were trained on.
+PARTS = ("backbone", "segmentation_decoder", "segmentation_head", "model.ckpt")
+CONFIG = "arch_cfg.yaml"
+LARGEST = 2**31  # bytes of a part: the largest of these networks has 0.2 GB
+
+
+def weights_folder() -> Path:
+    """The folder of weights: R2FLOW_WEIGHTS, or ~/.cache/r2flow/weights."""
+    named = os.environ.get("R2FLOW_WEIGHTS")
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    return Path(named).expanduser() if named else cache / "r2flow" / "weights"
+
+
+def kept_file(name: str) -> Path:
+    """Where the weights of a network are kept."""
+    return weights_folder() / f"{name}.safetensors"
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Weights that this machine has.
+
+    Attributes:
+        weights: First 12 digits of the SHA-256 of the parameters themselves, whatever file they came from.
+        source: Name of the file that they came from.
+        sha256: Of that file; None where it was a folder.
+        published: Whether that file is the published one; None where its hash is not known.
+    """
+
+    weights: str
+    source: str
+    sha256: str | None
+    published: bool | None
+
+
+def kept(name: str) -> Kept | None:
+    """What is kept of a network's weights, or None.
+
+    Raises:
+        InputError: a file that is not one of ours.
+    """
+    path = kept_file(name)
+    if not path.exists():
+        return None
+    notes = _open(path, with_tensors=False)[1]
+    return Kept(notes["weights"], notes["source"], notes["sha256"], notes["published"])
+
+
+def add(name: str, path: Path) -> Kept:
+    """Take weights from a file, or an archive or folder of several, into the folder of weights.
+
+    Raises:
+        InputError: no network of that name, a file that cannot be read safely, or weights of another network.
+    """
+    source = SOURCES[name]
+    tensors, config = read_published(path)
+    try:
+        extractor = extractor_class(name).from_tensors(tensors, config)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    found = Kept(weights_hash(extractor), path.name, None if path.is_dir() else _sha256(path), _is(source, path))
+    _keep(kept_file(name), tensors, {**vars(found), "config": config})
+    return found
+
+
+def read_kept(cls: type[E]) -> E:
+    """A network with the weights that are kept for it, in evaluation mode on the CPU.
+
+    Raises:
+        InputError: none are kept, or not whole.
+    """
+    path = kept_file(cls.name)
+    if not path.exists():
+        raise InputError(
+            f"no weights of {cls.name} in {path.parent}: get {SOURCES[cls.name].file} and give "
+            f"r2flow weights --add {cls.name} FILE (r2flow weights says where from)."
+        )
+    tensors, notes = _open(path)
+    extractor = cls.from_tensors(tensors, notes["config"])
+    extractor.weights = weights_hash(extractor)
+    if extractor.weights != notes["weights"]:
+        raise InputError(
+            f"{path} is not what was added ({extractor.weights}, not {notes['weights']}); add its weights again."
+        )
+    return extractor
+
+
+def weights_hash(extractor: Extractor) -> str:
+    """First 12 digits of the SHA-256 of all that a network computes with, by name."""
+    digest = hashlib.sha256()
+    for name, value in sorted({**dict(extractor.named_parameters()), **dict(extractor.named_buffers())}.items()):
+        digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()[:12]
+
+
+def fill(extractor: Extractor, tensors: Mapping[str, Tensor]) -> None:
+    """Give a network its parameters, by name, none missing and none left over, and set it up for inference.
+
+    Raises:
+        InputError: parameters of another network, or some that are not finite.
+    """
+    wanted = extractor.state_dict()
+    # A count of training steps that inference never reads; files older than it lack it.
+    counts = {name: value for name, value in wanted.items() if name.endswith("num_batches_tracked")}
+    given = {**counts, **tensors}
+    missing = [name for name in wanted if name not in given]
+    left = [name for name in given if name not in wanted]
+    other = [name for name in wanted if name in given and given[name].shape != wanted[name].shape]
+    if missing or left:
+        found = [f"{len(missing)} of its {len(wanted)} parameters are missing ('{missing[0]}')"] if missing else []
+        found += [f"{len(left)} are none of its own ('{left[0]}')"] if left else []
+        raise InputError(f"these are no weights of {extractor.name}: {' and '.join(found)}.")
+    if other:
+        name = other[0]
+        raise InputError(
+            f"these are no weights of {extractor.name}: '{name}' has the shape {tuple(given[name].shape)}, "
+            f"not {tuple(wanted[name].shape)}."
+        )
+    bad = next((name for name in wanted if not given[name].isfinite().all()), None)
+    if bad:
+        raise InputError(f"the weights of {extractor.name} are damaged: '{bad}' has values that are not finite.")
+    extractor.load_state_dict(given)
+    extractor.requires_grad_(False).eval()
+
+
+def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors by name, and the archive's config, of a file or of an archive or folder of several.
+
+    Raises:
+        InputError: nothing there, nothing of weights in it, or objects that would run code when loaded.
+    """
+    import yaml
+
+    if not path.exists():
+        raise InputError(f"{path} does not exist; give a file, a .tar.gz or a folder of weights.")
+    if path.suffix == ".safetensors":
+        tensors, notes = _open(path)
+        return tensors, notes["config"]
+    if not (path.is_dir() or tarfile.is_tarfile(path) or _is_archive(path)):
+        with path.open("rb") as file:
+            return _tensors(file, str(path)), {}
+    tensors = {}
+    members = _members(path)
+    for part in PARTS:
+        if part in members:
+            tensors.update(_tensors(io.BytesIO(members[part]), f"{path}: {part}"))
+    try:
+        config = yaml.safe_load(members[CONFIG]) if CONFIG in members else {}
+    except yaml.YAMLError:
+        raise InputError(f"{path}: {CONFIG} is not YAML; is the archive whole?") from None
+    if not isinstance(config, dict):
+        raise InputError(f"{path}: {CONFIG} is no table of settings; is the archive whole?")
+    if not tensors:
+        raise InputError(f"{path} holds none of {', '.join(PARTS)}; give the archive as it was published.")
+    return tensors, config
+
+
+def _is_archive(path: Path) -> bool:
+    """A .zip of files; torch's own files are .zip too, of another kind."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as file:
+        return not any(name.endswith("data.pkl") for name in file.namelist())
+
+
+def _members(path: Path) -> dict[str, bytes]:
+    """The files of `PARTS` and `CONFIG` in a folder, a tar or a zip, by their last name."""
+    found: dict[str, bytes] = {}
+
+    def take(name: str, size: int, file: IO[bytes] | None) -> None:
+        last = PurePosixPath(name).name
+        if file is None or last not in (*PARTS, CONFIG):
+            return
+        if last in found:
+            raise InputError(f"{path} holds several networks ('{last}' twice); unpack it and give the folder of one.")
+        if size > LARGEST:
+            raise InputError(f"{path}: {name} is {size / 2**30:.1f} GiB, which no such network is.")
+        found[last] = file.read(LARGEST)
+
+    try:
+        if path.is_dir():
+            for child in sorted(path.iterdir()):
+                if child.is_file():
+                    with child.open("rb") as part:
+                        take(child.name, child.stat().st_size, part)
+        elif tarfile.is_tarfile(path):
+            with tarfile.open(path) as tar:
+                for member in tar:
+                    take(member.name, member.size, tar.extractfile(member) if member.isreg() else None)
+                # What is compressed carries a check sum behind the last member: it is held against it at the end.
+                while tar.fileobj is not None and tar.fileobj.read(2**20):
+                    pass
+        else:
+            with zipfile.ZipFile(path) as archive:
+                for info in archive.infolist():
+                    with archive.open(info) as packed:
+                        take(info.filename, info.file_size, None if info.is_dir() else packed)
+    except (
+        tarfile.TarError,
+        zipfile.BadZipFile,
+        gzip.BadGzipFile,
+        zlib.error,
+        EOFError,
+        NotImplementedError,
+        RuntimeError,
+    ):
+        raise InputError(f"{path} is a damaged archive; get it again.") from None
+    return found
+
+
+def _tensors(file: IO[bytes], what: str) -> dict[str, Tensor]:
+    """The tensors of one of torch's files, by name."""
+    _check_sums(file, what)
+    try:
+        content = torch.load(file, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        held = re.search(r"(?:GLOBAL|Unsupported (?:global|class):?(?: GLOBAL)?) (\S+)", str(error))
+        if held is None:
+            raise InputError(f"{what} is not a file of weights.") from None
+        raise InputError(
+            f"{what} is refused: it holds objects that would run code when loaded ({held[1]}). Save its 'state_dict' "
+            "alone, where you trust it: torch.save(torch.load(FILE, weights_only=False)['state_dict'], 'weights.pth')."
+        ) from None
+    except Exception:  # torch's reader raises nearly anything on bytes that are none of its own
+        raise InputError(f"{what} is not a file of weights.") from None
+    if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
+        content = content["state_dict"]
+    if not isinstance(content, dict) or not content or not all(_plain(*item) for item in content.items()):
+        raise InputError(f"{what} holds no table of tensors.")
+    return dict(content)
+
+
+def _check_sums(file: IO[bytes], what: str) -> None:
+    """Hold a file of torch's against its check sums, which torch does not: a .zip has one for each of its members."""
+    if zipfile.is_zipfile(file):
+        try:
+            with zipfile.ZipFile(file) as archive:
+                whole = archive.testzip() is None
+        except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError):
+            whole = False
+        if not whole:
+            raise InputError(f"{what} is damaged: its check sums do not hold; get it again.")
+    file.seek(0)
+
+
+def _plain(name: object, value: object) -> bool:
+    """Whether it is a name and a tensor of real numbers, all of them there."""
+    return (
+        isinstance(name, str)
+        and isinstance(value, Tensor)
+        and value.layout == torch.strided
+        and not (value.is_meta or value.is_quantized or value.is_complex())
+    )
+
+
+def _keep(path: Path, tensors: Mapping[str, Tensor], notes: Mapping[str, Any]) -> None:
+    from safetensors.torch import save
+
+    whole = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}  # some share their memory
+    data = save(whole, metadata={"r2flow": json.dumps(dict(notes), default=str)})
+    with atomic_write(path) as file:
+        file.write(data)
+
+
+def _open(path: Path, with_tensors: bool = True) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and notes of a file that `_keep` wrote, or of another safetensors file, which has no notes."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            notes = json.loads((file.metadata() or {}).get("r2flow", "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys() if with_tensors}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError):
+        raise InputError(f"{path} is not a safetensors file, or a damaged one.") from None
+    return tensors, {"config": {}, "weights": "", "source": path.name, "sha256": None, "published": None, **notes}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _is(source: Source, path: Path) -> bool | None:
+    """Whether a file is the published one; None where its hash is not known."""
+    if path.is_dir():
+        return None
+    if source.sha256:
+        return _sha256(path) == source.sha256
+    if source.git_blob:
+        with path.open("rb") as file:
+            digest = hashlib.sha1(f"blob {path.stat().st_size}\0".encode(), usedforsecurity=False)
+            while block := file.read(2**20):
+                digest.update(block)
+        return digest.hexdigest() == source.git_blob
+    return None

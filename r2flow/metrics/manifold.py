@@ -1,0 +1,132 @@
+"""Whether generated scans lie where real ones do, and real ones where generated ones do."""
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.metrics.base import SIDES, Protocol, ScanMetric
+from r2flow.metrics.extractors.base import Extractor
+from r2flow.metrics.features import FeatureStore, extract
+from r2flow.metrics.frechet import loaded
+from r2flow.metrics.scans import Scans
+
+BLOCK = 2000  # scans: their distances take 32 MB
+TIE = 1e-9  # relative: a neighbour at the very radius lies inside, however its distance was rounded
+NAMES = ("precision", "recall", "density", "coverage")
+
+
+class Manifold(ScanMetric):
+    """Precision, recall, density and coverage of generated scans, in the space of a network's features.
+
+    A set is taken for the union of balls around its scans, each as wide as the k-th nearest neighbour in the set lies
+    away. Kynkaanniemi et al. (2019): precision is the share of generated scans in a ball of a real one, recall that of
+    real scans in a ball of a generated one. Naeem et al. (2020): density is the mean number of real balls that a
+    generated scan lies in, over k (it may exceed 1, and a single outlier cannot lift it), coverage the share of real
+    balls with a generated scan in them.
+
+    There is no bootstrap interval: in a set with scans drawn twice the balls shrink to nothing, and with the balls held
+    fast intervals of 95 % were seen to hold the mean figure in 76 to 81 of 100 cases.
+
+    The figures are named `precision_<network>` and so on, with `_k<k>` for another k than 5.
+
+    Args:
+        extractor: The network, or its name in `EXTRACTORS`.
+        neighbours: k.
+        keep: Features are always kept.
+        folder: Where to.
+
+    Raises:
+        InputError: k below 1; no network of that name, or no weights for it on this machine.
+    """
+
+    resamples = False
+
+    def __init__(
+        self,
+        extractor: Extractor | str = "embedded",
+        neighbours: int = 5,
+        keep: bool = True,
+        folder: str | Path | None = None,
+    ) -> None:
+        super().__init__(True, folder)
+        if neighbours < 1:
+            raise InputError(f"manifold: neighbours must be at least 1, found {neighbours}.")
+        self.extractor = loaded(extractor)
+        self.needs_reflectance = self.extractor.needs_reflectance
+        self.neighbours = neighbours
+        self.own_group()
+
+    @property
+    def protocol(self) -> Protocol:
+        network = self.extractor
+        return Protocol(
+            metric=f"manifold_{self._suffix}",
+            representation="features of a network",
+            extractor=network.name,
+            weights=network.weights,
+            layer=f"{network.layer}, {network.dim}",
+            settings={"neighbours": self.neighbours, "distance": "Euclidean"},
+        )
+
+    @property
+    def _suffix(self) -> str:
+        random = "_random" if self.extractor.weights == "random" else ""
+        return f"{self.extractor.name}{random}" + (f"_k{self.neighbours}" if self.neighbours != 5 else "")
+
+    def rows(self, scans: Scans) -> Tensor:
+        return extract(self.extractor, scans)
+
+    def figures(self) -> tuple[dict[str, float], list[str]]:
+        names = [f"{name}_{self._suffix}" for name in NAMES]
+        few = [side for side in SIDES if self.count(side) <= self.neighbours]
+        if few:
+            said = (
+                f"{self.protocol.metric}: too few {' and '.join(few)} scans to have {self.neighbours} neighbours each."
+            )
+            return dict.fromkeys(names, float("nan")), [said]
+        per_scan = self._per_scan()
+        return {name: float(per_scan[one].mean()) for name, one in zip(names, NAMES, strict=True)}, []
+
+    def _per_scan(self) -> dict[str, Tensor]:
+        """What each scan adds to the figures, (N) of the side that is asked."""
+        real, generated = self.store("real"), self.store("generated")
+        middle = next(block for _, block in real.blocks(BLOCK)).mean(0)
+        in_real, in_generated = (radii(store, self.neighbours, middle) * (1 + TIE) for store in (real, generated))
+        balls = torch.zeros(len(generated), dtype=torch.float64)
+        recalled, covered = (torch.zeros(len(real), dtype=torch.bool) for _ in range(2))
+        for i, x in real.blocks(BLOCK):
+            for j, y in generated.blocks(BLOCK):
+                d = squared_distances(x - middle, y - middle)
+                within = d <= in_real[i, None]
+                balls[j] += within.sum(0)
+                covered[i] |= within.any(1)
+                recalled[i] |= (d <= in_generated[j]).any(1)
+        return {
+            "precision": (balls > 0).double(),
+            "recall": recalled.double(),
+            "density": balls / self.neighbours,
+            "coverage": covered.double(),
+        }
+
+
+def radii(store: FeatureStore, k: int, middle: Tensor) -> Tensor:
+    """Squared distance of every row from its k-th nearest neighbour among the others, (N), about a common middle."""
+    found = []
+    for i, x in store.blocks(BLOCK):
+        nearest = torch.full((len(x), k), torch.inf, dtype=torch.float64)
+        for j, y in store.blocks(BLOCK):
+            d = squared_distances(x - middle, y - middle)
+            if i == j:
+                d.fill_diagonal_(torch.inf)
+            nearest = torch.cat([nearest, d], 1).topk(k, largest=False).values
+        found.append(nearest.amax(1))
+    return torch.cat(found)
+
+
+def squared_distances(x: Tensor, y: Tensor) -> Tensor:
+    """|x - y|^2 of all pairs, (N, M), from products; what rounding alone has left of equal rows is 0."""
+    size = x.square().sum(1)[:, None] + y.square().sum(1)
+    d = size - 2 * x @ y.T
+    return d.masked_fill_(d <= 1e-12 * size, 0)

@@ -1,0 +1,81 @@
+"""How alike the single scans of two sets look from above: the field's MMD."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from r2flow.metrics.base import SIDES, Protocol, ScanMetric, Side
+from r2flow.metrics.birds_eye import PROTOCOL
+from r2flow.metrics.features import FeatureStore
+from r2flow.metrics.jsd import histograms
+from r2flow.metrics.scans import Scans
+
+SIGMA = 0.5
+BLOCK = 500  # scans: two blocks of histograms and what is made of them take 250 MB
+
+
+class MMD(ScanMetric):
+    """Maximum mean discrepancy between bird's-eye histograms of single scans, each normalised to a sum of 1.
+
+    MMD^2 = mean k(p, p') + mean k(q, q') - 2 mean k(p, q), k(a, b) = exp(-|a - b|^2 / (2 sigma^2)), sigma = 0.5: the
+    biased estimate of Gretton et al. (2012), without a root and with each scan against itself, as the field prints it
+    (times 10^4) since Zyrianov et al. (2022). Of its digits float32 loses the first ones: all is float64 here.
+
+    The histograms are kept in files and read in blocks. Memory does not grow with the scans; time grows with their
+    square: 2 s on a core for 1000 against 1000, 2 minutes for 10,000 against 10,000.
+
+    Args:
+        keep: Histograms are always kept.
+        folder: Where to.
+    """
+
+    def __init__(self, keep: bool = True, folder: str | Path | None = None) -> None:
+        super().__init__(True, folder)
+        self.own_group()
+
+    @property
+    def protocol(self) -> Protocol:
+        settings = {**PROTOCOL, "kernel": "Gaussian", "sigma": SIGMA, "estimate": "biased"}
+        return Protocol("mmd", "bird's-eye histogram", settings=settings)
+
+    def rows(self, scans: Scans) -> Tensor:
+        return histograms(scans)
+
+    def figures(self) -> tuple[dict[str, float], list[str]]:
+        if not all(self.count(side) for side in SIDES):
+            return {"mmd": float("nan")}, ["mmd: does not exist without a return on either side."]
+        once = {side: torch.ones(1, self.count(side), dtype=torch.float64) for side in SIDES}
+        return {"mmd": float(self.resampled(once)["mmd"])}, []
+
+    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
+        real, generated = ((self.store(side), weights[side]) for side in SIDES)
+        value = mean_kernel(real, real) + mean_kernel(generated, generated) - 2 * mean_kernel(real, generated)
+        return {"mmd": value.clamp(min=0)}
+
+
+def mean_kernel(a: tuple[FeatureStore, Tensor], b: tuple[FeatureStore, Tensor]) -> Tensor:
+    """Weighted mean of k(p, q) - 1 over all scans p of one set and q of another, for every draw of weights, (R).
+
+    Less 1, which drops out of MMD^2: so little does the kernel vary here that its 1 would take four digits. It is
+    computed once for all draws.
+
+    Args:
+        a: Kept histograms and how often each counts, (R, N).
+        b: Another set, or the same object.
+    """
+    (x_store, x_weights), (y_store, y_weights) = a, b
+    total = torch.zeros(len(x_weights), dtype=torch.float64)
+    for i, x in x_store.blocks(BLOCK):
+        held = x.sum(0) > 0
+        p = x[:, held] / x.sum(1, keepdim=True)  # over half of the square lies beyond the mask, or is never seen
+        for j, y in y_store.blocks(BLOCK):
+            if a is b and j.start < i.start:
+                continue  # k is symmetric
+            q = y / y.sum(1, keepdim=True)
+            d = p.square().sum(1)[:, None] + q.square().sum(1) - 2 * p @ q[:, held].T
+            kernel = torch.expm1(d.clamp_(min=0).div_(-2 * SIGMA**2))
+            twice = 2 if a is b and j.start > i.start else 1
+            total += twice * ((x_weights[:, i] @ kernel) * y_weights[:, j]).sum(1)
+    return total / (x_weights.sum(1) * y_weights.sum(1))

@@ -1,0 +1,71 @@
+"""Metrics whose figures are made of sums over a set's scans: histograms, counts."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.metrics.base import SIDES, ScanMetric, Side
+
+BLOCK = 1000  # scans read from a file at once
+
+
+class SumMetric(ScanMetric):
+    """A metric that adds the rows of a set's scans up, in float64: sums of whole numbers are exact in any order.
+
+    Args:
+        width: The most numbers in a row. How many there are may depend on the sensor, and a state has one size.
+        keep: Keep the row of every scan, for bootstrap intervals.
+        folder: Where to.
+    """
+
+    real_sum: Tensor
+    generated_sum: Tensor
+
+    def __init__(self, width: int, keep: bool = False, folder: str | Path | None = None) -> None:
+        super().__init__(keep, folder)
+        for side in SIDES:
+            self.add_state(f"{side}_sum", torch.zeros(width, dtype=torch.float64), dist_reduce_fx="sum")
+            self.add_state(f"{side}_width", torch.tensor(0), dist_reduce_fx="max")
+        self.own_group()
+
+    @abstractmethod
+    def figures_of(self, real: np.ndarray, generated: np.ndarray) -> dict[str, float]:
+        """Figures from the two sums of rows, (D) each; of zeros where a set has nothing to compare."""
+
+    def accumulate(self, rows: Tensor, side: Side) -> None:
+        width: Tensor = getattr(self, f"{side}_width")
+        if width > 0 and int(width) != rows.shape[1]:
+            raise self._other_size(int(width), rows.shape[1])
+        width.fill_(rows.shape[1])
+        total: Tensor = getattr(self, f"{side}_sum")
+        total[: rows.shape[1]] += rows.sum(0, dtype=torch.float64).to(total)
+
+    def figures(self) -> tuple[dict[str, float], list[str]]:
+        widths = {int(getattr(self, f"{side}_width")) for side in SIDES} - {0}
+        if len(widths) > 1:
+            raise self._other_size(*sorted(widths))
+        width = max(widths, default=0)
+        real, generated = (getattr(self, f"{side}_sum")[:width].cpu().numpy() for side in SIDES)
+        values = self.figures_of(real, generated)
+        if not all(int(getattr(self, f"{side}_scans")) for side in SIDES):
+            return dict.fromkeys(values, float("nan")), []
+        return values, []
+
+    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
+        sums = {}
+        for side in SIDES:
+            parts = [weights[side][:, at] @ block for at, block in self.store(side).blocks(BLOCK)]
+            sums[side] = torch.stack(parts).sum(0).numpy()
+        drawn = [self.figures_of(real, generated) for real, generated in zip(*sums.values(), strict=True)]
+        return {name: torch.tensor([one[name] for one in drawn], dtype=torch.float64) for name in drawn[0]}
+
+    def _other_size(self, a: int, b: int) -> InputError:
+        return InputError(
+            f"{self.protocol.metric}: some scans give {a} numbers and others {b}; "
+            "are they of two sensors? Compare scans of one sensor alone."
+        )

@@ -1,0 +1,62 @@
+"""A small sensor, scans of it, and a network that needs no weights."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from r2flow.lidar.sensors import SENSORS
+from r2flow.metrics.extractors.base import Extractor
+from r2flow.metrics.scans import Scans
+
+SMALL = SENSORS["hdl64e"].resized(8, 32)
+
+
+class Summary(Extractor):
+    """Six plain averages of a scan instead of a network: each metric of features can be built on it."""
+
+    name = "summary"
+    layer = "averages"
+    dim = 6
+    weights = "0123456789ab"
+
+    def features(self, scans: Scans) -> Tensor:
+        r = scans.images[:, 0]
+        quarters = r.unflatten(2, (4, -1)).mean((1, 3))
+        both = torch.stack([r.amax((1, 2)), scans.returned.float().mean((1, 2, 3))], 1)
+        features = torch.cat([quarters, both], 1)
+        return torch.where(scans.returned.flatten(1).any(1)[:, None], features, torch.nan)
+
+
+@pytest.fixture
+def scans_of() -> Callable[..., Scans]:
+    """Random scans of the small sensor, (n, 2, 8, 32): as far as `scale` metres, decided by a seed."""
+
+    def make(n: int, seed: int = 0, scale: float = 40.0) -> Scans:
+        g = torch.Generator().manual_seed(seed)
+        r = 4 + scale * torch.rand(n, 1, *SMALL.shape, generator=g) * torch.rand(n, 1, 1, 1, generator=g)
+        r = r * (torch.rand(n, 1, *SMALL.shape, generator=g) < 0.8)
+        return Scans(torch.cat([r, torch.rand(r.shape, generator=g) * (r > 0)], 1), SMALL)
+
+    return make
+
+
+@pytest.fixture
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Larger cells on the ground, for tests to which their size is nothing: millions of them take time."""
+    monkeypatch.setattr("r2flow.metrics.lidm.FINE", 0.5)
+    monkeypatch.setattr("r2flow.metrics.lidm.COARSE", 5)
+
+
+@pytest.fixture
+def summary(monkeypatch: pytest.MonkeyPatch) -> Summary:
+    """The stand-in; also what every name of a network loads."""
+
+    def load(name: str) -> Extractor:
+        extractor = Summary()
+        extractor.name = name  # type: ignore[misc]
+        return extractor
+
+    monkeypatch.setattr("r2flow.metrics.extractors.load_extractor", load)
+    return Summary()

@@ -1,0 +1,116 @@
+"""JSD, MMD and their namesakes of another toolbox, from above."""
+
+import math
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.metrics import lidm, mmd
+from r2flow.metrics.birds_eye import birds_eye_histogram
+from r2flow.metrics.jsd import JSD
+from r2flow.metrics.lidm import JSDLiDM, MMDLiDM, squared_distance_map
+from r2flow.metrics.mmd import MMD
+from r2flow.metrics.scans import Scans
+
+
+class Seen:
+    """Scans of which nothing is known but their histograms."""
+
+    def __init__(self, histograms):
+        self.birds_eye = np.asarray(histograms, dtype=np.float64)
+
+
+def figure(metric, real, generated):
+    metric.update(real, real=True)
+    metric.update(generated, real=False)
+    return metric.compute()
+
+
+def test_reference_figures(shared):
+    case = torch.load(shared / "oracle" / "bev_metrics.pt", weights_only=True)
+    seen = np.stack([birds_eye_histogram(points.numpy()) for points in case["point_clouds"]])
+    np.testing.assert_array_equal(seen, case["hists"])
+    real, generated = Seen(seen[:12]), Seen(seen[12:])
+    assert figure(JSD(), real, generated)["jsd"] == pytest.approx(case["jsd"], rel=1e-7)  # made of float32 histograms
+    assert figure(MMD(), real, generated)["mmd"] == pytest.approx(case["mmd_float64"], rel=1e-10)
+    assert figure(JSD(), real, real)["jsd"] == case["jsd_same"]
+    assert figure(MMD(), real, real)["mmd"] == pytest.approx(case["mmd_same"], abs=1e-15)
+
+
+def test_mmd_is_the_mean_over_all_pairs_in_blocks_of_any_size(monkeypatch):
+    counts = np.random.default_rng(0).poisson(0.02, (17, 100, 100))
+    p = counts.reshape(17, -1) / counts.sum((1, 2))[:, None]
+
+    def mean(a, b):
+        return np.mean([math.exp(-2 * ((x - y) ** 2).sum()) for x, y in product(a, b)])  # 1 / (2 sigma^2) = 2
+
+    expected = mean(p[:10], p[:10]) + mean(p[10:], p[10:]) - 2 * mean(p[:10], p[10:])
+    for block in (3, 1000):
+        monkeypatch.setattr(mmd, "BLOCK", block)
+        assert figure(MMD(), Seen(counts[:10]), Seen(counts[10:]))["mmd"] == pytest.approx(expected, rel=1e-9)
+
+
+def test_disjoint_sets_lie_as_far_as_can_be(scans_of):
+    near, far = scans_of(3, scale=0.0), scans_of(3)
+    far.images[:, 0] = torch.where(far.returned[:, 0], 45.0, 0.0)
+    near.images[:, 0] = torch.where(near.returned[:, 0], 4.0, 0.0)
+    assert figure(JSD(), near, far)["jsd"] == pytest.approx(math.sqrt(math.log(2)), rel=1e-12)
+    assert figure(JSDLiDM(), near, far)["jsd_lidm"] == pytest.approx(math.sqrt(math.log(2)), rel=1e-12)
+
+
+def test_a_set_without_a_return_is_said(scans_of):
+    empty = Scans(torch.zeros(2, 2, 8, 32), scans_of(1).sensor)
+    for metric in (JSD(), JSDLiDM()):
+        value = figure(metric, scans_of(3), empty)
+        assert list(value.values()) == [pytest.approx(math.sqrt(math.log(2)))]
+        assert any("none of the 2 generated scans" in said for said in metric.remarks())
+        assert any("no generated scan has a return" in said for said in metric.remarks())
+
+
+def cells(points, size, depth=(1.0, 56.0)):
+    """Cells that hold a return, by another way: a set of pairs."""
+    r = np.linalg.norm(points, axis=1)
+    inside = points[(r > depth[0]) & (r < depth[1]) & (np.abs(points[:, :2]) < 50).all(1)]
+    return {tuple(cell) for cell in np.floor(inside[:, :2] / np.float32(size)).astype(int).tolist()}
+
+
+def test_jsd_of_the_other_toolbox_counts_scans_that_hold_a_cell(scans_of):
+    def shares(scans):
+        held = [cells(p.numpy(), 0.05) for p in scans.points]
+        every = set().union(*held)
+        counts = {cell: sum(cell in one for one in held) for cell in every}
+        total = sum(counts.values())
+        return {cell: n / total for cell, n in counts.items()}
+
+    real, generated = scans_of(4, 1, scale=3), scans_of(3, 2, scale=3)
+    p, q = shares(real), shares(generated)
+    divergence = 0.0
+    for a, b in ((p, q), (q, p)):
+        divergence += sum(x * math.log(2 * x / (x + b.get(cell, 0))) for cell, x in a.items()) / 2
+    assert 0.01 < divergence < 0.69
+    assert figure(JSDLiDM(), real, generated)["jsd_lidm"] == pytest.approx(math.sqrt(divergence), rel=1e-9)
+
+
+def test_mmd_of_the_other_toolbox_is_the_mean_distance_to_the_best_match(scans_of, monkeypatch):
+    monkeypatch.setattr(lidm, "BLOCK", 2)
+    real, generated = scans_of(5, 1), scans_of(3, 2)
+
+    def chamfer(a, b):
+        d = ((a[:, None] - b) ** 2).sum(-1)
+        return (d.min(0).mean() + d.min(1).mean()) / 2
+
+    sets = [[np.array(sorted(cells(p.numpy(), 0.5))) / 200 for p in side.points] for side in (real, generated)]
+    expected = np.mean([min(chamfer(a, b) for b in sets[1]) for a in sets[0]])
+    assert figure(MMDLiDM(), real, generated)["mmd_lidm"] == pytest.approx(expected, rel=1e-6)
+    assert figure(MMDLiDM(), real, real)["mmd_lidm"] == 0
+
+
+def test_a_distance_map_is_that_of_the_nearest_held_cell():
+    held = torch.rand(13, 9, generator=torch.Generator().manual_seed(0)) < 0.1
+    at = held.nonzero()
+    every = torch.cartesian_prod(torch.arange(13), torch.arange(9))
+    expected = (every[:, None] - at).square().sum(-1).amin(1).view(13, 9)
+    assert torch.equal(squared_distance_map(held), expected.float())
+    assert squared_distance_map(held & False).isnan().all()

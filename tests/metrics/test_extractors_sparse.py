@@ -1,0 +1,245 @@
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from r2flow.metrics.extractors.minkowski import MinkowskiNet
+from r2flow.metrics.extractors.sparse import Grid, Sparse, SparseConv3d, offsets
+from r2flow.metrics.extractors.spvcnn import SPVCNN, Corners
+
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
+
+
+def occupied(size: int, share: float, scans: int = 2, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, ...]:
+    """Voxels of `scans` random cubes in a random order, (N, 4), and whether each place is one, (B, 1, size^3)."""
+    mask = torch.rand(scans, size, size, size) < share
+    coords = mask.nonzero()
+    return coords[torch.randperm(len(coords))], mask[:, None].to(dtype)
+
+
+def to_dense(features: torch.Tensor, coords: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
+    dense = features.new_zeros(shape[0], features.shape[1], *shape[2:])
+    b, x, y, z = coords.T
+    dense[b, :, x, y, z] = features
+    return dense
+
+
+def dense_kernel(kernel: torch.Tensor, size: int) -> torch.Tensor:
+    """(C_out, C_in, x, y, z) of (K, C_in, C_out): torchsparse counts x fastest in odd kernels, z in even ones."""
+    cube = kernel.view(size, size, size, *kernel.shape[1:])
+    return cube.permute(4, 3, 2, 1, 0) if size % 2 else cube.permute(4, 3, 0, 1, 2)
+
+
+def at(dense: torch.Tensor, coords: torch.Tensor) -> torch.Tensor:
+    b, x, y, z = coords.T
+    return dense[b, :, x, y, z]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [1, 3, 5])
+def test_stride_1_is_a_dense_convolution_at_the_voxels(dtype, size):
+    coords, mask = occupied(7, 0.3, dtype=dtype)
+    x = torch.randn(len(coords), 3, dtype=dtype)
+    convolution = SparseConv3d(3, 4, size).to(dtype)
+    y = convolution(Sparse(x, Grid(coords)))
+    weight = dense_kernel(convolution.kernel.view(size**3, 3, 4), size)
+    expected = F.conv3d(to_dense(x, coords, mask.shape), weight, padding=size // 2)
+    torch.testing.assert_close(y.features, at(expected, coords), rtol=0, atol=TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_stride_and_its_undoing_are_dense_ones(dtype):
+    coords, mask = occupied(6, 0.1, dtype=dtype)
+    x = torch.randn(len(coords), 3, dtype=dtype)
+    down = SparseConv3d(3, 4, 2, 2).to(dtype)
+    up = SparseConv3d(4, 5, 2, 2, transposed=True).to(dtype)
+    below = down(Sparse(x, Grid(coords)))
+    dense = F.conv3d(to_dense(x, coords, mask.shape), dense_kernel(down.kernel, 2), stride=2)
+    torch.testing.assert_close(below.features, at(dense, below.grid.coords), rtol=0, atol=TOLERANCE[dtype])
+    assert len(below.grid) == F.max_pool3d(mask, 2).sum()  # each larger voxel with one in it, and no other
+
+    above = up(below)
+    # conv_transpose3d has its weights as (C_in, C_out, ...). Every voxel of the larger ones would be filled; the
+    # stored ones alone are.
+    expected = F.conv_transpose3d(dense, dense_kernel(up.kernel, 2).transpose(0, 1), stride=2)
+    assert above.grid.coords is coords
+    torch.testing.assert_close(above.features, at(expected, coords), rtol=0, atol=TOLERANCE[dtype])
+
+
+def test_the_order_of_the_weights_is_torchsparse_s():
+    # Its get_kernel_offsets by hand: odd sizes are centred and count x fastest, even ones start at 0 and count z.
+    assert offsets(3)[:4] == [(-1, -1, -1), (0, -1, -1), (1, -1, -1), (-1, 0, -1)]
+    assert offsets(3)[13] == (0, 0, 0)
+    assert offsets(2) == [(0, 0, 0), (0, 0, 1), (0, 1, 0), (0, 1, 1), (1, 0, 0), (1, 0, 1), (1, 1, 0), (1, 1, 1)]
+    assert offsets(1) == [(0, 0, 0)]
+    # A voxel at the origin, one behind it in x and one above it: weight k is k, so that a sum says which were used.
+    coords = torch.tensor([[0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    x = Sparse(torch.tensor([[1.0], [10.0], [100.0]]), Grid(coords))
+    odd, down = SparseConv3d(1, 1, 3), SparseConv3d(1, 1, 2, 2)
+    odd.kernel.data = torch.arange(27.0).view(27, 1, 1)
+    down.kernel.data = torch.arange(8.0).view(8, 1, 1)
+    # +x is offset 14 and +z offset 22; the origin is 12 from the first and 4 from the second; and so on.
+    assert odd(x).features.flatten().tolist() == [
+        13 * 1 + 14 * 10 + 22 * 100,
+        13 * 10 + 12 * 1 + 21 * 100,
+        13 * 100 + 4 * 1 + 5 * 10,
+    ]
+    assert down(x).features.flatten().tolist() == [0 * 1 + 4 * 10 + 1 * 100]
+
+
+def test_coordinates_may_be_negative_and_scans_do_not_touch():
+    coords = torch.tensor([[0, -3, 5, 0], [1, -2, 5, 0], [1, -3, 5, 1]])
+    grid = Grid(coords)
+    assert grid.find(coords).tolist() == [0, 1, 2]
+    assert grid.find(coords + torch.tensor([0, 1, 0, 0])).tolist() == [-1, -1, -1]  # (0, -2, 5, 0) is the other scan's
+    assert grid.find(torch.tensor([1, -3, 5, 10**6])) == -1
+    assert sorted(grid.coarser().coords.tolist()) == [[0, -2, 2, 0], [1, -2, 2, 0], [1, -1, 2, 0]]
+
+
+def test_what_is_no_grid_is_refused():
+    with pytest.raises(ValueError, match="distinct"):
+        Grid(torch.zeros(2, 4, dtype=torch.int64))
+    with pytest.raises(ValueError, match="at least one voxel"):
+        Grid(torch.zeros(0, 4, dtype=torch.int64))
+    with pytest.raises(ValueError, match="too far apart"):
+        Grid(torch.tensor([[0, 0, 0, 0], [0, 2**30, 2**30, 2**30]]))
+    with pytest.raises(ValueError, match="no stride was taken"):
+        SparseConv3d(1, 1, 2, 2, transposed=True)(Sparse(torch.zeros(1, 1), Grid(torch.zeros(1, 4, dtype=torch.int64))))
+    with pytest.raises(ValueError, match="found 2, 3"):
+        SparseConv3d(1, 1, 3, 2)
+
+
+class Dense:
+    """The sparse U-Nets once more, on dense cubes: everything outside the voxels is put to 0 after each layer."""
+
+    def __init__(self, network: MinkowskiNet, coords: torch.Tensor, mask: torch.Tensor) -> None:
+        self.network, self.coords = network, coords
+        self.masks = [F.max_pool3d(mask, 2**level) if level else mask for level in range(5)]
+
+    def steps(self, modules: nn.Sequential, x: torch.Tensor, level: int) -> torch.Tensor:
+        for module in modules:
+            if isinstance(module, SparseConv3d) and module.size == 1:
+                x = torch.einsum("bcxyz,co->boxyz", x, module.kernel)
+            elif isinstance(module, SparseConv3d):
+                weight = dense_kernel(module.kernel, module.size)
+                if module.transposed:
+                    x = F.conv_transpose3d(x, weight.transpose(0, 1), stride=2)
+                else:
+                    x = F.conv3d(x, weight, stride=module.stride, padding=1 if module.size == 3 else 0)
+            elif isinstance(module, nn.BatchNorm1d):
+                parameters = (module.running_mean, module.running_var, module.weight, module.bias)
+                x = F.batch_norm(x, *parameters, eps=module.eps)
+            else:
+                x = x.relu()
+            x = x * self.masks[level]
+        return x
+
+    def residuals(self, blocks: list[nn.Module], x: torch.Tensor, level: int) -> torch.Tensor:
+        for block in blocks:
+            x = (self.steps(block.net, x, level) + self.steps(block.downsample, x, level)).relu()
+        return x
+
+    def down(self, x: torch.Tensor) -> list[torch.Tensor]:
+        maps = [self.steps(self.network.stem, x, 0)]
+        for level in range(1, 5):
+            change, *blocks = self.network.get_submodule(f"stage{level}")
+            maps.append(self.residuals(blocks, self.steps(change.net, maps[-1], level), level))
+        return maps
+
+    def up(self, number: int, x: torch.Tensor, kept: torch.Tensor) -> torch.Tensor:
+        change, blocks = self.network.get_submodule(f"up{number}")
+        x = self.steps(change.net, x, 4 - number)
+        return self.residuals(list(blocks), torch.cat([x, kept], 1), 4 - number)
+
+    def to_points(self, x: torch.Tensor, level: int) -> torch.Tensor:
+        """Point by point: the eight voxels from its own on, by the share of the way to each, as far as they exist."""
+        scale, mask = 2**level, self.masks[level]
+        rows = []
+        for b, *place in self.coords.tolist():
+            total, weights = torch.zeros(x.shape[1], dtype=x.dtype), 0.0
+            for ahead in offsets(2):
+                corner = [p // scale + a for p, a in zip(place, ahead, strict=True)]
+                weight = 1.0
+                for p, a in zip(place, ahead, strict=True):
+                    share = (p % scale) / scale
+                    weight *= share if a else 1 - share
+                if max(corner) < mask.shape[2] and mask[b, 0, corner[0], corner[1], corner[2]]:
+                    total += weight * x[b, :, corner[0], corner[1], corner[2]]
+                    weights += weight
+            rows.append(total / weights)
+        return torch.stack(rows)
+
+    def to_voxels(self, points: torch.Tensor, level: int) -> torch.Tensor:
+        held = to_dense(points, self.coords, self.masks[0].shape)
+        size = 2**level
+        return F.avg_pool3d(held, size) / F.avg_pool3d(self.masks[0], size).clamp(min=1e-9)
+
+
+def randomised(network: MinkowskiNet) -> MinkowskiNet:
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm1d):
+            module.running_mean.normal_(0, 0.1)
+            module.running_var.uniform_(0.5, 1.5)
+    return network.double().eval().requires_grad_(False)
+
+
+def test_minkowskinet_is_its_dense_self():
+    coords, mask = occupied(16, 0.02)
+    x = torch.randn(len(coords), 4, dtype=torch.float64)
+    network = randomised(MinkowskiNet((3, 3, 4, 5, 6, 6, 5, 4, 3)))
+    dense = Dense(network, coords, mask)
+    maps = dense.down(to_dense(x, coords, mask.shape))
+    y = maps[4]
+    for number in range(1, 5):
+        y = dense.up(number, y, maps[4 - number])
+    torch.testing.assert_close(network(coords, x), at(y, coords), rtol=0, atol=1e-11)
+
+
+def test_spvcnn_is_its_dense_self():
+    coords, mask = occupied(32, 0.003, scans=1)
+    x = torch.randn(len(coords), 4, dtype=torch.float64)
+    network = randomised(SPVCNN((3, 3, 4, 5, 6, 6, 5, 4, 3)))
+    dense = Dense(network, coords, mask)
+    maps = dense.down(to_dense(x, coords, mask.shape))
+    points = dense.to_points(maps[4], 4) + network.point_transforms[0](at(maps[0], coords))
+    y = dense.up(1, dense.to_voxels(points, 4), maps[3])
+    y = dense.up(2, y, maps[2])
+    points = dense.to_points(y, 2) + network.point_transforms[1](points)
+    y = dense.up(3, dense.to_voxels(points, 2), maps[1])
+    y = dense.up(4, y, maps[0])
+    expected = at(y, coords) + network.point_transforms[2](points)
+    # 1e-8 is added to the sum of the eight weights, as torchsparse does, and weights are float32 there.
+    torch.testing.assert_close(network(coords, x), expected, rtol=0, atol=1e-6)
+
+
+def test_interpolation_is_exact_for_what_is_linear():
+    cube = torch.cartesian_prod(torch.zeros(1, dtype=torch.int64), *[torch.arange(5)] * 3)
+    points = torch.cartesian_prod(torch.zeros(1, dtype=torch.int64), *[torch.arange(0, 16, 3)] * 3)
+    linear = torch.tensor([[1.0, -2.0], [0.5, 3.0], [2.0, 0.25]])
+    corners = Corners(points, Grid(cube), 4)
+    expected = points[:, 1:].float() / 4 @ linear + 7
+    torch.testing.assert_close(corners.to_points(cube[:, 1:].float() @ linear + 7), expected, rtol=1e-6, atol=1e-5)
+
+
+def test_parameters_have_torchsparse_s_names_and_shapes():
+    # As 2DPASS's MinkowskiNet and SPVCNN name them, with torchsparse's kernels.
+    shapes = {name: tuple(value.shape) for name, value in SPVCNN().state_dict().items()}
+    for name, shape in {
+        "stem.0.kernel": (27, 4, 16),
+        "stem.3.kernel": (27, 16, 16),
+        "stage1.0.net.0.kernel": (8, 16, 16),
+        "stage2.1.net.0.kernel": (27, 16, 32),
+        "stage2.1.downsample.0.kernel": (16, 32),
+        "stage4.2.net.4.running_var": (128,),
+        "up1.0.net.0.kernel": (8, 128, 128),
+        "up1.1.0.net.0.kernel": (27, 128 + 64, 128),
+        "up4.1.0.downsample.0.kernel": (48 + 16, 48),
+        "up4.1.1.net.3.kernel": (27, 48, 48),
+        "point_transforms.2.0.weight": (48, 64),
+        "point_transforms.0.1.running_mean": (128,),
+        "classifier.0.weight": (20, 48),
+    }.items():
+        assert shapes[name] == shape
+    assert "stage1.1.downsample.0.kernel" not in shapes  # 16 to 16: nothing to change
+    own = {name for name in shapes if not name.startswith("point_transforms.")}
+    assert own == set(MinkowskiNet().state_dict())

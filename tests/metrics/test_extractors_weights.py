@@ -1,0 +1,243 @@
+import gzip
+import hashlib
+import io
+import os
+import pickle
+import tarfile
+import zipfile
+
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file
+
+from r2flow.errors import InputError
+from r2flow.metrics.extractors import EXTRACTORS, extractor_class, load_extractor
+from r2flow.metrics.extractors.pointnet import PointNet
+from r2flow.metrics.extractors.weights import SOURCES, Source, _is, add, kept, read_published, weights_hash
+
+PARTS = {
+    "backbone": {"conv1.weight": torch.ones(2)},
+    "segmentation_decoder": {"dec5.upconv.bias": torch.zeros(3)},
+    "segmentation_head": {"1.bias": torch.ones(1)},
+}
+CONFIG = {"dataset": {"sensor": {"img_means": [12.12]}}}
+
+
+class Runs:
+    """What a pickle runs when it is loaded."""
+
+    def __init__(self, mark) -> None:
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.mark),)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("R2FLOW_WEIGHTS", str(tmp_path / "kept"))
+    return tmp_path / "kept"
+
+
+@pytest.fixture
+def pointnet(tmp_path):
+    network = PointNet.random(3)
+    path = tmp_path / "cls_model_39.pth"
+    torch.save(network.state_dict(), path)
+    return network, path
+
+
+def saved(content) -> bytes:
+    stream = io.BytesIO()
+    torch.save(content, stream)
+    return stream.getvalue()
+
+
+def pack(folder, kind):
+    """The release's files as a folder, a .tar.gz or a .zip, one folder deep as they are published."""
+    files = {**{name: saved(content) for name, content in PARTS.items()}, "arch_cfg.yaml": yaml.dump(CONFIG).encode()}
+    if kind == "folder":
+        for name, data in files.items():
+            (folder / name).write_bytes(data)
+        return folder
+    path = folder / f"darknet53-1024.{kind}"
+    if kind == "zip":
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, data in files.items():
+                archive.writestr(f"darknet53-1024/{name}", data)
+        return path
+    with tarfile.open(path, "w:gz") as tar:
+        for name, data in files.items():
+            info = tarfile.TarInfo(f"darknet53-1024/{name}")
+            info.size = len(data)
+            tar.addfile(info, io.BytesIO(data))
+        link = tarfile.TarInfo("darknet53-1024/model.ckpt")
+        link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
+        tar.addfile(link)
+    return path
+
+
+def test_every_network_says_where_its_weights_are_got(folder):
+    assert set(SOURCES) == {"rangenet53", "rangenet21", "pointnet", "minkowskinet", "spvcnn"} <= set(EXTRACTORS)
+    for name, source in SOURCES.items():
+        assert source.page.startswith("http")
+        assert kept(name) is None
+        assert extractor_class(name).name == name
+        with pytest.raises(InputError, match=f"no weights of {name} in {folder}.*r2flow weights --add {name} FILE"):
+            load_extractor(name)
+    with pytest.raises(InputError, match="no extractor named 'pointnett'"):
+        load_extractor("pointnett")
+
+
+def test_weights_that_are_added_are_those_that_are_loaded(pointnet, folder):
+    network, path = pointnet
+    found = add("pointnet", path)
+    assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert found.published is False  # the published file's git id is known, and these weights are random
+    assert kept("pointnet") == found
+    loaded = load_extractor("pointnet")
+    assert loaded.weights == found.weights == weights_hash(network)
+    x = torch.randn(1, 3, 50)
+    assert torch.equal(loaded(x), network(x))
+    assert not loaded.training
+    # The hash is the weights', not the file's.
+    torch.save({"state_dict": network.state_dict(), "epoch": 39}, path)
+    again = add("pointnet", path)
+    assert again.weights == found.weights
+    assert again.sha256 != found.sha256
+    assert add("pointnet", folder / "pointnet.safetensors").weights == found.weights
+    assert PointNet.random(4).weights == "random"
+    assert weights_hash(PointNet.random(4)) != found.weights
+
+
+def test_kept_weights_that_were_changed_are_not_used(pointnet, folder):
+    network, path = pointnet
+    add("pointnet", path)
+    kept_path = folder / "pointnet.safetensors"
+    data = bytearray(kept_path.read_bytes())
+    data[-100] ^= 1
+    kept_path.write_bytes(data)
+    with pytest.raises(InputError, match="is not what was added"):
+        load_extractor("pointnet")
+    kept_path.write_bytes(data[:-100])
+    with pytest.raises(InputError, match="damaged"):
+        load_extractor("pointnet")
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_a_file_that_would_run_code_is_refused_and_runs_none(tmp_path, folder, legacy):
+    mark = tmp_path / "ran"
+    path = tmp_path / "weights.pth"
+    content = {"state_dict": PARTS["backbone"], "hyper_parameters": Runs(mark)}
+    torch.save(content, path, _use_new_zipfile_serialization=not legacy)
+    with pytest.raises(InputError, match=r"refused: it holds objects that would run code when loaded \(\w+\.mkdir\)"):
+        add("pointnet", path)
+    path.write_bytes(pickle.dumps(content, protocol=2))
+    with pytest.raises(InputError):
+        add("pointnet", path)
+    assert not mark.exists()
+    assert not folder.exists()
+
+
+def test_weights_of_another_network_are_refused_in_a_line(tmp_path, pointnet, folder):
+    network, path = pointnet
+    with pytest.raises(InputError, match=rf"{path}: these are no weights of rangenet21: .* are missing .* and .*\.$"):
+        add("rangenet21", path)
+    tensors = network.state_dict()
+    torch.save({**tensors, "fc3.weight": torch.zeros(40, 256), "fc3.bias": torch.zeros(40)}, path)
+    with pytest.raises(InputError, match=r"'fc3.weight' has the shape \(40, 256\), not \(16, 256\)"):
+        add("pointnet", path)
+    torch.save({**tensors, "fc3.bias": torch.full((16,), torch.nan)}, path)
+    with pytest.raises(InputError, match="'fc3.bias' has values that are not finite"):
+        add("pointnet", path)
+    odd = ({0: torch.ones(1)}, {"a": torch.eye(2).to_sparse()}, {"a": torch.ones(1) * 1j})
+    odd += ({"a": torch.ones(1, device="meta")},)
+    for content in (b"", b"\x80\x02}q\x00.", b"nonsense" * 100, saved([1]), saved({"a": 1}), *map(saved, odd)):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match="not a file of weights|no table of tensors"):
+            add("pointnet", path)
+    with pytest.raises(InputError, match="does not exist"):
+        add("pointnet", tmp_path / "none")
+    with pytest.raises(InputError, match="no network with published weights named 'embeded'"):
+        add("embeded", path)
+    assert not folder.exists()
+
+
+def test_counts_that_old_files_lack_are_not_asked_for(tmp_path, pointnet):
+    network, path = pointnet
+    tensors = {name: value for name, value in network.state_dict().items() if "num_batches" not in name}
+    torch.save(tensors, path)
+    assert add("pointnet", path).weights == weights_hash(network)
+
+
+@pytest.mark.parametrize("kind", ["folder", "tar.gz", "zip"])
+def test_the_release_of_several_files_is_read_as_one(tmp_path, kind):
+    tensors, config = read_published(pack(tmp_path, kind))
+    expected = {name: value for part in PARTS.values() for name, value in part.items()}
+    assert {name: value.tolist() for name, value in tensors.items()} == {n: v.tolist() for n, v in expected.items()}
+    assert config == CONFIG
+
+
+def test_archives_of_nothing_of_several_and_of_halves_are_said(tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="holds none of backbone"):
+        read_published(tmp_path / "empty")
+    with zipfile.ZipFile(tmp_path / "two.zip", "w") as archive:
+        archive.writestr("kitti/spvcnn/model.ckpt", saved(PARTS["backbone"]))
+        archive.writestr("nuscenes/spvcnn/model.ckpt", saved(PARTS["backbone"]))
+    with pytest.raises(InputError, match=r"several networks \('model.ckpt' twice\)"):
+        read_published(tmp_path / "two.zip")
+    path = pack(tmp_path, "tar.gz")
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(InputError, match="damaged"):
+        read_published(path)
+
+
+def test_a_byte_that_came_otherwise_is_damage(tmp_path, pointnet):
+    _, path = pointnet
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1  # in the midst of a tensor, where the file still reads as one
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="damaged"):
+        read_published(path)
+    # Stored uncompressed in a gzip file: the check sum alone says that a tensor is another.
+    whole, archive = gzip.decompress(pack(tmp_path, "tar.gz").read_bytes()), tmp_path / "stored.tar.gz"
+    archive.write_bytes(gzip.compress(whole, 0))
+    assert set(read_published(archive)[0]) == {name for part in PARTS.values() for name in part}
+    at = gzip.compress(whole, 0).index(torch.ones(2).numpy().tobytes())
+    packed = bytearray(archive.read_bytes())
+    packed[at + 1] ^= 1
+    archive.write_bytes(packed)
+    with pytest.raises(InputError, match="damaged"):
+        read_published(archive)
+
+
+def test_settings_of_an_archive_are_a_table_of_whatever(tmp_path, pointnet):
+    network, _ = pointnet
+    (tmp_path / "net").mkdir()
+    torch.save(network.state_dict(), tmp_path / "net" / "model.ckpt")
+    (tmp_path / "net" / "arch_cfg.yaml").write_text("date: 2020-01-01\n")
+    assert add("pointnet", tmp_path / "net").weights == weights_hash(network)
+    (tmp_path / "net" / "arch_cfg.yaml").write_text("[1, 2]\n")
+    with pytest.raises(InputError, match="no table of settings"):
+        add("pointnet", tmp_path / "net")
+
+
+def test_a_published_file_is_known_by_its_hash(tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(b"hello\n")
+    # Of "hello\n", as sha256sum and git hash-object print them.
+    sha256 = "5891b5b522d5df086d0ff0b110fbd9d21bb4fc7163af34d08286a2e846f6be03"
+    blob = "ce013625030ba8dba906f756967f9e9ca394464a"
+    assert _is(Source("", "", "", sha256=sha256), path) is True
+    assert _is(Source("", "", "", git_blob=blob), path) is True
+    assert _is(Source("", "", "", git_blob=blob[::-1]), path) is False
+    assert _is(Source("", "", ""), path) is None
+
+
+def test_what_is_kept_is_safetensors(pointnet, folder):
+    network, path = pointnet
+    add("pointnet", path)
+    assert set(load_file(folder / "pointnet.safetensors")) == set(network.state_dict())
+    assert [file.name for file in folder.iterdir()] == ["pointnet.safetensors"]

@@ -1,0 +1,120 @@
+"""Frechet distances with known answers."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.metrics.frechet import FrechetDistance, frechet_distance
+from r2flow.metrics.moments import add_moments, merge_moments, moments, no_moments
+
+
+def positive(d, seed, rank=None):
+    """A random symmetric matrix without negative eigenvalues."""
+    a = torch.randn(d, rank or d, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return a @ a.T / d
+
+
+def test_commuting_covariances_differ_by_the_roots_of_their_eigenvalues():
+    q = torch.linalg.qr(torch.randn(30, 30, dtype=torch.float64)).Q
+    a, b = torch.rand(2, 30, dtype=torch.float64) * 5
+    mean = torch.arange(30, dtype=torch.float64)
+    value = frechet_distance(mean, q @ a.diag() @ q.T, mean + 2, q @ b.diag() @ q.T)
+    assert value == pytest.approx(float(30 * 4 + (a.sqrt() - b.sqrt()).square().sum()), abs=1e-9)
+
+
+def test_two_by_two_has_a_closed_form():
+    # tr M^(1/2) = sqrt(tr M + 2 sqrt(det M)) for a 2 x 2 matrix M without negative eigenvalues.
+    s_1, s_2, zero = positive(2, 1), positive(2, 2), torch.zeros(2, dtype=torch.float64)
+    m = s_1 @ s_2
+    expected = s_1.trace() + s_2.trace() - 2 * (m.trace() + 2 * m.det().sqrt()).sqrt()
+    assert frechet_distance(zero, s_1, zero, s_2) == pytest.approx(float(expected), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("d", "rank_1", "rank_t", "tolerance"),
+    # Full rank, but eigenvalues down to 1e-13 of the largest, whose roots are known to that much less.
+    [(20, 20, 20, 1e-6), (60, 60, 60, 1e-6), (40, 7, 40, 1e-11), (40, 40, 5, 1e-11), (40, 9, 12, 1e-11)],
+)
+def test_non_commuting_and_singular_covariances_cost_what_the_optimal_map_costs(d, rank_1, rank_t, tolerance):
+    # A positive T carries N(0, S_1) to N(0, T S_1 T) optimally (Brenier): at the cost tr (I - T) S_1 (I - T).
+    s_1, t = positive(d, 1, rank_1), positive(d, 2, rank_t)
+    move = torch.eye(d, dtype=torch.float64) - t
+    expected = float((move @ s_1 @ move).trace())
+    zero = torch.zeros(d, dtype=torch.float64)
+    assert frechet_distance(zero, s_1, zero, t @ s_1 @ t) == pytest.approx(expected, abs=tolerance)
+    assert frechet_distance(zero, t @ s_1 @ t, zero, s_1) == pytest.approx(expected, abs=tolerance)
+
+
+def test_equal_and_degenerate_gaussians():
+    zero, s = torch.zeros(50, dtype=torch.float64), positive(50, 3, 20)
+    assert frechet_distance(zero, s, zero, s) == pytest.approx(0, abs=1e-10)
+    assert frechet_distance(zero, 0 * s, zero, s) == pytest.approx(float(s.trace()), rel=1e-12)
+    assert frechet_distance(zero, 0 * s, zero + 3, 0 * s) == 50 * 9
+
+
+def test_float32_covariances_are_computed_with_in_float64():
+    a, b = 0.5 + torch.rand(2, 30)
+    zero = torch.zeros(30)
+    expected = float((a.double().sqrt() - b.double().sqrt()).square().sum())
+    assert frechet_distance(zero, a.diag(), zero, b.diag()) == pytest.approx(expected, abs=1e-12)
+
+
+def test_reference_figures(shared):
+    cases = torch.load(shared / "oracle" / "distribution_metrics.pt", weights_only=True)
+    for case in cases.values():
+        sides = []
+        for rows in (case["f1"], case["f2"]):
+            matrix = no_moments(rows.shape[1])
+            for batch in rows.split(17):
+                add_moments(matrix, batch)
+            sides += [moments(matrix).mean, moments(matrix).covariance]
+        assert frechet_distance(*sides) == pytest.approx(case["frechet"], rel=1e-9)
+
+
+def test_float32_features_far_from_zero_lose_nothing():
+    far = (1e4 + 1e-2 * torch.randn(999, 12, dtype=torch.float64)).float()
+    x = far.double().numpy()
+    expected = np.cov(x, rowvar=False)
+    parts = torch.stack([no_moments(12) for _ in range(3)])
+    for k, batch in enumerate(far.split(10)):
+        add_moments(parts[k % 3], batch)
+    for found in (moments(merge_moments(parts)), moments(merge_moments(parts.flip(0)))):
+        assert found.n == 999
+        np.testing.assert_allclose(found.mean, x.mean(0), rtol=1e-14)
+        np.testing.assert_allclose(found.covariance, expected, rtol=0, atol=1e-10 * expected.max())
+
+
+def test_empty_parts_change_nothing():
+    rows = torch.randn(9, 4)
+    one = no_moments(4)
+    add_moments(one, rows)
+    add_moments(one, rows[:0])
+    assert torch.equal(merge_moments(torch.stack([no_moments(4), one, no_moments(4)])), one)
+
+
+def test_fewer_scans_than_dimensions_is_exact_and_said(scans_of, summary):
+    metric = FrechetDistance(summary)
+    real, generated = scans_of(4, 1), scans_of(5, 2)
+    metric.update(real, real=True)
+    metric.update(generated, real=False)
+    # tr (S_1 S_2)^(1/2) is the nuclear norm of the centred features' product: no covariance is made.
+    x, y = (summary.features(s).double().numpy() for s in (real, generated))
+    a, b = (z - z.mean(0) for z in (x, y))
+    common = np.linalg.norm(a @ b.T, "nuc") / math.sqrt(3 * 4)
+    expected = ((x.mean(0) - y.mean(0)) ** 2).sum() + (a**2).sum() / 3 + (b**2).sum() / 4 - 2 * common
+    assert metric.compute() == {"frechet_summary": pytest.approx(expected, rel=1e-9)}
+    assert [("4 real" in said, "rank of at most 3" in said) for said in metric.remarks()][:1] == [(True, True)]
+
+
+@pytest.mark.parametrize(
+    ("network", "name"),
+    [("rangenet53", "frd"), ("rangenet21", "frid"), ("pointnet", "fpd"), ("spvcnn", "fpvd"), ("minkowskinet", "fsvd"),
+     ("embedded", "frechet_embedded")],
+)  # fmt: skip
+def test_the_network_gives_the_name_and_random_weights_never_the_fields(network, name, summary):
+    metric = FrechetDistance(network)
+    assert metric.protocol.metric == name
+    metric.extractor.weights = "random"
+    assert metric.protocol.metric == f"frechet_{network}_random"

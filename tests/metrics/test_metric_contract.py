@@ -1,0 +1,217 @@
+"""What holds for every metric of the table, whatever it measures."""
+
+import copy
+import json
+import math
+import pickle
+
+import pytest
+import torch
+from torchmetrics import MetricCollection
+
+from r2flow.errors import InputError
+from r2flow.metrics import METRICS
+from r2flow.metrics.base import SIDES
+from r2flow.metrics.extractors.base import Extractor
+from r2flow.metrics.features import extract
+from r2flow.metrics.scans import Scans
+
+REAL, GENERATED = 12, 9
+# One network stands for all: the others' metrics are the same classes.
+DISTINCT = ["frd", "jsd", "mmd", "jsd_lidm", "mmd_lidm", "beams", "drop_rate", "manifold_embedded", "kid_embedded"]
+pytestmark = pytest.mark.usefixtures("coarse")
+
+
+@pytest.fixture(params=DISTINCT)
+def build(request, summary):
+    """Builds the metric of a name, on averages instead of networks."""
+    return METRICS[request.param]
+
+
+@pytest.fixture
+def sets(scans_of):
+    return {"real": scans_of(REAL, 1), "generated": scans_of(GENERATED, 2, scale=30)}
+
+
+def part(scans, numbers):
+    return Scans(scans.images[numbers], scans.sensor)
+
+
+def give(metric, sets, size=4, order=1):
+    """Both sets in batches of `size`, forwards or backwards."""
+    for side, scans in sets.items():
+        for first in range(0, len(scans), size)[::order]:
+            metric.update(part(scans, slice(first, first + size)), side == "real", first)
+    return metric
+
+
+def shared_by(metrics):
+    """The states of several processes, put together as torchmetrics does it, in the first one."""
+    for name, reduce in metrics[0]._reductions.items():
+        setattr(metrics[0], name, reduce(torch.stack([getattr(one, name) for one in metrics])))
+    return metrics[0]
+
+
+def test_every_name_is_its_protocols_and_no_two_figures_share_one(summary, sets):
+    figures = []
+    for name, build in METRICS.items():
+        metric = give(build(), sets)
+        assert metric.protocol.metric == name
+        json.dumps(metric.protocol.asdict())
+        values = metric.compute()
+        assert values
+        assert all(isinstance(value, float) and math.isfinite(value) for value in values.values())
+        figures += values
+    assert {type(METRICS[name]()) for name in METRICS} == {type(METRICS[name]()) for name in DISTINCT}
+    assert len(set(figures)) == len(figures)
+
+
+@pytest.mark.parametrize("processes", [2, 3])
+def test_figures_know_nothing_of_processes_nor_of_the_order_of_scans(build, sets, processes, tmp_path):
+    expected = give(build(), sets).compute()
+    backwards = give(build(), sets, size=5, order=-1).compute()
+    ranks = [build(folder=tmp_path) for _ in range(processes)]
+    for side, scans in sets.items():
+        for k, first in enumerate(range(0, len(scans), 2)):
+            ranks[k % processes].update(part(scans, slice(first, first + 2)), side == "real", first)
+    shuffled = {s: part(scans, torch.randperm(len(scans))) for s, scans in sets.items()}
+    for values in (backwards, shared_by(ranks).compute(), give(build(), shuffled).compute()):
+        assert values == pytest.approx(expected, rel=1e-10, abs=1e-13)
+
+
+def test_an_empty_scan_leaves_the_figures_of_the_others_and_a_word(build, sets):
+    expected = give(build(), sets).compute()
+    with_empty = dict(sets)
+    more = torch.cat([sets["generated"].images, torch.zeros(2, 2, 8, 32)])
+    with_empty["generated"] = Scans(more, sets["real"].sensor)
+    metric = give(build(), with_empty)
+    values = metric.compute()
+    if metric.protocol.metric == "drop_rate":  # to drop every ray is what it measures
+        assert values["drop_rate"] > expected["drop_rate"] + 0.1
+    else:
+        assert values == pytest.approx(expected, rel=1e-9)
+        assert any("2 of 11 generated scans are left out: empty" in said for said in metric.remarks())
+
+
+@pytest.mark.parametrize("case", ["all empty", "one alone", "none"])
+def test_a_figure_that_does_not_exist_comes_with_a_word(build, sets, case):
+    few = {"all empty": 0 * sets["generated"].images, "one alone": sets["generated"].images[:1]}
+    chosen = {"real": sets["real"]}
+    if case != "none":
+        chosen["generated"] = Scans(few[case], sets["real"].sensor)
+    metric = give(build(), chosen)
+    missing = [math.isnan(value) for value in metric.compute().values()]
+    assert metric.remarks() or not any(missing)
+    if case == "none":
+        assert all(missing)
+        assert "there are no generated scans." in metric.remarks()
+    if case == "all empty" and metric.protocol.metric != "drop_rate":
+        assert any("none of the 9 generated scans" in said for said in metric.remarks())
+
+
+def test_identical_sets_are_no_distance_apart(build, sets):
+    values = give(build(), dict.fromkeys(SIDES, sets["real"])).compute()
+    for name, value in values.items():
+        if name.startswith(("precision", "recall", "coverage")):
+            assert value == 1
+        elif name.startswith("density"):
+            assert value == pytest.approx(6 / 5)
+        elif not name.startswith("kid"):  # unbiased: 0 on average
+            assert value == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_the_real_set_is_taken_from_its_statistics(build, sets, keep):
+    whole = give(build(keep=keep), sets)
+    kept = build(keep=keep)
+    give(kept, {"real": sets["real"]})
+    state = {name: value.clone() for name, value in kept.real_state().items()}
+    again = build(keep=keep)
+    for _ in range(2):
+        again.reset()
+        again.load_real_state(state)
+        give(again, {"generated": sets["generated"]})
+        assert again.compute() == pytest.approx(whole.compute(), rel=1e-12)
+    assert again.remarks() == whole.remarks()
+    with pytest.raises(InputError, match="measure the real set again"):
+        build(keep=keep).load_real_state({"real_scans": state["real_scans"]})
+
+
+def test_reset_copies_and_pickles(build, sets):
+    metric = give(build(), sets)
+    expected = metric.compute()
+    for other in (copy.deepcopy(metric), metric.clone(), pickle.loads(pickle.dumps(metric))):
+        assert other.compute() == expected
+        other.reset()
+        give(other, dict.fromkeys(SIDES, sets["real"]))
+    assert metric.compute() == expected  # the copies' rows are their own
+    metric.reset()
+    assert give(metric, sets).compute() == expected
+
+
+def test_rows_given_under_one_number_are_not_passed_over(build, sets):
+    metric = build(keep=True)
+    for side, scans in sets.items():
+        for _ in range(2):
+            metric.update(scans, side == "real", 0)
+    if metric.keeps:
+        with pytest.raises(InputError, match="24 real scans were given but 12 are kept"):
+            metric.compute()
+    else:
+        metric.compute()
+
+
+def test_in_a_collection_every_metric_has_its_own_say(summary, sets):
+    names = [*DISTINCT, "frid", "manifold_rangenet53"]
+    collection = MetricCollection({name: METRICS[name]() for name in names})
+    assert collection(sets["real"], real=True) == {}  # a batch has no distance of its own
+    collection.reset()
+    alone = {}
+    for one in (collection, *(METRICS[name]() for name in names)):
+        for side, scans in sets.items():
+            for first in (0, 4, 8):
+                one.update(part(scans, slice(first, first + 4)), real=side == "real", first=first)
+        if one is not collection:
+            alone.update(one.compute())
+    assert {key.split("/")[-1]: value for key, value in collection.compute().items()} == pytest.approx(alone, rel=1e-10)
+
+
+def test_a_network_runs_once_for_all_metrics_of_it(summary, sets, monkeypatch):
+    ran = []
+    features = type(summary).features
+    monkeypatch.setattr(type(summary), "features", lambda self, scans: ran.append(self) or features(self, scans))
+    metrics = [METRICS[name]() for name in ("frechet_embedded", "manifold_embedded", "kid_embedded", "frid")]
+    for metric in metrics:
+        metric.update(sets["real"], real=True)
+    assert [network.name for network in ran] == ["embedded", "rangenet21"]
+
+
+def test_features_of_a_network_that_is_gone_are_not_those_of_the_next(summary, sets):
+    class Numbered(type(summary)):
+        weights = "random"
+
+        def features(self, scans):
+            return torch.full((len(scans), 6), float(self.number))
+
+    for number in range(50):  # each where the one before it lay, which had its id
+        network = Numbered()
+        network.number = number
+        assert extract(network, sets["real"])[0, 0] == number
+        del network
+
+
+def test_a_batch_of_no_scans_changes_nothing(build, sets):
+    metric = build(keep=True)
+    metric.update(part(sets["real"], slice(0, 0)), real=True)
+    assert give(metric, sets).compute() == give(build(keep=True), sets).compute()
+
+
+def test_reflectance_is_asked_for_where_a_network_looks_at_it(build, sets):
+    metric = build()
+    if isinstance(getattr(metric, "extractor", None), Extractor):
+        metric.extractor.needs_reflectance = True
+        with pytest.raises(InputError, match="looks at reflectance"):
+            metric.update(Scans(sets["real"].images[:, :1], sets["real"].sensor), real=True)
+    else:
+        metric.update(Scans(sets["real"].images[:, :1], sets["real"].sensor), real=True)
+        assert not metric.needs_reflectance

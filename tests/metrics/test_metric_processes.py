@@ -1,0 +1,75 @@
+"""One, two and three real processes: the same figures."""
+
+import json
+
+import pytest
+import torch
+import torch.distributed as dist
+import torch.multiprocessing as mp
+
+from r2flow.lidar.sensors import SENSORS
+from r2flow.metrics.bootstrap import bootstrap
+from r2flow.metrics.extractors import random_extractor
+from r2flow.metrics.frechet import FrechetDistance
+from r2flow.metrics.manifold import Manifold
+from r2flow.metrics.scans import Scans
+
+SENSOR = SENSORS["hdl64e"].resized(16, 64)
+PLAIN = ("jsd", "mmd", "jsd_lidm", "mmd_lidm", "beams", "drop_rate")
+
+
+def images(seed, n):
+    g = torch.Generator().manual_seed(seed)
+    r = 4 + 40 * torch.rand(n, 1, *SENSOR.shape, generator=g) * torch.rand(n, 1, 1, 1, generator=g)
+    r = r * (torch.rand(n, 1, *SENSOR.shape, generator=g) < 0.8)
+    r[1] = 0  # an empty scan
+    return torch.cat([r, torch.rand(r.shape, generator=g)], 1)
+
+
+def measure(rank, ranks, folder):
+    """Figures, remarks and intervals of all metrics, of two generated sets one after the other."""
+    from r2flow.metrics import METRICS
+
+    network = random_extractor("embedded")
+    metrics = [METRICS[name](keep=True, folder=folder / name) for name in PLAIN]
+    metrics += [FrechetDistance(network, keep=True, folder=folder), Manifold(network, folder=folder)]
+    found = []
+    for metric in metrics:
+        kept = None
+        for seed in (2, 3):
+            metric.reset()
+            if kept is None:
+                give(metric, images(1, 14), True, rank, ranks)
+                kept = metric.real_state()
+            else:
+                metric.load_real_state(kept)
+            give(metric, images(seed, 11), False, rank, ranks)
+            intervals = {name: [i.low, i.high] for name, i in bootstrap(metric, draws=5).items()}
+            found.append([metric.compute(), metric.remarks(), intervals])
+    return found
+
+
+def give(metric, scans, real, rank, ranks):
+    starts = list(range(0, len(scans), 3))
+    for first in starts[rank::ranks][:: -1 if rank else 1]:
+        metric.update(Scans(scans[first : first + 3], SENSOR), real, first)
+
+
+def work(rank, ranks, folder):
+    torch.set_num_threads(1)
+    dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=ranks)
+    (folder / f"{rank}.json").write_text(json.dumps(measure(rank, ranks, folder / "rows")))
+    dist.destroy_process_group()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_processes_have_the_figures_of_one(ranks, tmp_path):
+    expected = measure(0, 1, tmp_path / "alone")
+    mp.start_processes(work, (ranks, tmp_path), nprocs=ranks, start_method="spawn")
+    for rank in range(ranks):
+        for one, other in zip(json.loads((tmp_path / f"{rank}.json").read_text()), expected, strict=True):
+            assert one[0] == pytest.approx(other[0], rel=1e-10, abs=1e-14)
+            assert one[1] == other[1]
+            for name, interval in other[2].items():
+                assert one[2][name] == pytest.approx(interval, rel=1e-9, abs=1e-14)

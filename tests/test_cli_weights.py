@@ -1,0 +1,61 @@
+"""r2flow weights."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from r2flow.metrics.extractors.pointnet import PointNet
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("R2FLOW_WEIGHTS", str(tmp_path / "kept"))
+    return tmp_path / "kept"
+
+
+def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):  # noqa: F811
+    code, said, _ = r2flow("weights")
+    assert code == 0
+    for words in (
+        "FRD",
+        "FRID",
+        "FPD",
+        "FSVD",
+        "FPVD",
+        "darknet53-1024.tar.gz",
+        "not known",
+        f"Looked for in {folder}",
+    ):
+        assert words in said
+    assert said.count("│ no ") == 5
+
+    path = tmp_path / "mine.pth"
+    torch.save(PointNet.random(0).state_dict(), path)
+    code, said, _ = r2flow("weights", "--add", "pointnet", path)
+    assert code == 0
+    assert said.startswith(f"{folder / 'pointnet.safetensors'}: weights ")
+    assert said.endswith("of mine.pth (not the published file)\n")
+    weights = said.split(": weights ")[1].split()[0]
+    code, said, _ = r2flow("weights")
+    assert code == 0
+    assert f"{weights} of mine.pth" in said
+    assert said.count("│ no ") == 4
+
+
+def test_what_cannot_be_added_is_a_line(r2flow, tmp_path):  # noqa: F811
+    path = tmp_path / "mine.pth"
+    path.write_bytes(b"nothing of the kind")
+    code, _, said = r2flow("weights", "--add", "pointnet", path)
+    assert (code, said) == (2, f"error: {path} is not a file of weights.\n")
+    code, _, said = r2flow("weights", "--add", "pointnets", path)
+    assert code == 2
+    assert "Did you mean 'pointnet'?" in said
+    assert r2flow("weights", "--add", "pointnet")[0] == 2
+
+
+def test_the_table_of_networks_is_light():
+    code = "import sys, r2flow.metrics.extractors; sys.exit(any(m in sys.modules for m in ('torch', 'torchmetrics')))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
