@@ -10,11 +10,13 @@ import typer
 from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     accuracy,
     compare,
+    evaluate,
     extractor,
     flows,
     inversion,
     measure,
     pairs,
+    paper,
     prepare,
     scans,
     sensors,

@@ -141,6 +141,11 @@ def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
     return "\n".join(lines)
 
 
+def picture(name: str) -> str:
+    """The line of Markdown that places a page's figure in its text."""
+    return f"![{name.replace('_', ' ')}]({name}.png)"
+
+
 def shown(value: Any) -> str:
     """A value for a reader: 0.00123, 1.2e-05, 128, '' for nothing."""
     if value is None:
@@ -194,16 +199,16 @@ def _json(contents: Mapping[str, Any]) -> str:
     """Strict JSON with a line for each row."""
     parts = []
     for name, value in contents.items():
-        rows = [
-            json.dumps(_plain(item), allow_nan=False) for item in ([value] if isinstance(value, Mapping) else value)
-        ]
+        rows = [json.dumps(plain(item), allow_nan=False) for item in ([value] if isinstance(value, Mapping) else value)]
         joined = rows[0] if isinstance(value, Mapping) else "[\n" + ",\n".join(rows) + "\n]"
         parts.append(f"{json.dumps(name)}: {joined}")
     return "{\n" + ",\n".join(parts) + "\n}\n"
 
 
 def _markdown(page: Page, origin: Mapping[str, Any]) -> str:
-    pictures = [f"![{name.replace('_', ' ')}]({name}.png)" for name in page.figures]
+    # A figure that the text does not place itself stands above it.
+    placed = "\n".join(page.text)
+    pictures = [picture(name) for name in page.figures if picture(name) not in placed]
     notes = "\n".join(
         f"- {key}: {_one_line(value)}" for key, value in origin.items() if key not in ("report", "command")
     )
@@ -217,12 +222,12 @@ def _one_line(value: Any) -> str:
     return str(value)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """For JSON, which has neither NaN nor infinity."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

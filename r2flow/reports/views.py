@@ -8,7 +8,8 @@ from torch import Tensor
 
 from r2flow.data.sources import read_labelled_scan, read_scan, spread
 from r2flow.errors import InputError
-from r2flow.lidar.scan_files import SCAN_ENDINGS, read_points
+from r2flow.evaluation.reading import range_image, scan_paths
+from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import Sensor
 
 log = logging.getLogger(__name__)
@@ -24,22 +25,16 @@ def scans_of(path: Path, most: int) -> list[Path]:
         raise InputError(f"{path} does not exist.")
     if not path.is_dir():
         return [path]
-    found = sorted(p for p in path.rglob("*") if p.name.lower().endswith(tuple(SCAN_ENDINGS)))
-    # A sample is written in several formats: one of each is enough, and its range image is the exact one.
-    one_of_each = {p.with_suffix(""): p for p in sorted(found, key=lambda p: p.suffix == ".npy")}
-    chosen = sorted(one_of_each.values())
-    if not chosen:
-        raise InputError(f"{path} holds no scan; known endings: {', '.join(sorted(SCAN_ENDINGS))}.")
+    chosen = scan_paths(path)
     return [chosen[index] for index in spread(len(chosen), most)]
 
 
 def project_file(
     path: Path, sensor: Sensor, projection: str, convention: str, reflectance_scale: float = 1.0
 ) -> np.ndarray:
-    """A scan as (2, H, W), range in metres and reflectance, which is 0 throughout where the file has none."""
+    """A scan as (2, H, W), range in metres and reflectance; (1, H, W) where the file has none."""
     with_reflectance = read_points(path).reflectance is not None
-    image = read_scan(path, sensor, projection, convention, with_reflectance, reflectance_scale)  # type: ignore[arg-type]
-    return image if with_reflectance else np.concatenate([image, np.zeros_like(image)])
+    return read_scan(path, sensor, projection, convention, with_reflectance, reflectance_scale)  # type: ignore[arg-type]
 
 
 def open_view(
@@ -68,15 +63,3 @@ def label_view(path: Path, sensor: Sensor, projection: str = "spherical") -> np.
     if labels is None:
         log.warning("%s: no .label file lies beside it", path)
     return labels
-
-
-def range_image(path: Path) -> np.ndarray | None:
-    if path.suffix.lower() != ".npy" or not path.is_file():
-        return None
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError):
-        return None  # read_points explains what is wrong with it
-    if array.ndim == 3 and array.shape[0] in (1, 2) and array.dtype.kind == "f":
-        return np.nan_to_num(array.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
-    return None

@@ -1,0 +1,220 @@
+"""Figures of generated scans against real ones, metric by metric, each with the protocol that it holds under."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from r2flow.errors import InputError
+from r2flow.evaluation.sets import SampledScans, ScanSet, fixed_choice
+from r2flow.evaluation.statistics import Cache, Statistics, key_of
+from r2flow.metrics.base import ScanMetric
+from r2flow.metrics.bootstrap import bootstrap
+from r2flow.metrics.scans import Scans
+
+# Opens a bar of so many scans, under a heading; what it gives is called after each.
+Bar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
+
+# The field compares single-scan histograms with so many real scans, by a fixed shuffle, and features with all.
+REAL_SCANS = 10_000
+
+LEVEL = 0.95  # of intervals
+
+
+def no_bar(heading: str, total: int) -> AbstractContextManager[Callable[[], None]]:
+    """Nothing to be seen."""
+    return nullcontext(lambda: None)
+
+
+@dataclass(frozen=True)
+class Work:
+    """How the work is done, which no figure depends on beyond rounding.
+
+    Attributes:
+        batch_size: Scans at once.
+        workers: Further processes that read.
+        rank, ranks: This process among those that share the batches by turns.
+        bar: What shows how far it is.
+    """
+
+    batch_size: int = 8
+    workers: int = 0
+    rank: int = 0
+    ranks: int = 1
+    bar: Bar = no_bar
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What one metric says of one comparison.
+
+    Attributes:
+        metric: Its name.
+        figures: By name; NaN where there is none, and a remark says why.
+        intervals: (low, high) of a figure, where it was asked for.
+        protocol: The metric's, with the numbers of scans and the rule that chose the real ones.
+        remarks: What a reader must know.
+    """
+
+    metric: str
+    figures: Mapping[str, float]
+    protocol: Mapping[str, Any]
+    remarks: Sequence[str] = ()
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """The statistics of a real set by metric, the rule of each's subset, and whether they were at hand already."""
+
+    statistics: Mapping[str, Statistics]
+    rules: Mapping[str, str]
+    kept: frozenset[str]
+
+
+def real_rule(metric: ScanMetric, count: int) -> tuple[list[int] | None, str]:
+    """Which of `count` real scans a metric is given: numbers, None for all, and the rule in words."""
+    if metric.protocol.extractor is not None or count <= REAL_SCANS:
+        return None, f"all {count}"
+    return fixed_choice(count, REAL_SCANS), f"{REAL_SCANS} of {count}, fixed shuffle, seed 0"
+
+
+def check_reflectance(metrics: Mapping[str, ScanMetric], sets: Iterable[ScanSet]) -> None:
+    """Know before the reading whether every metric will find what it looks at.
+
+    Raises:
+        InputError: a metric of reflectance, and a set without.
+    """
+    needing = [name for name, metric in metrics.items() if metric.needs_reflectance]
+    for scans in sets:
+        if needing and not scans.about.get("reflectance", True):
+            raise InputError(f"{scans.label} has no reflectance, which {', '.join(needing)} looks at; leave it out.")
+
+
+def gather_real(metrics: Mapping[str, ScanMetric], real: ScanSet, work: Work, cache: Cache | None = None) -> Gathered:
+    """What each metric needs of the real scans, from the cache where it is there.
+
+    Raises:
+        InputError: no real scan, or one that cannot be read.
+    """
+    if len(real) == 0:
+        raise InputError(f"{real.label} holds no scan to compare with.")
+    chosen = {name: real_rule(metric, len(real)) for name, metric in metrics.items()}
+    rules = {name: rule for name, (_, rule) in chosen.items()}
+    keys = {name: key_of(metric, real, rules[name]) for name, metric in metrics.items()}
+    found: dict[str, Statistics] = {}
+    if cache is not None:
+        found = {name: s for name in metrics if (s := cache.read(keys[name])) is not None}
+    common = _common(set(found), work)
+    found = {name: s for name, s in found.items() if name in common}
+    missing = {name: metric for name, metric in metrics.items() if name not in found}
+    for metric in missing.values():
+        metric.reset()
+    # First the subset, for every metric, then the rest for those that take all: every scan is read once.
+    some = next((numbers for name, (numbers, _) in chosen.items() if name in missing and numbers is not None), [])
+    greedy = {name: metric for name, metric in missing.items() if chosen[name][0] is None}
+    rest = sorted(set(range(len(real))) - set(some)) if greedy else []
+    first = _update(missing, real, some, 0, True, work)
+    second = _update(greedy, real, rest, len(some), True, work)
+    counts = {name: (len(some), first) for name in missing}
+    counts |= {name: (len(real), first + second) for name in greedy}
+    for name, metric in missing.items():
+        found[name] = Statistics(metric.real_state(), *counts[name])
+        if cache is not None and work.rank == 0:
+            cache.write(keys[name], found[name])
+    return Gathered(found, rules, frozenset(metrics.keys() - missing.keys()))
+
+
+def measure(
+    metrics: Mapping[str, ScanMetric], gathered: Gathered, generated: ScanSet, work: Work, draws: int = 0
+) -> list[Measured]:
+    """Every metric's figures of a generated set.
+
+    Args:
+        metrics: Built with `keep=True` where there are draws.
+        draws: Bootstrap resamples for 95 % intervals; 0 for none. The first process alone has intervals.
+
+    Raises:
+        InputError: no generated scan, or one that cannot be read.
+    """
+    if len(generated) == 0:
+        raise InputError(f"{generated.label} holds no scan to measure.")
+    for name, metric in metrics.items():
+        metric.reset()
+        metric.load_real_state(gathered.statistics[name].states)
+    empty = _update(metrics, generated, range(len(generated)), 0, False, work)
+    source, results = generated.source, []
+    unsolved = []
+    if isinstance(source, SampledScans) and source.unsolved:
+        unsolved = [
+            f"{source.unsolved} of {len(generated)} scans are not solved to the tolerance, and taken as they are."
+        ]
+    for name, metric in metrics.items():
+        real = gathered.statistics[name]
+        figures = {key: float(value) for key, value in metric.compute().items()}
+        remarks = [*metric.remarks(), *_remarks(real, len(generated), figures), *unsolved]
+        sizes = {
+            "real": real.scans, "real_chosen": gathered.rules[name], "real_empty": real.empty,
+            "generated": len(generated), "generated_empty": empty,
+        }  # fmt: skip
+        image = {"sensor": generated.sensor.name, "image": list(generated.sensor.shape)}
+        protocol: dict[str, Any] = {**metric.protocol.asdict(), **image, "sizes": sizes}
+        intervals: dict[str, tuple[float, float]] = {}
+        if draws and not metric.resamples:
+            remarks.append(f"{name} has no bootstrap interval.")
+        elif draws and work.rank == 0:
+            protocol["interval"] = {"bootstrap draws": draws, "level": LEVEL, "seed": 0}
+            with work.bar("resamples", draws) as advance:
+                found = bootstrap(metric, draws, LEVEL, advance=advance)
+            intervals = {key: (one.low, one.high) for key, one in found.items()}
+        results.append(Measured(name, figures, protocol, remarks, intervals))
+    return results
+
+
+def _update(
+    metrics: Mapping[str, ScanMetric], scans: ScanSet, numbers: Sequence[int], first: int, real: bool, work: Work
+) -> int:
+    """Give scans to metrics, those of this process; how many of all had no return within the mask."""
+    if not metrics or not numbers:
+        return 0
+    device = next(iter(metrics.values())).device
+    starts = range(0, len(numbers), work.batch_size)[work.rank :: work.ranks]
+    own = [number for start in starts for number in numbers[start : start + work.batch_size]]
+    empty = 0
+    with work.bar("real" if real else "generated", len(own)) as advance, torch.no_grad():
+        for start, images in zip(starts, scans.batches(own, work.batch_size, work.workers), strict=True):
+            batch = Scans(images.to(device), scans.sensor)
+            empty += int((~batch.returned.flatten(1).any(1)).sum())
+            for metric in metrics.values():
+                metric.update(batch, real=real, first=first + start)
+            for _ in range(len(batch)):
+                advance()
+    return _sum_over_processes(empty, work)
+
+
+def _remarks(real: Statistics, generated: int, figures: Mapping[str, float]) -> list[str]:
+    """What holds for any metric and is not said by it."""
+    sides = ((real.scans, "real"), (generated, "generated"))
+    said = [f"a single {whose} scan says nothing of a distribution." for total, whose in sides if total == 1]
+    lost = [name for name, value in figures.items() if math.isnan(value)]
+    return [*said, f"no figure for {', '.join(lost)}."] if lost else said
+
+
+def _sum_over_processes(count: int, work: Work) -> int:
+    if work.ranks == 1:
+        return count
+    total = torch.tensor(count)
+    torch.distributed.all_reduce(total)
+    return int(total)
+
+
+def _common(names: set[str], work: Work) -> set[str]:
+    """What every process has found in the cache: all of them read, or none."""
+    if work.ranks == 1:
+        return names
+    all_names: list[set[str] | None] = [None] * work.ranks
+    torch.distributed.all_gather_object(all_names, names)
+    return set.intersection(*(each or set() for each in all_names))

@@ -1,0 +1,113 @@
+"""What metrics keep of the real scans: gathered once, and kept on the disk under a hash of all that made it."""
+
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.evaluation.sets import ScanSet
+from r2flow.files import atomic_write
+from r2flow.metrics.base import ScanMetric
+
+log = logging.getLogger(__name__)
+
+FORMAT = 1  # to be raised when what a metric makes of the same scans changes without its protocol saying so
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """A metric's states after one set of scans, and how many it has seen.
+
+    Attributes:
+        states: What `ScanMetric.real_state` gives.
+        scans: How many scans it was given.
+        empty: How many of them had no return within the mask.
+    """
+
+    states: Mapping[str, Tensor] = field(repr=False)
+    scans: int
+    empty: int
+
+
+class Cache:
+    """Statistics of real scans in a folder, each file named by a hash of all that it is a function of.
+
+    Args:
+        folder: Where; `default_folder()` if left out.
+    """
+
+    def __init__(self, folder: str | Path | None = None) -> None:
+        self.folder = default_folder() if folder is None else Path(folder)
+
+    def path(self, key: str) -> Path:
+        """The file of a key of `key_of`."""
+        metric = json.loads(key)["protocol"]["metric"]
+        return self.folder / f"{metric}-{hashlib.sha256(key.encode()).hexdigest()[:24]}.safetensors"
+
+    def read(self, key: str | None) -> Statistics | None:
+        """What was kept under a key; None where there is nothing, or nothing that can be read."""
+        if key is None or not (path := self.path(key)).is_file():
+            return None
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(path, framework="pt") as file:
+                notes = file.metadata() or {}
+                if notes.get("key") != key:
+                    return None
+                states = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return Statistics(states, int(notes["scans"]), int(notes["empty"]))
+        except (SafetensorError, OSError, KeyError, ValueError):
+            log.warning("%s is damaged; its statistics are gathered again.", path)
+            return None
+
+    def write(self, key: str | None, statistics: Statistics) -> None:
+        """Keep statistics; a disk that cannot take them costs a warning and no figure."""
+        if key is None:
+            return
+        from safetensors.torch import save
+
+        notes = {"key": key, "scans": str(statistics.scans), "empty": str(statistics.empty)}
+        data = save({name: value.contiguous() for name, value in statistics.states.items()}, metadata=notes)
+        try:
+            with atomic_write(self.path(key)) as file:
+                file.write(data)
+        except OSError as error:
+            log.warning("statistics are not kept: %s: %s", self.folder, error.strerror or error)
+
+
+def default_folder() -> Path:
+    """`statistics` in R2FLOW_CACHE, or in r2flow's folder of the user's cache."""
+    own = os.environ.get("R2FLOW_CACHE")
+    base = Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "r2flow"
+    return base.expanduser() / "statistics"
+
+
+def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str | None:
+    """All that a metric's statistics of a set are a function of, as JSON; None where the set is drawn anew.
+
+    The scans' files with sizes and times (or seed, or manifest), sensor, projection, mask, subset, the metric's
+    protocol with its weights' hash, the kind of device, and the format of these files.
+    """
+    if scans.identity is None:
+        return None
+    parts: dict[str, Any] = {
+        "format": FORMAT,
+        "scans": scans.identity,
+        "subset": rule,
+        "protocol": metric.protocol.asdict(),
+        "keeps": metric.keeps,
+        "device": torch.device(metric.device).type,
+    }
+    try:
+        return json.dumps(parts, sort_keys=True)
+    except TypeError as error:
+        raise InputError(f"the protocol of '{metric.protocol.metric}' is not made of plain values: {error}.") from None

@@ -1,0 +1,252 @@
+"""Figures of generated scans beside those of real ones: in the terminal, as JSON, as a page."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from r2flow.evaluation.measuring import Measured
+from r2flow.evaluation.sets import ScanSet
+from r2flow.files import atomic_write
+from r2flow.reports.pages import STYLES, Page, blank_figure, plain, provenance, shown, table
+
+FORMAT = "r2flow evaluation 1"
+
+# Figures that the field's tables print scaled: heading and factor. The figure itself stays what it is.
+PRINTED = {"jsd": ("JSD x 10^2", 1e2), "mmd": ("MMD x 10^4", 1e4)}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One set against another.
+
+    Attributes:
+        name: "generated", "real halves", ...
+        real, generated: The two sets.
+        measured: What each metric says.
+        seconds: That it took, the real side's share included where it was gathered for this one.
+    """
+
+    name: str
+    real: ScanSet
+    generated: ScanSet
+    measured: Sequence[Measured]
+    seconds: float
+
+
+def heading(metric: str, figure: str) -> tuple[str, float]:
+    """How a figure is headed in a table, and by what it is multiplied there."""
+    return PRINTED[metric] if metric in PRINTED and figure == metric else (figure, 1.0)
+
+
+def rows_of(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
+    """A row for each figure."""
+    rows = []
+    for one in comparisons:
+        for measured in one.measured:
+            for name, value in measured.figures.items():
+                said, factor = heading(measured.metric, name)
+                low, high = measured.intervals.get(name, (None, None))
+                rows.append({
+                    "comparison": one.name, "metric": measured.metric, "figure": name, "value": value, "low": low,
+                    "high": high, "printed_as": said, "printed": value * factor,
+                    "real": measured.protocol["sizes"]["real"], "generated": measured.protocol["sizes"]["generated"],
+                    "remarks": "; ".join(measured.remarks),
+                })  # fmt: skip
+    return rows
+
+
+def print_comparisons(comparisons: Sequence[Comparison]) -> None:
+    """A line for each figure, a column for each comparison, and what must be known of them."""
+    from rich.console import Console
+    from rich.measure import Measurement
+    from rich.table import Table
+
+    columns, lines = _table(comparisons, "\n")
+    grid = Table(box=None, header_style="bold", pad_edge=False)
+    for number, name in enumerate(columns):
+        grid.add_column(name, justify="right" if number else "left", no_wrap=True)
+    for line in lines:
+        grid.add_row(*line)
+    console = Console()
+    # Figures are not cut short: a terminal that is too narrow wraps them.
+    console.width = max(console.width, Measurement.get(console, console.options.update(width=300), grid).maximum)
+    console.print(grid, crop=False, highlight=False, markup=False)
+    for remark in _remarks(comparisons):
+        console.print(f"  {remark}", style="dim", highlight=False, soft_wrap=True)
+
+
+def write_json(page: Page, comparisons: Sequence[Comparison], path: Path) -> None:
+    """Every figure with its protocol, remarks and origin, as strict JSON: what does not exist is null."""
+    content = {
+        "format": FORMAT,
+        "origin": provenance(page),
+        "comparisons": [_plain_comparison(one) for one in comparisons],
+    }
+    with atomic_write(path, "w") as file:
+        file.write(json.dumps(plain(content), indent=2, allow_nan=False) + "\n")
+
+
+def evaluation_page(comparisons: Sequence[Comparison], command: str, device: str, seeds: Mapping[str, int]) -> Page:
+    """The page of an evaluation: table, protocols, and each figure beside its floor."""
+    columns, lines = _table(comparisons)
+    keys = [str(number) for number in range(len(columns))]
+    figures = [dict(zip(keys, line, strict=True)) for line in lines]
+    remarks = "\n".join(f"- {remark}" for remark in _remarks(comparisons))
+    text = [
+        table(figures, dict(zip(keys, columns, strict=True))),
+        *([remarks] if remarks else []),
+        "## Sets",
+        table(
+            [
+                {"comparison": one.name, "whose": whose, "set": s.label, "scans": len(s), "about": _words(s.about)}
+                for one in comparisons
+                for whose, s in (("real", one.real), ("generated", one.generated))
+            ],
+            {"comparison": "comparison", "whose": "as", "set": "set", "scans": "scans", "about": "what they are"},
+        ),
+        "## Protocols",
+        "Returns nearer or farther than the mask are dropped on both sides before every metric. Figures of protocols "
+        "that differ in anything are not comparable.",
+        table(
+            [_protocol_row(measured) for measured in comparisons[0].measured],
+            {
+                "metric": "metric", "representation": "compares", "mask": "mask, m", "extractor": "network",
+                "weights": "weights", "layer": "features", "settings": "settings", "real_chosen": "real scans",
+                "generated": "generated scans",
+            },
+        ),
+    ]  # fmt: skip
+    more = {"comparisons": [_plain_comparison(one) for one in comparisons]}
+    picture = {"evaluation": _figure(comparisons)} if comparisons else {}
+    return Page("evaluation", "Generated scans against real ones", text, rows_of(comparisons), picture, command,
+                seeds, device, more)  # fmt: skip
+
+
+def _table(comparisons: Sequence[Comparison], between: str = " ") -> tuple[list[str], list[list[str]]]:
+    """Headings and lines: figures down, comparisons across, numbers as the field prints them.
+
+    Args:
+        between: What stands between a figure and its interval, and between a comparison and its sizes.
+    """
+    columns = ["", *(f"{one.name}{between}({len(one.generated)} : {len(one.real)})" for one in comparisons)]
+    cells: dict[str, dict[str, str]] = {}
+    for one in comparisons:
+        for measured in one.measured:
+            for name, value in measured.figures.items():
+                said, factor = heading(measured.metric, name)
+                cells.setdefault(said, {})[one.name] = _cell(value, measured.intervals.get(name), factor, between)
+    return columns, [[said, *(cells[said].get(one.name, "") for one in comparisons)] for said in cells]
+
+
+def _cell(value: float, interval: tuple[float, float] | None, factor: float, between: str) -> str:
+    if math.isnan(value):
+        return "none"
+    low_high = "" if interval is None else f"{between}[{interval[0] * factor:#.3g}, {interval[1] * factor:#.3g}]"
+    return f"{value * factor:#.4g}{low_high}"
+
+
+def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
+    """Each said once, with the metrics and comparisons that it is said of."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for one in comparisons:
+        for measured in one.measured:
+            for remark in measured.remarks:
+                found.setdefault((one.name, remark), []).append(measured.metric)
+    everything = {one.name: len(one.measured) for one in comparisons}
+    sizes = {one.name: (len(one.real), len(one.generated)) for one in comparisons}
+    uneven = (
+        ["Distances of fewer scans are larger: compare columns of equal sizes alone."]
+        if len(set(sizes.values())) > 1
+        else []
+    )
+    drawn = [m.protocol["interval"] for one in comparisons for m in one.measured if m.intervals]
+    brackets = (
+        [f"In brackets: intervals of {drawn[0]['level']:.0%}, from {drawn[0]['bootstrap draws']} bootstrap draws."]
+        if drawn
+        else []
+    )
+    return [
+        *brackets,
+        *uneven,
+        *(
+            f"{name}: {remark}"
+            if len(metrics) == everything[name] or remark.startswith(tuple(metrics))
+            else f"{name}, {', '.join(metrics)}: {remark}"
+            for (name, remark), metrics in found.items()
+        ),
+    ]
+
+
+def _protocol_row(measured: Measured) -> dict[str, Any]:
+    protocol = measured.protocol
+    return {
+        **{key: protocol[key] for key in ("metric", "representation", "extractor", "weights", "layer")},
+        "mask": "{:g} < r < {:g}".format(*protocol["mask"]),
+        "settings": _words(protocol["settings"]),
+        "real_chosen": protocol["sizes"]["real_chosen"],
+        "generated": protocol["sizes"]["generated"],
+    }
+
+
+def _words(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} {shown(value)}" for key, value in values.items())
+
+
+def _plain_comparison(one: Comparison) -> dict[str, Any]:
+    sets = {"real": one.real, "generated": one.generated}
+    return {
+        "comparison": one.name,
+        **{whose: {"set": s.label, "scans": len(s), **s.about} for whose, s in sets.items()},
+        "seconds": round(one.seconds, 2),
+        "metrics": [
+            {
+                "metric": measured.metric,
+                "figures": dict(measured.figures),
+                "printed": {
+                    said: value * factor
+                    for name, value in measured.figures.items()
+                    for said, factor in [heading(measured.metric, name)]
+                },
+                "intervals": {name: list(ends) for name, ends in measured.intervals.items()},
+                "protocol": dict(measured.protocol),
+                "remarks": list(measured.remarks),
+            }
+            for measured in one.measured
+        ],
+    }
+
+
+def _figure(comparisons: Sequence[Comparison]) -> Figure:
+    """A panel for each metric's first figure, a mark for each comparison; the floor is what real scans reach."""
+    first = {m.metric: next(iter(m.figures)) for m in comparisons[0].measured if m.figures}
+    columns = max(min(len(first), 4), 1)
+    lines = max(math.ceil(len(first) / columns), 1)
+    figure = blank_figure(
+        2.9 * columns + 1.0,
+        0.5 * len(comparisons) * lines + 1.2 * lines,
+        "Each metric's first figure, generated scans and real ones",
+    )
+    for place, (metric, name) in enumerate(first.items()):
+        axes = figure.add_subplot(lines, columns, place + 1)
+        said, factor = heading(metric, name)
+        for row, one in enumerate(comparisons):
+            measured = next(m for m in one.measured if m.metric == metric)
+            value = measured.figures.get(name, math.nan) * factor
+            style = STYLES[row % len(STYLES)]
+            if name in measured.intervals:
+                low, high = measured.intervals[name]
+                axes.hlines(row, low * factor, high * factor, color=style["color"], lw=1.5)
+            axes.plot([value], [row], marker=style["marker"], color=style["color"], ms=7, ls="")
+            if math.isnan(value):
+                axes.text(0.02, row, "none", transform=axes.get_yaxis_transform(), fontsize=8, va="center")
+        axes.set_yticks(range(len(comparisons)), [one.name for one in comparisons] if place % columns == 0 else [])
+        axes.set(xlabel=said, ylim=(len(comparisons) - 0.5, -0.5))
+        axes.set_xlim(min(0.0, axes.get_xlim()[0]), axes.get_xlim()[1] * 1.05)
+        axes.grid(True, axis="x", color="0.88", lw=0.6)
+        axes.tick_params(labelsize=8)
+    return figure

@@ -1,0 +1,306 @@
+"""Generated scans beside the training scans that are nearest to them: whether a flow has learned or memorised."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.evaluation.measuring import Work
+from r2flow.evaluation.sets import ScanSet
+from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.sensors import Sensor
+from r2flow.metrics.scans import Scans
+from r2flow.reports.pages import STYLES, Page, Row, blank_figure, shown, table
+from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_birds_eye, draw_range
+
+LIKENESSES = ("embedded", "pixels")
+COPY = 0.1  # of the usual distance
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """By what scans are near to each other: Euclidean distance between what `describe` gives, (B, D).
+
+    Attributes:
+        name: One of `LIKENESSES`.
+        words: The same for a reader.
+        device: Where `describe` wants its scans.
+    """
+
+    name: str
+    words: str
+    describe: Callable[[Scans], Tensor]
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """The nearest training scan of each scan of a set; scans without a return have none and are not among them.
+
+    Attributes:
+        scans: The set.
+        numbers: Of its scans that have a return, (N,).
+        distances: To the nearest training scan, (N,) float64.
+        neighbours: Its number, (N,).
+    """
+
+    scans: ScanSet
+    numbers: np.ndarray
+    distances: np.ndarray
+    neighbours: np.ndarray
+
+    def order(self) -> np.ndarray:
+        """Places in the arrays, the nearest first."""
+        return np.argsort(self.distances, kind="stable")
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Generated scans and real ones, each with its nearest training scan.
+
+    Attributes:
+        generated: The judged ones.
+        real: Held-out scans, or training scans each against the others.
+        training: What all of them are compared with.
+        held_out: Whether `real` was held out.
+    """
+
+    generated: Nearest
+    real: Nearest
+    training: ScanSet
+    likeness: Likeness
+    held_out: bool
+
+
+def likeness_of(name: str | None, sets: Sequence[ScanSet], device: str) -> Likeness:
+    """A likeness by its name; without one, the embedded network's where it is there, else that of pixels.
+
+    Raises:
+        InputError: no such name, or the network asked for is not there.
+    """
+    if name is not None and name not in LIKENESSES:
+        raise InputError(f"--by must be {' or '.join(LIKENESSES)}, found {name!r}.")
+    sensor = sets[0].sensor
+    if name != "pixels":
+        from r2flow.metrics.extractors import load_extractor
+
+        kind = "embedded" if all(s.about["reflectance"] for s in sets) else "embedded_range"
+        try:
+            network = load_extractor(kind).to(device)
+            return Likeness("embedded", f"features of '{kind}' ({network.layer})", network.features, device)
+        except InputError:
+            if name is not None:
+                raise
+    return Likeness("pixels", "RMS difference of log-range in model space, pixel by pixel", _pixels(sensor), device)
+
+
+def _pixels(sensor: Sensor) -> Callable[[Scans], Tensor]:
+    encoding = Encoding(sensor, reflectance=False)
+
+    def describe(scans: Scans) -> Tensor:
+        x = encoding.encode(scans.images[:, :1].cpu()).flatten(1)
+        x = x / x.shape[1] ** 0.5
+        return torch.where(scans.returned.cpu().flatten(1).any(1)[:, None], x, torch.nan)
+
+    return describe
+
+
+def find_neighbours(
+    generated: ScanSet, training: ScanSet, held: ScanSet | None, likeness: Likeness, work: Work
+) -> Neighbours:
+    """The nearest training scan of each generated and each held-out scan.
+
+    Training scans are read once and none is kept. Without held-out scans, at most as many training scans as there are
+    generated ones are compared to all the others.
+
+    Raises:
+        InputError: nothing to compare.
+    """
+    chosen = list(range(len(training)))[: len(generated)] if held is None else None
+    real = held if held is not None else training.part(chosen or [], "training scans, each without itself")
+    if len(training) < (2 if held is None else 1):
+        raise InputError(f"{training.label} holds {len(training)} training scans; needs at least two, or --real HELD.")
+    described = [_describe(s, likeness, work) for s in (generated, real)]
+    for (numbers, _), s in zip(described, (generated, real), strict=True):
+        if len(numbers) == 0:
+            raise InputError(f"none of the {len(s)} scans of {s.label} has a return: there is nothing to compare.")
+    best = [(torch.full((len(n),), torch.inf), torch.zeros(len(n), dtype=torch.int64)) for n, _ in described]
+    with work.bar("training scans", len(training)) as advance, torch.no_grad():
+        first = 0
+        for images in training.batches(range(len(training)), work.batch_size, work.workers):
+            there = likeness.describe(Scans(images.to(likeness.device), training.sensor)).float().cpu()
+            there = there.nan_to_num(torch.inf)
+            for own, (queries, x) in enumerate(described):
+                d = _square_distances(x, there)
+                if own == 1 and chosen is not None:
+                    d[torch.from_numpy(queries)[:, None] == torch.arange(first, first + len(there))] = torch.inf
+                least, where = d.min(1)
+                nearer = least < best[own][0]
+                best[own][0][nearer], best[own][1][nearer] = least[nearer], where[nearer] + first
+            first += len(there)
+            for _ in range(len(there)):
+                advance()
+    found = [
+        Nearest(s, queries, _exact(x, nearest, training, likeness, work), nearest.numpy())
+        for s, (queries, x), (_, nearest) in zip((generated, real), described, best, strict=True)
+    ]
+    return Neighbours(found[0], found[1], training, likeness, held is not None)
+
+
+def _describe(scans: ScanSet, likeness: Likeness, work: Work) -> tuple[np.ndarray, Tensor]:
+    """Numbers of the scans that have a return, and what they are compared by."""
+    rows = []
+    with work.bar("scans", len(scans)) as advance, torch.no_grad():
+        for images in scans.batches(range(len(scans)), work.batch_size, work.workers):
+            rows.append(likeness.describe(Scans(images.to(likeness.device), scans.sensor)).float().cpu())
+            for _ in range(len(images)):
+                advance()
+    x = torch.cat(rows)
+    kept = x.isfinite().all(1)
+    return torch.nonzero(kept)[:, 0].numpy(), x[kept]
+
+
+def _square_distances(x: Tensor, y: Tensor) -> Tensor:
+    """|x - y|^2 by one product, (N, M): near enough to tell which is nearest; infinite where y is."""
+    away = y.isinf().any(1)
+    y = torch.where(away[:, None], 0.0, y)
+    d = x.square().sum(1)[:, None] + y.square().sum(1) - 2 * x @ y.T
+    return d.masked_fill(away, torch.inf)
+
+
+def _exact(x: Tensor, nearest: Tensor, training: ScanSet, likeness: Likeness, work: Work) -> np.ndarray:
+    """|x - y| of each scan and its nearest training scan: the product's rounding would hide a copy."""
+    wanted = sorted(set(nearest.tolist()))
+    place = {number: i for i, number in enumerate(wanted)}
+    own = torch.tensor([place[number] for number in nearest.tolist()])
+    d = torch.zeros(len(x), dtype=torch.float64)
+    first = 0
+    with torch.no_grad():
+        for images in training.batches(wanted, work.batch_size, work.workers):
+            there = likeness.describe(Scans(images.to(likeness.device), training.sensor)).double().cpu()
+            mine = torch.nonzero((own >= first) & (own < first + len(there)))[:, 0]
+            d[mine] = torch.linalg.vector_norm(x[mine].double() - there[own[mine] - first], dim=1)
+            first += len(there)
+    return d.numpy()
+
+
+def neighbours_page(found: Neighbours, pairs: int, command: str, device: str) -> Page:
+    """The sheet, the distances' distributions, and what they say."""
+    usual = _usual(found)
+    sets = [
+        {
+            "set": name, "scans": len(one.distances), "empty": len(one.scans) - len(one.distances),
+            "least": float(one.distances.min()), "5 %": float(np.quantile(one.distances, 0.05)),
+            "median": float(np.median(one.distances)), "largest": float(one.distances.max()),
+        }
+        for name, one in (("generated", found.generated), (usual, found.real))
+    ]  # fmt: skip
+    near = "" if found.held_out else " Neighbouring frames of one drive are near-duplicates of each other: give --real."
+    how = f"Distance: {found.likeness.words}; to the nearest of {len(found.training)} training scans.{near}"
+    text = [*sentences(found), how, table(sets, {key: key for key in sets[0]})]
+    figures = {"neighbours": _sheet(found, pairs), "neighbours_distances": _distances(found, usual)}
+    title = "Generated scans and their nearest training scans"
+    return Page("neighbours", title, text, pair_rows(found), figures, command, {}, device)
+
+
+def sentences(found: Neighbours) -> list[str]:
+    """What the distances say of copies."""
+    generated, real = found.generated.distances, found.real.distances
+    usual = _usual(found)
+    nearer, expected = int((generated < real.min()).sum()), len(generated) / (len(real) + 1)
+    share = float((generated < np.quantile(real, 0.05)).mean())
+    copies = int((generated < COPY * np.median(real)).sum())
+    return [
+        f"{nearer} of {len(generated)} generated scans lie nearer to a training scan than any of {len(real)} {usual} "
+        f"does; about {shown(expected)} would if both were drawn alike. {share:.0%} lie nearer than the nearest 5 % of "
+        "these.",
+        f"{copies} lie nearer than a tenth of the usual (median) distance: look at them, they are copies or nearly so."
+        if copies
+        else "None lies nearer than a tenth of the usual (median) distance: no copy among them.",
+    ]
+
+
+def _usual(found: Neighbours) -> str:
+    return "held-out real scans" if found.held_out else "training scans (each against the others)"
+
+
+def pair_rows(found: Neighbours) -> list[Row]:
+    """Every pair, the nearest first."""
+    training = found.training.source.names
+    rows: list[Row] = []
+    for name, one in (("generated", found.generated), ("real", found.real)):
+        names = one.scans.source.names
+        rows += [
+            {"set": name, "scan": names[int(one.numbers[i])], "nearest": training[int(one.neighbours[i])],
+             "distance": float(one.distances[i])}
+            for i in one.order()
+        ]  # fmt: skip
+    return rows
+
+
+def _sheet(found: Neighbours, pairs: int) -> Figure:
+    """The nearest pairs and the farthest, generated on the left and real on the right."""
+    sides = (found.generated, found.real)
+    chosen = [_chosen(one, pairs) for one in sides]
+    lines = max(map(len, chosen))
+    height = 1.62 * lines + 0.2
+    figure = blank_figure(17, height)
+    figure.set_layout_engine("none")  # the layout is a grid already, and working it out again takes seconds
+    figure.set_facecolor(BACKGROUND)
+    grid = figure.add_gridspec(
+        lines, 9, width_ratios=[2.3, 1, 2.3, 1, 0.12, 2.3, 1, 2.3, 1], wspace=0.03, hspace=0.16,
+        left=0.005, right=0.995, top=1 - 0.25 / height, bottom=0.05 / height,
+    )  # fmt: skip
+    heads = ("generated", "held-out real" if found.held_out else "training")
+    for side, (one, head, picks) in enumerate(zip(sides, heads, chosen, strict=True)):
+        for line, (place, word) in enumerate(picks):
+            number, neighbour = int(one.numbers[place]), int(one.neighbours[place])
+            titles = (
+                f"{word}: {head} {number}, {shown(float(one.distances[place]))} away from",
+                f"training {neighbour}",
+            )
+            images = one.scans.source[number], found.training.source[neighbour]
+            for half, (image, title) in enumerate(zip(images, titles, strict=True)):
+                column = 5 * side + 2 * half
+                _draw(figure, grid[line, column], grid[line, column + 1], image, found.training.sensor, title)
+    return figure
+
+
+def _chosen(one: Nearest, pairs: int) -> list[tuple[int, str]]:
+    """Places of the nearest pairs and of half as many of the farthest, each with its word."""
+    order = one.order().tolist()
+    near = order[:pairs]
+    far = order[len(near) :][::-1][: max(pairs // 2, 1)]
+    return [
+        *((place, f"nearest {i + 1}") for i, place in enumerate(near)),
+        *((place, f"farthest {i + 1}") for i, place in enumerate(far)),
+    ]
+
+
+def _draw(figure: Figure, strip: Any, square: Any, image: np.ndarray, sensor: Sensor, title: str) -> None:
+    axes = figure.add_subplot(strip)
+    draw_range(axes, image, label=False)
+    axes.set_title(title, color=FOREGROUND, fontsize=8, loc="left", pad=3)
+    xyz, _ = image_to_points(image, sensor.rays())
+    draw_birds_eye(figure.add_subplot(square), xyz, label=False)
+
+
+def _distances(found: Neighbours, usual: str) -> Figure:
+    """Share of scans whose nearest training scan lies within a distance."""
+    figure = blank_figure(6.4, 4, "Distance to the nearest training scan")
+    axes = figure.add_subplot()
+    for style, one, name in zip(STYLES, (found.generated, found.real), ("generated", usual), strict=False):
+        d = np.sort(one.distances)
+        look: dict[str, Any] = {key: style[key] for key in ("linestyle", "color")}
+        axes.step(d, np.arange(1, len(d) + 1) / len(d), where="post", **look, lw=1.6, label=f"{name} ({len(d)})")
+    axes.set(xlabel=found.likeness.words, ylabel="share of the scans", ylim=(0, 1.02))
+    axes.set_xlim(left=0)
+    axes.grid(True, color="0.88", lw=0.6)
+    axes.legend(fontsize=8, frameon=False)
+    return figure

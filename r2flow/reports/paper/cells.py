@@ -1,0 +1,140 @@
+"""Every flow at every number of evaluations, measured once and kept: a report that was stopped goes on."""
+
+import hashlib
+import json
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r2flow.checkpoints import Checkpoint
+from r2flow.evaluation.measuring import Gathered, Work, measure
+from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
+from r2flow.files import atomic_write
+from r2flow.metrics.base import ScanMetric, Side
+from r2flow.metrics.birds_eye import BINS
+from r2flow.metrics.jsd import JSD
+from r2flow.reports.paper.subjects import Subject
+from r2flow.sampling import sample
+
+SHOWN = 2  # scans of each flow that are drawn
+SEED = 0  # of their noise, the same for every flow
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One flow at one number of Euler steps.
+
+    Attributes:
+        row: label, role, family, seed, steps, seconds a scan, and each metric's first figure under the metric's name
+            with its interval's `_low` and `_high`.
+        birds_eye: Points from above, of all scans together, (100, 100).
+        images: The first scans, (SHOWN, 2 or 1, H, W).
+    """
+
+    row: dict[str, Any]
+    birds_eye: np.ndarray
+    images: np.ndarray
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What all cells have in common.
+
+    Attributes:
+        real: The scans that all are compared with.
+        metrics: By name, `jsd` among them.
+        gathered: Their statistics of the real scans.
+        num: Scans of each flow.
+        bootstrap: Resamplings for the interval of a figure; 0 for none.
+        work: How it is done.
+        folder: Where finished cells are kept.
+        device: What the networks run on.
+    """
+
+    real: ScanSet
+    metrics: Mapping[str, ScanMetric]
+    gathered: Gathered
+    num: int
+    bootstrap: int
+    work: Work
+    folder: Path
+    device: str
+
+    def path(self, subject: Subject, steps: int) -> Path:
+        """A cell's file, named by all that it is a function of."""
+        parts = {
+            "weights": subject.weights, "steps": steps, "num": self.num, "seed": SEED, "bootstrap": self.bootstrap,
+            "real": self.real.identity or self.real.label, "device": self.device,
+            "metrics": {name: metric.protocol.asdict() for name, metric in self.metrics.items()},
+        }  # fmt: skip
+        key = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:16]
+        return self.folder / f"{key}.safetensors"
+
+
+def steps_of(subject: Subject, steps: Sequence[int]) -> list[int]:
+    """A distilled flow is measured at its own number of steps alone; it was not trained for another."""
+    return list(steps) if subject.steps is None else [subject.steps]
+
+
+def measure_cells(bench: Bench, flow: Checkpoint, subject: Subject, steps: Sequence[int]) -> Iterator[Cell]:
+    """The cells of one flow, kept as each is done."""
+    for count in steps_of(subject, steps):
+        path = bench.path(subject, count)
+        cell = _read(path)
+        if cell is None:
+            cell = _measure(bench, flow, subject, count)
+            _write(path, cell)
+        # Names and places may have changed since.
+        yield Cell({**cell.row, "label": subject.label, "role": subject.role}, cell.birds_eye, cell.images)
+
+
+def _measure(bench: Bench, flow: Checkpoint, subject: Subject, steps: int) -> Cell:
+    drawn = sampled_set(flow, f"{subject.label}, {steps} steps", bench.num, steps, "euler", 1e-5, SEED)
+    found = measure(bench.metrics, bench.gathered, drawn, bench.work, bench.bootstrap)
+    assert isinstance(drawn.source, SampledScans)
+    row: dict[str, Any] = {
+        "label": subject.label, "role": subject.role, "family": subject.family, "seed": subject.seed, "steps": steps,
+        "scans": bench.num, "seconds": statistics.median(drawn.source.seconds),
+    }  # fmt: skip
+    for one in found:
+        first = next(iter(one.figures))
+        row[one.metric] = one.figures[first]
+        if first in one.intervals:
+            row[f"{one.metric}_low"], row[f"{one.metric}_high"] = one.intervals[first]
+    row["remarks"] = "; ".join(dict.fromkeys(remark for one in found for remark in one.remarks))
+    counts = counts_of(bench.metrics["jsd"], "generated")
+    images = np.concatenate([s.images.numpy() for s in sample(flow, min(SHOWN, bench.num), steps, SEED)])
+    return Cell(row, counts, images)
+
+
+def counts_of(jsd: ScanMetric, side: Side) -> np.ndarray:
+    """Points from above of one side's scans together, (100, 100), which the JSD compares."""
+    assert isinstance(jsd, JSD)
+    total = jsd.real_sum if side == "real" else jsd.generated_sum
+    return total.cpu().numpy().reshape(BINS, BINS)
+
+
+def _read(path: Path) -> Cell | None:
+    """A finished cell; one that cannot be read is measured again."""
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        return None
+    try:
+        with safe_open(path, framework="numpy") as file:
+            row = json.loads((file.metadata() or {})["row"])
+            return Cell(row, file.get_tensor("birds_eye"), file.get_tensor("images"))
+    except (SafetensorError, OSError, KeyError, ValueError):
+        return None
+
+
+def _write(path: Path, cell: Cell) -> None:
+    from safetensors.numpy import save
+
+    tensors = {"birds_eye": cell.birds_eye, "images": cell.images}
+    with atomic_write(path) as file:
+        file.write(save(tensors, metadata={"row": json.dumps(cell.row)}))

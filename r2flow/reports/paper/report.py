@@ -1,0 +1,153 @@
+"""Measure what the paper's tables and figures show, flow by flow, and write the page."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from r2flow.checkpoints import Checkpoint, load_checkpoint
+from r2flow.data.datamodule import ScanDataModule
+from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
+from r2flow.evaluation.sets import ScanSet
+from r2flow.evaluation.statistics import Cache
+from r2flow.metrics.base import ScanMetric
+from r2flow.reports.compare import cost
+from r2flow.reports.curvature import Paths, measure_paths
+from r2flow.reports.pages import Page
+from r2flow.reports.paper.cells import SEED, Bench, Cell, counts_of, measure_cells
+from r2flow.reports.paper.figures import marginals_apart
+from r2flow.reports.paper.page import Measured, kind_of, paper_page
+from r2flow.reports.paper.subjects import Subject
+from r2flow.runs import read_config
+from r2flow.sampling import Interpolation, interpolate_scans
+
+FRAMES = 6  # of figure 3, as in the paper: both ends' round trips and four between
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How much is measured.
+
+    Attributes:
+        num: Scans of each flow and number of steps.
+        steps: Euler steps of the flows that are not distilled.
+        curved: Scenes whose paths are followed for figure 8; 0 leaves it out.
+        repeats: Timed evaluations of each network for table II; 0 leaves latency out.
+        bootstrap: Resamplings for intervals.
+        tolerance: Of dopri5 in the inversion of figure 3; None leaves it out.
+    """
+
+    num: int
+    steps: tuple[int, ...]
+    curved: int
+    repeats: int
+    bootstrap: int
+    tolerance: float | None
+
+
+def report(
+    subjects: Sequence[Subject],
+    out: Path,
+    metrics: Mapping[str, ScanMetric],
+    missing: Mapping[str, str],
+    budget: Budget,
+    work: Work,
+    real: ScanSet | None = None,
+    cache: Cache | None = None,
+    device: str = "cpu",
+    command: str = "",
+    said: Callable[[str], None] = lambda line: None,
+) -> Page:
+    """The page, still to be written; what is finished is kept in `out/cells`.
+
+    Args:
+        subjects: Of `find_subjects`.
+        metrics: By name; `jsd` has to be among them.
+        missing: The paper's metrics that are not, and why.
+        real: The scans to compare with; those that the first 1-RF held out if left out.
+        said: Told what is being done.
+
+    Raises:
+        InputError: scans that cannot be read, or without what a metric looks at.
+    """
+    first = next(one for one in subjects if one.role == "1-RF")
+    real = real or held_out(first)
+    check_reflectance(metrics, [real])
+    said(f"{len(subjects)} runs: {', '.join(f'{one.label} ({one.role})' for one in subjects)}; real: {real.label}")
+    gathered = gather_real(metrics, real, work, cache)
+    bench = Bench(real, metrics, gathered, budget.num, budget.bootstrap, work, out / "cells", device)
+    cells: list[Cell] = []
+    paths: dict[str, Paths] = {}
+    architectures: list[dict[str, Any]] = []
+    costs: dict[str, dict[str, Any]] = {}
+    between: Interpolation | None = None
+    metrics["jsd"].load_real_state(gathered.statistics["jsd"].states)
+    birds_eye = counts_of(metrics["jsd"], "real")
+    for subject in subjects:
+        flow = load_checkpoint(subject.run, device)
+        own = list(measure_cells(bench, flow, subject, budget.steps))
+        cells += own
+        if budget.curved and subject.steps is None:
+            paths[subject.label] = _paths(flow, subject, budget, work)
+        if subject.role == "1-RF":
+            network = json.dumps(subject.config["backbone"], sort_keys=True)
+            if network not in costs:
+                costs[network] = cost(subject.config, budget.repeats, device)
+            architectures.append({**_architecture(subject, own[-1], birds_eye, metrics), **costs[network]})
+        if subject is first and budget.tolerance is not None and len(real) > 1:
+            between = _interpolation(flow, real, budget.tolerance, work)
+        del flow
+    ends = torch.from_numpy(np.stack([real.source[index] for index in _two(len(real))]))
+    measured = Measured(subjects, real, cells, birds_eye, paths, architectures, ends.numpy(), between)
+    return paper_page(measured, list(metrics), missing, budget.num, command, device, {"sampled scans": SEED})
+
+
+def held_out(subject: Subject) -> ScanSet:
+    """All scans that a run held out of its training."""
+    config = read_config(subject.run) or subject.config  # the folder's own knows where the scans have moved
+    flow = load_checkpoint(subject.run)
+    data = {**config["data"], "validation": {**(config["data"].get("validation") or {}), "scans": 10**9}}
+    module = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **data)
+    _, held = module.sources()
+    where = config["data"]["name"]
+    identity = {"held out of": config.get("scans"), "data": _placeless(data), "sensor": subject.config["sensor"]}
+    about = {"kind": "held out", "of": where, "reflectance": flow.encoding.reflectance}
+    return ScanSet(f"held out of {where}", held, flow.sensor, about, identity)
+
+
+def _placeless(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A data config without where the scans lie."""
+    return {
+        key: _placeless(value) if isinstance(value, Mapping) else value for key, value in data.items() if key != "root"
+    }
+
+
+def _paths(flow: Checkpoint, subject: Subject, budget: Budget, work: Work) -> Paths:
+    with work.bar(f"paths of {subject.label}", 2 * max(budget.steps)) as advance:
+        return measure_paths(
+            flow, subject.label, budget.curved, max(budget.steps), SEED, budget.curved, progress=advance
+        )
+
+
+def _architecture(subject: Subject, cell: Cell, real: np.ndarray, metrics: Mapping[str, ScanMetric]) -> dict[str, Any]:
+    """A row of table II, but for what its network costs."""
+    return {
+        "label": subject.label, "family": subject.family, "seed": subject.seed, "steps": cell.row["steps"],
+        "backbone": subject.backbone, "position": subject.position, "kind": kind_of(subject),
+        **{name: cell.row.get(name) for name in metrics}, "marginals": marginals_apart(cell.birds_eye, real),
+    }  # fmt: skip
+
+
+def _interpolation(flow: Checkpoint, real: ScanSet, tolerance: float, work: Work) -> Interpolation:
+    """Figure 3, between two scans far apart in the set."""
+    pair = torch.from_numpy(np.stack([real.source[index] for index in _two(len(real))]))
+    with work.bar("figure 3", FRAMES) as advance:
+        return interpolate_scans(flow, pair, FRAMES, tolerance=tolerance, arrived=lambda _: advance())
+
+
+def _two(count: int) -> tuple[int, int]:
+    return count // 4, 3 * count // 4

@@ -1,0 +1,213 @@
+"""How good a flow's scans are within a number of evaluations, and within seconds: the paper's figure 6."""
+
+import hashlib
+import json
+import math
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from r2flow.checkpoints import Checkpoint, weights_hash
+from r2flow.errors import InputError
+from r2flow.evaluation.measuring import Gathered, Work, measure
+from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
+from r2flow.metrics.base import ScanMetric
+from r2flow.reports.evaluation import heading
+from r2flow.reports.pages import STYLES, Page, blank_figure, shown, table
+
+NAME = "speed_quality"
+BETWEEN = " | "  # remarks of a row
+AXES = (("evaluations", "network evaluations a scan"), ("seconds", "seconds a scan"))
+
+
+@dataclass(frozen=True)
+class Curve:
+    """What every point of a speed-quality curve has in common.
+
+    Attributes:
+        real: The scans that it is measured against.
+        metrics: By name.
+        gathered: Their statistics of the real scans.
+        num, seed: Of the scans that are sampled at each point, the same noise at all.
+        method, tolerance: The solver's.
+        device: What the network runs on, in words.
+    """
+
+    real: ScanSet
+    metrics: Mapping[str, ScanMetric]
+    gathered: Gathered
+    num: int
+    seed: int
+    method: str
+    tolerance: float
+    device: str
+
+    def key(self, flow: Checkpoint, steps: int) -> str:
+        """Of a point: it is measured again when anything in it differs."""
+        parts = {
+            "weights": weights_hash(flow), "steps": steps, "num": self.num, "seed": self.seed, "method": self.method,
+            "tolerance": self.tolerance, "device": self.device, "real": self.real.identity or self.real.label,
+            "metrics": {name: metric.protocol.asdict() for name, metric in self.metrics.items()},
+        }  # fmt: skip
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def measure_curve(
+    curve: Curve,
+    flows: Mapping[str, Checkpoint],
+    steps: Sequence[int],
+    work: Work,
+    done: Sequence[Mapping[str, Any]] = (),
+    arrived: Callable[[list[dict[str, Any]]], None] = lambda rows: None,
+) -> list[dict[str, Any]]:
+    """A row for each flow and number of steps; those that are done already are taken as they are.
+
+    Seconds are of the network and its solver alone, the median over batches, so that neither the first batch's warm-up
+    nor the metrics count.
+
+    Args:
+        flows: By label.
+        done: Rows of an earlier, perhaps unfinished call.
+        arrived: Called with all rows so far after each point that was measured.
+    """
+    known = {row["key"]: dict(row) for row in done}
+    rows: list[dict[str, Any]] = []
+    for label, flow in flows.items():
+        for count in steps:
+            key = curve.key(flow, count)
+            if key in known:
+                rows.append({**known[key], "flow": label})
+                continue
+            drawn = sampled_set(flow, label, curve.num, count, curve.method, curve.tolerance, curve.seed)
+            measured = measure(curve.metrics, curve.gathered, drawn, work)
+            assert isinstance(drawn.source, SampledScans)
+            figures = {f"{m.metric}/{name}": value for m in measured for name, value in m.figures.items()}
+            remarks = dict.fromkeys(remark for m in measured for remark in m.remarks)
+            rows.append({
+                "flow": label, "weights": weights_hash(flow), "distilled_for": flow.distilled_steps, "steps": count,
+                "solver": curve.method, "evaluations": statistics.fmean(drawn.source.evaluations),
+                "seconds": statistics.median(drawn.source.seconds), "batch_size": work.batch_size,
+                "scans": curve.num, "seed": curve.seed, **figures, "remarks": BETWEEN.join(remarks), "key": key,
+            })  # fmt: skip
+            arrived(rows)
+    return rows
+
+
+def read_rows(folder: Path) -> list[dict[str, Any]]:
+    """The rows of a page that was written there, none where there is no page.
+
+    Raises:
+        InputError: a file of its name that is none of ours.
+    """
+    path = folder / f"{NAME}.json"
+    if not path.is_file():
+        return []
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        rows = [*content["rows"], *content["other_points"]]
+        return [{k: math.nan if v is None and "/" in k else v for k, v in row.items()} for row in rows if "key" in row]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(
+            f"{path} is no page of this report, or a damaged one; delete it or give another --out."
+        ) from None
+
+
+def speed_quality_page(
+    curve: Curve,
+    rows: Sequence[Mapping[str, Any]],
+    command: str,
+    done: Sequence[Mapping[str, Any]] = (),
+    figures: bool = True,
+) -> Page:
+    """The page of a curve.
+
+    Args:
+        done: Rows of earlier calls, which the JSON keeps although this call did not ask for them.
+        figures: False while it is still being measured.
+    """
+    shown_keys = {row["key"] for row in rows}
+    others = [row for row in done if row["key"] not in shown_keys]
+    names = figure_names(rows)
+    columns = {"flow": "flow", "steps": "steps", "evaluations": "evaluations", "seconds": "s a scan"}
+    columns |= {name: heading(*name.split("/", 1))[0] for name in names}
+    printed = [{**row, **{n: row[n] * heading(*n.split("/", 1))[1] for n in names if n in row}} for row in rows]
+    sampled = (
+        f"{curve.num} scans of seed {curve.seed} at every point, from the same noise, by {curve.method}; measured "
+        f"against {len(curve.real)} scans of {curve.real.label}. Seconds are those of the network and its solver, "
+        "the median over batches."
+    )
+    text = [*_best(rows, names), sampled, table(printed, columns), *_remarks(rows)]
+    protocols = [
+        {**curve.metrics[metric].protocol.asdict(), "real_chosen": curve.gathered.rules[metric]}
+        for metric in curve.metrics
+    ]
+    drawn = {NAME: _figure(rows, names)} if figures and names else {}
+    return Page(NAME, "Quality against speed", text, rows, drawn, command, {"sampled scans": curve.seed}, curve.device,
+                {"protocols": protocols, "other_points": others})  # fmt: skip
+
+
+def figure_names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """METRIC/FIGURE of every figure that a row has."""
+    return list(dict.fromkeys(key for row in rows for key in row if "/" in key))
+
+
+def _remarks(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Each remark once, with the points that it is made of."""
+    found: dict[str, list[str]] = {}
+    for row in rows:
+        for remark in filter(None, row["remarks"].split(BETWEEN)):
+            found.setdefault(remark, []).append(f"{row['flow']} at {row['steps']}")
+    lines = [
+        f"- {'every point' if len(points) == len(rows) else ', '.join(points)}: {remark}"
+        for remark, points in found.items()
+    ]
+    return ["\n".join(lines)] if lines else []
+
+
+def _best(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[str]:
+    """Where each flow is best by each metric's first figure."""
+    first = list({name.split("/", 1)[0]: name for name in reversed(names)}.values())[::-1]
+    said = []
+    for name in first:
+        heads, factor = heading(*name.split("/", 1))
+        parts = []
+        for flow in dict.fromkeys(row["flow"] for row in rows):
+            own = [row for row in rows if row["flow"] == flow and math.isfinite(row.get(name, math.nan))]
+            if own:
+                best = min(own, key=lambda row: row[name])
+                parts.append(f"{flow} at {best['steps']} steps ({shown(best[name] * factor)})")
+        if parts:
+            said.append(f"{heads} is least for {', for '.join(parts)}.")
+    return [" ".join(said)] if said else []
+
+
+def _figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Figure:
+    """Each metric's first figure against evaluations (above) and seconds (below), a line for each flow."""
+    first = list({name.split("/", 1)[0]: name for name in reversed(names)}.values())[::-1]
+    flows = list(dict.fromkeys(row["flow"] for row in rows))
+    figure = blank_figure(3.4 * len(first) + 0.6, 6.2, "quality against speed: down and to the left is better")
+    for line, (x, label) in enumerate(AXES):
+        for place, name in enumerate(first):
+            axes = figure.add_subplot(2, len(first), line * len(first) + place + 1)
+            said, factor = heading(*name.split("/", 1))
+            for number, flow in enumerate(flows):
+                own = sorted((row for row in rows if row["flow"] == flow), key=lambda row: row[x])
+                values = [row.get(name, math.nan) * factor for row in own]
+                axes.plot([row[x] for row in own], values, **STYLES[number % len(STYLES)], ms=5, lw=1.2, label=flow)
+            axes.set(xscale="log", xlabel=label, ylabel=said)
+            values = [row[name] for row in rows if row.get(name, 0) > 0]
+            if values and max(values) > 20 * min(values):
+                axes.set_yscale("log")
+            if x == "evaluations":
+                ticks = sorted({row[x] for row in rows})
+                axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+                axes.set_xticks([], minor=True)
+            axes.grid(True, which="major", color="0.88", lw=0.6)
+            axes.tick_params(labelsize=8)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(flows), 4), fontsize=8, frameon=False)
+    return figure

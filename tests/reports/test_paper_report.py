@@ -1,0 +1,132 @@
+"""r2flow report paper: from run folders to the page, with chains of random weights."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from r2flow.checkpoints import AtomicCheckpointIO, load_checkpoint, weights_hash
+from r2flow.errors import InputError
+from r2flow.metrics.birds_eye import js_distance
+from r2flow.reports.paper import cells
+from r2flow.reports.paper.figures import marginals, marginals_apart
+from r2flow.reports.paper.subjects import find_subjects
+from r2flow.reports.paper.tables import beside, differences, same_architecture
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.test_sampling import network
+
+DATA = {"name": "simulated", "scenes": 6, "batch_size": 2, "validation": {"share": 0.5, "scans": 2}}
+
+
+def make_run(folder: Path, stage: dict, parent: Path | None = None, seed: int = 0) -> Path:
+    """A run folder whose flow has small random weights, others for another folder and seed."""
+    flow = network()
+    scale = 0.3 + 0.01 * len(stage) + 0.02 * seed + 0.05 * (parent is not None)
+    config = {**flow.config, "stage": stage, "data": DATA, "seed": seed, "trainer": {"max_steps": 7}}
+    if parent is not None:
+        above = load_checkpoint(parent)
+        config["parent"] = {"path": "moved", "weights": weights_hash(above), "stage": above.config["stage"]["name"]}
+    weights = {f"velocity.{name}": scale * value for name, value in flow.model.state_dict().items()}
+    content = {"state_dict": weights, "config": config, "global_step": 7}
+    AtomicCheckpointIO().save_checkpoint(content, folder / "checkpoints" / "step-00000007.ckpt")
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def chains(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("chains")
+    for seed in (0, 1):
+        first = make_run(root / f"{seed}" / "a", {"name": "rectify"}, seed=seed)
+        second = make_run(root / f"{seed}" / "b", {"name": "reflow"}, first, seed)
+        make_run(root / f"{seed}" / "c", {"name": "distill", "steps": 2}, second, seed)
+    return root
+
+
+def test_every_run_finds_its_role_and_its_chain(chains):
+    found = {one.label: one for one in find_subjects([chains])}
+    assert {label: one.role for label, one in found.items()} == {
+        f"{seed}/{name}": role for seed in (0, 1) for name, role in (("a", "1-RF"), ("b", "2-RF"), ("c", "2-TD"))
+    }
+    for seed in (0, 1):
+        families = {found[f"{seed}/{name}"].family for name in "abc"}
+        assert families == {weights_hash(load_checkpoint(chains / str(seed) / "a"))}
+
+
+def test_runs_without_a_first_flow_or_of_two_sensors_are_refused(chains, tmp_path):
+    with pytest.raises(InputError, match="no 1-RF among the runs"):
+        find_subjects([chains / "0" / "b"])
+    other = make_run(tmp_path / "other", {"name": "rectify"})
+    config = load_checkpoint(other).config
+    path = other / "checkpoints" / "step-00000007.ckpt"
+    from r2flow.checkpoints import read_checkpoint
+
+    content = {**read_checkpoint(path), "config": {**config, "sensor": {**config["sensor"], "max_range": 70.0}}}
+    AtomicCheckpointIO().save_checkpoint(content, path)
+    with pytest.raises(InputError, match="another sensor"):
+        find_subjects([chains, other])
+
+
+def paper(runs: Path, out: Path, *options: object) -> tuple[object, ...]:
+    return ("report", "paper", "--runs", runs, "--out", out, "--num", 3, "--steps", "1,2", "--repeats", 0,
+            "--metrics", "mmd", "--device", "cpu", *options)  # fmt: skip
+
+
+def test_the_page_goes_on_where_it_stopped(r2flow, chains, tmp_path, monkeypatch):  # noqa: F811
+    command = paper(chains, tmp_path, "--bootstrap", 4, "--curved", 0, "--tolerance", 0)
+    code, said, error = r2flow(*command)
+    assert code == 0, error
+    assert "Of 12 claims of the paper" in said
+    content = json.loads((tmp_path / "paper.json").read_text())
+    found = {(row["label"], row["steps"]) for row in content["rows"]}
+    assert found == {(f"{s}/{n}", k) for s in (0, 1) for n, k in (("a", 1), ("a", 2), ("b", 1), ("b", 2), ("c", 2))}
+    assert all(row["jsd_low"] < row["jsd_high"] for row in content["rows"])
+    assert {claim["verdict"] for claim in content["claims"]} <= {"holds", "does not hold", "cannot tell"}
+    page = (tmp_path / "paper.md").read_text()
+    assert "**FRD, FRID, FPD, FPVD, FSVD:** not computed: not asked for" in page
+
+    monkeypatch.setattr(cells, "sampled_set", lambda *_: pytest.fail("a finished cell was measured again"))
+    assert r2flow(*command)[0] == 0
+    assert json.loads((tmp_path / "paper.json").read_text())["rows"] == content["rows"]
+
+
+@pytest.mark.slow
+def test_every_figure_stands_in_its_place(r2flow, chains, tmp_path):  # noqa: F811
+    code, _, error = r2flow(*paper(chains, tmp_path, "--bootstrap", 0, "--curved", 1))
+    assert code == 0, error
+    page = (tmp_path / "paper.md").read_text()
+    for name in ("figure_3", "figure_5", "figure_6", "figure_7", "figure_8a", "figure_8b"):
+        assert page.count(f"({name}.png)") == 1
+        assert (tmp_path / f"{name}.png").stat().st_size > 1000
+
+
+def test_marginals_add_up_and_lie_apart_as_their_histograms_do():
+    a, b = np.zeros((100, 100)), np.zeros((100, 100))
+    a[10, 20], b[10, 30] = 5, 7
+    along_x, along_y = marginals(a)
+    assert along_x[10] == along_y[20] == 5
+    # Equal along x, disjoint along y: the mean of 0 and sqrt(ln 2).
+    assert marginals_apart(a, b) == pytest.approx(js_distance(np.eye(2)[0], np.eye(2)[1]) / 2)
+
+
+def test_printed_and_own_figures_stand_in_one_line():
+    rows = [
+        {"role": "2-TD", "steps": 2, "seconds": 0.1, "jsd": 0.05},
+        {"role": "1-RF", "steps": 32, "seconds": 1, "jsd": 0.02},
+    ]
+    lines = beside(rows, ["jsd", "frechet_embedded"]).splitlines()
+    assert lines[0].split(" | ")[3:] == ["JSD x 10^2, paper", "ours |"]
+    assert "| 1-RF | 256 | 32 | 2.16 | 2 |" in lines
+    assert "| 2-TD | 2 | 2 | 2.39 | 5 |" in lines
+
+
+def test_what_differs_is_said_and_nothing_else():
+    paper = differences("KITTI-360", 81_106, 10_000, (64, 1024), [80_908_420], [2_560_000], {})
+    assert len(paper) == 1
+    small = " ".join(differences("simulated", 51, 32, (32, 256), [2_000_000], [3600], {"frd": "no weights"}))
+    for words in ("32 generated against 51 real", "32 x 256", "2,000,000", "3,600", "FRD:** not computed: no weights"):
+        assert words in small
+    assert same_architecture(125_246_466).frd == 134.22  # printed as 125.5 M
+    assert same_architecture(2_000_000) is None

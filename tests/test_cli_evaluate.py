@@ -1,0 +1,206 @@
+"""r2flow evaluate as a user types it."""
+
+import csv
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r2flow.evaluation.sets import open_set, prepared_reading
+from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.scan_files import write_points
+from tests.test_checkpoints import saved  # noqa: F401  a fixture
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.test_evaluation import SENSOR, folder, generated, images, real  # noqa: F401  fixtures
+
+QUICK = ("--metrics", "jsd,mmd", "--size", "8x64", "--workers", 0)
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("R2FLOW_CACHE", str(tmp_path / "cache"))
+
+
+def refuse(constant: str) -> None:
+    raise AssertionError(constant)
+
+
+def test_the_json_says_all_of_a_figure(r2flow, real, generated, tmp_path):  # noqa: F811
+    code, said, _ = r2flow("evaluate", real, generated, *QUICK, "--floor", "--json", tmp_path / "e.json")
+    assert code == 0
+    content = json.loads((tmp_path / "e.json").read_text(), parse_constant=refuse)
+    names = [one["comparison"] for one in content["comparisons"]]
+    assert names == ["generated", "real halves", "generated, as many"]
+    jsd, mmd = content["comparisons"][0]["metrics"]
+    assert jsd["printed"]["JSD x 10^2"] == pytest.approx(100 * jsd["figures"]["jsd"])
+    assert mmd["printed"]["MMD x 10^4"] == pytest.approx(1e4 * mmd["figures"]["mmd"])
+    assert jsd["protocol"]["mask"] == [0.5, 63.0]
+    assert jsd["protocol"]["sizes"] == {
+        "real": 12, "real_chosen": "all 12", "real_empty": 0, "generated": 10, "generated_empty": 0
+    }  # fmt: skip
+    assert content["origin"]["versions"].keys() == {"r2flow", "torch", "python"}
+    for words in ("JSD x 10^2", "MMD x 10^4", f"{100 * jsd['figures']['jsd']:#.4g}", "(10 : 12)"):
+        assert words in said
+    assert len(list((tmp_path / "cache" / "statistics").iterdir())) == 4
+
+
+def test_prepared_shards_are_the_scans_that_they_were_made_of(r2flow, generated, tmp_path):  # noqa: F811
+    for number, image in enumerate(images(6, 1)):
+        write_points(tmp_path / "drives" / str(number // 3) / f"{number}.bin", *image_to_points(image, SENSOR.rays()))
+    assert r2flow("prepare", "folder", tmp_path / "drives", "--size", "8x64", "--out", tmp_path / "shards")[0] == 0
+    found = open_set(str(tmp_path / "shards"), prepared_reading(str(tmp_path / "shards")))
+    assert {name: list(numbers) for name, numbers in found.drives.items()} == {"0": [0, 1, 2], "1": [3, 4, 5]}
+    np.testing.assert_allclose(found.source[4], images(6, 1)[4], atol=5e-3)
+    code, said, _ = r2flow("evaluate", tmp_path / "shards", generated, *QUICK[:2], "--workers", 0, "--floor")
+    assert code == 0  # sensor and size are the shards'
+    assert "real drives" in said
+
+
+def test_a_scale_of_reflectance_is_asked_for_where_it_matters(r2flow, real, tmp_path):  # noqa: F811
+    for number, image in enumerate(images(3, 1)):
+        xyz, reflectance = image_to_points(image, SENSOR.rays())
+        write_points(tmp_path / "g" / f"{number}.ply", xyz, 255 * reflectance)
+    assert r2flow("evaluate", real, tmp_path / "g", *QUICK)[0] == 0
+    options = ("--metrics", "beams", *QUICK[2:], "--json", tmp_path / "e.json")
+    code, _, said = r2flow("evaluate", real, tmp_path / "g", *options)
+    assert code == 2
+    assert "--reflectance-scale 255" in said
+    assert r2flow("evaluate", real, tmp_path / "g", *options, "--generated-scale", 255)[0] == 0
+    (beams,) = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["metrics"]
+    assert beams["figures"]["beam_reflectance"] == 0  # 0.5 of all rays that return, on both sides
+
+
+def test_a_figure_that_does_not_exist_is_null_and_said(r2flow, real, tmp_path):  # noqa: F811
+    empty = folder(tmp_path / "empty", np.zeros((2, 2, 8, 64), np.float32))
+    code, said, _ = r2flow(
+        "evaluate",
+        real,
+        empty,
+        "--metrics",
+        "mmd",
+        *QUICK[2:],
+        "--json",
+        tmp_path / "e.json",
+        "--out",
+        tmp_path / "page",
+    )
+    assert code == 0
+    (metric,) = json.loads((tmp_path / "e.json").read_text(), parse_constant=refuse)["comparisons"][0]["metrics"]
+    assert metric["figures"] == {"mmd": None}
+    assert any("no figure for mmd" in remark for remark in metric["remarks"])
+    assert any("2 generated scans" in remark for remark in metric["remarks"])
+    assert "none" in said
+    assert {path.name for path in (tmp_path / "page").iterdir()} == {
+        f"evaluation.{ending}" for ending in ("png", "csv", "json", "md")
+    }
+
+
+def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):  # noqa: F811
+    run = saved[0].parent.parent
+    code, said, _ = r2flow(
+        "evaluate",
+        real,
+        run,
+        "--metrics",
+        "jsd",
+        "--num",
+        3,
+        "--steps",
+        2,
+        "--workers",
+        0,
+        "--json",
+        tmp_path / "e.json",
+    )
+    assert code == 0
+    about = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["generated"]
+    assert (about["kind"], about["num"], about["steps"], about["noise"]) == ("sampled", 3, 2, "evaluation")
+    code, _, said = r2flow("evaluate", real, run, *QUICK[:2], "--size", "16x64", "--num", 3)
+    assert code == 2
+    assert "the flow's images are 8x64, not 16x64" in said
+
+
+def test_a_curve_goes_on_where_it_stopped(r2flow, saved, real, tmp_path, monkeypatch):  # noqa: F811
+    import r2flow.reports.speed_quality as speed_quality
+
+    def points(steps: str) -> list[dict[str, str]]:
+        code, said, err = r2flow(
+            "evaluate", real, "-c", saved[0], "--steps", steps, "--metrics", "jsd", "--num", 4, "--workers", 0,
+            "--batch-size", 2, "--out", tmp_path / "curve",
+        )  # fmt: skip
+        assert code == 0, err
+        lines = (tmp_path / "curve" / "speed_quality.csv").read_text().splitlines()
+        return list(csv.DictReader(line for line in lines if not line.startswith("#")))
+
+    first = points("1,2")
+    measured: list[int] = []
+    measure = speed_quality.measure
+    monkeypatch.setattr(speed_quality, "measure", lambda *a: (measured.append(1), measure(*a))[1])
+    third = points("4")
+    second = points("4,2,1")
+    assert len(measured) == 1
+    assert third[0] == second[0]
+    assert second[2] == first[0]
+    assert second[1] == first[1]
+    assert [float(row["evaluations"]) for row in second] == [4, 2, 1]
+    assert all(float(row["seconds"]) > 0 and 0 <= float(row["jsd/jsd"]) <= math.sqrt(math.log(2)) for row in second)
+    assert {path.suffix for path in (tmp_path / "curve").iterdir()} == {".png", ".csv", ".json", ".md"}
+
+
+def test_weights_that_are_missing_are_left_out_or_named(r2flow, real, generated, tmp_path):  # noqa: F811
+    code, _, said = r2flow("evaluate", real, generated, "--metrics", "jsd,frd", *QUICK[2:])
+    assert code == 2
+    assert "r2flow weights" in said
+    assert len(said.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("{real}", "{generated}", "--metrics", "jds", *QUICK[2:]), "Did you mean 'jsd'"),
+        (("{real}", "nowhere", *QUICK), "nowhere is not a folder"),
+        (("{real}", "{generated}", *QUICK[:2]), "give --size 8x64"),
+        (("{real}", "{generated}", *QUICK, "--split", "test"), "has no standard split"),
+        (("{real}", *QUICK), "give GENERATED, --checkpoint RUN or --floor"),
+        (("{real}", "-c", "run", *QUICK), "a curve needs --out"),
+        (("{real}", "{bare}", "--metrics", "frechet_embedded", *QUICK[2:]), "has no reflectance"),
+    ],
+)
+def test_what_cannot_be_is_one_line(r2flow, real, generated, tmp_path, arguments, message):  # noqa: F811
+    places = {"real": real, "generated": generated, "bare": tmp_path / "bare"}
+    folder(places["bare"], images(3, 4)[:, :1])
+    code, _, said = r2flow("evaluate", *(str(one).format(**places) for one in arguments))
+    assert code == 2
+    assert message in said
+    assert len([line for line in said.splitlines() if not line.startswith("WARNING")]) == 1
+
+
+def test_help_has_an_example(r2flow):  # noqa: F811
+    for verb in (("evaluate",), ("report", "neighbours")):
+        code, said, _ = r2flow(*verb, "--help")
+        assert code == 0
+        assert f"Example: r2flow {' '.join(verb)}" in " ".join(said.split())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path, ranks):  # noqa: F811
+    def run(out: Path, *launcher: str) -> dict[str, float]:
+        options = ("--metrics", "jsd,mmd,frechet_embedded", "--size", "8x64", "--batch-size", "2", "--workers", "0")
+        command = [*launcher, "-m", "r2flow.cli", "evaluate", str(real), str(generated), *options, "--json", str(out)]
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "R2FLOW_CACHE": str(out.with_suffix(""))}
+        done = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        metrics = json.loads(out.read_text())["comparisons"][0]["metrics"]
+        return {name: value for metric in metrics for name, value in metric["figures"].items()}
+
+    expected = run(tmp_path / "one.json")
+    shared = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks))
+    assert run(tmp_path / "many.json", *shared) == pytest.approx(expected, rel=1e-10)
+    again = run(tmp_path / "many.json", *shared)  # from the cache
+    assert again == pytest.approx(expected, rel=1e-10)

@@ -1,0 +1,335 @@
+"""Generated scans against real ones, with figures that are computed here by other means."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.checkpoints import Checkpoint
+from r2flow.errors import InputError
+from r2flow.evaluation import measuring
+from r2flow.evaluation.floor import floor_sets
+from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
+from r2flow.evaluation.reading import Reading
+from r2flow.evaluation.sets import ScanSet, fixed_choice, open_set, sampled_set
+from r2flow.evaluation.statistics import Cache, key_of
+from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.sensors import SENSORS
+from r2flow.metrics.jsd import JSD
+from r2flow.metrics.mmd import MMD
+from r2flow.noise import standard_normal
+from tests.data.conftest import kitti_360  # noqa: F401  a fixture
+from tests.test_sampling import flow as without_config
+
+SENSOR = SENSORS["hdl64e"].resized(8, 64)
+READING = Reading(SENSOR)
+
+
+def flow() -> Checkpoint:
+    return replace(without_config(), config={"sensor": {}, "encoding": {}})
+
+
+def images(count: int, seed: int) -> np.ndarray:
+    """Walls with holes at 4 to 60 m, (N, 2, 8, 64)."""
+    draw = np.random.default_rng(seed)
+    r = draw.uniform(4, 60, (count, 1, 8, 64)) * (draw.random((count, 1, 8, 64)) > 0.3)
+    return np.concatenate([r, 0.5 * (r > 0)], 1).astype(np.float32)
+
+
+def folder(path: Path, scans: np.ndarray) -> Path:
+    path.mkdir(parents=True)
+    for number, image in enumerate(scans):
+        np.save(path / f"{number:06d}.npy", image)
+    return path
+
+
+@pytest.fixture
+def real(tmp_path: Path) -> Path:
+    return folder(tmp_path / "real", images(12, 1))
+
+
+@pytest.fixture
+def generated(tmp_path: Path) -> Path:
+    return folder(tmp_path / "generated", images(10, 2))
+
+
+def figures(real: ScanSet, generated: ScanSet, cache: Cache | None = None, work: Work | None = None):
+    metrics, work = {"jsd": JSD(), "mmd": MMD()}, work or Work()
+    measured = measure(metrics, gather_real(metrics, real, work, cache), generated, work)
+    return {name: value for one in measured for name, value in one.figures.items()}
+
+
+def histograms(scans: np.ndarray) -> np.ndarray:
+    """The field's bird's-eye histograms of 3 m < r < 63 m, point by point, (N, 10000)."""
+    rays = SENSOR.rays().numpy().astype(np.float64)
+    counts = np.zeros((len(scans), 100, 100))
+    for n, image in enumerate(scans):
+        for h in range(8):
+            for w in range(64):
+                r = float(image[0, h, w])
+                if 3 < r < 63:
+                    e, a = rays[:, h, w]
+                    x, y = r * np.cos(e) * np.cos(a), r * np.cos(e) * np.sin(a)
+                    counts[n, int((x + 80) // 1.6), int((y + 80) // 1.6)] += 1
+    return counts.reshape(len(scans), -1)
+
+
+def test_the_figures_are_the_formulas(real, generated):
+    p, q = histograms(images(12, 1)), histograms(images(10, 2))
+    found = figures(open_set(str(real), READING), open_set(str(generated), READING), work=Work(batch_size=5))
+    a, b = p.sum(0) / p.sum(), q.sum(0) / q.sum()
+    m = (a + b) / 2
+    entropy = [-(x[x > 0] * np.log(x[x > 0])).sum() for x in (a, b, m)]
+    assert found["jsd"] == pytest.approx(math.sqrt(entropy[2] - (entropy[0] + entropy[1]) / 2), rel=1e-9)
+
+    def mean_kernel(x, y):
+        d = ((x[:, None] / x.sum(1)[:, None, None] - y / y.sum(1)[:, None]) ** 2).sum(-1)
+        return np.exp(-d / (2 * 0.5**2)).mean()
+
+    assert found["mmd"] == pytest.approx(mean_kernel(p, p) + mean_kernel(q, q) - 2 * mean_kernel(p, q), rel=1e-6)
+
+
+def test_neither_order_nor_batches_nor_reading_processes_are_seen(real, generated, tmp_path):
+    there = open_set(str(real), READING)
+    expected = figures(there, open_set(str(generated), READING))
+    backwards = folder(tmp_path / "backwards", images(10, 2)[::-1])
+    found = figures(there.part(range(11, -1, -1), "backwards"), open_set(str(backwards), READING), work=Work(3, 1))
+    assert found == pytest.approx(expected, rel=1e-10)
+
+
+class TestCache:
+    def test_what_is_kept_gives_the_same_figures_and_is_not_read_again(self, real, generated, tmp_path, monkeypatch):
+        cache, other = Cache(tmp_path / "cache"), open_set(str(generated), READING)
+        fresh = figures(open_set(str(real), READING), other)
+        assert figures(open_set(str(real), READING), other, cache) == fresh
+        truth = open_set(str(real), READING)
+        monkeypatch.setattr(ScanSet, "batches", lambda *_: pytest.fail("the real scans were read again"))
+        gathered = gather_real({"jsd": JSD(), "mmd": MMD()}, truth, Work(), cache)
+        assert gathered.kept == {"jsd", "mmd"}
+        monkeypatch.undo()
+        assert figures(truth, other, cache) == fresh
+
+    def test_any_change_of_what_made_them_misses_it(self, real, tmp_path, monkeypatch):
+        def key(root: Path = real, reading: Reading = READING, metric: JSD | None = None, rule: str = "all") -> str:
+            found = key_of(metric or JSD(), open_set(str(root), reading), rule)
+            assert found is not None
+            return found
+
+        first = key()
+        assert key() == first
+        keys = [
+            first,
+            key(rule="10 of 12"),
+            key(metric=JSD(keep=True)),
+            key_of(MMD(), open_set(str(real), READING), "all"),
+        ]
+
+        class Other(JSD):
+            protocol = property(lambda self: JSD.protocol.fget(self).__class__("jsd", "other", weights="abc"))
+
+        keys.append(key(metric=Other()))
+        keys += [key(reading=Reading(SENSOR, reflectance=False)), key(reading=Reading(SENSOR, "unfolding"))]
+        keys += [
+            key(reading=Reading(SENSOR, convention="reference")),
+            key(reading=Reading(SENSOR, reflectance_scale=2)),
+        ]
+        keys.append(key_of(JSD(), open_set(str(real), READING, num=7), "all"))
+        monkeypatch.setattr("r2flow.evaluation.statistics.FORMAT", 2)
+        keys.append(key())
+        monkeypatch.undo()
+        scan = real / "000003.npy"
+        scan.write_bytes(scan.read_bytes())  # another time, the same content
+        keys.append(key())
+        np.save(scan, np.zeros((2, 8, 64)))  # another size
+        keys.append(key())
+        scan.rename(real / "000099.npy")
+        keys.append(key())
+        assert len(set(keys)) == len(keys)
+
+    def test_a_damaged_file_is_gathered_again(self, real, generated, tmp_path, caplog):
+        cache, there, other = Cache(tmp_path / "cache"), open_set(str(real), READING), open_set(str(generated), READING)
+        expected = figures(there, other, cache)
+        for path in cache.folder.iterdir():
+            path.write_bytes(path.read_bytes()[:100])
+        assert figures(there, other, cache) == expected
+        assert "is damaged" in caplog.text
+
+    def test_sampled_scans_are_never_kept(self):
+        drawn = sampled_set(flow(), "flow", 2, 1)
+        assert key_of(JSD(), drawn, "all 2") is None
+
+
+def test_the_field_s_subset_is_read_first_and_every_scan_once(real, generated, monkeypatch):
+    monkeypatch.setattr(measuring, "REAL_SCANS", 5)
+    read: list[int] = []
+    there = open_set(str(real), READING)
+    fetch = type(there.source).__getitem__
+    monkeypatch.setattr(type(there.source), "__getitem__", lambda self, i: (read.append(i), fetch(self, i))[1])
+    everything = CountReturns()
+    metrics = {"jsd": JSD(), "returns": everything}
+    gathered = gather_real(metrics, there, Work(batch_size=2))
+    chosen = fixed_choice(12, 5)
+    assert read[:5] == chosen
+    assert sorted(read) == list(range(12))
+    assert gathered.rules == {"jsd": "5 of 12, fixed shuffle, seed 0", "returns": "all 12"}
+    assert (gathered.statistics["jsd"].scans, gathered.statistics["returns"].scans) == (5, 12)
+    assert gathered.statistics["jsd"].states["real_sum"].sum() == histograms(images(12, 1)[chosen]).sum()
+    assert gathered.statistics["returns"].states["real_returns"] == (images(12, 1)[:, 0] > 0).sum() - far(images(12, 1))
+
+
+def far(scans: np.ndarray) -> int:
+    return int((scans[:, 0] >= 63).sum())
+
+
+class CountReturns(JSD):
+    """Returns of all scans; it passes for a metric of a network's features, which are given every real scan."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.add_state("real_returns", torch.tensor(0), dist_reduce_fx="sum")
+
+    @property
+    def protocol(self):
+        return type(super().protocol)("returns", "range image", extractor="counter")
+
+    def update(self, scans, real, first=0):
+        self.real_returns += scans.returned.sum()
+
+
+def test_the_fixed_shuffle_is_stated_and_does_not_change():
+    assert fixed_choice(7, 7) == list(range(7))
+    assert fixed_choice(81106, 10000)[:3] == sorted(np.random.Generator(philox()).permutation(81106)[:10000])[:3]
+    assert real_rule(JSD(), 10_000) == (None, "all 10000")
+
+
+def philox() -> np.random.Philox:
+    import zlib
+
+    return np.random.Philox(key=np.array([0, zlib.crc32(b"shuffle")], dtype=np.uint64), counter=[0, 0, 0, 0])
+
+
+class TestSets:
+    def test_every_format_gives_the_same_figures(self, real, tmp_path):
+        made = images(10, 2)
+        files = tmp_path / "files"
+        for number, image in enumerate(made):
+            ending = ("ply", "bin", "npy", "pcd")[number % 4]
+            xyz, reflectance = image_to_points(image, SENSOR.rays())
+            write_points(files / f"{number}.{ending}", xyz, reflectance)
+        found = open_set(str(files), READING)
+        assert found.about["reflectance"]
+        for index, name in enumerate(found.source.names):
+            np.testing.assert_allclose(found.source[index], made[int(Path(name).stem)], atol=1e-4)
+
+    def test_one_of_each_where_a_sample_lies_in_several_formats(self, generated):
+        for number, image in enumerate(images(10, 2)):
+            write_points(generated / f"{number:06d}.ply", *image_to_points(image, SENSOR.rays()))
+        assert open_set(str(generated), READING).source.names == [f"{n:06d}.npy" for n in range(10)]
+
+    def test_a_layout_with_its_split_and_drives(self, kitti_360):  # noqa: F811
+        found = open_set(f"kitti_360:{kitti_360}", READING, "test")
+        assert len(found) == 6
+        assert {drive[-9:-5]: list(numbers) for drive, numbers in found.drives.items()} == {
+            "0000": [0, 1, 2], "0002": [3, 4, 5]
+        }  # fmt: skip
+        assert found.part([4, 0], "two").drives.keys() == found.drives.keys()
+        assert found.source[4][0].max() == pytest.approx(5 + 2 * 3 + 1, abs=0.02)
+
+    def test_simulated_scenes_are_numbered_by_their_seed(self):
+        found = open_set("simulated:3", READING, num=2)
+        assert len(found) == 2
+        assert found.about["seed"] == 3
+        np.testing.assert_array_equal(found.source[1], open_set("simulated:3", READING, num=3).source[1])
+
+    def test_a_flow_is_sampled_from_the_noise_of_evaluations(self):
+        drawn = sampled_set(flow(), "flow", 5, steps=1, seed=9)
+        batches = list(drawn.batches(range(5), 2))
+        assert [len(batch) for batch in batches] == [2, 2, 1]
+        x_0 = standard_normal((2, 8, 64), 9, "evaluation", 3)
+        v = flow().model(torch.tensor([0.0]), x_0[None])
+        torch.testing.assert_close(batches[1][1], flow().encoding.decode(x_0[None] + v)[0])
+        assert drawn.source.evaluations == [1] * 5
+        assert len(drawn.source.seconds) == 3
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("nowhere", "nowhere is not a folder"),
+            ("kitti360:x", "Did you mean 'kitti_360'"),
+            ("simulated:x", "named by their seed"),
+        ],
+    )
+    def test_what_is_not_there_is_said(self, text, message, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(InputError, match=message):
+            open_set(text, READING)
+
+    def test_another_size_names_the_option(self, real):
+        with pytest.raises(InputError, match=r"000000\.npy is a range image of 8x64, .* 16x64; give --size 8x64"):
+            next(open_set(str(real), Reading(SENSOR.resized(16, 64))).batches([0], 1))
+
+
+class TestExtremes:
+    def test_an_empty_scan_counts_and_is_said(self, real, tmp_path):
+        made = images(4, 2)
+        made[1] = 0
+        made[2] = np.where(made[2] > 0, 70, 0)  # beyond the mask
+        found = self.measured(real, folder(tmp_path / "g", made))
+        assert all(math.isfinite(value) for one in found for value in one.figures.values())
+        assert all(one.protocol["sizes"]["generated_empty"] == 2 for one in found)
+        assert all("2 of 4 generated scans" in " ".join(one.remarks) for one in found)
+
+    def test_points_out_of_view_are_an_empty_scan_and_no_points_a_clear_error(self, real, tmp_path):
+        write_points(tmp_path / "g" / "0.ply", np.array([[0, 0, 9.0]]), np.array([0.5]))
+        assert not open_set(str(tmp_path / "g"), READING).source[0].any()
+        found = self.measured(real, tmp_path / "g")
+        for one in found:
+            assert any(math.isnan(value) for value in one.figures.values()) <= bool(one.remarks)
+            assert "single" in " ".join(one.remarks)
+
+    def test_a_single_scan_is_said(self, real, tmp_path):
+        found = self.measured(real, folder(tmp_path / "g", images(1, 2)))
+        assert all("a single generated scan" in " ".join(one.remarks) for one in found)
+
+    def measured(self, real: Path, generated: Path) -> Sequence[measuring.Measured]:
+        metrics = {"jsd": JSD(), "mmd": MMD()}
+        gathered = gather_real(metrics, open_set(str(real), READING), Work())
+        return measure(metrics, gathered, open_set(str(generated), READING), Work())
+
+
+def test_intervals_hold_their_figure(real, generated):
+    metrics = {"jsd": JSD(keep=True)}
+    gathered = gather_real(metrics, open_set(str(real), READING), Work())
+    (found,) = measure(metrics, gathered, open_set(str(generated), READING), Work(), draws=30)
+    low, high = found.intervals["jsd"]
+    assert low < found.figures["jsd"] < high
+    assert found.protocol["interval"] == {"bootstrap draws": 30, "level": 0.95, "seed": 0}
+
+
+def test_the_floor_is_halves_by_block_and_two_drives(kitti_360, tmp_path):  # noqa: F811
+    real = open_set(f"kitti_360:{kitti_360}", READING, "train")
+    other = open_set(str(folder(tmp_path / "g", images(8, 2))), READING)
+    found = floor_sets(real, other)
+    assert list(found) == ["real halves", "generated, as many", "real drives"]
+    names = real.source.names
+    halves = [one.source.names for one in found["real halves"]]
+    assert [*halves[0], *halves[1]] == names
+    assert len(halves[0]) == 4
+    assert [len(one) for one in found["generated, as many"]] == [4, 5]
+    assert [sorted({name.split("/")[1][17:21] for name in one.source.names}) for one in found["real drives"]] == [
+        ["0003"], ["0004"]
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="at least two"):
+        floor_sets(real.part([0], "one"))
+
+
+def test_identity_is_plain_and_holds_no_path(real):
+    found = open_set(str(real), READING)
+    assert str(real) not in json.dumps(found.identity)
+    assert str(real) not in json.dumps(dict(found.about))
