@@ -16,6 +16,7 @@ from r2flow.checkpoints import FOLDER, checkpoints_of, read_checkpoint
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
+from r2flow.locks import Lock
 
 log = logging.getLogger(__name__)
 
@@ -89,31 +90,26 @@ def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
     Raises:
         InputError: another process still trains there after `patience` seconds.
     """
-    try:
-        import fcntl
-    except ImportError:  # Windows has no flock
-        yield
-        return
-    path = Path(run, ".lock")
+    path, until = Path(run, ".lock"), time.monotonic() + patience
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+", encoding="utf-8") as file:
-        until = time.monotonic() + patience
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() > until:
-                    file.seek(0)
-                    holder = file.read().strip() or "unknown"
-                    raise InputError(
-                        f"{run} is being trained by another process ({holder}). Wait for it, or give name=OTHER."
-                    ) from None
-                time.sleep(0.2)
-        file.truncate(0)
-        file.write(f"pid {os.getpid()} on {platform.node()}")
-        file.flush()
+    while True:
+        try:
+            lock = Lock(path)
+            break
+        except BlockingIOError:
+            if time.monotonic() > until:
+                holder = path.read_text(encoding="utf-8").strip() or "unknown"
+                raise InputError(
+                    f"{run} is being trained by another process ({holder}). Wait for it, or give name=OTHER."
+                ) from None
+            time.sleep(0.2)
+    try:
+        lock.file.truncate(0)
+        lock.file.write(f"pid {os.getpid()} on {platform.node()}".encode())
+        lock.file.flush()
         yield
+    finally:
+        lock.release()
 
 
 def read_config(run: str | Path) -> dict[str, Any] | None:

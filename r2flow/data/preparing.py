@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from r2flow.data.locks import Lock
 from r2flow.data.manifest import (
     MANIFEST,
     Manifest,
@@ -35,6 +34,7 @@ from r2flow.data.shards import Damaged
 from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
+from r2flow.locks import Lock
 
 log = logging.getLogger(__name__)
 

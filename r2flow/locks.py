@@ -1,4 +1,4 @@
-"""Files that one process holds: who makes what, among several at work in one folder."""
+"""Files that one process holds, among several at work in one folder."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import IO
 
 try:
     import fcntl
-except ImportError:  # Windows: two commands at once make the same bytes twice there, and harm nothing
+except ImportError:  # Windows has no flock: nobody is kept out there
     fcntl = None  # type: ignore[assignment]
 
 
@@ -26,7 +26,7 @@ class Lock:
         except BlockingIOError:
             self.file.close()
             raise
-        except OSError:  # a file system without locks: the same bytes may be made twice
+        except OSError:  # a file system without locks: likewise
             pass
 
     def release(self) -> None:
