@@ -4,7 +4,11 @@
 
 Five corruptions at four levels each, four controls and a training run. Levels, sizes, seeds and what each claim means
 in numbers are the constants below, written down before the first run; the features were chosen before it and stayed.
-About 20 minutes on one core, as much again where the run has to be trained first.
+
+The first network failed two claims (docs/metrics.md): its distance did not grow with range noise beyond 3 cm and did
+not fall along the run, because it had only ever seen the simulator's few millimetres of noise. The second was shown
+ranges disturbed by up to a metre; that is the one change, and it is judged by the same levels on scenes of another seed.
+About 7 minutes on one core, 3 more where the run has to be trained first.
 """
 
 import argparse
@@ -45,7 +49,7 @@ from r2flow.sampling import sample
 EXTRACTORS = ("embedded", "embedded_range")
 SENSOR = SENSORS["hdl64e"]
 SIMULATED = 300  # scans of a set; the other set are the next as many scenes
-SEED = 11  # of the simulator and of corruptions; no seed that the network was trained with
+SEED = 12  # of the simulator and of corruptions; no seed that a network was trained with (the first was judged by 11)
 
 # Level by level, the least first.
 NOISE = (0.03, 0.1, 0.3, 1.0)  # metres, standard deviation of what is added to every range
@@ -109,7 +113,7 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, Sequence[float]]] = {
 }
 UNITS = {
     "noise": "metres", "blur": "pixels", "dropped beams": "share of beams", "turned": "degrees",
-    "repeated": "copies of each scan",
+    "repeated": "copies",
 }  # fmt: skip
 
 
@@ -273,13 +277,13 @@ def figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Distance against level, a panel for each corruption, as times the distance of the uncorrupted set."""
     kinds = list(dict.fromkeys((row["scans"], row["extractor"]) for row in rows))
     out = blank_figure(12, 3.2, "Frechet distance of the embedded extractor, corruption by corruption")
-    for axes, name in zip(out.subplots(1, len(UNITS)), UNITS, strict=True):
+    for axes, name in zip(out.subplots(1, len(UNITS), sharey=True), UNITS, strict=True):
         for style, (what, extractor) in zip(STYLES, kinds, strict=False):
             own = [r for r in rows if (r["scans"], r["extractor"], r["corruption"]) == (what, extractor, name)]
             axes.plot([r["level"] for r in own], [r["distance"] for r in own], **style, label=f"{what}, {extractor}")
         axes.set(xscale="log", yscale="log", xlabel=f"{name}, {UNITS[name]}")
         axes.set_xticks([r["level"] for r in own], [f"{r['level']:.3g}" for r in own], minor=False)
-        axes.minorticks_off()
+        axes.set_xticks([], minor=True)
     out.axes[0].set_ylabel("distance")
     out.legend(*out.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     return out

@@ -123,6 +123,12 @@ def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):
     code, _, said = r2flow("evaluate", real, run, *QUICK[:2], "--size", "16x64", "--num", 3)
     assert code == 2
     assert "the flow's images are 8x64, not 16x64" in said
+    code, _, said = r2flow("evaluate", real, run, *QUICK[:2], "--sensor", "vlp16", "--size", "8x64", "--num", 3)
+    assert code == 2
+    assert "the flow looks through hdl64e, not vlp16" in said
+    code, _, said = r2flow("evaluate", real, run, *QUICK[:2], "--projection", "flat", "--num", 3)
+    assert code == 2
+    assert "--projection must be one of spherical, unfolding; found 'flat'" in said
 
 
 def test_a_curve_goes_on_where_it_stopped(r2flow, saved, real, tmp_path, monkeypatch):  # noqa: F811
@@ -168,6 +174,7 @@ def test_weights_that_are_missing_are_left_out_or_named(r2flow, real, generated,
         (("{real}", "{generated}", *QUICK, "--split", "test"), "has no standard split"),
         (("{real}", *QUICK), "give GENERATED, --checkpoint RUN or --floor"),
         (("{real}", "-c", "run", *QUICK), "a curve needs --out"),
+        (("{real}", "{generated}", *QUICK, "--json", "{real}"), "is a folder; name a file"),
         (("{real}", "{bare}", "--metrics", "frechet_embedded", *QUICK[2:]), "has no reflectance"),
     ],
 )

@@ -107,6 +107,8 @@ def evaluate(
         raise InputError("nothing to compare with: give GENERATED, --checkpoint RUN or --floor.")
     if checkpoint and (floor or bootstrap or json):
         raise InputError("--floor, --bootstrap and --json belong to one comparison; a curve writes its page to --out.")
+    if json is not None and json.is_dir():
+        raise InputError(f"--json {json} is a folder; name a file to write to.")
     check_method(solver)
     check_tolerance(tolerance)
     with joined(choose_device(device)) as place:
@@ -306,6 +308,7 @@ def reading_of(
     """How scans become images: as asked for, else as the flow's or a prepared set's were, else the default."""
     from r2flow.evaluation.reading import Reading
     from r2flow.evaluation.sets import is_prepared, prepared_reading
+    from r2flow.lidar.projection import CONVENTIONS, PROJECTIONS
 
     prepared = [prepared_reading(text) for text in (real, generated) if text is not None and is_prepared(text)]
     if flows:
@@ -320,7 +323,12 @@ def reading_of(
         if flows and chosen.shape != found.sensor.shape:
             asked, own = ("x".join(map(str, one.shape)) for one in (chosen, found.sensor))
             raise InputError(f"the flow's images are {own}, not {asked}; leave --sensor and --size out.")
+        if flows and chosen.elevations != found.sensor.elevations:
+            raise InputError(f"the flow looks through {found.sensor.name}, not {chosen.name}; leave --sensor out.")
         found = found if flows else replace(found, sensor=chosen)
+    for option, value, known in (("projection", projection, PROJECTIONS), ("convention", convention, CONVENTIONS)):
+        if value is not None and value not in known:
+            raise InputError(f"--{option} must be one of {', '.join(known)}; found {value!r}.")
     how: dict[str, Any] = {"projection": projection, "convention": convention}
     return replace(found, reflectance_scale=reflectance_scale, **{k: v for k, v in how.items() if v is not None})
 

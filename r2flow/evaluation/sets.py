@@ -19,7 +19,7 @@ from r2flow.checkpoints import Checkpoint, checkpoints_of, weights_hash
 from r2flow.data.layouts import LAYOUTS, find_drives
 from r2flow.data.manifest import MANIFEST, read_manifest
 from r2flow.data.prepared import open_prepared
-from r2flow.data.sources import ScanSource, SimulatedScans
+from r2flow.data.sources import ScanSource, SimulatedScans, spread
 from r2flow.errors import InputError
 from r2flow.evaluation.reading import FolderScans, Reading, has_reflectance, scan_paths
 from r2flow.flow.solvers import solve
@@ -235,7 +235,9 @@ def _of_files(label: str, root: Path, paths: list[Path], reading: Reading, about
     for number, path in enumerate(paths):
         drives.setdefault(str(path.parent.relative_to(root)), []).append(number)
     stats = [(str(path.relative_to(root)), s.st_size, s.st_mtime_ns) for path in paths if (s := path.stat())]
-    files = hashlib.sha256(json.dumps(stats).encode()).hexdigest()
+    # Some contents, too: unpacked archives have equal names, sizes and times.
+    some = [hashlib.sha256(paths[number].read_bytes()).hexdigest() for number in spread(len(paths), 8)]
+    files = hashlib.sha256(json.dumps([stats, some]).encode()).hexdigest()
     identity = {"files": files, **reading.identity()}
     about = {**about, "files": files[:12], "reflectance": reading.reflectance}
     source = FolderScans(root, paths, reading)

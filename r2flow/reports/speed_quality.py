@@ -89,12 +89,17 @@ def measure_curve(
             remarks = dict.fromkeys(remark for m in measured for remark in m.remarks)
             rows.append({
                 "flow": label, "weights": weights_hash(flow), "distilled_for": flow.distilled_steps, "steps": count,
-                "solver": curve.method, "evaluations": statistics.fmean(drawn.source.evaluations),
-                "seconds": statistics.median(drawn.source.seconds), "batch_size": work.batch_size,
+                "solver": curve.method, "evaluations": _or_nan(statistics.fmean, drawn.source.evaluations),
+                "seconds": _or_nan(statistics.median, drawn.source.seconds), "batch_size": work.batch_size,
                 "scans": curve.num, "seed": curve.seed, **figures, "remarks": BETWEEN.join(remarks), "key": key,
             })  # fmt: skip
             arrived(rows)
     return rows
+
+
+def _or_nan(average: Callable[[Sequence[float]], float], values: Sequence[float]) -> float:
+    """NaN for a process that had no batch; the first one, which writes the page, always has."""
+    return average(values) if values else math.nan
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:

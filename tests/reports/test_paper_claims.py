@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from r2flow.reports.paper.claims import FAILS, HOLDS, UNKNOWN, At, claims, judge_less, together
+from r2flow.reports.paper.claims import FAILS, HOLDS, UNKNOWN, At, claims, comparable, judge_less, together
 from r2flow.reports.paper.printed import COLUMNS, TABLE_I, TABLE_II
 
 
@@ -87,3 +87,50 @@ def test_the_paper_s_own_table_bears_out_the_paper_s_claims():
     assert FAILS not in {
         claim.verdict for claim in claims(rows, ["fpd", "jsd"], [], []) if claim.text.startswith("On some metrics")
     }
+
+
+def test_a_curve_of_few_evaluations_says_nothing_of_many():
+    rows = rows_of("1-RF", 4, [0.1, 0.1, 0.1]) + rows_of("2-RF", 4, [0.3, 0.3, 0.3])
+    many = At("1-RF", None), At("2-RF", None)
+    assert judge_less(rows, *many, "jsd") == (UNKNOWN, "no run of 1-RF at 16 or more nor 2-RF at 16 or more")
+    assert judge_less([{**row, "steps": 16} for row in rows], *many, "jsd")[0] == HOLDS
+
+
+@pytest.mark.parametrize(
+    ("few", "verdict"), [([1.0, 1.0, 1.0], HOLDS), ([0.8, 1.0, 1.3], UNKNOWN), ([1.4, 1.5, 1.6], FAILS)]
+)
+def test_a_distance_is_close_only_where_its_interval_over_seeds_is(few, verdict):
+    rows = rows_of("2-RF", 256, [1.0, 1.0, 1.0]) + rows_of("2-TD", 2, few)
+    assert comparable(rows, ["jsd"]).verdict == verdict
+
+
+@pytest.mark.parametrize(("high", "verdict"), [(1.05, HOLDS), (1.5, UNKNOWN)])
+def test_one_seed_is_close_only_by_its_intervals_over_scans(high, verdict):
+    parent = rows_of("2-RF", 256, [1.0], jsd_low=1.0, jsd_high=1.02)
+    assert comparable(parent + rows_of("2-TD", 2, [1.0]), ["jsd"]).verdict == UNKNOWN
+    child = rows_of("2-TD", 2, [1.0], jsd_low=0.95, jsd_high=high)
+    assert comparable(parent + child, ["jsd"]).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("dropped", "verdict"),
+    [([0.2], UNKNOWN), ([0.05, 0.2], UNKNOWN), ([0.20, 0.21, 0.22], HOLDS), ([0.01, 0.02, 0.01], FAILS)],
+)
+def test_ray_drop_of_the_most_curved_paths_is_judged_over_seeds(dropped, verdict):
+    curved = [
+        {"family": str(i), "role": "1-RF", "integral_normalised": 1.0, "first_tenth": 0.2, "last_tenth": 0.2,
+         "paths_dropped": share, "dropped_share": 0.1}
+        for i, share in enumerate(dropped)
+    ]  # fmt: skip
+    found = {claim.source: claim.verdict for claim in claims([], [], curved, [])}
+    assert found["figure 8 (b)"] == verdict
+
+
+def test_hdit_without_ape_does_not_stand_for_the_paper_s():
+    common = {"family": "0", "steps": 256, "gmac": 1.0, "marginals": 0.1}
+    rows = []
+    for seed in range(3):
+        for backbone, position, frd in (("hdit", "learnable", 1.0), ("hdit", "none", 9.0), ("adm_unet", "none", 5.0)):
+            rows.append({**common, "seed": seed, "backbone": backbone, "position": position, "frd": frd})
+    found = {claim.text: claim.verdict for claim in claims([], ["frd"], [], rows)}
+    assert found["HDiT learns the better 1-RF than either U-Net."] == HOLDS

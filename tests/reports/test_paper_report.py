@@ -12,8 +12,9 @@ from r2flow.errors import InputError
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.reports.paper import cells
 from r2flow.reports.paper.figures import marginals, marginals_apart
+from r2flow.reports.paper.report import held_out
 from r2flow.reports.paper.subjects import find_subjects
-from r2flow.reports.paper.tables import beside, differences, same_architecture
+from r2flow.reports.paper.tables import beside, differences, over_seeds, same_architecture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_sampling import network
 
@@ -53,6 +54,41 @@ def test_every_run_finds_its_role_and_its_chain(chains):
     for seed in (0, 1):
         families = {found[f"{seed}/{name}"].family for name in "abc"}
         assert families == {weights_hash(load_checkpoint(chains / str(seed) / "a"))}
+
+
+def test_a_child_finds_its_parent_in_any_order_where_the_first_flow_is_not_there(chains, tmp_path):
+    first = make_run(tmp_path / "0" / "elsewhere", {"name": "rectify"}, seed=5)
+    second = make_run(tmp_path / "1" / "z", {"name": "reflow"}, first, seed=5)
+    make_run(tmp_path / "1" / "a", {"name": "distill", "steps": 2}, second, seed=5)
+    found = {one.role: one for one in find_subjects([tmp_path / "1", chains / "0" / "a"])}
+    assert found["2-TD"].family == found["2-RF"].family == weights_hash(load_checkpoint(second))
+
+
+def test_a_cell_that_was_kept_belongs_to_the_chain_that_is_known_now(r2flow, chains, tmp_path):  # noqa: F811
+    command = paper(chains / "0" / "a", tmp_path, "--runs", chains / "0" / "c", "--bootstrap", 0, "--curved", 0,
+                    "--tolerance", 0)  # fmt: skip
+    for more in ((), ("--runs", chains / "0" / "b")):
+        assert r2flow(*command, *more)[0] == 0
+    rows = json.loads((tmp_path / "paper.json").read_text())["rows"]
+    assert len({row["family"] for row in rows}) == 1
+
+
+def test_held_out_scenes_of_another_seed_are_other_scans(chains):
+    sets = [held_out(one) for one in find_subjects([chains]) if one.role == "1-RF"]
+    assert not np.array_equal(sets[0].source[0], sets[1].source[0])
+    assert sets[0].identity != sets[1].identity
+
+
+def test_seeds_are_those_of_one_kind_of_network():
+    rows = [
+        {"role": "1-RF", "kind": kind, "steps": 256, "seconds": 1.0, "jsd": d}
+        for kind, d in (("adm_unet", 0.4), ("hdit with APE", 0.1), ("hdit with APE", 0.3))
+    ]
+    merged = {row["kind"]: row for row in over_seeds(rows, ["jsd"])}
+    assert merged["hdit with APE"]["jsd"] == pytest.approx(0.2)
+    assert merged["hdit with APE"]["n"] == 2
+    assert merged["adm_unet"]["jsd"] == 0.4
+    assert beside(rows, ["jsd"]).splitlines()[2] == "| 1-RF | 256 | 256 | 2.16 | 20 |"
 
 
 def test_runs_without_a_first_flow_or_of_two_sensors_are_refused(chains, tmp_path):

@@ -29,8 +29,8 @@ class Cell:
     """One flow at one number of Euler steps.
 
     Attributes:
-        row: label, role, family, seed, steps, seconds a scan, and each metric's first figure under the metric's name
-            with its interval's `_low` and `_high`.
+        row: label, role, family, kind, seed, steps, seconds a scan, and each metric's first figure under the metric's
+            name with its interval's `_low` and `_high`.
         birds_eye: Points from above, of all scans together, (100, 100).
         images: The first scans, (SHOWN, 2 or 1, H, W).
     """
@@ -88,8 +88,9 @@ def measure_cells(bench: Bench, flow: Checkpoint, subject: Subject, steps: Seque
         if cell is None:
             cell = _measure(bench, flow, subject, count)
             _write(path, cell)
-        # Names and places may have changed since.
-        yield Cell({**cell.row, "label": subject.label, "role": subject.role}, cell.birds_eye, cell.images)
+        # Names and places, and which other runs there are, may have changed since.
+        row = {**cell.row, "label": subject.label, "role": subject.role, "family": subject.family, "kind": subject.kind}
+        yield Cell(row, cell.birds_eye, cell.images)
 
 
 def _measure(bench: Bench, flow: Checkpoint, subject: Subject, steps: int) -> Cell:

@@ -61,19 +61,23 @@ def _draw_marginals(above: Any, beside: Any, counts: np.ndarray, real: np.ndarra
 
 
 def trade_off_figure(rows: Sequence[Row], metrics: Mapping[str, str]) -> Figure:
-    """Figure 6: distance against evaluations and against seconds, a line for each role, a band over its seeds.
+    """Figure 6: distance against evaluations and against seconds, a band over seeds.
+
+    A line for each role, of each kind of network where there are several.
 
     Args:
         rows: As `claims` takes them, with `seconds` a scan.
         metrics: Name -> heading.
     """
     figure = blank_figure(10, 3.1 * len(metrics) + 0.3)
-    roles = list(dict.fromkeys(row["role"] for row in rows))
+    lines = list(dict.fromkeys((row["role"], row.get("kind", "")) for row in rows))
+    several = len({kind for _, kind in lines}) > 1
     for place, (metric, heading) in enumerate(metrics.items()):
         for side, (work, label) in enumerate((("steps", "network evaluations"), ("seconds", "seconds a scan"))):
             axes = figure.add_subplot(len(metrics), 2, 2 * place + side + 1)
-            for number, role in enumerate(roles):
-                _draw_line(axes, [row for row in rows if row["role"] == role], work, metric, role, number)
+            for number, (role, kind) in enumerate(lines):
+                own = [row for row in rows if (row["role"], row.get("kind", "")) == (role, kind)]
+                _draw_line(axes, own, work, metric, f"{role}, {kind}" if several else role, number)
             axes.set_xscale("log", base=2 if work == "steps" else 10)
             axes.set_yscale("log")
             axes.set(xlabel=label, ylabel=heading if side == 0 else "")

@@ -78,6 +78,7 @@ def paper_page(
         "\n".join(f"- {part}" for part in parts),
         "## Table I: methods and metrics",
         ours(rows, headings),
+        *remarks_of(rows),
         *_section("### The paper's figures beside ours", beside(rows, metrics)),
         "### As the paper prints it",
         printed_table(),
@@ -101,6 +102,12 @@ def paper_page(
     }
     title = "The paper's tables and figures"
     return Page("paper", title, text, rows, figures, command, seeds, device, more)
+
+
+def remarks_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What a reader of the figures must know, each once: too few scans for a covariance, empty scans."""
+    said = dict.fromkeys(remark for row in rows for remark in str(row.get("remarks") or "").split("; ") if remark)
+    return ["\n".join(f"- {remark}" for remark in said)] if said else []
 
 
 def _section(title: str, body: str) -> list[str]:
@@ -145,16 +152,9 @@ def from_above(measured: Measured) -> dict[str, np.ndarray]:
     added: dict[str, np.ndarray] = {}
     for cell in roots:
         if cell.row["steps"] == most:
-            name = kind_of(known[cell.row["label"]])
+            name = known[cell.row["label"]].kind
             added[name] = added.get(name, 0) + cell.birds_eye
     return added
-
-
-def kind_of(subject: Subject) -> str:
-    """Its backbone, and for HDiT what tells a token its place."""
-    if subject.backbone != "hdit":
-        return subject.backbone
-    return f"hdit {({'learnable': 'with APE', 'none': 'without APE'}).get(subject.position, subject.position)}"
 
 
 def scans_figure(measured: Measured) -> Figure:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+import r2flow
 from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
@@ -20,7 +21,7 @@ from r2flow.reports.curvature import Paths, measure_paths
 from r2flow.reports.pages import Page
 from r2flow.reports.paper.cells import SEED, Bench, Cell, counts_of, measure_cells
 from r2flow.reports.paper.figures import marginals_apart
-from r2flow.reports.paper.page import Measured, kind_of, paper_page
+from r2flow.reports.paper.page import Measured, paper_page
 from r2flow.reports.paper.subjects import Subject
 from r2flow.runs import read_config
 from r2flow.sampling import Interpolation, interpolate_scans
@@ -114,7 +115,11 @@ def held_out(subject: Subject) -> ScanSet:
     module = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **data)
     _, held = module.sources()
     where = config["data"]["name"]
-    identity = {"held out of": config.get("scans"), "data": _placeless(data), "sensor": subject.config["sensor"]}
+    # The run's seed is that of its simulated scenes, whose names are the same for every seed.
+    identity = {
+        "held out of": config.get("scans"), "data": _placeless(data), "sensor": subject.config["sensor"],
+        "seed": config["seed"], "r2flow": r2flow.__version__,
+    }  # fmt: skip
     about = {"kind": "held out", "of": where, "reflectance": flow.encoding.reflectance}
     return ScanSet(f"held out of {where}", held, flow.sensor, about, identity)
 
@@ -137,7 +142,7 @@ def _architecture(subject: Subject, cell: Cell, real: np.ndarray, metrics: Mappi
     """A row of table II, but for what its network costs."""
     return {
         "label": subject.label, "family": subject.family, "seed": subject.seed, "steps": cell.row["steps"],
-        "backbone": subject.backbone, "position": subject.position, "kind": kind_of(subject),
+        "backbone": subject.backbone, "position": subject.position, "kind": subject.kind,
         **{name: cell.row.get(name) for name in metrics}, "marginals": marginals_apart(cell.birds_eye, real),
     }  # fmt: skip
 

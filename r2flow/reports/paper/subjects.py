@@ -45,6 +45,13 @@ class Subject:
         """What tells a token its place: "learnable" (the paper's APE), "none", ..."""
         return str(self.config["backbone"].get("position") or "none")
 
+    @property
+    def kind(self) -> str:
+        """Its backbone, and for HDiT what tells a token its place."""
+        if self.backbone != "hdit":
+            return self.backbone
+        return f"hdit {({'learnable': 'with APE', 'none': 'without APE'}).get(self.position, self.position)}"
+
 
 def find_subjects(folders: Sequence[Path]) -> list[Subject]:
     """The runs in some folders, parents before their children.
@@ -60,9 +67,9 @@ def find_subjects(folders: Sequence[Path]) -> list[Subject]:
     found: dict[str, Subject] = {}
     rest = [_read(run, label) for run, label in zip(runs, labels(runs), strict=True)]
     while rest:
-        known = [one for one in rest if one.family in found or not one.family]
-        if not known:  # of parents that are not among the runs: each is a family by itself
-            known = rest
+        # A parent that is not among the runs cannot be waited for: its child is a family by itself.
+        waiting = {one.weights for one in rest}
+        known = [one for one in rest if one.family not in waiting] or rest
         for one in known:
             parent = found.get(one.family)
             role = _role(one, parent)

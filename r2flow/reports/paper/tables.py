@@ -11,16 +11,17 @@ from r2flow.reports.paper.printed import COLUMNS, TABLE_I, TABLE_II, Architectur
 
 # The paper's numbers, by which ours are told apart.
 SCANS, REAL, IMAGES, SIZE = 10_000, 81_106, 2_560_000, (64, 1024)
+PAPER_KIND = "hdit with APE"  # of its chains
 
 
 def over_seeds(rows: Sequence[Row], metrics: Sequence[str]) -> list[dict[str, Any]]:
-    """One row for each flow and number of evaluations: means over seeds, `_spread` where there are several."""
-    grouped: dict[tuple[str, int], list[Row]] = {}
+    """One row for each flow, kind of network and number of evaluations: means over seeds, `_spread` of several."""
+    grouped: dict[tuple[str, str, int], list[Row]] = {}
     for row in rows:
-        grouped.setdefault((row["role"], row["steps"]), []).append(row)
+        grouped.setdefault((row["role"], row.get("kind", ""), row["steps"]), []).append(row)
     merged = []
-    for (role, steps), same in grouped.items():
-        one: dict[str, Any] = {"role": role, "steps": steps, "n": len(same)}
+    for (role, kind, steps), same in grouped.items():
+        one: dict[str, Any] = {"role": role, "kind": kind, "steps": steps, "n": len(same)}
         one["seconds"] = fmean(row["seconds"] for row in same)
         for metric in metrics:
             values = [row[metric] for row in same if row.get(metric) is not None]
@@ -38,8 +39,10 @@ def ours(rows: Sequence[Row], metrics: Mapping[str, str]) -> str:
     lines = []
     for row in over_seeds(rows, list(metrics)):
         cells = {metric: _cell(row, metric) for metric in metrics}
-        lines.append({"role": row["role"], "steps": row["steps"], "n": row["n"], "seconds": row["seconds"], **cells})
-    headings = {"role": "flow", "steps": "evaluations", "n": "seeds", "seconds": "seconds a scan"}
+        lines.append({**{key: row[key] for key in ("role", "kind", "steps", "n", "seconds")}, **cells})
+    headings = {
+        "role": "flow", "kind": "backbone", "steps": "evaluations", "n": "seeds", "seconds": "seconds a scan",
+    }  # fmt: skip
     return table(lines, {**headings, **metrics})
 
 
@@ -55,8 +58,12 @@ def _cell(row: Row, metric: str) -> str:
 
 
 def beside(rows: Sequence[Row], metrics: Sequence[str]) -> str:
-    """Table I's flows, printed and ours, in the columns that both have; "" where they share none."""
+    """Table I's flows, printed and ours, in the columns that both have; "" where they share none.
+
+    The paper's are of HDiT with APE: of several kinds of ours, that one.
+    """
     shared = [metric for metric in COLUMNS if metric in metrics]
+    rows = [row for row in rows if row.get("kind") == PAPER_KIND] or rows
     mine = {(row["role"], row["steps"]): row for row in over_seeds(rows, shared)}
     most = max((row["steps"] for row in rows), default=0)
     lines = []
