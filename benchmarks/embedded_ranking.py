@@ -7,7 +7,7 @@ in numbers are the constants below, written down before the first run; the featu
 
 The first network failed two claims (docs/metrics.md): its distance did not grow with range noise beyond 3 cm and did
 not fall along the run, because it had only ever seen the simulator's few millimetres of noise. The second was shown
-ranges disturbed by up to a metre; that is the one change, and it is judged by the same levels on scenes of another seed.
+ranges disturbed by up to a metre: the one change, judged by the same levels on scenes of another seed.
 About 7 minutes on one core, 3 more where the run has to be trained first.
 """
 

@@ -3,8 +3,7 @@
 It was trained on simulated scans alone (`r2flow train-extractor`), so a Frechet distance exists without any download.
 It is not the field's RangeNet-53, and no figure of it is an FRD.
 
-How it ranks is measured by benchmarks/embedded_ranking.py and told in docs/metrics.md: real scans lie nearer to scans
-that know nothing of scenes than one would wish, two to one against simulated ones.
+How it ranks is measured by benchmarks/embedded_ranking.py and told in docs/metrics.md, limits included.
 """
 
 import hashlib
