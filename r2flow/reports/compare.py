@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 import yaml
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
 
 from r2flow.backbones.cost import count_macs, count_parameters
 from r2flow.checkpoints import checkpoints_of, step_of
 from r2flow.errors import InputError
 from r2flow.reports.backbones import latency
-from r2flow.reports.pages import STYLES, Page, blank_figure, shown
+from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks, shown
 from r2flow.reports.training import Curve, read_curves
 from r2flow.runs import CONFIG, contradictions, flatten, read_config
 from r2flow.stages import build_parts
@@ -424,10 +423,7 @@ def _draw_curves(axes: Any, groups: Sequence[Group], name: str) -> None:
     every = np.concatenate(drawn)
     if (every > 0).all() and every.max() > 4 * every.min():
         axes.set_yscale("log")
-        # Minor ticks at 2 and 5 alone: all nine of a decade would print over each other.
-        axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
-        for axis in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
-            axis(lambda value, _: f"{value:g}")
+        few_log_ticks(axes.yaxis)
     axes.legend(fontsize=8)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 import r2flow
 from r2flow.errors import InputError
@@ -166,6 +167,13 @@ def blank_figure(width: float, height: float, title: str = "") -> Figure:
     if title:
         figure.suptitle(title, fontsize=11)
     return figure
+
+
+def few_log_ticks(axis: Any) -> None:
+    """Plain numbers at 1, 2 and 5 of each decade: all nine would print over each other."""
+    axis.set_minor_locator(LogLocator(subs=(2, 5)))
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(lambda value, _: f"{value:g}")
 
 
 def _write_figure(figure: Figure, path: Path, origin: Mapping[str, Any]) -> Path:

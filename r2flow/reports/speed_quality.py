@@ -17,7 +17,7 @@ from r2flow.evaluation.measuring import Gathered, Work, measure
 from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
 from r2flow.metrics.base import ScanMetric
 from r2flow.reports.evaluation import heading
-from r2flow.reports.pages import STYLES, Page, blank_figure, shown, table
+from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks, shown, table
 
 NAME = "speed_quality"
 BETWEEN = " | "  # remarks of a row
@@ -207,6 +207,8 @@ def _figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Figure:
             values = [row[name] for row in rows if row.get(name, 0) > 0]
             if values and max(values) > 20 * min(values):
                 axes.set_yscale("log")
+            if x == "seconds":
+                few_log_ticks(axes.xaxis)
             if x == "evaluations":
                 ticks = sorted({row[x] for row in rows})
                 axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])

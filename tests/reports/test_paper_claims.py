@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from r2flow.reports.paper.claims import FAILS, HOLDS, UNKNOWN, At, claims, comparable, judge_less, together
+from r2flow.reports.paper.claims import FAILS, HOLDS, UNKNOWN, At, all_of, claims, comparable, judge_less, together
 from r2flow.reports.paper.printed import COLUMNS, TABLE_I, TABLE_II
 
 
@@ -52,6 +52,12 @@ def test_what_is_missing_is_named():
     found = claims([], ["jsd"], [], [])
     assert {claim.verdict for claim in found} == {UNKNOWN}
     assert "no run of 2-RF at 1 nor 1-RF at 1" in [claim.evidence for claim in found]
+
+
+def test_several_comparisons_have_to_hold_all_of_them():
+    assert all_of({"a": (HOLDS, "x"), "b": (HOLDS, "y")})[0] == HOLDS
+    assert all_of({"a": (HOLDS, "x"), "b": (UNKNOWN, "y")})[0] == UNKNOWN
+    assert all_of({"a": (FAILS, "x"), "b": (UNKNOWN, "y")})[0] == FAILS
 
 
 def test_one_contradiction_outweighs_what_holds():

@@ -126,6 +126,16 @@ def together(verdicts: Mapping[str, tuple[str, str]]) -> tuple[str, str]:
     return overall, "; ".join(said)
 
 
+def all_of(verdicts: Mapping[str, tuple[str, str]]) -> tuple[str, str]:
+    """One verdict from several comparisons, all of which have to hold."""
+    words = [verdict for verdict, _ in verdicts.values()]
+    overall = FAILS if FAILS in words else UNKNOWN if UNKNOWN in words else HOLDS
+    if len(verdicts) == 1:
+        return overall, next(iter(verdicts.values()))[1]
+    said = [f"{name} {verdict}: {evidence}" for name, (verdict, evidence) in verdicts.items()]
+    return overall, "; ".join(said)
+
+
 def claims(
     rows: Sequence[Row], metrics: Sequence[str], curved: Sequence[Row], architectures: Sequence[Row]
 ) -> list[Claim]:
@@ -142,12 +152,8 @@ def claims(
     """
 
     def less(text: str, source: str, *pairs: tuple[At, At]) -> Claim:
-        found = {
-            f"{metric}{f', {a} / {b}' if len(pairs) > 1 else ''}": judge_less(rows, a, b, metric)
-            for a, b in pairs
-            for metric in metrics
-        }
-        return Claim(text, source, *together(found))
+        found = {f"{a} / {b}": together({m: judge_less(rows, a, b, m) for m in metrics}) for a, b in pairs}
+        return Claim(text, source, *all_of(found))
 
     return [
         less("At many evaluations the 1-RF is better than the 2-RF, whose teacher it is.", "table I",
@@ -243,14 +249,14 @@ def _on_architectures(rows: Sequence[Row], metrics: Sequence[str]) -> list[Claim
         verdicts = {}
         for other in others:
             theirs = [{**row, "role": other, "family": row["seed"]} for row in rows if row["backbone"] == other]
-            for metric in metrics:
-                verdicts[f"{metric}, {other}"] = judge_less([*hdit, *theirs], At("hdit", None), At(other, None), metric)
+            a, b = At("hdit", None), At(other, None)
+            verdicts[f"{a} / {b}"] = together({m: judge_less([*hdit, *theirs], a, b, m) for m in metrics})
         costs = {row["backbone"]: row["gmac"] for row in rows}
         mine = max(row["gmac"] for row in hdit)
         said = ", ".join(f"{name} {gmac:.2f}" for name, gmac in costs.items()) + " GMAC"
         dearer = all(mine < costs[other] for other in others)
         found = [
-            Claim(best, "table II", *together(verdicts)),
+            Claim(best, "table II", *all_of(verdicts)),
             Claim(cheap, "table II", HOLDS if dearer else FAILS, said),
         ]
     # Other embeddings say where a token is, too: only a flow without any can turn its scenes at will.

@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
 
 from r2flow.metrics.birds_eye import js_distance
-from r2flow.reports.pages import STYLES, Row, blank_figure
+from r2flow.reports.pages import STYLES, Row, blank_figure, few_log_ticks
 
 REACH = 80  # metres from the sensor to each side of a bird's-eye histogram
 
@@ -81,13 +80,13 @@ def trade_off_figure(rows: Sequence[Row], metrics: Mapping[str, str]) -> Figure:
             axes.set_xscale("log", base=2 if work == "steps" else 10)
             axes.set_yscale("log")
             axes.set(xlabel=label, ylabel=heading if side == 0 else "")
-            if work == "seconds":  # all nine ticks of a decade would print over each other
-                axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
-                axes.xaxis.set_minor_formatter(lambda value, _: f"{value:g}")
+            if work == "seconds":
+                few_log_ticks(axes.xaxis)
             axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+            few_log_ticks(axes.yaxis)
             axes.grid(True, which="both", color="0.9", lw=0.6)
-            if place == 0 and side == 0:
-                axes.legend(fontsize=8, framealpha=0.9)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4), fontsize=8, frameon=False)
     return figure
 
 
