@@ -445,8 +445,8 @@ def test_killed_at_random_moments_the_same_command_ends_alike(clouds: Path, tmp_
     draw, folder = random.Random(0), tmp_path / "killed"
     killed, kept = 0, []
     for _ in range(8):
-        child = in_process(folder, plan, seconds=8e-3)
-        time.sleep(draw.uniform(0.005, 0.1))
+        child = in_process(folder, plan, seconds=0.03)  # a third of a second for all
+        time.sleep(draw.uniform(0.01, 0.1))
         os.kill(child, signal.SIGKILL)
         _, status = os.waitpid(child, 0)
         killed += os.WIFSIGNALED(status)

@@ -102,6 +102,7 @@ def kill(process: subprocess.Popen, all_of_it: bool) -> None:
     process.wait()
 
 
+@pytest.mark.slow
 def test_a_killed_chain_ends_as_the_one_left_alone(chained: tuple[Path, str], scans: Path, tmp_path: Path):
     run = tmp_path / "runs" / "demo"
     process, begin = start(scans, tmp_path), time.monotonic()

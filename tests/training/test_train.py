@@ -56,8 +56,10 @@ def stop_when(
     command = [sys.executable, str(ROOT / "train.py"), *TINY, f"data.root={scans}", *overrides]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
-        command, cwd=cwd, env=environment, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-    )
+        command, cwd=cwd, env=environment, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        # A shell's background job is started with Ctrl-C ignored, and hands that on.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
     waited = time.monotonic()
     while not (run / "checkpoints" / f"step-{step:08d}.ckpt").exists():
         assert process.poll() is None, process.stdout and process.stdout.read().decode()
