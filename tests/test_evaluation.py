@@ -333,3 +333,9 @@ def test_identity_is_plain_and_holds_no_path(real):
     found = open_set(str(real), READING)
     assert str(real) not in json.dumps(found.identity)
     assert str(real) not in json.dumps(dict(found.about))
+
+
+def test_another_revision_of_the_simulator_draws_other_scans(monkeypatch):
+    before = open_set("simulated:0", READING, num=3).identity
+    monkeypatch.setattr("r2flow.simulator.REVISION", 10**6)
+    assert open_set("simulated:0", READING, num=3).identity != before

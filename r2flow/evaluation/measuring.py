@@ -1,5 +1,7 @@
 """Figures of generated scans against real ones, metric by metric, each with the protocol that it holds under."""
 
+import hashlib
+import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -172,6 +174,17 @@ def measure(
             intervals = {key: (one.low, one.high) for key, one in found.items()}
         results.append(Measured(name, figures, protocol, remarks, intervals))
     return results
+
+
+def point_key(real: ScanSet, metrics: Mapping[str, ScanMetric], **sampling: Any) -> str:
+    """16 hex digits of all that figures of a sampled flow depend on: what differs in any of it is measured again.
+
+    Args:
+        sampling: How the flow is sampled: its weights, steps, number of scans, seed, device, ...
+    """
+    protocols = {name: metric.protocol.asdict() for name, metric in metrics.items()}
+    parts = {"real": real.identity or real.label, "metrics": protocols, **sampling}
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _update(

@@ -58,12 +58,9 @@ class FolderScans:
     def __getitem__(self, index: int) -> np.ndarray:
         path, reading = self.paths[index], self.reading
         channels = 1 + reading.reflectance
-        image = range_image(path)
+        image = range_image(path, reading.sensor)
         if image is None:
             return self._projected(path)
-        if image.shape[1:] != reading.sensor.shape:
-            found, wanted = ("x".join(map(str, shape)) for shape in (image.shape[1:], reading.sensor.shape))
-            raise InputError(f"{path} is a range image of {found}, the sensor's is {wanted}; give --size {found}.")
         if len(image) < channels:
             raise InputError(f"{path} has no reflectance, which other scans of its set have; measure range alone.")
         return image[:channels]
@@ -82,17 +79,24 @@ class FolderScans:
         return np.zeros((1 + reading.reflectance, *reading.sensor.shape), np.float32)
 
 
-def range_image(path: Path) -> np.ndarray | None:
-    """The range image in a .npy of shape (2 or 1, H, W), what is not finite as 0; None where the file is another."""
+def range_image(path: Path, sensor: Sensor | None = None) -> np.ndarray | None:
+    """The range image in a .npy of shape (2 or 1, H, W), what is not finite as 0; None where the file is another.
+
+    Raises:
+        InputError: one of another size than the sensor's.
+    """
     if path.suffix.lower() != ".npy":
         return None
     try:
         array = np.load(path, allow_pickle=False)
     except (ValueError, OSError, EOFError):
         return None  # the reader of points explains what is wrong with it
-    if array.ndim == 3 and array.shape[0] in (1, 2) and array.dtype.kind == "f":
-        return np.nan_to_num(array.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
-    return None
+    if array.ndim != 3 or array.shape[0] not in (1, 2) or array.dtype.kind != "f":
+        return None
+    if sensor is not None and array.shape[1:] != sensor.shape:
+        found, wanted = ("x".join(map(str, shape)) for shape in (array.shape[1:], sensor.shape))
+        raise InputError(f"{path} is a range image of {found}, the sensor's is {wanted}; give --size {found}.")
+    return np.nan_to_num(array.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def scan_paths(root: Path) -> list[Path]:

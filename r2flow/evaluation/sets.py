@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-import r2flow
+from r2flow import simulator
 from r2flow.checkpoints import Checkpoint, checkpoints_of, weights_hash
 from r2flow.data.layouts import LAYOUTS, find_drives
 from r2flow.data.manifest import MANIFEST, read_manifest
@@ -279,6 +279,6 @@ def _simulated(seed: int, num: int, reading: Reading) -> ScanSet:
         raise InputError(f"needs at least one scene to simulate, found {num}.")
     scenes = range(num)
     about = {"kind": SIMULATED, "seed": seed, "scenes": num, "reflectance": reading.reflectance}
-    identity = {**about, "simulator": r2flow.__version__, **reading.identity()}
+    identity = {**about, "simulator": simulator.REVISION, **reading.identity()}
     source = SimulatedScans(reading.sensor, seed, scenes, reading.reflectance)
     return ScanSet(f"{SIMULATED}:{seed}", source, reading.sensor, about, identity)

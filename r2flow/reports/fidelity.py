@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from r2flow.data.sources import read_scan
-from r2flow.errors import InputError
 from r2flow.lidar.projection import Projection
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import Sensor
@@ -44,13 +43,10 @@ def load_images(
     images = []
     paths = scans_of(Path(path), most)
     for file in track(paths, f"reading {path}", disable=len(paths) < 32, transient=True):
-        image = range_image(file)
+        image = range_image(file, sensor)
         if image is None:
             reflectance = read_points(file).reflectance is not None
             image = read_scan(file, sensor, projection, "centre", reflectance, reflectance_scale)
-        if image.shape[1:] != sensor.shape:
-            found, wanted = ("x".join(map(str, shape)) for shape in (image.shape[1:], sensor.shape))
-            raise InputError(f"{file} is a range image of {found}, the sensor's is {wanted}; give --size {found}.")
         images.append(image)
     return joined(images)
 

@@ -1,6 +1,5 @@
 """How good a flow's scans are within a number of evaluations, and within seconds: the paper's figure 6."""
 
-import hashlib
 import json
 import math
 import statistics
@@ -13,7 +12,7 @@ from matplotlib.figure import Figure
 
 from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.errors import InputError
-from r2flow.evaluation.measuring import Gathered, Work, measure
+from r2flow.evaluation.measuring import Gathered, Work, measure, point_key
 from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
 from r2flow.metrics.base import ScanMetric
 from r2flow.reports.evaluation import heading
@@ -48,12 +47,10 @@ class Curve:
 
     def key(self, flow: Checkpoint, steps: int) -> str:
         """Of a point: it is measured again when anything in it differs."""
-        parts = {
-            "weights": weights_hash(flow), "steps": steps, "num": self.num, "seed": self.seed, "method": self.method,
-            "tolerance": self.tolerance, "device": self.device, "real": self.real.identity or self.real.label,
-            "metrics": {name: metric.protocol.asdict() for name, metric in self.metrics.items()},
-        }  # fmt: skip
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+        return point_key(
+            self.real, self.metrics, weights=weights_hash(flow), steps=steps, num=self.num, seed=self.seed,
+            method=self.method, tolerance=self.tolerance, device=self.device,
+        )  # fmt: skip
 
 
 def measure_curve(

@@ -12,9 +12,11 @@ from r2flow.errors import InputError
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.reports.paper import cells
 from r2flow.reports.paper.figures import marginals, marginals_apart
+from r2flow.reports.paper.page import remarks_of
 from r2flow.reports.paper.report import held_out
 from r2flow.reports.paper.subjects import find_subjects
 from r2flow.reports.paper.tables import beside, differences, over_seeds, same_architecture
+from r2flow.reports.speed_quality import BETWEEN
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_sampling import network
 
@@ -166,3 +168,9 @@ def test_what_differs_is_said_and_nothing_else():
         assert words in small
     assert same_architecture(125_246_466).frd == 134.22  # printed as 125.5 M
     assert same_architecture(2_000_000) is None
+
+
+def test_a_remark_stays_whole_and_is_said_once():
+    rows = [{"remarks": BETWEEN.join(["too few; compare with as many", "one is empty"])}, {"remarks": "one is empty"}]
+    assert remarks_of(rows) == ["- too few; compare with as many\n- one is empty"]
+    assert remarks_of([{"remarks": ""}, {}]) == []

@@ -1,6 +1,5 @@
 """Every flow at every number of evaluations, measured once and kept: a report that was stopped goes on."""
 
-import hashlib
 import json
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from r2flow.checkpoints import Checkpoint
-from r2flow.evaluation.measuring import Gathered, Work, measure
+from r2flow.evaluation.measuring import Gathered, Work, measure, point_key
 from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
 from r2flow.files import atomic_write
 from r2flow.metrics.base import ScanMetric, Side
 from r2flow.metrics.birds_eye import BINS
 from r2flow.metrics.jsd import JSD
 from r2flow.reports.paper.subjects import Subject
+from r2flow.reports.speed_quality import BETWEEN
 from r2flow.sampling import sample
 
 SHOWN = 2  # scans of each flow that are drawn
@@ -66,12 +66,10 @@ class Bench:
 
     def path(self, subject: Subject, steps: int) -> Path:
         """A cell's file, named by all that it is a function of."""
-        parts = {
-            "weights": subject.weights, "steps": steps, "num": self.num, "seed": SEED, "bootstrap": self.bootstrap,
-            "real": self.real.identity or self.real.label, "device": self.device,
-            "metrics": {name: metric.protocol.asdict() for name, metric in self.metrics.items()},
-        }  # fmt: skip
-        key = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:16]
+        key = point_key(
+            self.real, self.metrics, weights=subject.weights, steps=steps, num=self.num, seed=SEED,
+            bootstrap=self.bootstrap, device=self.device,
+        )  # fmt: skip
         return self.folder / f"{key}.safetensors"
 
 
@@ -106,7 +104,7 @@ def _measure(bench: Bench, flow: Checkpoint, subject: Subject, steps: int) -> Ce
         row[one.metric] = one.figures[first]
         if first in one.intervals:
             row[f"{one.metric}_low"], row[f"{one.metric}_high"] = one.intervals[first]
-    row["remarks"] = "; ".join(dict.fromkeys(remark for one in found for remark in one.remarks))
+    row["remarks"] = BETWEEN.join(dict.fromkeys(remark for one in found for remark in one.remarks))
     counts = counts_of(bench.metrics["jsd"], "generated")
     images = np.concatenate([s.images.numpy() for s in sample(flow, min(SHOWN, bench.num), steps, SEED)])
     return Cell(row, counts, images)

@@ -25,6 +25,7 @@ from r2flow.reports.paper.tables import (
     printed_table,
 )
 from r2flow.reports.pictures import contact_sheet
+from r2flow.reports.speed_quality import BETWEEN
 from r2flow.sampling import Interpolation
 
 
@@ -106,7 +107,7 @@ def paper_page(
 
 def remarks_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """What a reader of the figures must know, each once: too few scans for a covariance, empty scans."""
-    said = dict.fromkeys(remark for row in rows for remark in str(row.get("remarks") or "").split("; ") if remark)
+    said = dict.fromkeys(remark for row in rows for remark in str(row.get("remarks") or "").split(BETWEEN) if remark)
     return ["\n".join(f"- {remark}" for remark in said)] if said else []
 
 

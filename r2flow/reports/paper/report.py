@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-import r2flow
+from r2flow import simulator
 from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
@@ -88,6 +88,7 @@ def report(
     between: Interpolation | None = None
     metrics["jsd"].load_real_state(gathered.statistics["jsd"].states)
     birds_eye = counts_of(metrics["jsd"], "real")
+    ends = np.stack([real.source[index] for index in (len(real) // 4, 3 * len(real) // 4)])  # far apart in the set
     for subject in subjects:
         flow = load_checkpoint(subject.run, device)
         own = list(measure_cells(bench, flow, subject, budget.steps))
@@ -100,10 +101,9 @@ def report(
                 costs[network] = cost(subject.config, budget.repeats, device)
             architectures.append({**_architecture(subject, own[-1], birds_eye, metrics), **costs[network]})
         if subject is first and budget.tolerance is not None and len(real) > 1:
-            between = _interpolation(flow, real, budget.tolerance, work)
+            between = _interpolation(flow, ends, budget.tolerance, work)
         del flow
-    ends = torch.from_numpy(np.stack([real.source[index] for index in _two(len(real))]))
-    measured = Measured(subjects, real, cells, birds_eye, paths, architectures, ends.numpy(), between)
+    measured = Measured(subjects, real, cells, birds_eye, paths, architectures, ends, between)
     return paper_page(measured, list(metrics), missing, budget.num, command, device, {"sampled scans": SEED})
 
 
@@ -118,7 +118,7 @@ def held_out(subject: Subject) -> ScanSet:
     # The run's seed is that of its simulated scenes, whose names are the same for every seed.
     identity = {
         "held out of": config.get("scans"), "data": _placeless(data), "sensor": subject.config["sensor"],
-        "seed": config["seed"], "r2flow": r2flow.__version__,
+        "seed": config["seed"], "simulator": simulator.REVISION,
     }  # fmt: skip
     about = {"kind": "held out", "of": where, "reflectance": flow.encoding.reflectance}
     return ScanSet(f"held out of {where}", held, flow.sensor, about, identity)
@@ -147,12 +147,7 @@ def _architecture(subject: Subject, cell: Cell, real: np.ndarray, metrics: Mappi
     }  # fmt: skip
 
 
-def _interpolation(flow: Checkpoint, real: ScanSet, tolerance: float, work: Work) -> Interpolation:
-    """Figure 3, between two scans far apart in the set."""
-    pair = torch.from_numpy(np.stack([real.source[index] for index in _two(len(real))]))
+def _interpolation(flow: Checkpoint, ends: np.ndarray, tolerance: float, work: Work) -> Interpolation:
+    """Figure 3, between two scans, (2, 2 or 1, H, W)."""
     with work.bar("figure 3", FRAMES) as advance:
-        return interpolate_scans(flow, pair, FRAMES, tolerance=tolerance, arrived=lambda _: advance())
-
-
-def _two(count: int) -> tuple[int, int]:
-    return count // 4, 3 * count // 4
+        return interpolate_scans(flow, torch.from_numpy(ends), FRAMES, tolerance=tolerance, arrived=lambda _: advance())
