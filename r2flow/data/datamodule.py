@@ -10,6 +10,7 @@ import lightning as L
 import torch
 from torch.utils.data import DataLoader, Dataset
 
+from r2flow import simulator
 from r2flow.data.augment import Augmentation
 from r2flow.data.loader import FixedSampler, FlowDataset, Item, Order, Permutations, RunLoader, RunSampler
 from r2flow.data.mixture import MixedOrder, Mixture, refuse_shared_scans, scan_places
@@ -187,7 +188,9 @@ class ScanDataModule(L.LightningDataModule):
         if self.pairs is not None:
             return f"{self.pairs.num} pairs, {self.pair_store.recipe.digest}"
         assert self.training_source is not None
-        names = hashlib.sha256("\n".join(self.names).encode()).hexdigest()[:12]
+        # Another revision of the simulator draws other scans of the same name.
+        revision = [f"simulator {simulator.REVISION}"] if any(p.name == SIMULATED for p in self.parts) else []
+        names = hashlib.sha256("\n".join([*self.names, *revision]).encode()).hexdigest()[:12]
         return f"{len(self.training_source)} of {len(self.names)} scans, {names}"
 
     def _kept(self, source: ScanSource, what: str) -> ScanSource:

@@ -129,6 +129,11 @@ def find_drives(
 
 
 def named_drive(drives: list[Drive], name: str) -> Drive:
+    """The drive of a name, or of a number in its name.
+
+    Raises:
+        InputError: none, or several.
+    """
     matches = [d for d in drives if name == d.name or (name.isdigit() and int(name) in _numbers(d.name))]
     if len(matches) != 1:
         known = ", ".join(d.name for d in drives)

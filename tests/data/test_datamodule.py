@@ -143,6 +143,13 @@ def test_the_fingerprint_knows_the_parts_of_a_mixture_and_not_where_they_lie(tmp
     assert mixed(tmp_path / "there").fingerprint() != first
 
 
+def test_the_fingerprint_knows_the_simulator_s_revision_where_it_is_used(numbered: Path, monkeypatch):
+    drawn, read = module(scenes=3).fingerprint(), module(name="folder", root=str(numbered)).fingerprint()
+    monkeypatch.setattr("r2flow.simulator.REVISION", 10**6)
+    assert module(scenes=3).fingerprint() != drawn
+    assert module(name="folder", root=str(numbered)).fingerprint() == read
+
+
 def test_the_fingerprint_does_not_know_how_the_root_was_written(numbered: Path, monkeypatch):
     monkeypatch.chdir(numbered.parent)
     written = [
