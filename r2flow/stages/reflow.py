@@ -38,5 +38,5 @@ class Distill(Reflow):
             raise InputError(
                 f"a distilled flow trains at the {steps} times that its steps visit; leave stage.time out."
             )
-        super().__init__(velocity, loss, {"name": "grid", "k": steps}, **options)
+        super().__init__(velocity, loss, {"name": "discrete", "k": steps}, **options)
         self.steps = steps
