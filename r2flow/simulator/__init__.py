@@ -9,7 +9,7 @@ import numpy as np
 
 from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator
-from r2flow.simulator.beams import beams_of
+from r2flow.simulator.lasers import lasers_of
 from r2flow.simulator.raycast import cast
 from r2flow.simulator.rays import Rays
 from r2flow.simulator.returns import report
@@ -43,7 +43,7 @@ def simulate(sensor: Sensor, seed: int, index: int) -> SimulatedScan:
 
 def observe(scene: Scene, sensor: Sensor, rng: np.random.Generator) -> SimulatedScan:
     """The scan that a sensor, at its usual height above the scene's origin, makes of a scene."""
-    rays = Rays(beams_of(sensor), sensor.columns, sensor.height)
+    rays = Rays(lasers_of(sensor), sensor.columns, sensor.height)
     image, labels = report(sensor, rays, cast(scene, rays, rng), scene.rig, rng)
     return SimulatedScan(image, labels)
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from r2flow.simulator.beams import Beams
+from r2flow.simulator.lasers import Lasers
 
 
 class Silhouette(NamedTuple):
@@ -61,6 +61,6 @@ def _hidden(elevation: tuple[float, ...], side: tuple[float, ...], columns: int,
     return hidden
 
 
-def hidden(beams: Beams, columns: int, rig: int) -> np.ndarray:
+def hidden(lasers: Lasers, columns: int, rig: int) -> np.ndarray:
     """Rays that end on the own car, (B, W), bool, for one of `RIGS`."""
-    return _hidden(tuple(beams.elevation.tolist()), tuple(beams.side.tolist()), columns, rig)
+    return _hidden(tuple(lasers.elevation.tolist()), tuple(lasers.side.tolist()), columns, rig)

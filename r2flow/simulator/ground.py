@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from r2flow.lidar.labels import LABELS
 from r2flow.simulator.exact import sine
-from r2flow.simulator.labels import LABELS
 from r2flow.simulator.materials import INDEX, column
 from r2flow.simulator.rays import Rays
 
@@ -194,8 +194,8 @@ class Ground:
         z = self.height(s * rays.cos, s * rays.sin)
         distance = np.full(rays.shape, np.inf, np.float32)
         steepness = np.zeros(rays.shape, np.float32)
-        for block in np.unique(rays.beams.block):
-            rows = np.flatnonzero(rays.beams.block == block)
+        for block in np.unique(rays.lasers.block):
+            rows = np.flatnonzero(rays.lasers.block == block)
             distance[rows], steepness[rows] = _meet_profile(s, z, rays.slope[rows], rays.height[rows])
         approach = steepness - rays.slope[:, None]  # how fast ray and ground close in, per metre of s
         cosine = approach / np.sqrt((1 + rays.slope[:, None] ** 2) * (1 + steepness**2))

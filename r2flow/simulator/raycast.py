@@ -92,7 +92,7 @@ def _on_solid(hits: Hits, rays: Rays, shape: Shape, surface: Surface, fragments:
     hits.label[pixel] = surface.label[k]
     hits.material[pixel], hits.albedo[pixel] = divided(surface, k, normal, z)
     moved = s + relief(surface, k, normal, z) / np.maximum(np.abs(ahead), 0.5)
-    if not rays.beams.straight:
+    if not rays.lasers.straight:
         moved = moved * _between_columns(rays, b, w, normal, ahead)
     hits.distance[pixel] = moved
 
@@ -103,7 +103,7 @@ def _between_columns(rays: Rays, b: np.ndarray, w: np.ndarray, normal: Normal, a
     A plane n . p = const met along d at s is met along d' at s (n . d) / (n . d'). Each laser fires about
     twice in a bin, and the nearer return is the one that the bin keeps.
     """
-    firing = (rays.beams.phase[b] + DRIFT * w) % 1
+    firing = (rays.lasers.phase[b] + DRIFT * w) % 1
     across = normal.y * rays.cos[w] - normal.x * rays.sin[w]  # d(n . d) / da
     turn = np.where(across * ahead > 0, firing, firing - 1) * (np.pi / rays.columns)
     other = ahead * cosine(turn) + across * sine(turn)

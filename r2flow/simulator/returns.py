@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 
 from r2flow.lidar.sensors import Sensor
-from r2flow.simulator.beams import rows_of
 from r2flow.simulator.ego import hidden
 from r2flow.simulator.exact import exponentials, logistic, normals
+from r2flow.simulator.lasers import rows_of
 from r2flow.simulator.materials import column
 from r2flow.simulator.raycast import Hits
 from r2flow.simulator.rays import Rays
@@ -57,13 +57,13 @@ def report(
     depth = DEPTH[hits.material] * exponentials(rng, rays.shape)
     s = np.where(np.isfinite(hits.distance), hits.distance, 0) + depth
     r = np.sqrt(s**2 + (rise + s * slope) ** 2)
-    r += (NOISE + NOISE_FAR * r) * noise[0] + rays.beams.bias.astype(np.float32)[:, None]
+    r += (NOISE + NOISE_FAR * r) * noise[0] + rays.lasers.bias.astype(np.float32)[:, None]
     r = np.round(r / RANGE_STEP) * np.float32(RANGE_STEP)
     reading = _reading(hits, r, noise[1], rays)
     seen = (hits.label > 0) & (uniforms > _lost(hits, r, reading))
     seen &= (r >= sensor.min_range) & (r <= sensor.max_range)
     if rig is not None:
-        seen &= ~hidden(rays.beams, rays.columns, rig)
+        seen &= ~hidden(rays.lasers, rays.columns, rig)
     reading[reading < FLOOR * rng.random(rays.shape, dtype=np.float32)] = 0
     reading = in_levels(reading)
     return _sorted_into_rows(sensor, rays, s, r, reading, hits.label, seen)
@@ -90,7 +90,7 @@ def _reading(hits: Hits, r: np.ndarray, normal: np.ndarray, rays: Rays) -> np.nd
     g = GLOSS[hits.material]
     falloff = (1 + g) * hits.cosine / (hits.cosine + g + 1e-6)
     faded = FADE * np.maximum(r - CALIBRATED, 0)
-    gain = rays.beams.gain.astype(np.float32)[:, None]
+    gain = rays.lasers.gain.astype(np.float32)[:, None]
     return hits.albedo * falloff - faded + gain + TEXTURE[hits.material] * normal
 
 
@@ -120,7 +120,7 @@ def _sorted_into_rows(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Each return into the row of its apparent elevation; the nearest of several wins."""
     h, w = sensor.shape
-    if rays.beams.straight:
+    if rays.lasers.straight:
         row = np.broadcast_to(np.arange(h)[:, None], rays.shape)
     else:
         rise = rays.height[:, None] - np.float32(rays.ground)

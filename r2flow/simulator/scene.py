@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from r2flow.simulator.draws import Draws
+from r2flow.lidar.labels import LABELS
 from r2flow.simulator.ground import Ground
-from r2flow.simulator.labels import LABELS
 from r2flow.simulator.materials import INDEX, MATERIALS
+from r2flow.simulator.scalar_draws import ScalarDraws
 from r2flow.simulator.shapes import Blobs, Boxes, Cylinders, Frusta, Shape
 
 PLAIN, FACADE, CABIN, BODY = range(4)  # patterns: how a solid's surface is divided among materials
@@ -63,7 +63,7 @@ class SceneBuilder:
 
     SHAPES = (Boxes, Frusta, Cylinders, Blobs)
 
-    def __init__(self, ground: Ground, draws: Draws) -> None:
+    def __init__(self, ground: Ground, draws: ScalarDraws) -> None:
         self.ground = ground
         self.draws = draws
         self._rows: dict[type, list[tuple[float, ...]]] = {shape: [] for shape in self.SHAPES}

@@ -3,9 +3,9 @@
 import numpy as np
 
 from r2flow.simulator import fronts, roadside
-from r2flow.simulator.draws import Draws
 from r2flow.simulator.ego import RIGS
 from r2flow.simulator.kinds import KINDS, draw_ground
+from r2flow.simulator.scalar_draws import ScalarDraws
 from r2flow.simulator.scene import Scene, SceneBuilder
 
 
@@ -16,7 +16,7 @@ def draw_scene(rng: np.random.Generator, kind: str | None = None) -> Scene:
         rng: Where all that is random about it comes from.
         kind: A name in `kinds.KINDS`, or None to draw one.
     """
-    draws = Draws(rng)
+    draws = ScalarDraws(rng)
     drawn = draws.pick(list(KINDS), [k.share for k in KINDS.values()])
     name = kind or drawn
     b, k = SceneBuilder(draw_ground(draws, name), draws), KINDS[name]

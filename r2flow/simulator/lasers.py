@@ -19,7 +19,7 @@ from r2flow.lidar.sensors import Sensor
 
 
 @dataclass(frozen=True)
-class Beams:
+class Lasers:
     """B lasers on a spinning head.
 
     Attributes:
@@ -75,7 +75,7 @@ _HDL64E_BIAS = (
 )  # fmt: skip
 
 
-HDL64E = Beams(
+HDL64E = Lasers(
     elevation=np.deg2rad(np.array(_HDL64E_UPPER + _HDL64E_LOWER)),
     height=np.concatenate([np.linspace(0.209, 0.198, 32), np.linspace(0.126, 0.116, 32)]),
     side=np.tile([0.026, -0.026], 32),  # neighbours sit left and right of the axis
@@ -91,18 +91,18 @@ BEAMS = {"hdl64e": HDL64E}  # by sensor name, whatever the image's size; others 
 
 
 @lru_cache(maxsize=16)
-def beams_of(sensor: Sensor) -> Beams:
+def lasers_of(sensor: Sensor) -> Lasers:
     """The lasers of a sensor: calibrated ones where known, else one along the middle of each row."""
     if sensor.name in BEAMS:
         return BEAMS[sensor.name]
     return along_rows(sensor)
 
 
-def along_rows(sensor: Sensor) -> Beams:
+def along_rows(sensor: Sensor) -> Lasers:
     """Lasers exactly along `sensor.rays("centre")`, all from the origin."""
     elevation = np.deg2rad(np.asarray(sensor.elevations, dtype=np.float64))
     zero = np.zeros_like(elevation)
-    return Beams(elevation, zero, zero, zero.astype(int), zero, zero, zero, straight=True)
+    return Lasers(elevation, zero, zero, zero.astype(int), zero, zero, zero, straight=True)
 
 
 def rows_of(sensor: Sensor, slope: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ T = TypeVar("T")
 _BULK = 4096  # a scene takes about three times as many
 
 
-class Draws:
+class ScalarDraws:
     """Scalar draws, each made of uniform ones that are fetched in bulk."""
 
     def __init__(self, rng: np.random.Generator) -> None:
