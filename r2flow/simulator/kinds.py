@@ -1,4 +1,4 @@
-"""Kinds of places, and the ground plan of one: where its streets run and how its ground rolls."""
+"""Kinds of places, and the ground plan of one: its streets and its uneven ground."""
 
 import math
 from typing import NamedTuple
@@ -30,7 +30,7 @@ class Kind(NamedTuple):
         fences: Share of fronts with a fence or wall.
         people: Mean number of people.
         traffic: Mean number of moving vehicles.
-        paved: Probability that what lies between pavement and houses is paved too, and no lawn.
+        paved: Probability that the ground between pavement and houses is paved, not lawn.
         crossing: Probability of a crossing street.
     """
 
@@ -73,7 +73,7 @@ KINDS = {
 
 
 def draw_ground(draws: ScalarDraws, name: str) -> Ground:
-    """The ground plan of a place of a kind: its streets, slopes and surfaces."""
+    """The ground of a place of this kind: its streets, slopes and surfaces."""
     kind = KINDS[name]
     streets = _streets(draws, kind, straight=name == "highway")
     main = streets[0]
@@ -96,9 +96,9 @@ def draw_ground(draws: ScalarDraws, name: str) -> Ground:
     )
 
 
-TUFTS = 0.02, 0.18  # metres: how high verges are overgrown, from and to
+TUFTS = 0.02, 0.18  # metres: height of grass and rubble on verges, from and to
 
-# Length and height in metres of the waves that the ground is made of.
+# Length and height in metres of the waves that add up to the ground.
 _WAVES = ((7.0, 0.012), (16.0, 0.03), (38.0, 0.07), (80.0, 0.20), (170.0, 0.40))
 
 
@@ -109,7 +109,7 @@ def _wave(draws: ScalarDraws, length: float, height: float) -> tuple[float, floa
 
 
 def _streets(draws: ScalarDraws, kind: Kind, straight: bool) -> tuple[Street, ...]:
-    """The street that the car drives on, its right half, and perhaps one that crosses or joins it."""
+    """The street that the car drives on, in its right half, and perhaps one that crosses or joins it."""
     half = draws.uniform(*kind.half_width)
     lines = (0.0, half - 0.3, 0.3 - half) if straight or draws.chance(0.35) else ()
     main = Street(

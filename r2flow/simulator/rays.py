@@ -1,8 +1,8 @@
-"""A scan's rays as a product of lasers and azimuths, and the window of them that a thing can cover.
+"""A scan's rays as a product of lasers and azimuths, and the windows of rays that an object can cover.
 
-Every ray is p(s) = (s cos a, s sin a, z + s T): s the horizontal distance, a the azimuth of the column,
-T = tan E the slope of the laser and z its height. That product makes ray casting cheap: whatever
-stands upright is met at an s that depends on the column alone.
+Every ray is p(s) = (s cos a, s sin a, z + s T): s the horizontal distance, a the azimuth of the column, T = tan E the
+slope of the laser and z its height. This makes ray casting cheap: an upright surface is met at an s that depends on the
+column alone.
 """
 
 from dataclasses import dataclass
@@ -68,7 +68,7 @@ def expand(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def column_windows(azimuth: np.ndarray, half: np.ndarray, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (thing k, column w) whose azimuth lies within half_k of azimuth_k, (N,) each, int32."""
+    """Pairs (object k, column w) whose azimuth lies within half_k of azimuth_k, (N,) each, int32."""
     to_column = columns / (2 * np.pi)
     half = np.minimum(half, np.pi * (1 - 1e-9))
     first = np.ceil((np.pi - azimuth - half) * to_column - 0.5).astype(np.int64)

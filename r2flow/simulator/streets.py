@@ -1,4 +1,4 @@
-"""Procedural places around a car that drives along x."""
+"""Procedural street scenes around a car that drives along x."""
 
 import numpy as np
 
@@ -10,11 +10,11 @@ from r2flow.simulator.scene import Scene, SceneBuilder
 
 
 def draw_scene(rng: np.random.Generator, kind: str | None = None) -> Scene:
-    """A place of a kind, or of any kind by its share.
+    """A scene.
 
     Args:
-        rng: Where all that is random about it comes from.
-        kind: A name in `kinds.KINDS`, or None to draw one.
+        rng: Source of its random numbers.
+        kind: A name in `kinds.KINDS`; None draws one by their shares.
     """
     draws = ScalarDraws(rng)
     drawn = draws.pick(list(KINDS), [k.share for k in KINDS.values()])
