@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
+from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.metrics.extractors import EXTRACTORS, load_extractor, training
 from r2flow.metrics.extractors.embedded import (
@@ -27,7 +28,6 @@ from r2flow.metrics.extractors.embedded import (
 from r2flow.metrics.extractors.training import CLASS_OF_LABEL, IGNORED, Settings, Training, judge, tensors_hash
 from r2flow.metrics.scans import Scans
 from r2flow.simulator import simulate
-from r2flow.simulator.labels import LABELS
 from tests.conftest import ROOT
 
 SENSOR = SENSORS["hdl64e"].resized(16, 128)
