@@ -4,10 +4,12 @@ import copy
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
+from r2flow.backbones import Backbone
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution, adapts, check_method, check_tolerance, solve
@@ -112,16 +114,12 @@ def batches(num: int, batch_size: int) -> int:
 
 def evaluated_region(checkpoint: Checkpoint, region: Region) -> Region:
     """The region rounded outward to what the backbone can take."""
-    from r2flow.backbones.crop import unit_of
-
-    return region.rounded(unit_of(checkpoint.model))
+    return region.rounded(cast(Backbone, checkpoint.model).unit)
 
 
 def part_of(model: nn.Module, region: Region) -> nn.Module:
     """The model for a region of whole units, its weights shared; the model itself for all of the image."""
-    from r2flow.backbones.crop import cropped
-
-    return model if region.share == 1 else cropped(model, region.rows, region.columns)
+    return model if region.share == 1 else cast(Backbone, model).cropped(region.rows, region.columns)
 
 
 def check_channels(checkpoint: Checkpoint, channels: str) -> None:

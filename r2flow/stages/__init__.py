@@ -7,7 +7,6 @@ from typing import Any
 from torch import nn
 
 from r2flow.backbones import build_backbone
-from r2flow.backbones.hdit import LearnablePosition
 from r2flow.data.augment import Augmentation
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding, build_encoding
@@ -52,7 +51,7 @@ def check_roll(augment: Augmentation, backbone: nn.Module) -> None:
     Raises:
         InputError: both.
     """
-    if augment.roll and any(isinstance(module, LearnablePosition) for module in backbone.modules()):
+    if augment.roll and getattr(backbone, "learns_directions", False):
         raise InputError(
             "data.augment.roll makes all directions alike, and backbone.position=learnable (the paper's APE) learns a "
             "vector of its own for each; give backbone.position=none, whose attention knows differences in azimuth "
