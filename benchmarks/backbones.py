@@ -38,7 +38,7 @@ def seconds(work: Callable[[], object], device: str) -> float:
 
 
 def built(config: str, rows: int, columns: int, attention: str, device: str) -> Backbone:
-    """The backbone of a config on the paper's sensor, no weight zero: a zero would be as fast, but a special case."""
+    """The backbone of a configuration on the paper's sensor; weights that start at zero are drawn instead."""
     options = configurations()[config]
     if options["name"] == "hdit":
         options["attention"] = attention

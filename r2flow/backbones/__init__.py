@@ -43,8 +43,8 @@ def build_backbone(
     return BACKBONES.build({**options, **asked}, rays)
 
 
-def configurations() -> dict[str, dict[str, Any]]:
-    """Options by name: those of conf/backbone/*.yaml, and the constructor's defaults of a backbone without a file."""
+def configurations() -> Registry[dict[str, Any]]:
+    """Options for `build_backbone`: conf/backbone/*.yaml, and the defaults of each backbone without such a file."""
     folder = files("r2flow") / "conf" / "backbone"
     written = sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
 
@@ -53,4 +53,5 @@ def configurations() -> dict[str, dict[str, Any]]:
         bases = [read(base) for base in own.pop("defaults", []) if base != "_self_"]
         return {key: value for part in (*bases, own) for key, value in part.items()}
 
-    return {name: {"name": name} for name in BACKBONES} | {name: read(name) for name in written}
+    defaults = {name: {"name": name} for name in BACKBONES}
+    return Registry("backbone configuration", **{**defaults, **{name: read(name) for name in written}})

@@ -1,8 +1,8 @@
 """Neighbourhood attention on an azimuth ring: each token attends to the window around it.
 
-Azimuth wraps, so that every window is centred. Elevation ends: at the top and bottom the window is moved
-inside, start = clamp(i - half, 0, H - rows), and always holds the same number of rows. A ring narrower than
-the window goes round more than once, and tokens met twice count twice, as in the published models.
+Azimuth wraps, so every window is centred. Elevation ends: at the top and bottom the window is moved inside,
+start = clamp(i - half, 0, H - rows), and always holds the same number of rows. On a ring narrower than the window
+a token appears more than once in it and counts as often, as in the published models.
 
 Backends, all of the same values and gradients:
     dense    every pair of tokens and a mask: the definition, for tests and small maps
@@ -55,7 +55,7 @@ def neighbourhood_attention(
 
 
 class _Axis(NamedTuple):
-    """One axis of the map, `size` tokens of which each sees `asked` (fewer where there are not as many)."""
+    """One axis of the map: `size` tokens, each of which sees `asked` of them, or all where there are fewer."""
 
     size: int
     asked: int
@@ -66,7 +66,7 @@ class _Axis(NamedTuple):
         return self.asked if self.wrap else min(self.asked, self.size)
 
     def starts(self, tokens: Tensor) -> Tensor:
-        """First place that each token sees; on a ring it may lie outside [0, size) and is meant modulo."""
+        """First place that each token sees; on a ring modulo `size`."""
         first = tokens - self.asked // 2
         return first if self.wrap else first.clamp(0, self.size - self.span)
 
@@ -85,7 +85,7 @@ def _dense(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tens
     return (weights @ v).transpose(1, 2).unflatten(1, (rows.size, columns.size))
 
 
-TILE = (4, 8)  # queries, whose keys are 6 x 16: smaller ones copy more, bigger ones multiply more in vain
+TILE = (4, 8)  # queries, whose keys are 6 x 16: smaller tiles copy more keys, larger ones compute more masked products
 
 
 def _tiles(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:

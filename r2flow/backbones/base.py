@@ -30,21 +30,21 @@ class OnRing(Protocol):
 class Backbone(ExactBuffers):
     """A field v(t, x) on images, or the mean velocity u(x, t, s) of a flow from time t to time s.
 
-    X_{t->s}(x) = x + (s - t) u(x, t, s), and u(x, t, t) = v(t, x) (Boffi et al. 2025, "Flow map matching").
+    X_{t->s}(x) = x + (s - t) u(x, t, s), and u(x, t, t) = v(t, x) (Geng et al. 2025, "Mean flows for one-step
+    generative modeling", with the sign of s - t).
 
-    A subclass implements `velocity`. The rest states what it can do beyond that:
-        unit: Rows and columns that the image, and each part of it, is a multiple of.
-        follow_rays: If it derives anything from the rays, it does so here, into buffers of fixed size outside the
-            state_dict, always in float32; called by its constructor and whenever `coords` is loaded.
-        takes_second_time: Whether `second_time=True` can be asked for. If it was, the constructor ends with an
-            `interval_embedding` of s - t whose last layer is zero, and `velocity` takes s (see `condition`).
-        croppable: Whether it can be evaluated on a part of its image. Its layers on a ring are then `OnRing`.
-        learns_directions: Whether it has learned a vector for each direction, so that a turn is not its own twin.
+    A subclass implements `velocity`; layers that see times are `ExactLinear`, because times stay float32 whatever
+    the network computes in. That is enough. A class that can do more says so:
+        unit: What the rows and columns of the image, and of each part of it, are multiples of.
+        follow_rays: What it derives from the rays goes into buffers here, of fixed size, outside the state_dict and
+            always float32; called by its constructor and whenever `coords` is loaded.
+        takes_second_time: It can be built with `second_time=True`. It then has an `interval_embedding` of s - t,
+            made after all else, whose last layer is zero, and `velocity` is given s (see `condition`).
+        croppable: It can be evaluated on a part of its image. Layers that use the ring are `OnRing`.
+        learns_directions: It learns a vector for each direction, so that scans must not be turned in training.
         tiny_options: Options that build it in milliseconds, for tests.
-    Modules of its own whose multiply-accumulates are not those of their torch layers have a method `macs`
+    A module in it whose multiply-accumulates are not those of its torch layers has a method `macs`
     (`r2flow.backbones.cost.Counted`).
-
-    Times are float32 whatever the network computes in: layers that see them are `ExactLinear`.
 
     `model.compile(dynamic=True)` makes it one graph without breaks: one for batches of two and more and one for a
     single image, for each of gradients on or off and autocast on or off; then no further one.
@@ -52,13 +52,13 @@ class Backbone(ExactBuffers):
     Args:
         rays: Elevation and azimuth of every pixel in radians, (2, H, W).
         unit: See above.
-        in_channels: Channels C of the image, a condition's included.
-        out_channels: Channels C' of the velocity; None for as many as come in.
+        in_channels: Channels C of the image, and of the condition that is concatenated to it.
+        out_channels: Channels C' of the answer; None for C.
         second_time: Whether the network takes s.
 
     Raises:
-        InputError: rays of another shape, H or W that are not multiples of the unit, channels below 1, or a second
-            time for a class that takes one alone.
+        InputError: rays of another shape, H or W that is not a multiple of the unit, channels below 1, or
+            second_time for a class that does not take it.
     """
 
     takes_second_time: ClassVar[bool] = False
@@ -119,7 +119,8 @@ class Backbone(ExactBuffers):
     def condition(self, time_embedding: nn.Module, t: Tensor, s: Tensor | None) -> Tensor:
         """time_embedding(t) + interval_embedding(s - t): what steers the network, (B or 1, K).
 
-        The second term is zero when training begins, so that u(x, t, s) = v(t, x) for every s.
+        The second term is zero when training begins: u(x, t, s) = v(t, x) for every s, bit by bit where t and s have
+        one shape.
         """
         c = time_embedding(t)
         return c if s is None else c + self.interval_embedding(s - t)
@@ -137,7 +138,7 @@ class Backbone(ExactBuffers):
 
     @property
     def learns_directions(self) -> bool:
-        """Whether a scan that is turned is another one to the network, because it learned each direction."""
+        """Whether the network learns a vector for each direction."""
         return False
 
     @classmethod

@@ -33,8 +33,8 @@ class EfficientUNet(UNet):
             deepest = level == self.levels
             attention = heads if deepest else None
             self.add_module(f"d_block{level}", Level(above, width, count, options, attention, down=level > 1))
-            come = width if deepest else 2 * width
-            self.add_module(f"u_block{level}", Level(come, above, count, options, attention, up=level > 1))
+            channels = width if deepest else 2 * width  # with the skip
+            self.add_module(f"u_block{level}", Level(channels, above, count, options, attention, up=level > 1))
         self.out_conv = zero_convolution(RingConv2d(base_channels, self.out_channels, options.ring))
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
@@ -51,7 +51,7 @@ class EfficientUNet(UNet):
 
 
 class Level(nn.Module):
-    """One resolution on the way down or up: half it, residual blocks, attention, double it; each where asked for.
+    """One resolution on the way down or up: halving, residual blocks, attention, doubling; each where asked for.
 
     Args:
         channels: Width that comes in.

@@ -12,7 +12,6 @@ from r2flow.backbones import build_backbone, configurations
 from r2flow.backbones.cost import RULE, count_macs, count_parameters
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Sensor
-from r2flow.registry import did_you_mean
 
 
 def backbone_costs(
@@ -33,13 +32,11 @@ def backbone_costs(
     """
     known = configurations()
     for name in names or known:
-        if name not in known:
-            hint = did_you_mean(name, known)
-            raise InputError(f"no backbone configuration named {name!r}; known: {', '.join(known)}.{hint}")
+        options = known[name]
         row: dict[str, Any] = {"name": name, "parameters": None, "gmac": None, "latency_ms": None}
         try:
             with torch.device("cpu" if repeats > 0 else "meta"):  # counting needs no weights
-                model = build_backbone(known[name], sensor.rays(), channels).eval()
+                model = build_backbone(options, sensor.rays(), channels).eval()
         except InputError as error:
             yield {**row, "error": str(error)}
             continue

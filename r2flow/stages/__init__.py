@@ -46,16 +46,16 @@ def build_parts(config: Mapping[str, Any]) -> Parts:
 
 
 def check_roll(augment: Augmentation, backbone: nn.Module) -> None:
-    """Refuse turned scans for a backbone that learns a vector for each direction.
+    """Refuse to turn scans for a backbone that learns a vector for each direction.
 
     Raises:
-        InputError: both.
+        InputError: data.augment.roll with such a backbone.
     """
     if augment.roll and getattr(backbone, "learns_directions", False):
         raise InputError(
-            "data.augment.roll makes all directions alike, and backbone.position=learnable (the paper's APE) learns a "
-            "vector of its own for each; give backbone.position=none, whose attention knows differences in azimuth "
-            "alone, or leave roll out."
+            "data.augment.roll makes all directions alike, but this backbone learns a vector for each, as "
+            "backbone.position=learnable (the paper's APE) does; give backbone.position=none, which sees differences "
+            "in azimuth alone, or leave roll out."
         )
 
 
