@@ -133,11 +133,11 @@ def backbones(
     """Parameters, multiply-accumulates and measured latency of every configuration: the paper's table II."""
     from rich.progress import track
 
-    from r2flow.backbones import CONFIGURATIONS
+    from r2flow.backbones import configurations
     from r2flow.reports.backbones import backbone_costs, print_costs
 
     chosen, where = build_sized(sensor, size), choose_device(device)
-    names = only.split(",") if only else list(CONFIGURATIONS)
+    names = only.split(",") if only else list(configurations())
     rows = backbone_costs(chosen, names, channels, repeats, where)
     measured = list(track(rows, "measuring", total=len(names), disable=json or repeats == 0, transient=True))
     if json:
