@@ -273,10 +273,9 @@ def neighbours(
 
 def work_of(batch_size: int, workers: int, rank: int = 0, ranks: int = 1) -> "Work":
     """How the work is done, its bars on standard error where somebody watches."""
-    from r2flow.cli.output import bar
-    from r2flow.evaluation.measuring import Work, no_bar
+    from r2flow.evaluation.measuring import Work
 
-    return Work(batch_size, workers, rank, ranks, bar if rank == 0 and sys.stderr.isatty() else no_bar)
+    return Work(batch_size, workers, rank, ranks, watched=rank == 0 and sys.stderr.isatty())
 
 
 def _is_flow(text: str | None) -> bool:

@@ -27,12 +27,11 @@ def sensor(
 
     The YAML is a sensor for the verbs (--sensor mine.yaml) and, in conf/sensor/, for train.py (sensor=mine).
     """
-    from rich.progress import track
-
     from r2flow.lidar.calibration import estimate_sensor
     from r2flow.lidar.scan_files import read_points
     from r2flow.lidar.sensor_files import ENDINGS, write_sensor
     from r2flow.lidar.sensors import SENSORS
+    from r2flow.progress import track
     from r2flow.reports.views import scans_of
 
     if out is not None and (out.suffix.lower() not in ENDINGS or out.is_dir()):
@@ -41,7 +40,7 @@ def sensor(
     if name in SENSORS or not re.fullmatch(r"[A-Za-z]\w*", name):
         raise InputError(f"--name must be letters, digits and _, and no sensor's of the table; found {name!r}.")
     paths = [path for scan in scans for path in scans_of(scan, most)]
-    points = [read_points(path) for path in track(paths, "reading scans", disable=len(paths) < 16)]
+    points = [read_points(path) for path in track(paths, "reading", "scans", least=16)]
     estimate = estimate_sensor(points)
     found = estimate.sensor(name)
     _print(estimate)

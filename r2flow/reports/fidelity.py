@@ -12,6 +12,7 @@ from r2flow.lidar.projection import Projection
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.fidelity import PANEL, PER_PIXEL, controls, distances, nearest, panel
+from r2flow.progress import track
 from r2flow.reports.views import range_image, scans_of
 
 Statistics = Mapping[str, np.ndarray]
@@ -38,11 +39,9 @@ def load_images(
     Raises:
         InputError: no scan there, or a range image of another size than the sensor's.
     """
-    from rich.progress import track
-
     images = []
     paths = scans_of(Path(path), most)
-    for file in track(paths, f"reading {path}", disable=len(paths) < 32, transient=True):
+    for file in track(paths, f"reading {path}", "scans", least=32):
         image = range_image(file, sensor)
         if image is None:
             reflectance = read_points(file).reflectance is not None
