@@ -1,6 +1,5 @@
 """A trained generator on disk, whatever its family: written whole, checked when read, no code from it run."""
 
-import hashlib
 import json
 import pickle
 import re
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, state_hash
 from r2flow.generators import Generator, RectifiedFlow, Sampler, build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
@@ -211,15 +210,8 @@ def _sampler_of_stage(stage: Mapping[str, Any]) -> dict[str, Any] | None:
 def weights_hash(checkpoint: Checkpoint) -> str:
     """A generator in 16 hex digits: its averaged weights and what its images mean, whatever file they came from."""
     meaning = {key: checkpoint.config[key] for key in ("sensor", "encoding")}
-    digest = hashlib.sha256(json.dumps(meaning, sort_keys=True).encode())
-    _add_state(digest, {n.removeprefix(BACKBONE): value for n, value in checkpoint.generator.state_dict().items()})
-    return digest.hexdigest()[:16]
-
-
-def _add_state(digest: Any, state: Mapping[str, Tensor]) -> None:
-    for name, value in sorted(state.items()):
-        digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
-        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    state = {name.removeprefix(BACKBONE): value for name, value in checkpoint.generator.state_dict().items()}
+    return state_hash(state, json.dumps(meaning, sort_keys=True).encode())[:16]
 
 
 def read_safetensors(path: Path) -> dict[str, Any]:

@@ -1,12 +1,16 @@
-"""Files that are whole or not there: written under a temporary name, flushed, renamed."""
+"""Files that are whole or not there: written under a temporary name, flushed, renamed. And what tensors hash to."""
 
 import errno
+import hashlib
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
+
+import torch
+from torch import Tensor
 
 
 @contextmanager
@@ -52,3 +56,16 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def state_hash(state: Mapping[str, Tensor], prefix: bytes = b"") -> str:
+    """SHA-256 (64 hex digits) of tensors: their names, shapes, types and bytes, whatever file they came from.
+
+    Args:
+        prefix: What else the hash depends on.
+    """
+    digest = hashlib.sha256(prefix)
+    for name, value in sorted(state.items()):
+        digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, state_hash
 from r2flow.metrics.extractors import extractor_class
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.registry import Registry
@@ -158,11 +158,7 @@ def read_kept(cls: type[E]) -> E:
 
 def weights_hash(extractor: Extractor) -> str:
     """First 12 digits of the SHA-256 of all that a network computes with, by name."""
-    digest = hashlib.sha256()
-    for name, value in sorted({**dict(extractor.named_parameters()), **dict(extractor.named_buffers())}.items()):
-        digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
-        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-    return digest.hexdigest()[:12]
+    return state_hash({**dict(extractor.named_parameters()), **dict(extractor.named_buffers())})[:12]
 
 
 def fill(extractor: Extractor, tensors: Mapping[str, Tensor]) -> None:
