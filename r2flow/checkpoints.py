@@ -240,9 +240,7 @@ def read_safetensors(path: Path) -> dict[str, Any]:
 
 
 def _digest(notes: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
-    digest = hashlib.sha256(json.dumps([notes.get(key) for key in ("config", "step", "sampler")]).encode())
-    _add_state(digest, weights)
-    return digest.hexdigest()
+    return state_hash(weights, json.dumps([notes.get(key) for key in ("config", "step", "sampler")]).encode())
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:

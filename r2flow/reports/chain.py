@@ -20,8 +20,9 @@ from r2flow.metrics.fidelity import distances, panel
 from r2flow.noise import Draws
 from r2flow.progress import track
 from r2flow.reports.outputs import draw_pages, write_scan
-from r2flow.reports.pages import Page, table, write_page
+from r2flow.reports.pages import Page, write_page
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
+from r2flow.reports.tables import print_table, table
 from r2flow.runs import read_config
 from r2flow.sampling import sample
 
@@ -88,7 +89,8 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
 
 
 COLUMNS = {
-    "flow": "flow", "steps": "Euler steps", "seconds": "seconds a scan", "bend": "bend", "mean": "distance to held-out",
+    "flow": "flow", "steps": "Euler steps", "seconds": "seconds a scan", "bend": "bend",
+    "mean": "distance to held-out scans",
 }  # fmt: skip
 
 
@@ -155,14 +157,7 @@ def figure(drawn: Mapping[tuple[str, int], np.ndarray], names: list[str]) -> Fig
 
 def tell(rows: list[dict[str, Any]], runs: Mapping[str, Path], out: Path, page: Path) -> None:
     """The table on the terminal, and where everything lies."""
-    from rich.console import Console
-    from rich.table import Table
-
-    shown = Table("flow", "Euler steps", "seconds a scan", "bend", "distance to held-out scans")
-    for row in rows:
-        numbers = (f"{row['seconds']:.3f}", f"{row['bend']:.4f}", f"{row['mean']:.3f}")
-        shown.add_row(row["flow"], str(row["steps"]), *numbers)
-    Console().print(shown)
+    print_table(rows, COLUMNS)
     last, folder = list(runs.items())[-1]
     print(
         f"""

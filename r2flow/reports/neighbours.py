@@ -16,8 +16,9 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.scans import Scans
-from r2flow.reports.pages import STYLES, Page, Row, blank_figure, shown, table
+from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_birds_eye, draw_range
+from r2flow.reports.tables import Row, shown, table
 
 LIKENESSES = ("embedded", "pixels")
 COPY = 0.1  # of the usual distance
