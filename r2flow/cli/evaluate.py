@@ -120,7 +120,9 @@ def evaluate(
             real, list(flows.values()), generated, sensor, size, projection, convention, reflectance_scale
         )
         if built is not None:  # a scale of reflectance is nobody's business where no metric looks at it
-            reading = replace(reading, reflectance=any(m.needs_reflectance or n == "beams" for n, m in built.items()))
+            reading = replace(
+                reading, reflectance=any(m.needs_reflectance or m.uses_reflectance for m in built.values())
+            )
         truth = _open(real, reading, split, real_num)
         judged: ScanSet | None = None
         if _is_flow(generated):
