@@ -43,9 +43,10 @@ def batches(*values: float, offset: dict[int, float] | None = None) -> DataLoade
 
 
 def fit(module: L.LightningModule, loader, tmp_path, *callbacks: L.Callback, **options) -> L.Trainer:
-    options = {"max_steps": 100, "max_epochs": 1, **options}
+    clip = 1.0 if module.automatic_optimization else None
+    options = {"max_steps": 100, "max_epochs": 1, "gradient_clip_val": clip, **options}
     trainer = L.Trainer(
-        accelerator="cpu", callbacks=list(callbacks), default_root_dir=tmp_path, logger=False, gradient_clip_val=1.0,
+        accelerator="cpu", callbacks=list(callbacks), default_root_dir=tmp_path, logger=False,
         enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
         use_distributed_sampler=False, plugins=[AtomicCheckpointIO(), *options.pop("plugins", [])], **options,
     )  # fmt: skip
