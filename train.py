@@ -95,12 +95,14 @@ def fit(config: dict[str, Any], asked: list[str]) -> None:
     if parent is not None:
         generator.start_from(parent.generator)
         del parent
-    data = ScanDataModule(generator.space.sensor, generator.space.encoding, config["seed"], **config["data"])
+    data = ScanDataModule(generator.space.sensor, generator.space.encoding, config["seed"], **config["data"], noise_shape=generator.noise_shape)
     check_roll(data.augment, generator)
     data.setup()
     config["scans"] = data.fingerprint()
     stage = build_stage(config, generator)
     check_options("trainer", L.Trainer, trainer_options)
+    if not stage.automatic_optimization:
+        stage.gradient_clip_val, trainer_options["gradient_clip_val"] = trainer_options["gradient_clip_val"], None
     callbacks, loggers = build_callbacks(config), build_loggers(config["loggers"], run_dir)
     try:
         trainer = L.Trainer(**trainer_options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])

@@ -86,8 +86,10 @@ class ScanDataModule(L.LightningDataModule):
         memory_gib: float = 2.0,
         validation: Mapping[str, Any] | None = None,
         pairs: Mapping[str, Any] | None = None,
+        noise_shape: Sequence[int] | None = None,
     ) -> None:
         super().__init__()
+        self.noise_shape = noise_shape
         if batch_size < 1 or workers < 0:
             raise InputError(
                 f"data.batch_size must be at least 1 and data.workers at least 0; found {batch_size} and {workers}."
@@ -263,7 +265,7 @@ class ScanDataModule(L.LightningDataModule):
         if isinstance(source, PairSource):
             return PairDataset(source, self.seed, purpose)
         augment = self.augment if purpose == "training" else None
-        return FlowDataset(source, self.encoding, self.seed, purpose, augment)
+        return FlowDataset(source, self.encoding, self.seed, purpose, augment, self.noise_shape)
 
     def val_dataloader(self) -> DataLoader[Item] | list[Any]:
         self._ready()

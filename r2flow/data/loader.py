@@ -33,7 +33,9 @@ class FlowDataset(Dataset[Item]):
         seed: int,
         purpose: str,
         augment: Augmentation | None = None,
+        noise_shape: Sequence[int] | None = None,
     ) -> None:
+        self.noise_shape = tuple(noise_shape or encoding.shape)
         self.source, self.encoding, self.seed, self.purpose = source, encoding, seed, purpose
         self.augment = augment
 
@@ -43,7 +45,7 @@ class FlowDataset(Dataset[Item]):
     def __getitem__(self, key: tuple[int, int]) -> Item:
         k, index = key
         draw = noise.generator(self.seed, self.purpose, k)
-        x_0 = torch.from_numpy(draw.standard_normal(self.encoding.shape, dtype=np.float32))
+        x_0 = torch.from_numpy(draw.standard_normal(self.noise_shape, dtype=np.float32))
         u = torch.tensor(draw.random(dtype=np.float32))
         if self.augment:
             image = self.augment(self.source[index], self.seed, k)
