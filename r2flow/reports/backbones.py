@@ -12,6 +12,7 @@ from r2flow.backbones import build_backbone, configurations
 from r2flow.backbones.cost import RULE, count_macs, count_parameters
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Sensor
+from r2flow.reports.tables import print_table
 
 
 def backbone_costs(
@@ -62,19 +63,13 @@ def latency(model: nn.Module, shape: tuple[int, ...], repeats: int, device: str)
 
 def print_costs(rows: Sequence[dict[str, Any]], sensor: Sensor, device: str) -> None:
     """The rows as a table, with the counting rule."""
-    from rich.console import Console
-    from rich.table import Table
-
     height, width = sensor.shape
-    table = Table("backbone", box=None, header_style="bold", title=f"{height} x {width}, batch 1, float32, {device}")
-    for column in ("parameters", "GMAC", "latency, ms"):
-        table.add_column(column, justify="right")
-    for row in rows:
-        if "error" in row:
-            table.add_row(row["name"], "", "", row["error"])
-        else:
-            shown = "" if row["latency_ms"] is None else f"{row['latency_ms']:,.0f}"
-            table.add_row(row["name"], f"{row['parameters']:,}", f"{row['gmac']:.2f}", shown)
-    console = Console()
-    console.print(table)
-    console.print(f"GMAC: {RULE}.")
+    formats = {"parameters": "{:,}", "gmac": "{:.2f}", "latency_ms": "{:,.0f}"}
+    cells = [
+        {**row, **{key: form.format(row[key]) for key, form in formats.items() if row[key] is not None}} for row in rows
+    ]
+    columns = {"name": "backbone", "parameters": "parameters", "gmac": "GMAC", "latency_ms": "latency, ms"}
+    if any("error" in row for row in rows):
+        columns["error"] = ""
+    print_table(cells, columns, f"{height} x {width}, batch 1, float32, {device}")
+    print(f"GMAC: {RULE}.")
