@@ -131,8 +131,6 @@ def backbones(
     json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
     """Parameters, multiply-accumulates and measured latency of every configuration: the paper's table II."""
-    from rich.progress import track
-
     from r2flow.backbones import configurations
     from r2flow.progress import track
     from r2flow.reports.backbones import backbone_costs, print_costs
