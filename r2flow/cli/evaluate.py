@@ -99,7 +99,7 @@ def evaluate(
     from r2flow.evaluation.measuring import check_reflectance
     from r2flow.evaluation.processes import joined
     from r2flow.evaluation.sets import sampled_set
-    from r2flow.reports.speed_quality import Drawing
+    from r2flow.reports.speed_quality import Drawing, steps_of
 
     if checkpoint and generated is not None:
         raise InputError("give GENERATED for one comparison or --checkpoint for a curve, not both.")
@@ -143,6 +143,8 @@ def evaluate(
         if checkpoint:
             assert out is not None
             drawing = Drawing(num or 1000, seed, solver, tolerance)
+            for label, flow in flows.items():
+                steps_of(flow, label, _many(steps), drawing)  # what it refuses is refused before anything is read
             _curve(truth, flows, built, _many(steps), drawing, work, no_cache, out, place.device)
         else:
             _compare(truth, judged, built, floor, bootstrap, work, no_cache, json, out, place.device, seed)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
-from r2flow.generators import Sampler
+from r2flow.generators import Sampler, as_flow
 from r2flow.inversion import TIGHT, interpolate_scans
 from r2flow.reports.inversion import errors_of, scan_of, unique_names
 from r2flow.reports.outputs import ScanBar, formats_of, write_scan
@@ -40,7 +40,7 @@ def interpolation(
     Raises:
         InputError: a scan or a solver that cannot be used, before anything is written; a scan without its noise.
     """
-    checkpoint.generator.check_sampler(sampler)
+    as_flow(checkpoint.generator, "interpolation").check_sampler(sampler)
     pair = torch.stack([scan_of(path, checkpoint, reflectance_scale) for path in paths])
     prepare_folder(out)
     names = unique_names(paths)

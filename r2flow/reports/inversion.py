@@ -12,7 +12,7 @@ from r2flow.checkpoints import Checkpoint
 from r2flow.data.sources import read_scan
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.generators import Sampler
+from r2flow.generators import Sampler, as_flow
 from r2flow.inversion import TIGHT, Inversion, invert, round_trip
 from r2flow.reports.outputs import ScanBar
 from r2flow.reports.pages import Page, prepare_folder
@@ -79,7 +79,7 @@ def invert_scans(
     Raises:
         InputError: a scan or a solver that cannot be used, before anything is written.
     """
-    checkpoint.generator.check_sampler(sampler)
+    as_flow(checkpoint.generator, "inversion").check_sampler(sampler)
     scans, names = [scan_of(path, checkpoint, reflectance_scale) for path in paths], unique_names(paths)
     prepare_folder(out)
     rows: list[dict[str, Any]] = []
