@@ -33,7 +33,7 @@ def test_scans_become_a_sensor_that_the_verbs_take(r2flow, scans: Path, tmp_path
     assert (code, error) == (0, "")
     printed = " ".join(printed.split())
     for words in (
-        "8, told by the files",
+        "8, lasers known from the files",
         "128 steps a turn",
         "reflectance_scale=255",
         "1.50 m above",
@@ -76,14 +76,14 @@ def test_what_cannot_be_a_sensor_is_one_line(r2flow, scans: Path, tmp_path: Path
     (tmp_path / "folder.yaml").mkdir()
     (tmp_path / "wrong.yaml").write_text("name: mine\nelevations: [1, 2]\n")
     for arguments, words in (
-        ([tmp_path / "one.bin"], "1 returns in all tell too little"),
+        ([tmp_path / "one.bin"], "1 returns in all are too few"),
         ([tmp_path / "text.bin"], "is text"),
         ([tmp_path / "notes.txt"], "no ending of a scan file"),
         ([tmp_path / "empty"], "holds no scan"),
         ([tmp_path / "missing"], "does not exist"),
         ([scans, "--out", tmp_path / "mine.txt"], "--out must be a .yaml"),
         ([scans, "--out", tmp_path / "folder.yaml"], "--out must be a .yaml file"),
-        ([scans, "--name", "vlp16"], "no sensor's of the table; found 'vlp16'"),
+        ([scans, "--name", "vlp16"], "not that of a built-in sensor; found 'vlp16'"),
         ([scans, "--name", "my sensor: 1"], "letters, digits and _"),
     ):
         code, _, error = r2flow("sensor", *arguments)

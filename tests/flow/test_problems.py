@@ -59,9 +59,11 @@ def test_a_mixture_keeps_the_share_of_paths_below():
 
 
 def test_a_mixture_of_one_is_a_gaussian():
-    from r2flow.flow.problems import Mixture
+    from r2flow.flow.problems import GaussianMixture
 
-    torch.testing.assert_close(Mixture([1.0], [0.7], [0.25]).solution(X_0, 0.6), Gaussian(0.7, 0.25).solution(X_0, 0.6))
+    torch.testing.assert_close(
+        GaussianMixture([1.0], [0.7], [0.25]).solution(X_0, 0.6), Gaussian(0.7, 0.25).solution(X_0, 0.6)
+    )
 
 
 def test_two_modes_are_symmetric():

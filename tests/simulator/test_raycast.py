@@ -24,7 +24,7 @@ def look(*solids, ground=None, sensor=HDL64E, lasers=None, material="concrete"):
     for label, solid in solids:
         b.add(solid, label, material)
     rays = Rays(lasers or along_rows(sensor), sensor.columns, sensor.height)
-    hits = cast(b.build("test", None), rays, np.random.default_rng(1))
+    hits = cast(b.build(), rays, np.random.default_rng(1))
     return hits, hits.distance / np.cos(rays.lasers.elevation)[:, None], rays
 
 

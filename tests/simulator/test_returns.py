@@ -23,7 +23,7 @@ def wall(material: str, distance: float = 10.0, sensor=VLP16, albedo: float | No
     b = SceneBuilder(Ground(), ScalarDraws(np.random.default_rng(0)))
     usual = MATERIALS[INDEX[material]].albedo if albedo is None else albedo
     b.add(Boxes(distance + 5, 0, 0, 10, 200, -1, 100), "building", material, usual)
-    scan = observe(b.build("test", None), sensor, np.random.default_rng(1))
+    scan = observe(b.build(), sensor, np.random.default_rng(1))
     return scan, np.abs(sensor.rays().numpy()[1]) < np.pi / 6
 
 
@@ -126,6 +126,6 @@ def test_the_nearest_of_several_lasers_in_a_pixel_wins():
     b = SceneBuilder(Ground(), ScalarDraws(np.random.default_rng(0)))
     b.add(Boxes(20, 0, 0, 1, 200, -1, 50), "building", "plaster", 0.4)
     b.add(Cylinders(10, 0, 0.5, 1.6, 1.7), "pole", "plaster", 0.4)  # a bar seen by two lasers at most
-    scan = observe(b.build("test", None), coarse, np.random.default_rng(1))
+    scan = observe(b.build(), coarse, np.random.default_rng(1))
     column = scan.labels[:, 512]
     assert (column == LABELS["pole"]).sum() >= 1

@@ -54,7 +54,7 @@ def _refuse_other_content(path: Path, head: bytes, layout: str) -> None:
 
 
 def write_kitti(file: IO[bytes], table: np.ndarray) -> None:
-    """Rows of x, y, z, reflectance out of a table (N, 4)."""
+    """Rows of x, y, z, reflectance from a table (N, 4)."""
     file.write(table.tobytes())
 
 
@@ -83,15 +83,15 @@ def read_npy(path: Path) -> Points:
 def _npy_header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     """The declared shape, whether it is in Fortran's order, and the type.
 
-    Not `np.load`, which allocates what is declared; nor a memory map, which kills the process when
-    somebody shortens the file meanwhile.
+    Not by `np.load`, which allocates what is declared, nor by a memory map, which kills the process when the file gets
+    shorter meanwhile.
     """
     try:
         version = np.lib.format.read_magic(file)
         if version == (1, 0):
             return np.lib.format.read_array_header_1_0(file)
-        return np.lib.format.read_array_header_2_0(file)  # 3.0 is for field names, which points have not
-    except Exception as error:  # NumPy evaluates the header and promises no particular exception
+        return np.lib.format.read_array_header_2_0(file)  # 3.0 is for field names, which points do not have
+    except Exception as error:  # NumPy evaluates the header and may raise anything
         reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
         raise InputError(f"{path} is not a readable .npy file ({reason[:160]}). Is it damaged?") from None
 
