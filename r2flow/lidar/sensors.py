@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import chain, pairwise
 from typing import Any, Literal
 
@@ -201,21 +200,6 @@ SENSORS: Registry[Sensor] = Registry(
 )
 
 
-@lru_cache(maxsize=32)
-def _build(
-    name: str,
-    elevations: tuple[float, ...] | None,
-    firing: tuple[int, ...] | None,
-    rows: int | None,
-    columns: int | None,
-    changes: tuple[tuple[str, float], ...],
-) -> Sensor:
-    sensor = SENSORS[name] if elevations is None else Sensor(name, elevations)
-    if firing is not None:
-        sensor = replace(sensor, firing=firing)
-    return replace(sensor.resized(rows, columns), **dict(changes))  # type: ignore[arg-type]
-
-
 def build_sensor(
     name: str,
     rows: int | None = None,
@@ -233,11 +217,15 @@ def build_sensor(
     """
     if elevations is not None and name in SENSORS:
         raise InputError(f"{name!r} is the name of a built-in sensor; give your own sensor another one.")
-    beams = None if elevations is None else tuple(map(float, _numbers(name, "elevations", elevations, int | float)))
-    lasers = None if firing is None else _numbers(name, "firing", firing, int)
-    changes = {"min_range": min_range, "max_range": max_range, "height": height}
-    given = tuple((key, float(value)) for key, value in changes.items() if value is not None)
-    return _build(name, beams, lasers, rows, columns, given)
+    if elevations is None:
+        sensor = SENSORS[name]
+    else:
+        sensor = Sensor(name, tuple(map(float, _numbers(name, "elevations", elevations, int | float))))
+    if firing is not None:
+        sensor = replace(sensor, firing=_numbers(name, "firing", firing, int))
+    limits = {"min_range": min_range, "max_range": max_range, "height": height}
+    given = {key: float(value) for key, value in limits.items() if value is not None}
+    return replace(sensor.resized(rows, columns), **given)  # type: ignore[arg-type]
 
 
 def _numbers(name: str, key: str, values: Sequence[Any], kind: Any) -> tuple[Any, ...]:

@@ -53,11 +53,6 @@ def _refuse_other_content(path: Path, head: bytes, layout: str) -> None:
         raise InputError(f"{path} is not {layout}: it is text, beginning with {head[:24].decode()!r}.")
 
 
-def write_kitti(file: IO[bytes], table: np.ndarray) -> None:
-    """Rows of x, y, z, reflectance from a table (N, 4)."""
-    file.write(table.tobytes())
-
-
 def read_npy(path: Path) -> Points:
     """An array (N, 3) or (N, 4) of floats; see `read_points`. Never unpickles."""
     with path.open("rb") as file:
@@ -102,8 +97,3 @@ def _shape_hint(shape: tuple[int, ...]) -> str:
     if len(shape) == 2 and shape[0] in (3, 4):
         return " It looks transposed."
     return ""
-
-
-def write_npy(file: IO[bytes], table: np.ndarray) -> None:
-    """The table itself, (N, 3) or (N, 4)."""
-    np.save(file, table, allow_pickle=False)
