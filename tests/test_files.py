@@ -120,6 +120,8 @@ def test_a_link_to_nothing_is_refused_in_one_line(tmp_path):
     assert (
         str(raised.value) == f"{link} is a link to nothing, which does not exist; remove the link or name another file."
     )
+    with pytest.raises(FileExistsError), atomic_write(link / "file"):  # a folder on a disk that is not mounted
+        pass
     assert os.listdir(tmp_path) == ["link"]
 
 
