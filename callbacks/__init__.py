@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
-from callbacks.curvature import Curvature
-from callbacks.ema import EMA
-from callbacks.guard import Guard
-from callbacks.pictures import SamplePictures
-from callbacks.progress import Progress
-from callbacks.reflow_pairs import ReflowPairs
-from callbacks.requeue import Requeue
+from .curvature import Curvature
+from .ema import EMA
+from .guard import Guard
+from .pictures import SamplePictures
+from .progress import Progress
+from .reflow_pairs import ReflowPairs
+from .requeue import Requeue
 from r2flow.checkpoints import FOLDER
 from r2flow.errors import InputError
 from r2flow.registry import Registry, check_options

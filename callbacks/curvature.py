@@ -3,7 +3,7 @@
 import lightning as L
 import torch
 
-from callbacks.ema import averaged_weights
+from .ema import averaged_weights
 from r2flow.errors import InputError
 from r2flow.flow.straightness import curvature
 from r2flow.sampling import noise_of

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from callbacks.ema import averaged_weights
+from .ema import averaged_weights
 from r2flow.flow.solvers import solve
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor

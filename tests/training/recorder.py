@@ -15,8 +15,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import train
-from callbacks import CALLBACKS, Entry
-from callbacks.ema import averaged_weights
+from r2flow.callbacks import CALLBACKS, Entry
+from r2flow.callbacks.ema import averaged_weights
 from r2flow.checkpoints import AtomicCheckpointIO
 from r2flow.data.loader import FlowDataset
 

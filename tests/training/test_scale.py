@@ -18,7 +18,7 @@ import pytest
 import torch
 
 import train as train_script
-from callbacks.requeue import LEFT, slurm_job
+from r2flow.callbacks.requeue import LEFT, slurm_job
 from r2flow.checkpoints import checkpoints_of, read_checkpoint
 from tests.training.conftest import ROOT, TINY, Run
 from tests.training.test_train import assert_bit_equal, weights
