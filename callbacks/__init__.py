@@ -7,17 +7,18 @@ from typing import Any, NamedTuple
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
+from r2flow.checkpoints import FOLDER
+from r2flow.errors import InputError
+from r2flow.registry import Registry, check_options
+from r2flow.stages import Parts
+
 from .curvature import Curvature
 from .ema import EMA
 from .guard import Guard
 from .pictures import SamplePictures
 from .progress import Progress
 from .reflow_pairs import ReflowPairs
-from .requeue import Requeue
-from r2flow.checkpoints import FOLDER
-from r2flow.errors import InputError
-from r2flow.registry import Registry, check_options
-from r2flow.stages import Parts
+from .stopping import Stopping
 
 
 class Entry(NamedTuple):
@@ -81,7 +82,7 @@ CALLBACKS = Registry(
     ),
     curvature=Entry(Curvature, lambda config, parts: (parts.encoding.shape, config["seed"])),
     guard=Entry(Guard, lambda config, parts: (config["run_dir"],)),
-    requeue=Entry(Requeue, lambda config, parts: (config["run_dir"],)),
+    requeue=Entry(Stopping, lambda config, parts: (config["run_dir"],)),
     checkpoint=Entry(keep_checkpoints, lambda config, parts: (Path(config["run_dir"], FOLDER),)),
     progress=Entry(Progress),
 )
@@ -111,8 +112,8 @@ __all__ = [
     "Guard",
     "Progress",
     "ReflowPairs",
-    "Requeue",
     "SamplePictures",
+    "Stopping",
     "build_callbacks",
     "build_loggers",
     "keep_checkpoints",

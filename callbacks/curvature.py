@@ -3,10 +3,11 @@
 import lightning as L
 import torch
 
-from .ema import averaged_weights
 from r2flow.errors import InputError
 from r2flow.flow.straightness import curvature
 from r2flow.sampling import noise_of
+
+from .ema import averaged_weights
 
 
 class Curvature(L.Callback):

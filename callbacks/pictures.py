@@ -7,11 +7,12 @@ import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from .ema import averaged_weights
 from r2flow.flow.solvers import solve
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.sampling import noise_of
+
+from .ema import averaged_weights
 
 
 class SamplePictures(L.Callback):

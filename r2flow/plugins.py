@@ -4,28 +4,25 @@
     r2flow sample --plugin ./my_stage.py --checkpoint runs/NAME
 
 A package can say so itself, in the entry-point group `r2flow.plugins`: it is imported when a name is asked for that no
-registry knows. A config or a checkpoint names the plug-ins that it was made with, which is information: nothing that a file
-names is imported.
+registry knows. A config or a checkpoint names the plug-ins that it was made with, which is information: nothing that a
+file names is imported.
 """
 
 import importlib
 import importlib.util
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Iterator
+from typing import Any
 
 from r2flow.errors import InputError
+from r2flow.registry import Registry, UnknownName
 
 GROUP = "r2flow.plugins"
 
-_loaded: dict[str, bool] = {}  # as sys.modules, which a path is not in
-
-
-class UnknownName(InputError):
-    """A registry has no entry of this name."""
+_loaded: set[str] = set()  # as sys.modules, in which a path has no name
 
 
 def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -63,7 +60,7 @@ def load_plugins(names: Sequence[str]) -> None:
         except Exception as error:  # whatever somebody's module raises
             said = " ".join(str(error).split()) or "no more is known"
             raise InputError(f"the plug-in {name} cannot be imported: {type(error).__name__}: {said}") from None
-        _loaded[name] = True
+        _loaded.add(name)
 
 
 def _import(name: str) -> None:
@@ -88,19 +85,16 @@ def _import(name: str) -> None:
         raise
 
 
-def load_installed() -> bool:
-    """Import what installed packages name in the entry-point group, once; whether there was anything new.
+def load_installed() -> None:
+    """Import what installed packages name in the entry-point group.
 
     Raises:
         InputError: one of them cannot be imported.
     """
-    if GROUP in _loaded:
-        return False
-    _loaded[GROUP] = True
-    found = [entry.value.partition(":")[0] for entry in entry_points(group=GROUP)]
-    new = [name for name in found if name not in _loaded]
-    load_plugins(new)
-    return bool(new)
+    load_plugins([entry.value.partition(":")[0] for entry in entry_points(group=GROUP)])
+
+
+Registry.on_missing.append(load_installed)
 
 
 @contextmanager

@@ -7,9 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
-Handler = Callable[[int, FrameType | None], None]
+Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 
 STOPPING = (signal.SIGTERM, signal.SIGINT)
+
+LATER = 75  # exit code, "try again later" among the system's: the run is not at its end, the same command goes on
 
 
 class Stopped(BaseException):

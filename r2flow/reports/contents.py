@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.checkpoints import load_checkpoint
-from r2flow.runs import flatten
+from r2flow.config import flatten
 
 
 def describe(path: str | Path) -> dict[str, Any]:

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from r2flow.callbacks.requeue import LEFT, slurm_job
 
 import train as train_script
-from r2flow.callbacks.requeue import LEFT, slurm_job
 from r2flow.checkpoints import checkpoints_of, read_checkpoint
 from tests.training.conftest import ROOT, TINY, Run
 from tests.training.test_train import assert_bit_equal, weights
