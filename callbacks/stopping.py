@@ -99,7 +99,9 @@ class Stopping(L.Callback):
             told = trainer.strategy.reduce_boolean_decision(told, all=False)
         if told and trainer.global_step < trainer.max_steps:
             if trainer.checkpoint_callbacks:
-                trainer.save_checkpoint(self.run_dir / FOLDER / f"step-{trainer.global_step:08d}.ckpt")
+                trainer.save_checkpoint(
+                    self.run_dir / FOLDER / f"step-{trainer.global_step:08d}.ckpt", weights_only=False
+                )
                 self._keep_two(trainer)
             self._training = False
             if not trainer.is_global_zero and isinstance(_environment(trainer), LightningEnvironment):

@@ -1,7 +1,8 @@
 """From a command line to a config: `conf/` composed by Hydra, choices for what plug-ins add, mistakes in one line."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -37,19 +38,27 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
     search = (
         [f"hydra.searchpath=[{','.join(f'file://{Path(folder).resolve()}' for folder in folders)}]"] if folders else []
     )
-    before = HydraConfig.instance().cfg
+    with _hydra():
+        try:
+            config = hydra.compose("train", [*overrides, *search], return_hydra_config=True)
+        except MissingConfigException as error:
+            if not add_choice(error):
+                raise
+            config = hydra.compose("train", [*overrides, *search], return_hydra_config=True)
+        HydraConfig.instance().set_config(config)
+        return plain(config)
+
+
+@contextmanager
+def _hydra() -> Iterator[None]:
+    """Hydra on `conf/` for the length of a block; the process's own, if it has one, is untouched."""
+    before, config = GlobalHydra.instance().hydra, HydraConfig.instance().cfg
+    GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
-            try:
-                config = hydra.compose("train", [*overrides, *search], return_hydra_config=True)
-            except MissingConfigException as error:
-                if not add_choice(error):
-                    raise
-                config = hydra.compose("train", [*overrides, *search], return_hydra_config=True)
-            HydraConfig.instance().set_config(config)
-            return plain(config)
+            yield
     finally:
-        HydraConfig.instance().cfg = before
+        GlobalHydra.instance().hydra, HydraConfig.instance().cfg = before, config
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -71,11 +80,12 @@ def add_choices(group: str) -> None:
         if group == "data":
             node: dict[str, Any] = {"defaults": ["base", "_self_"], "name": name}
         else:
-            node = {"name": name, **options_of(entry, given=1)}
+            node = {key: value for key, value in options_of(entry, given=1).items() if key not in given_by_run}
             if group == "stage":  # with the budget of the default stage
-                usual = OmegaConf.load(CONF / "stage" / "rectify.yaml")
-                node |= {"init": None, **{key: usual[key] for key in ("learning_rate", "warmup_images") if key in node}}
-            node = {key: value for key, value in node.items() if key not in given_by_run}
+                usual = DictConfig(OmegaConf.load(CONF / "stage" / "rectify.yaml"))
+                budget = {key: usual[key] for key in ("learning_rate", "warmup_images") if key in node}
+                node = {"init": None, **node, **budget}
+            node = {"name": name, **node}
         store.store(name, node, group=group)
 
 
@@ -121,7 +131,7 @@ def explain(error: Exception) -> str:
 
 def known_keys() -> list[str]:
     """Every key of the default config, and its groups."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+    with _hydra():
         composed = hydra.compose("train")
     keys: list[str] = []
 
