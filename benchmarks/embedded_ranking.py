@@ -229,7 +229,7 @@ def training_run(run: Path) -> list[dict[str, Any]]:
     sets |= {f"control: {k}": torch.from_numpy(v) for k, v in controls(truth.numpy(), sensor, RUN_SCANS, SEED).items()}
     for step in track(LOOKED_AT, "checkpoints", transient=True):
         checkpoint = load_checkpoint(kept[step])
-        drawn = sample(checkpoint, RUN_SCANS, RUN_EULER, SEED, batch_size=4)
+        drawn = sample(checkpoint, RUN_SCANS, SEED, batch_size=4, steps=RUN_EULER)
         sets[f"step {step}"] = torch.cat([part.images for part in drawn])
     rows = []
     for name, extractor in extractors.items():

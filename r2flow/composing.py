@@ -10,6 +10,7 @@ from typing import Any
 import hydra
 from hydra import initialize_config_dir
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import MissingConfigException
 from omegaconf import DictConfig, OmegaConf
@@ -82,8 +83,8 @@ def add_choices(group: str) -> None:
         else:
             node = {key: value for key, value in options_of(entry, given=1).items() if key not in given_by_run}
             if group == "stage":  # with the budget of the default stage
-                usual = DictConfig(OmegaConf.load(CONF / "stage" / "rectify.yaml"))
-                budget = {key: usual[key] for key in ("learning_rate", "warmup_images") if key in node}
+                usual: Any = DictConfig(OmegaConf.load(CONF / "stage" / "rectify.yaml"))
+                budget: dict[str, Any] = {key: usual[key] for key in ("learning_rate", "warmup_images") if key in node}
                 node = {"init": None, **node, **budget}
             node = {"name": name, **node}
         store.store(name, node, group=group)

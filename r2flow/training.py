@@ -20,18 +20,21 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from r2flow.callbacks import build_callbacks, build_loggers
 from r2flow.callbacks.stopping import Stopping
-from r2flow.checkpoints import AtomicCheckpointIO, checkpoints_of, step_of
+from r2flow.checkpoints import checkpoints_of, step_of
 from r2flow.composing import compose
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import AUTO, resolve_reflectance
 from r2flow.errors import InputError
+from r2flow.generators import Generator, build_generator
 from r2flow.lineage import Parent, find_parent, inherit
 from r2flow.noise import seed_torch
 from r2flow.plugins import made_with
 from r2flow.registry import check_options
 from r2flow.reports.training import check_samples, finish, read_curves
 from r2flow.runs import check_run, open_run, run_lock
-from r2flow.stages import build_parts, build_stage, check_roll
+from r2flow.stages import STAGES, build_stage, check_roll
+from r2flow.stages.base import Stage
+from r2flow.stages.checkpointing import AtomicCheckpointIO
 
 __all__ = ["Result", "Run", "build", "check", "compose", "fit"]
 
@@ -59,7 +62,7 @@ class Run:
     """
 
     config: dict[str, Any]
-    stage: L.LightningModule
+    stage: Stage
     data: ScanDataModule
     trainer: L.Trainer
 
@@ -103,10 +106,10 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
     config = _checked(config, asked, parent)
     config["encoding"]["reflectance"] = resolve_reflectance(config["encoding"].get("reflectance", AUTO), config["data"])
     seed_torch(config["seed"], "weights")
-    parts = build_parts(config)
+    generator = build_generator(config)
     if checkpoint is not None:
-        parts.backbone.load_state_dict(checkpoint.model.state_dict())
-    return _assembled(config, parts)
+        generator.start_from(checkpoint.generator)
+    return _assembled(config, generator)
 
 
 def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None) -> dict[str, Any]:
@@ -128,8 +131,8 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
     if config["encoding"].get("reflectance", AUTO) == AUTO:
         config["encoding"]["reflectance"] = True  # the scans will tell
     with torch.device("meta"):
-        parts = build_parts(config)
-    run = _assembled(config, parts)
+        generator = build_generator(config)
+    run = _assembled(config, generator)
     if run.data.pairs is not None:
         run.data.pairs.recipe(run.data.encoding.shape)
     check_run(run.folder, config)
@@ -146,20 +149,22 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
         raise InputError(f"seed must be a whole number of at least 0, found {seed!r}.")
     with made_with(parent.config if parent else {}, "the run that it starts from"):
         config = inherit(config, asked, parent)
+    config["generator"] = config["generator"] or {"name": STAGES[config["stage"]["name"]].generator_name}
     check_options("data", ScanDataModule, config["data"], given=3)
     return config
 
 
-def _assembled(config: dict[str, Any], parts: Any) -> Run:
-    data = ScanDataModule(parts.sensor, parts.encoding, config["seed"], **config["data"])
-    check_roll(data.augment, parts.backbone)
-    stage = build_stage(config, parts.backbone)
-    trainer = _build_trainer(config, stage, parts)
+def _assembled(config: dict[str, Any], generator: Generator) -> Run:
+    space = generator.space
+    data = ScanDataModule(space.sensor, space.encoding, config["seed"], **config["data"])
+    check_roll(data.augment, generator)
+    stage = build_stage(config, generator)
+    trainer = _build_trainer(config, stage)
     data.check_run(trainer.world_size, trainer.accumulate_grad_batches, trainer.max_steps)
     return Run(config, stage, data, trainer)
 
 
-def _build_trainer(config: Mapping[str, Any], stage: L.LightningModule, parts: Any) -> L.Trainer:
+def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
     options = dict(config["trainer"])
     check_options("trainer", L.Trainer, options)
     if not stage.automatic_optimization:  # Lightning leaves these two to the stage
@@ -167,7 +172,7 @@ def _build_trainer(config: Mapping[str, Any], stage: L.LightningModule, parts: A
             name = config["stage"]["name"]
             raise InputError(f"stage={name} takes its own optimiser steps: trainer.accumulate_grad_batches must be 1.")
         stage.gradient_clip_val, options["gradient_clip_val"] = options["gradient_clip_val"], None
-    callbacks = build_callbacks(config, parts)
+    callbacks = build_callbacks(config)
     loggers = build_loggers(config["loggers"], Path(config["run_dir"]))
     try:
         with _quiet():
@@ -207,7 +212,7 @@ def fit(run: Run) -> Result:
     with stopping.listening(), _quiet():
         run.data.setup()
         run.config["scans"] = run.data.fingerprint()
-        run.stage.config.update(run.config)  # type: ignore[union-attr,operator]
+        run.stage.config = dict(run.config)
         if run.config["trainer"]["fast_dev_run"]:
             run.trainer.fit(run.stage, run.data)
             return _result(run, run.trainer.global_step, finished=True)

@@ -64,6 +64,7 @@ def work_precision(
     """Error of every solver against evaluations and time, on exact problems and on a checkpoint."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.flow.solvers import check_tolerance
+    from r2flow.generators import as_flow
     from r2flow.reports import work_precision as measuring
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.work_precision_page import work_precision_page
@@ -86,7 +87,9 @@ def work_precision(
         if loaded is not None:
             x_0 = measuring.starts(loaded, num, seed)
             with bar("reference evaluations", num * 4 * reference_steps) as advance:
-                found = measuring.reference(loaded.model, x_0, reference_steps, reference_tolerance, advance)
+                found = measuring.reference(
+                    as_flow(loaded.generator, measuring.NAME), x_0, reference_steps, reference_tolerance, advance
+                )
             subjects.append(measuring.checkpoint_subject(loaded, str(checkpoint), found, num, seed, batch_size))
         with bar("solutions", measuring.runs(subjects, chosen, repeats)) as advance:
             rows = measuring.measure(subjects, chosen, repeats, advance)

@@ -35,13 +35,14 @@ def invert(
     """Carry scans back to the noise that they come from, and forward again: how far from themselves they end."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.output import command
+    from r2flow.generators import Sampler
     from r2flow.reports.inversion import invert_scans, print_rows
     from r2flow.reports.pages import write_page
     from r2flow.reports.views import scans_of
 
     loaded = load_checkpoint(checkpoint, choose_device(device))
     paths = [path for scan in scans for path in scans_of(scan, most)]
-    page = invert_scans(loaded, paths, out, solver, steps, tolerance, batch_size, reflectance_scale, command())
+    page = invert_scans(loaded, paths, out, Sampler(solver, steps, tolerance), batch_size, reflectance_scale, command())
     written = write_page(page, out)
     print_rows(page.rows)  # type: ignore[arg-type]
     print(f"noise in {out}/*.x_0.npy; {', '.join(str(path) for path in written)}")
@@ -64,12 +65,13 @@ def interpolate(
     """Go from one real scan to another through their noises: a figure and a point cloud for every frame."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.output import command
+    from r2flow.generators import Sampler
     from r2flow.reports.interpolation import interpolation
     from r2flow.reports.pages import write_page
 
     loaded = load_checkpoint(checkpoint, choose_device(device))
     page = interpolation(
-        loaded, [first, last], frames, out, solver, steps, tolerance, batch_size, reflectance_scale, command()
+        loaded, [first, last], frames, out, Sampler(solver, steps, tolerance), batch_size, reflectance_scale, command()
     )
     written = write_page(page, out)
     print(f"{frames} scans in {out / 'frames'}; {', '.join(str(path) for path in written)}")

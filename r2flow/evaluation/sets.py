@@ -2,10 +2,8 @@
 
 import hashlib
 import json
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +20,11 @@ from r2flow.data.prepared import open_prepared
 from r2flow.data.sources import ScanSource, SimulatedScans, spread
 from r2flow.errors import InputError
 from r2flow.evaluation.reading import FolderScans, Reading, has_reflectance, scan_paths
-from r2flow.flow.solvers import solve
+from r2flow.generators import Sampler
 from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator
 from r2flow.registry import did_you_mean
-from r2flow.sampling import decode, noise_of
+from r2flow.sampling import draw
 
 SIMULATED = "simulated"
 CHECKPOINTS = (".ckpt", ".pth", ".safetensors")
@@ -161,40 +159,39 @@ def is_checkpoint(text: str) -> bool:
     return path.suffix in CHECKPOINTS
 
 
-def sampled_set(
-    flow: Checkpoint, label: str, num: int, steps: int, method: str = "euler", tolerance: float = 1e-5, seed: int = 0
-) -> ScanSet:
-    """Scans 0 to num - 1 of a flow's seed, drawn when they are asked for.
+def sampled_set(flow: Checkpoint, label: str, num: int, sampler: Sampler | None = None, seed: int = 0) -> ScanSet:
+    """Scans 0 to num - 1 of a generator's seed, drawn when they are asked for.
 
     Their noise is that of (seed, "evaluation", i), which no training step and no reflow pair has seen.
 
+    Args:
+        sampler: How it is run; its own if left out.
+
     Raises:
-        InputError: fewer than one.
+        InputError: fewer than one, or a sampler that the generator does not have.
     """
     if num < 1:
         raise InputError(f"needs at least one scan to sample, found {num}.")
+    sampler = sampler or flow.generator.sampler
+    flow.generator.check_sampler(sampler)
     about = {
-        "kind": "sampled", "weights": weights_hash(flow), "step": flow.step, "num": num, "solver": method,
-        "steps": steps, "seed": seed, "noise": "evaluation", "reflectance": flow.encoding.reflectance,
+        "kind": "sampled", "weights": weights_hash(flow), "step": flow.step, "num": num, "solver": sampler.method,
+        "steps": sampler.steps, "seed": seed, "noise": "evaluation", "reflectance": flow.encoding.reflectance,
     }  # fmt: skip
-    source = SampledScans(flow, range(num), steps, method, tolerance, seed)
-    return ScanSet(label, source, flow.sensor, about)
+    return ScanSet(label, SampledScans(flow, range(num), sampler, seed), flow.sensor, about)
 
 
 class SampledScans:
-    """Scans of a flow by their numbers; what one is depends on (seed, number) alone.
+    """Scans of a generator by their numbers; what one is depends on (seed, number) alone.
 
     Attributes:
         unsolved: How many of those drawn so far are no solution to the tolerance.
         evaluations: Network evaluations of each.
-        seconds: Of the solution of a scan, for each batch.
+        seconds: Of the generation of a scan, for each batch.
     """
 
-    def __init__(
-        self, flow: Checkpoint, numbers: Sequence[int], steps: int, method: str, tolerance: float, seed: int
-    ) -> None:
-        self.flow, self.numbers, self.seed = flow, numbers, seed
-        self.solve = partial(solve, flow.model, t_0=0.0, t_1=1.0, method=method, steps=steps, tolerance=tolerance)
+    def __init__(self, flow: Checkpoint, numbers: Sequence[int], sampler: Sampler, seed: int) -> None:
+        self.flow, self.numbers, self.sampler, self.seed = flow, numbers, sampler, seed
         self.unsolved = 0
         self.evaluations: list[int] = []
         self.seconds: list[float] = []
@@ -216,16 +213,11 @@ class SampledScans:
 
     def draw(self, indices: Sequence[int]) -> Tensor:
         """The scans of a batch together, (B, 2 or 1, H, W). One that is not solved is taken as it is, and counted."""
-        shape = self.flow.encoding.shape
-        x_0 = torch.cat([noise_of(range(n, n + 1), shape, self.seed) for n in (self.numbers[i] for i in indices)])
-        start = time.perf_counter()
-        with torch.inference_mode():
-            end = self.solve(x=x_0.to(next(self.flow.model.parameters()).device))
-            x_1 = end.x.cpu()
-        self.seconds.append((time.perf_counter() - start) / len(x_1))
-        self.evaluations += end.evaluations.tolist()
-        self.unsolved += int((~end.converged).sum())
-        return decode(self.flow, x_1).nan_to_num(0.0)
+        drawn = draw(self.flow.generator, [self.numbers[i] for i in indices], self.seed, self.sampler)
+        self.seconds.append(drawn.seconds / len(indices))
+        self.evaluations += drawn.evaluations.tolist()
+        self.unsolved += int((~drawn.converged).sum())
+        return drawn.images.nan_to_num(0.0)
 
 
 def _of_files(label: str, root: Path, paths: list[Path], reading: Reading, about: dict[str, Any]) -> ScanSet:

@@ -17,12 +17,14 @@ from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.files import atomic_write
 from r2flow.flow.straightness import curvature
+from r2flow.generators import as_flow
 from r2flow.metrics.fidelity import distances, panel
+from r2flow.noise import Draws
 from r2flow.reports.outputs import draw_pages, write_scan
 from r2flow.reports.pages import Page, table, write_page
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
 from r2flow.runs import read_config
-from r2flow.sampling import noise_of, sample
+from r2flow.sampling import sample
 
 MANY = 32  # steps that stand for "as many as one likes"
 
@@ -50,7 +52,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     bends = {name: bend(flow, num) for name, flow in flows.items()}
     for name, steps in track(cells, "sampling every flow", transient=True, disable=not sys.stdout.isatty()):
         start = time.perf_counter()
-        images = np.concatenate([one.images.numpy() for one in sample(flows[name], num, steps, seed=0)])
+        images = np.concatenate([one.images.numpy() for one in sample(flows[name], num, steps=steps)])
         seconds = (time.perf_counter() - start) / num
         found = distances(truth, panel(images, first.sensor))
         rows.append({
@@ -93,9 +95,10 @@ COLUMNS = {
 
 def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
     """A distilled flow has its own number of steps; the others are shown at all of these and at many."""
-    if flow.distilled_steps is not None:
-        return [flow.distilled_steps]
-    return sorted({1, *(steps for other in flows if (steps := other.distilled_steps) is not None), MANY})
+    own = flow.generator.sampler
+    if own.fixed:
+        return [own.steps]
+    return sorted({1, *(other.generator.sampler.steps for other in flows if other.generator.sampler.fixed), MANY})
 
 
 def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
@@ -109,10 +112,10 @@ def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
 
 def bend(flow: Checkpoint, num: int) -> float:
     """int s(t) dt over |x_1 - x_0|^2, median over scenes: 0 is straight."""
-    x_0 = noise_of(range(num), flow.encoding.shape, 0)
-    x_0 = x_0.to(next(flow.model.parameters()).device)
+    followed = as_flow(flow.generator, "a chain's report")
+    x_0 = Draws(0, range(num)).start(followed.noise_shape).to(followed.device)
     with torch.inference_mode():
-        return float(curvature(flow.model, x_0, MANY).normalised.median())
+        return float(curvature(followed.velocity, x_0, MANY).normalised.median())
 
 
 def explanation(num: int, real: int) -> str:

@@ -20,11 +20,11 @@ from r2flow.backbones.cost import count_macs, count_parameters
 from r2flow.checkpoints import checkpoints_of, step_of
 from r2flow.config import flatten
 from r2flow.errors import InputError
+from r2flow.generators import RectifiedFlow, build_generator
 from r2flow.reports.backbones import latency
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks, shown
 from r2flow.reports.training import Curve, read_curves
 from r2flow.runs import CONFIG, contradictions, read_config
-from r2flow.stages import build_parts
 
 log = logging.getLogger(__name__)
 
@@ -170,10 +170,12 @@ def stage_name(config: Mapping[str, Any]) -> str:
 
 def cost(config: Mapping[str, Any], repeats: int, device: str) -> dict[str, Any]:
     """Parameters, GMAC and, on request, milliseconds of one evaluation for one image of a config's backbone."""
-    parts = build_parts(config)
-    model = parts.backbone.eval()
-    found: dict[str, Any] = {"parameters": count_parameters(model), "gmac": count_macs(model) / 1e9}  # type: ignore[arg-type]
-    shape = (1, parts.encoding.channels, *parts.sensor.shape)
+    generator = build_generator(config)
+    if not isinstance(generator, RectifiedFlow):
+        return {"parameters": count_parameters(generator)}
+    model = generator.backbone.eval()
+    found: dict[str, Any] = {"parameters": count_parameters(model), "gmac": count_macs(model) / 1e9}
+    shape = (1, *generator.space.shape)
     found["latency_ms"] = latency(model.to(device), shape, repeats, device) if repeats else None
     return found
 

@@ -17,7 +17,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "step": loaded.step,
         "stage": loaded.config.get("stage", {}).get("name", "unknown"),
         "backbone": loaded.config["backbone"]["name"],
-        "parameters": sum(p.numel() for p in loaded.model.parameters()),
+        "parameters": sum(p.numel() for p in loaded.generator.parameters()),
         "image": [loaded.encoding.channels, rows, columns],
         "sensor": loaded.sensor.name,
         "range_m": [loaded.sensor.min_range, loaded.sensor.max_range],

@@ -12,11 +12,11 @@ from r2flow.checkpoints import Checkpoint
 from r2flow.data.sources import read_scan
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.flow.solvers import check_method, check_tolerance
-from r2flow.reports.outputs import ScanBar, evaluations_of
+from r2flow.generators import Sampler
+from r2flow.inversion import TIGHT, Inversion, invert, round_trip
+from r2flow.reports.outputs import ScanBar
 from r2flow.reports.pages import Page, prepare_folder, table
 from r2flow.reports.views import range_image
-from r2flow.sampling import Inversion, invert, round_trip
 
 COLUMNS = {
     "scan": "scan",
@@ -65,9 +65,7 @@ def invert_scans(
     checkpoint: Checkpoint,
     paths: Sequence[Path],
     out: str | Path,
-    method: str = "dopri5",
-    steps: int = 32,
-    tolerance: float = 1e-5,
+    sampler: Sampler = TIGHT,
     batch_size: int = 1,
     reflectance_scale: float | None = None,
     command: str = "",
@@ -80,17 +78,17 @@ def invert_scans(
     Raises:
         InputError: a scan or a solver that cannot be used, before anything is written.
     """
-    check_solver(method, tolerance)
+    checkpoint.generator.check_sampler(sampler)
     scans, names = [scan_of(path, checkpoint, reflectance_scale) for path in paths], unique_names(paths)
     prepare_folder(out)
     rows: list[dict[str, Any]] = []
     pairs: list[tuple[str, np.ndarray]] = []
-    way = 2 * evaluations_of(method, steps) * -(-len(paths) // batch_size)
+    way = 2 * checkpoint.generator.evaluations_of(sampler) * -(-len(paths) // batch_size)
     with ScanBar("inverting", len(paths), way) as bar:
         for first in range(0, len(paths), batch_size):
             some = slice(first, first + batch_size)
             images = torch.stack(scans[some])
-            found = invert(checkpoint, images, method, steps, tolerance, bar.evaluated)
+            found = invert(checkpoint, images, sampler, bar.evaluated)
             for name, x_0 in zip(names[some], found.x_0.numpy(), strict=True):
                 with atomic_write(Path(out, f"{name}.x_0.npy")) as file:
                     np.save(file, x_0)
@@ -99,7 +97,7 @@ def invert_scans(
                 if len(pairs) < 2 * SHOWN:
                     pairs += [(f"{name}, real", image.numpy()), ("there and back", _decoded(checkpoint, x))]
             bar.finished(len(rows))
-    return _page(checkpoint, rows, pairs, _solver(method, steps, tolerance), command)
+    return _page(checkpoint, rows, pairs, _solver(sampler, way), command)
 
 
 def errors_of(checkpoint: Checkpoint, found: Inversion, names: Sequence[str], images: Tensor) -> list[dict[str, Any]]:
@@ -113,16 +111,6 @@ def errors_of(checkpoint: Checkpoint, found: Inversion, names: Sequence[str], im
             row[key] = float(getattr(errors, key)[i])
         rows.append({**row, "converged": bool(found.converged[i])})
     return rows
-
-
-def check_solver(method: str, tolerance: float) -> None:
-    """Know a solver and its tolerance before they are needed.
-
-    Raises:
-        InputError: an unknown method, or a tolerance that is not positive and finite.
-    """
-    check_method(method)
-    check_tolerance(tolerance)
 
 
 def unique_names(paths: Sequence[Path]) -> list[str]:
@@ -158,8 +146,8 @@ def _decoded(checkpoint: Checkpoint, x: Tensor) -> np.ndarray:
     return checkpoint.encoding.decode(x).nan_to_num(0.0).numpy()
 
 
-def _solver(method: str, steps: int, tolerance: float) -> str:
-    return f"{method}, {steps} steps" if evaluations_of(method, steps) else f"{method}, tolerance {tolerance:g}"
+def _solver(sampler: Sampler, evaluations: int) -> str:
+    return f"{sampler.method}, " + (f"{sampler.steps} steps" if evaluations else f"tolerance {sampler.tolerance:g}")
 
 
 def _page(
@@ -179,5 +167,5 @@ def _page(
         "gained are a share of all. x_0 of a scan that the flow knows has a standard deviation near 1.",
         table(rows, COLUMNS),
     )
-    device = str(next(checkpoint.model.parameters()).device)
+    device = str(checkpoint.generator.device)
     return Page("invert", "Scans there and back", text, rows, {"invert": figure}, command, device=device)

@@ -24,11 +24,11 @@ from torch import Tensor
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.flow.solvers import SOLVERS, adapts, check_method
+from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.region import Region
 from r2flow.lidar.scan_files import write_points
-from r2flow.sampling import batches, check_channels, sample
+from r2flow.sampling import batches, sample
 
 log = logging.getLogger(__name__)
 
@@ -46,28 +46,25 @@ def write_samples(
     checkpoint: Checkpoint,
     out: str | Path,
     num: int,
-    steps: int,
     seed: int,
-    method: str = "euler",
-    formats: Sequence[str] = FORMATS,
+    sampler: Sampler | None = None,
+    formats: Sequence[str] | None = None,
     pictures: int = 8,
     batch_size: int = 1,
-    tolerance: float = 1e-5,
     region: Region | None = None,
     channels: str = "both",
-    straight_first: bool = False,
-    grid: str | Tensor = "uniform",
 ) -> list[np.ndarray]:
     """Draw scans and write each as `out/NNNNNN.FORMAT`, with a page and a contact sheet of the first ones.
 
     Scan i of a seed is the same whatever `num` and `batch_size` are.
 
     Args:
-        formats: `ply` and `bin` are points in metres with reflectance, `npy` the range image,
+        sampler: How the generator is run; its own if left out.
+        formats: All that fit if left out. `ply` and `bin` are points in metres with reflectance, `npy` the range image,
             float32 (2 or 1, H, W) in metres and reflectance; reflectance alone is `NNNNNN.reflectance.npy`.
         pictures: How many scans get a page of their own; the contact sheet shows at most 8 of them.
-        region, channels, straight_first, grid: See `r2flow.sampling.sample`. Pictures show the region alone, files are
-            of the sensor's shape, 0 outside.
+        region, channels: See `r2flow.sampling.sample`. Pictures show the region alone, files are of the sensor's
+            shape, 0 outside.
 
     Returns:
         The images drawn as pictures.
@@ -75,19 +72,20 @@ def write_samples(
     Raises:
         InputError: an unknown format, one that cannot hold what is asked for, or nothing to draw.
     """
-    if num < 1 or steps < 1 or batch_size < 1:
-        raise InputError(f"needs at least one scan, step and scan a batch; found {num}, {steps} and {batch_size}.")
-    check_channels(checkpoint, channels)
+    if num < 1 or batch_size < 1:
+        raise InputError(f"needs at least one scan and a batch of at least one; found {num} and {batch_size}.")
+    generator = checkpoint.generator
+    sampler = sampler or generator.sampler
+    generator.space.check_channels(channels)
+    generator.check_sampler(sampler)
+    formats = formats_of(checkpoint, channels) if formats is None else formats
     check_formats(checkpoint, formats, channels)
-    check_method(method)
-    if straight_first and not adapts(method):
-        raise InputError(f"scenes that are not straight need an adaptive solver, dopri5 or bosh3; found {method!r}.")
     out, rays = Path(out), checkpoint.sensor.rays()
     shown: list[np.ndarray] = []
-    with ScanBar("sampling", num, batches(num, batch_size) * evaluations_of(method, steps)) as bar:
+    with ScanBar("sampling", num, batches(num, batch_size) * generator.evaluations_of(sampler)) as bar:
         for drawn in sample(
-            checkpoint, num, steps, seed, method, tolerance, batch_size,
-            progress=bar.evaluated, region=region, channels=channels, straight_first=straight_first, grid=grid,
+            generator, num, seed, sampler=sampler, batch_size=batch_size, region=region, channels=channels,
+            progress=bar.evaluated,
         ):  # fmt: skip
             lost = [drawn.first + offset for offset, solved in enumerate(drawn.converged.tolist()) if not solved]
             if lost:
@@ -124,11 +122,6 @@ def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str)
             held = "points, which need a range," if channels == "reflectance" else "reflectance"
             whose = "this model has none" if channels == "both" else f"--channels {channels} leaves it out"
             raise InputError(f"a .{name} holds {held} and {whose}; use --format {','.join(fitting)}.")
-
-
-def evaluations_of(method: str, steps: int) -> int:
-    """Network evaluations of a solution; 0 where they depend on the scene."""
-    return steps * (SOLVERS[method].evaluations or 0) if method in SOLVERS else 0
 
 
 class ScanBar:

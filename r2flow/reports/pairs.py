@@ -24,7 +24,7 @@ def make_and_tell(
     seconds: float = 15.0,
 ) -> Made:
     """`make_pairs` with a bar, or a line every `seconds` where no one watches or several work."""
-    model = checkpoint.model.to(device)
+    generator = checkpoint.generator.to(device)
     there = sum(store.shard_path(shard).is_file() for shard in store.shards(num))
     if there > 4 and rank == 0:
         print(f"checking {there} shards of pairs", flush=True)
@@ -32,7 +32,7 @@ def make_and_tell(
     who = f"process {rank + 1} of {ranks}: " if ranks > 1 else ""
     teller = _Teller(who, len(own) * store.recipe.batch_size, seconds, watched=sys.stdout.isatty() and ranks == 1)
     with teller.bar:
-        made = make_pairs(store, model, num, rank, ranks, device, teller)
+        made = make_pairs(store, generator, num, rank, ranks, teller)
     if made.pairs:
         share = made.writing / max(made.seconds, 1e-9)
         unusable = f", {made.unusable} did not come to an end and are left out" if made.unusable else ""

@@ -57,7 +57,7 @@ def savings_page(
     figures = {"savings_scenes": scenes_figure(mixed)}
     rows, device = [*mixed, *lone], "cpu"
     if checkpoint is not None:
-        device = str(next(checkpoint.model.parameters()).device)
+        device = str(checkpoint.generator.device)
         scenes = scene_rows(checkpoint, num, tolerance, seed, advance)
         regions = region_rows(checkpoint, num, steps, seed, advance)
         channels = channel_rows(checkpoint)

@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from r2flow.flow.problems import PROBLEMS, Mixed, NarrowJet
-from r2flow.flow.solvers import SOLVERS, Solution, Velocity, adapts, solve
+from r2flow.flow.solvers import SOLVERS, Solution, Velocity, adapts
+from r2flow.generators import Field, Sampler
 from r2flow.noise import generator, standard_normal
 
 Row = dict[str, Any]
@@ -81,7 +82,7 @@ def jet_probe(
     exact = jets.solution(x_0, 1.0)
     rows = []
     for solver, share in itertools.product([name for name, _ in SOLVERS.items() if adapts(name)], shares):
-        solution = solve(jets, x_0, method=solver, tolerance=tolerance, max_step=share)
+        solution = Field(jets, (16,)).solve(x_0, sampler=Sampler(solver, tolerance=tolerance), max_step=share)
         found = _rms(solution.x - exact) <= FAILS_AT * tolerance
         rows.append(
             {
@@ -175,10 +176,10 @@ def _cell(
     state, network = PRECISIONS[precision]
     velocity = HalfPrecision(problem, network) if network else problem
     x_0 = x_0.to(state)
-    asked = {"method": solver, "steps": steps, "finish": finish, "max_evaluations": max_evaluations}
-    if tolerance is not None:
-        asked["tolerance"] = tolerance
-    solution = solve(velocity, x_0, **asked, global_error=tolerance is not None)  # type: ignore[arg-type]
+    sampler = Sampler(solver, steps).changed(tolerance=tolerance)
+    solution = Field(velocity, x_0.shape[1:]).solve(
+        x_0, sampler=sampler, finish=finish, max_evaluations=max_evaluations, global_error=tolerance is not None
+    )
     extra = 0.0 if solution.estimate_evaluations is None else solution.estimate_evaluations.double().mean().item()
     errors = _rms(solution.x.double() - problem.solution(x_0, 1.0))
     worst = int(errors.argmax())

@@ -14,11 +14,11 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-import train
 from r2flow.callbacks import CALLBACKS, Entry
 from r2flow.callbacks.ema import averaged_weights
-from r2flow.checkpoints import AtomicCheckpointIO
 from r2flow.data.loader import FlowDataset
+from r2flow.launch import main
+from r2flow.stages.checkpointing import AtomicCheckpointIO
 
 FOLDER = Path(os.environ["R2FLOW_RECORD"])
 BROKEN = set(json.loads(os.environ["R2FLOW_BROKEN"]))  # images whose scan is NaN
@@ -68,4 +68,4 @@ FlowDataset.__getitem__ = item_broken
 CALLBACKS.add("recorder", Entry(Recorder))
 
 if __name__ == "__main__":
-    sys.exit(train.main())
+    sys.exit(main(sys.argv[1:], [sys.executable, __file__]))

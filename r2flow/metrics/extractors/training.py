@@ -23,7 +23,7 @@ from r2flow.metrics.scans import Scans
 from r2flow.noise import generator, seed_torch
 from r2flow.simulator import simulate
 from r2flow.simulator.labels import LABELS
-from r2flow.stages.rectify import learning_rate_factor
+from r2flow.stages.base import learning_rate_factor
 
 IGNORED = -1  # class of pixels that are not learned from
 LEARNING_RATE, WARMUP, WEIGHT_DECAY = 2e-3, 100, 1e-2
