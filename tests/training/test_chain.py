@@ -29,7 +29,9 @@ from tests.training.conftest import (
     wait_for,
 )  # fmt: skip
 
-CHAIN = ["experiment=demo", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8", "data.pairs.batch_size=4"]
+HELD = Path("held")  # in the folder that a chain is started from
+CHAIN = ["experiment=demo", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8", "data.pairs.batch_size=4",
+         *hold_at(5, HELD)]  # fmt: skip
 LINKS = ("rf1", "rf2", "td2")
 SCANS_ALONE = ("data=", "sensor", "backbone", "data.root")
 
@@ -47,6 +49,7 @@ def train_child(cwd: Path, *overrides: str, check: bool = True) -> Done:
 def chained(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """(folder, what it printed) of the tiny chain that nobody disturbed."""
     cwd = tmp_path_factory.mktemp("chained")
+    let_go(cwd / HELD)
     done = run_train(cwd, scans, *CHAIN)
     return cwd / "runs" / "demo", done.stdout
 
@@ -111,17 +114,17 @@ def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(
     run = tmp_path / "runs" / "demo"
     shutil.rmtree(run / "td2")
     shutil.rmtree(run / "report")
-    process = start(tmp_path, tiny(scans, *CHAIN, *hold_at(5, tmp_path / "held")))
-    wait_for(tmp_path / "held", process)
+    process = start(tmp_path, tiny(scans, *CHAIN))
+    wait_for(tmp_path / HELD, process)
     process.send_signal(signal.SIGTERM)  # to the chain alone
-    let_go(tmp_path / "held")
     said, _ = process.communicate(timeout=100)
     assert process.returncode == 143, said
     assert "stopped at step 6; the same command goes on from the last checkpoint" in said
     assert "the chain stopped in td2; the same command goes on there" in said
     assert not (run / "td2" / "link.json").exists()
     assert not (run / "report").exists()
-    run_train(tmp_path, scans, *CHAIN, *hold_at(5, tmp_path / "held"))
+    let_go(tmp_path / HELD)
+    run_train(tmp_path, scans, *CHAIN)
     assert_alike(chained[0], run)
 
 
@@ -130,12 +133,11 @@ def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(
 def test_a_killed_chain_ends_as_the_one_left_alone(
     chained: tuple[Path, str], scans: Path, tmp_path: Path, all_of_it: bool
 ):
-    command = [*CHAIN, *hold_at(6, tmp_path / "held")]
-    process = start(tmp_path, tiny(scans, *command))
-    wait_for(tmp_path / "held", process)
+    process = start(tmp_path, tiny(scans, *CHAIN))
+    wait_for(tmp_path / HELD, process)
     kill(process, all_of_it)
-    let_go(tmp_path / "held")
-    run_train(tmp_path, scans, *command)
+    let_go(tmp_path / HELD)
+    run_train(tmp_path, scans, *CHAIN)
     assert_alike(chained[0], tmp_path / "runs" / "demo")
 
 
@@ -143,6 +145,7 @@ def test_a_killed_chain_ends_as_the_one_left_alone(
 def test_a_chain_killed_at_ten_random_moments_ends_as_the_one_left_alone(
     chained: tuple[Path, str], scans: Path, tmp_path: Path
 ):
+    let_go(tmp_path / HELD)
     draw = random.Random(1)
     for number in range(10):
         process = start(tmp_path, tiny(scans, *CHAIN))

@@ -55,8 +55,8 @@ def stop_held(held: Path, by: int, command: list[str]) -> tuple[int, str]:
     process = start(held.parent, command)
     wait_for(held, process)
     os.killpg(process.pid, by)
-    let_go(held)
     said, _ = process.communicate(timeout=100)
+    let_go(held)
     return process.returncode, said
 
 
