@@ -42,7 +42,8 @@ from r2flow.metrics.frechet import frechet_distance
 from r2flow.metrics.scans import Scans
 from r2flow.noise import generator
 from r2flow.reports.fidelity import load_images
-from r2flow.reports.pages import STYLES, Page, blank_figure, prepare_folder, table, write_page
+from r2flow.reports.pages import STYLES, Page, blank_figure, prepare_folder, write_page
+from r2flow.reports.tables import table
 from r2flow.reports.views import scans_of
 from r2flow.sampling import sample
 

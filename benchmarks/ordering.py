@@ -28,7 +28,8 @@ from r2flow.flow.straightness import curvature
 from r2flow.generators import Field
 from r2flow.metrics.fidelity import controls, distances, panel
 from r2flow.noise import Draws
-from r2flow.reports.pages import Page, table, write_page
+from r2flow.reports.pages import Page, write_page
+from r2flow.reports.tables import table
 from r2flow.stages import STAGES
 from r2flow.stages.base import learning_rate_factor
 from r2flow.stages.rectify import Rectify

@@ -1,6 +1,5 @@
 """A trained generator on disk, whatever its family: written whole, checked when read, no code from it run."""
 
-import hashlib
 import json
 import pickle
 import re
@@ -17,6 +16,7 @@ from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.generators import Generator, RectifiedFlow, Sampler, build_generator
+from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.published import published_cfg, published_config, published_rings, published_step
@@ -211,15 +211,8 @@ def _sampler_of_stage(stage: Mapping[str, Any]) -> dict[str, Any] | None:
 def weights_hash(checkpoint: Checkpoint) -> str:
     """A generator in 16 hex digits: its averaged weights and what its images mean, whatever file they came from."""
     meaning = {key: checkpoint.config[key] for key in ("sensor", "encoding")}
-    digest = hashlib.sha256(json.dumps(meaning, sort_keys=True).encode())
-    _add_state(digest, {n.removeprefix(BACKBONE): value for n, value in checkpoint.generator.state_dict().items()})
-    return digest.hexdigest()[:16]
-
-
-def _add_state(digest: Any, state: Mapping[str, Tensor]) -> None:
-    for name, value in sorted(state.items()):
-        digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
-        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    state = {name.removeprefix(BACKBONE): value for name, value in checkpoint.generator.state_dict().items()}
+    return state_hash(state, json.dumps(meaning, sort_keys=True).encode())[:16]
 
 
 def read_safetensors(path: Path) -> dict[str, Any]:
@@ -248,9 +241,7 @@ def read_safetensors(path: Path) -> dict[str, Any]:
 
 
 def _digest(notes: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
-    digest = hashlib.sha256(json.dumps([notes.get(key) for key in ("config", "step", "sampler")]).encode())
-    _add_state(digest, weights)
-    return digest.hexdigest()
+    return state_hash(weights, json.dumps([notes.get(key) for key in ("config", "step", "sampler")]).encode())
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:

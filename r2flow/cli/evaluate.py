@@ -120,7 +120,9 @@ def evaluate(
             real, list(flows.values()), generated, sensor, size, projection, convention, reflectance_scale
         )
         if built is not None:  # a scale of reflectance is nobody's business where no metric looks at it
-            reading = replace(reading, reflectance=any(m.needs_reflectance or n == "beams" for n, m in built.items()))
+            reading = replace(
+                reading, reflectance=any(m.needs_reflectance or m.uses_reflectance for m in built.values())
+            )
         truth = _open(real, reading, split, real_num)
         judged: ScanSet | None = None
         if _is_flow(generated):
@@ -273,10 +275,9 @@ def neighbours(
 
 def work_of(batch_size: int, workers: int, rank: int = 0, ranks: int = 1) -> "Work":
     """How the work is done, its bars on standard error where somebody watches."""
-    from r2flow.cli.output import bar
-    from r2flow.evaluation.measuring import Work, no_bar
+    from r2flow.evaluation.measuring import Work
 
-    return Work(batch_size, workers, rank, ranks, bar if rank == 0 and sys.stderr.isatty() else no_bar)
+    return Work(batch_size, workers, rank, ranks, watched=rank == 0 and sys.stderr.isatty())
 
 
 def _is_flow(text: str | None) -> bool:

@@ -75,7 +75,7 @@ def calibrate(
 ) -> None:
     """Find where a flow's steps should fall so that their errors are equal: a grid for `r2flow sample --grid`."""
     from r2flow.checkpoints import load_checkpoint
-    from r2flow.cli.output import bar
+    from r2flow.progress import Bar
     from r2flow.reports.pages import prepare_folder
     from r2flow.time_grids import calibrate as find_grid
     from r2flow.time_grids import check_grid_solver, evaluations_of_calibration, write_grid
@@ -85,7 +85,7 @@ def calibrate(
     check_grid_solver(solver)
     loaded = load_checkpoint(checkpoint, choose_device(device))
     prepare_folder(out.parent)
-    with bar("evaluations", evaluations_of_calibration(steps)) as advance:
+    with Bar("measuring", evaluations_of_calibration(steps), "evaluations") as advance:
         times = find_grid(loaded, steps, solver, num, advance)
     write_grid(out, times, loaded, solver)
     print(f"{steps} steps of {solver} at t = {', '.join(f'{t:.3g}' for t in times.tolist())} in {out}")
@@ -131,15 +131,14 @@ def backbones(
     json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
     """Parameters, multiply-accumulates and measured latency of every configuration: the paper's table II."""
-    from rich.progress import track
-
-    from r2flow.backbones import CONFIGURATIONS
+    from r2flow.backbones import configurations
+    from r2flow.progress import track
     from r2flow.reports.backbones import backbone_costs, print_costs
 
     chosen, where = build_sized(sensor, size), choose_device(device)
-    names = only.split(",") if only else list(CONFIGURATIONS)
+    names = only.split(",") if only else list(configurations())
     rows = backbone_costs(chosen, names, channels, repeats, where)
-    measured = list(track(rows, "measuring", total=len(names), disable=json or repeats == 0, transient=True))
+    measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
     if json:
         import json as encoder
 

@@ -29,6 +29,7 @@ from r2flow.data.sources import InMemory, ScanFiles, ScanSource, SimulatedScans,
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
+from r2flow.progress import track
 from r2flow.registry import check_options
 from r2flow.signals import outlive_the_signal
 
@@ -201,13 +202,12 @@ class ScanDataModule(L.LightningDataModule):
         scans = sum(len(part) for part in parts if isinstance(part, ScanFiles | SimulatedScans))
         if scans * (1 + self.encoding.reflectance) * height * width * 4 > self.memory_gib * 2**30:
             return source
-        from rich.progress import track
 
         def read(part: ScanSource) -> ScanSource:
             # What was prepared is mapped from its files, which the system keeps in memory as it sees fit.
             if not isinstance(part, ScanFiles | SimulatedScans) or len(part) == 0:
                 return part
-            return InMemory(part, lambda numbers: track(numbers, f"reading {what}", disable=len(numbers) < 16))
+            return InMemory(part, lambda numbers: track(numbers, f"reading {what}", least=16))
 
         return Mixture([read(part) for part in parts]) if isinstance(source, Mixture) else read(source)
 

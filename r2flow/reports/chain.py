@@ -1,7 +1,6 @@
 """What straightening and distilling did: every flow of a chain at few and at many steps, from the same noise."""
 
 import json
-import sys
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -11,7 +10,6 @@ import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from rich.progress import track
 
 from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
@@ -20,9 +18,11 @@ from r2flow.flow.straightness import curvature
 from r2flow.generators import as_flow
 from r2flow.metrics.fidelity import distances, panel
 from r2flow.noise import Draws
+from r2flow.progress import track
 from r2flow.reports.outputs import draw_pages, write_scan
-from r2flow.reports.pages import Page, table, write_page
+from r2flow.reports.pages import Page, write_page
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
+from r2flow.reports.tables import print_table, table
 from r2flow.runs import read_config
 from r2flow.sampling import sample
 
@@ -50,7 +50,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     cells = [(name, steps) for name, flow in flows.items() for steps in steps_of(flow, flows.values())]
     rows, drawn = [], {}
     bends = {name: bend(flow, num) for name, flow in flows.items()}
-    for name, steps in track(cells, "sampling every flow", transient=True, disable=not sys.stdout.isatty()):
+    for name, steps in track(cells, "sampling every flow"):
         start = time.perf_counter()
         images = np.concatenate([one.images.numpy() for one in sample(flows[name], num, steps=steps)])
         seconds = (time.perf_counter() - start) / num
@@ -89,7 +89,8 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
 
 
 COLUMNS = {
-    "flow": "flow", "steps": "Euler steps", "seconds": "seconds a scan", "bend": "bend", "mean": "distance to held-out",
+    "flow": "flow", "steps": "Euler steps", "seconds": "seconds a scan", "bend": "bend",
+    "mean": "distance to held-out scans",
 }  # fmt: skip
 
 
@@ -106,7 +107,7 @@ def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
     config = read_config(run) or flow.config  # the folder's own knows where the scans have moved
     data = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **config["data"])
     _, held = data.sources()
-    numbers = track(range(len(held)), "held-out scans", transient=True, disable=not sys.stdout.isatty())
+    numbers = track(range(len(held)), "reading held-out scans", "scans")
     return np.stack([held[i] for i in numbers])
 
 
@@ -156,14 +157,7 @@ def figure(drawn: Mapping[tuple[str, int], np.ndarray], names: list[str]) -> Fig
 
 def tell(rows: list[dict[str, Any]], runs: Mapping[str, Path], out: Path, page: Path) -> None:
     """The table on the terminal, and where everything lies."""
-    from rich.console import Console
-    from rich.table import Table
-
-    shown = Table("flow", "Euler steps", "seconds a scan", "bend", "distance to held-out scans")
-    for row in rows:
-        numbers = (f"{row['seconds']:.3f}", f"{row['bend']:.4f}", f"{row['mean']:.3f}")
-        shown.add_row(row["flow"], str(row["steps"]), *numbers)
-    Console().print(shown)
+    print_table(rows, COLUMNS)
     last, folder = list(runs.items())[-1]
     print(
         f"""

@@ -5,6 +5,7 @@ from typing import Any
 
 from r2flow.checkpoints import load_checkpoint
 from r2flow.config import flatten
+from r2flow.reports.tables import print_table
 
 
 def describe(path: str | Path) -> dict[str, Any]:
@@ -28,20 +29,11 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 def print_contents(contents: dict[str, Any]) -> None:
     """The same as two short tables."""
-    from rich.console import Console
-    from rich.table import Table
-
-    summary = Table(show_header=False, box=None)
-    for key, value in contents.items():
-        if key != "config":
-            shown = f"{value:,}" if isinstance(value, int) else value
-            shown = " x ".join(map(str, value)) if key == "image" else shown
-            shown = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else shown
-            summary.add_row(key, str(shown))
-    details = Table("config", "value", box=None, header_style="bold")
-    for key, value in flatten({k: v for k, v in contents["config"].items() if k != "published"}):
-        details.add_row(key, str(value))
-    console = Console()
-    console.print(summary)
-    console.print()
-    console.print(details)
+    summary = {key: value for key, value in contents.items() if key != "config"}
+    summary["image"] = " x ".join(map(str, contents["image"]))
+    summary["encoding"] = ", ".join(f"{key} {value}" for key, value in contents["encoding"].items())
+    summary |= {key: f"{value:,}" for key, value in summary.items() if isinstance(value, int)}
+    print_table([(key, str(value)) for key, value in summary.items()], ("", ""))
+    print()
+    config = flatten({key: value for key, value in contents["config"].items() if key != "published"})
+    print_table([(key, str(value)) for key, value in config], ("config", "value"))

@@ -16,7 +16,8 @@ from r2flow.flow.straightness import Straightness, straightness
 from r2flow.generators import as_flow
 from r2flow.lidar.encoding import Encoding
 from r2flow.noise import Draws
-from r2flow.reports.pages import STYLES, Page, blank_figure, table
+from r2flow.reports.pages import STYLES, Page, blank_figure
+from r2flow.reports.tables import table
 
 MOST_CURVED = 200  # paths drawn, as in the paper's figure 8 (b)
 

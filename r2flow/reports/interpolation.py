@@ -14,7 +14,8 @@ from r2flow.generators import Sampler
 from r2flow.inversion import TIGHT, interpolate_scans
 from r2flow.reports.inversion import errors_of, scan_of, unique_names
 from r2flow.reports.outputs import ScanBar, formats_of, write_scan
-from r2flow.reports.pages import Page, prepare_folder, table
+from r2flow.reports.pages import Page, prepare_folder
+from r2flow.reports.tables import table
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,8 @@ from r2flow.files import atomic_write
 from r2flow.generators import Sampler
 from r2flow.inversion import TIGHT, Inversion, invert, round_trip
 from r2flow.reports.outputs import ScanBar
-from r2flow.reports.pages import Page, prepare_folder, table
+from r2flow.reports.pages import Page, prepare_folder
+from r2flow.reports.tables import print_table, table
 from r2flow.reports.views import range_image
 
 COLUMNS = {
@@ -124,18 +125,8 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
 
 def print_rows(rows: Sequence[dict[str, Any]]) -> None:
     """The errors as a table, and a line for what has not been solved."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from r2flow.reports.pages import shown
-
     headings = ("scan", "returns", "evals", "RMS", "med. m", "RMS m", "rays ±", "std x_0", "solved")
-    shape = Table(box=None, header_style="bold", pad_edge=False)
-    for key, heading in zip(COLUMNS, headings, strict=True):
-        shape.add_column(heading, justify="left" if key == "scan" else "right", no_wrap=key != "scan", overflow="fold")
-    for row in rows:
-        shape.add_row(*(shown(row[key]) for key in COLUMNS))
-    Console().print(shape)
+    print_table(rows, dict(zip(COLUMNS, headings, strict=True)))
     print("RMS in model space; rays ±: share of all rays lost or gained; std x_0: near 1 for scans that the flow knows")
     lost = [row["scan"] for row in rows if not row["converged"]]
     if lost:

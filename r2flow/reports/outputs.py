@@ -3,22 +3,10 @@
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeRemainingColumn,
-    track,
-)
-from rich.text import Text
 from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
@@ -28,6 +16,7 @@ from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.region import Region
 from r2flow.lidar.scan_files import write_points
+from r2flow.progress import Bar, track
 from r2flow.sampling import batches, sample
 
 log = logging.getLogger(__name__)
@@ -124,49 +113,33 @@ def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str)
             raise InputError(f"a .{name} holds {held} and {whose}; use --format {','.join(fitting)}.")
 
 
-class ScanBar:
-    """A progress bar of scans with their rate and the time left, which moves with the evaluations between two scans.
+class ScanBar(Bar):
+    """A bar of scans that moves with the network evaluations between two scans.
 
     Args:
-        what: What is done to them.
+        doing: What is done to them.
         num: Scans in all.
         evaluations: Network evaluations in all, batches counted as one; 0 where nobody knows: then a batch is taken
             to need as many as the one before it.
     """
 
-    def __init__(self, what: str, num: int, evaluations: int = 0) -> None:
-        columns = BarColumn(), MofNCompleteColumn(), TextColumn("scans"), ScansPerSecond(), TimeRemainingColumn()
-        self._bar = Progress(TextColumn(what), *columns, TextColumn("{task.fields[spent]} evaluations"))
-        self._task = self._bar.add_task(what, total=num, spent=0)
-        self._num, self._share = num, num / evaluations if evaluations else 0.0
+    def __init__(self, doing: str, num: int, evaluations: int = 0) -> None:
+        super().__init__(doing, num, "scans")
+        self._share = num / evaluations if evaluations else 0.0
         self._spent = self._done = self._spent_before = 0
-
-    def __enter__(self) -> Self:
-        self._bar.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._bar.stop()
 
     def evaluated(self) -> None:
         """One more evaluation of the network."""
         self._spent += 1
-        self._bar.update(self._task, advance=self._share, spent=self._spent)
+        self(self._share)
+        self.set(note=f"{self._spent} evaluations")
 
     def finished(self, done: int) -> None:
         """So many scans are done by now."""
         if self._spent > self._spent_before:
             self._share = (done - self._done) / (self._spent - self._spent_before)
         self._done, self._spent_before = done, self._spent
-        self._bar.update(self._task, completed=done)
-
-
-class ScansPerSecond(ProgressColumn):
-    """How fast it goes, once that can be told."""
-
-    def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        return Text(f"{speed:.2f} scans/s" if speed else "")
+        self.set(done)
 
 
 def write_scan(image: np.ndarray, rays: Tensor, out: Path, name: str, formats: Sequence[str]) -> None:
@@ -185,7 +158,7 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path) -> Path:
     from r2flow.reports.pictures import contact_sheet, save_figure, scan_figure
 
     numbered = list(enumerate(images))
-    for index, image in track(numbered, "drawing", disable=len(numbered) < 3, transient=True):
+    for index, image in track(numbered, "drawing", "pages", least=3):
         save_figure(scan_figure(image, rays, f"sample {index}"), out / f"{index:06d}.png")
     return save_figure(contact_sheet(images[:8], rays), out / "samples.png")
 

@@ -6,11 +6,11 @@ import time
 from collections.abc import Mapping
 
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.data.pairs import Made, make_pairs
 from r2flow.data.shards import PairStore
+from r2flow.progress import Bar
 from r2flow.reports.clock import duration
 
 
@@ -50,13 +50,11 @@ class _Teller:
 
     def __init__(self, who: str, total: int, seconds: float, watched: bool) -> None:
         self.who, self.total, self.seconds, self.watched = who, total, seconds, watched
-        columns = (TextColumn("drawing pairs"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"))
-        self.bar = Progress(*columns, TimeRemainingColumn(), disable=not watched)
-        self.task = self.bar.add_task("pairs", total=total, rate="")
+        self.bar = Bar("drawing", total, "pairs", shown=watched)
         self.last = time.monotonic()
 
     def __call__(self, made: Made) -> None:
-        self.bar.update(self.task, completed=made.pairs, rate=rate(made))
+        self.bar.set(made.pairs, rate(made))
         now = time.monotonic()
         if self.watched or now - self.last < self.seconds:
             return

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from r2flow.checkpoints import Checkpoint
-from r2flow.reports.pages import Page, blank_figure, shown, table
+from r2flow.reports.pages import Page, blank_figure
 from r2flow.reports.savings import (
     ELEMENTS,
     EULER,
@@ -22,6 +22,7 @@ from r2flow.reports.savings import (
     region_rows,
     scene_rows,
 )
+from r2flow.reports.tables import shown, table
 
 KIND_NAMES = {"straight": "straight", "gaussian": "smooth", "two_modes": "two modes", "ray_drop": "ray-drop"}
 # Told apart without colour.

@@ -17,7 +17,8 @@ from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
 from r2flow.generators import Sampler
 from r2flow.metrics.base import ScanMetric
 from r2flow.reports.evaluation import heading
-from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks, shown, table
+from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
+from r2flow.reports.tables import shown, table
 
 NAME = "speed_quality"
 BETWEEN = " | "  # remarks of a row

@@ -133,7 +133,7 @@ def _placeless(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _paths(flow: Checkpoint, subject: Subject, budget: Budget, work: Work) -> Paths:
-    with work.bar(f"paths of {subject.label}", 2 * max(budget.steps)) as advance:
+    with work.bar(f"following paths of {subject.label}", 2 * max(budget.steps), "evaluations") as advance:
         return measure_paths(
             flow, subject.label, budget.curved, max(budget.steps), SEED, budget.curved, progress=advance
         )
@@ -150,6 +150,6 @@ def _architecture(subject: Subject, cell: Cell, real: np.ndarray, metrics: Mappi
 
 def _interpolation(flow: Checkpoint, ends: np.ndarray, tolerance: float, work: Work) -> Interpolation:
     """Figure 3, between two scans, (2, 2 or 1, H, W)."""
-    with work.bar("figure 3", FRAMES) as advance:
+    with work.bar("interpolating figure 3", FRAMES) as advance:
         sampler = Sampler("dopri5", tolerance=tolerance)
         return interpolate_scans(flow, torch.from_numpy(ends), FRAMES, sampler, arrived=lambda _: advance())
