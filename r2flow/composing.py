@@ -22,7 +22,7 @@ CONF = Path(__file__).resolve().parent / "conf"
 # What has a Hydra group: its registry, and what a config does not say because the run does.
 REGISTRIES = {
     "stage": ("r2flow.stages", "STAGES", ("batch_size", "seed")),
-    "backbone": ("r2flow.backbones", "BACKBONES", ("in_channels", "out_channels")),
+    "backbone": ("r2flow.backbones", "BACKBONES", ("in_channels", "out_channels", "second_time")),
     "data": ("r2flow.data.layouts", "LAYOUTS", ()),
 }
 

@@ -47,6 +47,8 @@ EXPECTED_WARNINGS = (
     ".*smaller than the logging interval.*",
     "Checkpoint directory .* exists and is not empty.*",
     ".*isinstance.treespec, LeafSpec.*",
+    "The dirpath has changed from.*",
+    "Using ModelCheckpoint with manual optimization.*",
 )
 
 

@@ -116,10 +116,14 @@ def link_in_process(command: Sequence[str]) -> int:
 
 
 def run_train(cwd: Path, scans: Path, *overrides: str, check: bool = True, flags: tuple[str, ...] = ()) -> Done:
-    """The tiny run, and a chain's links or a sweep's jobs, in this process."""
+    """The tiny run, a chain's links and a sweep's jobs too in this process."""
+    return run_links(cwd, [*flags, *tiny(scans, *overrides)], check)
+
+
+def run_links(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("r2flow.chain.run_process", link_in_process)
-        return in_process(cwd, [*flags, *tiny(scans, *overrides)], check)
+        return in_process(cwd, arguments, check)
 
 
 def start(cwd: Path, arguments: Sequence[str], **variables: str) -> subprocess.Popen[str]:

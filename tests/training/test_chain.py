@@ -227,6 +227,27 @@ def test_links_take_what_concerns_them():
     )  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    "given", ["data.augment.flip=true", "data.a_key_of_tomorrow=1", "data.validation.data.root=x", "sensor=vlp16"]
+)
+def test_what_concerns_scans_goes_to_the_link_that_reads_them(given: str):
+    first, second = links_of({"rf1": {}, "rf2": {"experiment": "reflow", "init": "rf1"}}, "runs", [given])
+    assert given in first.overrides
+    assert given not in second.overrides
+
+
+def test_every_link_of_the_paper_s_chain_is_built_before_the_first_one_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    ran: list[list[str]] = []
+    monkeypatch.setattr("r2flow.chain.run_process", lambda command: ran.append(command) or 2)
+    command = ["experiment=r2flow", "data.root=/nowhere", "data.augment.flip=true", "trainer.accelerator=cpu"]
+    assert in_process(tmp_path, command, check=False).returncode == 2
+    (first,) = ran  # the later ones have been built, and are not refused for the flip
+    assert {"data.augment.flip=true", "experiment=r2flow_1rf"} <= set(first)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_is_given_to_one_link_wins_over_what_is_given_to_all():
     given = ["chain.rf1.trainer.max_steps=5", "trainer.max_steps=9", "+chain.rf2.seed=2"]
     first, second = links_of({"rf1": {"trainer": {"max_steps": 5}}, "rf2": {"init": "rf1", "seed": 2}}, "runs", given)

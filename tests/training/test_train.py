@@ -169,6 +169,17 @@ def test_a_sweep_runs_every_job_and_reports_the_failed(train: Run, tmp_path: Pat
     assert "mse" in finished.pop()
 
 
+@pytest.mark.slow
+def test_a_killed_sweep_takes_its_job_with_it(scans: Path, tmp_path: Path):
+    command = ["-m", *tiny(scans, "stage.loss=mse,pseudo_huber", *hold_at(3, tmp_path / "held"))]
+    process = start(tmp_path, command)
+    wait_for(tmp_path / "held", process)
+    (job,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate(timeout=100)  # its output ends when the job has gone
+    assert not Path("/proc", job).exists()
+
+
 @pytest.mark.parametrize("precision", ["bf16-mixed"])
 def test_mixed_precision_trains(train: Run, tmp_path: Path, precision: str):
     train(f"trainer.precision={precision}", "trainer.max_steps=4", "name=half")
