@@ -1,4 +1,4 @@
-"""Between metres and model space: what a network sees of a range image."""
+"""Range images between metres and model space, [-1, 1]."""
 
 import math
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Sensor
 from r2flow.registry import Registry, check_options
 
-# Decoding may miss a range limit by float32's rounding; within this share of it, it is the limit.
+# Decoding may miss a range limit by float32's rounding: within this relative distance a range is the limit.
 LIMIT_TOLERANCE = 1e-5
 
 
@@ -84,7 +84,7 @@ class Encoding:
     """Range images in metres to model space, [-1, 1] in every channel, and back.
 
     Args:
-        sensor: Its range limits decide what counts as a return.
+        sensor: Its range limits say which ranges are returns.
         format: `logscale` (the paper's), `inverse`, `metric`, or `cartesian` (three channels).
         reflectance: Whether reflectance is a channel; without it a model is of range alone.
     """
@@ -123,7 +123,7 @@ class Encoding:
     def decode(self, x: Tensor) -> Tensor:
         """(..., channels, H, W) -> range in metres and reflectance, (..., 2 or 1, H, W).
 
-        Whatever lies outside [min_range, max_range] is a dropped ray, 0 in both; reflectance is held in [0, 1].
+        A range outside [min_range, max_range] is a dropped ray, 0 in both; reflectance is clamped to [0, 1].
         """
         y = (x + 1) / 2
         ranges = self.format.channels

@@ -1,7 +1,7 @@
 """The arguments and results that all solvers share."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -44,10 +44,6 @@ class Solution:
         counts = [torch.from_numpy(np.broadcast_to(n, of).astype(np.int64)) for n in (evaluations, accepted, rejected)]
         flags = [torch.from_numpy(np.broadcast_to(flag, of).astype(bool)) for flag in (stiff, converged)]
         return cls(x, *counts, *flags)
-
-    def shaped(self, shape: torch.Size) -> "Solution":
-        """The same with the scenes of x in another shape."""
-        return replace(self, x=self.x.view(shape))
 
 
 class Evaluations:
