@@ -19,6 +19,7 @@ from r2flow.generators import Generator, RectifiedFlow, Sampler, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
+from r2flow.plugins import made_with
 from r2flow.published import published_cfg, published_config, published_rings, published_step
 
 FOLDER = "checkpoints"
@@ -191,7 +192,8 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
             f"{path} is a torch file but not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
             f"(ours) nor 'cfg' and 'weights' (published); found {', '.join(map(repr, list(content)[:6]))}."
         )
-    with torch.device("meta"):  # sizes are compared before any memory is taken for them
+    # Sizes are compared before any memory is taken for them.
+    with made_with(config, str(path)), torch.device("meta"):
         check_weights(build_generator(config), weights, path)
     generator = build_generator(config)
     generator.load_state_dict(weights)

@@ -5,8 +5,8 @@ from typing import Any
 
 from r2flow.backbones import Backbone
 from r2flow.checkpoints import load_checkpoint
+from r2flow.config import flatten
 from r2flow.reports.tables import print_table
-from r2flow.runs import flatten
 
 
 def describe(path: str | Path) -> dict[str, Any]:

@@ -8,9 +8,9 @@ from lightning.pytorch.plugins import MixedPrecision
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
-from callbacks.ema import EMA
-from callbacks.guard import Guard
 from r2flow import noise
+from r2flow.callbacks.ema import EMA
+from r2flow.callbacks.guard import Guard
 from r2flow.checkpoints import checkpoints_of
 from r2flow.data.loader import Permutations, RunLoader, RunSampler
 from r2flow.errors import InputError

@@ -1,12 +1,10 @@
 """What a user gets wrong: one line that names it, exit code 2, nothing written."""
 
-import sys
 from pathlib import Path
 
 import pytest
 
-import train as train_script
-from tests.training.conftest import TINY, Run
+from tests.training.conftest import Run
 
 
 @pytest.mark.parametrize(
@@ -49,12 +47,10 @@ from tests.training.conftest import TINY, Run
         (["data.validation.data={name: mixed}"], ["must name one data set"]),
     ],
 )
-def test_wrong_config(scans, tmp_path, monkeypatch, capfd, overrides: list[str], words: list[str]):
-    # In this process: each test costs no import of torch.
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["train.py", *TINY, f"data.root={scans}", "name=bad", *overrides])
-    assert train_script.main() == 2
-    lines = capfd.readouterr().err.strip().splitlines()
+def test_wrong_config(train: Run, tmp_path: Path, overrides: list[str], words: list[str]):
+    done = train("name=bad", *overrides, check=False)
+    assert done.returncode == 2
+    lines = done.stderr.strip().splitlines()
     assert len(lines) == 1
     assert lines[0].startswith("error: ")
     for word in words:
