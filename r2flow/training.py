@@ -47,6 +47,8 @@ EXPECTED_WARNINGS = (
     ".*smaller than the logging interval.*",
     "Checkpoint directory .* exists and is not empty.*",
     ".*isinstance.treespec, LeafSpec.*",
+    "You passed in a .val_dataloader. but have no .validation_step.*",
+    "Using ModelCheckpoint with manual optimization and every_n_train_steps.*",
     "The dirpath has changed from.*",
     "Using ModelCheckpoint with manual optimization.*",
 )
@@ -158,7 +160,7 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
 
 def _assembled(config: dict[str, Any], generator: Generator) -> Run:
     space = generator.space
-    data = ScanDataModule(space.sensor, space.encoding, config["seed"], **config["data"])
+    data = ScanDataModule(space.sensor, space.encoding, config["seed"], noise_shape=generator.noise_shape, **config["data"])
     check_roll(data.augment, generator)
     stage = build_stage(config, generator)
     trainer = _build_trainer(config, stage)
