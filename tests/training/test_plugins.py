@@ -159,7 +159,7 @@ def test_every_verb_takes_plugins(tmp_path: Path):
 
 def test_a_plugin_reaches_the_links_of_a_chain(eager: Path, scans: Path, tmp_path: Path):
     chain = "+chain={one: {stage: {name: eager}}}"
-    done = in_process(
+    in_process(
         tmp_path,
         tiny(scans, f"--plugin={eager}", "name=chain", "trainer.max_steps=2", "samples.num=0", chain),
         check=False,
