@@ -32,7 +32,7 @@ from r2flow.plugins import made_with
 from r2flow.registry import check_options
 from r2flow.reports.training import check_samples, finish, read_curves
 from r2flow.runs import check_run, open_run, run_lock
-from r2flow.stages import STAGES, build_stage, check_roll
+from r2flow.stages import build_stage, check_roll
 from r2flow.stages.base import Stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 
@@ -153,14 +153,15 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
         raise InputError(f"seed must be a whole number of at least 0, found {seed!r}.")
     with made_with(parent.config if parent else {}, "the run that it starts from"):
         config = inherit(config, asked, parent)
-    config["generator"] = config["generator"] or {"name": STAGES[config["stage"]["name"]].generator_name}
     check_options("data", ScanDataModule, config["data"], given=3)
     return config
 
 
 def _assembled(config: dict[str, Any], generator: Generator) -> Run:
     space = generator.space
-    data = ScanDataModule(space.sensor, space.encoding, config["seed"], noise_shape=generator.noise_shape, **config["data"])
+    data = ScanDataModule(
+        space.sensor, space.encoding, config["seed"], noise_shape=generator.noise_shape, **config["data"]
+    )
     check_roll(data.augment, generator)
     stage = build_stage(config, generator)
     trainer = _build_trainer(config, stage)

@@ -28,12 +28,15 @@ def curvature(
 ) -> None:
     """How straight trained flows are: s(t), and the paths of the most curved pixels (the paper's figure 8)."""
     from r2flow.checkpoints import load_checkpoint
+    from r2flow.generators import as_flow
     from r2flow.reports.curvature import curvature_page, measure_paths
     from r2flow.reports.pages import prepare_folder
     from r2flow.sampling import batches
 
     where = choose_device(device)
     loaded = {str(path): load_checkpoint(path, where) for path in dict.fromkeys(checkpoints)}
+    for checkpoint in loaded.values():
+        as_flow(checkpoint.generator, "curvature")
     prepare_folder(out)
     with Bar("measuring", len(loaded) * batches(num, batch_size) * 2 * steps, "evaluations") as advance:
         flows = [
@@ -82,15 +85,14 @@ def work_precision(
     if loaded is None and not subjects:
         raise InputError("nothing to measure: give a checkpoint, or leave --problems none out.")
     check_tolerance(reference_tolerance)
+    flow = None if loaded is None else as_flow(loaded.generator, "a work-precision report")
     prepare_folder(out)
     found = None
     with only_errors():
-        if loaded is not None:
+        if loaded is not None and flow is not None:
             x_0 = measuring.starts(loaded, num, seed)
             with Bar("measuring", num * 4 * reference_steps, "reference evaluations") as advance:
-                found = measuring.reference(
-                    as_flow(loaded.generator, measuring.NAME), x_0, reference_steps, reference_tolerance, advance
-                )
+                found = measuring.reference(flow, x_0, reference_steps, reference_tolerance, advance)
             subjects.append(measuring.checkpoint_subject(loaded, str(checkpoint), found, num, seed, batch_size))
         with Bar("measuring", measuring.runs(subjects, chosen, repeats), "solutions") as advance:
             rows = measuring.measure(subjects, chosen, repeats, advance)

@@ -114,7 +114,9 @@ CANNOT = {
     "interpolate": (
         ["SCAN", "SCAN", "-c", "RUN", "-o", "OUT"], "interpolation needs the velocity of a flow, which a ToyGenerator"
     ),
-    "report": (["curvature", "RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
+    "report curvature": (["RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
+    "report savings": (["RUN", "-o", "OUT"], "a savings report needs the velocity of a flow, which a ToyGenerator"),
+    "report work-precision": (["RUN", "-o", "OUT"], "a work-precision report needs the velocity of a flow"),
     "calibrate": (["RUN", "-o", "OUT.json"], "a time grid needs the velocity of a flow, which a ToyGenerator"),
     "convert": (["RUN", "OUT.pth"], "the published format cannot hold a ToyGenerator; convert to .safetensors"),
     "pairs": (["RUN"], "pairs need noise of the scans' shape (2, 16, 64), found (8,)"),
@@ -127,7 +129,7 @@ def test_what_a_gan_cannot_do_is_one_line(gan: Path, tmp_path: Path, verb: str):
     arguments, said = CANNOT[verb]
     for name, value in (("RUN", gan), ("SCAN", gan / "samples" / "000000.ply"), ("OUT", tmp_path / "out")):
         arguments = [one.replace(name, str(value)) for one in arguments]
-    done = r2flow(verb, GAN.plugin, *arguments)
+    done = r2flow(*verb.split(), GAN.plugin, *arguments)
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.splitlines()) == 1
