@@ -30,7 +30,7 @@ from tests.training.conftest import Run
         (["encoding.reflectance=maybe"], ["reflectance must be true, false or auto", "'maybe'"]),
         (["sensor.rows=abc"], ["rows must be a whole number or null", "'abc'"]),
         (["stage.betas=0.9"], ["betas must be a list"]),
-        (["stage.time.name=grid"], ["needs the option 'k'"]),
+        (["stage.time.name=discrete"], ["needs the option 'k'"]),
         (["backbone.depths=3"], ["depths must be a list"]),
         (["seed=-1"], ["seed must be a whole number", "-1"]),
         (["sampler.method=eulr"], ["Did you mean 'euler'?"]),

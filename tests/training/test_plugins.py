@@ -155,16 +155,3 @@ def test_every_verb_takes_plugins(tmp_path: Path):
         )
         assert done.returncode == 2
         assert done.stderr == f"error: the plug-in {path} cannot be imported: RuntimeError: here it is\n"
-
-
-def test_a_plugin_reaches_the_links_of_a_chain(eager: Path, scans: Path, tmp_path: Path):
-    chain = "+chain={one: {stage: {name: eager}}}"
-    in_process(
-        tmp_path,
-        tiny(scans, f"--plugin={eager}", "name=chain", "trainer.max_steps=2", "samples.num=0", chain),
-        check=False,
-    )
-    config = read_config(tmp_path / "runs" / "chain" / "one")
-    assert config is not None
-    assert config["plugins"] == [str(eager)]
-    assert checkpoints_of(tmp_path / "runs" / "chain" / "one")[0].stem == "step-00000002"
