@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from r2flow.data.layouts import SPLITS, named_drive, split_of
-from r2flow.data.manifest import Manifest, ShardEntry, describe_sensor, difference, read_manifest, shard_name
+from r2flow.data.manifest import Manifest, ShardEntry, describe_sensor, read_manifest, shard_name
 from r2flow.data.quantise import RangeCodes, ReflectanceCodes
-from r2flow.data.shards import Damaged
+from r2flow.data.store import Damaged, difference
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor

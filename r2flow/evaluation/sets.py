@@ -17,9 +17,10 @@ from torch.utils.data import DataLoader, Dataset
 from r2flow import simulator
 from r2flow.checkpoints import Checkpoint, checkpoints_of, weights_hash
 from r2flow.data.layouts import LAYOUTS, find_drives
-from r2flow.data.manifest import MANIFEST, read_manifest
+from r2flow.data.manifest import read_manifest
 from r2flow.data.prepared import open_prepared
 from r2flow.data.sources import ScanSource, SimulatedScans, spread
+from r2flow.data.store import MANIFEST
 from r2flow.errors import InputError
 from r2flow.evaluation.reading import FolderScans, Reading, has_reflectance, scan_paths
 from r2flow.flow.solvers import solve

@@ -19,12 +19,13 @@ import torch
 from r2flow.data import preparing
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive, find_drives
-from r2flow.data.manifest import MANIFEST, read_manifest
+from r2flow.data.manifest import read_manifest
 from r2flow.data.plans import Plan, plan_files, plan_simulated
 from r2flow.data.prepared import PreparedScans, check_prepared, open_prepared
 from r2flow.data.preparing import Preparation
 from r2flow.data.quantise import RangeCodes, ReflectanceCodes, find_levels
 from r2flow.data.sources import ScanFiles, SimulatedScans
+from r2flow.data.store import MANIFEST
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import FORMATS, Encoding
 from r2flow.lidar.scan_files import write_points
