@@ -61,7 +61,9 @@ def fit(config: dict[str, Any], asked: list[str]) -> None:
     from callbacks import build_callbacks, build_loggers
     from r2flow.checkpoints import AtomicCheckpointIO, checkpoints_of, step_of
     from r2flow.data.datamodule import ScanDataModule
-    from r2flow.data.opening import AUTO, resolve_reflectance
+    from r2flow.data.opening import resolve_reflectance
+    from r2flow.data.options import DataOptions
+    from r2flow.data.sources import AUTO
     from r2flow.lineage import inherit
     from r2flow.noise import seed_torch
     from r2flow.registry import check_options
@@ -84,7 +86,7 @@ def fit(config: dict[str, Any], asked: list[str]) -> None:
     if not (isinstance(config["seed"], int) and 0 <= config["seed"] < 2**63):
         raise InputError(f"seed must be a whole number of at least 0, found {config['seed']!r}.")
     config, parent = inherit(config, asked)
-    check_options("data", ScanDataModule, config["data"], given=3)
+    check_options("data", DataOptions, config["data"])
     encoding = config["encoding"]
     encoding["reflectance"] = resolve_reflectance(encoding.get("reflectance", AUTO), config["data"])
     seed_torch(config["seed"], "weights")

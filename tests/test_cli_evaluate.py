@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.evaluation.sets import open_set, prepared_reading
+from r2flow.data.opening import open_scans
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
@@ -53,7 +53,7 @@ def test_prepared_shards_are_the_scans_that_they_were_made_of(r2flow, generated,
     for number, image in enumerate(images(6, 1)):
         write_points(tmp_path / "drives" / str(number // 3) / f"{number}.bin", *image_to_points(image, SENSOR.rays()))
     assert r2flow("prepare", "folder", tmp_path / "drives", "--size", "8x64", "--out", tmp_path / "shards")[0] == 0
-    found = open_set(str(tmp_path / "shards"), prepared_reading(str(tmp_path / "shards")))
+    found = open_scans(tmp_path / "shards")
     assert {name: list(numbers) for name, numbers in found.drives.items()} == {"0": [0, 1, 2], "1": [3, 4, 5]}
     np.testing.assert_allclose(found.source[4], images(6, 1)[4], atol=5e-3)
     code, said, _ = r2flow("evaluate", tmp_path / "shards", generated, *QUICK[:2], "--workers", 0, "--floor")
@@ -169,7 +169,7 @@ def test_weights_that_are_missing_are_left_out_or_named(r2flow, real, generated,
     ("arguments", "message"),
     [
         (("{real}", "{generated}", "--metrics", "jds", *QUICK[2:]), "Did you mean 'jsd'"),
-        (("{real}", "nowhere", *QUICK), "nowhere is not a folder"),
+        (("{real}", "nowhere", *QUICK), "nowhere does not exist"),
         (("{real}", "{generated}", *QUICK[:2]), "give --size 8x64"),
         (("{real}", "{generated}", *QUICK, "--split", "test"), "has no standard split"),
         (("{real}", *QUICK), "give GENERATED, --checkpoint RUN or --floor"),

@@ -38,7 +38,8 @@ def pairs(
     SLURM array, with the settings of `data.pairs`.
     """
     from r2flow.checkpoints import load_checkpoint, weights_hash
-    from r2flow.data.pairs import PairOptions, default_folder
+    from r2flow.data.options import PairOptions
+    from r2flow.data.pairs import default_folder
     from r2flow.data.shards import PairStore
     from r2flow.lineage import check_finished, pairs_of
     from r2flow.reports.pairs import make_and_tell, place
