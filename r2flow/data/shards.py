@@ -2,8 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -254,13 +254,8 @@ class PairStore:
     def _read(self, path: Path, batch: int) -> Block:
         """A file, every byte of it checked."""
         notes = read_notes(path)
-        try:
-            with safe_open(path, framework="numpy") as file:
-                tensors = {name: file.get_tensor(name) for name in ("evaluations", "x_1")}
-        except FileNotFoundError:
-            raise
-        except (SafetensorError, OSError, ValueError, KeyError) as error:
-            raise Damaged(str(error)) from None
+        with _opened(path) as file:
+            tensors = {name: file.get_tensor(name) for name in ("evaluations", "x_1")}
         self._check_recipe(path, notes)
         if notes["first"] != self.recipe.first + batch * self.recipe.batch_size:
             raise Damaged(f"it begins with pair {notes['first']}")
@@ -277,13 +272,20 @@ def read_notes(path: Path) -> dict[str, Any]:
         FileNotFoundError: no such file.
         Damaged: not a file of pairs, or not whole.
     """
+    with _opened(path) as file:
+        notes: dict[str, Any] = json.loads((file.metadata() or {})["pairs"])
+        notes["recipe"], notes["first"], notes["usable"], notes["sha256"]
+        return notes
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A safetensors file; whatever goes wrong in reading it is damage."""
     if not path.is_file():
         raise FileNotFoundError(path)
     try:
         with safe_open(path, framework="numpy") as file:
-            notes: dict[str, Any] = json.loads((file.metadata() or {})["pairs"])
-            notes["recipe"], notes["first"], notes["usable"], notes["sha256"]
-            return notes
+            yield file
     except FileNotFoundError:
         raise
     except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:

@@ -273,18 +273,28 @@ def lacks_reflectance(paths: Iterable[str | Path], on_bad_scan: str = "error") -
     """
     for path in paths:
         try:
-            image = range_image(Path(path))
-            found = read_points(path).reflectance if image is None else image[1] if len(image) > 1 else None
+            found = stored_reflectance(path)
         except InputError as error:
             if on_bad_scan == "error" or (on_bad_scan == "empty" and not isinstance(error, NoPointsError)):
                 raise
             continue
-        if image is not None and not image[0].any():
-            continue
         if found is None:
             return f"{path} has no reflectance"
-        return None if found.any() else f"the reflectance in {path} is 0 throughout"
+        if found.size:
+            return None if found.any() else f"the reflectance in {path} is 0 throughout"
     return "no scan has a return"
+
+
+def stored_reflectance(path: str | Path) -> np.ndarray | None:
+    """The reflectance of all returns of a scan file or a range image, as it is stored; None where there is none.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    image = range_image(Path(path))
+    if image is None:
+        return read_points(path).reflectance
+    return image[1][image[0] > 0] if len(image) > 1 else None
 
 
 class ScanFiles(ScanSource):
