@@ -11,21 +11,30 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from r2flow.cli.app import app, report
-from r2flow.cli.options import OutOption, SizeOption, build_sized, choose_device
+from r2flow.cli.options import (
+    SETS,
+    ConventionChoice,
+    OutOption,
+    ProjectionChoice,
+    ScaleChoice,
+    SensorChoice,
+    SizeOption,
+    choose_device,
+    choose_reading,
+)
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.checkpoints import Checkpoint
+    from r2flow.data.sets import ScanSet
+    from r2flow.data.sources import Reading
     from r2flow.evaluation.measuring import Work
     from r2flow.evaluation.processes import Place
-    from r2flow.evaluation.reading import Reading
-    from r2flow.evaluation.sets import ScanSet
     from r2flow.metrics.base import ScanMetric
     from r2flow.reports.speed_quality import Drawing
 
 log = logging.getLogger(__name__)
 
-SETS = "a folder of scans or range images, prepared shards, LAYOUT:FOLDER, simulated:SEED"
 EMBEDDED = "frechet_embedded"
 DEFAULT = ("jsd", "mmd", EMBEDDED)
 RealArgument = Annotated[str, typer.Argument(help=f"Real scans: {SETS}.", show_default=False)]
@@ -34,14 +43,6 @@ MetricsOption = Annotated[
     typer.Option(help="Names, separated by commas; jsd,mmd,frechet_embedded (or _range of it) if left out."),
 ]
 WorkersOption = Annotated[int, typer.Option(min=0, help="Further processes that read scans.")]
-SensorChoice = Annotated[
-    str | None, typer.Option(help="Name of the sensor; the flow's, the prepared scans', or hdl64e if left out.")
-]
-ProjectionChoice = Annotated[str | None, typer.Option(help="spherical or unfolding; theirs, or spherical.")]
-ConventionChoice = Annotated[
-    str | None, typer.Option(help="centre, or reference for the published models'; theirs, or centre.")
-]
-ScaleChoice = Annotated[float, typer.Option(min=1e-6, help="Value in scan files that means full reflectance.")]
 
 
 @app.command(epilog="Example: r2flow evaluate kitti_360:/data/KITTI-360 runs/1rf --split test --num 1000 --json e.json")
@@ -82,7 +83,7 @@ def evaluate(
     size: SizeOption = None,
     projection: ProjectionChoice = None,
     convention: ConventionChoice = None,
-    reflectance_scale: ScaleChoice = 1.0,
+    reflectance_scale: ScaleChoice = None,
     generated_scale: Annotated[
         float | None, typer.Option(min=1e-6, help="The same of GENERATED's files, if other.")
     ] = None,
@@ -116,13 +117,13 @@ def evaluate(
         flows = _load_flows(
             [*(checkpoint or []), *([Path(generated)] if generated and _is_flow(generated) else [])], place.device
         )
+        judged_scans = None if _is_flow(generated) else generated
         reading = reading_of(
-            real, list(flows.values()), generated, sensor, size, projection, convention, reflectance_scale
+            [real, judged_scans], list(flows.values()), sensor, size, projection, convention, reflectance_scale
         )
         if built is not None:  # a scale of reflectance is nobody's business where no metric looks at it
-            reading = replace(
-                reading, reflectance=any(m.needs_reflectance or m.uses_reflectance for m in built.values())
-            )
+            looks = any(m.needs_reflectance or m.uses_reflectance for m in built.values())
+            reading = replace(reading, reflectance=reading.reflectance if looks else False)
         truth = _open(real, reading, split, real_num)
         judged: ScanSet | None = None
         if _is_flow(generated):
@@ -130,8 +131,7 @@ def evaluate(
             sampler = flow.generator.sampler.changed(steps=_one(steps), method=solver, tolerance=tolerance)
             judged = sampled_set(flow, label, num or 1000, sampler, seed)
         elif generated is not None:
-            scale = reflectance_scale if generated_scale is None else generated_scale
-            judged = _open(generated, replace(reading, reflectance_scale=scale), generated_split, num)
+            judged = _open(generated, _rescaled(generated, reading, generated_scale), generated_split, num)
         sets = [truth, *([judged] if judged else [])]
         with_reflectance = all(s.about["reflectance"] for s in sets) and all(
             flow.encoding.reflectance for flow in flows.values()
@@ -250,7 +250,7 @@ def neighbours(
     size: SizeOption = None,
     projection: ProjectionChoice = None,
     convention: ConventionChoice = None,
-    reflectance_scale: ScaleChoice = 1.0,
+    reflectance_scale: ScaleChoice = None,
     batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 8,
     workers: WorkersOption = 2,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto",
@@ -261,8 +261,8 @@ def neighbours(
     from r2flow.reports.pages import prepare_folder
 
     where = choose_device(device)
-    reading = reading_of(train, [], generated, sensor, size, projection, convention, reflectance_scale)
-    reading = replace(reading, reflectance=by != "pixels")
+    reading = reading_of([train, generated, real], [], sensor, size, projection, convention, reflectance_scale)
+    reading = replace(reading, reflectance=False) if by == "pixels" else reading
     trained = _open(train, reading, split, None)
     judged = _open(generated, reading, None, num)
     held = None if real is None else _open(real, reading, real_split, num)
@@ -297,47 +297,35 @@ def _load_flows(paths: list[Path], device: str) -> "dict[str, Checkpoint]":
 
 
 def reading_of(
-    real: str,
+    specs: "Sequence[str | None]",
     flows: "Sequence[Checkpoint]" = (),
-    generated: str | None = None,
     sensor: str | None = None,
     size: str | None = None,
     projection: str | None = None,
     convention: str | None = None,
-    reflectance_scale: float = 1.0,
+    reflectance_scale: float | None = None,
 ) -> "Reading":
-    """How scans become images: as asked for, else as the flow's or a prepared set's were, else the default."""
-    from r2flow.evaluation.reading import Reading
-    from r2flow.evaluation.sets import is_prepared, prepared_reading
-    from r2flow.lidar.projection import CONVENTIONS, PROJECTIONS
+    """How scans become images: as asked for, else as the flow's or one of the named sets' were, else the usual way."""
+    from r2flow.evaluation.sets import reading_of_flow
 
-    prepared = [prepared_reading(text) for text in (real, generated) if text is not None and is_prepared(text)]
-    if flows:
-        data = flows[0].config.get("data", {})
-        found = Reading(flows[0].sensor, data.get("projection", "spherical"), data.get("convention", "centre"))
-    elif prepared:
-        found = prepared[0]
-    else:
-        found = Reading(build_sized(sensor or "hdl64e", size))
-    if sensor is not None or size is not None:
-        chosen = build_sized(sensor or found.sensor.name, size)
-        if flows and chosen.shape != found.sensor.shape:
-            asked, own = ("x".join(map(str, one.shape)) for one in (chosen, found.sensor))
-            raise InputError(f"the flow's images are {own}, not {asked}; leave --sensor and --size out.")
-        if flows and chosen.elevations != found.sensor.elevations:
-            raise InputError(f"the flow looks through {found.sensor.name}, not {chosen.name}; leave --sensor out.")
-        found = found if flows else replace(found, sensor=chosen)
-    for option, value, known in (("projection", projection, PROJECTIONS), ("convention", convention, CONVENTIONS)):
-        if value is not None and value not in known:
-            raise InputError(f"--{option} must be one of {', '.join(known)}; found {value!r}.")
-    how: dict[str, Any] = {"projection": projection, "convention": convention}
-    return replace(found, reflectance_scale=reflectance_scale, **{k: v for k, v in how.items() if v is not None})
+    flow = reading_of_flow(flows[0]) if flows else None
+    return choose_reading(specs, sensor, size, projection, convention, reflectance_scale, flow)
+
+
+def _rescaled(generated: str, reading: "Reading", scale: float | None) -> "Reading":
+    """The reading with the scale of reflectance that was asked for, else the generated scans' own."""
+    from r2flow.data.opening import own_reading
+
+    own = own_reading(generated)
+    if scale is None:
+        scale = reading.reflectance_scale if own is None else own.reflectance_scale
+    return replace(reading, reflectance_scale=scale)
 
 
 def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> "ScanSet":
-    from r2flow.evaluation.sets import open_set
+    from r2flow.data.opening import open_scans
 
-    return open_set(text, reading, split, num)
+    return open_scans(text, reading, split, num)
 
 
 def _build(names: Sequence[str], bootstrap: int, place: "Place") -> "dict[str, ScanMetric]":
