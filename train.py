@@ -59,17 +59,19 @@ def fit(config: dict[str, Any], asked: list[str]) -> None:
     from lightning.fabric.utilities.exceptions import MisconfigurationException
 
     from callbacks import build_callbacks, build_loggers
-    from r2flow.checkpoints import AtomicCheckpointIO, checkpoints_of, step_of
+    from r2flow.checkpoints import checkpoints_of, step_of
     from r2flow.data.datamodule import ScanDataModule
     from r2flow.data.opening import resolve_reflectance
     from r2flow.data.options import DataOptions
     from r2flow.data.sources import AUTO
+    from r2flow.generators import build_generator
     from r2flow.lineage import inherit
     from r2flow.noise import seed_torch
     from r2flow.registry import check_options
     from r2flow.reports.training import check_samples, finish
     from r2flow.runs import open_run, run_lock
-    from r2flow.stages import build_parts, build_stage, check_roll
+    from r2flow.stages import STAGES, build_stage, check_roll
+    from r2flow.stages.checkpointing import AtomicCheckpointIO
 
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
     warnings.filterwarnings("ignore", message="Total length of .list. across ranks is zero.*")
@@ -89,18 +91,20 @@ def fit(config: dict[str, Any], asked: list[str]) -> None:
     check_options("data", DataOptions, config["data"])
     encoding = config["encoding"]
     encoding["reflectance"] = resolve_reflectance(encoding.get("reflectance", AUTO), config["data"])
+    config["generator"] = config["generator"] or {"name": STAGES[config["stage"]["name"]].generator_name}
     seed_torch(config["seed"], "weights")
-    parts = build_parts(config)
+    generator = build_generator(config)
     if parent is not None:
-        parts.backbone.load_state_dict(parent.model.state_dict())
+        generator.start_from(parent.generator)
         del parent
-    data = ScanDataModule(parts.sensor, parts.encoding, config["seed"], **config["data"])
-    check_roll(data.augment, parts.backbone)
+    space, noise_shape = generator.space, generator.noise_shape
+    data = ScanDataModule(space.sensor, space.encoding, config["seed"], noise_shape, **config["data"])
+    check_roll(data.augment, generator)
     data.setup()
     config["scans"] = data.fingerprint()
-    stage = build_stage(config, parts.backbone)
+    stage = build_stage(config, generator)
     check_options("trainer", L.Trainer, trainer_options)
-    callbacks, loggers = build_callbacks(config, parts), build_loggers(config["loggers"], run_dir)
+    callbacks, loggers = build_callbacks(config), build_loggers(config["loggers"], run_dir)
     try:
         trainer = L.Trainer(**trainer_options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])
     except (TypeError, ValueError, MisconfigurationException) as error:

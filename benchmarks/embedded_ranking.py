@@ -42,7 +42,8 @@ from r2flow.metrics.frechet import frechet_distance
 from r2flow.metrics.scans import Scans
 from r2flow.noise import generator
 from r2flow.reports.fidelity import load_scans
-from r2flow.reports.pages import STYLES, Page, blank_figure, prepare_folder, table, write_page
+from r2flow.reports.pages import STYLES, Page, blank_figure, prepare_folder, write_page
+from r2flow.reports.tables import table
 from r2flow.reports.views import scans_of
 from r2flow.sampling import sample
 
@@ -229,7 +230,7 @@ def training_run(run: Path) -> list[dict[str, Any]]:
     sets |= {f"control: {k}": torch.from_numpy(v) for k, v in controls(truth.numpy(), sensor, RUN_SCANS, SEED).items()}
     for step in track(LOOKED_AT, "checkpoints", transient=True):
         checkpoint = load_checkpoint(kept[step])
-        drawn = sample(checkpoint, RUN_SCANS, RUN_EULER, SEED, batch_size=4)
+        drawn = sample(checkpoint, RUN_SCANS, SEED, batch_size=4, steps=RUN_EULER)
         sets[f"step {step}"] = torch.cat([part.images for part in drawn])
     rows = []
     for name, extractor in extractors.items():

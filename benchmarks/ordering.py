@@ -25,11 +25,14 @@ from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.flow.solvers import Velocity, solve
 from r2flow.flow.straightness import curvature
+from r2flow.generators import Field
 from r2flow.metrics.fidelity import controls, distances, panel
-from r2flow.reports.pages import Page, table, write_page
-from r2flow.sampling import noise_of
+from r2flow.noise import Draws
+from r2flow.reports.pages import Page, write_page
+from r2flow.reports.tables import table
 from r2flow.stages import STAGES
-from r2flow.stages.rectify import RectifiedFlow, learning_rate_factor
+from r2flow.stages.base import learning_rate_factor
+from r2flow.stages.rectify import Rectify
 
 ROOT = Path(__file__).resolve().parents[1]
 SEEDS = (1, 2, 3)
@@ -97,7 +100,7 @@ def sliced_distance(a: Tensor, b: Tensor, directions: int = 64) -> float:
     return float((p.sort(0).values - q.sort(0).values).square().mean().sqrt())
 
 
-def train_plane(stage: RectifiedFlow, batch: Callable[[int], dict[str, Tensor]], steps: int) -> nn.Module:
+def train_plane(stage: Rectify, batch: Callable[[int], dict[str, Tensor]], steps: int) -> nn.Module:
     stage.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
     optimizer = torch.optim.AdamW(stage.parameters(), lr=2e-3, weight_decay=0.0)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: learning_rate_factor(step, 200, steps))
@@ -106,7 +109,7 @@ def train_plane(stage: RectifiedFlow, batch: Callable[[int], dict[str, Tensor]],
         stage.training_step(batch(step), step).backward()
         optimizer.step()
         schedule.step()
-    return stage.velocity.requires_grad_(False)
+    return stage.generator.function.requires_grad_(False)
 
 
 def plane_flows(seed: int) -> dict[str, nn.Module]:
@@ -140,7 +143,8 @@ def plane_flows(seed: int) -> dict[str, nn.Module]:
             parent = list(flows.values())[-1]
             network.load_state_dict(parent.state_dict())
             batch = pairs_of(parent)
-        flows[name] = train_plane(STAGES.build(options, network), batch, PLANE_STEPS[str(options["name"])])
+        stage = STAGES.build(options, Field(network, (1, 1, 2)))
+        flows[name] = train_plane(stage, batch, PLANE_STEPS[str(options["name"])])
     return flows
 
 
@@ -193,7 +197,7 @@ def scans(seed: int, folder: Path) -> dict[str, float]:
     }
     known = np.stack([training[i] for i in range(SCAN_SAMPLES, 2 * SCAN_SAMPLES)])
     extra["floor"] = mean_of(distances(truth, panel(known, first.sensor)))
-    x_0 = noise_of(range(SCAN_SAMPLES), first.encoding.shape, seed)
+    x_0 = Draws(seed, range(SCAN_SAMPLES)).start(first.encoding.shape)
     return measure({name: flow.model for name, flow in flows.items()}, x_0, judge(first, truth), extra)
 
 

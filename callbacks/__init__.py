@@ -17,17 +17,16 @@ from callbacks.requeue import Requeue
 from r2flow.checkpoints import FOLDER
 from r2flow.errors import InputError
 from r2flow.registry import Registry, check_options
-from r2flow.stages import Parts
 
 
 class Entry(NamedTuple):
     """A callback, or several that belong together, and what it takes by position beside its options."""
 
     constructor: Callable[..., Any]
-    given: Callable[[Mapping[str, Any], Parts], tuple[Any, ...]] = lambda config, parts: ()
+    given: Callable[[Mapping[str, Any]], tuple[Any, ...]] = lambda config: ()
 
 
-def build_callbacks(config: Mapping[str, Any], parts: Parts) -> list[Callback]:
+def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
     """The callbacks that a config's `callbacks` names; null leaves one out."""
     if config["trainer"]["fast_dev_run"]:
         return [Progress()] if config["trainer"]["enable_progress_bar"] else []
@@ -38,7 +37,7 @@ def build_callbacks(config: Mapping[str, Any], parts: Parts) -> list[Callback]:
     built: list[Callback] = []
     for name, entry in CALLBACKS.items():
         if name in wanted:
-            given = entry.given(config, parts)
+            given = entry.given(config)
             check_options(f"callbacks.{name}", entry.constructor, wanted[name], given=len(given))
             made = entry.constructor(*given, **wanted[name])
             built += made if isinstance(made, list) else [made]
@@ -73,16 +72,16 @@ def keep_checkpoints(folder: Path, every: int = 1000) -> list[Callback]:
 # In the order in which they act.
 CALLBACKS = Registry(
     "callback",
-    reflow_pairs=Entry(ReflowPairs, lambda config, parts: (config["stage"].get("init"),)),
+    reflow_pairs=Entry(ReflowPairs, lambda config: (config["stage"].get("init"),)),
     ema=Entry(EMA),
     pictures=Entry(
         SamplePictures,
-        lambda config, parts: (Path(config["run_dir"], "pictures"), parts.sensor, parts.encoding, config["seed"]),
+        lambda config: (Path(config["run_dir"], "pictures"), config["seed"]),
     ),
-    curvature=Entry(Curvature, lambda config, parts: (parts.encoding.shape, config["seed"])),
-    guard=Entry(Guard, lambda config, parts: (config["run_dir"],)),
-    requeue=Entry(Requeue, lambda config, parts: (config["run_dir"],)),
-    checkpoint=Entry(keep_checkpoints, lambda config, parts: (Path(config["run_dir"], FOLDER),)),
+    curvature=Entry(Curvature, lambda config: (config["seed"],)),
+    guard=Entry(Guard, lambda config: (config["run_dir"],)),
+    requeue=Entry(Requeue, lambda config: (config["run_dir"],)),
+    checkpoint=Entry(keep_checkpoints, lambda config: (Path(config["run_dir"], FOLDER),)),
     progress=Entry(Progress),
 )
 

@@ -6,7 +6,8 @@ import torch
 from callbacks.ema import averaged_weights
 from r2flow.errors import InputError
 from r2flow.flow.straightness import curvature
-from r2flow.sampling import noise_of
+from r2flow.generators import Flow
+from r2flow.noise import Draws
 
 
 class Curvature(L.Callback):
@@ -17,7 +18,6 @@ class Curvature(L.Callback):
     whole of s(t), which takes two, is `r2flow report curvature`.
 
     Args:
-        shape: Of an image in model space, (C, H, W).
         every: Steps between two measurements; 0 leaves them out.
         num: Scans a measurement.
         steps: Euler steps a scan.
@@ -26,13 +26,13 @@ class Curvature(L.Callback):
         InputError: `every` is below 0, `num` or `steps` below 1.
     """
 
-    def __init__(self, shape: tuple[int, ...], seed: int, every: int = 500, num: int = 2, steps: int = 16) -> None:
+    def __init__(self, seed: int, every: int = 500, num: int = 2, steps: int = 16) -> None:
         if every < 0 or num < 1 or steps < 1:
             raise InputError(
                 "callbacks.curvature needs every of at least 0, num and steps of at least 1; "
                 f"found {every}, {num} and {steps}."
             )
-        self.shape, self.seed = shape, seed
+        self.seed = seed
         self.every, self.num, self.steps = every, num, steps
         self._measured = 0
 
@@ -42,18 +42,19 @@ class Curvature(L.Callback):
         step = trainer.global_step
         due = self.every > 0 and step > 0 and (step % self.every == 0 or step == trainer.max_steps)
         # Under accumulation a step lasts several batches: the first one that ends it measures.
-        if due and trainer.is_global_zero and step != self._measured:
+        if due and isinstance(pl_module.generator, Flow) and trainer.is_global_zero and step != self._measured:
             self._measured = step
             values = self._measure(trainer, pl_module)
             for logger in trainer.loggers:
                 logger.log_metrics(values, step - 1)  # Lightning counts the step that was being taken
 
     def _measure(self, trainer: L.Trainer, pl_module: L.LightningModule) -> dict[str, float]:
-        x_0 = noise_of(range(self.num), self.shape, self.seed).to(pl_module.device)
+        flow: Flow = pl_module.generator  # type: ignore[assignment]
+        x_0 = Draws(self.seed, range(self.num)).start(flow.noise_shape).to(pl_module.device)
         training = pl_module.training
         with averaged_weights(trainer, pl_module), torch.no_grad():
             pl_module.eval()
-            found = curvature(pl_module.velocity, x_0, self.steps)  # type: ignore[arg-type]
+            found = curvature(flow.velocity, x_0, self.steps)
             pl_module.train(training)
         return {
             "curvature/s": found.total.mean().item(),

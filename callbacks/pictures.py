@@ -8,10 +8,8 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from callbacks.ema import averaged_weights
-from r2flow.flow.solvers import solve
-from r2flow.lidar.encoding import Encoding
-from r2flow.lidar.sensors import Sensor
-from r2flow.sampling import noise_of
+from r2flow.generators import Generator
+from r2flow.sampling import draw
 
 
 class SamplePictures(L.Callback):
@@ -23,20 +21,13 @@ class SamplePictures(L.Callback):
         folder: Where `step-XXXXXXXX.png` goes.
         every: Steps between two pictures; 0 leaves them out.
         num: Scans a picture.
-        steps: Euler steps a scan.
+        steps: Steps a scan; None for the generator's own sampler.
     """
 
     def __init__(
-        self,
-        folder: str | Path,
-        sensor: Sensor,
-        encoding: Encoding,
-        seed: int,
-        every: int = 1000,
-        num: int = 4,
-        steps: int = 16,
+        self, folder: str | Path, seed: int, every: int = 1000, num: int = 4, steps: int | None = None
     ) -> None:
-        self.folder, self.sensor, self.encoding, self.seed = Path(folder), sensor, encoding, seed
+        self.folder, self.seed = Path(folder), seed
         self.every, self.num, self.steps = every, num, steps
 
     def on_train_batch_end(
@@ -52,15 +43,14 @@ class SamplePictures(L.Callback):
     def _draw(self, trainer: L.Trainer, pl_module: L.LightningModule, path: Path) -> None:
         from r2flow.reports.pictures import contact_sheet, figure_pixels, save_figure
 
-        shape = self.encoding.shape
-        x_0 = noise_of(range(self.num), shape, self.seed).to(pl_module.device)
+        generator: Generator = pl_module.generator  # type: ignore[assignment]
         training = pl_module.training
         with averaged_weights(trainer, pl_module), torch.no_grad():
             pl_module.eval()
-            end = solve(pl_module.velocity, x_0, steps=self.steps)  # type: ignore[arg-type]
+            drawn = draw(generator, range(self.num), self.seed, generator.sampler.changed(steps=self.steps))
             pl_module.train(training)
-        images = list(self.encoding.decode(end.x.cpu()).numpy())
-        figure = contact_sheet(images, self.sensor.rays(), [f"step {trainer.global_step}"])
+        images = list(drawn.images.numpy())
+        figure = contact_sheet(images, generator.space.sensor.rays(), [f"step {trainer.global_step}"])
         save_figure(figure, path)
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):

@@ -1,86 +1,69 @@
-"""Checkpoints: written whole, read without running code, and turned into models."""
+"""A trained generator on disk, whatever its family: written whole, checked when read, no code from it run."""
 
-import hashlib
 import json
-import os
 import pickle
 import re
+import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import Tensor, nn
 
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
+from r2flow.generators import Generator, RectifiedFlow, Sampler, build_generator
+from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.published import published_cfg, published_config, published_rings, published_step
-from r2flow.stages import build_parts
 
 FOLDER = "checkpoints"
-PREFIX = "velocity."  # of the backbone's weights in a LightningModule
+PREFIX = "generator."  # of the generator's weights in a LightningModule
+BACKBONE = "backbone."  # of a flow's network in the generator
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A trained flow, ready for `model(t, x)`.
+    """A trained generator.
 
     Attributes:
-        model: The backbone with its averaged weights, in eval mode.
-        sensor: What its images look through.
-        encoding: Between its model space and metres.
+        generator: With its averaged weights, in eval mode.
         config: The config it was trained with, as plain dicts.
         step: Optimiser steps taken.
         path: Where it was read from.
         format: `r2flow`, or `published` for the reference implementation's files.
     """
 
-    model: nn.Module
-    sensor: Sensor
-    encoding: Encoding
+    generator: Generator
     config: dict[str, Any]
     step: int
     path: Path
     format: str
 
     @property
-    def distilled_steps(self) -> int | None:
-        """k of a k-TD flow, which takes k steps; None of the others."""
-        stage = self.config.get("stage") or {}
-        return int(stage["steps"]) if stage.get("name") == "distill" else None
-
-
-class AtomicCheckpointIO(TorchCheckpointIO):
-    """Lightning's checkpoints, flushed to the disk beside the old one before they take its place."""
-
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any | None = None
-    ) -> None:
-        """Write a checkpoint whole; whatever happens, the ones before it stay.
+    def model(self) -> nn.Module:
+        """The network v(t, x) of a flow.
 
         Raises:
-            InputError: the disk is full, the folder cannot be written, ...
+            InputError: the generator is no rectified flow.
         """
-        try:
-            with atomic_write(Path(path)) as file:
-                torch.save(checkpoint, file)
-        except (OSError, RuntimeError) as error:
-            # torch's writer ends in a RuntimeError of its own when the file's write fails.
-            cause = error.__context__ if isinstance(error, RuntimeError) else error
-            if not isinstance(cause, OSError):
-                raise
-            raise InputError(
-                f"{path} cannot be written: {cause.strerror or cause}. The checkpoints before it are whole; "
-                "mend that and give the same command again."
-            ) from None
+        if not isinstance(self.generator, RectifiedFlow):
+            raise InputError(f"{self.path} holds a {type(self.generator).__name__}, which has no network v(t, x).")
+        return self.generator.backbone
 
-    def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
-        return read_checkpoint(path, map_location)
+    @property
+    def sensor(self) -> Sensor:
+        """What the images look through."""
+        return self.generator.space.sensor
+
+    @property
+    def encoding(self) -> Encoding:
+        """Between model space and metres."""
+        return self.generator.space.encoding
 
 
 def step_of(path: Path) -> int:
@@ -118,6 +101,7 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
     Raises:
         InputError: not a checkpoint, a damaged one, or one that holds more than plain values.
     """
+    _check_sums(path)
     try:
         content = torch.load(path, map_location=map_location, weights_only=True)
     except pickle.UnpicklingError as error:
@@ -135,6 +119,41 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
         raise InputError(_not_a_checkpoint(path)) from None
     if not isinstance(content, dict):
         raise InputError(_not_a_checkpoint(path))
+    return _renamed(content)
+
+
+def _check_sums(path: str | Path) -> None:
+    """Hold every entry of a torch file, which is a zip archive, to its CRC-32: torch.load itself does not.
+
+    Raises:
+        InputError: an entry that is not what was written.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            broken = archive.testzip()
+    except zipfile.BadZipFile as error:
+        if "CRC" in str(error):
+            raise InputError(_damaged(path, "an entry of it")) from None
+        return  # no archive: torch's older format, or no checkpoint at all, as torch.load will tell
+    except OSError:
+        return  # said by torch.load
+    except Exception:  # zlib's and zipfile's own, on a directory that is damaged
+        raise InputError(_not_a_checkpoint(path)) from None
+    if broken is not None:
+        raise InputError(_damaged(path, broken))
+
+
+def _damaged(path: str | Path, what: str) -> str:
+    return f"{path} is damaged: the checksum of {what} does not fit. Take another checkpoint, or copy it again."
+
+
+def _renamed(content: dict[str, Any]) -> dict[str, Any]:
+    """A checkpoint of 0.1.0 in today's names: the backbone was the LightningModule's `velocity`."""
+    if "pytorch-lightning_version" not in content:
+        return content
+    for key in ("state_dict", "current_model_state"):
+        if key in content:
+            content[key] = {re.sub(r"^velocity\.", PREFIX + BACKBONE, name): v for name, v in content[key].items()}
     return content
 
 
@@ -144,7 +163,7 @@ def _not_a_checkpoint(path: str | Path) -> str:
 
 
 def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averaged: bool = True) -> Checkpoint:
-    """A model from a checkpoint file or run folder, of ours or of the published R2Flow format.
+    """A generator from a checkpoint file or run folder, of ours or of the published R2Flow format.
 
     Args:
         averaged: Take the averaged weights, which a model is judged by; False takes the raw ones of a run
@@ -155,8 +174,10 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     """
     path = find_checkpoint(path)
     content = read_safetensors(path) if path.suffix == ".safetensors" else read_checkpoint(path)
+    sampler: Mapping[str, Any] | None = None
     if "cfg" in content and "weights" in content:
-        config, weights = published_config(content["cfg"], path), content["weights"]
+        config = published_config(content["cfg"], path)
+        weights = {BACKBONE + name: value for name, value in content["weights"].items()}
         step, kind = published_step(content), "published"
     elif "config" in content and "state_dict" in content:
         config, step, kind = dict(content["config"]), int(content.get("global_step", 0)), "r2flow"
@@ -164,65 +185,87 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
             config["data"] = upgraded(config["data"])
         state = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
         weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
+        sampler = content.get("sampler") or _sampler_of_stage(config.get("stage") or {})
     else:
         raise InputError(
-            f"{path} is a torch file but not a checkpoint of a flow: it has neither 'config' and 'state_dict' (ours) "
-            f"nor 'cfg' and 'weights' (published); found {', '.join(map(repr, list(content)[:6]))}."
+            f"{path} is a torch file but not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
+            f"(ours) nor 'cfg' and 'weights' (published); found {', '.join(map(repr, list(content)[:6]))}."
         )
-    parts = build_parts(config)
-    load_weights(parts.backbone, weights, path)
-    model = parts.backbone.eval().requires_grad_(False).to(device)
-    sensor = parts.sensor
+    with torch.device("meta"):  # sizes are compared before any memory is taken for them
+        check_weights(build_generator(config), weights, path)
+    generator = build_generator(config)
+    generator.load_state_dict(weights)
+    if sampler is not None:
+        generator.sampler = Sampler.of(sampler)
     if "published" in config and config["data"]["projection"] == "unfolding":
-        sensor = published_rings(sensor, weights["coords"])
-    return Checkpoint(model, sensor, parts.encoding, config, step, path, kind)
+        sensor = published_rings(generator.space.sensor, weights[BACKBONE + "coords"])
+        generator.space = replace(generator.space, sensor=sensor)
+    return Checkpoint(generator.eval().requires_grad_(False).to(device), config, step, path, kind)
+
+
+def _sampler_of_stage(stage: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What 0.1.0 did not write down: a k-TD flow takes k Euler steps."""
+    return {"method": "euler", "steps": int(stage["steps"]), "fixed": True} if stage.get("name") == "distill" else None
 
 
 def weights_hash(checkpoint: Checkpoint) -> str:
-    """What a flow is, in 16 hex digits: its averaged weights and what its images mean, whatever file they came from."""
+    """A generator in 16 hex digits: its averaged weights and what its images mean, whatever file they came from."""
     meaning = {key: checkpoint.config[key] for key in ("sensor", "encoding")}
-    digest = hashlib.sha256(json.dumps(meaning, sort_keys=True).encode())
-    for name, value in sorted(checkpoint.model.state_dict().items()):
-        digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
-        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-    return digest.hexdigest()[:16]
+    state = {name.removeprefix(BACKBONE): value for name, value in checkpoint.generator.state_dict().items()}
+    return state_hash(state, json.dumps(meaning, sort_keys=True).encode())[:16]
 
 
 def read_safetensors(path: Path) -> dict[str, Any]:
     """Weights and config of a `.safetensors` of ours, in the shape of our other checkpoints.
 
     Raises:
-        InputError: not a safetensors file, or one without our config.
+        InputError: not a safetensors file, one without our config, or one whose weights are not what was written.
     """
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(path, framework="pt") as file:
             notes = file.metadata() or {}
-            weights = {f"{PREFIX}{name}": file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return {"config": json.loads(notes["config"]), "global_step": int(notes["step"]), "state_dict": weights}
+            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        config, step = json.loads(notes["config"]), int(notes["step"])
+        sampler = json.loads(notes["sampler"]) if "sampler" in notes else None
     except (SafetensorError, OSError, ValueError) as error:
         raise InputError(f"{path} is not a safetensors file, or a damaged one: {error}.") from None
     except KeyError as error:
         raise InputError(f"{path} holds weights but no r2flow config (no {error} in its metadata).") from None
+    if "digest" in notes and notes["digest"] != _digest(notes, weights):
+        raise InputError(_damaged(path, "its weights and config"))
+    prefix = PREFIX if sampler is not None else PREFIX + BACKBONE  # 0.1.0 held the backbone alone
+    state = {prefix + name: value for name, value in weights.items()}
+    return {"config": config, "global_step": step, "state_dict": state, "sampler": sampler}
+
+
+def _digest(notes: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
+    return state_hash(weights, json.dumps([notes.get(key) for key in ("config", "step", "sampler")]).encode())
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
-    """Write a model with its config: `.safetensors` in our format, `.pth` in the published one, weights bit-equal.
+    """Write a generator with its config: `.safetensors` in our format, `.pth` in the published one, weights bit-equal.
 
     Raises:
-        InputError: another ending, or a config that the published format cannot say.
+        InputError: another ending, or a generator or a config that the published format cannot say.
     """
     path = Path(path)
-    weights = {name: value.detach().cpu().contiguous() for name, value in checkpoint.model.state_dict().items()}
     if path.suffix == ".safetensors":
         from safetensors.torch import save
 
-        notes = {"format": "r2flow", "config": json.dumps(checkpoint.config), "step": str(checkpoint.step)}
-        data = save(weights, metadata=notes)
+        weights = _plain(checkpoint.generator)
+        notes = {
+            "format": "r2flow",
+            "config": json.dumps(checkpoint.config),
+            "step": str(checkpoint.step),
+            "sampler": json.dumps(checkpoint.generator.sampler.asdict()),
+        }
+        data = save(weights, metadata={**notes, "digest": _digest(notes, weights)})
         with atomic_write(path) as file:
             file.write(data)
     elif path.suffix == ".pth":
+        weights = _plain(checkpoint.model)
         cfg = published_cfg(checkpoint.config)
         images = checkpoint.step * int(cfg.get("training", {}).get("batch_size", 1))
         content = {"cfg": cfg, "weights": weights, "optimizer": {}, "lr_scheduler": {}, "num_images": images}
@@ -232,8 +275,12 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
         raise InputError(f"{path}: give .safetensors for our format or .pth for the published one.")
 
 
-def load_weights(model: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:
-    """Fill a model, every name and shape accounted for.
+def _plain(module: nn.Module) -> dict[str, Tensor]:
+    return {name: value.detach().cpu().contiguous() for name, value in module.state_dict().items()}
+
+
+def check_weights(model: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:
+    """Account for every name and shape before anything is loaded.
 
     Raises:
         InputError: the first name or shape that differs.
@@ -251,4 +298,3 @@ def load_weights(model: nn.Module, weights: Mapping[str, Tensor], path: Path) ->
                 f"the weights in {path} do not fit its config: '{name}' has shape {tuple(weights[name].shape)}, "
                 f"the config makes it {tuple(value.shape)}."
             )
-    model.load_state_dict(dict(weights))

@@ -3,9 +3,12 @@
 The noise of image k does not depend on the worker, rank or device that draws it, nor on what was
 drawn before; that is what makes a run resumable bit for bit and pairs redrawable from their index.
 The purpose is part of the key, so that training, evaluation and simulation never share a draw.
+A sampler that draws noise in every step counts the steps as well (`Draws`).
 """
 
 import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,38 +18,78 @@ from r2flow.errors import InputError
 
 PURPOSES = (
     "training", "validation", "pairs", "evaluation", "simulator", "shuffle", "mixture", "augmentation", "dropout",
-    "weights",
+    "weights", "condition",
 )  # fmt: skip
 
 
-def generator(seed: int, purpose: str, index: int) -> np.random.Generator:
-    """The random stream of one index: Philox keyed by (seed, purpose), its counter started at index.
+def generator(seed: int, purpose: str, index: int, step: int = 0) -> np.random.Generator:
+    """The random stream of one index and step: Philox keyed by (seed, purpose), counting from [0, 0, step, index].
 
     Args:
         seed: Run seed, 0 <= seed < 2^64.
         purpose: One of `PURPOSES`.
         index: Number of the image, scene or epoch, 0 <= index < 2^64.
+        step: Step of a sampler that draws noise on the way, 0 <= step < 2^64; 0 is everything else.
 
     Raises:
         InputError: a seed outside its range, which is the user's to choose.
-        ValueError: an unknown purpose, or an index outside its range.
+        ValueError: an unknown purpose, or an index or a step outside its range.
     """
     if purpose not in PURPOSES:
         raise ValueError(f"no purpose named {purpose!r}; known: {', '.join(PURPOSES)}.")
     if not 0 <= seed < 2**64:
         raise InputError(f"a seed must lie in [0, 2^64), found {seed}.")
-    if not 0 <= index < 2**64:
-        raise ValueError(f"an index must lie in [0, 2^64), found {index}.")
+    for what, number in (("an index", index), ("a step", step)):
+        if not 0 <= number < 2**64:
+            raise ValueError(f"{what} must lie in [0, 2^64), found {number}.")
     # Philox4x64 has a 128-bit key and a 256-bit counter that counts blocks of four draws in its low
-    # words: the index goes into the highest word, which leaves 2^192 blocks to each index.
+    # words: index and step go into the two highest words, which leaves 2^128 blocks to each pair.
     key = np.array([seed, zlib.crc32(purpose.encode())], dtype=np.uint64)
-    counter = np.array([0, 0, 0, index], dtype=np.uint64)
+    counter = np.array([0, 0, step, index], dtype=np.uint64)
     return np.random.Generator(np.random.Philox(key=key, counter=counter))
 
 
-def standard_normal(shape: tuple[int, ...], seed: int, purpose: str, index: int) -> Tensor:
-    """x_0 ~ N(0, I) of one index, float32 on the CPU, of the given shape."""
-    return torch.from_numpy(generator(seed, purpose, index).standard_normal(shape, dtype=np.float32))
+def standard_normal(shape: tuple[int, ...], seed: int, purpose: str, index: int, step: int = 0) -> Tensor:
+    """N(0, I) of one index and step, float32 on the CPU, of the given shape; x_0 at step 0."""
+    return torch.from_numpy(generator(seed, purpose, index, step).standard_normal(shape, dtype=np.float32))
+
+
+@dataclass(frozen=True)
+class Draws:
+    """The standard normal noise of a batch of scans: scan i in step j has a function of (seed, purpose, i, j).
+
+    A scan's noise does not depend on the others of its batch, nor on their order. A sampler that leaves out
+    steps or takes them in another order draws the same noise for the steps that it takes.
+
+    Attributes:
+        seed: Run seed, 0 <= seed < 2^64.
+        numbers: Number of each scan of the batch, (B,).
+        purpose: One of `PURPOSES`.
+    """
+
+    seed: int
+    numbers: Sequence[int]
+    purpose: str = "evaluation"
+
+    def start(self, shape: tuple[int, ...]) -> Tensor:
+        """x_0 of each scan, (B, *shape) float32 on the CPU: the rows are `standard_normal` of the scans' numbers."""
+        return self._of_step(shape, 0)
+
+    def step(self, shape: tuple[int, ...], j: int) -> Tensor:
+        """Noise of each scan in step j >= 1, (B, *shape) float32 on the CPU.
+
+        Raises:
+            ValueError: j < 1, which is the start's noise, or j >= 2^64.
+        """
+        if j < 1:
+            raise ValueError(f"steps that draw noise are counted from 1, found {j}.")
+        return self._of_step(shape, j)
+
+    def _of_step(self, shape: tuple[int, ...], j: int) -> Tensor:
+        noise = torch.empty(len(self.numbers), *shape)
+        for row, number in zip(noise, self.numbers, strict=True):
+            row.copy_(standard_normal(shape, self.seed, self.purpose, number, j))
+        return noise
 
 
 def seed_torch(seed: int, purpose: str, index: int = 0) -> None:

@@ -1,14 +1,17 @@
-"""A table of named constructors, and wrong names that explain themselves."""
+"""Tables of named constructors, whose errors say which names and options exist."""
 
+import dataclasses
 import difflib
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import NoneType, UnionType
-from typing import Any, Generic, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Generic, TypeVar, Union, get_args, get_origin
 
 from r2flow.errors import InputError
 
 T = TypeVar("T")
+
+MISSING = "???"  # what OmegaConf writes where a value must be given
 
 
 def did_you_mean(name: str, known: Mapping[str, Any] | list[str]) -> str:
@@ -19,29 +22,36 @@ def did_you_mean(name: str, known: Mapping[str, Any] | list[str]) -> str:
 
 
 class Registry(Generic[T]):
-    """Named values of one kind, read like the table they are.
+    """Named values of one kind.
 
     BACKBONES = Registry("backbone", hdit=HDiT, adm_unet=ADMUNet)
     BACKBONES["hditt"]
     # no backbone named 'hditt'; known: adm_unet, hdit. Did you mean 'hdit'?
+
+    Attributes:
+        on_missing: Functions that may add entries, as those of installed plug-ins. Each is called once in a process,
+            when a name is not found in a table for the first time; the name is then looked up again.
     """
+
+    on_missing: ClassVar[list[Callable[[], None]]] = []
 
     def __init__(self, kind: str, **entries: T) -> None:
         self.kind = kind
         self._entries = dict(entries)
 
     def __getitem__(self, name: str) -> T:
-        try:
-            return self._entries[name]
-        except KeyError:
+        if name not in self:
             known = ", ".join(sorted(self._entries))
             hint = did_you_mean(str(name), self._entries)
-            raise InputError(f"no {self.kind} named {name!r}; known: {known}.{hint}") from None
+            raise InputError(f"no {self.kind} named {name!r}; known: {known}.{hint}")
+        return self._entries[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._entries)
 
     def __contains__(self, name: object) -> bool:
+        while name not in self._entries and Registry.on_missing:
+            Registry.on_missing.pop(0)()
         return name in self._entries
 
     def __len__(self) -> int:
@@ -51,7 +61,7 @@ class Registry(Generic[T]):
         return iter(self._entries.items())
 
     def add(self, name: str, entry: T) -> None:
-        """Enter a value of your own.
+        """Add an entry.
 
         Raises:
             ValueError: the name is taken.
@@ -78,7 +88,7 @@ class Registry(Generic[T]):
 
 
 def check_options(what: str, constructor: Callable[..., Any], options: Mapping[str, Any], given: int = 0) -> None:
-    """Hold options to the signature that they are meant for.
+    """Check options against the signature of the constructor that they are for.
 
     Args:
         given: How many parameters are passed by position beside the options.
@@ -90,7 +100,7 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
     parameters = _parameters(constructor)
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return
-    known = {p.name: p for p in parameters[given:] if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)}
+    known = _by_keyword(parameters[given:])
     for key, value in options.items():
         if key not in known:
             hint = did_you_mean(key, known)
@@ -101,6 +111,25 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
     for key, parameter in known.items():
         if parameter.default is parameter.empty and key not in options:
             raise InputError(f"{what} needs the option {key!r}.")
+
+
+def options_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, Any]:
+    """The options that a constructor takes by keyword, with their defaults; `MISSING` for one without a default.
+
+    Args:
+        given: How many parameters are passed by position beside the options.
+    """
+    options = _by_keyword(_parameters(constructor)[given:])
+    defaults = {name: MISSING if p.default is p.empty else p.default for name, p in options.items()}
+    if dataclasses.is_dataclass(constructor):
+        for f in dataclasses.fields(constructor):
+            if f.name in defaults and callable(f.default_factory):
+                defaults[f.name] = f.default_factory()
+    return defaults
+
+
+def _by_keyword(parameters: Sequence[inspect.Parameter]) -> dict[str, inspect.Parameter]:
+    return {p.name: p for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)}
 
 
 def _parameters(constructor: Callable[..., Any]) -> list[inspect.Parameter]:
@@ -133,6 +162,11 @@ PLAIN: dict[Any, Check] = {
 
 def _wanted(annotation: Any) -> list[Check]:
     """The checks of an annotation, any of which may hold; none where it cannot be checked."""
-    alternatives = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
-    checks = [PLAIN.get(get_origin(one) or one) for one in alternatives]
-    return [] if None in checks else [check for check in checks if check is not None]
+    origin = get_origin(annotation)
+    if origin is Annotated:
+        return _wanted(get_args(annotation)[0])
+    if origin in (Union, UnionType):
+        alternatives = [_wanted(one) for one in get_args(annotation)]
+        return [check for checks in alternatives for check in checks] if all(alternatives) else []
+    check = PLAIN.get(origin or annotation)
+    return [check] if check else []

@@ -27,6 +27,7 @@ FREE = (
     "name",
     "loggers",
     "samples",
+    "sampler",
     "callbacks.pictures",
     "callbacks.progress",
     "callbacks.checkpoint",
@@ -74,7 +75,8 @@ def _is_free(key: str) -> bool:
 
 def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """The keys, with both values, in which a command departs from the run that it would go on with."""
-    before, now = dict(flatten(old)), dict(flatten(new))
+    then = {"generator": {"name": "rectified_flow"}}  # of a run of 0.1.0, which knew no other
+    before, now = (dict(flatten({**then, **config})) for config in (old, new))
     return [
         f"{key}={before.get(key)} there, {now.get(key)} here"
         for key in sorted(before.keys() | now.keys())

@@ -12,7 +12,8 @@ from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.flow.solvers import GRIDS, SOLVERS, TORCHDIFFEQ, FixedStep, calibrated_grid, check_method
-from r2flow.sampling import noise_of
+from r2flow.generators import as_flow
+from r2flow.noise import Draws
 
 log = logging.getLogger(__name__)
 
@@ -35,11 +36,11 @@ def calibrate(
     solver = check_grid_solver(method)
     if num < 1:
         raise InputError(f"a time grid is found on at least one scene, found {num}.")
-    shape = checkpoint.encoding.shape
-    x_0 = noise_of(range(num), shape, seed=0, purpose="validation").to(next(checkpoint.model.parameters()).device)
+    flow = as_flow(checkpoint.generator, "a time grid")
+    x_0 = Draws(0, range(num), "validation").start(flow.noise_shape).to(flow.device)
 
     def velocity(t: Tensor, x: Tensor) -> Tensor:
-        v: Tensor = checkpoint.model(t, x)
+        v = flow.velocity(t, x)
         if progress is not None:
             progress()
         return v
@@ -94,7 +95,7 @@ def read_grid(path: str | Path, checkpoint: Checkpoint) -> Tensor:
     return times
 
 
-def grid_of(text: str, checkpoint: Checkpoint) -> str | Tensor:
+def grid_of(text: str, checkpoint: Checkpoint) -> str | list[float]:
     """A grid by its name, or the times in a file of `write_grid`.
 
     Raises:
@@ -103,4 +104,4 @@ def grid_of(text: str, checkpoint: Checkpoint) -> str | Tensor:
     if text in GRIDS or not (text.endswith(".json") or Path(text).exists()):
         GRIDS[text]
         return text
-    return read_grid(text, checkpoint)
+    return read_grid(text, checkpoint).tolist()

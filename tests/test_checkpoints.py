@@ -1,13 +1,18 @@
+import json
 import pickle
+import random
 import resource
 from pathlib import Path
 
 import pytest
+import safetensors.torch
 import torch
 
-from r2flow.checkpoints import AtomicCheckpointIO, checkpoints_of, load_checkpoint, save_checkpoint
+from r2flow.checkpoints import checkpoints_of, load_checkpoint, save_checkpoint, weights_hash
 from r2flow.errors import InputError
-from r2flow.stages import build_parts, build_stage
+from r2flow.generators import Sampler, build_generator
+from r2flow.stages import build_stage
+from r2flow.stages.checkpointing import AtomicCheckpointIO
 
 CONFIG = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 64, "rays": "centre"},
@@ -22,7 +27,7 @@ CONFIG = {
 @pytest.fixture
 def saved(tmp_path: Path) -> tuple[Path, dict]:
     """A checkpoint of ours with random weights, averaged and raw, and the averaged ones."""
-    stage = build_stage(CONFIG, build_parts(CONFIG).backbone)
+    stage = build_stage(CONFIG, build_generator(CONFIG))
     parameters = dict(stage.named_parameters())
     raw = {name: torch.randn_like(v) if name in parameters else v for name, v in stage.state_dict().items()}
     averaged = {name: v + 1 if name in parameters else v for name, v in raw.items()}
@@ -41,9 +46,9 @@ def test_the_averaged_weights_are_the_model(saved):
         assert loaded.sensor.shape == (8, 64)
         assert not loaded.model.training
         for name, value in loaded.model.state_dict().items():
-            assert torch.equal(value, averaged[f"velocity.{name}"])
+            assert torch.equal(value, averaged[f"generator.backbone.{name}"])
     for name, value in load_checkpoint(path, averaged=False).model.named_parameters():
-        assert torch.equal(value + 1, averaged[f"velocity.{name}"])
+        assert torch.equal(value + 1, averaged[f"generator.backbone.{name}"])
 
 
 def test_the_newest_of_a_run_is_taken(saved):
@@ -87,7 +92,58 @@ def test_what_is_no_checkpoint_says_so(tmp_path: Path, content: bytes):
         load_checkpoint(path)
 
 
-def test_a_cut_or_flipped_checkpoint_is_an_error_or_whole(saved):
+@pytest.mark.parametrize("ending", [".ckpt", ".safetensors"])
+def test_a_flipped_bit_is_refused_or_changes_nothing(saved, tmp_path: Path, ending: str):
+    path, original = saved[0], load_checkpoint(saved[0])
+    if ending == ".safetensors":
+        path = tmp_path / "model.safetensors"
+        save_checkpoint(original, path)
+    whole, draw, refused = path.read_bytes(), random.Random(0), 0
+    for _ in range(200):
+        place = draw.randrange(len(whole))
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << draw.randrange(8)]) + whole[place + 1 :])
+        try:
+            loaded = load_checkpoint(path)
+        except InputError:
+            refused += 1
+            continue
+        assert loaded.config == original.config
+        assert loaded.generator.sampler == original.generator.sampler
+        for name, value in loaded.generator.state_dict().items():
+            assert torch.equal(value, original.generator.state_dict()[name]), f"bit of byte {place}"
+    assert refused > 150  # what is neither weights nor config, padding for one, may pass
+
+
+def test_names_of_0_1_0_are_read(saved, tmp_path: Path):
+    path, averaged = saved
+    content = torch.load(path, weights_only=True)
+    for key in ("state_dict", "current_model_state"):
+        content[key] = {n.replace("generator.backbone.", "velocity."): v for n, v in content[key].items()}
+    config = {**CONFIG, "stage": {"name": "distill", "steps": 2}}
+    torch.save({**content, "config": config, "pytorch-lightning_version": "2.6.0"}, path)
+    loaded = load_checkpoint(path)
+    assert loaded.generator.sampler == Sampler("euler", 2, fixed=True)
+    for name, value in loaded.generator.state_dict().items():
+        assert torch.equal(value, averaged[f"generator.{name}"])
+    notes = {"format": "r2flow", "config": json.dumps(config), "step": "7"}
+    safetensors.torch.save_file(loaded.model.state_dict(), tmp_path / "old.safetensors", notes)
+    again = load_checkpoint(tmp_path / "old.safetensors")
+    assert again.generator.sampler == loaded.generator.sampler
+    assert weights_hash(again) == weights_hash(loaded)
+
+
+def test_a_size_that_the_file_does_not_hold_takes_no_memory(saved):
+    path, _ = saved
+    content = torch.load(path, weights_only=True)
+    content["config"] = {**CONFIG, "backbone": {**CONFIG["backbone"], "base_channels": 2**16}}
+    torch.save(content, path)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match="do not fit its config"):
+        load_checkpoint(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000  # kB; the weights would take 200 GB
+
+
+def test_a_cut_checkpoint_is_an_error(saved):
     path, _ = saved
     whole = path.read_bytes()
     for end in range(0, len(whole) - 1, len(whole) // 40):

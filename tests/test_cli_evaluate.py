@@ -10,10 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from r2flow.data.opening import open_scans
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
+from r2flow.metrics import METRICS
+from r2flow.metrics.extractors import EXTRACTORS
+from r2flow.metrics.extractors.base import Extractor
+from r2flow.metrics.sums import SumMetric
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_evaluation import SENSOR, folder, generated, images, real  # noqa: F401  fixtures
@@ -163,6 +168,62 @@ def test_weights_that_are_missing_are_left_out_or_named(r2flow, real, generated,
     assert code == 2
     assert "r2flow weights" in said
     assert len(said.splitlines()) == 1
+
+
+class MeanRange(SumMetric):
+    """A metric of a user's: the difference of the mean ranges."""
+
+    name = "mine"
+    representation = "range image"
+    width = 2
+
+    def rows(self, scans):
+        returns = scans.returned.sum((1, 2, 3)).double()
+        rows = torch.stack([scans.images[:, 0].sum((1, 2)).double(), returns], 1)
+        return torch.where(returns[:, None] > 0, rows, torch.nan)
+
+    def figures_of(self, *sums):
+        means = [total[0] / total[1] if len(total) and total[1] else math.nan for total in sums]
+        return {"mine": abs(means[0] - means[1])}
+
+
+class MeanRanges(Extractor):
+    """A feature network of a user's, without weights: the mean range of each row."""
+
+    name = "means"
+    layer = "rows"
+    dim = 8
+    weights = "none"
+
+    @classmethod
+    def trained(cls):
+        return cls()
+
+    def features(self, scans):
+        return scans.images[:, 0].mean(2)
+
+
+@pytest.fixture
+def plugged_in(monkeypatch):
+    for table in (METRICS, EXTRACTORS):
+        monkeypatch.setattr(table, "_entries", dict(table._entries))
+    METRICS.add("mine", MeanRange)
+    EXTRACTORS.add("means", MeanRanges)
+
+
+def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, generated, tmp_path, plugged_in):  # noqa: F811
+    options = ("--metrics", "mine,frechet_means,kid_means", *QUICK[2:], "--bootstrap", 5, "--json", tmp_path / "e.json")
+    code, said, _ = r2flow("evaluate", real, generated, *options)
+    assert code == 0
+    ranges = [scans[:, 0][(scans[:, 0] > 0) & (scans[:, 0] < 63)].mean() for scans in (images(12, 1), images(10, 2))]
+    rows = [scans[:, 0].astype(np.float64).mean(2) for scans in (images(12, 1), images(10, 2))]
+    (a, s), (b, t) = ((x.mean(0), np.cov(x.T)) for x in rows)
+    frechet = ((a - b) ** 2).sum() + np.trace(s + t) - 2 * np.sqrt(np.linalg.eigvals(s @ t).clip(0)).real.sum()
+    found = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["metrics"]
+    assert found[0]["figures"] == {"mine": pytest.approx(abs(ranges[0] - ranges[1]), rel=1e-4)}
+    assert found[1]["figures"] == {"frechet_means": pytest.approx(frechet, rel=1e-4)}
+    assert "mine" in found[0]["intervals"]
+    assert "kid_means" in said
 
 
 @pytest.mark.parametrize(

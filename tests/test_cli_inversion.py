@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.checkpoints import AtomicCheckpointIO
 from r2flow.errors import InputError
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.savings import scene_rows
+from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_sampling import Lost, flow, network, scans
 
@@ -24,9 +24,11 @@ SENSOR = SENSORS["hdl64e"].resized(8, 64)
 def write_checkpoint(path: Path, reflectance: bool = True) -> Path:
     """A run folder with a flow of small random weights."""
     flow = network(reflectance)
-    weights = {f"velocity.{name}": 0.3 * value for name, value in flow.model.state_dict().items()}
+    weights = {f"generator.backbone.{name}": 0.3 * value for name, value in flow.model.state_dict().items()}
     weights |= {
-        f"velocity.{name}": value for name, value in flow.model.named_buffers() if f"velocity.{name}" in weights
+        f"generator.backbone.{name}": value
+        for name, value in flow.model.named_buffers()
+        if f"generator.backbone.{name}" in weights
     }
     content = {"state_dict": weights, "config": {**flow.config, "stage": {"name": "rectify"}}, "global_step": 7}
     AtomicCheckpointIO().save_checkpoint(content, path / "checkpoints" / "step-00000007.ckpt")
@@ -189,7 +191,7 @@ class TestBadInput:
         self.check(r2flow(*options, "--grid", "cubic"), out, "no time grid named 'cubic'")
         self.check(r2flow(*options, "--grid", bad), out, "bad.json is no time grid", "r2flow calibrate")
         self.check(r2flow(*options, "--grid", tmp_path / "no.json"), out, "no.json")
-        self.check(r2flow(*options, "--grid", good, "--steps", 3), out, "a grid of 2 steps, found --steps 3")
+        self.check(r2flow(*options, "--grid", good, "--steps", 3), out, "the time grid has 2 steps, found steps=3")
         self.check(r2flow(*options, "--grid", good, "--solver", "dopri5"), out, "dopri5 chooses its own")
         self.check(r2flow("calibrate", run, "--out", out), out, "ends in .json")
         self.check(r2flow("calibrate", run, "--out", out / "a.json", "--solver", "bosh3"), out, "fixed steps")
@@ -220,7 +222,7 @@ class TestBadInput:
 
 def test_what_is_not_asked_for_is_not_imported():
     shown = "print([m for m in ({}) if m in sys.modules]); "
-    code = "import r2flow.flow.straight_exit, r2flow.flow.problems, r2flow.lidar.region, r2flow.backbones.crop, sys; "
+    code = "import r2flow.flow.straight_exit, r2flow.flow.problems, r2flow.lidar.region, r2flow.backbones, sys; "
     code += shown.format("'lightning', 'matplotlib', 'torchdiffeq', 'r2flow.simulator'")
     code += "import r2flow.sampling, r2flow.reports.inversion, r2flow.reports.interpolation, r2flow.reports.savings; "
     code += shown.format("'r2flow.simulator', 'tensorboard', 'torchdiffeq', 'plotly', 'natten'")

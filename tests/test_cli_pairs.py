@@ -36,7 +36,8 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):  # noqa: F811
 
 
 def test_an_unfinished_run_draws_no_pairs(r2flow, saved):  # noqa: F811
-    from r2flow.checkpoints import AtomicCheckpointIO, read_checkpoint
+    from r2flow.checkpoints import read_checkpoint
+    from r2flow.stages.checkpointing import AtomicCheckpointIO
 
     path, _ = saved
     content = read_checkpoint(path)

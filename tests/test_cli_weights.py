@@ -26,11 +26,10 @@ def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):  # noq
         "FSVD",
         "FPVD",
         "darknet53-1024.tar.gz",
-        "not known",
         f"Looked for in {folder}",
     ):
         assert words in said
-    assert said.count("│ no ") == 5
+    assert sum(line.split()[2] == "no" for line in said.splitlines()[1:6]) == 5
 
     path = tmp_path / "mine.pth"
     torch.save(PointNet.random(0).state_dict(), path)
@@ -42,7 +41,7 @@ def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):  # noq
     code, said, _ = r2flow("weights")
     assert code == 0
     assert f"{weights} of mine.pth" in said
-    assert said.count("│ no ") == 4
+    assert sum(line.split()[2] == "no" for line in said.splitlines()[1:6]) == 4
 
 
 def test_what_cannot_be_added_is_a_line(r2flow, tmp_path):  # noqa: F811

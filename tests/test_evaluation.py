@@ -19,6 +19,7 @@ from r2flow.evaluation.floor import floor_sets
 from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
 from r2flow.evaluation.sets import ScanSet, fixed_choice, sampled_set
 from r2flow.evaluation.statistics import Cache, key_of
+from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
@@ -166,7 +167,7 @@ class TestCache:
         assert "is damaged" in caplog.text
 
     def test_sampled_scans_are_never_kept(self):
-        drawn = sampled_set(flow(), "flow", 2, 1)
+        drawn = sampled_set(flow(), "flow", 2)
         assert key_of(JSD(), drawn, "all 2") is None
 
 
@@ -253,11 +254,11 @@ class TestSets:
         np.testing.assert_array_equal(found.source[1], open_scans("simulated:3", READING, num=3).source[1])
 
     def test_a_flow_is_sampled_from_the_noise_of_evaluations(self):
-        drawn = sampled_set(flow(), "flow", 5, steps=1, seed=9)
+        drawn = sampled_set(flow(), "flow", 5, Sampler("euler", 1), seed=9)
         batches = list(drawn.batches(range(5), 2))
         assert [len(batch) for batch in batches] == [2, 2, 1]
         x_0 = standard_normal((2, 8, 64), 9, "evaluation", 3)
-        v = flow().model(torch.tensor([0.0]), x_0[None])
+        v = flow().generator.velocity(torch.tensor([0.0]), x_0[None])
         torch.testing.assert_close(batches[1][1], flow().encoding.decode(x_0[None] + v)[0])
         assert drawn.source.evaluations == [1] * 5
         assert len(drawn.source.seconds) == 3

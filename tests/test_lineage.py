@@ -4,10 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from r2flow.checkpoints import AtomicCheckpointIO, load_checkpoint
+from r2flow.checkpoints import load_checkpoint
 from r2flow.errors import InputError
+from r2flow.generators import build_generator
 from r2flow.lineage import inherit
-from r2flow.stages import build_parts, build_stage
+from r2flow.stages import build_stage
+from r2flow.stages.checkpointing import AtomicCheckpointIO
 
 CONFIG = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 64},
@@ -22,7 +24,7 @@ CONFIG = {
 @pytest.fixture
 def parent(tmp_path: Path) -> Path:
     """A checkpoint of range alone, from before `data.augment` had a group of its own."""
-    stage = build_stage(CONFIG, build_parts(CONFIG).backbone)
+    stage = build_stage(CONFIG, build_generator(CONFIG))
     path = tmp_path / "parent.ckpt"
     AtomicCheckpointIO().save_checkpoint({"state_dict": stage.state_dict(), "config": CONFIG, "global_step": 7}, path)
     return path

@@ -1,7 +1,11 @@
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import omegaconf
 import pytest
 
 from r2flow.errors import InputError
-from r2flow.registry import Registry
+from r2flow.registry import MISSING, Registry, check_options, options_of
 
 TABLE = Registry("backbone", hdit=dict, adm_unet=dict)
 
@@ -30,3 +34,58 @@ def test_a_name_is_entered_once():
     assert table["b"] == 2
     with pytest.raises(ValueError, match="exists already"):
         table.add("a", 3)
+
+
+def test_a_missing_name_calls_each_hook_once_and_is_looked_up_again(monkeypatch):
+    table, calls = Registry("thing", a=1), []
+
+    def load():
+        calls.append("load")
+        assert "c" not in table  # a plug-in that looks something up does not start the hooks again
+        table.add("b", 2)
+
+    monkeypatch.setattr(Registry, "on_missing", [load])
+    assert table["a"] == 1
+    assert not calls
+    assert "b" in table
+    assert table["b"] == 2
+    with pytest.raises(InputError, match="no thing named 'c'; known: a, b"):
+        table["c"]
+    assert calls == ["load"]
+
+
+def test_an_annotated_option_is_checked_as_what_it_annotates():
+    def make(width: Annotated[int, "pixels"], name: Annotated[str | None, "of a file"] | bool = None) -> None:
+        pass
+
+    for good in ({"width": 1}, {"width": 1, "name": "a"}, {"width": 1, "name": None}, {"width": 1, "name": True}):
+        check_options("thing", make, good)
+    with pytest.raises(InputError, match=r"thing: width must be a whole number, found 1\.5"):
+        check_options("thing", make, {"width": 1.5})
+    with pytest.raises(InputError, match="thing: name must be a word or null or true or false, found 3"):
+        check_options("thing", make, {"width": 1, "name": 3})
+
+
+def test_options_are_those_of_the_constructor_and_of_the_base_that_it_passes_them_to():
+    class Base:
+        def __init__(self, first, width: int, depth: int = 2, *, kind: str = "a"):
+            pass
+
+    class Child(Base):
+        def __init__(self, first, depth: int = 3, **options):
+            pass
+
+    assert options_of(Child, given=1) == {"depth": 3, "width": MISSING, "kind": "a"}
+    assert MISSING == omegaconf.MISSING
+
+
+def test_options_of_a_dataclass_have_values_of_their_own():
+    @dataclass
+    class Settings:
+        size: int
+        names: list[str] = field(default_factory=list)
+
+    first = options_of(Settings)
+    assert first == {"size": MISSING, "names": []}
+    first["names"].append("changed")
+    assert options_of(Settings)["names"] == []

@@ -8,15 +8,17 @@ import pytest
 import torch
 from torch import nn
 
-from r2flow import sampling
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
+from r2flow.generators import Field, Sampler, build_generator
+from r2flow.inversion import interpolate_scans, invert, round_trip, slerp
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.region import Region, region
 from r2flow.lidar.sensors import SENSORS
+from r2flow.lidar.space import ModelSpace
+from r2flow.noise import Draws
 from r2flow.reports.outputs import write_samples
-from r2flow.sampling import evaluated_region, interpolate_scans, invert, noise_of, part_of, round_trip, sample, slerp
-from r2flow.stages import build_parts
+from r2flow.sampling import evaluated_region, sample
 from r2flow.time_grids import calibrate, evaluations_of_calibration, grid_of, read_grid, write_grid
 from tests.test_checkpoints import CONFIG
 
@@ -37,19 +39,19 @@ class GaussianFlow(nn.Module):
 
 
 def flow(model: nn.Module | None = None, **encoding) -> Checkpoint:
-    model = model or GaussianFlow()
-    return Checkpoint(model.requires_grad_(False), SENSOR, Encoding(SENSOR, **encoding), {}, 0, Path("none"), "r2flow")
+    space = ModelSpace(SENSOR, Encoding(SENSOR, **encoding), SENSOR.rays())
+    generator = Field((model or GaussianFlow()).requires_grad_(False), space.shape, space)
+    return Checkpoint(generator, {}, 0, Path("none"), "r2flow")
 
 
 def network(reflectance: bool = True) -> Checkpoint:
     """An HDiT with random weights."""
     config = {**CONFIG, "encoding": {"format": "logscale", "reflectance": reflectance}}
-    parts = build_parts(config)
+    generator = build_generator(config).eval().requires_grad_(False)
     torch.manual_seed(4)
-    model = parts.backbone.eval().requires_grad_(False)
-    for parameter in model.parameters():
+    for parameter in generator.parameters():
         parameter.copy_(0.2 * torch.randn_like(parameter))
-    return Checkpoint(model, parts.sensor, parts.encoding, config, 0, Path("none"), "r2flow")
+    return Checkpoint(generator, config, 0, Path("none"), "r2flow")
 
 
 def scans(count: int = 2) -> torch.Tensor:
@@ -62,7 +64,7 @@ def scans(count: int = 2) -> torch.Tensor:
 
 @pytest.mark.parametrize(("method", "apart"), [("dopri5", 1e-4), ("bosh3", 1e-3), ("rk4", 1e-4), ("euler", 0.2)])
 def test_inversion_finds_the_noise(method, apart):
-    found = invert(flow(), scans(), method, steps=64, tolerance=1e-6)
+    found = invert(flow(), scans(), Sampler(method, 64, 1e-6))
     expected = (flow().encoding.encode(scans()) - M) / S
     assert (found.x_0 - expected).abs().max() < apart
     assert found.converged.all()
@@ -76,7 +78,7 @@ def test_inversion_finds_the_noise(method, apart):
 
 def test_round_trip_errors_are_what_they_say():
     checkpoint, images = flow(), scans(1)
-    found = invert(checkpoint, images, "rk4", steps=8)
+    found = invert(checkpoint, images, Sampler("rk4", 8))
     changed = images.clone()
     changed[0, :, 0, :16] = 0  # 16 columns of the first row lost
     changed[0, 0, 1, :] += 0.5 * (images[0, 0, 1] > 0)
@@ -103,7 +105,7 @@ EXTREMES = {
 def test_extreme_scans_go_there_and_back(name):
     image = EXTREMES[name].clone()
     image[:, 1] = image[:, 1].clamp(0, 1)
-    found = invert(flow(), image, "dopri5", tolerance=1e-6)
+    found = invert(flow(), image, Sampler("dopri5", tolerance=1e-6))
     errors = round_trip(flow(), found)
     assert found.converged.all()
     assert errors.rms.item() < 1e-4
@@ -132,7 +134,7 @@ def test_a_scene_with_nan_is_flagged_and_its_neighbours_are_right():
 @pytest.mark.parametrize("scale", [1e3, 1e30])
 def test_weights_scaled_beyond_reason_raise_nothing_and_are_flagged(scale):
     # v a thousand times too large goes nowhere near data; too large for float32 it is not solved at all.
-    found = invert(flow(GaussianFlow(scale)), scans(1), "dopri5", tolerance=1e-3)
+    found = invert(flow(GaussianFlow(scale)), scans(1), Sampler("dopri5", tolerance=1e-3))
     assert not found.converged.any() or (found.again - found.x_1).abs().max() < 1
     assert found.x_0.isnan().all() == (not found.converged.any())
 
@@ -182,7 +184,7 @@ def test_slerp_refuses_ends_without_a_way():
 
 def test_frames_lie_between_the_scans():
     a, b = scans(2)
-    found = interpolate_scans(flow(), torch.stack([a, b]), 5, "dopri5", tolerance=1e-6, batch_size=2)
+    found = interpolate_scans(flow(), torch.stack([a, b]), 5, Sampler("dopri5", tolerance=1e-6), batch_size=2)
     assert found.images.shape == (5, 2, 8, 64)
     for frame, scan in ((found.images[0], a), (found.images[-1], b)):
         both = (frame[0] > 0) & (scan[0] > 0)
@@ -192,7 +194,7 @@ def test_frames_lie_between_the_scans():
     torch.testing.assert_close(found.images[2], middle[0], rtol=1e-2, atol=1e-2)
     assert (found.evaluations > 0).all()
     arrived = []
-    interpolate_scans(flow(), torch.stack([a, b]), 5, "euler", batch_size=2, arrived=arrived.append)
+    interpolate_scans(flow(), torch.stack([a, b]), 5, Sampler("euler"), batch_size=2, arrived=arrived.append)
     assert arrived == [1, 2, 4, 5]
     with pytest.raises(InputError, match="two frames"):
         interpolate_scans(flow(), torch.stack([a, b]), 1)
@@ -201,11 +203,11 @@ def test_frames_lie_between_the_scans():
 def test_a_region_is_generated_from_the_whole_image_s_noise():
     checkpoint = network()
     wanted = region(SENSOR.shape, (-30, 40), (2, 5))
-    seen = evaluated_region(checkpoint, wanted)
+    seen = evaluated_region(checkpoint.generator, wanted)
     (drawn,) = sample(checkpoint, 2, steps=3, batch_size=2, seed=9, region=wanted)
     shapes = []
-    part = part_of(checkpoint.model, seen)
-    x = seen.crop(noise_of(range(2), (2, 8, 64), 9))
+    part = checkpoint.generator.part(seen).backbone
+    x = seen.crop(Draws(9, range(2)).start((2, 8, 64)))
     for step in range(3):  # three Euler steps, written out
         shapes.append(tuple(x.shape[2:]))
         x = x + part(torch.tensor(step / 3), x) / 3
@@ -227,7 +229,7 @@ def test_a_scan_that_is_not_solved_is_flagged_and_said(tmp_path, caplog):
     assert drawn.converged.tolist() == [True, False, True]
     (others,) = sample(flow(), 3, steps=4, batch_size=3)
     assert torch.equal(drawn.images[::2], others.images[::2])
-    write_samples(flow(Lost()), tmp_path, 3, 4, seed=0, pictures=0, batch_size=3)
+    write_samples(flow(Lost()), tmp_path, 3, 0, Sampler("euler", 4), pictures=0, batch_size=3)
     assert "not solved, and no scans of this flow: 1" in caplog.text
 
 
@@ -240,7 +242,7 @@ def test_the_region_that_is_all_changes_nothing():
 
 def test_a_part_of_nothing_is_refused():
     with pytest.raises(InputError, match="needs columns"):
-        part_of(network().model, Region((8, 64), 0, 8, 0, 0))
+        network().generator.part(Region((8, 64), 0, 8, 0, 0))
 
 
 def test_one_channel_is_that_of_both():
@@ -284,22 +286,24 @@ def test_a_calibrated_grid_is_written_read_and_sampled_on(tmp_path, caplog):
     path = tmp_path / "grid.json"
     write_grid(path, times, checkpoint, "euler")
     read = grid_of(str(path), checkpoint)
-    assert torch.equal(read, times)
+    assert read == times.tolist()
 
-    def moved(grid, steps=4):
-        x_0 = sampling.noise_of(range(1), (2, *SENSOR.shape), 0)
-        return (sampling._solve(checkpoint.model, x_0, 0, 1, "euler", steps, 1e-5, None, grid).x - x_0).mean()
+    def moved(grid):
+        x_0 = Draws(0, range(1)).start((2, *SENSOR.shape))
+        return (checkpoint.generator.generate(x_0, sampler=Sampler("euler", 4, grid=grid)).x - x_0).mean()
 
     exact = 1 - math.exp(-8)
-    assert abs(moved(read) - exact) < 0.6 * abs(moved("uniform") - exact)
-    (drawn,) = sample(checkpoint, 1, steps=99, grid=read)
+    assert abs(moved(tuple(read)) - exact) < 0.6 * abs(moved("uniform") - exact)
+    (drawn,) = sample(checkpoint, 1, grid=read)
+    with pytest.raises(InputError, match="the time grid has 4 steps, found steps=99"):
+        next(sample(checkpoint, 1, steps=99, grid=read))
     (same,) = sample(checkpoint, 1, steps=4, grid=read)
     (uniform,) = sample(checkpoint, 1, steps=4)
     assert torch.equal(drawn.images, same.images)
     assert drawn.evaluations.tolist() == [4]
     assert not torch.equal(drawn.images, uniform.images)
     assert "another flow" not in caplog.text
-    read_grid(path, replace(checkpoint, model=Turning(2.0)))
+    read_grid(path, replace(checkpoint, generator=flow(Turning(2.0)).generator))
     assert "calibrated on another flow" in caplog.text
 
 

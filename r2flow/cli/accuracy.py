@@ -10,8 +10,9 @@ import typer
 
 from r2flow.cli.app import report
 from r2flow.cli.options import OutOption, choose_device
-from r2flow.cli.output import bar, command, finish, numbers
+from r2flow.cli.output import command, finish, numbers
 from r2flow.errors import InputError
+from r2flow.progress import Bar
 
 
 @report.command(epilog="Example: r2flow report curvature runs/1rf runs/2rf --out reports")
@@ -34,7 +35,7 @@ def curvature(
     where = choose_device(device)
     loaded = {str(path): load_checkpoint(path, where) for path in dict.fromkeys(checkpoints)}
     prepare_folder(out)
-    with bar("evaluations", len(loaded) * batches(num, batch_size) * 2 * steps) as advance:
+    with Bar("measuring", len(loaded) * batches(num, batch_size) * 2 * steps, "evaluations") as advance:
         flows = [
             measure_paths(checkpoint, label, num, steps, seed, batch_size, most_curved, advance)
             for label, checkpoint in loaded.items()
@@ -64,6 +65,7 @@ def work_precision(
     """Error of every solver against evaluations and time, on exact problems and on a checkpoint."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.flow.solvers import check_tolerance
+    from r2flow.generators import as_flow
     from r2flow.reports import work_precision as measuring
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.work_precision_page import work_precision_page
@@ -85,10 +87,12 @@ def work_precision(
     with only_errors():
         if loaded is not None:
             x_0 = measuring.starts(loaded, num, seed)
-            with bar("reference evaluations", num * 4 * reference_steps) as advance:
-                found = measuring.reference(loaded.model, x_0, reference_steps, reference_tolerance, advance)
+            with Bar("measuring", num * 4 * reference_steps, "reference evaluations") as advance:
+                found = measuring.reference(
+                    as_flow(loaded.generator, measuring.NAME), x_0, reference_steps, reference_tolerance, advance
+                )
             subjects.append(measuring.checkpoint_subject(loaded, str(checkpoint), found, num, seed, batch_size))
-        with bar("solutions", measuring.runs(subjects, chosen, repeats)) as advance:
+        with Bar("measuring", measuring.runs(subjects, chosen, repeats), "solutions") as advance:
             rows = measuring.measure(subjects, chosen, repeats, advance)
     seeds = {"scenes": seed, "exact problems": measuring.PROBLEM_SEED}
     name = None if checkpoint is None else str(checkpoint)
@@ -122,7 +126,7 @@ def stability(
     prepare_folder(out)
     cells = len(measuring.PRECISIONS) * (len(names) + ("point_mass" in names))
     cells *= sum(len(held_to) if adapts(solver) else 1 for solver in chosen)
-    with only_errors(), bar("cells", cells) as advance:
+    with only_errors(), Bar("measuring", cells, "cells") as advance:
         rows = measuring.stability(
             names, chosen, tolerances=held_to, steps=steps, scenes=scenes, seed=seed,
             max_evaluations=max_evaluations, progress=advance,

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from r2flow.evaluation.measuring import Work
     from r2flow.evaluation.processes import Place
     from r2flow.metrics.base import ScanMetric
+    from r2flow.reports.speed_quality import Drawing
 
 log = logging.getLogger(__name__)
 
@@ -61,8 +62,8 @@ def evaluate(
     steps: Annotated[
         str | None, typer.Option(help="Of the sampled flow, 32 or k of a k-TD if left out; of a curve, 1,2,4,...,256.")
     ] = None,
-    solver: Annotated[str, typer.Option(help="Of the sampled flow: euler, heun2, rk4, dopri5, ...")] = "euler",
-    tolerance: Annotated[float, typer.Option(help="Of an adaptive solver.")] = 1e-5,
+    solver: Annotated[str | None, typer.Option(help="Of the sampled flow: euler, heun2, rk4, dopri5, ...")] = None,
+    tolerance: Annotated[float | None, typer.Option(help="Of an adaptive solver.")] = None,
     num: Annotated[
         int | None, typer.Option(min=1, help="Scans to sample or simulate (1000); the most to take of a folder (all).")
     ] = None,
@@ -98,7 +99,8 @@ def evaluate(
     """
     from r2flow.evaluation.measuring import check_reflectance
     from r2flow.evaluation.processes import joined
-    from r2flow.flow.solvers import check_method, check_tolerance
+    from r2flow.evaluation.sets import sampled_set
+    from r2flow.reports.speed_quality import Drawing
 
     if checkpoint and generated is not None:
         raise InputError("give GENERATED for one comparison or --checkpoint for a curve, not both.")
@@ -110,8 +112,6 @@ def evaluate(
         raise InputError("--floor, --bootstrap and --json belong to one comparison; a curve writes its page to --out.")
     if json is not None and json.is_dir():
         raise InputError(f"--json {json} is a folder; name a file to write to.")
-    check_method(solver)
-    check_tolerance(tolerance)
     with joined(choose_device(device)) as place:
         built = _build(metrics.split(","), bootstrap, place) if metrics else None
         flows = _load_flows(
@@ -122,14 +122,14 @@ def evaluate(
             [real, judged_scans], list(flows.values()), sensor, size, projection, convention, reflectance_scale
         )
         if built is not None:  # a scale of reflectance is nobody's business where no metric looks at it
-            looks = any(metric.needs_reflectance or name == "beams" for name, metric in built.items())
+            looks = any(metric.needs_reflectance or metric.uses_reflectance for metric in built.values())
             reading = replace(reading, reflectance=reading.reflectance if looks else False)
         truth = _open(real, reading, split, real_num)
         judged: ScanSet | None = None
-        sampling: dict[str, Any] = {"num": num or 1000, "method": solver, "tolerance": tolerance, "seed": seed}
         if _is_flow(generated):
             (label, flow), *_ = flows.items()
-            judged = _sampled(flow, label, _one(steps, flow), sampling)
+            sampler = flow.generator.sampler.changed(steps=_one(steps), method=solver, tolerance=tolerance)
+            judged = sampled_set(flow, label, num or 1000, sampler, seed)
         elif generated is not None:
             judged = _open(generated, _rescaled(generated, reading, generated_scale), generated_split, num)
         sets = [truth, *([judged] if judged else [])]
@@ -142,7 +142,8 @@ def evaluate(
         work = work_of(batch_size, workers, place.rank, place.ranks)
         if checkpoint:
             assert out is not None
-            _curve(truth, flows, built, _many(steps), sampling, work, no_cache, out, place.device)
+            drawing = Drawing(num or 1000, seed, solver, tolerance)
+            _curve(truth, flows, built, _many(steps), drawing, work, no_cache, out, place.device)
         else:
             _compare(truth, judged, built, floor, bootstrap, work, no_cache, json, out, place.device, seed)
 
@@ -204,7 +205,7 @@ def _curve(
     flows: "dict[str, Checkpoint]",
     metrics: "dict[str, ScanMetric]",
     steps: Sequence[int],
-    sampling: dict[str, Any],
+    drawing: "Drawing",
     work: "Work",
     no_cache: bool,
     out: Path,
@@ -219,8 +220,7 @@ def _curve(
     prepare_folder(out)
     done = read_rows(out)
     gathered = gather_real(metrics, truth, work, None if no_cache else Cache())
-    curve = Curve(truth, metrics, gathered, sampling["num"], sampling["seed"], sampling["method"],
-                  sampling["tolerance"], device)  # fmt: skip
+    curve = Curve(truth, metrics, gathered, drawing, device)
 
     def keep(rows: list[dict[str, Any]]) -> None:
         if work.rank == 0:
@@ -275,10 +275,9 @@ def neighbours(
 
 def work_of(batch_size: int, workers: int, rank: int = 0, ranks: int = 1) -> "Work":
     """How the work is done, its bars on standard error where somebody watches."""
-    from r2flow.cli.output import bar
-    from r2flow.evaluation.measuring import Work, no_bar
+    from r2flow.evaluation.measuring import Work
 
-    return Work(batch_size, workers, rank, ranks, bar if rank == 0 and sys.stderr.isatty() else no_bar)
+    return Work(batch_size, workers, rank, ranks, watched=rank == 0 and sys.stderr.isatty())
 
 
 def _is_flow(text: str | None) -> bool:
@@ -326,13 +325,10 @@ def _rescaled(generated: str, reading: "Reading", scale: float | None) -> "Readi
 def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> "ScanSet":
     from r2flow.data.opening import open_scans
 
-    return open_scans(text, reading, split, num)
-
-
-def _sampled(flow: "Checkpoint", label: str, steps: int, sampling: dict[str, Any]) -> "ScanSet":
-    from r2flow.evaluation.sets import sampled_set
-
-    return sampled_set(flow, label, steps=steps, **sampling)
+    scans = open_scans(text, reading, split, num)
+    if len(scans):
+        _ = scans.source[0]  # what does not fit is better known now than after the other set was read
+    return scans
 
 
 def _build(names: Sequence[str], bootstrap: int, place: "Place") -> "dict[str, ScanMetric]":
@@ -353,8 +349,8 @@ def _build_default(reflectance: bool, bootstrap: int, place: "Place") -> "dict[s
     return built
 
 
-def _one(steps: str | None, flow: "Checkpoint") -> int:
-    found = [flow.distilled_steps or 32] if steps is None else _many(steps)
+def _one(steps: str | None) -> int | None:
+    found = [None] if steps is None else _many(steps)
     if len(found) != 1:
         raise InputError(f"one comparison takes one number of --steps, found {steps}; --checkpoint makes a curve.")
     return found[0]

@@ -7,7 +7,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.options import SizeOption, build_sized
-from r2flow.cli.output import bar
+from r2flow.progress import Bar
 
 
 @app.command("train-extractor", epilog="Example: r2flow train-extractor --seed 7 --out embedded.safetensors")
@@ -36,7 +36,7 @@ def train_extractor(
     training = Training(Settings(seed, steps, batch_size, views), out)
     if training.step:
         print(f"goes on after step {training.step}")
-    with bar("steps", steps - training.step, "training") as advance:
+    with Bar("training", steps - training.step, "steps") as advance:
         training.run(workers, advance)
     judged = training.finish()
     print("on held-out simulated scans: accuracy of pixels, mean intersection over union")

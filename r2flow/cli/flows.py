@@ -20,16 +20,20 @@ def sample(
     out: OutOption,
     num: Annotated[int, typer.Option(min=1, help="Number of scans.")] = 4,
     steps: Annotated[
-        int | None, typer.Option(min=1, help="Steps from noise to data; 32, or k of a k-TD flow, if left out.")
+        int | None, typer.Option(min=1, help="Steps from noise to data; the model's own if left out.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0,
     solver: Annotated[
-        str, typer.Option(help="euler, midpoint, heun2, heun3, rk4, ab2; adaptive: dopri5, bosh3, torchdiffeq:NAME.")
-    ] = "euler",
-    tolerance: Annotated[float, typer.Option(help="Of an adaptive solver.")] = 1e-5,
+        str | None,
+        typer.Option(
+            help="euler, midpoint, heun2, heun3, rk4, ab2; adaptive: dopri5, bosh3, torchdiffeq:NAME; the model's own "
+            "if left out."
+        ),
+    ] = None,
+    tolerance: Annotated[float | None, typer.Option(help="Of an adaptive solver.")] = None,
     grid: Annotated[
-        str, typer.Option(help="Where fixed steps fall: uniform, quadratic, or a file of 'r2flow calibrate'.")
-    ] = "uniform",
+        str | None, typer.Option(help="Where fixed steps fall: uniform, quadratic, or a file of 'r2flow calibrate'.")
+    ] = None,
     format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture.")] = 8,
     sector: Annotated[
@@ -49,18 +53,13 @@ def sample(
     from r2flow.time_grids import grid_of
 
     loaded = load_checkpoint(checkpoint, device=choose_device(device))
-    times = grid_of(grid, loaded)
-    if not isinstance(times, str):
-        if steps not in (None, len(times) - 1):
-            raise InputError(f"{grid} is a grid of {len(times) - 1} steps, found --steps {steps}.")
-        steps = len(times) - 1
-    steps = steps or loaded.distilled_steps or 32
+    sampler = loaded.generator.sampler.changed(
+        steps=steps, method=solver, tolerance=tolerance, straight_first=straight_first or None,
+        grid=None if grid is None else grid_of(grid, loaded),
+    )  # fmt: skip
     formats = format.split(",") if format else formats_of(loaded, channels)
     part = choose_region(loaded, sector, rows) if sector or rows else None
-    write_samples(
-        loaded, out, num, steps, seed, solver, formats, pictures, batch_size, tolerance, part, channels,
-        straight_first, times,
-    )  # fmt: skip
+    write_samples(loaded, out, num, seed, sampler, formats, pictures, batch_size, part, channels)
     seen = f", pictures in {out / 'samples.png'}" if pictures else ""
     print(f"{num} scans ({', '.join(formats)}) in {out}{seen}")
 
@@ -76,7 +75,7 @@ def calibrate(
 ) -> None:
     """Find where a flow's steps should fall so that their errors are equal: a grid for `r2flow sample --grid`."""
     from r2flow.checkpoints import load_checkpoint
-    from r2flow.cli.output import bar
+    from r2flow.progress import Bar
     from r2flow.reports.pages import prepare_folder
     from r2flow.time_grids import calibrate as find_grid
     from r2flow.time_grids import check_grid_solver, evaluations_of_calibration, write_grid
@@ -86,7 +85,7 @@ def calibrate(
     check_grid_solver(solver)
     loaded = load_checkpoint(checkpoint, choose_device(device))
     prepare_folder(out.parent)
-    with bar("evaluations", evaluations_of_calibration(steps)) as advance:
+    with Bar("measuring", evaluations_of_calibration(steps), "evaluations") as advance:
         times = find_grid(loaded, steps, solver, num, advance)
     write_grid(out, times, loaded, solver)
     print(f"{steps} steps of {solver} at t = {', '.join(f'{t:.3g}' for t in times.tolist())} in {out}")
@@ -132,15 +131,14 @@ def backbones(
     json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
     """Parameters, multiply-accumulates and measured latency of every configuration: the paper's table II."""
-    from rich.progress import track
-
-    from r2flow.backbones import CONFIGURATIONS
+    from r2flow.backbones import configurations
+    from r2flow.progress import track
     from r2flow.reports.backbones import backbone_costs, print_costs
 
     chosen, where = build_sized(sensor, size), choose_device(device)
-    names = only.split(",") if only else list(CONFIGURATIONS)
+    names = only.split(",") if only else list(configurations())
     rows = backbone_costs(chosen, names, channels, repeats, where)
-    measured = list(track(rows, "measuring", total=len(names), disable=json or repeats == 0, transient=True))
+    measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
     if json:
         import json as encoder
 
@@ -157,7 +155,7 @@ def choose_region(checkpoint: "Checkpoint", sector: str | None, rows: str | None
     angles = None if sector is None else _pair("--sector", sector, ",", float, "two azimuths in degrees, as -45,45")
     limits = None if rows is None else _pair("--rows", rows, "-", int, "the first and the last row, as 0-31")
     wanted = region(checkpoint.sensor.shape, angles, limits)
-    seen = evaluated_region(checkpoint, wanted)
+    seen = evaluated_region(checkpoint.generator, wanted)
     rounded = "" if seen == wanted else f", rounded outward from {wanted}"
     print(f"generating {seen}{rounded}: {seen.share:.0%} of the image")
     return wanted

@@ -35,12 +35,13 @@ def invert(
     """Carry scans back to the noise that they come from, and forward again: how far from themselves they end."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.output import command
+    from r2flow.generators import Sampler
     from r2flow.reports.inversion import invert_scans, print_rows, real_scans
     from r2flow.reports.pages import write_page
 
     loaded = load_checkpoint(checkpoint, choose_device(device))
     real = real_scans(loaded, scans, reflectance_scale, most)
-    page = invert_scans(loaded, real, out, solver, steps, tolerance, batch_size, command())
+    page = invert_scans(loaded, real, out, Sampler(solver, steps, tolerance), batch_size, command())
     written = write_page(page, out)
     print_rows(page.rows)  # type: ignore[arg-type]
     print(f"noise in {out}/*.x_0.npy; {', '.join(str(path) for path in written)}")
@@ -63,13 +64,14 @@ def interpolate(
     """Go from one real scan to another through their noises: a figure and a point cloud for every frame."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.output import command
+    from r2flow.generators import Sampler
     from r2flow.reports.interpolation import interpolation
     from r2flow.reports.inversion import real_scans
     from r2flow.reports.pages import write_page
 
     loaded = load_checkpoint(checkpoint, choose_device(device))
     ends = real_scans(loaded, [first, last], reflectance_scale)
-    page = interpolation(loaded, ends, frames, out, solver, steps, tolerance, batch_size, command())
+    page = interpolation(loaded, ends, frames, out, Sampler(solver, steps, tolerance), batch_size, command())
     written = write_page(page, out)
     print(f"{frames} scans in {out / 'frames'}; {', '.join(str(path) for path in written)}")
 
@@ -88,14 +90,15 @@ def savings(
 ) -> None:
     """What a scene need not cost: own steps, leaving early, one step for the straight, regions, single channels."""
     from r2flow.checkpoints import load_checkpoint
-    from r2flow.cli.output import bar, command, finish
+    from r2flow.cli.output import command, finish
     from r2flow.flow.solvers import check_tolerance
+    from r2flow.progress import Bar
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.savings_page import evaluations_of_page, savings_page
 
     check_tolerance(tolerance)
     loaded = None if checkpoint is None else load_checkpoint(checkpoint, choose_device(device))
     prepare_folder(out)
-    with bar("evaluations", evaluations_of_page(num, steps) if loaded else 0) as advance:
+    with Bar("measuring", evaluations_of_page(num, steps) if loaded else 0, "evaluations") as advance:
         page = savings_page(loaded, num, steps, tolerance, seed, command(), advance)
     finish(page, out)

@@ -3,8 +3,7 @@
 import math
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,26 +26,6 @@ def numbers(option: str, text: str, kind: type = float) -> list[Any]:
     if not all(0 < value < math.inf for value in values):
         raise InputError(f"--{option} must be positive numbers separated by commas, found {text!r}.")
     return values
-
-
-@contextmanager
-def bar(unit: str, total: int, doing: str = "measuring") -> Iterator[Callable[[], None]]:
-    """A progress bar with rate and time left; yields what advances it by one."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
-    from rich.progress import TimeRemainingColumn as TimeLeft
-    from rich.text import Text
-
-    class Rate(ProgressColumn):
-        def render(self, task: Task) -> Text:
-            speed = task.finished_speed or task.speed
-            return Text(f"{speed:.1f} {unit}/s" if speed else "")
-
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn(unit), Rate(), TimeLeft())
-    # On standard error: what is printed about the result may be piped.
-    with Progress(TextColumn(doing), *columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(unit, total=total)
-        yield lambda: progress.advance(task)
 
 
 def command() -> str:

@@ -64,7 +64,9 @@ def pairs(
         "num": num, "method": solver, "steps": steps, "tolerance": tolerance, "batch_size": batch_size,
         "shard_mib": shard_mib, "seed": seed, "first": first,
     }  # fmt: skip
-    recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(flow.encoding.shape)
+    recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(
+        flow.encoding.shape, flow.generator.noise_shape
+    )
     store = PairStore(out or default_folder(flow.path), recipe)
     make_and_tell(store, flow, num, rank, ranks, where)
     lacking = len(store.missing(num))

@@ -91,13 +91,13 @@ def prepare(
 
 
 def _run(work: "Preparation", on_bad_scan: str, workers: int | None) -> None:
-    from r2flow.cli.output import bar
+    from r2flow.progress import Bar
 
     recipe, workers = work.recipe, workers or _cores()
-    with bar("scans", recipe.scans, "checking what is there") as advance:
+    with Bar("checking what is there", recipe.scans, "scans") as advance:
         missing = work.begin(lambda scans: _repeat(advance, scans))
     scans = sum(len(recipe.numbers_of(shard)) for shard in missing)
-    with bar("scans", scans, "preparing") as advance:
+    with Bar("preparing", scans, "scans") as advance:
         manifest = work.make(missing, on_bad_scan, workers if workers > 1 else 0, lambda scans: _repeat(advance, scans))
     print(_summary(work.folder, manifest))
 
@@ -127,12 +127,12 @@ def _summary(folder: Path, manifest: "Manifest") -> str:
 
 
 def _check(folder: Path) -> None:
-    from r2flow.cli.output import bar
     from r2flow.data.manifest import read_manifest
     from r2flow.data.prepared import check_prepared
+    from r2flow.progress import Bar
 
     shards = len(read_manifest(folder).shards or ())
-    with bar("shards", shards, "checking") as advance:
+    with Bar("checking", shards, "shards") as advance:
         damaged = check_prepared(folder, advance)
     for path, reason in damaged.items():
         print(f"{path}: {reason}")

@@ -27,12 +27,11 @@ def sensor(
 
     The YAML is a sensor for the verbs (--sensor mine.yaml) and, in conf/sensor/, for train.py (sensor=mine).
     """
-    from rich.progress import track
-
     from r2flow.lidar.calibration import estimate_sensor
     from r2flow.lidar.scan_files import read_points
     from r2flow.lidar.sensor_files import ENDINGS, write_sensor
     from r2flow.lidar.sensors import SENSORS
+    from r2flow.progress import track
     from r2flow.reports.views import scans_of
 
     if out is not None and (out.suffix.lower() not in ENDINGS or out.is_dir()):
@@ -41,7 +40,7 @@ def sensor(
     if name in SENSORS or not re.fullmatch(r"[A-Za-z]\w*", name):
         raise InputError(f"--name must be letters, digits and _, and no sensor's of the table; found {name!r}.")
     paths = [path for scan in scans for path in scans_of(scan, most)]
-    points = [read_points(path) for path in track(paths, "reading scans", disable=len(paths) < 16)]
+    points = [read_points(path) for path in track(paths, "reading", "scans", least=16)]
     estimate = estimate_sensor(points)
     found = estimate.sensor(name)
     _print(estimate)
@@ -54,37 +53,33 @@ def sensor(
 
 
 def _print(estimate: "Estimate") -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from r2flow.reports.tables import print_table
 
     beams, (near, far) = estimate.beams, estimate.ranges
-    table = Table(box=None, show_header=False)
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column()
+    rows: list[tuple[str, str]] = []
     e, middle = beams.elevations, len(beams.elevations) // 2
     shown = [*e[:2], None, *e[middle - 1 : middle + 1], None, *e[-2:]]
-    table.add_row("beams", f"{len(e)}, {_sureness(beams)}")
-    table.add_row("elevations", " ".join("..." if one is None else f"{one:+.2f}" for one in shown) + " degrees")
+    rows.append(("beams", f"{len(e)}, {_sureness(beams)}"))
+    rows.append(("elevations", " ".join("..." if one is None else f"{one:+.2f}" for one in shown) + " degrees"))
     if (known := estimate.nearest_known()) is not None:
-        table.add_row("", f"of the table {known[0]} is nearest, {known[1]:.2f} degrees off in the median")
-    table.add_row("resolution", f"{estimate.steps:,.0f} steps a turn; images of {estimate.columns} columns")
-    table.add_row("range", f"{near:.2f} to {far:.2f} m")
+        rows.append(("", f"of the table {known[0]} is nearest, {known[1]:.2f} degrees off in the median"))
+    rows.append(("resolution", f"{estimate.steps:,.0f} steps a turn; images of {estimate.columns} columns"))
+    rows.append(("range", f"{near:.2f} to {far:.2f} m"))
     if estimate.near_share > 0.05:
         share = f"{estimate.near_share:.0%} of the returns lie within 1 m"
-        table.add_row("", f"{share}: the vehicle itself? Then raise min_range in the YAML.")
+        rows.append(("", f"{share}: the vehicle itself? Then raise min_range in the YAML."))
     if estimate.height is None:
-        table.add_row("height", "no ground found; the usual 1.73 m is taken")
+        rows.append(("height", "no ground found; the usual 1.73 m is taken"))
     else:
-        table.add_row(
-            "height", f"{estimate.height:.2f} m above the ground, where {estimate.ground_share:.0%} of them lie"
-        )
+        above = f"{estimate.height:.2f} m above the ground, where {estimate.ground_share:.0%} of them lie"
+        rows.append(("height", above))
     if (found := estimate.reflectance) is None:
-        table.add_row("reflectance", "none: encoding.reflectance=false")
+        rows.append(("reflectance", "none: encoding.reflectance=false"))
     else:
         values = f"{found.levels} values up to {found.highest:.4g}"
-        table.add_row("reflectance", f"{values}: data.reflectance_scale={found.scale:g}")
-    table.add_row("storage", beams.order)
-    Console().print(table)
+        rows.append(("reflectance", f"{values}: data.reflectance_scale={found.scale:g}"))
+    rows.append(("storage", beams.order))
+    print_table(rows, ("", ""))
 
 
 def _sureness(beams: "Beams") -> str:

@@ -26,13 +26,13 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate scans of streets, as many as asked for. Stopped or killed, the same command goes on."""
-    from r2flow.cli.output import bar
+    from r2flow.progress import Bar
     from r2flow.simulator.folder import SimulatedFolder, write_folder
 
     formats = tuple(dict.fromkeys(format.split(",")))
     folder = SimulatedFolder(out, build_sized(sensor, size), seed, formats, labels)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    with bar("scans", num, "simulating") as advance:
+    with Bar("simulating", num, "scans") as advance:
         made = write_folder(folder, range(first, first + num), workers or cores, advance)
     kept = f", {num - made} were there" if made < num else ""
     print(f"{made} scans ({', '.join(formats)}{', labels' if labels else ''}) in {out}{kept}")

@@ -1,14 +1,11 @@
 """Weights of the published feature networks: `r2flow weights`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from r2flow.cli.app import app
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 
 @app.command(epilog="Example: r2flow weights --add rangenet53 darknet53-1024.tar.gz")
@@ -23,10 +20,9 @@ def weights(
     Nothing is fetched: get the file, then --add it. It is read as tensors alone, checked against its network and
     kept in R2FLOW_WEIGHTS, or ~/.cache/r2flow/weights.
     """
-    from rich.console import Console
-
-    from r2flow.metrics.extractors.weights import SOURCES, kept_file, weights_folder
+    from r2flow.metrics.extractors.weights import SOURCES, kept, kept_file, weights_folder
     from r2flow.metrics.extractors.weights import add as take
+    from r2flow.reports.tables import print_table
 
     if add is not None:
         name, path = add
@@ -34,21 +30,11 @@ def weights(
         same = {True: "the published file", False: "not the published file", None: "its published hash is not known"}
         print(f"{kept_file(name)}: weights {found.weights} of {found.source} ({same[found.published]})")
         return
-    Console(width=None if Console().is_terminal else 200).print(_table())
+    rows = []
+    for name, source in SOURCES.items():
+        there = kept(name)
+        rows.append((name, source.metric, f"{there.weights} of {there.source}" if there else "no", source.file))
+    print_table(rows, ("network", "distance", "here", "published file"))
     print(f"\nLooked for in {weights_folder()} (R2FLOW_WEIGHTS). Take one from disk: r2flow weights --add NAME FILE")
     for name, source in SOURCES.items():
         print(f"  {name}: {source.page}" + (f" (git blob {source.git_blob})" if source.git_blob else ""))
-
-
-def _table() -> "Table":
-    from rich.table import Table
-
-    from r2flow.metrics.extractors.weights import SOURCES, kept
-
-    table = Table("network", "distance", "here", "published file", "bytes", "SHA-256")
-    for name, source in SOURCES.items():
-        found = kept(name)
-        here = f"{found.weights} of {found.source}" if found else "no"
-        size = "not known" if source.size is None else f"{source.size:,}"
-        table.add_row(name, source.metric, here, source.file, size, source.sha256 or "not known")
-    return table

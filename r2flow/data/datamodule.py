@@ -7,7 +7,6 @@ from typing import Any
 
 import lightning as L
 import torch
-from rich.progress import track
 from torch.utils.data import DataLoader, Dataset
 
 from r2flow import simulator
@@ -22,6 +21,7 @@ from r2flow.data.sources import Reading, ScanSource, holdout_block, spread
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
+from r2flow.progress import track
 from r2flow.registry import check_options
 
 log = logging.getLogger(__name__)
@@ -161,7 +161,7 @@ class ScanDataModule(L.LightningDataModule):
         size = source.slow_scans() * (1 + self.encoding.reflectance) * height * width * 4
         if size > self.options.memory_gib * 2**30:
             return source
-        return source.kept(lambda numbers: track(numbers, f"reading {what}", disable=len(numbers) < 16))
+        return source.kept(lambda numbers: track(numbers, f"reading {what}", least=16))
 
     def _ranks(self) -> tuple[int, int]:
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)

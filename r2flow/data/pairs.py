@@ -20,7 +20,7 @@ from r2flow import noise
 from r2flow.data.loader import Item
 from r2flow.data.shards import Block, PairStore, Recipe, read_notes
 from r2flow.errors import InputError
-from r2flow.flow.solvers import Velocity, solve
+from r2flow.generators import Generator, Sampler
 
 
 def pair_noise(recipe: Recipe, index: int) -> Tensor:
@@ -46,18 +46,17 @@ class Made:
 
 def make_pairs(
     store: PairStore,
-    velocity: Velocity,
+    generator: Generator,
     num: int,
     rank: int = 0,
     ranks: int = 1,
-    device: torch.device | str = "cpu",
     progress: Callable[[Made], None] = lambda made: None,
 ) -> Made:
     """Make those of the first `num` pairs that are missing or damaged, as one of `ranks` processes.
 
-    x_1 is where the flow carries x_0 = `pair_noise`, neither clamped nor snapped, in half precision. Rank r owns the
-    batches r, r + R, ... and talks to no other; a batch is computed alike whoever owns it, so the shards are the same,
-    byte for byte, for every R. What is there already, from any earlier process, is kept.
+    x_1 is where the generator carries x_0 = `pair_noise`, neither clamped nor snapped, in half precision. Rank r owns
+    the batches r, r + R, ... and talks to no other; a batch is computed alike whoever owns it, so the shards are the
+    same, byte for byte, for every R. What is there already, from any earlier process, is kept.
 
     Args:
         progress: Called after each batch that is on the disk.
@@ -66,6 +65,9 @@ def make_pairs(
         InputError: no pair is usable: the flow is broken, or the tolerance out of its reach; or the folder cannot be
             written, or holds other pairs.
     """
+    wanted = store.recipe.noise_shape or store.recipe.shape
+    if generator.noise_shape != wanted:
+        raise InputError(f"these pairs are made of noise of the shape {wanted}, the flow's is {generator.noise_shape}.")
     store.begin()
     # Shards are checked by turns; who finds one damaged makes its batches, which the others hold to be there.
     shards = store.shards(num)
@@ -76,7 +78,7 @@ def make_pairs(
     for batch in own:
         if store.has(batch):
             continue
-        block = solve_batch(store.recipe, velocity, batch, device)
+        block = solve_batch(store.recipe, generator, batch)
         made.add(block)
         kept.append((batch, block))
         _check_usable(made, store.recipe)
@@ -117,12 +119,12 @@ def _check_usable(made: Made, recipe: Recipe, patience: int = 64) -> None:
         )
 
 
-def solve_batch(recipe: Recipe, velocity: Velocity, batch: int, device: torch.device | str = "cpu") -> Block:
+def solve_batch(recipe: Recipe, generator: Generator, batch: int) -> Block:
     """The pairs first + [b B, (b + 1) B) of batch b."""
     first = recipe.first + batch * recipe.batch_size
     x_0 = torch.stack([pair_noise(recipe, index) for index in range(first, first + recipe.batch_size)])
-    with torch.inference_mode():
-        end = solve(velocity, x_0.to(device), 0.0, 1.0, recipe.method, recipe.steps, recipe.tolerance)
+    sampler = Sampler(recipe.method, recipe.steps, recipe.tolerance)
+    end = generator.generate(x_0.to(generator.device), sampler=sampler)
     x_1 = end.x.to(torch.float16).cpu()
     usable = end.converged.cpu() & x_1.isfinite().flatten(1).all(1)
     return Block(x_1.numpy(), end.evaluations.cpu().numpy().astype(np.int32), usable.numpy())

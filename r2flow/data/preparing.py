@@ -258,6 +258,8 @@ class Preparation:
             )
         if path.is_dir() and not path.is_symlink():
             raise InputError(f"{path} is a folder where a shard belongs; remove it.")
+        if path.is_symlink() and not path.exists():
+            path.unlink()
         with atomic_write(path) as file:
             file.write(data)
         if self.finished is None:

@@ -3,8 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,19 +15,12 @@ from r2flow.evaluation.statistics import Cache, Statistics, key_of
 from r2flow.metrics.base import ScanMetric
 from r2flow.metrics.bootstrap import bootstrap
 from r2flow.metrics.scans import Scans
-
-# Opens a bar of so many scans, under a heading; what it gives is called after each.
-Bar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
+from r2flow.progress import Bar
 
 # The field compares single-scan histograms with so many real scans, by a fixed shuffle, and features with all.
 REAL_SCANS = 10_000
 
 LEVEL = 0.95  # of intervals
-
-
-def no_bar(heading: str, total: int) -> AbstractContextManager[Callable[[], None]]:
-    """Nothing to be seen."""
-    return nullcontext(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -39,14 +31,18 @@ class Work:
         batch_size: Scans at once.
         workers: Further processes that read.
         rank, ranks: This process among those that share the batches by turns.
-        bar: What shows how far it is.
+        watched: Whether progress bars are shown.
     """
 
     batch_size: int = 8
     workers: int = 0
     rank: int = 0
     ranks: int = 1
-    bar: Bar = no_bar
+    watched: bool = False
+
+    def bar(self, doing: str, total: int, unit: str = "scans") -> Bar:
+        """A progress bar of `total` units; shows nothing unless the work is watched."""
+        return Bar(doing, total, unit, shown=self.watched)
 
 
 @dataclass(frozen=True)
@@ -169,7 +165,7 @@ def measure(
             remarks.append(f"{name} has no bootstrap interval.")
         elif draws and work.rank == 0:
             protocol["interval"] = {"bootstrap draws": draws, "level": LEVEL, "seed": 0}
-            with work.bar("resamples", draws) as advance:
+            with work.bar("resampling", draws, "sets") as advance:
                 found = bootstrap(metric, draws, LEVEL, advance=advance)
             intervals = {key: (one.low, one.high) for key, one in found.items()}
         results.append(Measured(name, figures, protocol, remarks, intervals))
@@ -197,14 +193,13 @@ def _update(
     starts = range(0, len(numbers), work.batch_size)[work.rank :: work.ranks]
     own = [number for start in starts for number in numbers[start : start + work.batch_size]]
     empty = 0
-    with work.bar("real" if real else "generated", len(own)) as advance, torch.no_grad():
+    with work.bar(f"reading {'real' if real else 'generated'} scans", len(own)) as advance, torch.no_grad():
         for start, images in zip(starts, scans.batches(own, work.batch_size, work.workers), strict=True):
             batch = Scans(images.to(device), scans.sensor)
             empty += int((~batch.returned.flatten(1).any(1)).sum())
             for metric in metrics.values():
                 metric.update(batch, real=real, first=first + start)
-            for _ in range(len(batch)):
-                advance()
+            advance(len(batch))
     return _sum_over_processes(empty, work)
 
 

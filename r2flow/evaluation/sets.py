@@ -1,20 +1,17 @@
 """Sets of scans that a flow draws when they are asked for."""
 
-import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint, checkpoints_of, weights_hash
 from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.data.sources import Reading, ScanSource
 from r2flow.errors import InputError
-from r2flow.flow.solvers import solve
-from r2flow.sampling import decode, noise_of
+from r2flow.generators import Sampler
+from r2flow.sampling import draw
 
 __all__ = ["SampledScans", "ScanSet", "fixed_choice", "is_checkpoint", "reading_of_flow", "sampled_set"]
 
@@ -36,42 +33,41 @@ def reading_of_flow(flow: Checkpoint) -> Reading:
     return Reading(flow.sensor, projection, convention, data.get("reflectance_scale", 1.0))
 
 
-def sampled_set(
-    flow: Checkpoint, label: str, num: int, steps: int, method: str = "euler", tolerance: float = 1e-5, seed: int = 0
-) -> ScanSet:
-    """Scans 0 to num - 1 of a flow's seed, drawn when they are asked for.
+def sampled_set(flow: Checkpoint, label: str, num: int, sampler: Sampler | None = None, seed: int = 0) -> ScanSet:
+    """Scans 0 to num - 1 of a generator's seed, drawn when they are asked for.
 
     Their noise is that of (seed, "evaluation", i), which no training step and no reflow pair has seen.
 
+    Args:
+        sampler: How it is run; its own if left out.
+
     Raises:
-        InputError: fewer than one.
+        InputError: fewer than one, or a sampler that the generator does not have.
     """
     if num < 1:
         raise InputError(f"needs at least one scan to sample, found {num}.")
+    sampler = sampler or flow.generator.sampler
+    flow.generator.check_sampler(sampler)
     about = {
-        "kind": "sampled", "weights": weights_hash(flow), "step": flow.step, "num": num, "solver": method,
-        "steps": steps, "seed": seed, "noise": "evaluation", "reflectance": flow.encoding.reflectance,
+        "kind": "sampled", "weights": weights_hash(flow), "step": flow.step, "num": num, "solver": sampler.method,
+        "steps": sampler.steps, "seed": seed, "noise": "evaluation", "reflectance": flow.encoding.reflectance,
     }  # fmt: skip
-    source = SampledScans(flow, range(num), steps, method, tolerance, seed)
-    return ScanSet(label, source, flow.sensor, about)
+    return ScanSet(label, SampledScans(flow, range(num), sampler, seed), flow.sensor, about)
 
 
 class SampledScans(ScanSource):
-    """Scans of a flow by their numbers; what one is depends on (seed, number) alone.
+    """Scans of a generator by their numbers; what one is depends on (seed, number) alone.
 
     Attributes:
         unsolved: How many of those drawn so far are no solution to the tolerance.
         evaluations: Network evaluations of each.
-        seconds: Of the solution of a scan, for each batch.
+        seconds: Of the generation of a scan, for each batch.
     """
 
     drawn = True
 
-    def __init__(
-        self, flow: Checkpoint, numbers: Sequence[int], steps: int, method: str, tolerance: float, seed: int
-    ) -> None:
-        self.flow, self.numbers, self.seed = flow, numbers, seed
-        self.solve = partial(solve, flow.model, t_0=0.0, t_1=1.0, method=method, steps=steps, tolerance=tolerance)
+    def __init__(self, flow: Checkpoint, numbers: Sequence[int], sampler: Sampler, seed: int) -> None:
+        self.flow, self.numbers, self.sampler, self.seed = flow, numbers, sampler, seed
         self.unsolved = 0
         self.evaluations: list[int] = []
         self.seconds: list[float] = []
@@ -96,13 +92,8 @@ class SampledScans(ScanSource):
 
     def draw(self, indices: Sequence[int]) -> Tensor:
         """The scans of a batch together, (B, 2 or 1, H, W). One that is not solved is taken as it is, and counted."""
-        shape = self.flow.encoding.shape
-        x_0 = torch.cat([noise_of(range(n, n + 1), shape, self.seed) for n in (self.numbers[i] for i in indices)])
-        start = time.perf_counter()
-        with torch.inference_mode():
-            end = self.solve(x=x_0.to(next(self.flow.model.parameters()).device))
-            x_1 = end.x.cpu()
-        self.seconds.append((time.perf_counter() - start) / len(x_1))
-        self.evaluations += end.evaluations.tolist()
-        self.unsolved += int((~end.converged).sum())
-        return decode(self.flow, x_1).nan_to_num(0.0)
+        drawn = draw(self.flow.generator, [self.numbers[i] for i in indices], self.seed, self.sampler)
+        self.seconds.append(drawn.seconds / len(indices))
+        self.evaluations += drawn.evaluations.tolist()
+        self.unsolved += int((~drawn.converged).sum())
+        return drawn.images.nan_to_num(0.0)

@@ -110,4 +110,4 @@ def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str | None:
     try:
         return json.dumps(parts, sort_keys=True)
     except TypeError as error:
-        raise InputError(f"the protocol of '{metric.protocol.metric}' is not made of plain values: {error}.") from None
+        raise InputError(f"the protocol of '{metric.name}' is not made of plain values: {error}.") from None

@@ -1,10 +1,9 @@
-"""Distances between real and generated scans, each under a name that means one protocol.
+"""Distances between real and generated scans, by name; a name means one protocol.
 
-Importing this loads no metric, no network and not torch: what a name needs is imported when it is built.
+`METRICS[name](keep=..., folder=...)` builds one. Importing this module loads no metric, no network and not torch.
 
-Every metric is built by `METRICS[name](keep=..., folder=...)`. Two protocols in use are not offered. LiDARGen's own JSD
-and MMD count returns of up to 70 m, where all scans here are masked to 63 m, as its successors' are; otherwise they are
-`jsd` and `mmd`. UltraLiDAR's compare the voxel centres of real scans with the plain points of generated ones.
+Two protocols of the field are not offered: LiDARGen's JSD and MMD keep returns up to 70 m, where all scans here are
+masked to 63 m, and UltraLiDAR's compare voxel centres of real scans with points of generated ones.
 """
 
 from __future__ import annotations
@@ -19,6 +18,9 @@ from r2flow.registry import Registry
 if TYPE_CHECKING:
     from r2flow.metrics.base import ScanMetric
 
+# What the field calls the Frechet distance between a network's features; of other networks it is `frechet_NETWORK`.
+FIELD_NAMES = {"rangenet53": "frd", "rangenet21": "frid", "pointnet": "fpd", "spvcnn": "fpvd", "minkowskinet": "fsvd"}
+
 
 def _lazily(where: str, *given: Any) -> Callable[..., ScanMetric]:
     """The constructor `module:Class` of this package, imported when it is called."""
@@ -32,19 +34,21 @@ def _lazily(where: str, *given: Any) -> Callable[..., ScanMetric]:
 
 METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     "metric",
-    frd=_lazily("frechet:FrechetDistance", "rangenet53"),
-    frid=_lazily("frechet:FrechetDistance", "rangenet21"),
-    fpd=_lazily("frechet:FrechetDistance", "pointnet"),
-    fpvd=_lazily("frechet:FrechetDistance", "spvcnn"),
-    fsvd=_lazily("frechet:FrechetDistance", "minkowskinet"),
-    frechet_embedded=_lazily("frechet:FrechetDistance", "embedded"),
-    frechet_embedded_range=_lazily("frechet:FrechetDistance", "embedded_range"),
     jsd=_lazily("jsd:JSD"),
     mmd=_lazily("mmd:MMD"),
     jsd_lidm=_lazily("lidm:JSDLiDM"),
     mmd_lidm=_lazily("lidm:MMDLiDM"),
     beams=_lazily("beams:BeamHistograms"),
     drop_rate=_lazily("beams:DropRate"),
-    **{f"manifold_{network}": _lazily("manifold:Manifold", network) for network in EXTRACTORS},
-    **{f"kid_{network}": _lazily("kid:KernelDistance", network) for network in EXTRACTORS},
 )
+
+
+def add_network(name: str) -> None:
+    """Enter the metrics of a network's features: Frechet distance, kernel distance, precision and recall."""
+    METRICS.add(FIELD_NAMES.get(name, f"frechet_{name}"), _lazily("frechet:FrechetDistance", name))
+    METRICS.add(f"kid_{name}", _lazily("kid:KernelDistance", name))
+    METRICS.add(f"manifold_{name}", _lazily("manifold:Manifold", name))
+
+
+for _network in EXTRACTORS:
+    add_network(_network)

@@ -1,4 +1,4 @@
-"""What a metric between two sets of scans is, and what is said of its figures."""
+"""What a metric between two sets of scans is, and the protocol under which its figures hold."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -11,8 +11,8 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from r2flow.errors import InputError
-from r2flow.metrics.features import FeatureStore
 from r2flow.metrics.scans import MASK, Scans
+from r2flow.metrics.store import FeatureStore
 
 Side = Literal["real", "generated"]
 SIDES: tuple[Side, Side] = ("real", "generated")
@@ -20,16 +20,16 @@ SIDES: tuple[Side, Side] = ("real", "generated")
 
 @dataclass(frozen=True)
 class Protocol:
-    """All that a figure depends on beside the scans: two protocols that differ never share a name.
+    """What a figure depends on beside the scans: two protocols that differ never share a name.
 
     Attributes:
         metric: Name in `r2flow.metrics.METRICS`.
-        representation: What of a scan is compared: "range image", "points", "bird's-eye histogram", "voxels 0.05 m".
+        representation: What of a scan is compared: "range image", "points", "bird's-eye histogram".
         mask: Metres between which returns are kept.
         extractor: Name of the network, or None without one.
         weights: First 12 digits of the SHA-256 of its weights, or None.
-        layer: Which features of it, with their number.
-        settings: Whatever else: bins, bandwidth, neighbours.
+        layer: Which features of the network, and how many.
+        settings: Everything else: bins, bandwidth, neighbours.
     """
 
     metric: str
@@ -45,53 +45,71 @@ class Protocol:
 
 
 class ScanMetric(Metric):
-    """A distance between real and generated scans, or several figures that fall out together.
+    """A distance between real and generated scans, or several figures that are computed together.
 
-    As torchmetrics' own FrechetInceptionDistance, it is given both sets by `update(scans, real=...)`; unlike it,
-    states are float64, so that neither order nor number of processes is seen in ten digits.
+    Both sets are given by `update(scans, real=...)`, as to torchmetrics' FrechetInceptionDistance. States are float64:
+    the order of the scans and the number of processes change no figure within ten digits.
 
-    A subclass says what it takes from each scan (`rows`) and either adds that up (`accumulate`) or has it kept one by
-    one (`keep=True`), and makes `figures` of it. Scans that have nothing to give, a row of NaN, are left out, counted
-    and remarked on.
+    A subclass takes a row of numbers from each scan (`rows`), adds the rows up (`accumulate`) or has them kept in a
+    file (`keeping`), and computes `figures`. A row of NaN stands for a scan that has nothing to compare: it is left
+    out, counted and remarked on.
+
+    Attributes:
+        name: Name in `r2flow.metrics.METRICS`.
+        representation, mask, settings: As in `Protocol`.
+        needs_reflectance: Whether scans without reflectance are refused.
+        uses_reflectance: Whether it reads reflectance where there is some.
+        keeping: Whether the rows are kept: "on request" (`keep=True`), "always" or "never".
+        resamples: Whether it has bootstrap intervals, which are made of kept rows.
+        counts_empty: Whether a scan without a return is compared as well.
+        of_equal_sets: The value of its figures for two equal sets; None where it depends on the sets.
 
     Args:
-        keep: Whether the rows are kept, in files: for metrics that need every scan, and for bootstrap intervals.
-        folder: Where. Several processes must be given the same one; a temporary folder if left out.
+        keep: Whether the rows are kept, for bootstrap intervals.
+        folder: Where they are kept. Several processes must be given the same folder; a temporary one if left out.
+        name: Where one class has several names.
     """
 
     is_differentiable = False
     full_state_update = False
+
+    name: str
+    representation: ClassVar[str]
+    mask: ClassVar[tuple[float, float]] = MASK
+    settings: ClassVar[Mapping[str, Any]] = {}
     needs_reflectance: bool = False
-    resamples: ClassVar[bool] = True  # whether intervals can be had of it
+    uses_reflectance: ClassVar[bool] = False
+    keeping: ClassVar[Literal["on request", "always", "never"]] = "on request"
+    resamples: ClassVar[bool] = True
+    counts_empty: ClassVar[bool] = False
+    of_equal_sets: ClassVar[float | None] = 0.0
 
-    real_scans: Tensor
-    real_left_out: Tensor
-    generated_scans: Tensor
-    generated_left_out: Tensor
-
-    def __init__(self, keep: bool = False, folder: str | Path | None = None) -> None:
+    def __init__(self, keep: bool = False, folder: str | Path | None = None, *, name: str | None = None) -> None:
         super().__init__()
+        self.name = name or type(self).name
+        self.keeps = self.keeping == "always" or (keep and self.keeping == "on request")
+        self.folder = None if folder is None else Path(folder)
         for side in SIDES:
             self.add_state(f"{side}_scans", torch.tensor(0), dist_reduce_fx="sum")
             self.add_state(f"{side}_left_out", torch.tensor(0), dist_reduce_fx="sum")
-        self.keeps = keep
-        self.folder = None if folder is None else Path(folder)
+        # A MetricCollection updates only one of several metrics whose states have equal names and values.
+        self.add_state(f"name_{self.name}", torch.tensor(0), dist_reduce_fx="sum")
         self._stores: dict[Side, FeatureStore] = {}
-        self._said: list[str] = []
+        self._remarks: list[str] = []
 
     @property
     def protocol(self) -> Protocol:
-        raise NotImplementedError
+        return Protocol(self.name, self.representation, self.mask, settings=self.settings)
 
     def rows(self, scans: Scans) -> Tensor:
-        """What is taken from each scan, (B, D); a row of NaN from one that has nothing to give."""
+        """What is taken from each scan, (B, D); a row of NaN for a scan that has nothing to compare."""
         raise NotImplementedError
 
     def accumulate(self, rows: Tensor, side: Side) -> None:
         """Add rows, all finite, to the statistics of a side."""
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
-        """Figures by name from the states, and what must be remarked on them."""
+        """Figures by name, computed from the states, and the remarks on them."""
         raise NotImplementedError
 
     def update(self, scans: Scans, real: bool, first: int = 0) -> None:
@@ -99,10 +117,22 @@ class ScanMetric(Metric):
 
         Args:
             scans: The batch.
-            real: Whose: the real set's or the generated one's.
-            first: Number of its first scan in its set, which decides where features kept one by one are kept.
+            real: Whether the scans are real or generated ones.
+            first: Number of the batch's first scan in its set, under which its rows are kept.
+
+        Raises:
+            InputError: something else than `Scans`, or scans without the reflectance that is needed.
         """
-        side: Side = "real" if real else "generated"
+        if not isinstance(scans, Scans):
+            raise InputError(
+                f"'{self.name}' takes r2flow.metrics.scans.Scans(images, sensor), found {type(scans).__name__}."
+            )
+        if self.needs_reflectance and not scans.has_reflectance:
+            raise InputError(f"'{self.name}' needs reflectance, which these scans have not; leave it out.")
+        self.take_in(scans, "real" if real else "generated", first)
+
+    def take_in(self, scans: Scans, side: Side, first: int) -> None:
+        """Add a batch to the statistics of a side."""
         rows = self.rows(scans)
         whole = rows.isfinite().all(1)
         self.add_scans(side, len(rows), int((~whole).sum()))
@@ -111,7 +141,7 @@ class ScanMetric(Metric):
             self.store(side).write(first, rows)
 
     def forward(self, scans: Scans, real: bool, first: int = 0) -> dict[str, float]:
-        """Take in a batch, which has no distance of its own: no figures."""
+        """Take in a batch; a batch has no distance of its own, so there are no figures."""
         self.update(scans, real, first)
         return {}
 
@@ -119,40 +149,44 @@ class ScanMetric(Metric):
         """Figures by name. A figure that does not exist is NaN, and `remarks` says why.
 
         Raises:
-            InputError: rows kept by number are fewer or more than the scans counted.
+            InputError: more or fewer rows are kept than scans were given.
         """
         for side in SIDES:
             if self.keeps and len(self.store(side)) != self.count(side):
                 raise InputError(
-                    f"{self.protocol.metric}: {self.count(side)} {side} scans were given but {len(self.store(side))} "
-                    "are kept; give every batch its own numbers (first), and all processes one folder, a fresh one."
+                    f"{self.name}: {self.count(side)} {side} scans were given but {len(self.store(side))} are kept; "
+                    "give every batch its own numbers (first), and all processes one folder, an empty one."
                 )
         values, remarks = self.figures()
-        self._said = self._left_out() + remarks
+        self._remarks = self._left_out() + remarks
         return values
 
     def remarks(self) -> list[str]:
-        """What a reader of the figures must know: empty scans, fewer scans than dimensions, one scan alone."""
+        """What a reader of the figures must know: empty scans, fewer scans than features, a single scan."""
         self.compute()
-        return list(self._said)
+        return list(self._remarks)
 
     def add_scans(self, side: Side, scans: int, left_out: int) -> None:
-        """Count scans of a side, and those among them that had nothing to give."""
+        """Count scans of a side, and those among them that have nothing to compare."""
         getattr(self, f"{side}_scans").add_(scans)
         getattr(self, f"{side}_left_out").add_(left_out)
 
+    def given(self, side: Side) -> int:
+        """Scans of a side."""
+        return int(getattr(self, f"{side}_scans"))
+
     def count(self, side: Side) -> int:
-        """Scans that have something to give."""
-        return int(getattr(self, f"{side}_scans")) - int(getattr(self, f"{side}_left_out"))
+        """Scans of a side that have something to compare."""
+        return self.given(side) - int(getattr(self, f"{side}_left_out"))
 
     def store(self, side: Side) -> FeatureStore:
-        """Where the rows of a side are kept."""
+        """The kept rows of a side."""
         if side not in self._stores:
-            self._stores[side] = FeatureStore(f"{self.protocol.metric}-{side}", self.folder)
+            self._stores[side] = FeatureStore(f"{self.name}-{side}", self.folder)
         return self._stores[side]
 
     def real_state(self) -> dict[str, Tensor]:
-        """All that is known of the real set, on the CPU and gathered from all processes: for a cache on disk."""
+        """All statistics of the real set, on the CPU and gathered from all processes: for a cache on disk."""
         with self.sync_context():
             names = [name for name in self._defaults if name.startswith("real_")]
             state = {name: getattr(self, name).detach().cpu().clone() for name in names}
@@ -161,12 +195,12 @@ class ScanMetric(Metric):
         return state
 
     def load_real_state(self, state: Mapping[str, Tensor]) -> None:
-        """Take the real set from `real_state` after `reset`, instead of scans.
+        """Take the real set's statistics from `real_state`, after `reset`.
 
-        With several processes the first one holds it, until figures are made.
+        With several processes the first one holds them until figures are computed.
 
         Raises:
-            InputError: a state of another metric, or without the rows that this one is to keep.
+            InputError: a state of another metric, or without the rows that this one keeps.
         """
         own = {name: getattr(self, name) for name in self._defaults if name.startswith("real_")}
         wanted = {name: tuple(value.shape) for name, value in own.items()}
@@ -175,7 +209,7 @@ class ScanMetric(Metric):
         if not fits or (self.keeps and "real_rows" not in found):
             rows = " and the rows of its scans" if self.keeps else ""
             raise InputError(
-                f"the kept statistics of the real set do not fit {self.protocol.metric}: it takes {wanted}{rows}, "
+                f"the kept statistics of the real set do not fit {self.name}: it takes {wanted}{rows}, "
                 f"found {found}; measure the real set again."
             )
         if dist.is_available() and dist.is_initialized() and dist.get_rank() > 0:
@@ -191,34 +225,29 @@ class ScanMetric(Metric):
         if self.keeps:
             for side in SIDES:  # both, in every process: their files are numbered by how often they were cleared
                 self.store(side).clear()
-        self._said = []
+        self._remarks = []
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        """Figures of sets that were drawn again from the kept rows, (R) for each name.
+        """Figures of resampled sets, computed from the kept rows, (R) for each name.
 
         Args:
             weights: How often each kept scan of a side was drawn, (R, N), float64.
 
         Raises:
-            InputError: a metric that has no interval.
+            InputError: a metric without intervals.
         """
-        raise InputError(f"{self.protocol.metric} has no bootstrap interval; leave it out of what needs one.")
-
-    def own_group(self) -> None:
-        """Keep a MetricCollection from taking two metrics for one because their counts of scans agree.
-
-        It compares states by name and value, and what a store holds is no state.
-        """
-        self.add_state(f"name_{self.protocol.metric}", torch.tensor(0), dist_reduce_fx="sum")
+        raise InputError(f"{self.name} has no bootstrap interval; leave it out.")
 
     def _left_out(self) -> list[str]:
-        said = []
+        remarks = []
         for side in SIDES:
-            scans, left_out = int(getattr(self, f"{side}_scans")), int(getattr(self, f"{side}_left_out"))
+            scans, compared = self.given(side), self.count(side)
             if scans == 0:
-                said.append(f"there are no {side} scans.")
-            elif left_out == scans:
-                said.append(f"none of the {scans} {side} scans has anything to compare, as if all were empty.")
-            elif left_out:
-                said.append(f"{left_out} of {scans} {side} scans are left out: empty, or nothing of them counts here.")
-        return said
+                remarks.append(f"there are no {side} scans.")
+            elif compared == 0:
+                remarks.append(f"none of the {scans} {side} scans has anything to compare; are all of them empty?")
+            elif compared < scans:
+                remarks.append(
+                    f"{scans - compared} of {scans} {side} scans are left out: empty, or nothing to compare."
+                )
+        return remarks

@@ -1,14 +1,13 @@
-"""What each beam measures: its ranges, its reflectances, and how often nothing comes back."""
+"""Statistics of single beams: ranges, reflectances, and the share of rays without a return."""
 
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.metrics.base import Protocol
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.metrics.scans import MASK, Scans
 from r2flow.metrics.sums import SumMetric
@@ -20,29 +19,24 @@ _BINS = len(RANGES) - 1 + len(REFLECTANCES) - 1
 
 
 class BeamHistograms(SumMetric):
-    """Jensen-Shannon distance between real and generated ranges of one beam, averaged over beams.
+    """Jensen-Shannon distance between the real and the generated histograms of one beam, averaged over the beams.
 
-    `beam_range` from 32 bins of equal logarithmic width over the mask, `beam_reflectance` from 25 bins over [0, 1] into
-    whose ends falls what lies beyond. Unlike the bird's-eye view, which adds all beams up, it sees a beam that is off.
-
-    Args:
-        keep: Keep the histograms of every scan, for bootstrap intervals.
-        folder: Where to.
+    `beam_range` has 32 bins of equal logarithmic width over the mask, `beam_reflectance` 25 bins over [0, 1], of which
+    the outer ones take all that lies beyond. Unlike the bird's-eye view, which adds up all beams, it sees a single beam
+    that is off.
     """
 
-    def __init__(self, keep: bool = False, folder: str | Path | None = None) -> None:
-        super().__init__(MOST_BEAMS * _BINS, keep, folder)
-
-    @property
-    def protocol(self) -> Protocol:
-        settings: dict[str, Any] = {
-            "range bins": len(RANGES) - 1, "reflectance bins": len(REFLECTANCES) - 1,
-            "distance": "mean over beams of the Jensen-Shannon distance",
-        }  # fmt: skip
-        return Protocol("beams", "range image", settings=settings)
+    name = "beams"
+    representation = "range image"
+    settings: ClassVar[Mapping[str, Any]] = {
+        "range bins": len(RANGES) - 1, "reflectance bins": len(REFLECTANCES) - 1,
+        "distance": "mean over beams of the Jensen-Shannon distance",
+    }  # fmt: skip
+    width = MOST_BEAMS * _BINS
+    uses_reflectance = True
 
     def rows(self, scans: Scans) -> Tensor:
-        _check_beams(scans)
+        _check_beams(self.name, scans)
         ranges = _per_beam(scans.images[:, 0], scans.returned[:, 0], RANGES)
         if scans.has_reflectance:
             reflectances = _per_beam(scans.images[:, 1], scans.returned[:, 0], REFLECTANCES)
@@ -54,23 +48,23 @@ class BeamHistograms(SumMetric):
     def figures_of(self, real: np.ndarray, generated: np.ndarray) -> dict[str, float]:
         sides = [total.reshape(-1, _BINS) for total in (real, generated)]
         ranges, reflectances = zip(*(np.split(side, [len(RANGES) - 1], axis=1) for side in sides), strict=True)
-        seen = all(side.any() for side in reflectances)
+        known = all(side.any() for side in reflectances)
         return {
             "beam_range": _mean_distance(*ranges),
-            "beam_reflectance": _mean_distance(*reflectances) if seen else float("nan"),
+            "beam_reflectance": _mean_distance(*reflectances) if known else float("nan"),
         }
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         values, remarks = super().figures()
         if np.isnan(values["beam_reflectance"]):
-            remarks.append("beam_reflectance: does not exist, as a side has no reflectance.")
+            remarks.append("beam_reflectance does not exist: a side has no reflectance.")
         return values, remarks
 
 
-def _check_beams(scans: Scans) -> None:
+def _check_beams(metric: str, scans: Scans) -> None:
     beams = scans.sensor.shape[0]
     if beams > MOST_BEAMS:
-        raise InputError(f"beams of sensors with up to {MOST_BEAMS} of them can be compared, found {beams}.")
+        raise InputError(f"{metric}: sensors with up to {MOST_BEAMS} beams can be compared, found {beams}.")
 
 
 def _per_beam(values: Tensor, returned: Tensor, edges: np.ndarray) -> Tensor:
@@ -90,30 +84,22 @@ def _mean_distance(real: np.ndarray, generated: np.ndarray) -> float:
 
 
 class DropRate(SumMetric):
-    """How far the share of rays without a return is off: over all rays, and as the mean of every beam's error.
+    """Error of the share of rays without a return: of all rays, and as the mean over the beams.
 
-    `drop_rate` = |d_real - d_generated|; `drop_rate_beams` = mean_h |d_real(h) - d_generated(h)|, where many beams that
-    drop too much do not make up for others that drop too little. A return beyond the mask counts as none; an empty scan
-    has dropped all of its rays and counts like any other.
-
-    Args:
-        keep: Keep every scan's counts, for bootstrap intervals.
-        folder: Where to.
+    `drop_rate` = |d_real - d_generated|; `drop_rate_beams` = mean_h |d_real(h) - d_generated(h)|, in which beams that
+    drop too much do not cancel others that drop too little. A return beyond the mask counts as none; an empty scan has
+    dropped all of its rays and counts like any other.
     """
 
-    def __init__(self, keep: bool = False, folder: str | Path | None = None) -> None:
-        super().__init__(MOST_BEAMS + 1, keep, folder)
-
-    @property
-    def protocol(self) -> Protocol:
-        return Protocol("drop_rate", "range image", settings={"of": "rays without a return within the mask"})
+    name = "drop_rate"
+    representation = "range image"
+    settings: ClassVar[Mapping[str, Any]] = {"of": "rays without a return within the mask"}
+    width = MOST_BEAMS + 1
+    counts_empty = True
 
     def rows(self, scans: Scans) -> Tensor:
+        _check_beams(self.name, scans)
         dropped = (~scans.returned[:, 0]).sum(-1)  # counts, and W beside them: whole numbers add up exactly
-        if dropped.shape[1] > MOST_BEAMS:
-            raise InputError(
-                f"drop_rate: sensors of up to {MOST_BEAMS} beams can be compared, found {dropped.shape[1]}."
-            )
         return torch.cat([dropped, dropped.new_full((len(dropped), 1), scans.images.shape[-1])], 1).double()
 
     def figures_of(self, real: np.ndarray, generated: np.ndarray) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""How sure a figure is: intervals from sets drawn again from the scans at hand."""
+"""Bootstrap intervals of a metric's figures, from resampling the scans."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,20 +11,20 @@ from r2flow.errors import InputError
 from r2flow.metrics.base import SIDES, ScanMetric, Side
 from r2flow.noise import generator
 
-DRAWS = 2**63  # index of the first draw: those from 0 on are the noise of scans
+DRAWS = 2**63  # index of the first draw; indices from 0 on are the noise of scans
 AT_ONCE = 20  # draws that a metric is asked for together
 
 
 @dataclass(frozen=True)
 class Interval:
-    """Where a figure lies, by bootstrap.
+    """The bootstrap interval of a figure.
 
     Attributes:
         low: Lower end.
         high: Upper end.
         level: Share of resampled figures between them.
         draws: How many there were.
-        bias: By how much they exceed the figure on average: this much was taken from both ends.
+        bias: Their mean less the figure, which is taken from both ends.
     """
 
     low: float
@@ -43,18 +43,16 @@ def bootstrap(
 ) -> dict[str, Interval]:
     """Percentile intervals of a metric's figures, from resampling the scans of both sides, Efron (1979).
 
-    A draw is N scans of the N, with repetition, as weights of the kept rows: nothing is copied, and a network never
-    runs again. Nearly all these distances grow when scans are repeated, as they grow with fewer scans, so that the
-    figure itself would lie below its interval: the ends are moved by the mean excess, and never below 0 where the
-    figure is not.
+    A draw is N of the N scans, with repetition, as weights of the kept rows: nothing is copied and no network runs
+    again. Nearly all these distances grow when scans are repeated, as they grow with fewer scans, so that the figure
+    itself would lie below its interval: the mean excess is taken from both ends, but none goes below 0.
 
-    Cost of a draw: JSD, beams, drop rate a product of its weights with the rows; MMD and the manifold next to nothing
-    after the kernel or the neighbours were computed, once for 20 draws; Frechet two scatter matrices and three spectra,
-    on a core 0.04 s for 256 features, 0.25 s for 512 and a minute for 4096, but 0.25 s for 4096 of 1000 scans, as then
-    nothing larger than the scans' products is decomposed.
+    Cost of a draw: for JSD, beams and drop rate a product of weights and rows; for MMD little, after the kernel, which
+    is computed once for 20 draws; for Frechet distances two scatter matrices and three spectra: on a core 0.04 s for
+    256 features, 0.25 s for 512, a minute for 4096, but 0.25 s for 4096 features of 1000 scans.
 
     Args:
-        metric: Made with `keep=True`, and given both sets.
+        metric: Built with `keep=True`, after both sets.
         draws: Resampled pairs of sets.
         level: Share of them within the interval.
         seed: Draw r depends on the seed and on r alone.
@@ -69,7 +67,7 @@ def bootstrap(
     if not metric.resamples:
         return {}
     if not metric.keeps:
-        raise InputError(f"{metric.protocol.metric} keeps nothing of single scans; build it with keep=True.")
+        raise InputError(f"{metric.name} keeps no rows of single scans; build it with keep=True.")
     if draws < 2 or not 0 < level < 1:
         raise InputError(f"a bootstrap needs 2 draws and a level within (0, 1), found {draws} and {level}.")
     values = {name: value for name, value in metric.compute().items() if not np.isnan(value)}

@@ -2,35 +2,31 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from r2flow.metrics.base import SIDES, Protocol, ScanMetric, Side
+from r2flow.metrics import FIELD_NAMES
+from r2flow.metrics.base import SIDES, Side
 from r2flow.metrics.extractors.base import Extractor
-from r2flow.metrics.features import FeatureStore, extract
+from r2flow.metrics.features import FeatureMetric
 from r2flow.metrics.moments import Moments, add_moments, merge_moments, moments, no_moments
-from r2flow.metrics.scans import Scans
-
-# What the field calls the distance on each network's features.
-FIELD_NAMES = {"rangenet53": "frd", "rangenet21": "frid", "pointnet": "fpd", "spvcnn": "fpvd", "minkowskinet": "fsvd"}
+from r2flow.metrics.store import FeatureStore
 
 BLOCK = 4000  # kept features read at once
 
 
 def frechet_distance(mean_1: Tensor, covariance_1: Tensor, mean_2: Tensor, covariance_2: Tensor) -> float:
-    """d^2 = |mu_1 - mu_2|^2 + tr(S_1 + S_2 - 2 (S_1 S_2)^(1/2)), of Dowson and Landau (1982).
+    """d^2 = |mu_1 - mu_2|^2 + tr(S_1 + S_2 - 2 (S_1 S_2)^(1/2)), of Dowson and Landau (1982), in float64.
 
-    With S_i = A_i A_i^T, of eigenvectors times the roots of their eigenvalues, tr (S_1 S_2)^(1/2) is the sum of the
-    singular values of A_1^T A_2. No complex root appears, singular covariances need no added diagonal, and no root is
-    taken of a rounding error: the eigenvalues of S_1^(1/2) S_2 S_1^(1/2), the usual way, have one of eps |S|^2 each,
-    and their roots one of sqrt(eps) |S|.
+    With S_i = A_i A_i^T, eigenvectors times the roots of their eigenvalues, tr (S_1 S_2)^(1/2) is the sum of the
+    singular values of A_1^T A_2. No complex root appears and singular covariances need no added diagonal. The usual
+    eigenvalues of S_1^(1/2) S_2 S_1^(1/2) have a rounding error of eps |S|^2, and their roots one of sqrt(eps) |S|.
 
     Args:
         mean_1: (D), as mean_2.
-        covariance_1: (D, D), as covariance_2: symmetric, eigenvalues of 0 or more but for rounding.
-
-    All is float64 here, whatever they are.
+        covariance_1: (D, D), as covariance_2: symmetric, positive semidefinite but for rounding.
     """
     a_1, a_2 = root(covariance_1.double()), root(covariance_2.double())
     return distance_from_roots(mean_1.double(), a_1, mean_2.double(), a_2)
@@ -53,58 +49,35 @@ def root(covariance: Tensor) -> Tensor:
     return vectors[:, kept] * values[kept].sqrt()
 
 
-class FrechetDistance(ScanMetric):
+class FrechetDistance(FeatureMetric):
     """Frechet distance between features of real and generated scans, of Heusel et al. (2017).
 
     The Gaussians have the mean and the unbiased covariance of the features. Both are added up in float64; nothing else
-    is kept. A figure of 4096 features takes a minute on a core, one of 256 next to nothing.
+    is kept. The distance takes a minute on a core for 4096 features, and next to nothing for 256.
 
-    The network gives the figure its name: `frd` (RangeNet-53, Zyrianov et al. 2022), `frid` (RangeNet-21), `fpvd`
-    (SPVCNN) and `fsvd` (MinkowskiNet, all three Ran et al. 2024), `fpd` (PointNet, Shu et al. 2019), and
-    `frechet_<network>` for any other, or `frechet_<network>_random` for one without trained weights.
-
-    Args:
-        extractor: The network, or its name in `EXTRACTORS` to have it loaded with its weights.
-        keep: Keep the features as well, for bootstrap intervals.
-        folder: Where to.
-
-    Raises:
-        InputError: no network of that name, or no weights for it on this machine.
+    The network gives it its name: `frd` (RangeNet-53, Zyrianov et al. 2022), `frid` (RangeNet-21), `fpvd` (SPVCNN) and
+    `fsvd` (MinkowskiNet, all three Ran et al. 2024), `fpd` (PointNet, Shu et al. 2019), `frechet_<network>` for any
+    other, `frechet_<network>_random` for one without trained weights.
     """
 
+    kind = "frechet"
+    names = FIELD_NAMES
+    settings: ClassVar[Mapping[str, Any]] = {"covariance": "unbiased, n - 1"}
+
     def __init__(self, extractor: Extractor | str, keep: bool = False, folder: str | Path | None = None) -> None:
-        super().__init__(keep, folder)
-        self.extractor = loaded(extractor)
-        self.needs_reflectance = self.extractor.needs_reflectance
+        super().__init__(extractor, keep, folder)
         for side in SIDES:
             self.add_state(f"{side}_moments", no_moments(self.extractor.dim), dist_reduce_fx=merge_moments)
-        self.own_group()
-
-    @property
-    def protocol(self) -> Protocol:
-        network = self.extractor
-        name = FIELD_NAMES.get(network.name, f"frechet_{network.name}")
-        return Protocol(
-            metric=name if network.weights != "random" else f"frechet_{network.name}_random",
-            representation="features of a network",
-            extractor=network.name,
-            weights=network.weights,
-            layer=f"{network.layer}, {network.dim}",
-            settings={"covariance": "unbiased, n - 1"},
-        )
-
-    def rows(self, scans: Scans) -> Tensor:
-        return extract(self.extractor, scans)
 
     def accumulate(self, rows: Tensor, side: Side) -> None:
         add_moments(getattr(self, f"{side}_moments"), rows)
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
-        name = self.protocol.metric
+        name = self.name
         both = {side: moments(getattr(self, f"{side}_moments")) for side in SIDES}
         if min(one.n for one in both.values()) < 2:
             few = [f"{one.n} {side}" for side, one in both.items() if one.n < 2]
-            return {name: float("nan")}, [f"{name}: {' and '.join(few)} scans have no covariance; two are the least."]
+            return {name: float("nan")}, [f"{name}: {' and '.join(few)} scans have no covariance; it takes two."]
         real, generated = both["real"], both["generated"]
         value = frechet_distance(real.mean, real.covariance, generated.mean, generated.covariance)
         return {name: value}, [r for side, one in both.items() for r in _remarks(name, side, one)]
@@ -115,7 +88,7 @@ class FrechetDistance(ScanMetric):
             pair = (weighted_root(self.store(s), w) for s, w in zip(SIDES, (real, generated), strict=True))
             (mean_1, a_1), (mean_2, a_2) = pair
             drawn.append(distance_from_roots(mean_1, a_1, mean_2, a_2))
-        return {self.protocol.metric: torch.tensor(drawn, dtype=torch.float64)}
+        return {self.name: torch.tensor(drawn, dtype=torch.float64)}
 
 
 def weighted_root(store: FeatureStore, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -133,19 +106,6 @@ def weighted_root(store: FeatureStore, weights: Tensor) -> tuple[Tensor, Tensor]
     for x in parts:
         scatter.addmm_(x.T, x)
     return mean, root(scatter / (n - 1))
-
-
-def loaded(extractor: Extractor | str) -> Extractor:
-    """A network as it is, or the one of a name with its weights.
-
-    Raises:
-        InputError: no such name, or weights that are not on this machine.
-    """
-    if isinstance(extractor, Extractor):
-        return extractor.eval()
-    from r2flow.metrics.extractors import load_extractor
-
-    return load_extractor(extractor)
 
 
 def _remarks(name: str, side: Side, one: Moments) -> list[str]:

@@ -1,12 +1,13 @@
-"""How alike two sets of scans look from above when each set is added up: the field's JSD."""
+"""JSD of the field: the bird's-eye histograms of two sets, each added up over its scans."""
 
-from pathlib import Path
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.metrics.base import SIDES, Protocol
+from r2flow.metrics.base import SIDES, ScanMetric
 from r2flow.metrics.birds_eye import BINS, PROTOCOL, js_distance
 from r2flow.metrics.scans import Scans
 from r2flow.metrics.sums import SumMetric
@@ -17,18 +18,12 @@ class JSD(SumMetric):
 
     sqrt((KL(p || m) + KL(q || m)) / 2), m = (p + q) / 2, natural logarithm: the square root of the divergence, as the
     field prints it (times 100) since Zyrianov et al. (2022). 0 for equal histograms, 0.833 for disjoint ones.
-
-    Args:
-        keep: Keep the histogram of every scan, for bootstrap intervals.
-        folder: Where to.
     """
 
-    def __init__(self, keep: bool = False, folder: str | Path | None = None) -> None:
-        super().__init__(BINS * BINS, keep, folder)
-
-    @property
-    def protocol(self) -> Protocol:
-        return Protocol("jsd", "bird's-eye histogram", settings={**PROTOCOL, "logarithm": "natural", "root": True})
+    name = "jsd"
+    representation = "bird's-eye histogram"
+    settings: ClassVar[Mapping[str, Any]] = {**PROTOCOL, "logarithm": "natural", "root": True}
+    width = BINS * BINS
 
     def rows(self, scans: Scans) -> Tensor:
         return histograms(scans)
@@ -38,7 +33,7 @@ class JSD(SumMetric):
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         values, remarks = super().figures()
-        return values, [*remarks, *one_sided("jsd", self.count("real"), self.count("generated"))]
+        return values, [*remarks, *one_sided(self)]
 
 
 def histograms(scans: Scans) -> Tensor:
@@ -47,9 +42,9 @@ def histograms(scans: Scans) -> Tensor:
     return torch.where(counts.sum(1, keepdim=True) > 0, counts, torch.nan)
 
 
-def one_sided(name: str, *counts: int) -> list[str]:
-    """The remark where one set alone has a return."""
-    sides = [side for side, count in zip(SIDES, counts, strict=True) if not count]
-    return (
-        [f"{name}: no {sides[0]} scan has a return, as far as can be from a set with some."] if len(sides) == 1 else []
-    )
+def one_sided(metric: ScanMetric) -> list[str]:
+    """The remark for a comparison in which only one set has a return."""
+    empty = [side for side in SIDES if not metric.count(side)]
+    if len(empty) != 1:
+        return []
+    return [f"{metric.name}: no {empty[0]} scan has a return: the largest distance that there is."]

@@ -1,67 +1,44 @@
 """Kernel distance between features: an unbiased relative of the Frechet distance for few scans."""
 
-from pathlib import Path
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.metrics.base import SIDES, Protocol, ScanMetric
-from r2flow.metrics.extractors.base import Extractor
-from r2flow.metrics.features import extract
-from r2flow.metrics.frechet import loaded
-from r2flow.metrics.scans import Scans
+from r2flow.metrics.base import SIDES
+from r2flow.metrics.features import FeatureMetric
 from r2flow.noise import generator
 
 SUBSETS, SUBSET_SIZE = 100, 1000
-DRAWS = 2**62  # index of the first subset's draw: those from 0 on are the noise of scans
+DRAWS = 2**62  # index of the first subset's draw; indices from 0 on are the noise of scans
 
 
-class KernelDistance(ScanMetric):
+class KernelDistance(FeatureMetric):
     """Mean over 100 random subsets of the squared MMD with a cubic kernel, the KID of Binkowski et al. (2018).
 
-    k(a, b) = (a . b / D + 1)^3 on a network's D features, 1000 scans of each set in a subset, or as many as the smaller
-    set has, without repetition; unbiased, so that it may fall below 0. The field's R2DM evaluation computes the same.
-
-    Args:
-        extractor: The network, or its name in `EXTRACTORS`.
-        keep: Features are always kept.
-        folder: Where to.
-
-    Raises:
-        InputError: no network of that name, or no weights for it on this machine.
+    k(a, b) = (a . b / D + 1)^3 on a network's D features. A subset has 1000 scans of each set, or as many as the
+    smaller set has, without repetition. The estimate is unbiased, so that it may fall below 0. R2DM's evaluation
+    computes the same.
     """
 
+    kind = "kid"
+    settings: ClassVar[Mapping[str, Any]] = {
+        "kernel": "(a b / D + 1)^3",
+        "subsets": SUBSETS,
+        "subset size": SUBSET_SIZE,
+        "seed": 0,
+    }
+    keeping = "always"
     resamples = False  # it is a mean over subsets already
-
-    def __init__(
-        self, extractor: Extractor | str = "embedded", keep: bool = True, folder: str | Path | None = None
-    ) -> None:
-        super().__init__(True, folder)
-        self.extractor = loaded(extractor)
-        self.needs_reflectance = self.extractor.needs_reflectance
-        self.own_group()
-
-    @property
-    def protocol(self) -> Protocol:
-        network = self.extractor
-        return Protocol(
-            metric=f"kid_{network.name}" + ("_random" if network.weights == "random" else ""),
-            representation="features of a network",
-            extractor=network.name,
-            weights=network.weights,
-            layer=f"{network.layer}, {network.dim}",
-            settings={"kernel": "(a b / D + 1)^3", "subsets": SUBSETS, "subset size": SUBSET_SIZE, "seed": 0},
-        )
-
-    def rows(self, scans: Scans) -> Tensor:
-        return extract(self.extractor, scans)
+    of_equal_sets = None
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
-        name = self.protocol.metric
+        name = self.name
         size = min(SUBSET_SIZE, *(self.count(side) for side in SIDES))
         if size < 2:
-            return {name: float("nan")}, [f"{name}: needs two scans a side."]
+            return {name: float("nan")}, [f"{name} needs two scans of each set."]
         both = [self.store(side).tensor() for side in SIDES]
         orders = [own_order(rows.numpy()) for rows in both]
         values = []
@@ -74,9 +51,9 @@ class KernelDistance(ScanMetric):
 
 
 def own_order(rows: np.ndarray) -> np.ndarray:
-    """Numbers of rows (N, D) as their values sort them, (N): that of the scans is nothing to the figure.
+    """The order of rows (N, D) by their values, (N), so that the order of the scans does not change the figure.
 
-    The first few columns decide, and more where they are equal: a channel may be 0 in every scan.
+    The first few columns decide, and more where these are equal: a channel may be 0 in every scan.
     """
     columns = 4
     while True:

@@ -7,12 +7,12 @@ al. (2018). There 2000 samples are compared with KITTI-360's drive 0003.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from r2flow.metrics.base import SIDES, Protocol, ScanMetric, Side
+from r2flow.metrics.base import SIDES, ScanMetric, Side
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.metrics.jsd import one_sided
 from r2flow.metrics.scans import Scans
@@ -34,27 +34,28 @@ def occupied(points: Tensor, cell: float) -> Tensor:
 class JSDLiDM(ScanMetric):
     """Jensen-Shannon distance (root, natural logarithm) between how many scans of each set hold each 5 cm cell.
 
-    Args:
-        keep: Nothing of single scans is kept, of 4 million cells each: there is no interval.
-        folder: Nothing lies there.
+    Nothing of single scans is kept, of 4 million cells each: there are no intervals.
     """
 
+    name = "jsd_lidm"
+    representation = "occupied cells from above"
+    mask = (NEAR, FAR)
+    settings: ClassVar[Mapping[str, Any]] = {
+        "cell": FINE,
+        "metres": [-EXTENT, EXTENT],
+        "logarithm": "natural",
+        "root": True,
+    }
+    keeping = "never"
     resamples = False
 
     def __init__(self, keep: bool = False, folder: str | Path | None = None) -> None:
-        super().__init__(False, folder)
+        super().__init__(keep, folder)
         cells = round(2 * EXTENT / FINE) ** 2
         for side in SIDES:
             self.add_state(f"{side}_cells", torch.zeros(cells, dtype=torch.int32), dist_reduce_fx="sum")
-        self.own_group()
 
-    @property
-    def protocol(self) -> Protocol:
-        settings: dict[str, Any] = {"cell": FINE, "metres": [-EXTENT, EXTENT], "logarithm": "natural", "root": True}
-        return Protocol("jsd_lidm", "occupied cells from above", (NEAR, FAR), settings=settings)
-
-    def update(self, scans: Scans, real: bool, first: int = 0) -> None:
-        side: Side = "real" if real else "generated"
+    def take_in(self, scans: Scans, side: Side, first: int) -> None:
         cells: Tensor = getattr(self, f"{side}_cells")
         found = [occupied(points, FINE) for points in scans.points]
         for one in found:
@@ -63,9 +64,9 @@ class JSDLiDM(ScanMetric):
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         real, generated = (getattr(self, f"{side}_cells").cpu().numpy() for side in SIDES)
-        if not all(int(getattr(self, f"{side}_scans")) for side in SIDES):
+        if not all(self.given(side) for side in SIDES):
             return {"jsd_lidm": float("nan")}, []
-        return {"jsd_lidm": js_distance(real, generated)}, one_sided("jsd_lidm", *(self.count(s) for s in SIDES))
+        return {"jsd_lidm": js_distance(real, generated)}, one_sided(self)
 
 
 class MMDLiDM(ScanMetric):
@@ -74,20 +75,17 @@ class MMDLiDM(ScanMetric):
     A scan is the set A of 0.5 m cells that hold a return, in a square of side 1. With |a - B| the distance of a cell
     from the nearest one of B, the distance is (mean_a |a - B|^2 + mean_b |b - A|^2) / 2. The squared distance map of
     every scan is computed once and kept; the Chamfer distances of all pairs are then two matrix products, exactly.
-
-    Args:
-        keep: The maps are always kept.
-        folder: Where to.
     """
 
-    def __init__(self, keep: bool = True, folder: str | Path | None = None) -> None:
-        super().__init__(True, folder)
-        self.own_group()
-
-    @property
-    def protocol(self) -> Protocol:
-        settings: dict[str, Any] = {"cell": COARSE, "metres": [-EXTENT, EXTENT], "distance": "Chamfer, squared, halved"}
-        return Protocol("mmd_lidm", "occupied cells from above", (NEAR, FAR), settings=settings)
+    name = "mmd_lidm"
+    representation = "occupied cells from above"
+    mask = (NEAR, FAR)
+    settings: ClassVar[Mapping[str, Any]] = {
+        "cell": COARSE,
+        "metres": [-EXTENT, EXTENT],
+        "distance": "Chamfer, squared, halved",
+    }
+    keeping = "always"
 
     def rows(self, scans: Scans) -> Tensor:
         side = round(2 * EXTENT / COARSE)
@@ -100,12 +98,13 @@ class MMDLiDM(ScanMetric):
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         if not all(self.count(side) for side in SIDES):
-            return {"mmd_lidm": float("nan")}, ["mmd_lidm: does not exist without a return on either side."]
+            return {"mmd_lidm": float("nan")}, ["mmd_lidm does not exist where a set has no return."]
         return {"mmd_lidm": float(self._nearest().mean())}, []
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        """Means over the real scans drawn. The generated ones stay: nearest of two is no nearer for being there twice,
-        so that sets drawn again from them would only lack some.
+        """Means over the resampled real scans.
+
+        The generated scans stay: one that is drawn twice is no nearer, so that resampled sets would only lack some.
         """
         return {"mmd_lidm": weights["real"] @ self._nearest() / weights["real"].sum(1)}
 

@@ -1,33 +1,33 @@
 """Whether generated scans lie where real ones do, and real ones where generated ones do."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.metrics.base import SIDES, Protocol, ScanMetric
+from r2flow.metrics.base import SIDES, Protocol
 from r2flow.metrics.extractors.base import Extractor
-from r2flow.metrics.features import FeatureStore, extract
-from r2flow.metrics.frechet import loaded
-from r2flow.metrics.scans import Scans
+from r2flow.metrics.features import FeatureMetric
+from r2flow.metrics.store import FeatureStore
 
 BLOCK = 2000  # scans: their distances take 32 MB
-TIE = 1e-9  # relative: a neighbour at the very radius lies inside, however its distance was rounded
+TIE = 1e-9  # relative: a neighbour at exactly the radius lies inside, however its distance is rounded
 NAMES = ("precision", "recall", "density", "coverage")
 
 
-class Manifold(ScanMetric):
+class Manifold(FeatureMetric):
     """Precision, recall, density and coverage of generated scans, in the space of a network's features.
 
-    A set is taken for the union of balls around its scans, each as wide as the k-th nearest neighbour in the set lies
-    away. Kynkaanniemi et al. (2019): precision is the share of generated scans in a ball of a real one, recall that of
-    real scans in a ball of a generated one. Naeem et al. (2020): density is the mean number of real balls that a
-    generated scan lies in, over k (it may exceed 1, and a single outlier cannot lift it), coverage the share of real
+    A set is taken for the union of balls around its scans, each with the distance to its k-th nearest neighbour in the
+    set as radius. Kynkaanniemi et al. (2019): precision is the share of generated scans in a ball of a real one, recall
+    that of real scans in a ball of a generated one. Naeem et al. (2020): density is the mean number of real balls that
+    a generated scan lies in, over k (it may exceed 1, and a single outlier cannot raise it), coverage the share of real
     balls with a generated scan in them.
 
-    There is no bootstrap interval: in a set with scans drawn twice the balls shrink to nothing, and with the balls held
-    fast intervals of 95 % were seen to hold the mean figure in 76 to 81 of 100 cases.
+    There is no bootstrap interval: balls around scans that are drawn twice have no radius, and with the balls held
+    fixed, intervals of 95 % held the mean figure in 76 to 81 of 100 cases.
 
     The figures are named `precision_<network>` and so on, with `_k<k>` for another k than 5.
 
@@ -35,62 +35,40 @@ class Manifold(ScanMetric):
         extractor: The network, or its name in `EXTRACTORS`.
         neighbours: k.
         keep: Features are always kept.
-        folder: Where to.
+        folder: Where they are kept.
 
     Raises:
         InputError: k below 1; no network of that name, or no weights for it on this machine.
     """
 
+    kind = "manifold"
+    keeping = "always"
     resamples = False
+    of_equal_sets = None
 
     def __init__(
-        self,
-        extractor: Extractor | str = "embedded",
-        neighbours: int = 5,
-        keep: bool = True,
-        folder: str | Path | None = None,
+        self, extractor: Extractor | str, neighbours: int = 5, keep: bool = True, folder: str | Path | None = None
     ) -> None:
-        super().__init__(True, folder)
         if neighbours < 1:
             raise InputError(f"manifold: neighbours must be at least 1, found {neighbours}.")
-        self.extractor = loaded(extractor)
-        self.needs_reflectance = self.extractor.needs_reflectance
+        super().__init__(extractor, keep, folder, suffix=f"_k{neighbours}" if neighbours != 5 else "")
         self.neighbours = neighbours
-        self.own_group()
 
     @property
     def protocol(self) -> Protocol:
-        network = self.extractor
-        return Protocol(
-            metric=f"manifold_{self._suffix}",
-            representation="features of a network",
-            extractor=network.name,
-            weights=network.weights,
-            layer=f"{network.layer}, {network.dim}",
-            settings={"neighbours": self.neighbours, "distance": "Euclidean"},
-        )
-
-    @property
-    def _suffix(self) -> str:
-        random = "_random" if self.extractor.weights == "random" else ""
-        return f"{self.extractor.name}{random}" + (f"_k{self.neighbours}" if self.neighbours != 5 else "")
-
-    def rows(self, scans: Scans) -> Tensor:
-        return extract(self.extractor, scans)
+        return replace(super().protocol, settings={"neighbours": self.neighbours, "distance": "Euclidean"})
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
-        names = [f"{name}_{self._suffix}" for name in NAMES]
+        names = [f"{name}_{self.name.removeprefix('manifold_')}" for name in NAMES]
         few = [side for side in SIDES if self.count(side) <= self.neighbours]
         if few:
-            said = (
-                f"{self.protocol.metric}: too few {' and '.join(few)} scans to have {self.neighbours} neighbours each."
-            )
-            return dict.fromkeys(names, float("nan")), [said]
+            remark = f"{self.name}: too few {' and '.join(few)} scans to have {self.neighbours} neighbours each."
+            return dict.fromkeys(names, float("nan")), [remark]
         per_scan = self._per_scan()
         return {name: float(per_scan[one].mean()) for name, one in zip(names, NAMES, strict=True)}, []
 
     def _per_scan(self) -> dict[str, Tensor]:
-        """What each scan adds to the figures, (N) of the side that is asked."""
+        """What each scan of the side in question adds to the figures, (N)."""
         real, generated = self.store("real"), self.store("generated")
         middle = next(block for _, block in real.blocks(BLOCK)).mean(0)
         in_real, in_generated = (radii(store, self.neighbours, middle) * (1 + TIE) for store in (real, generated))
@@ -126,7 +104,7 @@ def radii(store: FeatureStore, k: int, middle: Tensor) -> Tensor:
 
 
 def squared_distances(x: Tensor, y: Tensor) -> Tensor:
-    """|x - y|^2 of all pairs, (N, M), from products; what rounding alone has left of equal rows is 0."""
+    """|x - y|^2 of all pairs, (N, M), from products; the rounding error between equal rows is set to 0."""
     size = x.square().sum(1)[:, None] + y.square().sum(1)
     d = size - 2 * x @ y.T
     return d.masked_fill_(d <= 1e-12 * size, 0)

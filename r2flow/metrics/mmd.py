@@ -1,16 +1,16 @@
-"""How alike the single scans of two sets look from above: the field's MMD."""
+"""MMD of the field: the bird's-eye histograms of single scans."""
 
 from collections.abc import Mapping
-from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from r2flow.metrics.base import SIDES, Protocol, ScanMetric, Side
+from r2flow.metrics.base import SIDES, ScanMetric, Side
 from r2flow.metrics.birds_eye import PROTOCOL
-from r2flow.metrics.features import FeatureStore
 from r2flow.metrics.jsd import histograms
 from r2flow.metrics.scans import Scans
+from r2flow.metrics.store import FeatureStore
 
 SIGMA = 0.5
 BLOCK = 500  # scans: two blocks of histograms and what is made of them take 250 MB
@@ -21,31 +21,23 @@ class MMD(ScanMetric):
 
     MMD^2 = mean k(p, p') + mean k(q, q') - 2 mean k(p, q), k(a, b) = exp(-|a - b|^2 / (2 sigma^2)), sigma = 0.5: the
     biased estimate of Gretton et al. (2012), without a root and with each scan against itself, as the field prints it
-    (times 10^4) since Zyrianov et al. (2022). Of its digits float32 loses the first ones: all is float64 here.
+    (times 10^4) since Zyrianov et al. (2022). Float32 would lose its first digits: all is float64 here.
 
     The histograms are kept in files and read in blocks. Memory does not grow with the scans; time grows with their
     square: 2 s on a core for 1000 against 1000, 2 minutes for 10,000 against 10,000.
-
-    Args:
-        keep: Histograms are always kept.
-        folder: Where to.
     """
 
-    def __init__(self, keep: bool = True, folder: str | Path | None = None) -> None:
-        super().__init__(True, folder)
-        self.own_group()
-
-    @property
-    def protocol(self) -> Protocol:
-        settings = {**PROTOCOL, "kernel": "Gaussian", "sigma": SIGMA, "estimate": "biased"}
-        return Protocol("mmd", "bird's-eye histogram", settings=settings)
+    name = "mmd"
+    representation = "bird's-eye histogram"
+    settings: ClassVar[Mapping[str, Any]] = {**PROTOCOL, "kernel": "Gaussian", "sigma": SIGMA, "estimate": "biased"}
+    keeping = "always"
 
     def rows(self, scans: Scans) -> Tensor:
         return histograms(scans)
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         if not all(self.count(side) for side in SIDES):
-            return {"mmd": float("nan")}, ["mmd: does not exist without a return on either side."]
+            return {"mmd": float("nan")}, ["mmd does not exist where a set has no return."]
         once = {side: torch.ones(1, self.count(side), dtype=torch.float64) for side in SIDES}
         return {"mmd": float(self.resampled(once)["mmd"])}, []
 
@@ -58,8 +50,8 @@ class MMD(ScanMetric):
 def mean_kernel(a: tuple[FeatureStore, Tensor], b: tuple[FeatureStore, Tensor]) -> Tensor:
     """Weighted mean of k(p, q) - 1 over all scans p of one set and q of another, for every draw of weights, (R).
 
-    Less 1, which drops out of MMD^2: so little does the kernel vary here that its 1 would take four digits. It is
-    computed once for all draws.
+    The 1 drops out of MMD^2, and k differs so little from it that it would cost four digits. The kernel is computed
+    once for all draws.
 
     Args:
         a: Kept histograms and how often each counts, (R, N).

@@ -1,13 +1,13 @@
 """Mean and scatter of features, added up in float64 batch by batch, in any order, in any number of processes.
 
-Sums of x x^T lose what features vary by when they lie far from 0: (1e4)^2 leaves 1e-8 of float64's digits to a
-variance of 1e-4. So the scatter is kept about the mean, and two parts are put together by the parallel formula of
-Chan, Golub and LeVeque (1979),
+Sums of x x^T lose the variance of features that lie far from 0: (1e4)^2 leaves 1e-8 of float64's digits to a variance
+of 1e-4. So the scatter is kept about the mean, and two parts are joined by the parallel formula of Chan, Golub and
+LeVeque (1979),
 
     n = n_a + n_b,  mean = mean_a + n_b / n delta,  M = M_a + M_b + n_a n_b / n delta delta^T,  delta = mean_b - mean_a.
 
-All three lie in one matrix, so that processes hand over, and put together, one tensor: n in the corner, the mean in
-the rest of the first row, the scatter M = sum (x - mean)(x - mean)^T below it, (1 + D, 1 + D).
+One matrix holds all three, so that processes exchange one tensor: n in the corner, the mean in the rest of the first
+row, the scatter M = sum (x - mean)(x - mean)^T below it, (1 + D, 1 + D).
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from torch import Tensor
 
 
 class Moments(NamedTuple):
-    """What a matrix of moments holds: n scans, their mean (D) and scatter (D, D), views of it."""
+    """The parts of a matrix of moments: n scans, and views of their mean (D) and scatter (D, D)."""
 
     n: int
     mean: Tensor
@@ -25,7 +25,7 @@ class Moments(NamedTuple):
 
     @property
     def covariance(self) -> Tensor:
-        """M / (n - 1), the unbiased one, as numpy.cov; needs two scans."""
+        """M / (n - 1), the unbiased estimate, as numpy.cov; needs two scans."""
         return self.scatter / (self.n - 1)
 
 
@@ -60,7 +60,7 @@ def merge_moments(parts: Tensor) -> Tensor:
 
 
 def _join(matrix: Tensor, n: int, mean: Tensor, centred: Tensor) -> None:
-    """Add n rows with a mean, of which `centred` are what their scatter is still to be made of, (B, D)."""
+    """Add n rows with a mean and the scatter of the `centred` rows, (B, D)."""
     old = moments(matrix)
     total = old.n + n
     delta = mean - old.mean

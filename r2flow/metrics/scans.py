@@ -1,4 +1,4 @@
-"""A batch of scans as every metric sees it: masked alike, in whichever representation is asked for."""
+"""A batch of scans as every metric sees it: masked, in the representation that it asks for."""
 
 from functools import cached_property
 
@@ -16,14 +16,11 @@ MASK = (0.5, 63.0)
 
 
 class Scans:
-    """Range images of one sensor, masked to MASK[0] < r < MASK[1], and what is derived from them.
-
-    Representations are computed when first asked for and kept: a metric that looks at images alone never
-    pays for voxels.
+    """Range images of one sensor, masked to MASK[0] < r < MASK[1], and what is derived from them when it is asked for.
 
     Args:
         images: Range in metres and, where known, reflectance of [0, 1], (B, 2 or 1, H, W); 0 where missing.
-        sensor: Whose rays the pixels look along.
+        sensor: The sensor of the images.
 
     Raises:
         InputError: images of another size than the sensor's.
@@ -50,12 +47,12 @@ class Scans:
 
     @cached_property
     def returned(self) -> Tensor:
-        """Where a ray came back, (B, 1, H, W), bool."""
+        """Pixels with a return, (B, 1, H, W), bool."""
         return self.images[:, :1] > 0
 
     @cached_property
     def xyz(self) -> Tensor:
-        """Points in metres of every pixel, (B, 3, H, W); the origin where a ray did not come back."""
+        """Points in metres of every pixel, (B, 3, H, W); the origin where there is no return."""
         return unproject(self.images[:, :1], self.sensor.rays().to(self.images.device))
 
     @cached_property

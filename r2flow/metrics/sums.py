@@ -1,8 +1,9 @@
-"""Metrics whose figures are made of sums over a set's scans: histograms, counts."""
+"""Metrics whose figures are computed from sums over the scans of a set: histograms, counts."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -15,27 +16,25 @@ BLOCK = 1000  # scans read from a file at once
 
 
 class SumMetric(ScanMetric):
-    """A metric that adds the rows of a set's scans up, in float64: sums of whole numbers are exact in any order.
+    """A metric that adds up the rows of a set's scans, in float64: sums of whole numbers are exact in any order.
 
-    Args:
-        width: The most numbers in a row. How many there are may depend on the sensor, and a state has one size.
-        keep: Keep the row of every scan, for bootstrap intervals.
-        folder: Where to.
+    Attributes:
+        width: The most numbers of a row. How many there are may depend on the sensor; a state has one size.
     """
 
+    width: ClassVar[int]
     real_sum: Tensor
     generated_sum: Tensor
 
-    def __init__(self, width: int, keep: bool = False, folder: str | Path | None = None) -> None:
+    def __init__(self, keep: bool = False, folder: str | Path | None = None) -> None:
         super().__init__(keep, folder)
         for side in SIDES:
-            self.add_state(f"{side}_sum", torch.zeros(width, dtype=torch.float64), dist_reduce_fx="sum")
+            self.add_state(f"{side}_sum", torch.zeros(self.width, dtype=torch.float64), dist_reduce_fx="sum")
             self.add_state(f"{side}_width", torch.tensor(0), dist_reduce_fx="max")
-        self.own_group()
 
     @abstractmethod
     def figures_of(self, real: np.ndarray, generated: np.ndarray) -> dict[str, float]:
-        """Figures from the two sums of rows, (D) each; of zeros where a set has nothing to compare."""
+        """Figures from the two sums of rows, (D) each; sums of zeros where a set has nothing to compare."""
 
     def accumulate(self, rows: Tensor, side: Side) -> None:
         width: Tensor = getattr(self, f"{side}_width")
@@ -52,7 +51,7 @@ class SumMetric(ScanMetric):
         width = max(widths, default=0)
         real, generated = (getattr(self, f"{side}_sum")[:width].cpu().numpy() for side in SIDES)
         values = self.figures_of(real, generated)
-        if not all(int(getattr(self, f"{side}_scans")) for side in SIDES):
+        if not all(self.given(side) for side in SIDES):
             return dict.fromkeys(values, float("nan")), []
         return values, []
 
@@ -66,6 +65,6 @@ class SumMetric(ScanMetric):
 
     def _other_size(self, a: int, b: int) -> InputError:
         return InputError(
-            f"{self.protocol.metric}: some scans give {a} numbers and others {b}; "
-            "are they of two sensors? Compare scans of one sensor alone."
+            f"{self.name}: some scans give {a} numbers and others {b}; are they of two sensors? "
+            "Compare scans of one sensor only."
         )

@@ -1,7 +1,6 @@
 """What straightening and distilling did: every flow of a chain at few and at many steps, from the same noise."""
 
 import json
-import sys
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -11,18 +10,21 @@ import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from rich.progress import track
 
 from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.files import atomic_write
 from r2flow.flow.straightness import curvature
+from r2flow.generators import as_flow
 from r2flow.metrics.fidelity import distances, panel
+from r2flow.noise import Draws
+from r2flow.progress import track
 from r2flow.reports.outputs import draw_pages, write_scan
-from r2flow.reports.pages import Page, table, write_page
+from r2flow.reports.pages import Page, write_page
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
+from r2flow.reports.tables import print_table, table
 from r2flow.runs import read_config
-from r2flow.sampling import noise_of, sample
+from r2flow.sampling import sample
 
 MANY = 32  # steps that stand for "as many as one likes"
 
@@ -48,9 +50,9 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     cells = [(name, steps) for name, flow in flows.items() for steps in steps_of(flow, flows.values())]
     rows, drawn = [], {}
     bends = {name: bend(flow, num) for name, flow in flows.items()}
-    for name, steps in track(cells, "sampling every flow", transient=True, disable=not sys.stdout.isatty()):
+    for name, steps in track(cells, "sampling every flow"):
         start = time.perf_counter()
-        images = np.concatenate([one.images.numpy() for one in sample(flows[name], num, steps, seed=0)])
+        images = np.concatenate([one.images.numpy() for one in sample(flows[name], num, steps=steps)])
         seconds = (time.perf_counter() - start) / num
         found = distances(truth, panel(images, first.sensor))
         rows.append({
@@ -87,15 +89,17 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
 
 
 COLUMNS = {
-    "flow": "flow", "steps": "Euler steps", "seconds": "seconds a scan", "bend": "bend", "mean": "distance to held-out",
+    "flow": "flow", "steps": "Euler steps", "seconds": "seconds a scan", "bend": "bend",
+    "mean": "distance to held-out scans",
 }  # fmt: skip
 
 
 def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
     """A distilled flow has its own number of steps; the others are shown at all of these and at many."""
-    if flow.distilled_steps is not None:
-        return [flow.distilled_steps]
-    return sorted({1, *(steps for other in flows if (steps := other.distilled_steps) is not None), MANY})
+    own = flow.generator.sampler
+    if own.fixed:
+        return [own.steps]
+    return sorted({1, *(other.generator.sampler.steps for other in flows if other.generator.sampler.fixed), MANY})
 
 
 def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
@@ -103,16 +107,16 @@ def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
     config = read_config(run) or flow.config  # the folder's own knows where the scans have moved
     data = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **config["data"])
     _, held = data.sources()
-    numbers = track(range(len(held)), "held-out scans", transient=True, disable=not sys.stdout.isatty())
+    numbers = track(range(len(held)), "reading held-out scans", "scans")
     return np.stack([held[i] for i in numbers])
 
 
 def bend(flow: Checkpoint, num: int) -> float:
     """int s(t) dt over |x_1 - x_0|^2, median over scenes: 0 is straight."""
-    x_0 = noise_of(range(num), flow.encoding.shape, 0)
-    x_0 = x_0.to(next(flow.model.parameters()).device)
+    followed = as_flow(flow.generator, "a chain's report")
+    x_0 = Draws(0, range(num)).start(followed.noise_shape).to(followed.device)
     with torch.inference_mode():
-        return float(curvature(flow.model, x_0, MANY).normalised.median())
+        return float(curvature(followed.velocity, x_0, MANY).normalised.median())
 
 
 def explanation(num: int, real: int) -> str:
@@ -153,14 +157,7 @@ def figure(drawn: Mapping[tuple[str, int], np.ndarray], names: list[str]) -> Fig
 
 def tell(rows: list[dict[str, Any]], runs: Mapping[str, Path], out: Path, page: Path) -> None:
     """The table on the terminal, and where everything lies."""
-    from rich.console import Console
-    from rich.table import Table
-
-    shown = Table("flow", "Euler steps", "seconds a scan", "bend", "distance to held-out scans")
-    for row in rows:
-        numbers = (f"{row['seconds']:.3f}", f"{row['bend']:.4f}", f"{row['mean']:.3f}")
-        shown.add_row(row["flow"], str(row["steps"]), *numbers)
-    Console().print(shown)
+    print_table(rows, COLUMNS)
     last, folder = list(runs.items())[-1]
     print(
         f"""

@@ -19,11 +19,12 @@ from matplotlib.figure import Figure
 from r2flow.backbones.cost import count_macs, count_parameters
 from r2flow.checkpoints import checkpoints_of, step_of
 from r2flow.errors import InputError
+from r2flow.generators import RectifiedFlow, build_generator
 from r2flow.reports.backbones import latency
-from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks, shown
+from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
+from r2flow.reports.tables import print_table, shown, table
 from r2flow.reports.training import Curve, read_curves
 from r2flow.runs import CONFIG, contradictions, flatten, read_config
-from r2flow.stages import build_parts
 
 log = logging.getLogger(__name__)
 
@@ -169,10 +170,12 @@ def stage_name(config: Mapping[str, Any]) -> str:
 
 def cost(config: Mapping[str, Any], repeats: int, device: str) -> dict[str, Any]:
     """Parameters, GMAC and, on request, milliseconds of one evaluation for one image of a config's backbone."""
-    parts = build_parts(config)
-    model = parts.backbone.eval()
-    found: dict[str, Any] = {"parameters": count_parameters(model), "gmac": count_macs(model) / 1e9}  # type: ignore[arg-type]
-    shape = (1, parts.encoding.channels, *parts.sensor.shape)
+    generator = build_generator(config)
+    if not isinstance(generator, RectifiedFlow):
+        return {"parameters": count_parameters(generator)}
+    model = generator.backbone.eval()
+    found: dict[str, Any] = {"parameters": count_parameters(model), "gmac": count_macs(model) / 1e9}
+    shape = (1, *generator.space.shape)
     found["latency_ms"] = latency(model.to(device), shape, repeats, device) if repeats else None
     return found
 
@@ -304,48 +307,31 @@ def cell(row: Mapping[str, Any], column: str) -> str:
     return text if deviation is None else f"{text} ± {shown(deviation)}"
 
 
-def tables(groups: Sequence[Group]) -> list[tuple[str, list[str], list[list[str]]]]:
-    """(title, headings, cells): what the runs are and cost, what came of them, and the panel where there is one."""
+def tables(groups: Sequence[Group]) -> list[tuple[str, list[list[str]], list[str]]]:
+    """(title, cells, headings): what the runs are and cost, their results, and the fidelity panel where it was run."""
     rows = rows_of(groups)
     several = {"n": "n"} if any(row["n"] > 1 for row in rows) else {}
-    latency_known = any(row["latency_ms"] is not None for row in rows)
     results = {key: heading for key, heading in MEASURED.items() if key != "latency_ms"}
-    latencies = {"latency_ms": MEASURED["latency_ms"]} if latency_known else {}
-    made = [
-        ("Runs", {"name": "run", **several, **FIXED, **latencies}),
-        ("Results", {"name": "run", **several, **results}),
-    ]
-    if lines := panel_lines(groups):
-        made.append(("Distance to real scans", {"name": "run", **{line: line for line in lines}}))
+    timed = any(row["latency_ms"] is not None for row in rows)
+    latencies = {"latency_ms": MEASURED["latency_ms"]} if timed else {}
+    lines = panel_lines(groups)
+    columns: dict[str, dict[str, str]] = {
+        "Runs": {**FIXED, **latencies},
+        "Results": results,
+        **({"Distance to real scans": {line: line for line in lines}} if lines else {}),
+    }
     return [
-        (title, list(columns.values()), [[cell(row, column) for column in columns] for row in rows])
-        for title, columns in made
-    ]
-
-
-def markdown_tables(groups: Sequence[Group]) -> list[str]:
-    text = []
-    for title, headings, cells in tables(groups):
-        lines = ["| " + " | ".join(headings) + " |", "|" + "---|" * len(headings)]
-        lines += ["| " + " | ".join(entry.replace("|", "\\|") for entry in line) + " |" for line in cells]
-        text += [f"## {title}", "\n".join(lines)]
-    return text
+        (title, [[row["name"], *(cell(row, key) for key in [*several, *own])] for row in rows],
+         ["run", *several.values(), *own.values()])
+        for title, own in columns.items()
+    ]  # fmt: skip
 
 
 def print_comparison(groups: Sequence[Group]) -> None:
     """The tables in the terminal."""
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console()
-    for title, headings, cells in tables(groups):
-        table = Table(box=None, header_style="bold", title=title, title_justify="left")
-        for heading in headings:
-            table.add_column(heading, justify="left" if heading in ("run", "stage", "backbone") else "right")
-        for line in cells:
-            table.add_row(*line)
-        console.print(table)
-        console.print()
+    for title, cells, headings in tables(groups):
+        print_table(cells, headings, title)
+        print()
 
 
 NOTES = (
@@ -360,11 +346,12 @@ def compare_page(groups: Sequence[Group], command: str, device: str = "cpu") -> 
     """`compare.md .csv .json .png`."""
     spread = ["Several seeds: mean ± standard deviation over n runs."] if any(len(g.runs) > 1 for g in groups) else []
     seeds = {run.label: int(run.config["seed"]) for group in groups for run in group.runs if "seed" in run.config}
+    written = [part for title, cells, headings in tables(groups) for part in (f"## {title}", table(cells, headings))]
     members = [{"group": g.label, "run": run.label, **run.values, **run.fidelity} for g in groups for run in g.runs]
     return Page(
         name="compare",
         title="Runs compared",
-        text=[*markdown_tables(groups), "## How to read it", NOTES, *spread],
+        text=[*written, "## How to read it", NOTES, *spread],
         rows=rows_of(groups),
         figures={"compare": compare_figure(groups)},
         command=command,

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.checkpoints import load_checkpoint
+from r2flow.reports.tables import print_table
 from r2flow.runs import flatten
 
 
@@ -17,7 +18,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "step": loaded.step,
         "stage": loaded.config.get("stage", {}).get("name", "unknown"),
         "backbone": loaded.config["backbone"]["name"],
-        "parameters": sum(p.numel() for p in loaded.model.parameters()),
+        "parameters": sum(p.numel() for p in loaded.generator.parameters()),
         "image": [loaded.encoding.channels, rows, columns],
         "sensor": loaded.sensor.name,
         "range_m": [loaded.sensor.min_range, loaded.sensor.max_range],
@@ -28,20 +29,11 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 def print_contents(contents: dict[str, Any]) -> None:
     """The same as two short tables."""
-    from rich.console import Console
-    from rich.table import Table
-
-    summary = Table(show_header=False, box=None)
-    for key, value in contents.items():
-        if key != "config":
-            shown = f"{value:,}" if isinstance(value, int) else value
-            shown = " x ".join(map(str, value)) if key == "image" else shown
-            shown = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else shown
-            summary.add_row(key, str(shown))
-    details = Table("config", "value", box=None, header_style="bold")
-    for key, value in flatten({k: v for k, v in contents["config"].items() if k != "published"}):
-        details.add_row(key, str(value))
-    console = Console()
-    console.print(summary)
-    console.print()
-    console.print(details)
+    summary = {key: value for key, value in contents.items() if key != "config"}
+    summary["image"] = " x ".join(map(str, contents["image"]))
+    summary["encoding"] = ", ".join(f"{key} {value}" for key, value in contents["encoding"].items())
+    summary |= {key: f"{value:,}" for key, value in summary.items() if isinstance(value, int)}
+    print_table([(key, str(value)) for key, value in summary.items()], ("", ""))
+    print()
+    config = flatten({key: value for key, value in contents["config"].items() if key != "published"})
+    print_table([(key, str(value)) for key, value in config], ("config", "value"))

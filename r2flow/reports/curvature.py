@@ -13,9 +13,11 @@ from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.flow.straightness import Straightness, straightness
+from r2flow.generators import as_flow
 from r2flow.lidar.encoding import Encoding
-from r2flow.reports.pages import STYLES, Page, blank_figure, table
-from r2flow.sampling import noise_of
+from r2flow.noise import Draws
+from r2flow.reports.pages import STYLES, Page, blank_figure
+from r2flow.reports.tables import table
 
 MOST_CURVED = 200  # paths drawn, as in the paper's figure 8 (b)
 
@@ -75,13 +77,12 @@ def measure_paths(
     Raises:
         InputError: fewer than one step.
     """
-    shape = checkpoint.encoding.shape
-    device = next(checkpoint.model.parameters()).device
+    flow = as_flow(checkpoint.generator, "curvature")
     batches: list[Paths] = []
     for first in range(0, num, batch_size):
-        x_0 = noise_of(range(first, min(first + batch_size, num)), shape, seed).to(device)
+        x_0 = Draws(seed, range(first, min(first + batch_size, num))).start(flow.noise_shape).to(flow.device)
         with torch.inference_mode():
-            found = straightness(checkpoint.model, x_0, steps, most_curved, progress)
+            found = straightness(flow.velocity, x_0, steps, most_curved, progress)
         batches.append(_paths(found, checkpoint.encoding, label))
     return _together(batches, most_curved)
 

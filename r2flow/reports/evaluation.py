@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from r2flow.evaluation.measuring import Measured
 from r2flow.evaluation.sets import ScanSet
 from r2flow.files import atomic_write
-from r2flow.reports.pages import STYLES, Page, blank_figure, plain, provenance, shown, table
+from r2flow.reports.pages import STYLES, Page, blank_figure, plain, provenance
+from r2flow.reports.tables import print_table, shown, table
 
 FORMAT = "r2flow evaluation 1"
 
@@ -62,22 +63,10 @@ def rows_of(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
 
 def print_comparisons(comparisons: Sequence[Comparison]) -> None:
     """A line for each figure, a column for each comparison, and what must be known of them."""
-    from rich.console import Console
-    from rich.measure import Measurement
-    from rich.table import Table
-
     columns, lines = _table(comparisons, "\n")
-    grid = Table(box=None, header_style="bold", pad_edge=False)
-    for number, name in enumerate(columns):
-        grid.add_column(name, justify="right" if number else "left", no_wrap=True)
-    for line in lines:
-        grid.add_row(*line)
-    console = Console()
-    # Figures are not cut short: a terminal that is too narrow wraps them.
-    console.width = max(console.width, Measurement.get(console, console.options.update(width=300), grid).maximum)
-    console.print(grid, crop=False, highlight=False, markup=False)
+    print_table(lines, columns)
     for remark in _remarks(comparisons):
-        console.print(f"  {remark}", style="dim", highlight=False, soft_wrap=True)
+        print(f"  {remark}")
 
 
 def write_json(page: Page, comparisons: Sequence[Comparison], path: Path) -> None:
@@ -94,11 +83,9 @@ def write_json(page: Page, comparisons: Sequence[Comparison], path: Path) -> Non
 def evaluation_page(comparisons: Sequence[Comparison], command: str, device: str, seeds: Mapping[str, int]) -> Page:
     """The page of an evaluation: table, protocols, and each figure beside its floor."""
     columns, lines = _table(comparisons)
-    keys = [str(number) for number in range(len(columns))]
-    figures = [dict(zip(keys, line, strict=True)) for line in lines]
     remarks = "\n".join(f"- {remark}" for remark in _remarks(comparisons))
     text = [
-        table(figures, dict(zip(keys, columns, strict=True))),
+        table(lines, columns),
         *([remarks] if remarks else []),
         "## Sets",
         table(

@@ -11,6 +11,8 @@ from r2flow.data.opening import open_scans
 from r2flow.data.sources import Reading
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.fidelity import PANEL, PER_PIXEL, controls, distances, nearest, panel
+from r2flow.progress import track
+from r2flow.reports.tables import table
 
 Statistics = Mapping[str, np.ndarray]
 Distances = Mapping[str, Mapping[str, float]]
@@ -30,11 +32,8 @@ def load_scans(spec: str | Path, reading: Reading, most: int = 1000) -> tuple[np
     Raises:
         InputError: no scan there, or one that is not of the reading's sensor.
     """
-    from rich.progress import track
-
     scans = open_scans(spec, reading).spread(most)
-    numbers = track(range(len(scans)), f"reading {spec}", disable=len(scans) < 32, transient=True)
-    images = np.stack([scans.source[number] for number in numbers])
+    images = np.stack([scans.source[n] for n in track(range(len(scans)), f"reading {spec}", "scans", least=32)])
     drives = {number: f"{spec}: {drive}" for drive, held in scans.drives.items() for number in held}
     return images, [drives.get(number, str(spec)) for number in range(len(scans))]
 
@@ -92,14 +91,14 @@ def compare_sets(
     statistics: dict[str, Statistics] = {
         name: panel(images, sensor, MEMBERS) for name, images in {**sets, **made}.items()
     }
-    table = {name: distances(found, statistics["real"]) for name, found in statistics.items() if name != "real"}
+    apart = {name: distances(found, statistics["real"]) for name, found in statistics.items() if name != "real"}
     if between := _between_drives(sets["real"], drives, sensor):
-        table = {"other": table.pop("other"), "drive against drive": between, **table}
+        apart = {"other": apart.pop("other"), "drive against drive": between, **apart}
     result: dict[str, Any] = {
         "sizes": {name.removesuffix(" scans"): len(images) for name, images in sets.items()},
-        "sets": _members(table, PANEL),
-        **_verdicts(_members(table, PANEL), list(made)),
-        "per_pixel": _members(table, PER_PIXEL),
+        "sets": _members(apart, PANEL),
+        **_verdicts(_members(apart, PANEL), list(made)),
+        "per_pixel": _members(apart, PER_PIXEL),
     }
     if training is not None:
         compared = {
@@ -148,48 +147,47 @@ def _between_drives(real: np.ndarray, drives: Sequence[str], sensor: Sensor) -> 
 
 def markdown(result: dict[str, Any], name: str = "other") -> str:
     """The result as Markdown tables; `name` stands for the set that was judged."""
-    sets = {(name if key == "other" else key): value for key, value in result["sets"].items()}
-    ratio = bool(result["floor"])
-    heading = [*sets, f"{name} / floor"] if ratio else [*sets]
-    lines = ["| distance to the real scans | " + " | ".join(heading) + " |", "|---" * (len(heading) + 1) + "|"]
-    for line in result["sets"]["other"]:
-        cells = [f"{v[line]:.4f}" for v in sets.values()]
+    sets, floor = result["sets"], result["floor"]
+    rows = []
+    for line, own in sets["other"].items():
+        cells = [f"{found[line]:.4f}" for found in sets.values()]
         if line in result["won"]:
             cells[0] = f"**{cells[0]}**"
-        if ratio:
-            cells.append(f"{result['sets']['other'][line] / max(result['floor'][line], 1e-9):.2f}")
-        lines.append(f"| {line} | " + " | ".join(cells) + " |")
-    lines += ["", f"Nearer to the real scans than every control (bold): {', '.join(result['won']) or 'nowhere'}."]
-    lines += [f"Not yet: {', '.join(result['lost']) or 'nowhere'}."]
-    lines += ["", *_about_the_floor(result)]
+        rows.append([line, *cells, *([f"{own / max(floor[line], 1e-9):.2f}"] if floor else [])])
+    parts = [
+        table(rows, ["distance to the real scans", *_named(sets, name), *([f"{name} / floor"] if floor else [])]),
+        f"Nearer to the real scans than every control (bold): {', '.join(result['won']) or 'nowhere'}.\n"
+        f"Not yet: {', '.join(result['lost']) or 'nowhere'}.",
+        _about_the_floor(result),
+    ]
     if "nearest" in result:
-        lines += ["", "| distance to the nearest training scan | median | least |", "|---|---|---|"]
-        for key, (median, least) in result["nearest"].items():
-            lines.append(f"| {name if key == 'other' else key} | {median:.3f} | {least:.3f} |")
+        found = zip(_named(result["nearest"], name), result["nearest"].values(), strict=True)
+        rows = [[key, f"{median:.3f}", f"{least:.3f}"] for key, (median, least) in found]
+        parts.append(table(rows, ["distance to the nearest training scan", "median", "least"]))
     sizes = ", ".join(f"{count} {key}" for key, count in result["sizes"].items() if count)
-    return "\n".join([*lines, "", f"Scans: {sizes}."])
+    return "\n\n".join([*parts, f"Scans: {sizes}."])
 
 
-def _about_the_floor(result: dict[str, Any]) -> list[str]:
+def _named(sets: Mapping[str, Any], name: str) -> list[str]:
+    return [name if key == "other" else key for key in sets]
+
+
+def _about_the_floor(result: dict[str, Any]) -> str:
     if not result["floor"]:
-        return ["No floor: give --floor OTHER_REAL, or real scans of several drives, to see what real scans come to."]
+        return "No floor: give --floor OTHER_REAL, or real scans of several drives, to see what real scans come to."
     meant = {
         "other real scans": "the distance of the real scans given as --floor",
         "training scans": "the distance of the training scans",
         "drive against drive": "the mean distance of two of the real drives",
     }[result["floor_is"]]
-    lines = [f"The floor is {meant}. Farther than twice the floor: {', '.join(result['beyond']) or 'nowhere'}."]
-    if result["blind"]:
-        lines.append(f"Not judged, as they hardly tell this floor from the controls: {', '.join(result['blind'])}.")
-    return lines
+    blind = result["blind"]
+    return f"The floor is {meant}. Farther than twice the floor: {', '.join(result['beyond']) or 'nowhere'}." + (
+        f"\nNot judged, as they hardly tell this floor from the controls: {', '.join(blind)}." if blind else ""
+    )
 
 
 def per_pixel_table(result: dict[str, Any], name: str = "other") -> str:
     """The statistics of single pixels, which judge nothing, as a Markdown table."""
-    sets = {(name if key == "other" else key): value for key, value in result["per_pixel"].items()}
-    lines = ["| distance to the real scans | " + " | ".join(sets) + " |", "|---" * (len(sets) + 1) + "|"]
-    lines += [
-        f"| {line} | " + " | ".join(f"{v[line]:.4f}" for v in sets.values()) + " |"
-        for line in result["per_pixel"]["other"]
-    ]
-    return "\n".join(lines)
+    sets = result["per_pixel"]
+    rows = [[line, *(f"{found[line]:.4f}" for found in sets.values())] for line in sets["other"]]
+    return table(rows, ["distance to the real scans", *_named(sets, name)])

@@ -11,10 +11,12 @@ from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
-from r2flow.reports.inversion import Real, check_solver, errors_of
-from r2flow.reports.outputs import ScanBar, evaluations_of, formats_of, write_scan
-from r2flow.reports.pages import Page, prepare_folder, table
-from r2flow.sampling import interpolate_scans
+from r2flow.generators import Sampler
+from r2flow.inversion import TIGHT, interpolate_scans
+from r2flow.reports.inversion import Real, errors_of
+from r2flow.reports.outputs import ScanBar, formats_of, write_scan
+from r2flow.reports.pages import Page, prepare_folder
+from r2flow.reports.tables import table
 
 log = logging.getLogger(__name__)
 
@@ -26,9 +28,7 @@ def interpolation(
     scans: Sequence[Real],
     frames: int,
     out: str | Path,
-    method: str = "dopri5",
-    steps: int = 32,
-    tolerance: float = 1e-5,
+    sampler: Sampler = TIGHT,
     batch_size: int = 1,
     command: str = "",
 ) -> Page:
@@ -40,7 +40,7 @@ def interpolation(
     Raises:
         InputError: a scan or a solver that cannot be used, before anything is written; a scan without its noise.
     """
-    check_solver(method, tolerance)
+    checkpoint.generator.check_sampler(sampler)
     if len(scans) != 2:
         raise InputError(f"needs the two scans to go between, found {len(scans)}; name two files.")
     pair = torch.stack([scan.image for scan in scans])
@@ -48,10 +48,8 @@ def interpolation(
     names = [scan.name for scan in scans]
     rays = checkpoint.sensor.rays()
     # both ends go there and back
-    with ScanBar("interpolating", frames, (frames + 2) * evaluations_of(method, steps)) as bar:
-        found = interpolate_scans(
-            checkpoint, pair, frames, method, steps, tolerance, batch_size, bar.evaluated, bar.finished
-        )
+    with ScanBar("interpolating", frames, (frames + 2) * checkpoint.generator.evaluations_of(sampler)) as bar:
+        found = interpolate_scans(checkpoint, pair, frames, sampler, batch_size, bar.evaluated, bar.finished)
     lost = [number for number, solved in enumerate(found.converged.tolist()) if not solved]
     if lost:
         log.warning("not solved, and no scans of this flow: %s; try another solver.", ", ".join(map(str, lost)))
@@ -163,5 +161,5 @@ def _page(
         table(ends, {**of_ends, "noise_std": "std of x_0", "converged": "converged"}),
         table(rows, between),
     )
-    device = str(next(checkpoint.model.parameters()).device)
+    device = str(checkpoint.generator.device)
     return Page("interpolation", "From scan to scan", text, rows, {"interpolation": figure}, command, device=device)

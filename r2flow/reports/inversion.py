@@ -13,10 +13,11 @@ from r2flow.checkpoints import Checkpoint
 from r2flow.data.opening import open_scans
 from r2flow.evaluation.sets import reading_of_flow
 from r2flow.files import atomic_write
-from r2flow.flow.solvers import check_method, check_tolerance
-from r2flow.reports.outputs import ScanBar, evaluations_of
-from r2flow.reports.pages import Page, prepare_folder, table
-from r2flow.sampling import Inversion, invert, round_trip
+from r2flow.generators import Sampler
+from r2flow.inversion import TIGHT, Inversion, invert, round_trip
+from r2flow.reports.outputs import ScanBar
+from r2flow.reports.pages import Page, prepare_folder
+from r2flow.reports.tables import print_table, table
 
 COLUMNS = {
     "scan": "scan",
@@ -66,9 +67,7 @@ def invert_scans(
     checkpoint: Checkpoint,
     scans: Sequence[Real],
     out: str | Path,
-    method: str = "dopri5",
-    steps: int = 32,
-    tolerance: float = 1e-5,
+    sampler: Sampler = TIGHT,
     batch_size: int = 1,
     command: str = "",
 ) -> Page:
@@ -80,17 +79,17 @@ def invert_scans(
     Raises:
         InputError: a solver that cannot be used, before anything is written.
     """
-    check_solver(method, tolerance)
+    checkpoint.generator.check_sampler(sampler)
     names = [scan.name for scan in scans]
     prepare_folder(out)
     rows: list[dict[str, Any]] = []
     pairs: list[tuple[str, np.ndarray]] = []
-    way = 2 * evaluations_of(method, steps) * -(-len(scans) // batch_size)
+    way = 2 * checkpoint.generator.evaluations_of(sampler) * -(-len(scans) // batch_size)
     with ScanBar("inverting", len(scans), way) as bar:
         for first in range(0, len(scans), batch_size):
             some = slice(first, first + batch_size)
             images = torch.stack([scan.image for scan in scans[some]])
-            found = invert(checkpoint, images, method, steps, tolerance, bar.evaluated)
+            found = invert(checkpoint, images, sampler, bar.evaluated)
             for name, x_0 in zip(names[some], found.x_0.numpy(), strict=True):
                 with atomic_write(Path(out, f"{name}.x_0.npy")) as file:
                     np.save(file, x_0)
@@ -99,7 +98,7 @@ def invert_scans(
                 if len(pairs) < 2 * SHOWN:
                     pairs += [(f"{name}, real", image.numpy()), ("there and back", _decoded(checkpoint, x))]
             bar.finished(len(rows))
-    return _page(checkpoint, rows, pairs, _solver(method, steps, tolerance), command)
+    return _page(checkpoint, rows, pairs, _solver(sampler, way), command)
 
 
 def errors_of(checkpoint: Checkpoint, found: Inversion, names: Sequence[str], images: Tensor) -> list[dict[str, Any]]:
@@ -115,16 +114,6 @@ def errors_of(checkpoint: Checkpoint, found: Inversion, names: Sequence[str], im
     return rows
 
 
-def check_solver(method: str, tolerance: float) -> None:
-    """Know a solver and its tolerance before they are needed.
-
-    Raises:
-        InputError: an unknown method, or a tolerance that is not positive and finite.
-    """
-    check_method(method)
-    check_tolerance(tolerance)
-
-
 def unique_names(paths: Sequence[Path]) -> list[str]:
     """Stems of the files, with a number where two share one."""
     stems = [path.name.split(".")[0].replace(" ", "_") for path in paths]
@@ -136,18 +125,8 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
 
 def print_rows(rows: Sequence[dict[str, Any]]) -> None:
     """The errors as a table, and a line for what has not been solved."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from r2flow.reports.pages import shown
-
     headings = ("scan", "returns", "evals", "RMS", "med. m", "RMS m", "rays ±", "std x_0", "solved")
-    shape = Table(box=None, header_style="bold", pad_edge=False)
-    for key, heading in zip(COLUMNS, headings, strict=True):
-        shape.add_column(heading, justify="left" if key == "scan" else "right", no_wrap=key != "scan", overflow="fold")
-    for row in rows:
-        shape.add_row(*(shown(row[key]) for key in COLUMNS))
-    Console().print(shape)
+    print_table(rows, dict(zip(COLUMNS, headings, strict=True)))
     print("RMS in model space; rays ±: share of all rays lost or gained; std x_0: near 1 for scans that the flow knows")
     lost = [row["scan"] for row in rows if not row["converged"]]
     if lost:
@@ -158,8 +137,8 @@ def _decoded(checkpoint: Checkpoint, x: Tensor) -> np.ndarray:
     return checkpoint.encoding.decode(x).nan_to_num(0.0).numpy()
 
 
-def _solver(method: str, steps: int, tolerance: float) -> str:
-    return f"{method}, {steps} steps" if evaluations_of(method, steps) else f"{method}, tolerance {tolerance:g}"
+def _solver(sampler: Sampler, evaluations: int) -> str:
+    return f"{sampler.method}, " + (f"{sampler.steps} steps" if evaluations else f"tolerance {sampler.tolerance:g}")
 
 
 def _page(
@@ -179,5 +158,5 @@ def _page(
         "gained are a share of all. x_0 of a scan that the flow knows has a standard deviation near 1.",
         table(rows, COLUMNS),
     )
-    device = str(next(checkpoint.model.parameters()).device)
+    device = str(checkpoint.generator.device)
     return Page("invert", "Scans there and back", text, rows, {"invert": figure}, command, device=device)

@@ -16,8 +16,9 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.scans import Scans
-from r2flow.reports.pages import STYLES, Page, Row, blank_figure, shown, table
+from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_birds_eye, draw_range
+from r2flow.reports.tables import Row, shown, table
 
 LIKENESSES = ("embedded", "pixels")
 COPY = 0.1  # of the usual distance
@@ -131,7 +132,7 @@ def find_neighbours(
         if len(numbers) == 0:
             raise InputError(f"none of the {len(s)} scans of {s.label} has a return: there is nothing to compare.")
     best = [(torch.full((len(n),), torch.inf), torch.zeros(len(n), dtype=torch.int64)) for n, _ in described]
-    with work.bar("training scans", len(training)) as advance, torch.no_grad():
+    with work.bar("reading training scans", len(training)) as advance, torch.no_grad():
         first = 0
         for images in training.batches(range(len(training)), work.batch_size, work.workers):
             there = likeness.describe(Scans(images.to(likeness.device), training.sensor)).float().cpu()
@@ -144,8 +145,7 @@ def find_neighbours(
                 nearer = least < best[own][0]
                 best[own][0][nearer], best[own][1][nearer] = least[nearer], where[nearer] + first
             first += len(there)
-            for _ in range(len(there)):
-                advance()
+            advance(len(there))
     found = [
         Nearest(s, queries, _exact(x, nearest, training, likeness, work), nearest.numpy())
         for s, (queries, x), (_, nearest) in zip((generated, real), described, best, strict=True)
@@ -156,11 +156,10 @@ def find_neighbours(
 def _describe(scans: ScanSet, likeness: Likeness, work: Work) -> tuple[np.ndarray, Tensor]:
     """Numbers of the scans that have a return, and what they are compared by."""
     rows = []
-    with work.bar("scans", len(scans)) as advance, torch.no_grad():
+    with work.bar("describing", len(scans)) as advance, torch.no_grad():
         for images in scans.batches(range(len(scans)), work.batch_size, work.workers):
             rows.append(likeness.describe(Scans(images.to(likeness.device), scans.sensor)).float().cpu())
-            for _ in range(len(images)):
-                advance()
+            advance(len(images))
     x = torch.cat(rows)
     kept = x.isfinite().all(1)
     return torch.nonzero(kept)[:, 0].numpy(), x[kept]

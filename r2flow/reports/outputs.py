@@ -2,23 +2,12 @@
 
 import logging
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeRemainingColumn,
-    track,
-)
-from rich.text import Text
 from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
@@ -26,11 +15,12 @@ from r2flow.data.opening import write_samples_note
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import reading_of_flow
 from r2flow.files import atomic_write
-from r2flow.flow.solvers import SOLVERS, adapts, check_method
+from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.region import Region
 from r2flow.lidar.scan_files import write_points
-from r2flow.sampling import batches, check_channels, sample
+from r2flow.progress import Bar, track
+from r2flow.sampling import batches, sample
 
 log = logging.getLogger(__name__)
 
@@ -48,28 +38,25 @@ def write_samples(
     checkpoint: Checkpoint,
     out: str | Path,
     num: int,
-    steps: int,
     seed: int,
-    method: str = "euler",
-    formats: Sequence[str] = FORMATS,
+    sampler: Sampler | None = None,
+    formats: Sequence[str] | None = None,
     pictures: int = 8,
     batch_size: int = 1,
-    tolerance: float = 1e-5,
     region: Region | None = None,
     channels: str = "both",
-    straight_first: bool = False,
-    grid: str | Tensor = "uniform",
 ) -> list[np.ndarray]:
     """Draw scans and write each as `out/NNNNNN.FORMAT`, with a page and a contact sheet of the first ones.
 
     Scan i of a seed is the same whatever `num` and `batch_size` are.
 
     Args:
-        formats: `ply` and `bin` are points in metres with reflectance, `npy` the range image,
+        sampler: How the generator is run; its own if left out.
+        formats: All that fit if left out. `ply` and `bin` are points in metres with reflectance, `npy` the range image,
             float32 (2 or 1, H, W) in metres and reflectance; reflectance alone is `NNNNNN.reflectance.npy`.
         pictures: How many scans get a page of their own; the contact sheet shows at most 8 of them.
-        region, channels, straight_first, grid: See `r2flow.sampling.sample`. Pictures show the region alone, files are
-            of the sensor's shape, 0 outside.
+        region, channels: See `r2flow.sampling.sample`. Pictures show the region alone, files are of the sensor's
+            shape, 0 outside.
 
     Returns:
         The images drawn as pictures.
@@ -77,19 +64,20 @@ def write_samples(
     Raises:
         InputError: an unknown format, one that cannot hold what is asked for, or nothing to draw.
     """
-    if num < 1 or steps < 1 or batch_size < 1:
-        raise InputError(f"needs at least one scan, step and scan a batch; found {num}, {steps} and {batch_size}.")
-    check_channels(checkpoint, channels)
+    if num < 1 or batch_size < 1:
+        raise InputError(f"needs at least one scan and a batch of at least one; found {num} and {batch_size}.")
+    generator = checkpoint.generator
+    sampler = sampler or generator.sampler
+    generator.space.check_channels(channels)
+    generator.check_sampler(sampler)
+    formats = formats_of(checkpoint, channels) if formats is None else formats
     check_formats(checkpoint, formats, channels)
-    check_method(method)
-    if straight_first and not adapts(method):
-        raise InputError(f"scenes that are not straight need an adaptive solver, dopri5 or bosh3; found {method!r}.")
     out, rays = Path(out), checkpoint.sensor.rays()
     shown: list[np.ndarray] = []
-    with ScanBar("sampling", num, batches(num, batch_size) * evaluations_of(method, steps)) as bar:
+    with ScanBar("sampling", num, batches(num, batch_size) * generator.evaluations_of(sampler)) as bar:
         for drawn in sample(
-            checkpoint, num, steps, seed, method, tolerance, batch_size,
-            progress=bar.evaluated, region=region, channels=channels, straight_first=straight_first, grid=grid,
+            generator, num, seed, sampler=sampler, batch_size=batch_size, region=region, channels=channels,
+            progress=bar.evaluated,
         ):  # fmt: skip
             lost = [drawn.first + offset for offset, solved in enumerate(drawn.converged.tolist()) if not solved]
             if lost:
@@ -104,7 +92,7 @@ def write_samples(
                     shown.append(image)
             bar.finished(min(drawn.first + batch_size, num))
     if channels != "reflectance":
-        keep_note(checkpoint, out, seed, method=method, steps=steps, tolerance=tolerance)
+        keep_note(checkpoint, out, seed, sampler)
     if shown:
         parts = shown if region is None else [region.crop(torch.from_numpy(image)).numpy() for image in shown]
         if channels == "reflectance":
@@ -114,13 +102,13 @@ def write_samples(
     return shown
 
 
-def keep_note(checkpoint: Checkpoint, out: Path, seed: int, **sampler: Any) -> None:
+def keep_note(checkpoint: Checkpoint, out: Path, seed: int, sampler: Sampler) -> None:
     """Leave beside samples what they are, so that nobody has to say their size or sensor."""
     sensor = checkpoint.sensor
     encoding = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
     limits = {"min_range": sensor.min_range, "max_range": sensor.max_range}
     write_samples_note(
-        out, reading_of_flow(checkpoint), encoding={**encoding, **limits}, seed=seed, sampler=sampler,
+        out, reading_of_flow(checkpoint), encoding={**encoding, **limits}, seed=seed, sampler=asdict(sampler),
         step=checkpoint.step,
     )  # fmt: skip
 
@@ -141,54 +129,33 @@ def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str)
             raise InputError(f"a .{name} holds {held} and {whose}; use --format {','.join(fitting)}.")
 
 
-def evaluations_of(method: str, steps: int) -> int:
-    """Network evaluations of a solution; 0 where they depend on the scene."""
-    return steps * (SOLVERS[method].evaluations or 0) if method in SOLVERS else 0
-
-
-class ScanBar:
-    """A progress bar of scans with their rate and the time left, which moves with the evaluations between two scans.
+class ScanBar(Bar):
+    """A bar of scans that moves with the network evaluations between two scans.
 
     Args:
-        what: What is done to them.
+        doing: What is done to them.
         num: Scans in all.
         evaluations: Network evaluations in all, batches counted as one; 0 where nobody knows: then a batch is taken
             to need as many as the one before it.
     """
 
-    def __init__(self, what: str, num: int, evaluations: int = 0) -> None:
-        columns = BarColumn(), MofNCompleteColumn(), TextColumn("scans"), ScansPerSecond(), TimeRemainingColumn()
-        self._bar = Progress(TextColumn(what), *columns, TextColumn("{task.fields[spent]} evaluations"))
-        self._task = self._bar.add_task(what, total=num, spent=0)
-        self._num, self._share = num, num / evaluations if evaluations else 0.0
+    def __init__(self, doing: str, num: int, evaluations: int = 0) -> None:
+        super().__init__(doing, num, "scans")
+        self._share = num / evaluations if evaluations else 0.0
         self._spent = self._done = self._spent_before = 0
-
-    def __enter__(self) -> Self:
-        self._bar.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._bar.stop()
 
     def evaluated(self) -> None:
         """One more evaluation of the network."""
         self._spent += 1
-        self._bar.update(self._task, advance=self._share, spent=self._spent)
+        self(self._share)
+        self.set(note=f"{self._spent} evaluations")
 
     def finished(self, done: int) -> None:
         """So many scans are done by now."""
         if self._spent > self._spent_before:
             self._share = (done - self._done) / (self._spent - self._spent_before)
         self._done, self._spent_before = done, self._spent
-        self._bar.update(self._task, completed=done)
-
-
-class ScansPerSecond(ProgressColumn):
-    """How fast it goes, once that can be told."""
-
-    def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        return Text(f"{speed:.2f} scans/s" if speed else "")
+        self.set(done)
 
 
 def write_scan(image: np.ndarray, rays: Tensor, out: Path, name: str, formats: Sequence[str]) -> None:
@@ -207,7 +174,7 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path) -> Path:
     from r2flow.reports.pictures import contact_sheet, save_figure, scan_figure
 
     numbered = list(enumerate(images))
-    for index, image in track(numbered, "drawing", disable=len(numbered) < 3, transient=True):
+    for index, image in track(numbered, "drawing", "pages", least=3):
         save_figure(scan_figure(image, rays, f"sample {index}"), out / f"{index:06d}.png")
     return save_figure(contact_sheet(images[:8], rays), out / "samples.png")
 

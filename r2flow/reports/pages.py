@@ -21,8 +21,7 @@ from matplotlib.ticker import LogLocator
 import r2flow
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-
-Row = Mapping[str, Any]
+from r2flow.reports.tables import Row
 
 # Told apart without colour: every line of a figure has a marker and a dash of its own.
 STYLES: tuple[dict[str, Any], ...] = tuple(
@@ -131,33 +130,9 @@ def provenance(page: Page) -> dict[str, Any]:
     }
 
 
-def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
-    """Rows as a Markdown table.
-
-    Args:
-        columns: Key -> heading, in order; numbers are printed to three digits.
-    """
-    lines = ["| " + " | ".join(columns.values()) + " |", "|" + "---|" * len(columns)]
-    lines += ["| " + " | ".join(shown(row.get(key)).replace("|", "\\|") for key in columns) + " |" for row in rows]
-    return "\n".join(lines)
-
-
 def picture(name: str) -> str:
     """The line of Markdown that places a page's figure in its text."""
     return f"![{name.replace('_', ' ')}]({name}.png)"
-
-
-def shown(value: Any) -> str:
-    """A value for a reader: 0.00123, 1.2e-05, 128, '' for nothing."""
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if not isinstance(value, float):
-        return str(value)
-    if math.isnan(value):
-        return "-"
-    return f"{value:.3g}" if value == 0 or 1e-3 <= abs(value) < 1e4 else f"{value:.1e}"
 
 
 def blank_figure(width: float, height: float, title: str = "") -> Figure:

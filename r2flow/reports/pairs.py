@@ -6,11 +6,11 @@ import time
 from collections.abc import Mapping
 
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.data.pairs import Made, make_pairs
 from r2flow.data.shards import PairStore
+from r2flow.progress import Bar
 from r2flow.reports.clock import duration
 
 
@@ -24,7 +24,7 @@ def make_and_tell(
     seconds: float = 15.0,
 ) -> Made:
     """`make_pairs` with a bar, or a line every `seconds` where no one watches or several work."""
-    model = checkpoint.model.to(device)
+    generator = checkpoint.generator.to(device)
     there = sum(store.shard_path(shard).is_file() for shard in store.shards(num))
     if there > 4 and rank == 0:
         print(f"checking {there} shards of pairs", flush=True)
@@ -32,7 +32,7 @@ def make_and_tell(
     who = f"process {rank + 1} of {ranks}: " if ranks > 1 else ""
     teller = _Teller(who, len(own) * store.recipe.batch_size, seconds, watched=sys.stdout.isatty() and ranks == 1)
     with teller.bar:
-        made = make_pairs(store, model, num, rank, ranks, device, teller)
+        made = make_pairs(store, generator, num, rank, ranks, teller)
     if made.pairs:
         share = made.writing / max(made.seconds, 1e-9)
         unusable = f", {made.unusable} did not come to an end and are left out" if made.unusable else ""
@@ -50,13 +50,11 @@ class _Teller:
 
     def __init__(self, who: str, total: int, seconds: float, watched: bool) -> None:
         self.who, self.total, self.seconds, self.watched = who, total, seconds, watched
-        columns = (TextColumn("drawing pairs"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"))
-        self.bar = Progress(*columns, TimeRemainingColumn(), disable=not watched)
-        self.task = self.bar.add_task("pairs", total=total, rate="")
+        self.bar = Bar("drawing", total, "pairs", shown=watched)
         self.last = time.monotonic()
 
     def __call__(self, made: Made) -> None:
-        self.bar.update(self.task, completed=made.pairs, rate=rate(made))
+        self.bar.set(made.pairs, rate(made))
         now = time.monotonic()
         if self.watched or now - self.last < self.seconds:
             return

@@ -15,11 +15,12 @@ from torch import Tensor, nn
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
 from r2flow.flow.problems import PROBLEMS, Mixed, Problem
-from r2flow.flow.solvers import Velocity, solve
-from r2flow.flow.straight_exit import probes, solve_straight_first
+from r2flow.flow.straight_exit import probes
+from r2flow.generators import Field, Flow, Sampler, as_flow
 from r2flow.lidar.region import Region, region
+from r2flow.noise import Draws
 from r2flow.reports.outputs import formats_of, write_scan
-from r2flow.sampling import decode, evaluated_region, noise_of, part_of
+from r2flow.sampling import evaluated_region
 
 Row = dict[str, Any]
 Progress = Callable[[], None]
@@ -49,11 +50,11 @@ class Solved:
     seconds: float
 
 
-def one_state(velocity: Velocity, x: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+def one_state(flow: Flow, x: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
     """torchdiffeq's dopri5 as it is usually called: one step and one error norm for the whole batch."""
     import torchdiffeq
 
-    calls = 0
+    calls, velocity = 0, flow.field()
 
     def counted(t: Tensor, state: Tensor) -> Tensor:
         nonlocal calls
@@ -65,36 +66,31 @@ def one_state(velocity: Velocity, x: Tensor, tolerance: float) -> tuple[Tensor, 
     return end, torch.full((len(x),), calls)
 
 
-def _steps(method: str) -> Callable[[Velocity, Tensor, float], tuple[Tensor, Tensor]]:
-    def way(velocity: Velocity, x: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
-        end = solve(velocity, x, method=method, steps=FIXED, tolerance=tolerance)
+def _by(sampler: Sampler) -> Callable[[Flow, Tensor, float], tuple[Tensor, Tensor]]:
+    def way(flow: Flow, x: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+        end = flow.solve(x, sampler=sampler.changed(tolerance=tolerance))
         return end.x, end.evaluations
 
     return way
 
 
-def _straight_first(velocity: Velocity, x: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
-    end = solve_straight_first(velocity, x, tolerance)
-    return end.x, end.evaluations
-
-
-WAYS: dict[str, Callable[[Velocity, Tensor, float], tuple[Tensor, Tensor]]] = {
-    EULER: _steps("euler"),
-    AB2: _steps("ab2"),
+WAYS: dict[str, Callable[[Flow, Tensor, float], tuple[Tensor, Tensor]]] = {
+    EULER: _by(Sampler("euler", FIXED)),
+    AB2: _by(Sampler("ab2", FIXED)),
     ONE_STATE: one_state,
-    LEAVING: _steps("dopri5"),
-    STRAIGHT: _straight_first,
+    LEAVING: _by(Sampler("dopri5")),
+    STRAIGHT: _by(Sampler("dopri5", straight_first=True)),
 }
 
 
-def solve_in_all_ways(velocity: Velocity, x: Tensor, tolerance: float, repeats: int = REPEATS) -> dict[str, Solved]:
+def solve_in_all_ways(flow: Flow, x: Tensor, tolerance: float, repeats: int = REPEATS) -> dict[str, Solved]:
     """Every row of the scenes' table, in its order; seconds are medians of `repeats`."""
     ends: dict[str, tuple[Tensor, Tensor]] = {}
     seconds: dict[str, list[float]] = {name: [] for name in WAYS}
     for _ in range(repeats):
         for name, way in WAYS.items():
             begin = time.perf_counter()
-            ends[name] = way(velocity, x, tolerance)
+            ends[name] = way(flow, x, tolerance)
             _wait(x)
             seconds[name].append(time.perf_counter() - begin)
     found = {}
@@ -113,12 +109,12 @@ def exact_rows(kinds: Mapping[str, int], batch: str, tolerances: Sequence[float]
         places[kind] = slice(len(problems), len(problems) + count)
         problems += [PROBLEMS[kind]()] * count
     # float64: the solver's error, not rounding, is what we measure
-    x_0 = noise_of(range(len(problems)), (ELEMENTS,), seed).double()
-    velocity = Mixed(problems)
-    truth = velocity.solution(x_0, 1.0)
+    x_0 = Draws(seed, range(len(problems))).start((ELEMENTS,)).double()
+    mixed = Mixed(problems)
+    truth, flow = mixed.solution(x_0, 1.0), Field(mixed, (ELEMENTS,))
     rows = []
     for tolerance in tolerances:
-        for way, solved in solve_in_all_ways(velocity, x_0, tolerance).items():
+        for way, solved in solve_in_all_ways(flow, x_0, tolerance).items():
             errors = (solved.x - truth).square().mean(1).sqrt()
             row: Row = {"part": batch, "way": way, "tolerance": None if way in (EULER, AB2) else tolerance}
             row |= {"evaluations": int(solved.evaluations.sum()), "seconds": solved.seconds}
@@ -136,11 +132,11 @@ def scene_rows(checkpoint: Checkpoint, num: int, tolerance: float, seed: int, ad
     Raises:
         InputError: the flow has none.
     """
-    model = checkpoint.model
-    x_0 = noise_of(range(num), checkpoint.encoding.shape, seed).to(_device(model))
-    counted = _Counted(model, advance)
+    flow = as_flow(checkpoint.generator, "a savings report")
+    x_0 = Draws(seed, range(num)).start(flow.noise_shape).to(flow.device)
+    counted = Field(_Counted(flow, advance), flow.noise_shape)
     with torch.inference_mode():
-        tight = solve(counted, x_0, method="dopri5", tolerance=TIGHT)
+        tight = counted.solve(x_0, sampler=Sampler("dopri5", tolerance=TIGHT))
         if not tight.converged.all():
             lost = ", ".join(str(scene) for scene in (~tight.converged).nonzero()[:, 0].tolist())
             raise InputError(
@@ -177,16 +173,15 @@ def regions_to_measure(shape: tuple[int, int]) -> dict[str, tuple[Region, Region
 
 def region_rows(checkpoint: Checkpoint, num: int, steps: int, seed: int, advance: Progress) -> list[Row]:
     """Parts of the image against the same pixels of the whole one, from the same noise and in the same steps."""
-    x_0 = noise_of(range(num), checkpoint.encoding.shape, seed)
+    flow = as_flow(checkpoint.generator, "a savings report")
+    x_0 = Draws(seed, range(num)).start(flow.noise_shape)
     wanted = regions_to_measure(checkpoint.sensor.shape)
     regions = {"the whole image": region(checkpoint.sensor.shape)}
-    regions |= {name: evaluated_region(checkpoint, generated) for name, (_, generated) in wanted.items()}
-    models = {name: part_of(checkpoint.model, seen) for name, seen in regions.items()}
-    ends = {name: _sampled(models[name], seen.crop(x_0), steps, advance) for name, seen in regions.items()}
+    regions |= {name: evaluated_region(flow, generated) for name, (_, generated) in wanted.items()}
+    parts = {name: as_flow(flow.part(seen), "a part") for name, seen in regions.items()}
+    ends = {name: _sampled(parts[name], seen.crop(x_0), steps, advance) for name, seen in regions.items()}
     t, first = torch.tensor(0.5), x_0[:1]
-    calls = {
-        name: partial(models[name], t, seen.crop(first).to(_device(models[name]))) for name, seen in regions.items()
-    }
+    calls = {name: partial(parts[name].velocity, t, seen.crop(first).to(flow.device)) for name, seen in regions.items()}
     seconds = _in_turns(calls, 1.0)
     whole = ends["the whole image"]
     rows: list[Row] = []
@@ -210,17 +205,17 @@ def channel_rows(checkpoint: Checkpoint, budget: float = 1.0) -> list[Row]:
     if not checkpoint.encoding.reflectance:
         return []
     ranges, t = checkpoint.encoding.format.channels, torch.tensor(0.5)
-    x = noise_of(range(1), (ranges + 1, *checkpoint.sensor.shape), seed=0)
-    rays = checkpoint.model.get_buffer("coords")[0].cpu()
-    alone = build_backbone(checkpoint.config["backbone"], rays, ranges).eval().to(_device(checkpoint.model))
-    on = x.to(_device(checkpoint.model))
+    space, device = checkpoint.generator.space, checkpoint.generator.device
+    x = Draws(0, range(1)).start((ranges + 1, *checkpoint.sensor.shape))
+    alone = build_backbone(checkpoint.config["backbone"], space.rays, ranges).eval().to(device)
+    on = x.to(device)
     network = _in_turns({"both": partial(checkpoint.model, t, on), "range": partial(alone, t, on[:, :ranges])}, budget)
-    decoding = _in_turns({name: partial(decode, checkpoint, x, name) for name in network}, budget)
+    decoding = _in_turns({name: partial(space.decode, x, name) for name in network}, budget)
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         writers = {}
         for name in network:
-            image = decode(checkpoint, x, name)[0].numpy()
+            image = space.decode(x, name)[0].numpy()
             formats = [ending for ending in formats_of(checkpoint, name) if ending != "bin"]
             writers[name] = partial(write_scan, image, checkpoint.sensor.rays(), Path(folder, name), "scan", formats)
         writing = _in_turns(writers, budget)
@@ -232,25 +227,21 @@ def channel_rows(checkpoint: Checkpoint, budget: float = 1.0) -> list[Row]:
 
 
 class _Counted(nn.Module):
-    """A network that tells of its evaluations."""
+    """A flow's velocity that tells of its evaluations."""
 
-    def __init__(self, model: nn.Module, advance: Progress) -> None:
+    def __init__(self, flow: Flow, advance: Progress) -> None:
         super().__init__()
-        self.model, self.advance = model, advance
+        self.flow, self.advance = flow, advance
 
     def forward(self, t: Tensor, x: Tensor) -> Tensor:
         self.advance()
-        return self.model(t, x)
+        return self.flow.velocity(t, x)
 
 
-def _sampled(model: nn.Module, x_0: Tensor, steps: int, advance: Progress) -> Tensor:
+def _sampled(flow: Flow, x_0: Tensor, steps: int, advance: Progress) -> Tensor:
     """Scenes one by one, (B, ...) on the CPU."""
-    with torch.inference_mode():
-        ends = [
-            solve(model, scene.to(_device(model)), method="ab2", steps=steps, progress=advance).x.cpu()
-            for scene in x_0.split(1)
-        ]
-    return torch.cat(ends)
+    sampler = Sampler("ab2", steps)
+    return torch.cat([flow.solve(scene, sampler=sampler, progress=advance).x.cpu() for scene in x_0.split(1)])
 
 
 def _in_turns(calls: Mapping[str, Callable[[], Any]], budget: float) -> dict[str, float]:
@@ -274,10 +265,6 @@ def _in_turns(calls: Mapping[str, Callable[[], Any]], budget: float) -> dict[str
 def _wait(result: Any) -> None:
     if isinstance(result, Tensor) and result.is_cuda:
         torch.cuda.synchronize(result.device)
-
-
-def _device(model: nn.Module) -> torch.device:
-    return next(model.parameters()).device
 
 
 def _rms(a: Tensor, b: Tensor) -> float:

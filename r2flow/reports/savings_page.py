@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from r2flow.checkpoints import Checkpoint
-from r2flow.reports.pages import Page, blank_figure, shown, table
+from r2flow.reports.pages import Page, blank_figure
 from r2flow.reports.savings import (
     ELEMENTS,
     EULER,
@@ -22,6 +22,7 @@ from r2flow.reports.savings import (
     region_rows,
     scene_rows,
 )
+from r2flow.reports.tables import shown, table
 
 KIND_NAMES = {"straight": "straight", "gaussian": "smooth", "two_modes": "two modes", "ray_drop": "ray-drop"}
 # Told apart without colour.
@@ -57,7 +58,7 @@ def savings_page(
     figures = {"savings_scenes": scenes_figure(mixed)}
     rows, device = [*mixed, *lone], "cpu"
     if checkpoint is not None:
-        device = str(next(checkpoint.model.parameters()).device)
+        device = str(checkpoint.generator.device)
         scenes = scene_rows(checkpoint, num, tolerance, seed, advance)
         regions = region_rows(checkpoint, num, steps, seed, advance)
         channels = channel_rows(checkpoint)

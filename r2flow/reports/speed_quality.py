@@ -14,13 +14,34 @@ from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.evaluation.measuring import Gathered, Work, measure, point_key
 from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
+from r2flow.generators import Sampler
 from r2flow.metrics.base import ScanMetric
 from r2flow.reports.evaluation import heading
-from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks, shown, table
+from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
+from r2flow.reports.tables import shown, table
 
 NAME = "speed_quality"
 BETWEEN = " | "  # remarks of a row
 AXES = (("evaluations", "network evaluations a scan"), ("seconds", "seconds a scan"))
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What is drawn at each point of a curve.
+
+    Attributes:
+        num, seed: Of the scans, the same noise at every point.
+        method, tolerance: The solver's; None for each generator's own.
+    """
+
+    num: int
+    seed: int
+    method: str | None = None
+    tolerance: float | None = None
+
+    def sampler(self, flow: Checkpoint, steps: int) -> Sampler:
+        """How a flow is run at this number of steps."""
+        return flow.generator.sampler.changed(steps=steps, method=self.method, tolerance=self.tolerance)
 
 
 @dataclass(frozen=True)
@@ -31,25 +52,22 @@ class Curve:
         real: The scans that it is measured against.
         metrics: By name.
         gathered: Their statistics of the real scans.
-        num, seed: Of the scans that are sampled at each point, the same noise at all.
-        method, tolerance: The solver's.
+        drawing: What is drawn at each point.
         device: What the network runs on, in words.
     """
 
     real: ScanSet
     metrics: Mapping[str, ScanMetric]
     gathered: Gathered
-    num: int
-    seed: int
-    method: str
-    tolerance: float
+    drawing: Drawing
     device: str
 
     def key(self, flow: Checkpoint, steps: int) -> str:
         """Of a point: it is measured again when anything in it differs."""
+        how = self.drawing.sampler(flow, steps)
         return point_key(
-            self.real, self.metrics, weights=weights_hash(flow), steps=steps, num=self.num, seed=self.seed,
-            method=self.method, tolerance=self.tolerance, device=self.device,
+            self.real, self.metrics, weights=weights_hash(flow), steps=steps, num=self.drawing.num,
+            seed=self.drawing.seed, method=how.method, tolerance=how.tolerance, device=self.device,
         )  # fmt: skip
 
 
@@ -79,16 +97,19 @@ def measure_curve(
             if key in known:
                 rows.append({**known[key], "flow": label})
                 continue
-            drawn = sampled_set(flow, label, curve.num, count, curve.method, curve.tolerance, curve.seed)
+            own, how = flow.generator.sampler, curve.drawing.sampler(flow, count)
+            drawn = sampled_set(flow, label, curve.drawing.num, how, curve.drawing.seed)
             measured = measure(curve.metrics, curve.gathered, drawn, work)
             assert isinstance(drawn.source, SampledScans)
             figures = {f"{m.metric}/{name}": value for m in measured for name, value in m.figures.items()}
             remarks = dict.fromkeys(remark for m in measured for remark in m.remarks)
             rows.append({
-                "flow": label, "weights": weights_hash(flow), "distilled_for": flow.distilled_steps, "steps": count,
-                "solver": curve.method, "evaluations": _or_nan(statistics.fmean, drawn.source.evaluations),
+                "flow": label, "weights": weights_hash(flow), "steps": count,
+                "distilled_for": own.steps if own.fixed else None,
+                "solver": how.method, "evaluations": _or_nan(statistics.fmean, drawn.source.evaluations),
                 "seconds": _or_nan(statistics.median, drawn.source.seconds), "batch_size": work.batch_size,
-                "scans": curve.num, "seed": curve.seed, **figures, "remarks": BETWEEN.join(remarks), "key": key,
+                "scans": curve.drawing.num, "seed": curve.drawing.seed, **figures,
+                "remarks": BETWEEN.join(remarks), "key": key,
             })  # fmt: skip
             arrived(rows)
     return rows
@@ -138,9 +159,9 @@ def speed_quality_page(
     columns |= {name: heading(*name.split("/", 1))[0] for name in names}
     printed = [{**row, **{n: row[n] * heading(*n.split("/", 1))[1] for n in names if n in row}} for row in rows]
     sampled = (
-        f"{curve.num} scans of seed {curve.seed} at every point, from the same noise, by {curve.method}; measured "
-        f"against {len(curve.real)} scans of {curve.real.label}. Seconds are those of the network and its solver, "
-        "the median over batches."
+        f"{curve.drawing.num} scans of seed {curve.drawing.seed} at every point, from the same noise, by "
+        f"{curve.drawing.method or 'its own solver'}; measured against {len(curve.real)} scans of {curve.real.label}. "
+        "Seconds are those of the network and its solver, the median over batches."
     )
     text = [*_best(rows, names), sampled, table(printed, columns), *_remarks(rows)]
     protocols = [
@@ -148,7 +169,8 @@ def speed_quality_page(
         for metric in curve.metrics
     ]
     drawn = {NAME: _figure(rows, names)} if figures and names else {}
-    return Page(NAME, "Quality against speed", text, rows, drawn, command, {"sampled scans": curve.seed}, curve.device,
+    seeds = {"sampled scans": curve.drawing.seed}
+    return Page(NAME, "Quality against speed", text, rows, drawn, command, seeds, curve.device,
                 {"protocols": protocols, "other_points": others})  # fmt: skip
 
 

@@ -15,8 +15,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from r2flow.flow.problems import PROBLEMS, Mixed, NarrowJet
-from r2flow.flow.solvers import SOLVERS, Solution, Velocity, adapts, solve
+from r2flow.flow.solvers import SOLVERS, Solution, Velocity, adapts
+from r2flow.generators import Field, Sampler
 from r2flow.noise import generator, standard_normal
+from r2flow.reports.tables import table
 
 Row = dict[str, Any]
 
@@ -81,7 +83,7 @@ def jet_probe(
     exact = jets.solution(x_0, 1.0)
     rows = []
     for solver, share in itertools.product([name for name, _ in SOLVERS.items() if adapts(name)], shares):
-        solution = solve(jets, x_0, method=solver, tolerance=tolerance, max_step=share)
+        solution = Field(jets, (16,)).solve(x_0, sampler=Sampler(solver, tolerance=tolerance), max_step=share)
         found = _rms(solution.x - exact) <= FAILS_AT * tolerance
         rows.append(
             {
@@ -135,10 +137,14 @@ def markdown(rows: Sequence[Row], probe: Sequence[Row] = ()) -> str:
         "Error: root mean square over the worst scene's elements. Evaluations: mean over scenes, the estimate's own in "
         "brackets. Flags: s stiff, n not converged, e no estimate to be had.",
         "",
-        "| problem | precision | solver | tolerance | error | estimate | evaluations | flags | verdict |",
-        "|---|---|---|---|---|---|---|---|---|",
+        table([_line(row) for row in rows], HEADINGS),
     ]
-    return "\n".join([*lines, *(_line(row) for row in rows)]) + "\n"
+    return "\n".join(lines) + "\n"
+
+
+HEADINGS = (
+    "problem", "precision", "solver", "tolerance", "error", "estimate", "evaluations", "flags", "verdict",
+)  # fmt: skip
 
 
 def figure(rows: Sequence[Row]) -> Figure:
@@ -175,10 +181,10 @@ def _cell(
     state, network = PRECISIONS[precision]
     velocity = HalfPrecision(problem, network) if network else problem
     x_0 = x_0.to(state)
-    asked = {"method": solver, "steps": steps, "finish": finish, "max_evaluations": max_evaluations}
-    if tolerance is not None:
-        asked["tolerance"] = tolerance
-    solution = solve(velocity, x_0, **asked, global_error=tolerance is not None)  # type: ignore[arg-type]
+    sampler = Sampler(solver, steps).changed(tolerance=tolerance)
+    solution = Field(velocity, x_0.shape[1:]).solve(
+        x_0, sampler=sampler, finish=finish, max_evaluations=max_evaluations, global_error=tolerance is not None
+    )
     extra = 0.0 if solution.estimate_evaluations is None else solution.estimate_evaluations.double().mean().item()
     errors = _rms(solution.x.double() - problem.solution(x_0, 1.0))
     worst = int(errors.argmax())
@@ -236,7 +242,7 @@ def _name(row: Row) -> str:
     return f"{row['problem']}{finish} / {row['precision']} / {row['solver']} / {row['tolerance']:g}"
 
 
-def _line(row: Row) -> str:
+def _line(row: Row) -> tuple[str, ...]:
     problem = row["problem"] + (f", finish {row['finish']:g}" if row["finish"] else "")
     held = f"{row['steps']} steps" if row["tolerance"] is None else f"{row['tolerance']:.0e}"
     estimate = "-" if row["estimate"] is None else f"{row['estimate']:.1e}"
@@ -246,24 +252,20 @@ def _line(row: Row) -> str:
     flags = "".join(letter for letter, up in raised if up) or "-"
     verdict = f"**{row['verdict']}**" if row["verdict"] == "silent" else row["verdict"]
     return (
-        f"| {problem} | {row['precision']} | {row['solver']} | {held} | {row['error']:.1e} | {estimate} "
-        f"| {row['evaluations']:.0f}{extra} | {flags} | {verdict} |"
-    )
+        problem, row["precision"], row["solver"], held, f"{row['error']:.1e}", estimate,
+        f"{row['evaluations']:.0f}{extra}", flags, verdict,
+    )  # fmt: skip
 
 
 def _probe_table(probe: Sequence[Row]) -> list[str]:
-    lines = [
-        "A limit on the longest step looks for narrow jets (width 2e-3, at random times) at a price:",
-        "",
-        "| solver | tolerance | longest step | jets found | evaluations |",
-        "|---|---|---|---|---|",
-    ]
+    lines = []
     for row in probe:
         share = f"1/{1 / row['longest_step']:.0f}" if row["longest_step"] < 1 else "any"
         lines.append(
-            f"| {row['solver']} | {row['tolerance']:.0e} | {share} | {row['found']:.0%} | {row['evaluations']:.0f} |"
+            (row["solver"], f"{row['tolerance']:.0e}", share, f"{row['found']:.0%}", f"{row['evaluations']:.0f}")
         )
-    return [*lines, ""]
+    said = "A limit on the longest step looks for narrow jets (width 2e-3, at random times) at a price:"
+    return [said, "", table(lines, ("solver", "tolerance", "longest step", "jets found", "evaluations")), ""]
 
 
 MARKERS = {"accurate": ("o", "none"), "owned up": ("s", "0.6"), "flagged": ("^", "none"), "silent": ("X", "black")}

@@ -9,7 +9,6 @@ import numpy as np
 
 from r2flow.checkpoints import checkpoints_of, find_checkpoint, load_checkpoint
 from r2flow.errors import InputError
-from r2flow.flow.solvers import check_method
 from r2flow.reports.outputs import write_samples
 
 Curve = tuple[np.ndarray, np.ndarray]
@@ -37,15 +36,14 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
     return curves
 
 
-def check_samples(num: int, steps: int, method: str) -> None:
+def check_samples(num: int = 4) -> None:
     """Refuse before the training what could not be drawn after it.
 
     Raises:
-        InputError: fewer than no scans, no steps, or an unknown solver.
+        InputError: fewer than no scans.
     """
-    if num < 0 or steps < 1:
-        raise InputError(f"samples.num must be at least 0 and samples.steps at least 1, found {num} and {steps}.")
-    check_method(method)
+    if num < 0:
+        raise InputError(f"samples.num must be at least 0, found {num}.")
 
 
 def finish(run: str | Path, samples: Mapping[str, Any], seed: int, device: str, max_steps: int) -> None:
@@ -64,18 +62,14 @@ def finish(run: str | Path, samples: Mapping[str, Any], seed: int, device: str, 
     if checkpoint.step < max_steps:
         print(f"stopped at step {checkpoint.step} of {max_steps}: the same command goes on from here")
     out = run / "samples"
-    formats = ("ply", "bin", "npy") if checkpoint.encoding.reflectance else ("ply", "npy")
     if samples["num"] == 0:
         print(f"checkpoint    {path}")
         return
-    write_samples(
-        checkpoint, out, samples["num"], samples["steps"], seed, samples["method"], formats,
-        pictures=samples["num"],
-    )  # fmt: skip
+    write_samples(checkpoint, out, samples["num"], seed, pictures=samples["num"])
     for name, (steps, values) in curves.items():
         tenth = max(len(values) // 10, 1)
         print(f"{name}: {values[:tenth].mean():.4f} at the start, {values[-tenth:].mean():.4f} at step {steps[-1]}")
-    advice = "" if checkpoint.distilled_steps else " --steps 64"  # a distilled flow has its own
+    advice = "" if checkpoint.generator.sampler.fixed else " --steps 64"
     print(
         f"""
 checkpoint    {path}

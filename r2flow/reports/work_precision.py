@@ -13,10 +13,12 @@ from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.flow.problems import PROBLEMS
-from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, Solution, Velocity, adapts, check_method, solve
+from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, Solution, adapts, check_method
+from r2flow.generators import Field, Flow, Sampler, as_flow
 from r2flow.lidar.encoding import Encoding
-from r2flow.sampling import noise_of
+from r2flow.noise import Draws
 
+NAME = "a work-precision report"
 BUDGETS = (4, 8, 16, 32, 64)  # evaluations of the fixed-step methods
 TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5)
 METHODS = (*SOLVERS, f"{TORCHDIFFEQ}dopri5")
@@ -42,14 +44,10 @@ class Configuration:
             return f"{self.method}, {self.tolerance:.0e}"
         return f"{self.method}, {self.steps} step{'s' * (self.steps > 1)}"
 
-    def solve(self, velocity: Velocity, x_0: Tensor, max_evaluations: int = MOST_EVALUATIONS) -> Solution:
+    def solve(self, flow: Flow, x_0: Tensor, max_evaluations: int = MOST_EVALUATIONS) -> Solution:
         """x_1 from x_0."""
-        options: dict[str, Any] = {"max_evaluations": max_evaluations}
-        if self.steps is not None:
-            options["steps"] = self.steps
-        if self.tolerance is not None:
-            options["tolerance"] = self.tolerance
-        return solve(velocity, x_0, method=self.method, **options)
+        sampler = Sampler(self.method).changed(steps=self.steps, tolerance=self.tolerance)
+        return flow.solve(x_0, sampler=sampler, max_evaluations=max_evaluations)
 
 
 @dataclass(frozen=True)
@@ -58,8 +56,8 @@ class Subject:
 
     Attributes:
         name: Of the problem, or the checkpoint as it was typed.
-        velocity: v(t, x).
-        x_0: Starts of the scenes, (N, ...), on the device of the velocity.
+        flow: What is solved.
+        x_0: Starts of the scenes, (N, ...), on the flow's device.
         x_1: Their ends, (N, ...), float64.
         batch_size: Scenes solved at once.
         floor: Below this root mean square error, `x_1` is not good enough to judge; 0 where it is exact.
@@ -67,7 +65,7 @@ class Subject:
     """
 
     name: str
-    velocity: Velocity
+    flow: Flow
     x_0: Tensor
     x_1: Tensor
     batch_size: int
@@ -121,7 +119,7 @@ def configurations(
 
 
 def reference(
-    velocity: Velocity,
+    flow: Flow,
     x_0: Tensor,
     steps: int = REFERENCE_STEPS,
     tolerance: float = REFERENCE_TOLERANCE,
@@ -133,9 +131,8 @@ def reference(
     """
     ends, apart, evaluations = [], [], []
     for scene in x_0.double().split(1):
-        with torch.inference_mode():
-            rk4 = solve(velocity, scene, method="rk4", steps=steps, progress=progress)
-            dopri5 = solve(velocity, scene, method="dopri5", tolerance=tolerance)
+        rk4 = flow.solve(scene, sampler=Sampler("rk4", steps), progress=progress)
+        dopri5 = flow.solve(scene, sampler=Sampler("dopri5", tolerance=tolerance))
         ends.append(rk4.x)
         arrived = bool(rk4.converged.all() and dopri5.converged.all())
         apart.append(rms(rk4.x - dopri5.x).item() if arrived else math.inf)
@@ -148,14 +145,20 @@ def checkpoint_subject(
 ) -> Subject:
     """A checkpoint on scenes 0 to num - 1 of a seed, against its reference."""
     return Subject(
-        name, checkpoint.model, starts(checkpoint, num, seed), found.x_1, batch_size, found.floor, checkpoint.encoding
+        name,
+        as_flow(checkpoint.generator, NAME),
+        starts(checkpoint, num, seed),
+        found.x_1,
+        batch_size,
+        found.floor,
+        checkpoint.encoding,
     )
 
 
 def starts(checkpoint: Checkpoint, num: int, seed: int) -> Tensor:
     """x_0 of scenes 0 to num - 1 of a seed, on the model's device."""
-    shape = checkpoint.encoding.shape
-    return noise_of(range(num), shape, seed).to(next(checkpoint.model.parameters()).device)
+    generator = checkpoint.generator
+    return Draws(seed, range(num)).start(generator.noise_shape).to(generator.device)
 
 
 def rms(x: Tensor) -> Tensor:
@@ -182,7 +185,7 @@ def measure(
     for subject in subjects:
         tallies = [_Tally() for _ in chosen]
         with torch.inference_mode():
-            subject.velocity(torch.zeros((), device=subject.x_0.device), subject.x_0[:1])  # what happens only once
+            subject.flow.velocity(torch.zeros((), device=subject.x_0.device), subject.x_0[:1])  # what happens only once
             for repeat in range(repeats):
                 _take_turns(subject, chosen, tallies, repeat == 0, progress)
         rows += _mark([tally.row(subject, of) for tally, of in zip(tallies, chosen, strict=True)])
@@ -200,7 +203,7 @@ def _take_turns(
     for x_0, x_1 in zip(*(x.split(subject.batch_size) for x in (subject.x_0, subject.x_1)), strict=True):
         for configuration, tally in zip(chosen, tallies, strict=True):
             if judge or tally.spent < PATIENCE:
-                found, seconds = timed(configuration, subject.velocity, x_0)
+                found, seconds = timed(configuration, subject.flow, x_0)
                 tally.add(seconds, len(x_0))
                 if judge:
                     tally.judge(found, x_1, subject.encoding)
@@ -213,11 +216,11 @@ def runs(subjects: Iterable[Subject], chosen: Sequence[Configuration], repeats: 
     return sum(repeats * len(chosen) * math.ceil(len(s.x_0) / s.batch_size) for s in subjects)
 
 
-def timed(configuration: Configuration, velocity: Velocity, x_0: Tensor) -> tuple[Solution, float]:
+def timed(configuration: Configuration, flow: Flow, x_0: Tensor) -> tuple[Solution, float]:
     """The solution and its seconds."""
     _wait_for(x_0.device)
     begin = time.perf_counter()
-    found = configuration.solve(velocity, x_0)
+    found = configuration.solve(flow, x_0)
     _wait_for(x_0.device)
     return found, time.perf_counter() - begin
 
@@ -330,6 +333,6 @@ def problem_subjects(names: Sequence[str] | None = None, scenes: int = 16, eleme
     for name in PROBLEMS if names is None else names:
         problem = PROBLEMS[name]()
         # float64: the solver's error, not rounding, is what we measure.
-        x_0 = noise_of(range(scenes), (elements,), PROBLEM_SEED).double()
-        subjects.append(Subject(name, problem, x_0, problem.solution(x_0, 1.0), scenes, floor=1e-9))
+        x_0 = Draws(PROBLEM_SEED, range(scenes)).start((elements,)).double()
+        subjects.append(Subject(name, Field(problem, (elements,)), x_0, problem.solution(x_0, 1.0), scenes, floor=1e-9))
     return subjects

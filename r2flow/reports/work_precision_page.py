@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from r2flow.reports.pages import STYLES, Page, blank_figure, shown, table
+from r2flow.reports.pages import STYLES, Page, blank_figure
+from r2flow.reports.tables import shown, table
 from r2flow.reports.work_precision import BUDGETS, METHODS, TRUST, Reference, best_within, reached
 
 Row = Mapping[str, Any]

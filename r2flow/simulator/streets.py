@@ -1,22 +1,22 @@
-"""Procedural places around a car that drives along x."""
+"""Procedural street scenes around a car that drives along x."""
 
 import numpy as np
 
 from r2flow.simulator import fronts, roadside
-from r2flow.simulator.draws import Draws
 from r2flow.simulator.ego import RIGS
 from r2flow.simulator.kinds import KINDS, draw_ground
+from r2flow.simulator.scalar_draws import ScalarDraws
 from r2flow.simulator.scene import Scene, SceneBuilder
 
 
 def draw_scene(rng: np.random.Generator, kind: str | None = None) -> Scene:
-    """A place of a kind, or of any kind by its share.
+    """A scene.
 
     Args:
-        rng: Where all that is random about it comes from.
-        kind: A name in `kinds.KINDS`, or None to draw one.
+        rng: Source of its random numbers.
+        kind: A name in `kinds.KINDS`; None draws one by their shares.
     """
-    draws = Draws(rng)
+    draws = ScalarDraws(rng)
     drawn = draws.pick(list(KINDS), [k.share for k in KINDS.values()])
     name = kind or drawn
     b, k = SceneBuilder(draw_ground(draws, name), draws), KINDS[name]

@@ -1,58 +1,26 @@
-"""LightningModules, one for each stage, and the one place where a config becomes one."""
+"""LightningModules: how a generator is learned."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
-from torch import nn
-
-from r2flow.backbones import build_backbone
-from r2flow.backbones.hdit import LearnablePosition
 from r2flow.data.augment import Augmentation
 from r2flow.errors import InputError
-from r2flow.lidar.encoding import Encoding, build_encoding
-from r2flow.lidar.sensors import Convention, Sensor, build_sensor
+from r2flow.generators import Generator, Sampler
 from r2flow.registry import Registry, check_options
-from r2flow.stages.rectify import RectifiedFlow
+from r2flow.stages.base import Stage
+from r2flow.stages.rectify import Rectify
 from r2flow.stages.reflow import Distill, Reflow
 
-STAGES: Registry[type[RectifiedFlow]] = Registry("stage", rectify=RectifiedFlow, reflow=Reflow, distill=Distill)
+STAGES: Registry[type[Stage]] = Registry("stage", rectify=Rectify, reflow=Reflow, distill=Distill)
 
 
-@dataclass(frozen=True)
-class Parts:
-    """What a config describes of a model: its sensor, its encoding and its backbone."""
-
-    sensor: Sensor
-    encoding: Encoding
-    backbone: nn.Module
-
-
-def build_parts(config: Mapping[str, Any]) -> Parts:
-    """Sensor, encoding and backbone of a config with the keys `sensor`, `encoding` and `backbone`.
-
-    Raises:
-        InputError: a key is missing, a name is unknown, an option is, or the sizes do not fit together.
-    """
-    for key in ("sensor", "encoding", "backbone"):
-        if key not in config:
-            raise InputError(f"the config has no '{key}'.")
-    options = dict(config["sensor"])
-    convention: Convention = options.pop("rays", "centre")
-    check_options("sensor", build_sensor, options)
-    sensor = build_sensor(**options)
-    encoding = build_encoding(config["encoding"], sensor)
-    rays = sensor.rays(convention)
-    return Parts(sensor, encoding, build_backbone(config["backbone"], rays, encoding.channels))
-
-
-def check_roll(augment: Augmentation, backbone: nn.Module) -> None:
-    """Refuse turned scans for a backbone that learns a vector for each direction.
+def check_roll(augment: Augmentation, generator: Generator) -> None:
+    """Refuse turned scans for a generator that learns a vector for each direction.
 
     Raises:
         InputError: both.
     """
-    if augment.roll and any(isinstance(module, LearnablePosition) for module in backbone.modules()):
+    if augment.roll and generator.learns_directions:
         raise InputError(
             "data.augment.roll makes all directions alike, and backbone.position=learnable (the paper's APE) learns a "
             "vector of its own for each; give backbone.position=none, whose attention knows differences in azimuth "
@@ -60,15 +28,22 @@ def check_roll(augment: Augmentation, backbone: nn.Module) -> None:
         )
 
 
-def build_stage(config: Mapping[str, Any], backbone: nn.Module) -> RectifiedFlow:
-    """The LightningModule of a config's `stage`, around a backbone; it carries the config into its checkpoints."""
+def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
+    """The LightningModule of a config's `stage`, around a generator; it carries the config into its checkpoints.
+
+    The config's `sampler`, where it has one, becomes the generator's.
+    """
     options = {"batch_size": config["data"]["batch_size"], "seed": config["seed"], **config["stage"]}
-    options.pop("init", None)  # the backbone has its weights already
-    stage = STAGES.build(options, backbone)
+    options.pop("init", None)  # the generator has its weights already
+    stage: Stage = STAGES.build(options, generator)
     on_pairs = config["data"]["name"] == "pairs"
     if stage.needs_pairs and not on_pairs:
         raise InputError(f"stage={options['name']} learns from pairs: give data=pairs, found {config['data']['name']}.")
     if on_pairs and not stage.needs_pairs:
         raise InputError(f"stage={options['name']} learns from scans, and data=pairs has none; give stage=reflow.")
+    wanted = config.get("sampler") or {}
+    check_options("sampler", Sampler, {key: value for key, value in wanted.items() if value is not None})
+    generator.sampler = generator.sampler.changed(**wanted)
+    generator.check_sampler(generator.sampler)
     stage.config = dict(config)
     return stage

@@ -3,13 +3,12 @@
 from collections.abc import Mapping
 from typing import Any
 
-from torch import nn
-
 from r2flow.errors import InputError
-from r2flow.stages.rectify import RectifiedFlow
+from r2flow.generators import Generator, Sampler
+from r2flow.stages.rectify import Rectify
 
 
-class Reflow(RectifiedFlow):
+class Reflow(Rectify):
     """k-RF: regress v(t, x_t) onto x_1 - x_0 for x_1 the end of the earlier flow from x_0 (paper, eq. 3).
 
     It starts from the earlier flow's averaged weights. The pairs come from the data (`data=pairs`); a batch's x_0 and
@@ -19,9 +18,9 @@ class Reflow(RectifiedFlow):
     needs_pairs = True
 
     def __init__(
-        self, velocity: nn.Module, loss: str = "pseudo_huber", time: Mapping[str, Any] | None = None, **options: Any
+        self, generator: Generator, loss: str = "pseudo_huber", time: Mapping[str, Any] | None = None, **options: Any
     ) -> None:
-        super().__init__(velocity, loss, time or {"name": "u_shaped", "a": 4.0}, **options)
+        super().__init__(generator, loss, time or {"name": "u_shaped", "a": 4.0}, **options)
 
 
 class Distill(Reflow):
@@ -31,12 +30,12 @@ class Distill(Reflow):
         steps: k, the steps that the flow is to be sampled with.
     """
 
-    def __init__(self, velocity: nn.Module, steps: int = 1, loss: str = "pseudo_huber", **options: Any) -> None:
+    def __init__(self, generator: Generator, steps: int = 1, loss: str = "pseudo_huber", **options: Any) -> None:
         if steps < 1:
             raise InputError(f"stage.steps must be at least 1, found {steps}: a distilled flow takes k steps.")
         if options.pop("time", None) is not None:
             raise InputError(
                 f"a distilled flow trains at the {steps} times that its steps visit; leave stage.time out."
             )
-        super().__init__(velocity, loss, {"name": "grid", "k": steps}, **options)
-        self.steps = steps
+        super().__init__(generator, loss, {"name": "discrete", "k": steps}, **options)
+        generator.sampler = Sampler("euler", steps, fixed=True)

@@ -10,6 +10,7 @@ from torch import nn
 from callbacks.curvature import Curvature
 from callbacks.ema import EMA
 from r2flow.errors import InputError
+from r2flow.generators import Field
 from r2flow.noise import standard_normal
 from r2flow.reports.training import read_curves
 
@@ -34,6 +35,7 @@ class Stage(L.LightningModule):
     def __init__(self) -> None:
         super().__init__()
         self.velocity = Shrinking(0.0)
+        self.generator = Field(self.velocity, SHAPE)
         self.warmup_steps = 0
         self.draws = []
 
@@ -77,7 +79,7 @@ def exact(a: float, n: int) -> tuple[float, float]:
 @pytest.mark.filterwarnings("ignore:.*")
 def test_the_logged_values_are_those_of_the_averaged_weights(tmp_path):
     ema = EMA(decay=0.5, every=1, warmup_steps=0)
-    fit(tmp_path, [ema, Curvature(SHAPE, seed=7, every=2, num=2, steps=4)], steps=3)
+    fit(tmp_path, [ema, Curvature(seed=7, every=2, num=2, steps=4)], steps=3)
     curves = read_curves(tmp_path, ("curvature/s", "curvature/s_normalised", "train/loss"))
     assert curves["curvature/s"][0].tolist() == [2, 3]  # every second step, and the last
     assert curves["train/loss"][0].tolist() == [1, 2, 3]
@@ -92,14 +94,14 @@ def test_the_logged_values_are_those_of_the_averaged_weights(tmp_path):
 @pytest.mark.filterwarnings("ignore:.*")
 def test_training_does_not_notice(tmp_path):
     plain = fit(tmp_path / "plain", [])
-    measured = fit(tmp_path / "measured", [Curvature(SHAPE, seed=0, every=2)])
+    measured = fit(tmp_path / "measured", [Curvature(seed=0, every=2)])
     assert plain.draws == measured.draws  # torch's generator stands where it stood
     assert torch.equal(plain.velocity.a, measured.velocity.a)
 
 
 @pytest.mark.filterwarnings("ignore:.*")
 def test_a_step_of_several_batches_is_measured_once(tmp_path):
-    fit(tmp_path, [Curvature(SHAPE, seed=0, every=2)], steps=4, accumulate_grad_batches=3)
+    fit(tmp_path, [Curvature(seed=0, every=2)], steps=4, accumulate_grad_batches=3)
     with (tmp_path / "metrics" / "version_0" / "metrics.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row.get("curvature/s")]
     assert [int(row["step"]) for row in rows] == [1, 3]
@@ -107,10 +109,10 @@ def test_a_step_of_several_batches_is_measured_once(tmp_path):
 
 
 def test_it_can_be_left_out(tmp_path):
-    fit(tmp_path, [Curvature(SHAPE, seed=0, every=0)], steps=2)
+    fit(tmp_path, [Curvature(seed=0, every=0)], steps=2)
     assert read_curves(tmp_path, ("curvature/s",)) == {}
 
 
 def test_bad_options_are_refused():
     with pytest.raises(InputError, match=r"found 5, 0 and 16"):
-        Curvature(SHAPE, 0, every=5, num=0)
+        Curvature(0, every=5, num=0)

@@ -17,6 +17,7 @@ from r2flow.data.prepared import check_prepared
 from r2flow.data.preparing import Preparation
 from r2flow.data.shards import PairStore
 from r2flow.data.sources import read_scan
+from r2flow.generators import Field
 from r2flow.lidar.sensors import SENSORS
 from r2flow.noise import standard_normal
 
@@ -35,9 +36,8 @@ def store(folder: Path) -> PairStore:
     return PairStore(folder, PairOptions(**PAIRS).recipe(SHAPE))
 
 
-def still(t: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-    """dx/dt = 0: every pair ends where it begins, on any machine."""
-    return torch.zeros_like(x)
+# dx/dt = 0: every pair ends where it begins, on any machine.
+STILL = Field(lambda t, x: torch.zeros_like(x), SHAPE)
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -101,6 +101,6 @@ def test_pairs_are_made_again(tmp_path: Path, begun: bool):
     out = tmp_path / "out"
     if begun:
         shutil.copytree(OLD / "pairs-half", out)
-    made = make_pairs(store(out), still, 20)
+    made = make_pairs(store(out), STILL, 20)
     assert made.pairs == (8 if begun else 20)  # two batches were sealed, one lay loose
     assert_same(out, OLD / "pairs")

@@ -25,6 +25,7 @@ from r2flow.data.preparing import Preparation
 from r2flow.data.shards import PairStore
 from r2flow.data.sources import Reading, ScanSource
 from r2flow.errors import InputError
+from r2flow.generators import Field
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
@@ -288,7 +289,7 @@ def test_pairs_are_made_of_noise_of_their_own_shape(tmp_path: Path):
     assert torch.equal(pair_noise(own, 3), standard_normal((5,), 0, "pairs", 3))
     assert own.digest != plain.digest
     store = PairStore(tmp_path, own)
-    make_pairs(store, lambda t, x: torch.zeros_like(x), 4)
+    make_pairs(store, Field(lambda t, x: torch.zeros_like(x), (5,)), 4)
     x_0, x_1 = PairSource(PairStore(tmp_path, own), 4)[2]
     assert torch.equal(x_1, x_0.half().float())
     with pytest.raises(InputError, match="holds other pairs: noise_shape"):

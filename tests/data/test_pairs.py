@@ -24,6 +24,7 @@ from r2flow.data.pairs import (
 )
 from r2flow.data.shards import PairStore
 from r2flow.errors import InputError
+from r2flow.generators import Field
 from r2flow.noise import standard_normal
 from r2flow.reports.pairs import wait_for_others
 
@@ -35,8 +36,7 @@ def store_in(folder: Path, **options) -> PairStore:
     return PairStore(folder, PairOptions(**{**OPTIONS, **options}).recipe(SHAPE))
 
 
-def grow(t, x):
-    return x
+grow = Field(lambda t, x: x, SHAPE)
 
 
 class Counted:
@@ -92,7 +92,7 @@ def in_process(folder: Path, rank: int = 0, ranks: int = 1, delay: float = 0.0, 
     if child == 0:
         try:
             torch.set_num_threads(1)  # a forked OpenMP pool hangs
-            make_pairs(store_in(folder), lambda t, x: time.sleep(delay) or x, num, rank, ranks)
+            make_pairs(store_in(folder), Field(lambda t, x: time.sleep(delay) or x, SHAPE), num, rank, ranks)
         finally:
             os._exit(0)
     return child
@@ -128,7 +128,7 @@ def test_killed_at_ten_random_moments_the_same_command_ends_alike(tmp_path: Path
 def test_nothing_is_made_twice(tmp_path: Path):
     make_pairs(store_in(tmp_path), grow, 20)
     flow = Counted()
-    made = make_pairs(store_in(tmp_path), flow, 20)
+    made = make_pairs(store_in(tmp_path), Field(flow, SHAPE), 20)
     assert (made.pairs, flow.begun) == (0, 0)
     made = make_pairs(store_in(tmp_path), grow, 50)  # five batches are there, 13 are wanted
     assert made.pairs == 8 * 4
@@ -259,7 +259,7 @@ def test_runs_that_share_pairs_share_the_work(tmp_path: Path):
     for _ in range(2):
         child = os.fork()
         if child == 0:
-            make_pairs(store_in(tmp_path / "pairs"), slow, 200)
+            make_pairs(store_in(tmp_path / "pairs"), Field(slow, SHAPE), 200)
             os._exit(0)
         children.append(child)
     for child in children:
@@ -303,7 +303,7 @@ def test_a_pair_that_does_not_come_to_an_end_is_left_out(tmp_path: Path):
         hit = (x - bad).abs().amax((1, 2, 3), keepdim=True) < 1e-6
         return torch.where(hit, torch.nan, 0.0) * x
 
-    made = make_pairs(store_in(tmp_path), broken, 8)
+    made = make_pairs(store_in(tmp_path), Field(broken, SHAPE), 8)
     assert made.unusable == 1
     source = PairSource(store_in(tmp_path), 8)
     assert source.indices.tolist() == [0, 1, 2, 3, 4, 6, 7]
@@ -312,7 +312,7 @@ def test_a_pair_that_does_not_come_to_an_end_is_left_out(tmp_path: Path):
 
 def test_a_flow_that_is_broken_is_said_to_be(tmp_path: Path):
     with pytest.raises(InputError, match="none of 8 pairs came to an end"):
-        make_pairs(store_in(tmp_path), lambda t, x: x * math.nan, 8)
+        make_pairs(store_in(tmp_path), Field(lambda t, x: x * math.nan, SHAPE), 8)
 
 
 def test_missing_pairs_are_named(tmp_path: Path):

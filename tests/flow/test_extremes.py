@@ -9,7 +9,7 @@ import torch
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, Mixed, PointMass, Rotating, StiffLinear, Straight
-from r2flow.flow.solvers import FLOOR, SOLVERS, solve
+from r2flow.flow.solvers import LEAST_TOLERANCE, SOLVERS, solve
 from r2flow.flow.straight_exit import solve_straight_first
 
 METHODS = [*SOLVERS, "torchdiffeq:dopri5", "torchdiffeq:rk4"]
@@ -108,8 +108,8 @@ def test_no_steps_no_budget_and_no_time_are_refused():
     for wrong, message in [
         ({"steps": 0}, "at least 1 step, found 0"),
         ({"tolerance": math.nan}, "must be positive"),
-        ({"finish": 1.0}, "shorter than the whole way"),
-        ({"finish": -1e-3}, "shorter than the whole way"),
+        ({"finish": 1.0}, "finish must be shorter than the interval"),
+        ({"finish": -1e-3}, "finish must be shorter than the interval"),
         ({"max_evaluations": 1}, "at least 2 evaluations, found 1"),
         ({"max_step": 0.0}, "a share of the interval"),
         ({"t_1": math.inf}, "needs two times"),
@@ -125,7 +125,7 @@ def test_a_tolerance_that_float32_cannot_hold_is_floored_and_every_call_says_so(
         solve(Gaussian(), X_0, method=method, tolerance=1e-12, global_error=True)
     said = "a tolerance of 1e-12 is below what float32 can hold: 1e-07 is used."
     assert [record.message for record in caplog.records] == [said, said]
-    at_floor = solve(Gaussian(), X_0, method=method, tolerance=FLOOR[torch.float32])
+    at_floor = solve(Gaussian(), X_0, method=method, tolerance=LEAST_TOLERANCE[torch.float32])
     assert torch.equal(floored.x, at_floor.x)
     assert floored.converged.all()
     torch.testing.assert_close(floored.x.double(), Gaussian().solution(X_0, 1.0), rtol=0, atol=3e-6)
@@ -140,7 +140,7 @@ def test_a_tolerance_below_the_noise_of_a_half_precision_network_is_floored(dtyp
 
     with caplog.at_level(logging.WARNING):
         noisy = solve(network, X_0, method="dopri5", tolerance=1e-7, global_error=True)
-    assert f"{FLOOR[dtype]:g} is used" in caplog.text
+    assert f"{LEAST_TOLERANCE[dtype]:g} is used" in caplog.text
     assert noisy.x.dtype == torch.float32
     error = (noisy.x.double() - problem.solution(X_0, 1.0)).square().mean(1).sqrt()
     assert (error < 0.05).all()

@@ -8,7 +8,7 @@ import torch
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, RayDrop
-from r2flow.flow.solvers import GRIDS, SOLVERS, FixedStep, Pair, calibrated_grid, solve
+from r2flow.flow.solvers import GRIDS, SOLVERS, EmbeddedMethod, FixedStep, calibrated_grid, solve
 from r2flow.flow.solvers.external import is_fixed, torchdiffeq_methods
 
 
@@ -25,7 +25,7 @@ X_0 = torch.tensor([[0.1], [0.3], [0.6]], dtype=torch.float64)
 
 
 FIXED = [name for name, entry in SOLVERS.items() if isinstance(entry, FixedStep)]
-ADAPTIVE = [name for name, entry in SOLVERS.items() if isinstance(entry, Pair)]
+ADAPTIVE = [name for name, entry in SOLVERS.items() if isinstance(entry, EmbeddedMethod)]
 
 
 @pytest.mark.parametrize("method", FIXED)

@@ -135,5 +135,5 @@ def test_probes_come_as_near_to_the_end_as_the_tolerance_asks():
 
 
 def test_an_estimate_is_refused_not_dropped():
-    with pytest.raises(InputError, match="ask `solve` for a global error"):
+    with pytest.raises(InputError, match="no estimate of their global error; call `solve`"):
         solve_straight_first(straight, X_0, 1e-3, global_error=True)

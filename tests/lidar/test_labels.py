@@ -8,10 +8,9 @@ import pytest
 
 from r2flow.data.sources import read_labelled_scan
 from r2flow.errors import InputError
-from r2flow.lidar.labels import CLASSES, labels_beside, read_labels
+from r2flow.lidar.labels import LABELS, labels_beside, read_labels
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.simulator.labels import LABELS
 
 SENSOR = SENSORS["hdl64e"].resized(8, 16)
 COUNT = 200
@@ -153,8 +152,9 @@ def test_what_is_no_file_is_said(scan: Path, label: Path, tmp_path: Path):
     assert "need 800" in refused(label, scan)
 
 
-def test_the_simulators_classes_have_names_and_colours():
-    assert set(LABELS.values()) <= set(CLASSES)
+def test_ids_are_those_of_semantickitti():
+    ids = {"unlabeled": 0, "car": 10, "other-vehicle": 20, "lane-marking": 60, "other-object": 99, "moving-truck": 258}
+    assert {name: LABELS[name] for name in ids} == ids
 
 
 def test_real_labels(shared: Path):

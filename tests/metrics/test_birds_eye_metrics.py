@@ -15,7 +15,7 @@ from r2flow.metrics.mmd import MMD
 from r2flow.metrics.scans import Scans
 
 
-class Seen:
+class Seen(Scans):
     """Scans of which nothing is known but their histograms."""
 
     def __init__(self, histograms):

@@ -10,6 +10,8 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
+from r2flow.hashing import state_hash
+from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.metrics.extractors import EXTRACTORS, load_extractor, training
 from r2flow.metrics.extractors.embedded import (
@@ -24,10 +26,9 @@ from r2flow.metrics.extractors.embedded import (
     inputs,
     pooled,
 )
-from r2flow.metrics.extractors.training import CLASS_OF_LABEL, IGNORED, Settings, Training, judge, tensors_hash
+from r2flow.metrics.extractors.training import CLASS_OF_LABEL, IGNORED, Settings, Training, judge
 from r2flow.metrics.scans import Scans
 from r2flow.simulator import simulate
-from r2flow.simulator.labels import LABELS
 from tests.conftest import ROOT
 
 SENSOR = SENSORS["hdl64e"].resized(16, 128)
@@ -47,7 +48,7 @@ def images() -> torch.Tensor:
 def test_the_shipped_weights_are_small_packaged_and_named_by_their_hash(embedded):
     assert SHIPPED.stat().st_size <= 4 * 2**20
     assert embedded.weights == hashlib.sha256(SHIPPED.read_bytes()).hexdigest()[:12]
-    assert embedded.notes["weights_sha256"] == tensors_hash(embedded.network.state_dict())
+    assert embedded.notes["weights_sha256"] == state_hash(embedded.network.state_dict())
     assert {"settings", "simulator", "versions", "held_out", "command"} <= embedded.notes.keys()
     packaged = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["r2flow"]
     assert SHIPPED.relative_to(ROOT / "r2flow").as_posix() in packaged
@@ -175,7 +176,7 @@ def test_a_training_that_was_killed_ends_at_the_weights_of_one_that_was_not(tmp_
     monkeypatch.setattr(training, "SAVE_EVERY", 2)
     whole, broken = tmp_path / "whole.safetensors", tmp_path / "broken.safetensors"
     one = Training(TINY, whole)
-    untrained = tensors_hash(one.network.state_dict())
+    untrained = state_hash(one.network.state_dict())
     one.run()
     one.finish()
     steps = iter(range(3))

@@ -9,7 +9,6 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.extractors.rangenet import (
     RangeNet21,
     RangeNet53,
-    mean_by_angle,
     mean_by_depth,
     subsample,
     translate,
@@ -57,14 +56,12 @@ def test_rangenet21_is_the_reference(case):
     close(network.head(maps[:1]), case["logits_b0"])
     close(subsample(maps), case["subsample"])
     close(mean_by_depth(maps), case["depth"])
-    close(mean_by_angle(maps), case["angle"])
 
 
 def test_the_published_depth_is_bands_of_rows():
     maps = torch.arange(64.0).view(1, 1, 64, 1).expand(1, 2, 64, 32) * torch.tensor([1.0, -1.0]).view(1, 2, 1, 1)
     rows = torch.arange(16.0) * 4 + 1.5  # mean of rows 4 i .. 4 i + 3
     torch.testing.assert_close(mean_by_depth(maps), torch.cat([rows, -rows])[None])
-    torch.testing.assert_close(mean_by_angle(maps.transpose(2, 3)), torch.cat([rows, -rows])[None])
 
 
 def release(layers: int) -> set[str]:

@@ -4,7 +4,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from r2flow.metrics.extractors.minkowski import MinkowskiNet
-from r2flow.metrics.extractors.sparse import Grid, Sparse, SparseConv3d, offsets
+from r2flow.metrics.extractors.sparse import Sparse, SparseConv3d, VoxelGrid, offsets
 from r2flow.metrics.extractors.spvcnn import SPVCNN, Corners
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
@@ -41,7 +41,7 @@ def test_stride_1_is_a_dense_convolution_at_the_voxels(dtype, size):
     coords, mask = occupied(7, 0.3, dtype=dtype)
     x = torch.randn(len(coords), 3, dtype=dtype)
     convolution = SparseConv3d(3, 4, size).to(dtype)
-    y = convolution(Sparse(x, Grid(coords)))
+    y = convolution(Sparse(x, VoxelGrid(coords)))
     weight = dense_kernel(convolution.kernel.view(size**3, 3, 4), size)
     expected = F.conv3d(to_dense(x, coords, mask.shape), weight, padding=size // 2)
     torch.testing.assert_close(y.features, at(expected, coords), rtol=0, atol=TOLERANCE[dtype])
@@ -53,7 +53,7 @@ def test_a_stride_and_its_undoing_are_dense_ones(dtype):
     x = torch.randn(len(coords), 3, dtype=dtype)
     down = SparseConv3d(3, 4, 2, 2).to(dtype)
     up = SparseConv3d(4, 5, 2, 2, transposed=True).to(dtype)
-    below = down(Sparse(x, Grid(coords)))
+    below = down(Sparse(x, VoxelGrid(coords)))
     dense = F.conv3d(to_dense(x, coords, mask.shape), dense_kernel(down.kernel, 2), stride=2)
     torch.testing.assert_close(below.features, at(dense, below.grid.coords), rtol=0, atol=TOLERANCE[dtype])
     assert len(below.grid) == F.max_pool3d(mask, 2).sum()  # each larger voxel with one in it, and no other
@@ -74,7 +74,7 @@ def test_the_order_of_the_weights_is_torchsparse_s():
     assert offsets(1) == [(0, 0, 0)]
     # A voxel at the origin, one behind it in x and one above it: weight k is k, so that a sum says which were used.
     coords = torch.tensor([[0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-    x = Sparse(torch.tensor([[1.0], [10.0], [100.0]]), Grid(coords))
+    x = Sparse(torch.tensor([[1.0], [10.0], [100.0]]), VoxelGrid(coords))
     odd, down = SparseConv3d(1, 1, 3), SparseConv3d(1, 1, 2, 2)
     odd.kernel.data = torch.arange(27.0).view(27, 1, 1)
     down.kernel.data = torch.arange(8.0).view(8, 1, 1)
@@ -89,7 +89,7 @@ def test_the_order_of_the_weights_is_torchsparse_s():
 
 def test_coordinates_may_be_negative_and_scans_do_not_touch():
     coords = torch.tensor([[0, -3, 5, 0], [1, -2, 5, 0], [1, -3, 5, 1]])
-    grid = Grid(coords)
+    grid = VoxelGrid(coords)
     assert grid.find(coords).tolist() == [0, 1, 2]
     assert grid.find(coords + torch.tensor([0, 1, 0, 0])).tolist() == [-1, -1, -1]  # (0, -2, 5, 0) is the other scan's
     assert grid.find(torch.tensor([1, -3, 5, 10**6])) == -1
@@ -98,13 +98,14 @@ def test_coordinates_may_be_negative_and_scans_do_not_touch():
 
 def test_what_is_no_grid_is_refused():
     with pytest.raises(ValueError, match="distinct"):
-        Grid(torch.zeros(2, 4, dtype=torch.int64))
+        VoxelGrid(torch.zeros(2, 4, dtype=torch.int64))
     with pytest.raises(ValueError, match="at least one voxel"):
-        Grid(torch.zeros(0, 4, dtype=torch.int64))
+        VoxelGrid(torch.zeros(0, 4, dtype=torch.int64))
     with pytest.raises(ValueError, match="too far apart"):
-        Grid(torch.tensor([[0, 0, 0, 0], [0, 2**30, 2**30, 2**30]]))
+        VoxelGrid(torch.tensor([[0, 0, 0, 0], [0, 2**30, 2**30, 2**30]]))
+    voxel = VoxelGrid(torch.zeros(1, 4, dtype=torch.int64))
     with pytest.raises(ValueError, match="no stride was taken"):
-        SparseConv3d(1, 1, 2, 2, transposed=True)(Sparse(torch.zeros(1, 1), Grid(torch.zeros(1, 4, dtype=torch.int64))))
+        SparseConv3d(1, 1, 2, 2, transposed=True)(Sparse(torch.zeros(1, 1), voxel))
     with pytest.raises(ValueError, match="found 2, 3"):
         SparseConv3d(1, 1, 3, 2)
 
@@ -216,7 +217,7 @@ def test_interpolation_is_exact_for_what_is_linear():
     cube = torch.cartesian_prod(torch.zeros(1, dtype=torch.int64), *[torch.arange(5)] * 3)
     points = torch.cartesian_prod(torch.zeros(1, dtype=torch.int64), *[torch.arange(0, 16, 3)] * 3)
     linear = torch.tensor([[1.0, -2.0], [0.5, 3.0], [2.0, 0.25]])
-    corners = Corners(points, Grid(cube), 4)
+    corners = Corners(points, VoxelGrid(cube), 4)
     expected = points[:, 1:].float() / 4 @ linear + 7
     torch.testing.assert_close(corners.to_points(cube[:, 1:].float() @ linear + 7), expected, rtol=1e-6, atol=1e-5)
 

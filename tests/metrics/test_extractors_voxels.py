@@ -6,7 +6,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.extractors import random_extractor
 from r2flow.metrics.extractors.minkowski import MinkowskiNet
 from r2flow.metrics.extractors.spvcnn import SPVCNN
-from r2flow.metrics.extractors.voxels import mean_by_angle, mean_by_distance, voxelise
+from r2flow.metrics.extractors.voxels import mean_by_distance, voxelise
 from r2flow.metrics.scans import Scans
 
 SMALL = SENSORS["hdl64e"].resized(8, 32)
@@ -26,7 +26,6 @@ def test_voxels_are_the_reference_s(case):
 def test_pooling_is_the_reference_s(case):
     features, coords = case["post_features_in"], case["voxel_coords"]
     torch.testing.assert_close(mean_by_distance(features, coords)[None], case["post_depth"], rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(mean_by_angle(features, coords)[None], case["post_angle"], rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(features.mean(0)[None], case["post_global"], rtol=1e-4, atol=1e-4)
 
 
@@ -46,9 +45,6 @@ def test_sectors_by_hand():
     # Edges 0, 7.25, 10.5, ...: 4 + 52 i / 16 m, the first put to 0.
     assert mean_by_distance(features, coords).tolist() == [2, 15] + [0] * 14
     assert mean_by_distance(features, coords, sectors=1).tolist() == [8.5]
-    # Azimuths 8.5, -171.5, 98.5 and -81.5 degrees: sectors of 22.5 degrees from -180 on.
-    by_angle = mean_by_angle(features, coords).tolist()
-    assert {i: value for i, value in enumerate(by_angle) if value} == {8: 1, 0: 3, 12: 10, 4: 20}
     far = coords * 1000
     assert mean_by_distance(features, far).tolist() == [0] * 16
 

@@ -6,7 +6,7 @@ import pickle
 import pytest
 import torch
 
-from r2flow.metrics.features import FeatureStore
+from r2flow.metrics.store import FeatureStore
 
 
 @pytest.fixture

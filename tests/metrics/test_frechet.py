@@ -117,4 +117,4 @@ def test_the_network_gives_the_name_and_random_weights_never_the_fields(network,
     metric = FrechetDistance(network)
     assert metric.protocol.metric == name
     metric.extractor.weights = "random"
-    assert metric.protocol.metric == f"frechet_{network}_random"
+    assert FrechetDistance(metric.extractor).protocol.metric == f"frechet_{network}_random"

@@ -9,6 +9,7 @@ from r2flow.metrics import kid, manifold
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.kid import KernelDistance, cubic_mmd
 from r2flow.metrics.manifold import Manifold
+from r2flow.metrics.scans import Scans
 
 
 class Given(Extractor):
@@ -23,7 +24,7 @@ class Given(Extractor):
         return scans.rows
 
 
-class Rows:
+class Rows(Scans):
     has_reflectance = False
 
     def __init__(self, rows):

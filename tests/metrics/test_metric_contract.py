@@ -12,17 +12,22 @@ from torchmetrics import MetricCollection
 from r2flow.errors import InputError
 from r2flow.metrics import METRICS
 from r2flow.metrics.base import SIDES
-from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.features import extract
 from r2flow.metrics.scans import Scans
+from tests.metrics.conftest import Summary
 
 REAL, GENERATED = 12, 9
-# One network stands for all: the others' metrics are the same classes.
-DISTINCT = ["frd", "jsd", "mmd", "jsd_lidm", "mmd_lidm", "beams", "drop_rate", "manifold_embedded", "kid_embedded"]
 pytestmark = pytest.mark.usefixtures("coarse")
 
 
-@pytest.fixture(params=DISTINCT)
+def one_of_each_class() -> list[str]:
+    """A name of every class in the table: its other names differ by their network alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("r2flow.metrics.extractors.load_extractor", lambda name: Summary())
+        return list({type(build()): name for name, build in METRICS.items()}.values())
+
+
+@pytest.fixture(params=one_of_each_class())
 def build(request, summary):
     """Builds the metric of a name, on averages instead of networks."""
     return METRICS[request.param]
@@ -62,7 +67,6 @@ def test_every_name_is_its_protocols_and_no_two_figures_share_one(summary, sets)
         assert values
         assert all(isinstance(value, float) and math.isfinite(value) for value in values.values())
         figures += values
-    assert {type(METRICS[name]()) for name in METRICS} == {type(METRICS[name]()) for name in DISTINCT}
     assert len(set(figures)) == len(figures)
 
 
@@ -86,11 +90,11 @@ def test_an_empty_scan_leaves_the_figures_of_the_others_and_a_word(build, sets):
     with_empty["generated"] = Scans(more, sets["real"].sensor)
     metric = give(build(), with_empty)
     values = metric.compute()
-    if metric.protocol.metric == "drop_rate":  # to drop every ray is what it measures
-        assert values["drop_rate"] > expected["drop_rate"] + 0.1
+    if metric.counts_empty:
+        assert values != pytest.approx(expected, rel=1e-2)
     else:
         assert values == pytest.approx(expected, rel=1e-9)
-        assert any("2 of 11 generated scans are left out: empty" in said for said in metric.remarks())
+        assert any("2 of 11 generated scans are left out" in remark for remark in metric.remarks())
 
 
 @pytest.mark.parametrize("case", ["all empty", "one alone", "none"])
@@ -105,19 +109,17 @@ def test_a_figure_that_does_not_exist_comes_with_a_word(build, sets, case):
     if case == "none":
         assert all(missing)
         assert "there are no generated scans." in metric.remarks()
-    if case == "all empty" and metric.protocol.metric != "drop_rate":
-        assert any("none of the 9 generated scans" in said for said in metric.remarks())
+    if case == "all empty" and not metric.counts_empty:
+        assert any("none of the 9 generated scans" in remark for remark in metric.remarks())
 
 
-def test_identical_sets_are_no_distance_apart(build, sets):
-    values = give(build(), dict.fromkeys(SIDES, sets["real"])).compute()
-    for name, value in values.items():
-        if name.startswith(("precision", "recall", "coverage")):
-            assert value == 1
-        elif name.startswith("density"):
-            assert value == pytest.approx(6 / 5)
-        elif not name.startswith("kid"):  # unbiased: 0 on average
-            assert value == pytest.approx(0, abs=1e-9)
+def test_equal_sets_have_the_figures_that_the_class_states(build, sets):
+    metric = give(build(), dict.fromkeys(SIDES, sets["real"]))
+    values = list(metric.compute().values())
+    if metric.of_equal_sets is None:
+        assert all(map(math.isfinite, values))
+    else:
+        assert values == pytest.approx([metric.of_equal_sets] * len(values), abs=1e-9)
 
 
 @pytest.mark.parametrize("keep", [False, True])
@@ -162,7 +164,7 @@ def test_rows_given_under_one_number_are_not_passed_over(build, sets):
 
 
 def test_in_a_collection_every_metric_has_its_own_say(summary, sets):
-    names = [*DISTINCT, "frid", "manifold_rangenet53"]
+    names = [*one_of_each_class(), "frd", "manifold_rangenet53"]
     collection = MetricCollection({name: METRICS[name]() for name in names})
     assert collection(sets["real"], real=True) == {}  # a batch has no distance of its own
     collection.reset()
@@ -206,12 +208,17 @@ def test_a_batch_of_no_scans_changes_nothing(build, sets):
     assert give(metric, sets).compute() == give(build(keep=True), sets).compute()
 
 
-def test_reflectance_is_asked_for_where_a_network_looks_at_it(build, sets):
+def test_scans_without_reflectance_are_refused_where_it_is_needed(build, sets):
+    metric, bare = build(), Scans(sets["real"].images[:, :1], sets["real"].sensor)
+    if not metric.needs_reflectance:
+        metric.update(bare, real=True)
+    metric.needs_reflectance = True
+    with pytest.raises(InputError, match=f"'{metric.name}' needs reflectance"):
+        metric.update(bare, real=True)
+
+
+def test_what_is_no_batch_of_scans_is_refused_in_one_line(build, sets):
     metric = build()
-    if isinstance(getattr(metric, "extractor", None), Extractor):
-        metric.extractor.needs_reflectance = True
-        with pytest.raises(InputError, match="looks at reflectance"):
-            metric.update(Scans(sets["real"].images[:, :1], sets["real"].sensor), real=True)
-    else:
-        metric.update(Scans(sets["real"].images[:, :1], sets["real"].sensor), real=True)
-        assert not metric.needs_reflectance
+    with pytest.raises(InputError, match=rf"^'{metric.name}' takes .*Scans\(images, sensor\), found Tensor\.$"):
+        metric.update(sets["real"].images, real=True)
+    assert metric.given("real") == 0

@@ -8,8 +8,11 @@ import torch
 from torch import nn
 
 from r2flow.checkpoints import Checkpoint
+from r2flow.generators import Field
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
+from r2flow.lidar.space import ModelSpace
+from r2flow.noise import Draws
 from r2flow.reports.curvature import (
     curvature_page,
     curvature_rows,
@@ -18,7 +21,6 @@ from r2flow.reports.curvature import (
     summary,
     trajectories_figure,
 )
-from r2flow.sampling import noise_of
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 
@@ -38,12 +40,13 @@ class Falling(nn.Module):
 
 
 def checkpoint(model: nn.Module) -> Checkpoint:
-    return Checkpoint(model, SENSOR, Encoding(SENSOR), {}, 0, None, "r2flow")  # type: ignore[arg-type]
+    space = ModelSpace(SENSOR, Encoding(SENSOR), SENSOR.rays())
+    return Checkpoint(Field(model, space.shape, space), {}, 0, None, "r2flow")  # type: ignore[arg-type]
 
 
 def by_hand(a: float, num: int) -> tuple[np.ndarray, np.ndarray]:
     """Every state and velocity of Euler's path, (num, n + 1, elements) and (num, n, elements), in numpy."""
-    x = noise_of(range(num), (2, *SENSOR.shape), 5).double().numpy().reshape(num, -1)
+    x = Draws(5, range(num)).start((2, *SENSOR.shape)).double().numpy().reshape(num, -1)
     states, velocities = [x], []
     for k in range(STEPS):
         velocities.append(-a * (states[-1] + 1) * k / STEPS)

@@ -5,11 +5,14 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
+from r2flow.generators import Sampler
+from r2flow.inversion import interpolate_scans, invert
+from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
+from r2flow.lidar.space import ModelSpace
 from r2flow.reports.interpolation import interpolation, interpolation_figure
 from r2flow.reports.inversion import errors_of, invert_scans, print_rows, real_scans, unique_names
 from r2flow.reports.pictures import figure_pixels
-from r2flow.sampling import interpolate_scans, invert
 from tests.test_sampling import SENSOR, GaussianFlow, flow, scans
 
 
@@ -42,7 +45,8 @@ def test_a_page_says_what_was_measured(tmp_path):
     paths = [tmp_path / "one.npy", tmp_path / "two.npy"]
     for path, image in zip(paths, scans(2).numpy(), strict=True):
         np.save(path, image)
-    page = interpolation(flow(), real_scans(flow(), paths), 3, tmp_path / "o", tolerance=1e-4, batch_size=2)
+    sampler = Sampler("dopri5", tolerance=1e-4)
+    page = interpolation(flow(), real_scans(flow(), paths), 3, tmp_path / "o", sampler, batch_size=2)
     assert [row["frame"] for row in page.rows] == [0, 1, 2]
     assert page.rows[1]["evaluations"] < page.rows[0]["evaluations"]
     assert "one" in page.text[1]
@@ -63,7 +67,7 @@ def test_a_frame_that_is_not_solved_is_said_to_be(tmp_path, caplog):
     for path, image in zip(paths, scans(2).numpy(), strict=True):
         np.save(path, image)
     checkpoint = flow(LostBetween())
-    page = interpolation(checkpoint, real_scans(checkpoint, paths), 4, tmp_path / "o", "rk4", steps=4, batch_size=2)
+    page = interpolation(checkpoint, real_scans(checkpoint, paths), 4, tmp_path / "o", Sampler("rk4", 4), batch_size=2)
     assert [row["converged"] for row in page.rows] == [True, False, False, True]
     assert "not solved, and no scans of this flow: 1, 2;" in caplog.text
     assert "| no |" in page.text[2]
@@ -73,9 +77,9 @@ def test_an_end_without_its_noise_is_refused(tmp_path):
     bad = scans(2)
     bad[1, 0, 0, 0] = math.nan
     with pytest.raises(InputError, match="the last scan cannot be carried to its noise"):
-        interpolate_scans(flow(), bad, 3, "rk4", steps=4)
+        interpolate_scans(flow(), bad, 3, Sampler("rk4", 4))
     with pytest.raises(InputError, match="the first scan cannot be carried to its noise"):
-        interpolate_scans(flow(), bad.flip(0), 3, "dopri5")
+        interpolate_scans(flow(), bad.flip(0), 3)
 
 
 def test_a_scan_that_is_not_solved_is_said_to_be(tmp_path, capsys):
@@ -90,7 +94,7 @@ def test_a_scan_that_is_not_solved_is_said_to_be(tmp_path, capsys):
 def test_inversion_refuses_before_it_writes(tmp_path):
     np.save(tmp_path / "scan.npy", scans(1)[0].numpy())
     with pytest.raises(InputError, match="Did you mean 'dopri5'"):
-        invert_scans(flow(), real_scans(flow(), [tmp_path / "scan.npy"]), tmp_path / "o", "dopri")
+        invert_scans(flow(), real_scans(flow(), [tmp_path / "scan.npy"]), tmp_path / "o", Sampler("dopri"))
     with pytest.raises(InputError, match="does not exist"):
         real_scans(flow(), [tmp_path / "scan.npy", tmp_path / "none.bin"])
     assert not (tmp_path / "o").exists()
@@ -101,7 +105,7 @@ def test_a_range_image_is_held_to_the_sensor_s_limits(tmp_path):
     sensor = SENSORS["hdl64e"].resized(2, 4)
     np.save(tmp_path / "image.npy", image.reshape(2, 2, 4))
     checkpoint = flow()
-    object.__setattr__(checkpoint, "sensor", sensor)
+    checkpoint.generator.space = ModelSpace(sensor, Encoding(sensor), sensor.rays())
     ((name, seen),) = real_scans(checkpoint, [tmp_path / "image.npy"])
     assert name == "image"
     np.testing.assert_allclose(seen[0].flatten(), [0, 1.45, 40, 80, 0, 0, 0, 0])

@@ -8,7 +8,8 @@ import torch
 
 import r2flow
 from r2flow.errors import InputError
-from r2flow.reports.pages import STYLES, Page, blank_figure, prepare_folder, shown, table, write_page
+from r2flow.reports.pages import STYLES, Page, blank_figure, prepare_folder, write_page
+from r2flow.reports.tables import table
 from tests.test_cli import r2flow as verb  # noqa: F401  a fixture
 
 ROWS = [
@@ -89,15 +90,6 @@ def test_a_page_that_fails_leaves_the_old_one(tmp_path):
 def test_styles_differ_without_colour():
     assert len({str((style["marker"], style["linestyle"])) for style in STYLES}) == len(STYLES)
     assert len({style["marker"] for style in STYLES}) == len(STYLES)
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.0123456, "0.0123"), (1.5e-7, "1.5e-07"), (0.0, "0"), (128, "128"), (True, "yes"), (None, ""), ("x", "x"),
-     (12345.6, "1.2e+04"), (math.nan, "-"), (math.inf, "inf")],
-)  # fmt: skip
-def test_values_are_short(value, text):
-    assert shown(value) == text
 
 
 def test_a_folder_that_cannot_be_one_is_refused_before_anything_is_measured(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from r2flow.checkpoints import AtomicCheckpointIO, load_checkpoint, weights_hash
+from r2flow.checkpoints import load_checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.reports.paper import cells
@@ -17,6 +17,7 @@ from r2flow.reports.paper.report import held_out
 from r2flow.reports.paper.subjects import find_subjects
 from r2flow.reports.paper.tables import beside, differences, over_seeds, same_architecture
 from r2flow.reports.speed_quality import BETWEEN
+from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_sampling import network
 
@@ -31,7 +32,7 @@ def make_run(folder: Path, stage: dict, parent: Path | None = None, seed: int = 
     if parent is not None:
         above = load_checkpoint(parent)
         config["parent"] = {"path": "moved", "weights": weights_hash(above), "stage": above.config["stage"]["name"]}
-    weights = {f"velocity.{name}": scale * value for name, value in flow.model.state_dict().items()}
+    weights = {f"generator.backbone.{name}": scale * value for name, value in flow.model.state_dict().items()}
     content = {"state_dict": weights, "config": config, "global_step": 7}
     AtomicCheckpointIO().save_checkpoint(content, folder / "checkpoints" / "step-00000007.ckpt")
     (folder / "config.yaml").write_text(yaml.safe_dump(config))

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from r2flow.generators import Field
 from r2flow.reports import savings
 from r2flow.reports.pages import write_page
 from r2flow.reports.savings import (
@@ -85,8 +86,8 @@ def test_regions_cost_their_share_and_are_measured_where_they_were_asked_for():
 
 def test_a_field_that_looks_at_no_neighbour_loses_nothing_by_a_cut(monkeypatch):
     # the exact Gaussian flow acts on each pixel by itself: any region of it is that of the whole
-    monkeypatch.setattr(savings, "evaluated_region", lambda checkpoint, region: region)
-    monkeypatch.setattr(savings, "part_of", lambda model, region: model)
+    monkeypatch.setattr(Field, "unit", (1, 1))
+    monkeypatch.setattr(Field, "part", lambda generator, region: generator)
     for row in region_rows(flow(), 2, steps=4, seed=0, advance=lambda: None)[1:]:
         assert row["error"] == pytest.approx(0, abs=1e-6)
         assert row["median_m"] == pytest.approx(0, abs=1e-4)

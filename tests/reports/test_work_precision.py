@@ -8,6 +8,7 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.flow.problems import PROBLEMS
+from r2flow.generators import Field
 from r2flow.reports import work_precision
 from r2flow.reports.work_precision import (
     Configuration,
@@ -41,7 +42,7 @@ def test_steps_fit_the_budgets():
 def test_a_row_is_what_the_solver_did():
     # x' = x by Euler: (1 + 1/n)^n x_0, off by (e - (1 + 1/n)^n) |x_0|, in closed form.
     x_0 = torch.randn(21, 6, dtype=torch.float64)
-    subject = Subject("growth", lambda t, x: x, x_0, math.e * x_0, batch_size=5)
+    subject = Subject("growth", Field(lambda t, x: x, x_0.shape[1:]), x_0, math.e * x_0, batch_size=5)
     rows = measure([subject], [Configuration("euler", 1), Configuration("euler", 10)], repeats=2)
     norms = x_0.square().mean(1).sqrt().numpy()
     for row, n in zip(rows, (1, 10), strict=True):
@@ -58,9 +59,9 @@ def test_a_row_is_what_the_solver_did():
 def test_configurations_take_turns(monkeypatch):
     order = []
 
-    def timed(configuration, velocity, x_0):
+    def timed(configuration, flow, x_0):
         order.append(configuration.label)
-        return configuration.solve(velocity, x_0), 3.0 if configuration.steps == 8 else 0.1
+        return configuration.solve(flow, x_0), 3.0 if configuration.steps == 8 else 0.1
 
     monkeypatch.setattr(work_precision, "timed", timed)
     (subject,) = problem_subjects(["gaussian"], scenes=2, elements=4)
@@ -83,7 +84,9 @@ def test_a_lost_scene_is_on_no_front():
     # Euler on x' = x^2 from 3 overflows in float64 after some steps; the other scene is solved.
     x_0 = torch.tensor([[0.1], [1e200]], dtype=torch.float64)
     exact = x_0 / (1 - x_0)
-    (row,) = measure([Subject("blow-up", lambda t, x: x * x, x_0, exact, 2)], [Configuration("euler", 8)], 1)
+    (row,) = measure(
+        [Subject("blow-up", Field(lambda t, x: x * x, x_0.shape[1:]), x_0, exact, 2)], [Configuration("euler", 8)], 1
+    )
     assert row["converged"] == 1
     assert not row["pareto_evaluations"]
     assert best_within([row], 100) is None
@@ -107,7 +110,7 @@ def test_metres_are_taken_where_both_return():
 def test_the_reference_s_floor_bounds_its_true_error(name):
     problem = PROBLEMS[name]()
     x_0 = torch.randn(3, 16)
-    found = reference(problem, x_0, steps=32, tolerance=1e-6)
+    found = reference(Field(problem, x_0.shape[1:]), x_0, steps=32, tolerance=1e-6)
     true = (found.x_1 - problem.solution(x_0, 1.0)).square().mean(1).sqrt()
     assert found.x_1.dtype == torch.float64
     assert true.max() < found.floor < 1e-2
@@ -116,9 +119,9 @@ def test_the_reference_s_floor_bounds_its_true_error(name):
 
 def test_where_no_reference_can_be_had_nothing_is_judged():
     x_0 = torch.ones(2, 2)  # x' = 9 x^2 has left for infinity at t = 1/9
-    found = reference(lambda t, x: 9 * x**2, x_0, steps=32, tolerance=1e-4)
+    found = reference(Field(lambda t, x: 9 * x**2, x_0.shape[1:]), x_0, steps=32, tolerance=1e-4)
     assert found.floor == math.inf
-    subject = Subject("blow-up", lambda t, x: 9 * x**2, x_0, found.x_1, 2, found.floor)
+    subject = Subject("blow-up", Field(lambda t, x: 9 * x**2, x_0.shape[1:]), x_0, found.x_1, 2, found.floor)
     rows = measure([subject], configurations(["euler"], [4]), repeats=1)
     page = work_precision_page(rows, "blow-up", found, {}, "")
     assert "no solver arrives within any budget" in " ".join(page.text)

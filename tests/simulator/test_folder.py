@@ -67,7 +67,7 @@ def test_two_processes_write_what_one_writes(tmp_path):
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        (SimulatedFolder(Path(), SMALL, 1), "seed 0, asked for is 1"),
+        (SimulatedFolder(Path(), SMALL, 1), "seed 0, not 1"),
         (SimulatedFolder(Path(), SENSORS["vlp16"], 0), "sensor hdl64e 16x128"),
     ],
     ids=["seed", "sensor"],
@@ -91,7 +91,8 @@ def test_other_peoples_scans_and_damaged_notes_are_left_alone(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("formats", "labels", "words"), [(("las",), False, "no format named 'las'"), (("npy",), True, "labels are one")]
+    ("formats", "labels", "words"),
+    [(("las",), False, "no format named 'las'"), (("npy",), True, "labels are those of points")],
 )
 def test_formats_that_cannot_be_written_are_named(tmp_path, formats, labels, words):
     with pytest.raises(InputError, match=words):

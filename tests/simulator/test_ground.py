@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
-from r2flow.simulator.beams import along_rows
 from r2flow.simulator.ground import Ground, Street
-from r2flow.simulator.labels import LABELS
+from r2flow.simulator.lasers import along_rows
 from r2flow.simulator.rays import Rays
 
 HDL64E = SENSORS["hdl64e"]
@@ -28,7 +28,7 @@ def test_a_slope_is_met_where_ray_and_plane_cross(lean):
 def test_the_normal_of_a_slope_sets_the_angle_of_incidence():
     hit = Ground(lean=(0.1, 0.0)).meet(RAYS)
     column = HDL64E.columns // 2  # ahead, to within a fifth of a degree
-    e = RAYS.beams.elevation
+    e = RAYS.lasers.elevation
     met = np.isfinite(hit.distance[:, column])
     np.testing.assert_allclose(hit.cosine[met, column], np.sin(np.arctan(0.1) - e[met]), atol=1e-4)
 
@@ -38,7 +38,7 @@ def test_on_waves_the_ray_ends_on_the_surface_and_passes_nothing_before():
     hit = ground.meet(RAYS)
     met = np.isfinite(hit.distance)
     s, a = np.where(met, hit.distance, 1.0), np.broadcast_to(RAYS.azimuth, RAYS.shape)
-    slope = np.broadcast_to(np.tan(RAYS.beams.elevation)[:, None], RAYS.shape)
+    slope = np.broadcast_to(np.tan(RAYS.lasers.elevation)[:, None], RAYS.shape)
     for share, tolerance in ((1.0, 0.0), (0.9, 0.02), (0.6, 0.02), (0.3, 0.02)):
         above = HEIGHT + share * s * slope - ground.height(share * s * np.cos(a), share * s * np.sin(a))
         if share == 1:

@@ -8,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 
+from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.noise import generator
 from r2flow.simulator import draw_scene, simulate
-from r2flow.simulator.labels import LABELS
 
 HDL64E = SENSORS["hdl64e"]
 SMALL = HDL64E.resized(32, 256)

@@ -6,9 +6,11 @@ from torch import nn
 
 from r2flow.errors import InputError
 from r2flow.flow.solvers import solve
+from r2flow.generators import Field
 from r2flow.noise import standard_normal
 from r2flow.stages import STAGES
-from r2flow.stages.rectify import RectifiedFlow, learning_rate_factor
+from r2flow.stages.base import learning_rate_factor
+from r2flow.stages.rectify import Rectify
 
 
 def test_the_schedule_is_the_reference_s(shared):
@@ -38,12 +40,16 @@ class Affine(nn.Module):
         return a * x + b
 
 
+def affine(network: Affine | None = None) -> Field:
+    return Field(network or Affine(), (1, 2, 2))
+
+
 M, S = 0.7, 0.25  # x_1 ~ N(M, S^2), x_0 ~ N(0, 1), independent: the flow carries x_0 to M + S x_0
 
 
 @pytest.fixture(scope="module")
-def trained() -> RectifiedFlow:
-    stage = RectifiedFlow(Affine())
+def trained() -> Rectify:
+    stage = Rectify(affine())
     optimizer = torch.optim.Adam(stage.parameters(), lr=3e-2)
     stage.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
     for step in range(1500):
@@ -64,7 +70,7 @@ def trained() -> RectifiedFlow:
 
 def test_a_gaussian_is_carried_to_a_gaussian(trained):
     x_0 = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
-    end = solve(trained.velocity, x_0, steps=256).x.detach()
+    end = solve(trained.generator.velocity, x_0, steps=256).x.detach()
     torch.testing.assert_close(end, M + S * x_0, rtol=0, atol=0.05)
 
 
@@ -74,19 +80,19 @@ def test_the_velocity_is_the_conditional_mean(trained):
         x = torch.tensor([-0.5, 0.5, 1.0]).reshape(3, 1, 1, 1)
         slope = (t * S**2 - (1 - t)) / (t**2 * S**2 + (1 - t) ** 2)
         expected = M + slope * (x - t * M)
-        estimate = trained.velocity(torch.full((3,), t), x).detach()
+        estimate = trained.generator.velocity(torch.full((3,), t), x).detach()
         torch.testing.assert_close(estimate, expected, rtol=0, atol=0.08)
 
 
 @pytest.mark.parametrize("name", list(STAGES))
 def test_every_stage_refuses_unknown_options(name):
     with pytest.raises(InputError, match=r"Did you mean 'learning_rate'\?"):
-        STAGES.build({"name": name, "learning_rat": 1.0}, Affine())
+        STAGES.build({"name": name, "learning_rat": 1.0}, affine())
 
 
 def test_an_untrained_stage_has_the_loss_of_predicting_nothing():
     # v = 0: the loss is E|x_1 - x_0|^2 / d = M^2 + S^2 + 1.
-    stage = RectifiedFlow(Affine())
+    stage = Rectify(affine())
     stage.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
     x_0 = torch.stack([standard_normal((1, 32, 32), 0, "training", k) for k in range(64)])
     x_1 = M + S * torch.stack([standard_normal((1, 32, 32), 0, "evaluation", k) for k in range(64)])

@@ -7,7 +7,7 @@ from r2flow.errors import InputError
 from r2flow.flow.solvers import solve
 from r2flow.stages import STAGES, build_stage
 from r2flow.stages.reflow import Distill, Reflow
-from tests.stages.test_rectify import Affine, M, S
+from tests.stages.test_rectify import Affine, M, S, affine
 
 
 def pairs(step: int, count: int = 256) -> dict[str, torch.Tensor]:
@@ -33,13 +33,13 @@ X_0 = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
 
 @pytest.mark.parametrize("loss", ["pseudo_huber", "pseudo_huber_elementwise", "mse"])
 def test_a_reflowed_gaussian_takes_one_step(loss: str):
-    end = solve(fitted(Reflow(Affine(), loss)).velocity, X_0, steps=1).x.detach()
+    end = solve(fitted(Reflow(affine(), loss)).generator.velocity, X_0, steps=1).x.detach()
     torch.testing.assert_close(end, M + S * X_0, rtol=0, atol=0.02)
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])
 def test_a_distilled_flow_is_right_at_its_own_number_of_steps(k: int):
-    end = solve(fitted(Distill(Affine(), steps=k)).velocity, X_0, steps=k).x.detach()
+    end = solve(fitted(Distill(affine(), steps=k)).generator.velocity, X_0, steps=k).x.detach()
     torch.testing.assert_close(end, M + S * X_0, rtol=0, atol=0.02)
 
 
@@ -52,14 +52,14 @@ def test_distillation_trains_at_the_times_of_its_steps_alone(k: int):
             seen.update(t.tolist())
             return super().forward(t, x)
 
-    stage = Distill(Spy(), steps=k)
+    stage = Distill(affine(Spy()), steps=k)
     stage.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
     stage.training_step(pairs(0), 0)
     assert seen == {i / k for i in range(k)}
 
 
 def test_the_paper_s_loss_and_times_are_the_defaults():
-    stage = Reflow(Affine())
+    stage = Reflow(affine())
     # Most of the U-shaped density lies at the ends: e^(4t) + e^(4(1 - t)) puts 2 e^2 sinh(1) / (e^4 - 1) = 0.324 inside
     # (1/4, 3/4), where a uniform one has 0.5.
     u = torch.linspace(0, 1, 20001)[:-1]
@@ -83,11 +83,11 @@ def test_the_paper_s_loss_and_times_are_the_defaults():
 )
 def test_what_cannot_be_is_refused(options, message):
     with pytest.raises(InputError, match=message):
-        STAGES.build(options, Affine())
+        STAGES.build(options, affine())
 
 
 @pytest.mark.parametrize(("stage", "data"), [("reflow", "simulated"), ("distill", "folder"), ("rectify", "pairs")])
 def test_stage_and_data_belong_together(stage: str, data: str):
     config = {"stage": {"name": stage}, "data": {"name": data, "batch_size": 4}, "seed": 0}
     with pytest.raises(InputError, match=f"stage={stage} learns from"):
-        build_stage(config, Affine())
+        build_stage(config, affine())

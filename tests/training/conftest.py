@@ -38,7 +38,7 @@ TINY = [
     "callbacks.checkpoint.every=2",
     "callbacks.pictures=null",
     "samples.num=1",
-    "samples.steps=2",
+    "sampler.steps=2",
     "loggers=[csv]",
 ]
 

@@ -17,8 +17,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import train
 from callbacks import CALLBACKS, Entry
 from callbacks.ema import averaged_weights
-from r2flow.checkpoints import AtomicCheckpointIO
 from r2flow.data.loader import FlowDataset
+from r2flow.stages.checkpointing import AtomicCheckpointIO
 
 FOLDER = Path(os.environ["R2FLOW_RECORD"])
 BROKEN = set(json.loads(os.environ["R2FLOW_BROKEN"]))  # images whose scan is NaN

@@ -52,7 +52,7 @@ def test_a_sensor_of_one_s_own_trains_and_travels_in_the_checkpoint(scans: Path,
     write_sensor(MINE, tmp_path / "conf" / "sensor" / "mine.yaml", "a sensor of a test")
     one_step(
         monkeypatch, tmp_path, "--config-dir", str(tmp_path / "conf"), *SMALL, f"data.root={scans}",
-        "sensor=mine", "name=own", "trainer.max_steps=1", "samples.steps=1",
+        "sensor=mine", "name=own", "trainer.max_steps=1", "sampler.steps=1",
     )  # fmt: skip
     shutil.rmtree(tmp_path / "conf")
     assert load_checkpoint(tmp_path / "runs" / "own").sensor == MINE

@@ -35,9 +35,9 @@ def _float_rows(path: Path, columns: int, layout: str) -> np.ndarray:
     if remainder:
         hint = ""
         if content.size % 20 == 0:
-            hint = " Its size fits nuScenes' rows of 5: if it is one, pass format='pcd.bin'."
+            hint = " Its size fits nuScenes' rows of 5: if it is one, name it .pcd.bin."
         elif content.size % 16 == 0:
-            hint = " Its size fits KITTI's rows of 4: if it is one, pass format='bin'."
+            hint = " Its size fits KITTI's rows of 4: if it is one, name it .bin."
         raise InputError(
             f"{path} is not a whole number of {layout}: {rows} rows of {width} bytes and {remainder} bytes more. "
             f"Is it cut short, or another layout?{hint}"
@@ -48,9 +48,7 @@ def _float_rows(path: Path, columns: int, layout: str) -> np.ndarray:
 def _refuse_other_content(path: Path, head: bytes, layout: str) -> None:
     for signature, name in _SIGNATURES.items():
         if head.startswith(signature):
-            raise InputError(
-                f"{path} is not {layout}: it begins like a .{name} file; rename it or pass format={name!r}."
-            )
+            raise InputError(f"{path} is not {layout}: it begins like a .{name} file; rename it.")
     if all(32 <= byte < 127 or byte in b"\t\r\n" for byte in head):
         raise InputError(f"{path} is not {layout}: it is text, beginning with {head[:24].decode()!r}.")
 

@@ -10,8 +10,23 @@ from r2flow.registry import Registry
 if TYPE_CHECKING:
     from r2flow.metrics.extractors.base import Extractor
 
-# Module of this package and class of it.
-EXTRACTORS: Registry[str] = Registry(
+
+class Extractors(Registry["str | type[Extractor]"]):
+    """Networks by name: classes, or `module:Class` of this package, imported when it is needed."""
+
+    def add(self, name: str, entry: str | type[Extractor]) -> None:
+        """Enter a network of your own, and with it the metrics of its features.
+
+        Raises:
+            ValueError: the name is taken.
+        """
+        from r2flow.metrics import add_network
+
+        super().add(name, entry)
+        add_network(name)
+
+
+EXTRACTORS = Extractors(
     "extractor",
     embedded="embedded:Embedded",
     embedded_range="embedded:EmbeddedRange",
@@ -24,12 +39,15 @@ EXTRACTORS: Registry[str] = Registry(
 
 
 def extractor_class(name: str) -> type[Extractor]:
-    """The class behind a name of `EXTRACTORS`, with what it needs imported now.
+    """The class behind a name of `EXTRACTORS`.
 
     Raises:
         InputError: no such name.
     """
-    module, cls = EXTRACTORS[name].split(":")
+    entry = EXTRACTORS[name]
+    if not isinstance(entry, str):
+        return entry
+    module, cls = entry.split(":")
     return getattr(importlib.import_module(f"{__name__}.{module}"), cls)
 
 
@@ -37,13 +55,13 @@ def load_extractor(name: str) -> Extractor:
     """A network with its trained weights, in evaluation mode on the CPU.
 
     Raises:
-        InputError: no such name, or weights that are not on this machine; `r2flow weights` says how they come here.
+        InputError: no such name, or weights that are not on this machine; `r2flow weights` says how to get them.
     """
     return extractor_class(name).trained()
 
 
 def random_extractor(name: str, seed: int = 0) -> Extractor:
-    """The same network with random weights of a seed, for tests and dry runs: its `weights` say "random".
+    """The network with random weights of a seed, for tests and dry runs: its `weights` are "random".
 
     Raises:
         InputError: no such name.

@@ -1,4 +1,4 @@
-"""What every feature network of the metrics has in common."""
+"""What a feature network of the metrics is."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar, Self
@@ -11,14 +11,16 @@ from r2flow.noise import seed_torch
 
 
 class Extractor(nn.Module):
-    """Features of scans, for inference alone.
+    """A network that gives features of scans, for inference only.
+
+    A subclass defines `features`; and `trained`, unless its weights come by `r2flow weights --add`.
 
     Attributes:
         name: Name in `r2flow.metrics.extractors.EXTRACTORS`.
         layer: Which features are taken, in words.
         dim: How many, D.
-        needs_reflectance: Whether the network looks at reflectance.
-        weights: First 12 digits of the SHA-256 of its weights; "random" without any.
+        needs_reflectance: Whether reflectance is one of its inputs.
+        weights: First 12 digits of the SHA-256 of its weights; "random" without trained ones.
     """
 
     name: ClassVar[str]
@@ -33,11 +35,11 @@ class Extractor(nn.Module):
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:
-        """The network of published weights: its sizes are read off them, its parameters are they.
+        """The network with published weights; its sizes are those of the tensors.
 
         Args:
             tensors: By their published names.
-            config: What the published archive says beside them; often nothing.
+            config: The published archive's config; often empty.
 
         Raises:
             InputError: weights of another network.
@@ -50,10 +52,10 @@ class Extractor(nn.Module):
 
     @classmethod
     def trained(cls) -> Self:
-        """The network with the weights that this machine has for it.
+        """The network with the weights that are on this machine.
 
         Raises:
-            InputError: it has none.
+            InputError: there are none.
         """
         from r2flow.metrics.extractors.weights import read_kept
 
@@ -61,7 +63,7 @@ class Extractor(nn.Module):
 
     @classmethod
     def random(cls, seed: int = 0) -> Self:
-        """The network with random weights that the seed alone decides."""
+        """The network with random weights of a seed."""
         with torch.random.fork_rng(devices=[]):
             seed_torch(seed, "weights")
             return cls().requires_grad_(False).eval()

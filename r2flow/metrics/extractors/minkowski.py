@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from r2flow.errors import InputError
 from r2flow.metrics.extractors.base import Extractor
-from r2flow.metrics.extractors.sparse import Grid, Sparse, SparseConv3d, SparseNorm, SparseReLU
+from r2flow.metrics.extractors.sparse import Sparse, SparseConv3d, SparseNorm, SparseReLU, VoxelGrid
 from r2flow.metrics.extractors.voxels import SECTORS, mean_by_distance, voxelise
 from r2flow.metrics.scans import Scans
 
@@ -101,7 +101,7 @@ class MinkowskiNet(Extractor):
         Returns:
             (N, 48), in the order of the voxels.
         """
-        maps = self.down(self.stem(Sparse(features, Grid(coords))))
+        maps = self.down(self.stem(Sparse(features, VoxelGrid(coords))))
         y = maps[4]
         for level in range(1, 5):
             y = self.up(level, y, maps[4 - level])

@@ -214,32 +214,17 @@ def subsample(maps: Tensor, num: int = 4096) -> Tensor:
 
 
 def mean_by_depth(maps: Tensor, bands: int = BANDS) -> Tensor:
-    """Means over `bands` bands of rows, (B, C bands), C slowest: the published "depth".
-
-    The name is the authors'. It means elevation: rows are beams, and nothing of range is looked at.
+    """Means over `bands` bands of rows, (B, C bands), C slowest: the published "depth", which means elevation.
 
     Raises:
-        InputError: rows that do not part into as many bands.
+        InputError: a number of rows that is no multiple of the bands.
     """
-    return maps.unflatten(2, (_parts(maps.shape[2], bands, "rows"), -1)).mean((3, 4)).flatten(1)
-
-
-def mean_by_angle(maps: Tensor, sectors: int = BANDS) -> Tensor:
-    """Means over `sectors` sectors of columns, (B, C sectors), C slowest.
-
-    Raises:
-        InputError: columns that do not part into as many sectors.
-    """
-    return maps.unflatten(3, (_parts(maps.shape[3], sectors, "columns"), -1)).mean((2, 4)).flatten(1)
-
-
-def _parts(size: int, parts: int, what: str) -> int:
-    if size % parts:
+    if maps.shape[2] % bands:
         raise InputError(
-            f"the metric takes means over {parts} equal parts of the {what}, found {size}; project to a multiple of "
-            f"{parts} (--size)."
+            f"the metric takes means over {bands} equal parts of the rows, found {maps.shape[2]}; project to a "
+            f"multiple of {bands} (--size)."
         )
-    return parts
+    return maps.unflatten(2, (bands, -1)).mean((3, 4)).flatten(1)
 
 
 def _normalisation(config: Mapping[str, Any], channels: int) -> tuple[tuple[float, ...], tuple[float, ...]]:

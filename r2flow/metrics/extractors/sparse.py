@@ -32,7 +32,7 @@ def offsets(size: int) -> list[tuple[int, int, int]]:
     return [(x, y, z) for x, y, z in product(along, repeat=3)]
 
 
-class Grid:
+class VoxelGrid:
     """Voxels of one size: distinct integer coordinates, and which of them lie where a kernel looks.
 
     Args:
@@ -63,12 +63,12 @@ class Grid:
         position = torch.searchsorted(self.keys, key).clamp_(max=len(self) - 1)
         return torch.where(self._box.holds(coords) & (self.keys[position] == key), self.order[position], -1)
 
-    def coarser(self) -> "Grid":
+    def coarser(self) -> "VoxelGrid":
         """Voxels twice as large, each around at least one of this grid's."""
         coords = self.coords.clone()
         coords[:, 1:] = coords[:, 1:].div(2, rounding_mode="floor")
         box = Box(coords)
-        return Grid(box.coords(box.keys(coords).unique()), finer=self)
+        return VoxelGrid(box.coords(box.keys(coords).unique()), finer=self)
 
     def around(self, size: int) -> KernelMap:
         """Where a kernel of size^3 and stride 1 looks on this grid."""
@@ -83,7 +83,7 @@ class Grid:
             raise ValueError("no stride was taken that could be undone.")
         return self._map(self.finer, 2, 2)
 
-    def _map(self, inputs: "Grid", size: int, stride: int) -> KernelMap:
+    def _map(self, inputs: "VoxelGrid", size: int, stride: int) -> KernelMap:
         scaled = self.coords * torch.tensor([1, stride, stride, stride], device=self.coords.device)
         entries = []
         for offset in offsets(size):
@@ -126,7 +126,7 @@ class Sparse:
     """Features (N, C) of a grid's voxels."""
 
     features: Tensor
-    grid: Grid
+    grid: VoxelGrid
 
     def with_features(self, features: Tensor) -> "Sparse":
         return Sparse(features, self.grid)
@@ -163,7 +163,7 @@ class SparseConv3d(nn.Module):
             return x.with_features(x.features @ self.kernel)
         if self.transposed:
             reverse = [(outputs, inputs) for inputs, outputs in x.grid.inside]
-            finer = cast(Grid, x.grid.finer)
+            finer = cast(VoxelGrid, x.grid.finer)
             return Sparse(convolve(x.features, self.kernel, reverse, len(finer)), finer)
         if self.stride > 1:
             coarser = x.grid.coarser()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.metrics.extractors.minkowski import CLASSES, WIDTHS, MinkowskiNet
-from r2flow.metrics.extractors.sparse import Grid, Sparse, offsets
+from r2flow.metrics.extractors.sparse import Sparse, VoxelGrid, offsets
 
 
 class SPVCNN(MinkowskiNet):
@@ -29,7 +29,7 @@ class SPVCNN(MinkowskiNet):
 
     def forward(self, coords: Tensor, features: Tensor) -> Tensor:
         """The points' last features: as MinkowskiNet's `forward`."""
-        x = self.stem(Sparse(features, Grid(coords)))
+        x = self.stem(Sparse(features, VoxelGrid(coords)))
         points = x.features
         maps = self.down(x)
         at_16 = Corners(coords, maps[4].grid, 16)
@@ -54,7 +54,7 @@ class Corners:
         scale: How much larger, along each axis.
     """
 
-    def __init__(self, coords: Tensor, grid: Grid, scale: int) -> None:
+    def __init__(self, coords: Tensor, grid: VoxelGrid, scale: int) -> None:
         self.num = len(grid)
         around = coords.clone()
         around[:, 1:] = coords[:, 1:].div(scale, rounding_mode="floor")

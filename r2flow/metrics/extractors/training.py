@@ -17,13 +17,14 @@ import r2flow
 from r2flow.checkpoints import read_checkpoint
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
+from r2flow.hashing import state_hash
+from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.metrics.extractors.embedded import CLASSES, REFLECTANCE, SegmentationNetwork, inputs
 from r2flow.metrics.scans import Scans
 from r2flow.noise import generator, seed_torch
 from r2flow.simulator import simulate
-from r2flow.simulator.labels import LABELS
-from r2flow.stages.rectify import learning_rate_factor
+from r2flow.stages.base import learning_rate_factor
 
 IGNORED = -1  # class of pixels that are not learned from
 LEARNING_RATE, WARMUP, WEIGHT_DECAY = 2e-3, 100, 1e-2
@@ -241,7 +242,7 @@ class Training:
                 shown = "range and reflectance" if reflectance else "range alone"
                 judged[f"{view}, {shown}"] = judge(self.network, Scans(images, sensor), classes, reflectance)
         state = {name: value.contiguous() for name, value in self.network.state_dict().items()}
-        notes = {**self.notes, "held_out": judged, "weights_sha256": tensors_hash(state)}
+        notes = {**self.notes, "held_out": judged, "weights_sha256": state_hash(state)}
         # one entry: the order of several would change from one writing to the next
         data = save(state, metadata={"r2flow-extractor": json.dumps(notes)})
         with atomic_write(self.out) as file:
@@ -269,12 +270,3 @@ def judge(network: SegmentationNetwork, scans: Scans, classes: Tensor, reflectan
         "mean_iou": float((hit / union)[there].mean()),
         "classes": int(there.sum()),
     }
-
-
-def tensors_hash(state: dict[str, Tensor]) -> str:
-    """SHA-256 of weights by name, whatever file they lie in."""
-    digest = hashlib.sha256()
-    for name, value in sorted(state.items()):
-        digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
-        digest.update(value.numpy().tobytes())
-    return digest.hexdigest()

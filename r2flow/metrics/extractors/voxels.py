@@ -1,6 +1,4 @@
-"""Voxels of a scan, before the sparse networks, and the pooling of their features, after them."""
-
-import math
+"""The voxels that the sparse networks take, and the pooling of the features that they give."""
 
 import torch
 from torch import Tensor
@@ -45,25 +43,10 @@ def mean_by_distance(features: Tensor, coords: Tensor, sectors: int = SECTORS) -
     """
     edges = torch.linspace(NEAR, FAR, sectors + 1, device=coords.device)
     edges[0] = 0
-    return _means(features, _centred(coords).norm(dim=1) * VOXEL, edges)
-
-
-def mean_by_angle(features: Tensor, coords: Tensor, sectors: int = SECTORS) -> Tensor:
-    """Means over sectors of azimuth about the centroid of the voxels; (sectors C,), as `mean_by_distance`."""
-    edges = torch.linspace(-math.pi - 1e-4, math.pi + 1e-4, sectors + 1, device=coords.device)
-    x, y, _ = _centred(coords).unbind(1)
-    return _means(features, torch.atan2(y, x), edges)
-
-
-def _centred(coords: Tensor) -> Tensor:
-    return coords.float() - coords.float().mean(0)
-
-
-def _means(features: Tensor, values: Tensor, edges: Tensor) -> Tensor:
-    """Means of features (M, C) over the voxels with edges[i] <= value < edges[i + 1]; (sectors C,)."""
-    sectors = len(edges) - 1
-    sector = torch.bucketize(values, edges, right=True) - 1
-    inside = (sector >= 0) & (sector < sectors)
+    position = coords.float()
+    distance = (position - position.mean(0)).norm(dim=1) * VOXEL
+    sector = torch.bucketize(distance, edges, right=True) - 1
+    inside = sector < sectors
     sector = sector[inside]
     # float64: tens of thousands of voxels in one sum.
     total = torch.zeros(sectors, features.shape[1], dtype=torch.float64, device=features.device)

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
+from r2flow.hashing import state_hash
 from r2flow.metrics.extractors import extractor_class
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.registry import Registry
@@ -36,37 +37,41 @@ class Source:
     """A published file of weights.
 
     Attributes:
-        metric: The distance that is taken on its features.
-        file: Its name.
+        metric: The distance between its features.
         page: Where its authors offer it.
-        size: Bytes, None where not known.
-        sha256: None where not known.
-        git_blob: Its id in the git repository that it lies in, which is the SHA-1 of a short header and the file.
+        git_blob: Its id in the git repository that it lies in, the SHA-1 of a short header and the file; None where no
+            hash of it is known.
     """
 
     metric: str
-    file: str
     page: str
-    size: int | None = None
-    sha256: str | None = None
     git_blob: str | None = None
+
+    @property
+    def file(self) -> str:
+        return self.page.rpartition("/")[2]
+
+    def matches(self, path: Path) -> bool | None:
+        """Whether a file is the published one; None where its hash is not known."""
+        if path.is_dir() or self.git_blob is None:
+            return None
+        content = path.read_bytes()
+        return (
+            hashlib.sha1(b"blob %d\0%b" % (len(content), content), usedforsecurity=False).hexdigest() == self.git_blob
+        )
 
 
 BONN = "http://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models/"
 R2FLOW = "https://github.com/kazuto1011/r2flow/releases/download/weights/"
+SPARENET = "https://github.com/microsoft/SpareNet/raw/main/Frechet/"
 
 SOURCES: Registry[Source] = Registry(
     "network with published weights",
-    rangenet53=Source("FRD", "darknet53-1024.tar.gz", f"{BONN}darknet53-1024.tar.gz"),
-    rangenet21=Source("FRID", "rangenet21_lidm.tar.gz", f"{R2FLOW}rangenet21_lidm.tar.gz"),
-    pointnet=Source(
-        "FPD",
-        "cls_model_39.pth",
-        "https://github.com/microsoft/SpareNet/raw/main/Frechet/cls_model_39.pth",
-        git_blob="c9e80093a093d5667e9aa705d87d923df50f1c25",
-    ),
-    minkowskinet=Source("FSVD", "minkowskinet_lidm.tar.gz", f"{R2FLOW}minkowskinet_lidm.tar.gz"),
-    spvcnn=Source("FPVD", "spvcnn_lidm.tar.gz", f"{R2FLOW}spvcnn_lidm.tar.gz"),
+    rangenet53=Source("FRD", f"{BONN}darknet53-1024.tar.gz"),
+    rangenet21=Source("FRID", f"{R2FLOW}rangenet21_lidm.tar.gz"),
+    pointnet=Source("FPD", f"{SPARENET}cls_model_39.pth", git_blob="c9e80093a093d5667e9aa705d87d923df50f1c25"),
+    minkowskinet=Source("FSVD", f"{R2FLOW}minkowskinet_lidm.tar.gz"),
+    spvcnn=Source("FPVD", f"{R2FLOW}spvcnn_lidm.tar.gz"),
 )
 
 # Files of an archive that hold parameters, and the one that says what they were trained on.
@@ -88,7 +93,7 @@ def kept_file(name: str) -> Path:
 
 
 @dataclass(frozen=True)
-class Kept:
+class InstalledWeights:
     """Weights that this machine has.
 
     Attributes:
@@ -104,7 +109,7 @@ class Kept:
     published: bool | None
 
 
-def kept(name: str) -> Kept | None:
+def kept(name: str) -> InstalledWeights | None:
     """What is kept of a network's weights, or None.
 
     Raises:
@@ -114,10 +119,10 @@ def kept(name: str) -> Kept | None:
     if not path.exists():
         return None
     notes = _open(path, with_tensors=False)[1]
-    return Kept(notes["weights"], notes["source"], notes["sha256"], notes["published"])
+    return InstalledWeights(notes["weights"], notes["source"], notes["sha256"], notes["published"])
 
 
-def add(name: str, path: Path) -> Kept:
+def add(name: str, path: Path) -> InstalledWeights:
     """Take weights from a file, or an archive or folder of several, into the folder of weights.
 
     Raises:
@@ -129,7 +134,8 @@ def add(name: str, path: Path) -> Kept:
         extractor = extractor_class(name).from_tensors(tensors, config)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    found = Kept(weights_hash(extractor), path.name, None if path.is_dir() else _sha256(path), _is(source, path))
+    sha256 = None if path.is_dir() else hashlib.sha256(path.read_bytes()).hexdigest()
+    found = InstalledWeights(weights_hash(extractor), path.name, sha256, source.matches(path))
     _keep(kept_file(name), tensors, {**vars(found), "config": config})
     return found
 
@@ -158,11 +164,7 @@ def read_kept(cls: type[E]) -> E:
 
 def weights_hash(extractor: Extractor) -> str:
     """First 12 digits of the SHA-256 of all that a network computes with, by name."""
-    digest = hashlib.sha256()
-    for name, value in sorted({**dict(extractor.named_parameters()), **dict(extractor.named_buffers())}.items()):
-        digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
-        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-    return digest.hexdigest()[:12]
+    return state_hash({**dict(extractor.named_parameters()), **dict(extractor.named_buffers())})[:12]
 
 
 def fill(extractor: Extractor, tensors: Mapping[str, Tensor]) -> None:
@@ -208,7 +210,7 @@ def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if path.suffix == ".safetensors":
         tensors, notes = _open(path)
         return tensors, notes["config"]
-    if not (path.is_dir() or tarfile.is_tarfile(path) or _is_archive(path)):
+    if not (path.is_dir() or tarfile.is_tarfile(path)):
         with path.open("rb") as file:
             return _tensors(file, str(path)), {}
     tensors = {}
@@ -227,16 +229,8 @@ def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, config
 
 
-def _is_archive(path: Path) -> bool:
-    """A .zip of files; torch's own files are .zip too, of another kind."""
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as file:
-        return not any(name.endswith("data.pkl") for name in file.namelist())
-
-
 def _members(path: Path) -> dict[str, bytes]:
-    """The files of `PARTS` and `CONFIG` in a folder, a tar or a zip, by their last name."""
+    """The files of `PARTS` and `CONFIG` in a folder or a tar archive, by their last name."""
     found: dict[str, bytes] = {}
 
     def take(name: str, size: int, file: IO[bytes] | None) -> None:
@@ -255,27 +249,14 @@ def _members(path: Path) -> dict[str, bytes]:
                 if child.is_file():
                     with child.open("rb") as part:
                         take(child.name, child.stat().st_size, part)
-        elif tarfile.is_tarfile(path):
+        else:
             with tarfile.open(path) as tar:
                 for member in tar:
                     take(member.name, member.size, tar.extractfile(member) if member.isreg() else None)
-                # What is compressed carries a check sum behind the last member: it is held against it at the end.
+                # A compressed archive ends with a check sum, which is compared when the end is read.
                 while tar.fileobj is not None and tar.fileobj.read(2**20):
                     pass
-        else:
-            with zipfile.ZipFile(path) as archive:
-                for info in archive.infolist():
-                    with archive.open(info) as packed:
-                        take(info.filename, info.file_size, None if info.is_dir() else packed)
-    except (
-        tarfile.TarError,
-        zipfile.BadZipFile,
-        gzip.BadGzipFile,
-        zlib.error,
-        EOFError,
-        NotImplementedError,
-        RuntimeError,
-    ):
+    except (tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError):
         raise InputError(f"{path} is a damaged archive; get it again.") from None
     return found
 
@@ -345,23 +326,3 @@ def _open(path: Path, with_tensors: bool = True) -> tuple[dict[str, Tensor], dic
     except (SafetensorError, OSError, ValueError):
         raise InputError(f"{path} is not a safetensors file, or a damaged one.") from None
     return tensors, {"config": {}, "weights": "", "source": path.name, "sha256": None, "published": None, **notes}
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _is(source: Source, path: Path) -> bool | None:
-    """Whether a file is the published one; None where its hash is not known."""
-    if path.is_dir():
-        return None
-    if source.sha256:
-        return _sha256(path) == source.sha256
-    if source.git_blob:
-        with path.open("rb") as file:
-            digest = hashlib.sha1(f"blob {path.stat().st_size}\0".encode(), usedforsecurity=False)
-            while block := file.read(2**20):
-                digest.update(block)
-        return digest.hexdigest() == source.git_blob
-    return None

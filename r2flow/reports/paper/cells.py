@@ -92,7 +92,8 @@ def measure_cells(bench: Bench, flow: Checkpoint, subject: Subject, steps: Seque
 
 
 def _measure(bench: Bench, flow: Checkpoint, subject: Subject, steps: int) -> Cell:
-    drawn = sampled_set(flow, f"{subject.label}, {steps} steps", bench.num, steps, "euler", 1e-5, SEED)
+    sampler = flow.generator.sampler.changed(steps=steps)
+    drawn = sampled_set(flow, f"{subject.label}, {steps} steps", bench.num, sampler, SEED)
     found = measure(bench.metrics, bench.gathered, drawn, bench.work, bench.bootstrap)
     assert isinstance(drawn.source, SampledScans)
     row: dict[str, Any] = {
@@ -106,7 +107,7 @@ def _measure(bench: Bench, flow: Checkpoint, subject: Subject, steps: int) -> Ce
             row[f"{one.metric}_low"], row[f"{one.metric}_high"] = one.intervals[first]
     row["remarks"] = BETWEEN.join(dict.fromkeys(remark for one in found for remark in one.remarks))
     counts = counts_of(bench.metrics["jsd"], "generated")
-    images = np.concatenate([s.images.numpy() for s in sample(flow, min(SHOWN, bench.num), steps, SEED)])
+    images = np.concatenate([s.images.numpy() for s in sample(flow, min(SHOWN, bench.num), SEED, sampler=sampler)])
     return Cell(row, counts, images)
 
 

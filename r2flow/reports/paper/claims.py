@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from statistics import fmean, stdev
 from typing import Any
 
-from r2flow.reports.pages import Row, shown
+from r2flow.reports.tables import Row, shown
 
 HOLDS, FAILS, UNKNOWN = "holds", "does not hold", "cannot tell"
 

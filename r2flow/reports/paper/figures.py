@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from r2flow.metrics.birds_eye import js_distance
-from r2flow.reports.pages import STYLES, Row, blank_figure, few_log_ticks
+from r2flow.reports.pages import STYLES, blank_figure, few_log_ticks
+from r2flow.reports.tables import Row
 
 REACH = 80  # metres from the sensor to each side of a bird's-eye histogram
 

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from r2flow.evaluation.sets import ScanSet
+from r2flow.inversion import Interpolation
 from r2flow.reports.curvature import Paths, curvature_figure, curvature_text, summary, trajectories_figure
 from r2flow.reports.evaluation import heading
 from r2flow.reports.interpolation import interpolation_figure
@@ -26,7 +27,6 @@ from r2flow.reports.paper.tables import (
 )
 from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.speed_quality import BETWEEN
-from r2flow.sampling import Interpolation
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ from r2flow.data.datamodule import ScanDataModule
 from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
 from r2flow.evaluation.sets import ScanSet
 from r2flow.evaluation.statistics import Cache
+from r2flow.generators import Sampler
+from r2flow.inversion import Interpolation, interpolate_scans
 from r2flow.metrics.base import ScanMetric
 from r2flow.reports.compare import cost
 from r2flow.reports.curvature import Paths, measure_paths
@@ -24,7 +26,6 @@ from r2flow.reports.paper.figures import marginals_apart
 from r2flow.reports.paper.page import Measured, paper_page
 from r2flow.reports.paper.subjects import Subject
 from r2flow.runs import read_config
-from r2flow.sampling import Interpolation, interpolate_scans
 
 FRAMES = 6  # of figure 3, as in the paper: both ends' round trips and four between
 
@@ -132,7 +133,7 @@ def _placeless(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _paths(flow: Checkpoint, subject: Subject, budget: Budget, work: Work) -> Paths:
-    with work.bar(f"paths of {subject.label}", 2 * max(budget.steps)) as advance:
+    with work.bar(f"following paths of {subject.label}", 2 * max(budget.steps), "evaluations") as advance:
         return measure_paths(
             flow, subject.label, budget.curved, max(budget.steps), SEED, budget.curved, progress=advance
         )
@@ -149,5 +150,6 @@ def _architecture(subject: Subject, cell: Cell, real: np.ndarray, metrics: Mappi
 
 def _interpolation(flow: Checkpoint, ends: np.ndarray, tolerance: float, work: Work) -> Interpolation:
     """Figure 3, between two scans, (2, 2 or 1, H, W)."""
-    with work.bar("figure 3", FRAMES) as advance:
-        return interpolate_scans(flow, torch.from_numpy(ends), FRAMES, tolerance=tolerance, arrived=lambda _: advance())
+    with work.bar("interpolating figure 3", FRAMES) as advance:
+        sampler = Sampler("dopri5", tolerance=tolerance)
+        return interpolate_scans(flow, torch.from_numpy(ends), FRAMES, sampler, arrived=lambda _: advance())

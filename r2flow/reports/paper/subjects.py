@@ -86,7 +86,9 @@ def _read(run: Path, label: str) -> Subject:
     config = checkpoint.config
     parent = (config.get("parent") or {}).get("weights", "")
     stage = config["stage"]["name"]
-    return Subject(run, label, stage, parent, weights_hash(checkpoint), config, checkpoint.distilled_steps)
+    own = checkpoint.generator.sampler
+    steps = own.steps if own.fixed else None
+    return Subject(run, label, stage, parent, weights_hash(checkpoint), config, steps)
 
 
 def _role(one: Subject, parent: Subject | None) -> str:

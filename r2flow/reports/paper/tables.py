@@ -5,9 +5,9 @@ from dataclasses import asdict
 from statistics import fmean, stdev
 from typing import Any
 
-from r2flow.reports.pages import Row, shown, table
 from r2flow.reports.paper.claims import Claim
 from r2flow.reports.paper.printed import COLUMNS, TABLE_I, TABLE_II, Architecture
+from r2flow.reports.tables import Row, shown, table
 
 # The paper's numbers, by which ours are told apart.
 SCANS, REAL, IMAGES, SIZE = 10_000, 81_106, 2_560_000, (64, 1024)

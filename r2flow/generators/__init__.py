@@ -1,0 +1,36 @@
+"""What turns noise, and perhaps a condition, into a scan; by name."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from r2flow.errors import InputError
+from r2flow.generators.base import Condition, Generated, Generator, Sampler
+from r2flow.generators.flow import Field, Flow, RectifiedFlow, as_flow
+from r2flow.lidar.space import build_space
+from r2flow.registry import Registry
+
+__all__ = [
+    "GENERATORS", "Condition", "Field", "Flow", "Generated", "Generator", "RectifiedFlow", "Sampler",
+    "as_flow", "build_generator",
+]  # fmt: skip
+
+GENERATORS: Registry[type[Generator]] = Registry("generator", rectified_flow=RectifiedFlow)
+
+
+def build_generator(config: Mapping[str, Any]) -> Generator:
+    """The generator of a config with the keys `sensor`, `encoding`, `backbone` and, where it is no rectified flow,
+    `generator`.
+
+    Raises:
+        InputError: a key is missing, a name is unknown, an option is, or the sizes do not fit together.
+    """
+    with torch.device("cpu"):  # geometry needs its numbers, also where the weights are made on the meta device
+        space = build_space(config)
+    if "backbone" not in config:
+        raise InputError("the config has no 'backbone'.")
+    generator: Generator = GENERATORS.build(
+        config.get("generator") or {"name": "rectified_flow"}, space, config["backbone"]
+    )
+    return generator

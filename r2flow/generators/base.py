@@ -1,0 +1,177 @@
+"""What every generator has in common: noise in, scan out."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+
+from r2flow.errors import InputError
+from r2flow.lidar.region import Region
+from r2flow.lidar.space import ModelSpace
+from r2flow.noise import Draws
+from r2flow.registry import check_options
+
+Condition = Mapping[str, Tensor]
+"""What is known of each scan, by name: tensors of shape (B, ...). Which names there are, the generator says."""
+
+Progress = Callable[[], None] | None
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """How a generator is run; saved with it.
+
+    Attributes:
+        method: A solver's name for a flow (`r2flow.flow.solvers`); other families have names of their own.
+        steps: Steps from noise to data, of a method of fixed steps.
+        tolerance: Absolute and relative tolerance of an adaptive method.
+        grid: Where fixed steps fall: a name, or the times themselves.
+        straight_first: Whether a scan that is straight to the tolerance takes one step (`r2flow.flow.straight_exit`).
+        fixed: Whether the generator was trained for this number of steps and is worse at any other.
+    """
+
+    method: str = "euler"
+    steps: int = 32
+    tolerance: float = 1e-5
+    grid: str | tuple[float, ...] = "uniform"
+    straight_first: bool = False
+    fixed: bool = False
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> Self:
+        """From plain values, as a config or a checkpoint holds them.
+
+        Raises:
+            InputError: an unknown option, or a value of the wrong type.
+        """
+        check_options("sampler", cls, options)
+        grid = options.get("grid", "uniform")
+        return cls(**{**options, "grid": grid if isinstance(grid, str) else tuple(grid)})
+
+    def changed(self, **options: Any) -> Self:
+        """The same with the options that are not None. Given times decide the number of steps.
+
+        Raises:
+            InputError: fewer than one step, or times and a number of steps that contradict.
+        """
+        given = {key: value for key, value in options.items() if value is not None}
+        grid = given.get("grid", "uniform")
+        if not isinstance(grid, str):
+            given["grid"] = tuple(float(t) for t in grid)
+            if given.setdefault("steps", len(given["grid"]) - 1) != len(given["grid"]) - 1:
+                raise InputError(f"the time grid has {len(given['grid']) - 1} steps, found steps={given['steps']}.")
+        elif "steps" in given and "grid" not in given and not isinstance(self.grid, str):
+            given["grid"] = "uniform"  # the times were those of another number of steps
+        found = replace(self, **given)
+        if found.steps < 1:
+            raise InputError(f"a sampler needs at least 1 step, found {found.steps}.")
+        return found
+
+    def asdict(self) -> dict[str, Any]:
+        """Plain values, as a config or a checkpoint holds them."""
+        return {**asdict(self), "grid": self.grid if isinstance(self.grid, str) else list(self.grid)}
+
+
+@dataclass(frozen=True)
+class Generated:
+    """Scans in model space.
+
+    Attributes:
+        x: x_1, (B, C, H, W), on the generator's device.
+        evaluations: Network evaluations of each, (B,) int64.
+        converged: Whether each is a scan of the generator, (B,) bool: finite and, for an adaptive method, solved.
+    """
+
+    x: Tensor
+    evaluations: Tensor
+    converged: Tensor
+
+
+class Generator(nn.Module):
+    """Noise in, scan out. What training makes, a checkpoint holds and every verb, report and callback runs.
+
+    A subclass implements `generate` and enters `GENERATORS`. Its constructor takes the model space and the config's
+    `backbone`, which it may ignore, and then options of its own, which are those of the config's `generator`.
+
+    Attributes:
+        space: The images it makes.
+        noise_shape: What one scan is made of: (C, H, W) for a flow, (latent,) for a GAN.
+        sampler: How it is run when nobody says otherwise.
+    """
+
+    def __init__(self, space: ModelSpace, noise_shape: tuple[int, ...] | None = None) -> None:
+        super().__init__()
+        self.space = space
+        self.noise_shape = space.shape if noise_shape is None else noise_shape
+        self.sampler = Sampler()
+
+    def generate(
+        self,
+        noise: Tensor,
+        condition: Condition | None = None,
+        *,
+        sampler: Sampler | None = None,
+        draws: Draws | None = None,
+        progress: Progress = None,
+    ) -> Generated:
+        """x_1 in model space with evaluations and convergence of each scan, (B, C, H, W).
+
+        Args:
+            noise: (B, *noise_shape).
+            condition: What is known of each scan; None for a scan of which nothing is known.
+            sampler: Another than the generator's own.
+            draws: Where further noise comes from, `draws.step(shape, j)` at step j = 1, 2, ...; a flow needs none.
+            progress: Called after every evaluation of the network.
+
+        Raises:
+            InputError: a sampler or a condition that the generator does not know.
+        """
+        raise NotImplementedError
+
+    def check_sampler(self, sampler: Sampler) -> None:
+        """Refuse a sampler before it is needed.
+
+        Raises:
+            InputError: this generator cannot be run so.
+        """
+
+    def evaluations_of(self, sampler: Sampler) -> int:
+        """Network evaluations of a batch, for a progress bar; 0 where they depend on the scans."""
+        return sampler.steps
+
+    @property
+    def unit(self) -> tuple[int, int]:
+        """Rows and columns that a part of the image must be a multiple of, and begin at a multiple of.
+
+        Raises:
+            InputError: this generator makes whole images only.
+        """
+        raise InputError(f"a {type(self).__name__} makes whole images and no part of one; leave the region out.")
+
+    def part(self, region: Region) -> "Generator":
+        """The same generator for a region of whole units, its weights shared.
+
+        Raises:
+            InputError: this generator makes whole images only.
+        """
+        return self if region.share == 1 else self._no_part()
+
+    def _no_part(self) -> "Generator":
+        _ = self.unit
+        raise NotImplementedError
+
+    def start_from(self, parent: "Generator") -> None:
+        """Take over a trained generator's weights: every name and shape must be this one's."""
+        self.load_state_dict(parent.state_dict())
+
+    @property
+    def learns_directions(self) -> bool:
+        """Whether it learns a vector for each direction, so that scans must not be turned in training."""
+        return False
+
+    @property
+    def device(self) -> torch.device:
+        """Where its weights are."""
+        return next(self.parameters()).device

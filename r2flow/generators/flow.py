@@ -1,0 +1,174 @@
+"""Generators that follow a velocity: dx/dt = v(t, x) from noise at t = 0 to data at t = 1."""
+
+from collections.abc import Mapping
+from copy import copy
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from r2flow.backbones import build_backbone
+from r2flow.errors import InputError
+from r2flow.flow.solvers import GRIDS, SOLVERS, Solution, Velocity, adapts, check_method, check_tolerance, solve
+from r2flow.flow.straight_exit import solve_straight_first
+from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
+from r2flow.lidar.region import Region
+from r2flow.lidar.space import ModelSpace
+from r2flow.noise import Draws
+
+
+class Flow(Generator):
+    """A generator by an ODE. A subclass gives its velocity."""
+
+    def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
+        """v(t, x), (B, C, H, W), at times t of shape () or (B,)."""
+        raise NotImplementedError
+
+    def field(self, condition: Condition | None = None) -> Velocity:
+        """v(t, x) under a condition, as solvers take it."""
+        return self.velocity if condition is None else _Conditioned(self, condition)
+
+    @torch.no_grad()
+    def solve(
+        self,
+        x: Tensor,
+        t_0: float = 0.0,
+        t_1: float = 1.0,
+        *,
+        sampler: Sampler | None = None,
+        condition: Condition | None = None,
+        progress: Progress = None,
+        **options: Any,
+    ) -> Solution:
+        """The state at t_1 of the ODE from x at t_0, (B, ...); see `r2flow.flow.solvers.solve` for the options."""
+        how = sampler or self.sampler
+        field, x = self.field(condition), x.to(self.device)
+        if how.straight_first:
+            return solve_straight_first(field, x, how.tolerance, how.method, progress)
+        grid = how.grid if isinstance(how.grid, str) else torch.tensor(how.grid, dtype=torch.float64)
+        return solve(field, x, t_0, t_1, how.method, how.steps, how.tolerance, progress, grid=grid, **options)
+
+    def generate(
+        self,
+        noise: Tensor,
+        condition: Condition | None = None,
+        *,
+        sampler: Sampler | None = None,
+        draws: Draws | None = None,
+        progress: Progress = None,
+    ) -> Generated:
+        end = self.solve(noise, sampler=sampler, condition=condition, progress=progress)
+        return Generated(end.x, end.evaluations, end.converged)
+
+    def check_sampler(self, sampler: Sampler) -> None:
+        check_method(sampler.method)
+        check_tolerance(sampler.tolerance)
+        if isinstance(sampler.grid, str):
+            GRIDS[sampler.grid]
+        if sampler.straight_first and not adapts(sampler.method):
+            raise InputError(
+                f"scenes that are not straight need an adaptive solver, dopri5 or bosh3; found {sampler.method!r}."
+            )
+        if adapts(sampler.method) and sampler.grid != "uniform":
+            raise InputError(f"a time grid is for a solver of fixed steps; {sampler.method} chooses its own.")
+
+    def evaluations_of(self, sampler: Sampler) -> int:
+        return sampler.steps * (SOLVERS[sampler.method].evaluations or 0) if sampler.method in SOLVERS else 0
+
+
+class RectifiedFlow(Flow):
+    """v(t, x) by a backbone: 1-RF, k-RF and k-TD alike, which differ in how they are learned and in their sampler.
+
+    Args:
+        space: The images it makes.
+        backbone: Name and options, as in conf/backbone.
+    """
+
+    condition_channels: ClassVar[int] = 0  # further input channels of the backbone, for a subclass with a condition
+    second_time: ClassVar[bool] = False  # whether the backbone takes a second time, for a subclass that is a flow map
+
+    def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
+        super().__init__(space)
+        channels = space.shape[0]
+        self.backbone = build_backbone(
+            backbone, space.rays, channels + self.condition_channels, channels, self.second_time
+        )
+
+    def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
+        if condition is not None:
+            raise InputError("this flow was trained without a condition and cannot take one.")
+        v: Tensor = self.backbone(t, x)
+        return v
+
+    def start_from(self, parent: Generator) -> None:
+        """Take over a flow's weights; what a second time adds keeps its own, which change nothing at first."""
+        own = self.backbone.state_dict()
+        new = {f"backbone.{name}": own[name] for name in self.backbone.second_time_names()}
+        self.load_state_dict({**new, **parent.state_dict()})
+
+    @property
+    def unit(self) -> tuple[int, int]:
+        return self.backbone.unit
+
+    @property
+    def learns_directions(self) -> bool:
+        return self.backbone.learns_directions
+
+    def part(self, region: Region) -> "RectifiedFlow":
+        """The flow on a region alone: its network does not see the rest of the image."""
+        if region.share == 1:
+            return self
+        part = copy(self)
+        part._modules = {"backbone": self.backbone.cropped(region.rows, region.columns)}
+        return part
+
+
+class Field(Flow):
+    """A flow whose velocity is a given function: an exact problem, or a network of another origin.
+
+    Args:
+        function: v(t, x) with t of shape () or (B,), as `r2flow.flow.solvers.solve` takes it.
+        noise_shape: Of one state.
+        space: The images that the states are, where they are images; without one there is nothing to decode.
+    """
+
+    def __init__(self, function: Velocity, noise_shape: tuple[int, ...], space: ModelSpace | None = None) -> None:
+        nn.Module.__init__(self)
+        self.function, self.noise_shape, self.sampler = function, noise_shape, Sampler()
+        if space is not None:
+            self.space = space
+
+    def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
+        return self.function(t, x)
+
+    def field(self, condition: Condition | None = None) -> Velocity:
+        return self.function
+
+    @property
+    def device(self) -> torch.device:
+        return next((p.device for p in self.parameters()), torch.device("cpu"))
+
+
+class _Conditioned:
+    """v(t, x) of a flow under a condition, which follows the scans that are still being solved."""
+
+    def __init__(self, flow: Flow, condition: Condition) -> None:
+        self.flow, self.condition = flow, condition
+        self.precision = max((p.dtype for p in flow.parameters()), key=lambda kind: torch.finfo(kind).eps)
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        return self.flow.velocity(t, x, self.condition)
+
+    def select(self, scenes: Tensor) -> "_Conditioned":
+        return _Conditioned(self.flow, {name: value[scenes.to(value.device)] for name, value in self.condition.items()})
+
+
+def as_flow(generator: Generator, what: str) -> Flow:
+    """The generator as a flow.
+
+    Raises:
+        InputError: it follows no velocity, which `what` needs.
+    """
+    if not isinstance(generator, Flow):
+        raise InputError(f"{what} needs the velocity of a flow, which a {type(generator).__name__} does not have.")
+    return generator

@@ -1,0 +1,190 @@
+"""From scans back to their noise, and from one scan to another: what only a flow can do."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from r2flow.checkpoints import Checkpoint
+from r2flow.errors import InputError
+from r2flow.flow.solvers import Solution
+from r2flow.generators import Sampler, as_flow
+from r2flow.generators.base import Progress
+
+TIGHT = Sampler("dopri5", tolerance=1e-5)
+
+
+@dataclass(frozen=True)
+class Inversion:
+    """Scans, their noise, and what becomes of it on the way forward again.
+
+    Attributes:
+        x_1: The scans in model space, (B, C, H, W), on the CPU as all of it.
+        x_0: Their noise.
+        again: x_1 once more, from x_0.
+        evaluations: Network evaluations of both ways, (B,).
+        converged: Whether both ways are solved to the tolerance and finite, (B,) bool.
+    """
+
+    x_1: Tensor
+    x_0: Tensor
+    again: Tensor
+    evaluations: Tensor
+    converged: Tensor
+
+
+def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, progress: Progress = None) -> Inversion:
+    """x_1 -> x_0 by the flow's ODE backward in time, and forward again.
+
+    A scan that holds a NaN is not converged, its noise is NaN, and its neighbours are what they are without it.
+
+    Args:
+        images: Range in metres and reflectance, (B, 2 or 1, H, W), 0 where a ray was dropped.
+        sampler: The solver of both ways.
+        progress: Called after every network evaluation.
+
+    Raises:
+        InputError: a generator without an ODE, images of another shape or without the model's reflectance; a solver's
+            own complaints.
+    """
+    encoding, flow = checkpoint.encoding, as_flow(checkpoint.generator, "inversion")
+    if images.ndim != 4 or images.shape[2:] != checkpoint.sensor.shape:
+        raise InputError(f"the model's images are {checkpoint.sensor.shape}, found {tuple(images.shape[2:])}.")
+    x_1 = encoding.encode(images[:, : 1 + encoding.reflectance])
+    there = flow.solve(x_1, 1.0, 0.0, sampler=sampler, progress=progress)
+    # where a solver gives up, its last state is not yet noise
+    x_0 = there.x.cpu().masked_fill(~there.converged.view(-1, 1, 1, 1), math.nan)
+    again = flow.solve(x_0, sampler=sampler, progress=progress)
+    evaluations, converged = there.evaluations + again.evaluations, there.converged & again.converged
+    return Inversion(x_1, x_0, again.x.cpu(), evaluations, converged)
+
+
+@dataclass(frozen=True)
+class RoundTrip:
+    """How far scans are from themselves after inversion and generation, each (B,).
+
+    Attributes:
+        rms: Root mean square in model space, whose values span [-1, 1].
+        median_m: Median |r' - r| in metres over the rays that return before and after.
+        rms_m: Its root mean square.
+        dropped: Share of all rays that return before and not after, or the other way round.
+        noise_std: Standard deviation of x_0; far from 1, the scan is unlike what the flow was trained on.
+    """
+
+    rms: Tensor
+    median_m: Tensor
+    rms_m: Tensor
+    dropped: Tensor
+    noise_std: Tensor
+
+
+def round_trip(checkpoint: Checkpoint, inversion: Inversion) -> RoundTrip:
+    """The errors of an inversion; NaN for a scene that is not finite, or in metres where no ray returns twice."""
+    rms = (inversion.again - inversion.x_1).double().square().flatten(1).mean(1).sqrt()
+    before, after = (checkpoint.encoding.decode(x)[:, 0].double() for x in (inversion.x_1, inversion.again))
+    both = (before > 0) & (after > 0)
+    apart = (after - before).abs().masked_fill(~both, math.nan).flatten(1)
+    dropped = ((before > 0) != (after > 0)).flatten(1).double().mean(1).masked_fill(rms.isnan(), math.nan)
+    metres = apart.nanmedian(1).values, apart.square().nanmean(1).sqrt()
+    return RoundTrip(rms, *metres, dropped, inversion.x_0.double().flatten(1).std(1))
+
+
+def slerp(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
+    """Spherical linear interpolation, (sin((1 - w) a) x + sin(w a) y) / sin a, a the angle of x and y.
+
+    Shoemake 1985, "Animating rotation with quaternion curves". Unlike the straight mean, which is shorter, it keeps
+    the length of noise: two independent draws are nearly orthogonal. Where the angle vanishes it is the straight mean.
+
+    Args:
+        x: One end, (...).
+        y: The other end, (...).
+        weights: w of each point, (N,); 0 gives x and 1 gives y.
+
+    Returns:
+        (N, ...).
+
+    Raises:
+        InputError: x and y are opposite, so that no way between them is the shortest; or one is zero.
+    """
+    u, v = x.double().flatten(), y.double().flatten()
+    lengths = torch.linalg.vector_norm(u), torch.linalg.vector_norm(v)
+    if min(lengths) == 0:
+        raise InputError("slerp needs two directions, and one of its ends is zero.")
+    u, v = u / lengths[0], v / lengths[1]
+    # arccos of the inner product loses half the digits of a small angle; this keeps them
+    angle = 2 * torch.atan2(torch.linalg.vector_norm(u - v), torch.linalg.vector_norm(u + v))
+    if math.pi - angle < 1e-6:
+        raise InputError("slerp has no shortest way between opposite ends.")
+    w = weights.double()
+    near = angle < 1e-9
+    of_x = 1 - w if near else ((1 - w) * angle).sin() / angle.sin()
+    of_y = w if near else (w * angle).sin() / angle.sin()
+    shape = -1, *(1,) * x.ndim
+    return (of_x.view(shape) * x.double() + of_y.view(shape) * y.double()).to(x.dtype)
+
+
+@dataclass(frozen=True)
+class Interpolation:
+    """Scans on the way from one to another.
+
+    Attributes:
+        ends: The two inverted.
+        weights: Where each frame lies, (N,), from 0 to 1.
+        images: Range in metres and reflectance, (N, 2 or 1, H, W); the first and the last are the ends' round trips.
+        evaluations: Network evaluations of each frame, (N,); the ends' are those of their inversion.
+        converged: Whether each is solved, (N,) bool; what is not is no scan of the flow. The ends always are.
+    """
+
+    ends: Inversion
+    weights: Tensor
+    images: Tensor
+    evaluations: Tensor
+    converged: Tensor
+
+
+def interpolate_scans(
+    checkpoint: Checkpoint,
+    pair: Tensor,
+    frames: int,
+    sampler: Sampler = TIGHT,
+    batch_size: int = 1,
+    progress: Progress = None,
+    arrived: Callable[[int], None] | None = None,
+) -> Interpolation:
+    """Invert two scans, `slerp` between their noises, generate the scans of it: the paper's figure 3.
+
+    Args:
+        pair: The two in metres and reflectance, (2, 2 or 1, H, W).
+        frames: Scans in all, the two ends included.
+        batch_size: Scans at once.
+        progress: Called after every network evaluation.
+        arrived: Called with the number of frames that are done, the ends first.
+
+    Raises:
+        InputError: fewer than two frames, an end that is not solved, or what `invert` and `slerp` refuse.
+    """
+    if frames < 2 or batch_size < 1:
+        raise InputError(f"needs at least two frames and a batch of at least one; found {frames} and {batch_size}.")
+    arrived = arrived or (lambda done: None)
+    inverted = []
+    for scan, which in zip(pair, ("first", "last"), strict=True):
+        inverted.append(invert(checkpoint, scan[None], sampler, progress))
+        if not inverted[-1].converged.all():
+            raise InputError(
+                f"the {which} scan cannot be carried to its noise and back by {sampler.method}: try another solver, "
+                "a larger tolerance or more steps."
+            )
+        arrived(len(inverted))
+    ends = Inversion(*(torch.cat([getattr(end, name) for end in inverted]) for name in Inversion.__annotations__))
+    weights = torch.linspace(0, 1, frames, dtype=torch.float64)
+    found: list[Solution] = []
+    for x_0 in slerp(ends.x_0[0], ends.x_0[1], weights[1:-1]).split(batch_size):
+        if len(x_0):
+            found.append(as_flow(checkpoint.generator, "interpolation").solve(x_0, sampler=sampler, progress=progress))
+            arrived(2 + sum(len(end.x) for end in found))
+    x_1 = torch.cat([ends.again[:1], *(end.x.cpu() for end in found), ends.again[1:]])
+    evaluations = torch.cat([ends.evaluations[:1], *(end.evaluations for end in found), ends.evaluations[1:]])
+    converged = torch.cat([ends.converged[:1], *(end.converged for end in found), ends.converged[1:]])
+    return Interpolation(ends, weights, checkpoint.encoding.decode(x_1), evaluations, converged)

@@ -1,0 +1,75 @@
+"""Model space: what a network sees of a scan, and the way back to metres."""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.lidar.encoding import Encoding, build_encoding
+from r2flow.lidar.sensors import Convention, Sensor, build_sensor
+from r2flow.registry import check_options
+
+CHANNELS = ("both", "range", "reflectance")
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSpace:
+    """Images (C, H, W) in model space: a sensor's range images, encoded.
+
+    Attributes:
+        sensor: What the images look through.
+        encoding: Between model space and metres.
+        rays: Elevation and azimuth of every pixel in radians, (2, H, W), as networks are told.
+    """
+
+    sensor: Sensor
+    encoding: Encoding
+    rays: Tensor
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """C, H and W of one image."""
+        return self.encoding.shape
+
+    def check_channels(self, channels: str) -> None:
+        """Refuse channels that an image of this space cannot give.
+
+        Raises:
+            InputError: no such channel, or reflectance where there is none.
+        """
+        if channels not in CHANNELS:
+            raise InputError(f"channels must be {', '.join(CHANNELS[:-1])} or {CHANNELS[-1]}, found {channels!r}.")
+        if channels == "reflectance" and not self.encoding.reflectance:
+            raise InputError("this model was trained on range alone and has no reflectance to give.")
+
+    def decode(self, x: Tensor, channels: str = "both") -> Tensor:
+        """Model space to metres and reflectance: (B, C, h, w) to (B, 2 or 1, h, w).
+
+        `reflectance` still decodes the range, which says where a ray was dropped; `range` skips the reflectance.
+        """
+        encoding = self.encoding
+        if channels == "range" and encoding.reflectance:
+            encoding = copy.copy(encoding)
+            encoding.reflectance = False
+            x = x[:, : encoding.channels]
+        image = encoding.decode(x)
+        return image[:, 1:] if channels == "reflectance" else image
+
+
+def build_space(config: Mapping[str, Any]) -> ModelSpace:
+    """The model space of a config with the keys `sensor` and `encoding`.
+
+    Raises:
+        InputError: a key is missing, a name or an option is unknown, or the numbers do not fit together.
+    """
+    for key in ("sensor", "encoding"):
+        if key not in config:
+            raise InputError(f"the config has no '{key}'.")
+    options = dict(config["sensor"])
+    convention: Convention = options.pop("rays", "centre")
+    check_options("sensor", build_sensor, options)
+    sensor = build_sensor(**options)
+    return ModelSpace(sensor, build_encoding(config["encoding"], sensor), sensor.rays(convention))

@@ -1,0 +1,68 @@
+"""The progress bar of everything that takes a while."""
+
+import sys
+from collections.abc import Iterable, Iterator
+from operator import length_hint
+from typing import Self, TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+T = TypeVar("T")
+
+
+class Bar:
+    """A progress bar with rate and time left, on standard error: results on standard output may be piped.
+
+    Args:
+        doing: What is being done, as "sampling".
+        total: Number of units.
+        unit: What is counted, as "scans".
+        shown: Whether it is drawn; on a terminal only if left out.
+    """
+
+    def __init__(self, doing: str, total: int, unit: str = "", shown: bool | None = None) -> None:
+        self._progress = Progress(
+            TextColumn(doing), BarColumn(), MofNCompleteColumn(), TextColumn(unit), _Rate(), TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
+            console=Console(stderr=True), transient=True, disable=not (sys.stderr.isatty() if shown is None else shown),
+        )  # fmt: skip
+        self._task = self._progress.add_task(unit, total=total, note="")
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def __call__(self, units: float = 1) -> None:
+        """So many more units are done."""
+        self._progress.advance(self._task, units)
+
+    def set(self, done: float | None = None, note: str | None = None) -> None:
+        """How many units are done by now, and what stands behind the bar."""
+        if done is not None:
+            self._progress.update(self._task, completed=done)
+        if note is not None:
+            self._progress.update(self._task, note=note)
+
+
+class _Rate(ProgressColumn):
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text(f"{speed:.2f} {task.description or ''}/s" if speed else "")
+
+
+def track(items: Iterable[T], doing: str, unit: str = "", total: int | None = None, least: int = 0) -> Iterator[T]:
+    """The items one by one, with a bar where there are at least `least` of them.
+
+    Args:
+        total: How many there are, for items that do not know their number.
+    """
+    count = length_hint(items) if total is None else total
+    with Bar(doing, count, unit, shown=None if count >= least else False) as bar:
+        for item in items:
+            yield item
+            bar()

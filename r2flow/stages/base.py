@@ -1,0 +1,100 @@
+"""What every stage has in common: a generator that learns, its optimiser, and what a checkpoint says of it."""
+
+import math
+from collections.abc import Iterable
+from typing import Any, ClassVar
+
+import lightning as L
+import torch
+from lightning.pytorch.core.optimizer import LightningOptimizer
+from torch import Tensor
+
+from r2flow.generators import Generator
+from r2flow.noise import seed_torch
+
+Batch = dict[str, Tensor]
+
+
+class Stage(L.LightningModule):
+    """How a generator is learned. A subclass gives `training_step`.
+
+    A batch is what the DataModule brings: `x_1` the scans in model space, (B, C, H, W); `x_0` noise, (B, *noise_shape);
+    `u` uniform draws in [0, 1), (B,); `k` the number of each image in the run, (B,), from which further draws are
+    counted (`r2flow.noise`).
+
+    A run resumes at `global_step`, which must count batches: a stage with several optimisers takes them from
+    `own_optimizers`, of which the first alone counts.
+
+    Args:
+        generator: What learns. Its weights, and no others, are those of a checkpoint.
+        learning_rate: AdamW's; warmed up linearly, then a cosine to 0 at the run's last step.
+        betas: AdamW's.
+        weight_decay: AdamW's.
+        warmup_images: Images seen during the warm-up.
+        batch_size: Images a step, which turns images into steps.
+        seed: Run seed.
+
+    Attributes:
+        config: The run's, which goes into its checkpoints.
+        gradient_clip_val: The run's, for a stage with manual optimisation, which clips for itself.
+    """
+
+    generator_name: ClassVar[str] = "rectified_flow"  # what it trains unless the config's `generator` says otherwise
+    needs_pairs: ClassVar[bool] = False  # whether a batch's x_0 and x_1 belong together
+
+    def __init__(
+        self,
+        generator: Generator,
+        learning_rate: float = 1e-4,
+        betas: tuple[float, float] = (0.9, 0.99),
+        weight_decay: float = 0.0,
+        warmup_images: int = 80_000,
+        batch_size: int = 8,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.generator = generator
+        self.learning_rate, self.betas, self.weight_decay = learning_rate, betas, weight_decay
+        self.warmup_steps = warmup_images // batch_size
+        self.seed = seed
+        self.config: dict[str, Any] = {}
+        self.gradient_clip_val: float | None = None
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        # Dropout draws from torch's own generator: seeded by position, a resumed run draws the same.
+        position = batch_idx * self.trainer.world_size + self.global_rank
+        seed_torch(self.seed, "dropout", position)
+
+    def configure_optimizers(self) -> Any:
+        optimizer = self.optimizer_for(self.generator.parameters())
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self.schedule_for(optimizer), "interval": "step"}}
+
+    def optimizer_for(self, parameters: Iterable[torch.nn.Parameter]) -> torch.optim.AdamW:
+        """AdamW with the stage's options."""
+        betas = self.betas[0], self.betas[1]
+        return torch.optim.AdamW(parameters, self.learning_rate, betas, eps=1e-8, weight_decay=self.weight_decay)
+
+    def schedule_for(self, optimizer: torch.optim.Optimizer) -> torch.optim.lr_scheduler.LambdaLR:
+        """`learning_rate_factor` over the run."""
+        total = max(int(self.trainer.max_steps), 1)
+        warmup = min(self.warmup_steps, total)
+        return torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: learning_rate_factor(step, warmup, total))
+
+    def own_optimizers(self) -> list[LightningOptimizer]:
+        """The optimisers of a stage with manual optimisation; a step of the first advances `global_step`."""
+        found = self.optimizers()
+        several = found if isinstance(found, list) else [found]
+        for other in several[1:]:  # Lightning would count a step of each
+            other._on_before_step = other._on_after_step = lambda: None
+        return several
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["config"] = self.config
+        checkpoint["sampler"] = self.generator.sampler.asdict()
+
+
+def learning_rate_factor(step: int, warmup: int, total: int) -> float:
+    """step / warmup during the warm-up, then (1 + cos(pi s)) / 2 with s the share of the rest done."""
+    if step < warmup:
+        return step / warmup
+    return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(total - warmup, 1)))
