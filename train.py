@@ -97,8 +97,9 @@ def fit(config: dict[str, Any], asked: list[str]) -> None:
     if parent is not None:
         generator.start_from(parent.generator)
         del parent
-    space, noise_shape = generator.space, generator.noise_shape
-    data = ScanDataModule(space.sensor, space.encoding, config["seed"], noise_shape, **config["data"])
+    data = ScanDataModule(
+        generator.space.sensor, generator.space.encoding, config["seed"], generator.noise_shape, **config["data"]
+    )
     check_roll(data.augment, generator)
     data.setup()
     config["scans"] = data.fingerprint()

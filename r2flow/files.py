@@ -27,18 +27,17 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
         InputError: it is a socket, a block device or a link to nothing.
     """
     path = Path(path)
-    into = _is_stream(path)
+    is_stream = _is_stream(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     target = Path(os.path.realpath(path))
-    if not into:
-        target.parent.mkdir(parents=True, exist_ok=True)
     temporary = None
     try:
-        handle, temporary = tempfile.mkstemp(".part", f".{target.name}.", None if into else target.parent)
+        handle, temporary = tempfile.mkstemp(".part", f".{target.name}.", None if is_stream else target.parent)
         with os.fdopen(handle, mode, encoding=None if "b" in mode else "utf-8") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        if into:
+        if is_stream:
             with open(temporary, "rb") as whole, open(path, "wb") as stream:
                 shutil.copyfileobj(whole, stream)
         else:

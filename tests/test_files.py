@@ -12,7 +12,7 @@ from r2flow.errors import InputError, explain_mistake
 from r2flow.files import atomic_write
 
 
-def test_the_file_is_whole_or_the_old_one(tmp_path):
+def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "folder" / "file.txt"
     with atomic_write(path, "w") as file:
         file.write("old")
@@ -22,7 +22,7 @@ def test_the_file_is_whole_or_the_old_one(tmp_path):
     assert os.listdir(path.parent) == ["file.txt"]
 
 
-def test_the_file_is_as_readable_as_any_other(tmp_path):
+def test_the_file_has_the_usual_permissions(tmp_path):
     with atomic_write(tmp_path / "ours") as file:
         file.write(b"1")
     (tmp_path / "plain").write_bytes(b"1")
@@ -30,7 +30,7 @@ def test_the_file_is_as_readable_as_any_other(tmp_path):
     assert modes[0] == modes[1]
 
 
-def test_a_folder_in_the_way_is_named_itself(tmp_path):
+def test_a_folder_is_refused_by_its_name(tmp_path):
     (tmp_path / "out").mkdir()
     with pytest.raises(IsADirectoryError) as raised, atomic_write(tmp_path / "out"):
         pass
@@ -120,6 +120,8 @@ def test_a_link_to_nothing_is_refused_in_one_line(tmp_path):
     assert (
         str(raised.value) == f"{link} is a link to nothing, which does not exist; remove the link or name another file."
     )
+    with pytest.raises(FileExistsError), atomic_write(link / "file"):  # a folder on a disk that is not mounted
+        pass
     assert os.listdir(tmp_path) == ["link"]
 
 
@@ -131,7 +133,7 @@ def test_links_in_a_circle_are_refused_in_one_line(tmp_path):
     assert explain_mistake(raised.value).startswith(f"{tmp_path / 'a'}: ")
 
 
-def test_a_folder_that_cannot_be_written_to_is_told_by_the_file_s_own_name(tmp_path, monkeypatch):
+def test_a_read_only_folder_is_an_error_with_the_file_s_own_name(tmp_path, monkeypatch):
     # Root may write into a read-only folder: what the system says to others is said here by hand.
     def refused(suffix, prefix, folder):
         raise PermissionError(errno.EACCES, "Permission denied", f"{folder}/{prefix}xyz{suffix}")

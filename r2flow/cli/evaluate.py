@@ -122,7 +122,7 @@ def evaluate(
             [real, judged_scans], list(flows.values()), sensor, size, projection, convention, reflectance_scale
         )
         if built is not None:  # a scale of reflectance is nobody's business where no metric looks at it
-            looks = any(metric.needs_reflectance or metric.uses_reflectance for metric in built.values())
+            looks = any(m.needs_reflectance or m.uses_reflectance for m in built.values())
             reading = replace(reading, reflectance=reading.reflectance if looks else False)
         truth = _open(real, reading, split, real_num)
         judged: ScanSet | None = None

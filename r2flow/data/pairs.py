@@ -65,9 +65,8 @@ def make_pairs(
         InputError: no pair is usable: the flow is broken, or the tolerance out of its reach; or the folder cannot be
             written, or holds other pairs.
     """
-    wanted = store.recipe.noise_shape or store.recipe.shape
-    if generator.noise_shape != wanted:
-        raise InputError(f"these pairs are made of noise of the shape {wanted}, the flow's is {generator.noise_shape}.")
+    if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
+        raise InputError(f"these pairs are of another noise than the generator's {generator.noise_shape}.")
     store.begin()
     # Shards are checked by turns; who finds one damaged makes its batches, which the others hold to be there.
     shards = store.shards(num)

@@ -27,7 +27,7 @@ def is_checkpoint(text: str) -> bool:
 
 
 def reading_of_flow(flow: Checkpoint) -> Reading:
-    """How a flow's training scans became images."""
+    """How a generator's training scans became images."""
     data = flow.config.get("data", {})
     projection, convention = data.get("projection", "spherical"), data.get("convention", "centre")
     return Reading(flow.sensor, projection, convention, data.get("reflectance_scale", 1.0))
@@ -92,8 +92,8 @@ class SampledScans(ScanSource):
 
     def draw(self, indices: Sequence[int]) -> Tensor:
         """The scans of a batch together, (B, 2 or 1, H, W). One that is not solved is taken as it is, and counted."""
-        drawn = draw(self.flow.generator, [self.numbers[i] for i in indices], self.seed, self.sampler)
-        self.seconds.append(drawn.seconds / len(indices))
-        self.evaluations += drawn.evaluations.tolist()
-        self.unsolved += int((~drawn.converged).sum())
-        return drawn.images.nan_to_num(0.0)
+        made = draw(self.flow.generator, [self.numbers[i] for i in indices], self.seed, self.sampler)
+        self.seconds.append(made.seconds / len(indices))
+        self.evaluations += made.evaluations.tolist()
+        self.unsolved += int((~made.converged).sum())
+        return made.images.nan_to_num(0.0)

@@ -33,7 +33,8 @@ def load_scans(spec: str | Path, reading: Reading, most: int = 1000) -> tuple[np
         InputError: no scan there, or one that is not of the reading's sensor.
     """
     scans = open_scans(spec, reading).spread(most)
-    images = np.stack([scans.source[n] for n in track(range(len(scans)), f"reading {spec}", "scans", least=32)])
+    numbers = track(range(len(scans)), f"reading {spec}", "scans", least=32)
+    images = np.stack([scans.source[number] for number in numbers])
     drives = {number: f"{spec}: {drive}" for drive, held in scans.drives.items() for number in held}
     return images, [drives.get(number, str(spec)) for number in range(len(scans))]
 

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +91,7 @@ def write_samples(
                     shown.append(image)
             bar.finished(min(drawn.first + batch_size, num))
     if channels != "reflectance":
-        keep_note(checkpoint, out, seed, sampler)
+        keep_note(checkpoint, out, seed, **sampler.asdict())
     if shown:
         parts = shown if region is None else [region.crop(torch.from_numpy(image)).numpy() for image in shown]
         if channels == "reflectance":
@@ -102,13 +101,13 @@ def write_samples(
     return shown
 
 
-def keep_note(checkpoint: Checkpoint, out: Path, seed: int, sampler: Sampler) -> None:
+def keep_note(checkpoint: Checkpoint, out: Path, seed: int, **sampler: Any) -> None:
     """Leave beside samples what they are, so that nobody has to say their size or sensor."""
     sensor = checkpoint.sensor
     encoding = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
     limits = {"min_range": sensor.min_range, "max_range": sensor.max_range}
     write_samples_note(
-        out, reading_of_flow(checkpoint), encoding={**encoding, **limits}, seed=seed, sampler=asdict(sampler),
+        out, reading_of_flow(checkpoint), encoding={**encoding, **limits}, seed=seed, sampler=sampler,
         step=checkpoint.step,
     )  # fmt: skip
 

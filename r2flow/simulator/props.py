@@ -121,10 +121,10 @@ def fence(b: SceneBuilder, x: float, y: float, yaw: float, length: float) -> Non
         b.add(Cylinders(x + u * c, y + u * s, 0.05, ground, ground + height + 0.08), "fence", "wood")
 
 
-def pole(b: SceneBuilder, x: float, y: float, tall: float | None = None) -> None:
+def pole(b: SceneBuilder, x: float, y: float) -> None:
     """A lamp post."""
     ground = b.level(x, y)
-    tall = b.draws.uniform(4.5, 8.5) if tall is None else tall
+    tall = b.draws.uniform(4.5, 8.5)
     b.add(Cylinders(x, y, b.draws.uniform(0.05, 0.11), ground - 0.3, ground + tall), "pole", "metal")
     if b.draws.chance(0.3):  # a foot with a door in it
         b.add(Cylinders(x, y, b.draws.uniform(0.10, 0.15), ground - 0.3, ground + 0.9), "pole", "metal")

@@ -42,14 +42,12 @@ class Scene:
         ground: The ground.
         solids: Tables of solids, one of each kind.
         surfaces: Their surfaces, one table for each of `solids`.
-        kind: Name of the kind of place.
         rig: Number of the silhouettes of the own car, or None without.
     """
 
     ground: Ground
     solids: tuple[Shape, ...] = ()
     surfaces: tuple[Surface, ...] = ()
-    kind: str = "bare"
     rig: int | None = None
 
 
@@ -95,12 +93,12 @@ class SceneBuilder:
         albedo = self.albedo(material) if albedo is None else albedo
         self._surfaces[kind].append((LABELS[label], INDEX[material], albedo, closed, pattern, base))
 
-    def build(self, kind: str, rig: int | None) -> Scene:
+    def build(self, rig: int | None = None) -> Scene:
         """The scene as tables."""
         kinds = [shape for shape in self.SHAPES if self._rows[shape]]
         solids = tuple(shape(*_columns(self._rows[shape])) for shape in kinds)
         surfaces = tuple(_surface(_columns(self._surfaces[shape])) for shape in kinds)
-        return Scene(self.ground, solids, surfaces, kind, rig)
+        return Scene(self.ground, solids, surfaces, rig)
 
 
 def _columns(rows: list[tuple[float, ...]]) -> np.ndarray:

@@ -9,16 +9,10 @@ from r2flow.simulator.scalar_draws import ScalarDraws
 from r2flow.simulator.scene import Scene, SceneBuilder
 
 
-def draw_scene(rng: np.random.Generator, kind: str | None = None) -> Scene:
-    """A scene.
-
-    Args:
-        rng: Source of its random numbers.
-        kind: A name in `kinds.KINDS`; None draws one by their shares.
-    """
+def draw_scene(rng: np.random.Generator) -> Scene:
+    """A scene of one of `kinds.KINDS`, drawn by their shares."""
     draws = ScalarDraws(rng)
-    drawn = draws.pick(list(KINDS), [k.share for k in KINDS.values()])
-    name = kind or drawn
+    name = draws.pick(list(KINDS), [k.share for k in KINDS.values()])
     b, k = SceneBuilder(draw_ground(draws, name), draws), KINDS[name]
     streets = b.ground.streets
     for street in streets:
@@ -32,4 +26,4 @@ def draw_scene(rng: np.random.Generator, kind: str | None = None) -> Scene:
     roadside.walk(b, k, streets[0])
     if name == "highway":
         roadside.guard(b, streets[0])
-    return b.build(name, rig=draws.pick(range(len(RIGS)), (0.7, 0.3)))
+    return b.build(rig=draws.pick(range(len(RIGS)), (0.7, 0.3)))

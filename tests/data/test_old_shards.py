@@ -36,8 +36,9 @@ def store(folder: Path) -> PairStore:
     return PairStore(folder, PairOptions(**PAIRS).recipe(SHAPE))
 
 
-# dx/dt = 0: every pair ends where it begins, on any machine.
-STILL = Field(lambda t, x: torch.zeros_like(x), SHAPE)
+def still(t: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """dx/dt = 0: every pair ends where it begins, on any machine."""
+    return torch.zeros_like(x)
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -101,6 +102,6 @@ def test_pairs_are_made_again(tmp_path: Path, begun: bool):
     out = tmp_path / "out"
     if begun:
         shutil.copytree(OLD / "pairs-half", out)
-    made = make_pairs(store(out), STILL, 20)
+    made = make_pairs(store(out), Field(still, store(out).recipe.shape), 20)
     assert made.pairs == (8 if begun else 20)  # two batches were sealed, one lay loose
     assert_same(out, OLD / "pairs")

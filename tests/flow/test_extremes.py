@@ -1,4 +1,4 @@
-"""What solvers make of what should not happen: each case with its stated outcome, none of them an exception."""
+"""Solvers in extreme cases: each has a defined outcome, none an exception."""
 
 import logging
 import math
@@ -68,7 +68,7 @@ def test_the_last_finite_state_is_kept():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_velocity_a_thousand_times_too_large_is_survived(method):
+def test_a_velocity_a_thousand_times_too_large_is_solved_or_flagged(method):
     # Blown up or solved, each scene says which; the state stays finite.
     problem = Rotating(turns=0.5 * 1e3)
     solution = solve(problem, X_0, method=method, steps=32, tolerance=1e-3, max_evaluations=1000)
@@ -87,7 +87,7 @@ def test_growth_beyond_float32_is_flagged(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_nowhere_to_go_is_the_start_at_no_cost(method):
+def test_an_empty_interval_returns_the_start_without_evaluations(method):
     for t in (0.0, 1.0):
         solution = solve(Gaussian(), X_0, t, t, method=method, global_error=True)
         assert torch.equal(solution.x, X_0)
@@ -97,14 +97,14 @@ def test_nowhere_to_go_is_the_start_at_no_cost(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_t_exactly_0_and_1_are_asked_for_and_answered(method):
+def test_velocities_are_evaluated_at_exactly_0_and_1(method):
     problem = Gaussian()
     there = solve(problem, X_0.double(), 0.0, 1.0, method=method, steps=128, tolerance=1e-7).x
     back = solve(problem, there, 1.0, 0.0, method=method, steps=128, tolerance=1e-7).x
     torch.testing.assert_close(back, X_0.double(), rtol=0, atol=0.2 if method == "euler" else 1e-2)
 
 
-def test_no_steps_no_budget_and_no_time_are_refused():
+def test_numbers_out_of_range_are_refused():
     for wrong, message in [
         ({"steps": 0}, "at least 1 step, found 0"),
         ({"tolerance": math.nan}, "must be positive"),
@@ -119,7 +119,7 @@ def test_no_steps_no_budget_and_no_time_are_refused():
 
 
 @pytest.mark.parametrize("method", [*ADAPTIVE, "torchdiffeq:dopri5"])
-def test_a_tolerance_that_float32_cannot_hold_is_floored_and_every_call_says_so(method, caplog):
+def test_a_tolerance_that_float32_cannot_hold_is_raised_with_a_warning_in_every_call(method, caplog):
     with caplog.at_level(logging.WARNING):
         floored = solve(Gaussian(), X_0, method=method, tolerance=1e-12)
         solve(Gaussian(), X_0, method=method, tolerance=1e-12, global_error=True)
@@ -132,7 +132,7 @@ def test_a_tolerance_that_float32_cannot_hold_is_floored_and_every_call_says_so(
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_a_tolerance_below_the_noise_of_a_half_precision_network_is_floored(dtype, caplog):
+def test_a_tolerance_below_the_noise_of_a_half_precision_network_is_raised(dtype, caplog):
     problem = Rotating()
 
     def network(t, x):
@@ -148,7 +148,7 @@ def test_a_tolerance_below_the_noise_of_a_half_precision_network_is_floored(dtyp
     assert (noisy.global_error < error * 5).all()
 
 
-def test_autocast_around_the_network_counts_as_its_precision(caplog):
+def test_autocast_sets_the_precision(caplog):
     weight = torch.eye(16)
     with torch.autocast("cpu", dtype=torch.bfloat16), caplog.at_level(logging.WARNING):
         solution = solve(lambda t, x: (x @ weight).float(), X_0, method="dopri5", tolerance=1e-6)
@@ -168,7 +168,7 @@ class Polite(torch.nn.Module):
 
 
 @pytest.mark.parametrize("method", [*ADAPTIVE, "torchdiffeq:dopri5"])
-def test_a_network_s_weights_tell_its_precision_where_its_answer_does_not(method, caplog):
+def test_the_type_of_the_weights_sets_the_precision(method, caplog):
     network = Polite(torch.bfloat16)
     with caplog.at_level(logging.WARNING):
         floored = solve(network, X_0, method=method, tolerance=1e-6)
@@ -193,7 +193,7 @@ def test_scenes_that_are_not_straight_keep_the_network_s_precision(network, capl
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
-def test_an_untrained_network_that_answers_0_is_one_step(method):
+def test_a_velocity_of_0_takes_one_step(method):
     solution = solve(lambda t, x: 0 * x, X_0, method=method, tolerance=1e-3)
     assert solution.accepted.tolist() == [1] * 4
     assert torch.equal(solution.x, X_0)
@@ -218,7 +218,7 @@ def test_a_network_that_is_being_trained_can_be_solved_straight_first():
 
 
 @pytest.mark.parametrize("method", [*ADAPTIVE, "torchdiffeq:dopri5"])
-def test_a_budget_is_kept_to_and_what_exhausts_it_is_flagged(method):
+def test_a_scene_that_exhausts_its_budget_is_flagged(method):
     easy = Straight()
     batch = Mixed([easy, StiffLinear(1e6), easy])
     solution = solve(batch, X_0[:3], method=method, tolerance=1e-3, max_evaluations=200)
@@ -229,7 +229,7 @@ def test_a_budget_is_kept_to_and_what_exhausts_it_is_flagged(method):
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
-def test_a_point_mass_needs_its_last_stretch_left_to_one_step(method):
+def test_a_point_mass_needs_an_euler_step_at_the_end(method):
     # (point - x) / (1 - t) is 0 / 0 at t = 1; from 1 - eps one Euler step is exact.
     problem, x_0 = PointMass(), X_0.double()
     finished = solve(problem, x_0, method=method, tolerance=1e-3, finish=1e-3)
@@ -242,11 +242,11 @@ def test_a_point_mass_needs_its_last_stretch_left_to_one_step(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_batch_of_no_scenes_is_solved(method):
+def test_an_empty_batch_is_solved(method):
     assert solve(Gaussian(), torch.zeros(0, 4), method=method).x.shape == (0, 4)
 
 
-def test_a_defect_of_the_network_is_raised_not_flagged():
+def test_an_exception_in_the_network_is_raised():
     def broken(t, x):
         raise RuntimeError("out of memory")
 

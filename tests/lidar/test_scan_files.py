@@ -203,7 +203,7 @@ def scan(count: int = 5000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("ending", WRITTEN)
-def test_what_is_written_is_read_back_to_the_last_bit(tmp_path, ending):
+def test_written_scans_are_read_back_bit_for_bit(tmp_path, ending):
     xyz, reflectance = scan()
     path = tmp_path / "new folder" / f"a.{ending}"
     write_points(path, xyz, reflectance)
@@ -223,7 +223,7 @@ def test_a_scan_without_reflectance_is_read_back_without(tmp_path, ending):
     assert points.reflectance is None
 
 
-def test_what_is_read_may_be_changed(tmp_path):
+def test_arrays_that_were_read_are_writable(tmp_path):
     # PyTorch warns of, and a caller may trip over, arrays that are views of a file's bytes.
     for ending in WRITTEN:
         write_points(tmp_path / f"a.{ending}", *scan(8))
@@ -245,7 +245,7 @@ def test_what_is_read_may_be_changed(tmp_path):
         ("a.ply", {"xyz": np.full((3, 3), 1e300)}, "infinite"),
     ],
 )
-def test_what_cannot_be_written_leaves_the_old_file(tmp_path, name, change, word):
+def test_a_refused_write_leaves_the_old_file(tmp_path, name, change, word):
     path = saved(tmp_path, name, b"old")
     with pytest.raises(InputError, match=word):
         write_points(path, **({"xyz": np.array(XYZ), "reflectance": np.array(REFLECTANCE)} | change))

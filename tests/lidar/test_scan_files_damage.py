@@ -1,4 +1,4 @@
-"""Damaged scan files: the clear line that names the file, or finite points; never anything else."""
+"""Damaged scan files give one line with the file's name, or finite points."""
 
 import json
 import os
@@ -109,7 +109,7 @@ def test_the_undamaged_file_is_read(tmp_path, originals, name):
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_every_cut_is_refused_but_where_nothing_can_show_it(tmp_path, originals, name):
+def test_every_truncated_file_is_refused_where_that_can_be_detected(tmp_path, originals, name):
     whole = originals[name]
     accepted = []
     for length in range(len(whole)):
@@ -158,7 +158,7 @@ def test_flipped_bits_in_the_body_cost_their_own_points_at_most(tmp_path, origin
 
 
 @pytest.mark.parametrize(("name", "columns"), [("bin", 4), ("pcd.bin", 5)])
-def test_what_a_flipped_bit_in_a_number_leaves_is_a_value_that_lidars_measure(tmp_path, originals, name, columns):
+def test_a_flipped_bit_leaves_only_values_that_lidars_measure(tmp_path, originals, name, columns):
     # These formats have no checksum: a coordinate that becomes another coordinate cannot be told from the right one.
     # What no LiDAR measures can, and costs its own point or the file.
     whole = originals[name]
@@ -233,7 +233,7 @@ def layouts() -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("layout", layouts())
-def test_no_other_layout_passes_for_kitti(tmp_path, layout):
+def test_other_layouts_are_refused_as_kitti(tmp_path, layout):
     content = layouts()[layout]
     assert len(content) % 16 == 0
     assert read_bytes(tmp_path, "bin", content) is None
@@ -241,13 +241,13 @@ def test_no_other_layout_passes_for_kitti(tmp_path, layout):
 
 @pytest.mark.parametrize("name", ["npy", "ply", "pcd"])
 @pytest.mark.parametrize("layout", [k for k in layouts() if k not in ("mostly NaN", "rows of 3")])
-def test_nothing_else_passes_for_a_file_with_a_header(tmp_path, name, layout):
+def test_other_content_is_refused_in_formats_with_a_header(tmp_path, name, layout):
     assert read_bytes(tmp_path, name, layouts()[layout]) is None
 
 
 @pytest.mark.parametrize("shown", FORMATS)
 @pytest.mark.parametrize("given", ["bin", "pcd.bin", "npy", "ply", "pcd"])
-def test_no_format_passes_for_another(tmp_path, originals, shown, given):
+def test_every_format_is_refused_under_the_endings_of_others(tmp_path, originals, shown, given):
     if shown.partition(" ")[0] != given:
         content = originals[shown]
         assert read_bytes(tmp_path, given, content + bytes(-len(content) % 80)) is None
@@ -291,7 +291,7 @@ def declarations() -> dict[str, tuple[str, bytes]]:
 
 
 @pytest.mark.parametrize("name", declarations())
-def test_a_declared_size_is_not_believed(tmp_path, name):
+def test_memory_is_not_allocated_for_a_declared_size(tmp_path, name):
     ending, content = declarations()[name]
     tracemalloc.start()
     try:
@@ -332,7 +332,7 @@ def test_a_declared_size_is_not_believed(tmp_path, name):
         ("a.ply", ply_ascii().replace(b"vertex 64", b"vertex -4"), "whole number"),
     ],
 )
-def test_the_line_says_what_was_found(tmp_path, name, content, word):
+def test_errors_say_what_was_found(tmp_path, name, content, word):
     path = tmp_path / name
     path.write_bytes(content)
     with pytest.raises(InputError, match=word) as caught:
@@ -354,7 +354,7 @@ def test_the_line_says_what_was_found(tmp_path, name, content, word):
         (np.array([["x", "y", "z"]]), "not floats"),
     ],
 )
-def test_an_array_that_is_no_points_is_said(tmp_path, array, word):
+def test_arrays_that_are_not_points_are_refused(tmp_path, array, word):
     np.save(tmp_path / "a.npy", array)
     with pytest.raises(InputError, match=word):
         read_points(tmp_path / "a.npy")
@@ -370,7 +370,7 @@ def test_a_pickle_in_a_npy_is_never_run(tmp_path):
     assert not (tmp_path / "ran").exists()
 
 
-def test_what_is_no_file_is_said(tmp_path):
+def test_paths_that_are_not_regular_files_are_refused(tmp_path):
     (tmp_path / "folder.bin").mkdir()
     (tmp_path / "link.bin").symlink_to(tmp_path / "gone.bin")
     (tmp_path / "loop.bin").symlink_to(tmp_path / "loop.bin")

@@ -28,6 +28,6 @@ def test_lzf_reaches_8192_bytes_back_and_no_farther():
     ("stream", "size"),
     [(STREAM[:-1], len(PLAIN)), (STREAM[:2], 3), (STREAM, len(PLAIN) + 1), (STREAM, 5), (b"\x20\x00", 3)],
 )
-def test_lzf_refuses_what_does_not_fit(stream, size):
+def test_lzf_refuses_damaged_streams(stream, size):
     with pytest.raises(ValueError, match=r"end in the middle|do not unpack|before the beginning"):
         lzf.decompress(stream, size)

@@ -1,4 +1,4 @@
-"""The ground: slopes, waves, kerbs and streets, against what geometry says."""
+"""The ground: slopes, waves, kerbs and streets against geometry."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def test_the_normal_of_a_slope_sets_the_angle_of_incidence():
     np.testing.assert_allclose(hit.cosine[met, column], np.sin(np.arctan(0.1) - e[met]), atol=1e-4)
 
 
-def test_on_waves_the_ray_ends_on_the_surface_and_passes_nothing_before():
+def test_on_waves_a_ray_ends_where_it_first_meets_the_surface():
     ground = Ground(waves=((0.4, 2 * np.pi / 60, 0.02, 1.0), (0.2, 0.0, 2 * np.pi / 45, 2.0)))
     hit = ground.meet(RAYS)
     met = np.isfinite(hit.distance)
@@ -61,7 +61,7 @@ def test_beside_the_street_the_ground_is_higher_by_the_kerb():
     np.testing.assert_allclose(np.abs(y[on_face]), 4.0, atol=0.02)
 
 
-def test_surfaces_lie_in_strips_beside_a_street():
+def test_surfaces_are_strips_beside_a_street():
     ground = Ground(streets=(STRAIGHT._replace(lines=(0.0, 3.5)),))
     y = np.array([3.0, 3.5, 3.9, 4.5, 5.9, 6.5])
     label, _, _ = ground.surface(np.full(6, 10.0), y)

@@ -1,4 +1,4 @@
-"""Ray casting against what geometry says."""
+"""Ray casting against geometry."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def look(*solids, ground=None, sensor=HDL64E, lasers=None, material="concrete"):
     for label, solid in solids:
         b.add(solid, label, material)
     rays = Rays(lasers or along_rows(sensor), sensor.columns, sensor.height)
-    hits = cast(b.build("test", None), rays, np.random.default_rng(1))
+    hits = cast(b.build(), rays, np.random.default_rng(1))
     return hits, hits.distance / np.cos(rays.lasers.elevation)[:, None], rays
 
 
@@ -103,7 +103,7 @@ def test_a_leaning_windscreen_is_met_in_its_plane():
     np.testing.assert_allclose(hits.distance[rows, w][leaning], 8 + 0.5 * z[leaning], atol=0.02)
 
 
-def test_a_wall_hides_what_is_behind_it_and_nothing_before_it():
+def test_a_wall_hides_what_is_behind_it_only():
     wall = ("building", Boxes(12.0, 0.0, 0.0, 0.5, 200.0, -1.0, 50.0))
     near, far = Cylinders(8.0, 0.0, 0.3, 0.0, 4.0), Cylinders(20.0, 1.0, 0.3, 0.0, 4.0)
     with_wall, _, _ = look(wall, ("pole", near), ("trunk", far))
@@ -114,14 +114,14 @@ def test_a_wall_hides_what_is_behind_it_and_nothing_before_it():
     assert (with_wall.label == LABELS["pole"]).sum() == (without.label == LABELS["pole"]).sum()
 
 
-def test_the_nearest_of_many_overlapping_things_wins():
+def test_the_nearest_of_many_overlapping_solids_is_met():
     solids = [("car", Boxes(x, 0.3 * x, 0.2 * x, 1.5, 1.0, 0.0, 2.0)) for x in (5.0, 6.0, 7.0, 9.0, 14.0)]
     together, _, _ = look(*solids)
     apart = np.min([look(one)[0].distance for one in solids], axis=0)
     np.testing.assert_array_equal(together.distance, apart)
 
 
-def test_a_free_path_lets_through_the_share_that_an_exponential_says():
+def test_the_share_of_pulses_through_leaves_is_exponential_in_their_path():
     radius, path = 2.0, 1.5
     hits, _, rays = look(("vegetation", Blobs(15.0, 0.0, 1.7, radius, radius, path)))
     d, c = directions(rays), np.array([15.0, 0.0, 1.7 - HEIGHT])

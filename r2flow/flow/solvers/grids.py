@@ -67,15 +67,7 @@ def extended(times: Tensor, t_1: float, closing: float) -> Tensor:
     return torch.cat([times, times.new_tensor(further)])
 
 
-def calibrated_grid(
-    velocity: Velocity,
-    x_0: Tensor,
-    steps: int,
-    t_0: float = 0.0,
-    t_1: float = 1.0,
-    order: int = 1,
-    fine: int = 256,
-) -> Tensor:
+def calibrated_grid(velocity: Velocity, x_0: Tensor, steps: int, order: int = 1, fine: int = 256) -> Tensor:
     """The time grid on which `steps` steps of a method of this order make equal local errors.
 
     D(t) = RMS |d^order v / dt^order| is estimated by differences along a fine solution from x_0. The local error is
@@ -90,14 +82,14 @@ def calibrated_grid(
         fine: Steps of the fine solution, one evaluation each; more than a few times `steps`.
 
     Returns:
-        Times from t_0 to t_1, (steps + 1,) float64 on the CPU: `solve(..., grid=times)`.
+        Times from 0 to 1, (steps + 1,) float64 on the CPU: `solve(..., grid=times)`.
 
     Raises:
         InputError: no step, or a solution along which the velocity is not finite.
     """
     if steps < 1 or order < 1 or fine <= order:
         raise InputError(f"needs a step, an order and more than {order} fine steps; found {steps}, {order}, {fine}.")
-    times = uniform(t_0, t_1, fine)
+    times = uniform(0.0, 1.0, fine)
     density = _derivatives(velocity, x_0, times, order) ** (1 / (order + 1))
     if not density.isfinite().all():
         raise InputError("the velocity is not finite along the fine solution: no grid can be calibrated on it.")

@@ -15,7 +15,7 @@ import numpy as np
 
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.lidar.scan_files.arrays import read_kitti, read_npy, read_nuscenes, write_kitti, write_npy
+from r2flow.lidar.scan_files.arrays import read_kitti, read_npy, read_nuscenes
 from r2flow.lidar.scan_files.pcd import read_pcd, write_pcd
 from r2flow.lidar.scan_files.ply import read_ply, write_ply
 from r2flow.lidar.scan_files.points import NoPointsError, Points
@@ -29,11 +29,11 @@ _READERS: dict[str, Callable[[Path], Points]] = {
     ".ply": read_ply,
     ".npy": read_npy,
 }
-_WRITERS: dict[str, Callable[[IO[bytes], np.ndarray], None]] = {
-    ".bin": write_kitti,
+_WRITERS: dict[str, Callable[[IO[bytes], np.ndarray], object]] = {
+    ".bin": lambda file, table: file.write(table.tobytes()),
     ".pcd": write_pcd,
     ".ply": write_ply,
-    ".npy": write_npy,
+    ".npy": np.save,
 }
 
 SCAN_ENDINGS = tuple(_READERS)

@@ -53,11 +53,6 @@ def _refuse_other_content(path: Path, head: bytes, layout: str) -> None:
         raise InputError(f"{path} is not {layout}: it is text, beginning with {head[:24].decode()!r}.")
 
 
-def write_kitti(file: IO[bytes], table: np.ndarray) -> None:
-    """Rows of x, y, z, reflectance out of a table (N, 4)."""
-    file.write(table.tobytes())
-
-
 def read_npy(path: Path) -> Points:
     """An array (N, 3) or (N, 4) of floats; see `read_points`. Never unpickles."""
     with path.open("rb") as file:
@@ -83,15 +78,15 @@ def read_npy(path: Path) -> Points:
 def _npy_header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     """The declared shape, whether it is in Fortran's order, and the type.
 
-    Not `np.load`, which allocates what is declared; nor a memory map, which kills the process when
-    somebody shortens the file meanwhile.
+    Not by `np.load`, which allocates what is declared, nor by a memory map, which kills the process when the file gets
+    shorter meanwhile.
     """
     try:
         version = np.lib.format.read_magic(file)
         if version == (1, 0):
             return np.lib.format.read_array_header_1_0(file)
-        return np.lib.format.read_array_header_2_0(file)  # 3.0 is for field names, which points have not
-    except Exception as error:  # NumPy evaluates the header and promises no particular exception
+        return np.lib.format.read_array_header_2_0(file)  # 3.0 is for field names, which points do not have
+    except Exception as error:  # NumPy evaluates the header and may raise anything
         reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
         raise InputError(f"{path} is not a readable .npy file ({reason[:160]}). Is it damaged?") from None
 
@@ -102,8 +97,3 @@ def _shape_hint(shape: tuple[int, ...]) -> str:
     if len(shape) == 2 and shape[0] in (3, 4):
         return " It looks transposed."
     return ""
-
-
-def write_npy(file: IO[bytes], table: np.ndarray) -> None:
-    """The table itself, (N, 3) or (N, 4)."""
-    np.save(file, table, allow_pickle=False)

@@ -69,7 +69,7 @@ def _read_header(path: Path, data: bytes) -> tuple[Header, int]:
         if key.startswith("#"):
             continue
         key = _OLD_KEYS.get(key, key)
-        # Not skipped: a COUNT that a flipped bit has renamed would change every row in silence.
+        # Not skipped: where a flipped bit has renamed COUNT, every row would be wrong.
         if key not in _KEYS or key in header:
             state = "repeats the" if key in header else "has an unknown"
             raise InputError(f"{path} {state} header line {key[:24]!r}; known: {', '.join(_KEYS)}.")
