@@ -325,7 +325,10 @@ def _rescaled(generated: str, reading: "Reading", scale: float | None) -> "Readi
 def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> "ScanSet":
     from r2flow.data.opening import open_scans
 
-    return open_scans(text, reading, split, num)
+    scans = open_scans(text, reading, split, num)
+    if len(scans):
+        _ = scans.source[0]  # what does not fit is better known now than after the other set was read
+    return scans
 
 
 def _build(names: Sequence[str], bootstrap: int, place: "Place") -> "dict[str, ScanMetric]":
