@@ -18,7 +18,7 @@ from r2flow.errors import InputError
 if TYPE_CHECKING:
     from r2flow.checkpoints import Checkpoint
     from r2flow.evaluation.measuring import Work
-    from r2flow.evaluation.processes import Place
+    from r2flow.evaluation.processes import Process
     from r2flow.evaluation.reading import Reading
     from r2flow.evaluation.sets import ScanSet
     from r2flow.metrics.base import ScanMetric
@@ -354,14 +354,14 @@ def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> 
     return open_set(text, reading, split, num)
 
 
-def _build(names: Sequence[str], bootstrap: int, place: "Place") -> "dict[str, ScanMetric]":
+def _build(names: Sequence[str], bootstrap: int, place: "Process") -> "dict[str, ScanMetric]":
     from r2flow.metrics import METRICS
 
     options = {"keep": bootstrap > 0, "folder": place.folder}
     return {name: METRICS[name](**options).to(place.device) for name in dict.fromkeys(names)}
 
 
-def _build_default(reflectance: bool, bootstrap: int, place: "Place") -> "dict[str, ScanMetric]":
+def _build_default(reflectance: bool, bootstrap: int, place: "Process") -> "dict[str, ScanMetric]":
     """The default metrics; a warning says which of them cannot be computed here."""
     built: dict[str, ScanMetric] = {}
     for name in DEFAULT:
