@@ -164,8 +164,7 @@ def measure(
         elif draws and work.rank == 0:
             protocol["interval"] = {"bootstrap draws": draws, "level": LEVEL, "seed": 0}
             with work.bar("resampling", draws, "sets") as advance:
-                found = bootstrap(metric, draws, LEVEL, advance=advance)
-            intervals = {key: (one.low, one.high) for key, one in found.items()}
+                intervals = bootstrap(metric, draws, LEVEL, advance=advance)
         results.append(MetricResult(name, figures, protocol, remarks, intervals))
     return results
 
