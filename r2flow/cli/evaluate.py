@@ -107,7 +107,6 @@ def evaluate(
     """
     from r2flow.evaluation.measuring import check_reflectance
     from r2flow.evaluation.processes import joined
-    from r2flow.evaluation.sets import sampled_set
     from r2flow.reports.speed_quality import Drawing
 
     _check_evaluation(generated, checkpoint, measured, output)
@@ -125,11 +124,7 @@ def evaluate(
         truth = _open(real, reading, scans.split, scans.real_num)
         judged: ScanSet | None = None
         if _is_flow(generated):
-            (label, flow), *_ = flows.items()
-            sampler = flow.generator.sampler.changed(
-                steps=_one(sampling.steps), method=sampling.solver, tolerance=sampling.tolerance
-            )
-            judged = sampled_set(flow, label, num, sampler, sampling.seed)
+            judged = _sampled(flows, num, sampling)
         elif generated is not None:
             scale = how.reflectance_scale if scans.generated_scale is None else scans.generated_scale
             judged = _open(generated, replace(reading, reflectance_scale=scale), scans.generated_split, scans.num)
@@ -352,6 +347,15 @@ def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> 
     from r2flow.evaluation.sets import open_set
 
     return open_set(text, reading, split, num)
+
+
+def _sampled(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOptions) -> "ScanSet":
+    """Scans of the one flow that is judged."""
+    from r2flow.evaluation.sets import sampled_set
+
+    (label, flow), *_ = flows.items()
+    changes = {"steps": _one(sampling.steps), "method": sampling.solver, "tolerance": sampling.tolerance}
+    return sampled_set(flow, label, num, flow.generator.sampler.changed(**changes), sampling.seed)
 
 
 def _build(names: Sequence[str], bootstrap: int, place: "Process") -> "dict[str, ScanMetric]":

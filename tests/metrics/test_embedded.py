@@ -70,7 +70,7 @@ def test_range_alone_has_a_name_of_its_own_and_needs_no_reflectance(embedded, im
     np.testing.assert_array_equal(
         of_range.features(Scans(images, SENSOR)), of_range.features(Scans(images[:, :1], SENSOR))
     )
-    with pytest.raises(InputError, match="use 'embedded_range'"):
+    with pytest.raises(InputError, match="no reflectance; use .* embedded_range"):
         embedded.features(Scans(images[:, :1], SENSOR))
 
 
