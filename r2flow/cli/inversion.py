@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from r2flow.cli.app import app, report
-from r2flow.cli.options import CheckpointOption, OutOption, choose_device
+from r2flow.cli.options import SETS, CheckpointOption, OutOption, choose_device
 
 SolverOption = Annotated[str, typer.Option(help="dopri5, bosh3, or one of fixed steps: euler, rk4, ab2, ...")]
 ToleranceOption = Annotated[float, typer.Option(help="Of an adaptive solver.")]
@@ -21,7 +21,7 @@ OwnScaleOption = Annotated[
 
 @app.command(epilog="Example: r2flow invert velodyne/0000000100.bin --checkpoint runs/NAME --out noise")
 def invert(
-    scans: Annotated[list[Path], typer.Argument(help="Scan files, range images (.npy), or folders of them.")],
+    scans: Annotated[list[str], typer.Argument(help=f"Scan files, range images (.npy), or {SETS}.")],
     checkpoint: CheckpointOption,
     out: OutOption,
     solver: SolverOption = "dopri5",
@@ -36,13 +36,12 @@ def invert(
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.output import command
     from r2flow.generators import Sampler
-    from r2flow.reports.inversion import invert_scans, print_rows
+    from r2flow.reports.inversion import invert_scans, print_rows, real_scans
     from r2flow.reports.pages import write_page
-    from r2flow.reports.views import scans_of
 
     loaded = load_checkpoint(checkpoint, choose_device(device))
-    paths = [path for scan in scans for path in scans_of(scan, most)]
-    page = invert_scans(loaded, paths, out, Sampler(solver, steps, tolerance), batch_size, reflectance_scale, command())
+    real = real_scans(loaded, scans, reflectance_scale, most)
+    page = invert_scans(loaded, real, out, Sampler(solver, steps, tolerance), batch_size, command())
     written = write_page(page, out)
     print_rows(page.rows)  # type: ignore[arg-type]
     print(f"noise in {out}/*.x_0.npy; {', '.join(str(path) for path in written)}")
@@ -67,12 +66,12 @@ def interpolate(
     from r2flow.cli.output import command
     from r2flow.generators import Sampler
     from r2flow.reports.interpolation import interpolation
+    from r2flow.reports.inversion import real_scans
     from r2flow.reports.pages import write_page
 
     loaded = load_checkpoint(checkpoint, choose_device(device))
-    page = interpolation(
-        loaded, [first, last], frames, out, Sampler(solver, steps, tolerance), batch_size, reflectance_scale, command()
-    )
+    ends = real_scans(loaded, [first, last], reflectance_scale)
+    page = interpolation(loaded, ends, frames, out, Sampler(solver, steps, tolerance), batch_size, command())
     written = write_page(page, out)
     print(f"{frames} scans in {out / 'frames'}; {', '.join(str(path) for path in written)}")
 

@@ -1,7 +1,7 @@
 """The floor of a distance: what it is between real scans, which a generator cannot be expected to go below."""
 
+from r2flow.data.sets import ScanSet
 from r2flow.errors import InputError
-from r2flow.evaluation.sets import SampledScans, ScanSet
 
 
 def floor_sets(real: ScanSet, generated: ScanSet | None = None) -> dict[str, tuple[ScanSet, ScanSet]]:
@@ -20,7 +20,7 @@ def floor_sets(real: ScanSet, generated: ScanSet | None = None) -> dict[str, tup
     first, second = range(count // 2), range(count // 2, count)
     half, other = real.part(first, "first half"), real.part(second, "second half")
     found = {"real halves": (half, other)}
-    if generated is not None and not isinstance(generated.source, SampledScans) and len(generated) >= len(other):
+    if generated is not None and not generated.source.drawn and len(generated) >= len(other):
         found["generated, as many"] = half, generated.limited(len(other))
     largest = sorted(real.drives, key=lambda drive: -len(real.drives[drive]))[:2]
     if len(largest) == 2:

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.files import state_hash
+from r2flow.hashing import state_hash
+from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.metrics.extractors import EXTRACTORS, load_extractor, training
 from r2flow.metrics.extractors.embedded import (
@@ -36,7 +37,6 @@ from r2flow.metrics.extractors.training import (
 )
 from r2flow.metrics.scans import Scans
 from r2flow.simulator import simulate
-from r2flow.simulator.labels import LABELS
 from tests.conftest import ROOT
 
 SENSOR = SENSORS["hdl64e"].resized(16, 128)

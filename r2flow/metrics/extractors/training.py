@@ -14,13 +14,14 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 import r2flow
-from r2flow.files import atomic_write, state_hash
+from r2flow.files import atomic_write
+from r2flow.hashing import state_hash
+from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.metrics.extractors.embedded import CLASSES, REFLECTANCE, SegmentationNetwork, inputs
 from r2flow.metrics.scans import Scans
 from r2flow.noise import generator, seed_torch
 from r2flow.simulator import simulate
-from r2flow.simulator.labels import LABELS
 from r2flow.stages.base import learning_rate_factor
 
 IGNORED = -1  # class of pixels that are not learned from
