@@ -16,7 +16,7 @@ from r2flow.files import atomic_write
 from r2flow.metrics.base import ScanMetric, Side
 from r2flow.metrics.birds_eye import BINS
 from r2flow.metrics.jsd import JSD
-from r2flow.reports.paper.subjects import Subject
+from r2flow.reports.paper.subjects import PaperRun
 from r2flow.reports.speed_quality import BETWEEN
 from r2flow.sampling import sample
 
@@ -64,7 +64,7 @@ class Bench:
     folder: Path
     device: str
 
-    def path(self, subject: Subject, steps: int) -> Path:
+    def path(self, subject: PaperRun, steps: int) -> Path:
         """A cell's file, named by all that it is a function of."""
         key = point_key(
             self.real, self.metrics, weights=subject.weights, steps=steps, num=self.num, seed=SEED,
@@ -73,12 +73,12 @@ class Bench:
         return self.folder / f"{key}.safetensors"
 
 
-def steps_of(subject: Subject, steps: Sequence[int]) -> list[int]:
+def steps_of(subject: PaperRun, steps: Sequence[int]) -> list[int]:
     """A distilled flow is measured at its own number of steps alone; it was not trained for another."""
     return list(steps) if subject.steps is None else [subject.steps]
 
 
-def measure_cells(bench: Bench, flow: Checkpoint, subject: Subject, steps: Sequence[int]) -> Iterator[Cell]:
+def measure_cells(bench: Bench, flow: Checkpoint, subject: PaperRun, steps: Sequence[int]) -> Iterator[Cell]:
     """The cells of one flow, kept as each is done."""
     for count in steps_of(subject, steps):
         path = bench.path(subject, count)
@@ -91,7 +91,7 @@ def measure_cells(bench: Bench, flow: Checkpoint, subject: Subject, steps: Seque
         yield Cell(row, cell.birds_eye, cell.images)
 
 
-def _measure(bench: Bench, flow: Checkpoint, subject: Subject, steps: int) -> Cell:
+def _measure(bench: Bench, flow: Checkpoint, subject: PaperRun, steps: int) -> Cell:
     sampler = flow.generator.sampler.changed(steps=steps)
     drawn = sampled_set(flow, f"{subject.label}, {steps} steps", bench.num, sampler, SEED)
     found = measure(bench.metrics, bench.gathered, drawn, bench.work, bench.bootstrap)

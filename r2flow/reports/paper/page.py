@@ -16,7 +16,7 @@ from r2flow.reports.pages import Page, picture
 from r2flow.reports.paper.cells import Cell
 from r2flow.reports.paper.claims import FAILS, HOLDS, UNKNOWN, Claim, claims
 from r2flow.reports.paper.figures import birds_eye_figure, trade_off_figure
-from r2flow.reports.paper.subjects import Subject
+from r2flow.reports.paper.subjects import PaperRun
 from r2flow.reports.paper.tables import (
     architectures_table,
     beside,
@@ -30,7 +30,7 @@ from r2flow.reports.speed_quality import BETWEEN
 
 
 @dataclass(frozen=True)
-class Measured:
+class PaperResults:
     """All that the page is made of.
 
     Attributes:
@@ -44,7 +44,7 @@ class Measured:
         between: Figure 3's frames, None where it was left out.
     """
 
-    subjects: Sequence[Subject]
+    subjects: Sequence[PaperRun]
     real: ScanSet
     cells: Sequence[Cell]
     birds_eye: np.ndarray
@@ -55,7 +55,7 @@ class Measured:
 
 
 def paper_page(
-    measured: Measured, metrics: Sequence[str], missing: Mapping[str, str], num: int, command: str, device: str,
+    measured: PaperResults, metrics: Sequence[str], missing: Mapping[str, str], num: int, command: str, device: str,
     seeds: Mapping[str, int],
 ) -> Page:  # fmt: skip
     """The page, still to be written."""
@@ -119,7 +119,7 @@ def _placed(figures: Mapping[str, Figure], name: str, title: str) -> list[str]:
     return [title, picture(name)] if name in figures else []
 
 
-def curved_rows(measured: Measured) -> list[dict[str, Any]]:
+def curved_rows(measured: PaperResults) -> list[dict[str, Any]]:
     """What `claims` needs of the paths."""
     known = {one.label: one for one in measured.subjects}
     return [
@@ -128,7 +128,9 @@ def curved_rows(measured: Measured) -> list[dict[str, Any]]:
     ]
 
 
-def figures_of(measured: Measured, rows: Sequence[dict[str, Any]], headings: Mapping[str, str]) -> dict[str, Figure]:
+def figures_of(
+    measured: PaperResults, rows: Sequence[dict[str, Any]], headings: Mapping[str, str]
+) -> dict[str, Figure]:
     """By name; one that has nothing to show is left out."""
     rays = measured.real.sensor.rays()
     figures: dict[str, Figure] = {}
@@ -145,7 +147,7 @@ def figures_of(measured: Measured, rows: Sequence[dict[str, Any]], headings: Map
     return figures
 
 
-def from_above(measured: Measured) -> dict[str, np.ndarray]:
+def from_above(measured: PaperResults) -> dict[str, np.ndarray]:
     """Points of every kind of 1-RF at the most evaluations, those of its seeds added."""
     known = {one.label: one for one in measured.subjects}
     roots = [cell for cell in measured.cells if cell.row["role"] == "1-RF"]
@@ -158,7 +160,7 @@ def from_above(measured: Measured) -> dict[str, np.ndarray]:
     return added
 
 
-def scans_figure(measured: Measured) -> Figure:
+def scans_figure(measured: PaperResults) -> Figure:
     """Figure 7: a real scan, then the first scan of every flow of the first chain at the steps that table I has."""
     family = measured.cells[0].row["family"]
     chain = [cell for cell in measured.cells if cell.row["family"] == family]
@@ -178,13 +180,13 @@ def tally(found: Sequence[Claim]) -> str:
     )
 
 
-def data_in_words(subjects: Sequence[Subject]) -> str:
+def data_in_words(subjects: Sequence[PaperRun]) -> str:
     """What the 1-RFs were trained on."""
     names = {str(one.config["data"]["name"]): one.config.get("scans", "") for one in subjects if one.role == "1-RF"}
     return "; ".join(f"{name} ({scans})" if scans else name for name, scans in names.items())
 
 
-def images_seen(subjects: Sequence[Subject]) -> list[int]:
+def images_seen(subjects: Sequence[PaperRun]) -> list[int]:
     """Images that each 1-RF took its steps on."""
     return [
         int(one.config["trainer"]["max_steps"]) * int(one.config["data"]["batch_size"])

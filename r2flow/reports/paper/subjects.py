@@ -11,7 +11,7 @@ from r2flow.reports.compare import find_runs, labels
 
 
 @dataclass(frozen=True)
-class Subject:
+class PaperRun:
     """One run.
 
     Attributes:
@@ -53,7 +53,7 @@ class Subject:
         return f"hdit {({'learnable': 'with APE', 'none': 'without APE'}).get(self.position, self.position)}"
 
 
-def find_subjects(folders: Sequence[Path]) -> list[Subject]:
+def find_subjects(folders: Sequence[Path]) -> list[PaperRun]:
     """The runs in some folders, parents before their children.
 
     A child is known by its parent's weights, wherever the folders have moved.
@@ -64,7 +64,7 @@ def find_subjects(folders: Sequence[Path]) -> list[Subject]:
     runs = find_runs(folders)
     if not runs:
         raise InputError(f"no run in {', '.join(map(str, folders))}; give folders that train.py has written.")
-    found: dict[str, Subject] = {}
+    found: dict[str, PaperRun] = {}
     rest = [_read(run, label) for run, label in zip(runs, labels(runs), strict=True)]
     while rest:
         # A parent that is not among the runs cannot be waited for: its child is a family by itself.
@@ -80,7 +80,7 @@ def find_subjects(folders: Sequence[Path]) -> list[Subject]:
     return subjects
 
 
-def _read(run: Path, label: str) -> Subject:
+def _read(run: Path, label: str) -> PaperRun:
     """A run as it says of itself; its family is its parent's weights still, "" without a parent."""
     checkpoint = load_checkpoint(run)
     config = checkpoint.config
@@ -88,10 +88,10 @@ def _read(run: Path, label: str) -> Subject:
     stage = config["stage"]["name"]
     own = checkpoint.generator.sampler
     steps = own.steps if own.fixed else None
-    return Subject(run, label, stage, parent, weights_hash(checkpoint), config, steps)
+    return PaperRun(run, label, stage, parent, weights_hash(checkpoint), config, steps)
 
 
-def _role(one: Subject, parent: Subject | None) -> str:
+def _role(one: PaperRun, parent: PaperRun | None) -> str:
     if one.role == "rectify":
         return "1-RF"
     # A parent that is not there is known by its stage alone.
@@ -104,7 +104,7 @@ def _role(one: Subject, parent: Subject | None) -> str:
     return f"{one.role} of {above}"
 
 
-def _check_comparable(subjects: Sequence[Subject]) -> None:
+def _check_comparable(subjects: Sequence[PaperRun]) -> None:
     if not any(one.role == "1-RF" for one in subjects):
         raise InputError(f"no 1-RF among the runs: {', '.join(f'{one.label} is {one.role}' for one in subjects)}.")
     first = subjects[0]

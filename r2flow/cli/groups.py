@@ -1,0 +1,69 @@
+"""Options that belong together: a dataclass with an option a field, which a verb takes as one parameter."""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import wraps
+from typing import Annotated, Any, get_type_hints
+
+import typer
+
+from r2flow.cli.options import SizeOption
+
+
+def grouped(verb: Callable[..., None]) -> Callable[..., None]:
+    """Let typer see every field of a verb's dataclass parameters as an option of its own.
+
+    @app.command()
+    @grouped
+    def evaluate(real: str, reading: ReadingOptions) -> None: ...   # r2flow evaluate REAL --sensor vlp16 --size 16x512
+    """
+    hints = get_type_hints(verb, include_extras=True)
+    groups: dict[str, Any] = {}
+    parameters: list[inspect.Parameter] = []
+    for name, positional in inspect.signature(verb).parameters.items():
+        parameter = positional.replace(kind=positional.KEYWORD_ONLY, annotation=hints[name])
+        if not is_dataclass(hints[name]):
+            parameters.append(parameter)
+            continue
+        groups[name] = hints[name]
+        types = get_type_hints(hints[name], include_extras=True)
+        for one in fields(groups[name]):
+            default = parameter.empty if one.default is MISSING else one.default
+            parameters.append(parameter.replace(name=one.name, default=default, annotation=types[one.name]))
+
+    @wraps(verb)
+    def call(**given: Any) -> None:
+        for name, group in groups.items():
+            given[name] = group(**{one.name: given.pop(one.name) for one in fields(group)})
+        verb(**given)
+
+    call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return call
+
+
+@dataclass(frozen=True)
+class ReadingOptions:
+    """How scans become images: as the flow or the prepared scans say where an option is left out."""
+
+    sensor: Annotated[
+        str | None, typer.Option(help="Name of the sensor; the flow's, the prepared scans', or hdl64e if left out.")
+    ] = None
+    size: SizeOption = None
+    projection: Annotated[str | None, typer.Option(help="spherical or unfolding; theirs, or spherical.")] = None
+    convention: Annotated[
+        str | None, typer.Option(help="centre, or reference for the published models'; theirs, or centre.")
+    ] = None
+    reflectance_scale: Annotated[
+        float, typer.Option(min=1e-6, help="Value in scan files that means full reflectance.")
+    ] = 1.0
+
+
+@dataclass(frozen=True)
+class WorkOptions:
+    """How the work is done; the figures do not depend on it."""
+
+    batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 8
+    workers: Annotated[int, typer.Option(min=0, help="Further processes that read scans.")] = 2
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto"
