@@ -1,11 +1,11 @@
-"""Verbs that go from scans to noise, and the report on what a scene need not cost."""
+"""Verbs that go from scans to noise."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from r2flow.cli.app import app, report
+from r2flow.cli.app import app
 from r2flow.cli.options import CheckpointOption, OutOption, choose_device
 
 SolverOption = Annotated[str, typer.Option(help="dopri5, bosh3, or one of fixed steps: euler, rk4, ab2, ...")]
@@ -75,31 +75,3 @@ def interpolate(
     )
     written = write_page(page, out)
     print(f"{frames} scans in {out / 'frames'}; {', '.join(str(path) for path in written)}")
-
-
-@report.command(epilog="Example: r2flow report savings runs/NAME --out reports")
-def savings(
-    checkpoint: Annotated[
-        Path | None, typer.Argument(help="A checkpoint file or a run folder; without one, exact problems alone.")
-    ] = None,
-    out: OutOption = Path("reports"),
-    num: Annotated[int, typer.Option(min=1, help="Scenes of the checkpoint's flow.")] = 4,
-    steps: Annotated[int, typer.Option(min=1, help="AB2 steps of the regions.")] = 16,
-    tolerance: Annotated[float, typer.Option(help="Of the checkpoint's adaptive solutions.")] = 1e-3,
-    seed: Annotated[int, typer.Option(min=0, help="Scene i depends on the seed and on i alone.")] = 0,
-    device: DeviceOption = "auto",
-) -> None:
-    """What a scene need not cost: own steps, leaving early, one step for the straight, regions, single channels."""
-    from r2flow.checkpoints import load_checkpoint
-    from r2flow.cli.output import command, finish
-    from r2flow.flow.solvers import check_tolerance
-    from r2flow.progress import Bar
-    from r2flow.reports.pages import prepare_folder
-    from r2flow.reports.savings_page import evaluations_of_page, savings_page
-
-    check_tolerance(tolerance)
-    loaded = None if checkpoint is None else load_checkpoint(checkpoint, choose_device(device))
-    prepare_folder(out)
-    with Bar("measuring", evaluations_of_page(num, steps) if loaded else 0, "evaluations") as advance:
-        page = savings_page(loaded, num, steps, tolerance, seed, command(), advance)
-    finish(page, out)
