@@ -143,7 +143,7 @@ def test_savings_of_exact_problems_need_no_checkpoint(r2flow, tmp_path):  # noqa
 
 
 def test_savings_need_a_flow_that_can_be_solved():
-    with pytest.raises(InputError, match="does not solve scene 1 of this flow"):
+    with pytest.raises(InputError, match="does not solve scan 1 of this flow"):
         scan_rows(flow(Lost()), 2, 1e-3, seed=0)
 
 
