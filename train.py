@@ -61,7 +61,9 @@ def fit(config: dict[str, Any], asked: list[str]) -> None:
     from callbacks import build_callbacks, build_loggers
     from r2flow.checkpoints import checkpoints_of, step_of
     from r2flow.data.datamodule import ScanDataModule
-    from r2flow.data.opening import AUTO, resolve_reflectance
+    from r2flow.data.opening import resolve_reflectance
+    from r2flow.data.options import DataOptions
+    from r2flow.data.sources import AUTO
     from r2flow.generators import build_generator
     from r2flow.lineage import inherit
     from r2flow.noise import seed_torch
@@ -86,7 +88,7 @@ def fit(config: dict[str, Any], asked: list[str]) -> None:
     if not (isinstance(config["seed"], int) and 0 <= config["seed"] < 2**63):
         raise InputError(f"seed must be a whole number of at least 0, found {config['seed']!r}.")
     config, parent = inherit(config, asked)
-    check_options("data", ScanDataModule, config["data"], given=3)
+    check_options("data", DataOptions, config["data"])
     encoding = config["encoding"]
     encoding["reflectance"] = resolve_reflectance(encoding.get("reflectance", AUTO), config["data"])
     config["generator"] = config["generator"] or {"name": STAGES[config["stage"]["name"]].generator_name}
@@ -95,7 +97,9 @@ def fit(config: dict[str, Any], asked: list[str]) -> None:
     if parent is not None:
         generator.start_from(parent.generator)
         del parent
-    data = ScanDataModule(generator.space.sensor, generator.space.encoding, config["seed"], **config["data"])
+    data = ScanDataModule(
+        generator.space.sensor, generator.space.encoding, config["seed"], generator.noise_shape, **config["data"]
+    )
     check_roll(data.augment, generator)
     data.setup()
     config["scans"] = data.fingerprint()

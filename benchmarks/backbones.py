@@ -15,19 +15,15 @@ import resource
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from r2flow.backbones import Backbone, build_backbone
+from r2flow.backbones import Backbone, build_backbone, configurations
 from r2flow.backbones.cost import RULE, count_macs, count_parameters
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import build_sensor
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
 MODES = ("float32", "bfloat16", "compiled-float32", "compiled-bfloat16", "training-float32", "training-bfloat16")
 ORDER = {"cpu": 2048, "cuda": 8192}  # of the square matrices whose product sets the rate
 
@@ -42,9 +38,8 @@ def seconds(work: Callable[[], object], device: str) -> float:
 
 
 def built(config: str, rows: int, columns: int, attention: str, device: str) -> Backbone:
-    """The backbone of a config on the paper's sensor, no weight zero: a zero would be as fast, but a special case."""
-    with initialize_config_dir(str(CONF), version_base=None):
-        options: Any = OmegaConf.to_container(compose(f"backbone/{config}").backbone, resolve=True)
+    """The backbone of a configuration on the paper's sensor; weights that start at zero are drawn instead."""
+    options = configurations()[config]
     if options["name"] == "hdit":
         options["attention"] = attention
     torch.manual_seed(0)

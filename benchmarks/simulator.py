@@ -14,7 +14,7 @@ import numpy as np
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.noise import generator
 from r2flow.simulator import draw_scene, simulate
-from r2flow.simulator.beams import beams_of
+from r2flow.simulator.lasers import lasers_of
 from r2flow.simulator.raycast import cast
 from r2flow.simulator.rays import Rays
 from r2flow.simulator.returns import report
@@ -33,7 +33,7 @@ def milliseconds(work: Callable[[int], object], times: int) -> float:
 
 def parts(sensor: Sensor, times: int) -> dict[str, float]:
     """Median milliseconds of drawing the scene, of casting its rays and of what the sensor makes of them."""
-    rays = Rays(beams_of(sensor), sensor.columns, sensor.height)
+    rays = Rays(lasers_of(sensor), sensor.columns, sensor.height)
     scenes = [draw_scene(generator(0, "simulator", index)) for index in range(times)]
     rng = np.random.default_rng(0)
     hits = [cast(scene, rays, rng) for scene in scenes]

@@ -16,8 +16,9 @@ from torch.overrides import TorchFunctionMode
 
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, state_hash
+from r2flow.files import atomic_write
 from r2flow.generators import Generator, RectifiedFlow, Sampler, build_generator
+from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.published import published_cfg, published_config, published_rings, published_step

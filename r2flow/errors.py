@@ -1,4 +1,4 @@
-"""The one exception that is the user's to mend."""
+"""The exception for mistakes of the user."""
 
 import errno
 
@@ -11,7 +11,7 @@ class InputError(ValueError):
     """
 
 
-# What a user can mend: the rest of the system's errors (a lost connection, a broken pipe) are not theirs.
+# System errors that a user can mend; others (a lost connection, a broken pipe) keep their traceback.
 MENDABLE = {
     errno.EACCES, errno.EPERM, errno.ENOENT, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENOTEMPTY,
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.ENAMETOOLONG, errno.ELOOP,
@@ -22,7 +22,7 @@ def explain_mistake(error: InputError | OSError) -> str:
     """A mistake in one line: an InputError's own, or what the system refused (a read-only folder, a full disk).
 
     Raises:
-        OSError: the error itself, where it is nothing that a user can mend.
+        OSError: the error itself, where a user cannot mend it.
     """
     if isinstance(error, OSError):
         if error.errno not in MENDABLE:

@@ -1,45 +1,76 @@
-"""Files that are whole or not there: written under a temporary name, flushed, renamed. And what tensors hash to."""
+"""Output files: a reader finds the old file or the whole new one, and devices, pipes and links stay what they are."""
 
 import errno
-import hashlib
 import os
+import shutil
+import stat
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-import torch
-from torch import Tensor
+from r2flow.errors import InputError
 
 
 @contextmanager
 def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
-    """Open a temporary file beside `path` that takes its place when the block ends well.
+    """Open a temporary file that takes the place of `path` when the block ends without an error.
 
-    The data is flushed to the disk before the rename and the folder after it, so that a reader, or a
-    power cut, finds the old file or the new one and never a part. When the block raises, the old file
-    stays and the temporary one is removed.
+    The temporary file lies in the same folder. It is flushed to the disk before the rename and the folder after it, so
+    that a reader, or a power cut, finds the old file or the new one and never a part. When the block raises, the old
+    file stays. Of a link, the file that it leads to is replaced. A character device or a pipe is never replaced: the
+    whole content is written into it.
+
+    Raises:
+        IsADirectoryError: `path` is a folder.
+        InputError: it is a socket, a block device or a link to nothing.
     """
     path = Path(path)
-    if path.is_dir():
-        raise IsADirectoryError(errno.EISDIR, "is a folder; name a file to write to", str(path))
+    is_stream = _is_stream(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    target = Path(os.path.realpath(path))
+    temporary = None
     try:
+        handle, temporary = tempfile.mkstemp(".part", f".{target.name}.", None if is_stream else target.parent)
         with os.fdopen(handle, mode, encoding=None if "b" in mode else "utf-8") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())  # mkstemp is private to the user; outputs are not
-        os.replace(temporary, path)
-    except BaseException as error:
-        with suppress(FileNotFoundError):
-            os.unlink(temporary)
-        if isinstance(error, OSError) and error.filename is None:  # a full disk does not say whose file it was
+        if is_stream:
+            with open(temporary, "rb") as whole, open(path, "wb") as stream:
+                shutil.copyfileobj(whole, stream)
+        else:
+            os.chmod(temporary, 0o666 & ~_umask())  # mkstemp is private to the user; outputs are not
+            os.replace(temporary, target)
+            _sync_folder(target.parent)
+    except OSError as error:
+        named = str(error.filename or "")
+        if not named or named.endswith(".part"):  # a full disk names no file, a read-only folder the temporary one
             error.filename = str(path)
         raise
-    _sync_folder(path.parent)
+    finally:
+        if temporary is not None:
+            with suppress(FileNotFoundError):
+                os.unlink(temporary)
+
+
+def _is_stream(path: Path) -> bool:
+    """Whether a path is written into rather than replaced: a character device or a pipe."""
+    try:
+        kind = path.stat().st_mode
+    except FileNotFoundError:
+        if path.is_symlink():
+            raise InputError(
+                f"{path} is a link to {path.readlink()}, which does not exist; remove the link or name another file."
+            ) from None
+        return False
+    if stat.S_ISDIR(kind):
+        raise IsADirectoryError(errno.EISDIR, "is a folder; name a file to write to", str(path))
+    if stat.S_ISSOCK(kind) or stat.S_ISBLK(kind):
+        what = "socket" if stat.S_ISSOCK(kind) else "block device"
+        raise InputError(f"{path} is a {what}; name a file to write to.")
+    return not stat.S_ISREG(kind)
 
 
 def _umask() -> int:
@@ -56,16 +87,3 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def state_hash(state: Mapping[str, Tensor], prefix: bytes = b"") -> str:
-    """SHA-256 (64 hex digits) of tensors: their names, shapes, types and bytes, whatever file they came from.
-
-    Args:
-        prefix: What else the hash depends on.
-    """
-    digest = hashlib.sha256(prefix)
-    for name, value in sorted(state.items()):
-        digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
-        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-    return digest.hexdigest()

@@ -222,7 +222,7 @@ class TestBadInput:
 
 def test_what_is_not_asked_for_is_not_imported():
     shown = "print([m for m in ({}) if m in sys.modules]); "
-    code = "import r2flow.flow.straight_exit, r2flow.flow.problems, r2flow.lidar.region, r2flow.backbones.crop, sys; "
+    code = "import r2flow.flow.straight_exit, r2flow.flow.problems, r2flow.lidar.region, r2flow.backbones, sys; "
     code += shown.format("'lightning', 'matplotlib', 'torchdiffeq', 'r2flow.simulator'")
     code += "import r2flow.sampling, r2flow.reports.inversion, r2flow.reports.interpolation, r2flow.reports.savings; "
     code += shown.format("'r2flow.simulator', 'tensorboard', 'torchdiffeq', 'plotly', 'natten'")

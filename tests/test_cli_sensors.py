@@ -1,4 +1,4 @@
-"""`r2flow sensor` and sensors of one's own, as a user types them."""
+"""`r2flow sensor` and a user's own sensors."""
 
 from pathlib import Path
 
@@ -27,13 +27,13 @@ def scans(tmp_path: Path) -> Path:
     return folder
 
 
-def test_scans_become_a_sensor_that_the_verbs_take(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
+def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
     out = tmp_path / "conf" / "mine.yaml"
     code, printed, error = r2flow("sensor", scans, "--out", out)
     assert (code, error) == (0, "")
     printed = " ".join(printed.split())
     for words in (
-        "8, told by the files",
+        "8, lasers known from the files",
         "128 steps a turn",
         "reflectance_scale=255",
         "1.50 m above",
@@ -68,7 +68,7 @@ def test_without_out_nothing_is_written(r2flow, scans: Path, tmp_path: Path, mon
     assert set(tmp_path.rglob("*")) == before
 
 
-def test_what_cannot_be_a_sensor_is_one_line(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
+def test_errors_are_one_line(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
     np.array([[1, 2, 3, 0.5]], np.float32).tofile(tmp_path / "one.bin")
     (tmp_path / "text.bin").write_text("one two three four, and so on for a while\n")
     (tmp_path / "notes.txt").write_text("text")
@@ -76,14 +76,14 @@ def test_what_cannot_be_a_sensor_is_one_line(r2flow, scans: Path, tmp_path: Path
     (tmp_path / "folder.yaml").mkdir()
     (tmp_path / "wrong.yaml").write_text("name: mine\nelevations: [1, 2]\n")
     for arguments, words in (
-        ([tmp_path / "one.bin"], "1 returns in all tell too little"),
+        ([tmp_path / "one.bin"], "1 returns in all are too few"),
         ([tmp_path / "text.bin"], "is text"),
         ([tmp_path / "notes.txt"], "no ending of a scan file"),
         ([tmp_path / "empty"], "holds no scan"),
         ([tmp_path / "missing"], "does not exist"),
         ([scans, "--out", tmp_path / "mine.txt"], "--out must be a .yaml"),
         ([scans, "--out", tmp_path / "folder.yaml"], "--out must be a .yaml file"),
-        ([scans, "--name", "vlp16"], "no sensor's of the table; found 'vlp16'"),
+        ([scans, "--name", "vlp16"], "not that of a built-in sensor; found 'vlp16'"),
         ([scans, "--name", "my sensor: 1"], "letters, digits and _"),
     ):
         code, _, error = r2flow("sensor", *arguments)
@@ -97,7 +97,7 @@ def test_what_cannot_be_a_sensor_is_one_line(r2flow, scans: Path, tmp_path: Path
         assert error.count("\n") == 1
 
 
-def test_the_table_s_sensors_stay_names(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
+def test_built_in_sensors_are_given_by_name(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
     for name in ("vlp32c", "os1_128"):
         out = tmp_path / f"{name}.npy"
         code, _, _ = r2flow("project", scans / "000000.bin", "--sensor", name, "--reflectance-scale", 255, "-o", out)

@@ -1,16 +1,18 @@
-import hashlib
+import errno
+import io
 import os
+import socket
 import stat
-import struct
+from pathlib import Path
 
+import numpy as np
 import pytest
-import torch
 
-from r2flow.errors import explain_mistake
-from r2flow.files import atomic_write, state_hash
+from r2flow.errors import InputError, explain_mistake
+from r2flow.files import atomic_write
 
 
-def test_the_file_is_whole_or_the_old_one(tmp_path):
+def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "folder" / "file.txt"
     with atomic_write(path, "w") as file:
         file.write("old")
@@ -20,7 +22,7 @@ def test_the_file_is_whole_or_the_old_one(tmp_path):
     assert os.listdir(path.parent) == ["file.txt"]
 
 
-def test_the_file_is_as_readable_as_any_other(tmp_path):
+def test_the_file_has_the_usual_permissions(tmp_path):
     with atomic_write(tmp_path / "ours") as file:
         file.write(b"1")
     (tmp_path / "plain").write_bytes(b"1")
@@ -28,7 +30,7 @@ def test_the_file_is_as_readable_as_any_other(tmp_path):
     assert modes[0] == modes[1]
 
 
-def test_a_folder_in_the_way_is_named_itself(tmp_path):
+def test_a_folder_is_refused_by_its_name(tmp_path):
     (tmp_path / "out").mkdir()
     with pytest.raises(IsADirectoryError) as raised, atomic_write(tmp_path / "out"):
         pass
@@ -36,12 +38,107 @@ def test_a_folder_in_the_way_is_named_itself(tmp_path):
     assert os.listdir(tmp_path) == ["out"]
 
 
-def test_the_hash_of_a_state_is_of_names_shapes_types_and_bytes():
-    state = {"b": torch.tensor([1.0, 2.0]).bfloat16(), "a": torch.tensor([[1, 2], [3, 4]]).T, "c": torch.tensor(0.5)}
-    named = (
-        b"a (2, 2) torch.int64" + struct.pack("<4q", 1, 3, 2, 4)
-        + b"b (2,) torch.bfloat16" + bytes.fromhex("803f0040")
-        + b"c () torch.float32" + struct.pack("<f", 0.5)
-    )  # fmt: skip
-    assert state_hash(state) == hashlib.sha256(named).hexdigest()
-    assert state_hash(dict(reversed(state.items())), b"kitti") == hashlib.sha256(b"kitti" + named).hexdigest()
+# What exists and is no regular file
+
+
+def special(path: Path, kind: int, device: int) -> Path:
+    try:
+        os.mknod(path, kind | 0o666, device)
+    except OSError as error:
+        pytest.skip(f"no device file can be made here: {error}")
+    return path
+
+
+def test_a_character_device_is_written_into_and_stays(tmp_path):
+    null = special(tmp_path / "null", stat.S_IFCHR, os.makedev(1, 3))
+    try:
+        null.write_bytes(b"")
+    except OSError as error:
+        pytest.skip(f"the folder allows no devices: {error}")
+    (tmp_path / "link").symlink_to("null")
+    for path in (null, tmp_path / "link"):
+        with atomic_write(path, "w") as file:
+            file.write("{}")
+    assert stat.S_ISCHR(null.stat().st_mode)
+    assert sorted(os.listdir(tmp_path)) == ["link", "null"]
+
+
+def test_a_block_device_is_refused(tmp_path):
+    disk = special(tmp_path / "disk", stat.S_IFBLK, os.makedev(240, 0))  # 240: no device of the system
+    with pytest.raises(InputError, match=f"{disk} is a block device; name a file"), atomic_write(disk):
+        pytest.fail("the block was entered")
+    assert stat.S_ISBLK(disk.stat().st_mode)
+
+
+def test_a_pipe_is_written_into_and_stays(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        with pytest.raises(TypeError), atomic_write(pipe, "w") as file:
+            file.writelines(["half", None])
+        with atomic_write(pipe) as file:
+            np.save(file, np.arange(3))  # asks for its place in the file, which a pipe does not have
+        content = os.read(reader, 1 << 12)
+    finally:
+        os.close(reader)
+    assert np.load(io.BytesIO(content)).tolist() == [0, 1, 2]
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert os.listdir(tmp_path) == ["pipe"]
+
+
+def test_a_socket_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # a socket's path must be short
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind("socket")
+        with pytest.raises(InputError, match="socket is a socket; name a file"), atomic_write("socket"):
+            pytest.fail("the block was entered")
+        assert stat.S_ISSOCK(Path("socket").stat().st_mode)
+
+
+@pytest.mark.parametrize("to", ["other/file", "first"])
+def test_the_file_that_a_link_leads_to_is_replaced(tmp_path, to):
+    target = tmp_path / "other" / "file"
+    target.parent.mkdir()
+    target.write_text("old")
+    (tmp_path / "first").symlink_to(target)
+    (tmp_path / "link").symlink_to(to)
+    before = target.stat().st_ino
+    with atomic_write(tmp_path / "link", "w") as file:
+        file.write("new")
+    assert target.read_text() == "new"
+    assert target.stat().st_ino != before  # replaced as a whole
+    assert os.readlink(tmp_path / "link") == to
+    assert os.listdir(target.parent) == ["file"]
+
+
+def test_a_link_to_nothing_is_refused_in_one_line(tmp_path):
+    link = tmp_path / "link"
+    link.symlink_to("nothing")
+    with pytest.raises(InputError) as raised, atomic_write(link):
+        pass
+    assert (
+        str(raised.value) == f"{link} is a link to nothing, which does not exist; remove the link or name another file."
+    )
+    with pytest.raises(FileExistsError), atomic_write(link / "file"):  # a folder on a disk that is not mounted
+        pass
+    assert os.listdir(tmp_path) == ["link"]
+
+
+def test_links_in_a_circle_are_refused_in_one_line(tmp_path):
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(OSError, match="symbolic links") as raised, atomic_write(tmp_path / "a"):
+        pass
+    assert explain_mistake(raised.value).startswith(f"{tmp_path / 'a'}: ")
+
+
+def test_a_read_only_folder_is_an_error_with_the_file_s_own_name(tmp_path, monkeypatch):
+    # Root may write into a read-only folder: what the system says to others is said here by hand.
+    def refused(suffix, prefix, folder):
+        raise PermissionError(errno.EACCES, "Permission denied", f"{folder}/{prefix}xyz{suffix}")
+
+    monkeypatch.setattr("tempfile.mkstemp", refused)
+    with pytest.raises(PermissionError) as raised, atomic_write(tmp_path / "out.json"):
+        pass
+    assert explain_mistake(raised.value) == f"{tmp_path / 'out.json'}: Permission denied"

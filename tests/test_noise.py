@@ -50,13 +50,13 @@ def test_the_noise_is_standard_normal():
 
 
 @pytest.mark.parametrize(("seed", "purpose", "index"), [(-1, "training", 0), (0, "training", 2**64), (0, "play", 0)])
-def test_what_cannot_be_a_key_is_refused(seed, purpose, index):
+def test_keys_out_of_range_are_refused(seed, purpose, index):
     with pytest.raises(ValueError, match=r"must lie in|no purpose"):
         generator(seed, purpose, index)
 
 
 @pytest.mark.parametrize("seed", [-1, 2**64])
-def test_a_seed_out_of_range_is_the_user_s_to_mend(seed):
+def test_a_seed_out_of_range_is_an_input_error(seed):
     with pytest.raises(InputError, match=f"found {seed}"):
         generator(seed, "evaluation", 0)
 

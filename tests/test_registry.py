@@ -10,13 +10,13 @@ from r2flow.registry import MISSING, Registry, check_options, options_of
 TABLE = Registry("backbone", hdit=dict, adm_unet=dict)
 
 
-def test_a_wrong_name_says_what_exists_and_what_was_meant():
+def test_a_wrong_name_lists_the_known_ones_and_the_closest():
     with pytest.raises(InputError) as error:
         TABLE["hditt"]
     assert str(error.value) == "no backbone named 'hditt'; known: adm_unet, hdit. Did you mean 'hdit'?"
 
 
-def test_a_wrong_option_says_what_exists_and_what_was_meant():
+def test_a_wrong_option_lists_the_known_ones_and_the_closest():
     def make(width: int = 1, depth: int = 2) -> int:
         return width
 
@@ -28,7 +28,7 @@ def test_options_reach_the_constructor():
     assert Registry("thing", make=lambda a, b: (a, b)).build({"name": "make", "b": 2}, 1) == (1, 2)
 
 
-def test_a_name_is_entered_once():
+def test_a_name_that_is_taken_is_refused():
     table = Registry("thing", a=1)
     table.add("b", 2)
     assert table["b"] == 2

@@ -1,8 +1,10 @@
-"""Velocity estimators v(t, x), by name: forward(t, x) -> v and nothing else."""
+"""Networks v(t, x) and u(x, t, s), by name, and the configurations of them in conf/backbone."""
 
 from collections.abc import Mapping
+from importlib.resources import files
 from typing import Any
 
+import yaml
 from torch import Tensor
 
 from r2flow.backbones.adm_unet import ADMUNet
@@ -13,50 +15,43 @@ from r2flow.registry import Registry
 
 BACKBONES: Registry[type[Backbone]] = Registry("backbone", hdit=HDiT, adm_unet=ADMUNet, efficient_unet=EfficientUNet)
 
-# The configurations of conf/backbone, as differences from the constructors' defaults: the paper's five and ours.
-CONFIGURATIONS: dict[str, dict[str, Any]] = {
-    "hdit": {"name": "hdit"},
-    "hdit_small": {
-        "name": "hdit",
-        "base_channels": 64,
-        "depths": (1, 1, 2, 2),
-        "num_heads": (1, 2, 4, 8),
-        "patch": (2, 4),
-    },
-    "hdit_tiny": {
-        "name": "hdit",
-        "base_channels": 48,
-        "depths": (1, 1, 2),
-        "num_heads": (2, 4, 8),
-        "time_channels": 128,
-        "patch": (2, 4),
-    },
-    "efficient_unet": {"name": "efficient_unet", "time_channels": 256},
-    "efficient_unet_large": {
-        "name": "efficient_unet",
-        "base_channels": 128,
-        "num_residual_blocks": (2, 4, 8, 8),
-        "time_channels": 512,
-    },
-    "adm_unet": {"name": "adm_unet", "time_channels": 256},
-    "adm_unet_large": {
-        "name": "adm_unet",
-        "base_channels": 128,
-        "channel_multiplier": (1, 2, 3, 4),
-        "time_channels": 512,
-    },
-}
 
-
-def build_backbone(options: Mapping[str, Any], rays: Tensor, channels: int) -> Backbone:
-    """The backbone `options["name"]` for images of `channels` channels seen along `rays` (2, H, W).
+def build_backbone(
+    options: Mapping[str, Any],
+    rays: Tensor,
+    in_channels: int,
+    out_channels: int | None = None,
+    second_time: bool = False,
+) -> Backbone:
+    """The backbone `options["name"]` for images of `in_channels` channels seen along `rays` (2, H, W).
 
     Args:
         options: `name` and keyword options of the constructor, as in conf/backbone/*.yaml.
         rays: Elevation and azimuth of every pixel in radians.
-        channels: Channels of the image.
+        in_channels: Channels of the image, and of the condition that is concatenated to it.
+        out_channels: Channels of the answer; None for as many as come in.
+        second_time: Whether the network takes a second time s.
 
     Raises:
-        InputError: an unknown name or option, or a shape that the backbone cannot take.
+        InputError: an unknown name or option, or something that the backbone cannot take.
     """
-    return BACKBONES.build({**options, "in_channels": channels}, rays)
+    asked: dict[str, Any] = {"in_channels": in_channels}
+    if out_channels is not None:
+        asked["out_channels"] = out_channels
+    if second_time:
+        asked["second_time"] = True
+    return BACKBONES.build({**options, **asked}, rays)
+
+
+def configurations() -> Registry[dict[str, Any]]:
+    """Options for `build_backbone`: conf/backbone/*.yaml, and the defaults of each backbone without such a file."""
+    folder = files("r2flow") / "conf" / "backbone"
+    written = sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
+
+    def read(name: str) -> dict[str, Any]:
+        own = yaml.safe_load((folder / f"{name}.yaml").read_text())
+        bases = [read(base) for base in own.pop("defaults", []) if base != "_self_"]
+        return {key: value for part in (*bases, own) for key, value in part.items()}
+
+    defaults = {name: {"name": name} for name in BACKBONES}
+    return Registry("backbone configuration", **{**defaults, **{name: read(name) for name in written}})

@@ -1,13 +1,13 @@
 """ADM U-Net: residual blocks that resample, and a skip from each of them (Dhariwal and Nichol 2021)."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
-from r2flow.backbones.base import integers
 from r2flow.backbones.convolutions import (
+    BlockOptions,
     GroupNorm,
     Resample,
     ResidualBlock,
@@ -21,75 +21,44 @@ FILTER = (1, 1)
 
 
 class ADMUNet(UNet):
-    """Velocity v(t, x) by an ADM U-Net; parameters carry the published weights' names.
+    """A field by an ADM U-Net: each level has one more residual block on the way up than on the way down.
 
-    Every output on the way down, of the first convolution and of the resampling blocks too, is a skip; each
-    block on the way up takes one.
-
-    Args:
-        rays: Elevation and azimuth of every pixel in radians, (2, H, W).
-        in_channels: Channels C of the image.
-        base_channels: Width of the outermost level.
-        channel_multiplier: Width of each level over base_channels.
-        num_residual_blocks: Residual blocks of each level on the way down; on the way up it is one more.
-        num_heads: Heads of the self-attention at the deepest level and in the middle.
-        time_channels: Width of the time embedding; None for 4 x base_channels.
-        position: "fourier_features", "polar", "spherical_harmonics" or "none".
-        ring: Whether the columns are a full turn.
-        dropout: Share of activations dropped in training.
-
-    Raises:
-        InputError: a shape, width, head count or position that cannot work.
+    Every output on the way down, of the first convolution and of the resampling blocks too, is a skip; each block
+    on the way up takes one. The middle has attention too. For its options see `UNet`.
     """
 
-    def __init__(
-        self,
-        rays: Tensor,
-        in_channels: int = 2,
-        base_channels: int = 64,
-        channel_multiplier: Sequence[int] = (1, 2, 4, 8),
-        num_residual_blocks: int | Sequence[int] = (3, 3, 3, 3),
-        num_heads: int = 8,
-        time_channels: int | None = None,
-        position: str | None = "fourier_features",
-        ring: bool = True,
-        dropout: float = 0.0,
+    def build_levels(
+        self, base_channels: int, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions
     ) -> None:
-        levels = len(channel_multiplier)
-        super().__init__(rays, in_channels, base_channels, levels, time_channels, position, ring)
-        widths = [base_channels * multiplier for multiplier in channel_multiplier]
-        counts = integers("num_residual_blocks", num_residual_blocks, levels)
-        deepest = levels - 1
-
-        def block(channels: int, out_channels: int, **options: Any) -> ADMBlock:
-            return ADMBlock(channels, out_channels, self.time_channels, ring, dropout, **options)
-
+        """`down_blocks`, `mid_blocks`, `up_blocks` and the last norm and convolution."""
+        deepest = self.levels - 1
         width, skips = base_channels, [base_channels]
         self.down_blocks = nn.ModuleList()
         for level, (out, count) in enumerate(zip(widths, counts, strict=True)):
-            heads = num_heads if level == deepest else None
             for _ in range(count):
-                self.down_blocks.append(block(width, out, heads=heads))
+                self.down_blocks.append(ADMBlock(width, out, options, heads=heads if level == deepest else None))
                 width = out
                 skips.append(width)
             if level != deepest:
-                self.down_blocks.append(block(width, width, resample=Resample(FILTER, up=False, ring=ring)))
+                halve = Resample(FILTER, up=False, ring=options.ring)
+                self.down_blocks.append(ADMBlock(width, width, options, halve))
                 skips.append(width)
-        self.mid_blocks = nn.ModuleList([block(width, width, heads=num_heads), block(width, width)])
+        self.mid_blocks = nn.ModuleList([ADMBlock(width, width, options, heads=heads), ADMBlock(width, width, options)])
         self.up_blocks = nn.ModuleList()
-        for level in reversed(range(levels)):
-            heads = num_heads if level == deepest else None
+        for level in reversed(range(self.levels)):
             for index in range(counts[level] + 1):
-                step = nn.ModuleList([block(width + skips.pop(), widths[level], heads=heads)])
+                attention = heads if level == deepest else None
+                step = nn.ModuleList([ADMBlock(width + skips.pop(), widths[level], options, heads=attention)])
                 width = widths[level]
                 if level > 0 and index == counts[level]:
-                    step.append(block(width, width, resample=Resample(FILTER, up=True, ring=ring)))
+                    double = Resample(FILTER, up=True, ring=options.ring)
+                    step.append(ADMBlock(width, width, options, double))
                 self.up_blocks.append(step)
-        head = zero_convolution(RingConv2d(width, in_channels, ring))
+        head = zero_convolution(RingConv2d(width, self.out_channels, options.ring))
         self.out_conv = nn.Sequential(GroupNorm(width), nn.SiLU(), head)
 
-    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
-        condition = self.time_embedding(t)
+    def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
+        condition = self.condition(self.time_embedding, t, s)
         h = self.entrance(x)
         skips = [h]
         for block in self.down_blocks:
@@ -110,9 +79,7 @@ class ADMBlock(ResidualBlock):
     Args:
         channels: Width that comes in.
         out_channels: Width that goes out.
-        condition_channels: Width of the time embedding.
-        ring: Whether the columns are a ring.
-        dropout: See `ADMUNet`.
+        options: What all blocks have in common.
         resample: Applied to the normed input and to the skip alike.
         heads: Attention heads; None for no attention.
     """
@@ -121,13 +88,11 @@ class ADMBlock(ResidualBlock):
         self,
         channels: int,
         out_channels: int,
-        condition_channels: int,
-        ring: bool,
-        dropout: float,
+        options: BlockOptions,
         resample: Resample | None = None,
         heads: int | None = None,
     ) -> None:
-        super().__init__(channels, out_channels, condition_channels, ring, dropout)
+        super().__init__(channels, out_channels, options)
         self.resample = resample or nn.Identity()
         self.skip_conv = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
         self.self_attn_block = nn.Identity() if heads is None else SelfAttention(out_channels, heads)

@@ -1,15 +1,16 @@
 """Neighbourhood attention on an azimuth ring: each token attends to the window around it.
 
-Azimuth wraps, so that every window is centred. Elevation ends: at the top and bottom the window is moved
-inside, start = clamp(i - half, 0, H - rows), and always holds the same number of rows. A ring narrower than
-the window goes round more than once, and tokens met twice count twice, as in the published models.
+Azimuth wraps, so every window is centred. Elevation ends: at the top and bottom the window is moved inside,
+start = clamp(i - half, 0, H - rows), and always holds the same number of rows. On a ring narrower than the window
+a token appears more than once in it and counts as often, as in the published models.
 
 Backends, all of the same values and gradients:
     dense    every pair of tokens and a mask: the definition, for tests and small maps
-    tiles    blocks of queries against the keys around them: plain matrix products, the best on a CPU
-    shifts   one pass for each place of the window, no products: for torch.compile, which fuses them into one loop
-    flex     flex_attention, where its kernels exist: CUDA
-    natten   natten.na2d, where its kernels are installed: CUDA
+    tiles    blocks of queries against the keys around them: plain matrix products, on every device
+    flex     flex_attention: CUDA
+    natten   natten.na2d, where it is installed with its kernels: CUDA
+
+"auto" takes natten, else flex, for CUDA tensors that their kernels can take, outside torch.compile; else tiles.
 """
 
 import functools
@@ -37,7 +38,7 @@ def neighbourhood_attention(
         q, k, v: (B, H, W, N, D), N heads of D channels.
         window: Rows and columns, both odd; clamped to the rows (and without wrap the columns) there are.
         wrap: Whether the columns are a ring; if not, windows are moved inside as the rows' are.
-        backend: A name in `BACKENDS`, or "auto" for the fastest that there is.
+        backend: A name in `BACKENDS`, or "auto" (above).
 
     Returns:
         (B, H, W, N, D).
@@ -54,7 +55,7 @@ def neighbourhood_attention(
 
 
 class _Axis(NamedTuple):
-    """One axis of the map, `size` tokens of which each sees `asked` (fewer where there are not as many)."""
+    """One axis of the map: `size` tokens, each of which sees `asked` of them, or all where there are fewer."""
 
     size: int
     asked: int
@@ -65,7 +66,7 @@ class _Axis(NamedTuple):
         return self.asked if self.wrap else min(self.asked, self.size)
 
     def starts(self, tokens: Tensor) -> Tensor:
-        """First place that each token sees; on a ring it may lie outside [0, size) and is meant modulo."""
+        """First place that each token sees; on a ring modulo `size`."""
         first = tokens - self.asked // 2
         return first if self.wrap else first.clamp(0, self.size - self.span)
 
@@ -84,7 +85,7 @@ def _dense(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tens
     return (weights @ v).transpose(1, 2).unflatten(1, (rows.size, columns.size))
 
 
-TILE = (4, 8)  # queries, whose keys are 6 x 16: smaller ones copy more, bigger ones multiply more in vain
+TILE = (4, 8)  # queries, whose keys are 6 x 16: smaller tiles copy more keys, larger ones compute more masked products
 
 
 def _tiles(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:
@@ -143,31 +144,6 @@ def _tile_sees(axis: _Axis, tile: int, keys: Tensor) -> Tensor:
         queries = queries.clamp(max=axis.size - 1)  # those beyond are padding, and cropped
     starts = axis.starts(queries).view(-1, tile, 1)
     return (starts <= keys[:, None]) & (keys[:, None] < starts + axis.span)
-
-
-def _shifts(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:
-    places = [(i, j) for i in range(rows.span) for j in range(columns.span)]
-    logits = [(q * _shift(_shift(k, 1, rows, i), 2, columns, j)).sum(-1) for i, j in places]
-    weights = torch.softmax(torch.stack(logits, dim=-1), dim=-1).unsqueeze(-2)
-    out = torch.zeros_like(q)
-    for place, (i, j) in enumerate(places):
-        out = out + weights[..., place] * _shift(_shift(v, 1, rows, i), 2, columns, j)
-    return out
-
-
-def _shift(x: Tensor, dim: int, axis: _Axis, place: int) -> Tensor:
-    """What each token sees at a place of its window: x[start(i) + place] along `dim`.
-
-    Slices, not an index: their gradient is a sum of slices, where that of an index is a scatter.
-    """
-    if axis.wrap:
-        return x.roll(axis.asked // 2 - place, dim)
-    # as many windows differ as fit into the axis; tokens at the ends share the first and the last of them
-    shared = axis.span - 1
-    top = min(axis.asked // 2, shared)
-    seen = x.narrow(dim, place, axis.size - shared)
-    first, last = seen.narrow(dim, 0, 1), seen.narrow(dim, -1, 1)
-    return torch.cat([*[first] * top, seen, *[last] * (shared - top)], dim)
 
 
 @functools.cache
@@ -239,16 +215,24 @@ def _natten(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Ten
 
 
 Backend = Callable[[Tensor, Tensor, Tensor, _Axis, _Axis], Tensor]
-BACKENDS: Registry[Backend] = Registry(
-    "attention backend", dense=_dense, tiles=_tiles, shifts=_shifts, flex=_flex, natten=_natten
-)
+BACKENDS: Registry[Backend] = Registry("attention backend", dense=_dense, tiles=_tiles, flex=_flex, natten=_natten)
+
+
+def backend_name(name: str) -> str:
+    """The backend of a config, so that a wrong name is found when a network is built.
+
+    Raises:
+        InputError: neither "auto" nor in `BACKENDS`.
+    """
+    if name == "shifts":  # a backend of version 0.1.0, of the same values
+        return "tiles"
+    if name != "auto":
+        BACKENDS[name]
+    return name
 
 
 def _fastest(q: Tensor, rows: _Axis, columns: _Axis) -> str:
-    """Library kernels where they exist and can take this input, else tiles.
-
-    Compiled on a CPU, shifts are no faster than tiles (float32, with gradients) or far slower (all else).
-    """
+    """What "auto" means for this input."""
     if q.is_cuda and q.dtype != torch.float64 and not torch.compiler.is_compiling():
         spans = rows.span, columns.span
         if _natten_kernels() and all(span > 1 and span % 2 for span in spans) and q.shape[-1] % 8 == 0:

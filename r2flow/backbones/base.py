@@ -1,72 +1,200 @@
-"""What all velocity estimators share: images of one shape, seen along rays that they keep."""
+"""What all backbones share: images of one shape, seen along rays that they keep, at one time or two."""
 
-from collections.abc import Sequence
-from typing import Any
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Protocol, Self, TypedDict, runtime_checkable
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from r2flow.backbones.layers import ExactBuffers, at_least_float32
 from r2flow.errors import InputError
 
 
-class Backbone(ExactBuffers):
-    """A field v(t, x) on images (B, C, H, W).
+class CommonOptions(TypedDict, total=False):
+    """The options of every backbone: a subclass takes them as `**common` and hands them to `Backbone`."""
 
-    A subclass calls `follow_rays` when it is built, and again whenever `coords` is loaded: what it derives from
-    the rays there goes into buffers of fixed size outside the state_dict, always in float32.
+    in_channels: int
+    out_channels: int | None
+    second_time: bool
+
+
+@runtime_checkable
+class OnRing(Protocol):
+    """A layer that treats the columns as a ring and can be told that they are none."""
+
+    def open_ring(self) -> None:
+        """From now on the columns have two ends."""
+
+
+class Backbone(ExactBuffers):
+    """A field v(t, x) on images, or the mean velocity u(x, t, s) of a flow from time t to time s.
+
+    X_{t->s}(x) = x + (s - t) u(x, t, s), and u(x, t, t) = v(t, x) (Geng et al. 2025, "Mean flows for one-step
+    generative modeling", with the sign of s - t).
+
+    A subclass implements `velocity`; layers that see times are `ExactLinear`, because times stay float32 whatever
+    the network computes in. That is enough. A class that can do more says so:
+        unit: What the rows and columns of the image, and of each part of it, are multiples of.
+        follow_rays: What it derives from the rays goes into buffers here, of fixed size, outside the state_dict and
+            always float32; called by its constructor and whenever `coords` is loaded.
+        takes_second_time: It can be built with `second_time=True`. It then has an `interval_embedding` of s - t,
+            made after all else, whose last layer is zero, and `velocity` is given s (see `condition`).
+        croppable: It can be evaluated on a part of its image. Layers that use the ring are `OnRing`.
+        learns_directions: It learns a vector for each direction, so that scans must not be turned in training.
+        tiny_options: Options that build it in milliseconds, for tests.
+    A module in it whose multiply-accumulates are not those of its torch layers has a method `macs`
+    (`r2flow.backbones.cost.Counted`).
 
     `model.compile(dynamic=True)` makes it one graph without breaks: one for batches of two and more and one for a
     single image, for each of gradients on or off and autocast on or off; then no further one.
 
     Args:
         rays: Elevation and azimuth of every pixel in radians, (2, H, W).
-        in_channels: Channels C of the image.
-        patch: Rows and columns of what the backbone takes for one unit at full resolution.
-        levels: Resolutions it works at, each half the one before.
+        unit: See above.
+        in_channels: Channels C of the image, and of the condition that is concatenated to it.
+        out_channels: Channels C' of the answer; None for C.
+        second_time: Whether the network takes s.
 
     Raises:
-        InputError: rays of another shape, or H or W not a multiple of patch x 2^(levels - 1).
+        InputError: rays of another shape, H or W that is not a multiple of the unit, channels below 1, or
+            second_time for a class that does not take it.
     """
 
+    takes_second_time: ClassVar[bool] = False
+    croppable: ClassVar[bool] = False
     coords: Tensor
+    interval_embedding: nn.Module
 
-    def __init__(self, rays: Tensor, in_channels: int, patch: tuple[int, int], levels: int) -> None:
+    def __init__(
+        self,
+        rays: Tensor,
+        unit: tuple[int, int] = (1, 1),
+        /,
+        in_channels: int = 2,
+        out_channels: int | None = None,
+        second_time: bool = False,
+    ) -> None:
         super().__init__()
-        self._check_shape(rays, patch, levels)
-        self.in_channels = in_channels
+        self.unit, self.second_time = unit, second_time
+        self.in_channels, self.out_channels = in_channels, in_channels if out_channels is None else out_channels
+        self._check(rays)
         # on the device that parameters are made on, which `with torch.device(...)` may have set
         device = torch.get_default_device() if rays.device.type == "cpu" else rays.device
         self.register_buffer("coords", rays[None].to(device, torch.float32, copy=True))
         self.register_load_state_dict_post_hook(_follow_loaded_rays)
 
-    def forward(self, t: Tensor | float, x: Tensor) -> Tensor:
-        """Velocity (B, C, H, W), in x's type, at times t, a scalar or (B,), of x (B, C, H, W)."""
+    def forward(self, t: Tensor | float, x: Tensor, s: Tensor | float | None = None) -> Tensor:
+        """v(t, x), or u(x, t, s) where the network takes a second time.
+
+        Args:
+            t: Time, a scalar or (B,).
+            x: Image and condition, (B, C, H, W).
+            s: Second time, a scalar or (B,); None for s = t.
+
+        Returns:
+            (B, C', H, W), in x's type.
+
+        Raises:
+            InputError: x of another shape, or s for a network of one time.
+            ValueError: times of another shape.
+        """
         expected = self.in_channels, *self.coords.shape[2:]
         if x.shape[1:] != expected:
             raise InputError(f"this backbone was built for images of {expected}, found {tuple(x.shape[1:])}.")
-        return self.velocity(_times(t, x), x.to(next(self.parameters()).dtype)).to(x.dtype)
+        if s is not None and not self.second_time:
+            raise InputError("this backbone was built for one time and takes no s: build it with second_time=True.")
+        y, t = x.to(next(self.parameters()).dtype), _times("t", t, x)
+        if not self.second_time:
+            return self.velocity(t, y).to(x.dtype)
+        return self.velocity(t, y, t if s is None else _times("s", s, x)).to(x.dtype)
 
-    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
-        """The field for t of shape (B,), or (1,) for the whole batch, in float32 or better."""
+    def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
+        """The field for t of shape (B,), or (1,) for the whole batch, in float32 or better.
+
+        s, of the same kind, is given where the network was built with a second time, and there alone.
+        """
         raise NotImplementedError
+
+    def condition(self, time_embedding: nn.Module, t: Tensor, s: Tensor | None) -> Tensor:
+        """time_embedding(t) + interval_embedding(s - t): what steers the network, (B or 1, K).
+
+        The second term is zero when training begins: u(x, t, s) = v(t, x) for every s, bit by bit where t and s have
+        one shape.
+        """
+        c = time_embedding(t)
+        return c if s is None else c + self.interval_embedding(s - t)
+
+    def second_time_names(self) -> frozenset[str]:
+        """Entries of the state_dict that a network of one time does not have.
+
+        The weights of one load with `load_state_dict({**new, **weights})`, `new` being this model's own values of
+        these names.
+        """
+        return frozenset(name for name in self.state_dict() if name.startswith("interval_embedding."))
 
     def follow_rays(self) -> None:
         """Compute again what derives from `coords`."""
-        raise NotImplementedError
 
-    def _check_shape(self, rays: Tensor, patch: tuple[int, int], levels: int) -> None:
+    @property
+    def learns_directions(self) -> bool:
+        """Whether the network learns a vector for each direction."""
+        return False
+
+    @classmethod
+    def tiny_options(cls) -> Mapping[str, Any]:
+        """Options of a network that builds in milliseconds and takes images of 16 x 64."""
+        return {}
+
+    def cropped(self, rows: Tensor, columns: Tensor) -> Self:
+        """The backbone for a part of its image, (B, C, len(rows), len(columns)), its parameters shared.
+
+        The part has its own rays, and no wrap where the turn is cut. What a pixel sees beyond the cut is gone:
+        neighbourhoods are moved inside, convolutions find zeros, global attention and group norms know the part
+        alone. The field is therefore another one, near the cut most of all (`r2flow report savings` measures it).
+
+        Args:
+            rows: Numbers of neighbouring rows, ascending.
+            columns: Numbers of neighbouring columns; they may pass the end of the ring.
+
+        Raises:
+            InputError: a backbone that cannot be cropped, or a part that is not made up of whole units.
+        """
+        if not self.croppable:
+            raise InputError(
+                f"a {type(self).__name__} cannot be evaluated on a part of its image; ask for all rows and columns."
+            )
+        for what, numbers, unit in zip(("rows", "columns"), (rows, columns), self.unit, strict=True):
+            if len(numbers) == 0:
+                raise InputError(f"a part of the image needs {what}, at least a unit of {unit}; found none.")
+            if len(numbers) % unit or int(numbers[0]) % unit:
+                raise InputError(
+                    f"{what} from {int(numbers[0])}, {len(numbers)} of them, are not whole units of {unit}."
+                )
+        part = copy.deepcopy(self, {id(parameter): parameter for parameter in self.parameters()})
+        rows, columns = rows.to(self.coords.device), columns.to(self.coords.device)
+        part.coords = self.coords.index_select(-2, rows).index_select(-1, columns)
+        if len(columns) < self.coords.shape[-1]:
+            for module in part.modules():
+                if isinstance(module, OnRing):
+                    module.open_ring()
+        part.follow_rays()
+        return part
+
+    def _check(self, rays: Tensor) -> None:
         if rays.ndim != 3 or rays.shape[0] != 2:
             raise InputError(f"rays must be elevation and azimuth, (2, H, W); found {tuple(rays.shape)}.")
-        shrink = 2 ** (levels - 1)
-        for dimension, size, unit in zip(("height", "width"), rays.shape[1:], patch, strict=True):
-            multiple = unit * shrink
-            if size % multiple or size == 0:
-                below = size // multiple * multiple
-                nearest = ", ".join(str(n) for n in (below, below + multiple) if n > 0)
+        name = type(self).__name__
+        if min(self.in_channels, self.out_channels) < 1:
+            raise InputError(f"{name} needs channels; found {self.in_channels} in and {self.out_channels} out.")
+        if self.second_time and not self.takes_second_time:
+            raise InputError(f"{name} takes no second time: choose a backbone that does, such as hdit.")
+        for dimension, size, unit in zip(("height", "width"), rays.shape[1:], self.unit, strict=True):
+            if size % unit or size == 0:
+                below = size // unit * unit
+                nearest = ", ".join(str(n) for n in (below, below + unit) if n > 0)
                 raise InputError(
-                    f"{dimension} {size} cannot be used by {type(self).__name__} with {levels} levels: it must be "
-                    f"a multiple of {unit} (patch) x {shrink} (halved {levels - 1} times) = {multiple}; "
+                    f"{dimension} {size} cannot be used by {name} with these options: it must be a multiple of {unit}; "
                     f"nearest: {nearest}."
                 )
 
@@ -75,11 +203,11 @@ def _follow_loaded_rays(backbone: Backbone, _keys: Any) -> None:
     backbone.follow_rays()
 
 
-def _times(t: Tensor | float, x: Tensor) -> Tensor:
-    t = torch.as_tensor(t, device=x.device)
-    if t.ndim > 1 or t.numel() not in (1, len(x)):
-        raise ValueError(f"t must be a scalar or of shape ({len(x)},), found {tuple(t.shape)}.")
-    return at_least_float32(t).reshape(-1)
+def _times(name: str, times: Tensor | float, x: Tensor) -> Tensor:
+    times = torch.as_tensor(times, device=x.device)
+    if times.ndim > 1 or times.numel() not in (1, len(x)):
+        raise ValueError(f"{name} must be a scalar or of shape ({len(x)},), found {tuple(times.shape)}.")
+    return at_least_float32(times).reshape(-1)
 
 
 def integers(name: str, values: int | Sequence[int], count: int) -> tuple[int, ...]:

@@ -1,15 +1,17 @@
 """Pieces that the two U-Nets share: convolutions on a ring, resampling, residual and attention blocks."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Unpack, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.base import Backbone
+from r2flow.backbones.base import Backbone, CommonOptions, integers
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, position_name
-from r2flow.backbones.layers import ExactBuffers, ExactLinear, at_least_float32
+from r2flow.backbones.layers import ExactBuffers, ExactLinear, at_least_float32, zero_initialised
 from r2flow.errors import InputError
 
 GROUPS = 8
@@ -25,6 +27,10 @@ class RingConv2d(nn.Conv2d):
 
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(F.pad(x, (1, 1, 0, 0), mode="circular") if self.ring else x)
+
+    def open_ring(self) -> None:
+        """Zeros beyond the left and right edges too, from now on."""
+        self.ring, self.padding = False, (1, 1)
 
 
 class Resample(ExactBuffers):
@@ -57,6 +63,14 @@ class Resample(ExactBuffers):
             crop = (margin, 3 * margin if self.ring else margin)
             return F.conv_transpose2d(x, kernel, stride=2, padding=crop, groups=channels)
         return F.conv2d(x, kernel, stride=2, padding=(margin, 0 if self.ring else margin), groups=channels)
+
+    def open_ring(self) -> None:
+        """Zeros beyond the left and right edges too, from now on."""
+        self.ring = False
+
+    def macs(self, inputs: tuple[Tensor, ...], output: Tensor) -> int:
+        """All taps for each output value."""
+        return output.numel() * self.kernel.numel() ** 2
 
 
 class GroupNorm(nn.GroupNorm):
@@ -100,10 +114,25 @@ class SinusoidalTime(nn.Module):
         return torch.cat([phase.sin(), phase.cos()], dim=1)
 
 
-def time_embedding(channels: int, out_channels: int) -> nn.Sequential:
-    """t (B,) to (B, out_channels): sinusoids, Linear, SiLU, Linear."""
-    layers = ExactLinear(channels, out_channels), nn.SiLU(), ExactLinear(out_channels, out_channels)
+def time_embedding(channels: int, out_channels: int, bias: bool = True) -> nn.Sequential:
+    """t (B,) to (B, out_channels): sinusoids, Linear, SiLU, Linear, the last one with a bias or without."""
+    layers = ExactLinear(channels, out_channels), nn.SiLU(), ExactLinear(out_channels, out_channels, bias=bias)
     return nn.Sequential(SinusoidalTime(channels), *layers)
+
+
+@dataclass(frozen=True)
+class BlockOptions:
+    """What all residual blocks of a U-Net have in common.
+
+    Attributes:
+        condition_channels: Width of the time embedding.
+        ring: Whether the columns are a full turn.
+        dropout: Share of activations dropped in training.
+    """
+
+    condition_channels: int
+    ring: bool
+    dropout: float
 
 
 class ResidualBlock(nn.Module):
@@ -111,14 +140,14 @@ class ResidualBlock(nn.Module):
 
     scale: Tensor
 
-    def __init__(self, channels: int, out_channels: int, condition_channels: int, ring: bool, dropout: float) -> None:
+    def __init__(self, channels: int, out_channels: int, options: BlockOptions) -> None:
         super().__init__()
         self.register_buffer("scale", torch.tensor(0.5**0.5))
         self.norm1 = GroupNorm(channels)
-        self.conv1 = RingConv2d(channels, out_channels, ring)
-        self.norm2 = AdaGroupNorm(out_channels, condition_channels)
-        self.dropout = nn.Dropout(dropout)
-        self.conv2 = zero_convolution(RingConv2d(out_channels, out_channels, ring))
+        self.conv1 = RingConv2d(channels, out_channels, options.ring)
+        self.norm2 = AdaGroupNorm(out_channels, options.condition_channels)
+        self.dropout = nn.Dropout(options.dropout)
+        self.conv2 = zero_convolution(RingConv2d(out_channels, out_channels, options.ring))
 
     def residual(self, x: Tensor, condition: Tensor) -> Tensor:
         """f of an x that `norm1` has normed."""
@@ -155,44 +184,77 @@ def zero_convolution(layer: nn.Conv2d) -> nn.Conv2d:
 
 
 class UNet(Backbone):
-    """A U-Net on the image beside features of its rays.
+    """A field by a U-Net on the image, beside features of its rays.
+
+    Parameters carry the published weights' names.
 
     Args:
-        rays: See `Backbone`.
-        in_channels: See `Backbone`.
-        base_channels: Width of the first convolution and of the sinusoidal time features.
-        levels: Resolutions, each half the one before.
+        rays: Elevation and azimuth of every pixel in radians, (2, H, W).
+        base_channels: Width of the first convolution, of the outermost level and of the sinusoidal time features.
+        channel_multiplier: Width of each level over base_channels.
+        num_residual_blocks: Residual blocks of each level, or one number for all.
+        num_heads: Heads of self-attention, which is at the deepest level alone.
         time_channels: Width of the time embedding; None for 4 x base_channels.
         position: Features beside the image: "fourier_features", "polar", "spherical_harmonics" or "none".
         ring: Whether the columns are a full turn.
+        dropout: Share of activations dropped in training.
+        common: See `Backbone`.
+
+    Raises:
+        InputError: a shape, width, head count or position that cannot work.
     """
 
+    takes_second_time = True
+    croppable = True
     features: Tensor
 
     def __init__(
         self,
         rays: Tensor,
-        in_channels: int,
-        base_channels: int,
-        levels: int,
-        time_channels: int | None,
-        position: str | None,
-        ring: bool,
+        base_channels: int = 64,
+        channel_multiplier: Sequence[int] = (1, 2, 4, 8),
+        num_residual_blocks: int | Sequence[int] = (3, 3, 3, 3),
+        num_heads: int = 8,
+        time_channels: int | None = None,
+        position: str | None = "fourier_features",
+        ring: bool = True,
+        dropout: float = 0.0,
+        **common: Unpack[CommonOptions],
     ) -> None:
-        super().__init__(rays, in_channels, patch=(1, 1), levels=levels)
+        levels = max(len(channel_multiplier), 1)
+        multipliers = integers("channel_multiplier", channel_multiplier, levels)
+        counts = integers("num_residual_blocks", num_residual_blocks, levels)
+        super().__init__(rays, (2 ** (levels - 1), 2 ** (levels - 1)), **common)
+        self.levels = levels
         name = position_name(position, "none")
         shape = rays.shape[1], rays.shape[2]
         self.coords_encoding: RayEncoding | None = None if name == "none" else ENCODINGS[name](shape)
         extra = self.coords_encoding.channels if self.coords_encoding else 0
-        self.time_channels = time_channels or 4 * base_channels
-        self.time_embedding = time_embedding(base_channels, self.time_channels)
-        self.in_conv = RingConv2d(in_channels + extra, base_channels, ring)
+        width = time_channels or 4 * base_channels
+        self.time_embedding = time_embedding(base_channels, width)
+        self.in_conv = RingConv2d(self.in_channels + extra, base_channels, ring)
+        widths = [base_channels * multiplier for multiplier in multipliers]
+        self.build_levels(base_channels, widths, counts, num_heads, BlockOptions(width, ring, dropout))
+        if self.second_time:
+            self.interval_embedding = time_embedding(base_channels, width, bias=False)
+            zero_initialised(cast(nn.Linear, self.interval_embedding[-1]))
         self.follow_rays()
+
+    def build_levels(
+        self, base_channels: int, widths: Sequence[int], counts: Sequence[int], heads: int, options: BlockOptions
+    ) -> None:
+        """Make all that follows the first convolution, whose output has base_channels."""
+        raise NotImplementedError
 
     def follow_rays(self) -> None:
         """Compute again the features of the rays."""
         if self.coords_encoding is not None:
             self.register_buffer("features", self.coords_encoding(self.coords), persistent=False)
+
+    @classmethod
+    def tiny_options(cls) -> Mapping[str, Any]:
+        """Two levels of one block each."""
+        return {"base_channels": 8, "channel_multiplier": [1, 2], "num_residual_blocks": 1, "num_heads": 2}
 
     def entrance(self, x: Tensor) -> Tensor:
         """The first convolution, on the image and its rays' features."""

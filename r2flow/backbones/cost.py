@@ -14,19 +14,27 @@ the one rule under which all five rows of the table come out, to 0.02 %.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
 from r2flow.backbones.base import Backbone
-from r2flow.backbones.convolutions import Resample
-from r2flow.backbones.hdit import Attention
 
 RULE = (
     "MACs of convolutions, linear layers, neighbourhood attention on the padded ring and group norm; "
     "global attention's products left out, as in the paper's table II"
 )
+
+LAYERS = nn.Conv2d, nn.ConvTranspose2d, nn.Linear, nn.GroupNorm, nn.MultiheadAttention
+
+
+@runtime_checkable
+class Counted(Protocol):
+    """A module that says its own multiply-accumulates, those of the torch layers within it left out."""
+
+    def macs(self, inputs: tuple[Tensor, ...], output: Tensor) -> int:
+        """Of one call."""
 
 
 def count_parameters(model: nn.Module) -> int:
@@ -49,7 +57,7 @@ def _counting(model: nn.Module) -> Iterator[list[int]]:
     handles = [
         module.register_forward_hook(lambda *call: counts.append(_macs(*call)))
         for module in model.modules()
-        if isinstance(module, nn.Conv2d | nn.Linear | nn.GroupNorm | nn.MultiheadAttention | Resample | Attention)
+        if isinstance(module, (*LAYERS, Counted))
     ]
     try:
         yield counts
@@ -58,22 +66,18 @@ def _counting(model: nn.Module) -> Iterator[list[int]]:
             handle.remove()
 
 
-def _macs(module: nn.Module, inputs: tuple[Any, ...], output: Any) -> int:
-    x: Tensor = inputs[0]
+def _macs(module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> int:
     match module:
+        case Counted():
+            return module.macs(inputs, output)
         case nn.Conv2d():
             return output.numel() * module.weight[0].numel()
-        case Resample():
-            return output.numel() * module.kernel.numel() ** 2
+        case nn.ConvTranspose2d():
+            return inputs[0].numel() * module.weight[0].numel()
         case nn.Linear():
             return output.numel() * module.in_features
         case nn.GroupNorm():
-            return x.numel() * (5 if module.affine else 4)
+            return output.numel() * (5 if module.affine else 4)
         case nn.MultiheadAttention():
-            return 4 * x.numel() * module.embed_dim
-        case Attention() if module.local is not None:
-            (rows, columns), ring, _ = module.local
-            batch, height, width, channels = x.shape
-            padded = width + 2 * (columns // 2) if ring else width
-            return 2 * batch * height * padded * rows * columns * channels
-    return 0
+            return 4 * inputs[0].numel() * module.embed_dim
+    raise TypeError(f"no rule for a {type(module).__name__}")

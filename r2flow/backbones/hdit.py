@@ -1,15 +1,16 @@
 """HDiT: an hourglass of transformer blocks on image tokens (paper, figure 4), with rays for positions."""
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import cast
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self, Unpack, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.attention import BACKENDS, neighbourhood_attention
-from r2flow.backbones.base import Backbone, integers
+from r2flow.backbones.attention import backend_name, neighbourhood_attention
+from r2flow.backbones.base import Backbone, CommonOptions, integers
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, Rotary, mean_rays, position_name, rotate
 from r2flow.backbones.layers import (
     GEGLU,
@@ -27,36 +28,38 @@ from r2flow.errors import InputError
 
 
 class HDiT(Backbone):
-    """Velocity v(t, x) by an hourglass transformer.
+    """A field by an hourglass transformer.
 
-    Tokens of patch_h x patch_w pixels; at each outer level `depths[l]` blocks of neighbourhood attention on
-    the way down and as many on the way up, 2 x 2 tokens merged between levels and the width doubled; in the
-    middle `depths[-1]` blocks of global attention. Queries and keys are rotated by the ray angles (`Rotary`).
-    Parameters carry the names of the published weights.
+    Tokens of patch_h x patch_w pixels; at each outer level `depths[l]` blocks of neighbourhood attention on the way
+    down and as many on the way up, 2 x 2 tokens merged between levels and the width doubled; in the middle
+    `depths[-1]` blocks of global attention. Queries and keys are rotated by the ray angles (`Rotary`). Parameters
+    carry the names of the published weights.
 
     Args:
         rays: Elevation and azimuth of every pixel in radians, (2, H, W).
-        in_channels: Channels C of the image.
         base_channels: Width of the outermost level, doubled at each level further in.
         depths: Blocks of each level, the last one the middle.
         num_heads: Heads of each level; the middle takes the last.
         time_channels: Width of the time embedding.
-        position: What is added to the tokens: "learnable", "fourier_features", "polar",
-            "spherical_harmonics" or "none".
+        position: What is added to the tokens: "learnable", "fourier_features", "polar", "spherical_harmonics" or
+            "none".
         window: Rows and columns of the attention window, odd.
         patch: Rows and columns of a token.
         ring: Whether the columns are a full turn.
         dropout: Share of attention outputs and of feed-forward activations dropped in training.
         attention: Backend of `neighbourhood_attention`.
+        common: See `Backbone`.
 
     Raises:
         InputError: a shape, head count, window, position or backend that cannot work.
     """
 
+    takes_second_time = True
+    croppable = True
+
     def __init__(
         self,
         rays: Tensor,
-        in_channels: int = 2,
         base_channels: int = 128,
         depths: Sequence[int] = (3, 3, 3, 3),
         num_heads: Sequence[int] = (2, 4, 8, 16),
@@ -67,6 +70,7 @@ class HDiT(Backbone):
         ring: bool = True,
         dropout: float = 0.0,
         attention: str = "auto",
+        **common: Unpack[CommonOptions],
     ) -> None:
         levels = max(len(depths), 1)
         depths = integers("depths", depths, levels)
@@ -74,38 +78,38 @@ class HDiT(Backbone):
             num_heads = [*num_heads[: levels - 1], num_heads[-1]]
         heads = integers("num_heads", num_heads, levels)
         patch_h, patch_w = integers("patch", patch, 2)
-        super().__init__(rays, in_channels, (patch_h, patch_w), levels)
-        if attention != "auto":
-            BACKENDS[attention]  # a wrong name is told now, not at the first call
+        super().__init__(rays, (patch_h << (levels - 1), patch_w << (levels - 1)), **common)
         self.patch, self.levels = (patch_h, patch_w), levels
         rows, columns = rays.shape[1] // patch_h, rays.shape[2] // patch_w
-        widths = [base_channels * 2**level for level in range(levels)]
         span_h, span_w = integers("window", window, 2)
-        local = (span_h, span_w), ring, attention
+        local = Neighbourhood((span_h, span_w), ring, backend_name(attention))
+        widths = [base_channels * 2**level for level in range(levels)]
 
-        def block(level: int) -> Block:
+        def blocks(level: int) -> nn.ModuleList:
             highest = max((rows // 2) >> level, 1), max((columns // 2) >> level, 1)
-            middle = level == levels - 1
-            return Block(widths[level], heads[level], time_channels, highest, None if middle else local, dropout)
+            seen = None if level == levels - 1 else local
+            options = BlockOptions(widths[level], heads[level], time_channels, highest, seen, dropout)
+            return nn.ModuleList([Block(options) for _ in range(depths[level])])
 
-        embed = RandomFourierFeatures(time_channels)
-        self.timestep_pe = nn.Sequential(embed, mapping_network(time_channels, dropout=dropout))
-        self.tokenizer = nn.Sequential(nn.Conv2d(in_channels, base_channels, self.patch, self.patch, bias=False))
+        self.timestep_pe = time_embedding(time_channels, dropout)
+        self.tokenizer = nn.Sequential(nn.Conv2d(self.in_channels, base_channels, self.patch, self.patch, bias=False))
         self.spatial_pe = _position(position, (rows, columns), base_channels, dropout)
         self.down_levels, self.up_levels = nn.ModuleDict(), nn.ModuleDict()
         for level in range(levels - 1):
             for side in (self.down_levels, self.up_levels):
-                blocks = [block(level) for _ in range(depths[level])]
-                side[f"level_{level}"] = nn.ModuleList(blocks)
+                side[f"level_{level}"] = blocks(level)
             self.down_levels[f"merge_{level}"] = Merge(widths[level])
             self.up_levels[f"expand_{level}"] = Expand(widths[level])
-        self.mid_levels = nn.ModuleList([block(levels - 1) for _ in range(depths[-1])])
-        pixels = zero_initialised(nn.Linear(base_channels, math.prod(self.patch) * in_channels, bias=False))
+        self.mid_levels = blocks(levels - 1)
+        pixels = zero_initialised(nn.Linear(base_channels, math.prod(self.patch) * self.out_channels, bias=False))
         self.detokenizer = nn.Sequential(RMSNorm(base_channels), pixels)
+        if self.second_time:
+            last = zero_initialised(ExactLinear(time_channels, time_channels, bias=False))
+            self.interval_embedding = time_embedding(time_channels, dropout).append(last)
         self.follow_rays()
 
-    def velocity(self, t: Tensor, x: Tensor) -> Tensor:
-        condition = self.timestep_pe(t)
+    def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
+        condition = self.condition(self.timestep_pe, t, s)
         h = self.tokenizer(x).permute(0, 2, 3, 1).contiguous()
         if self.spatial_pe is not None:
             h = h + self.spatial_pe().to(h.dtype)
@@ -132,6 +136,21 @@ class HDiT(Backbone):
         if isinstance(self.spatial_pe, FeaturePosition):
             self.spatial_pe.follow(mean_rays(self.coords, self.patch))
 
+    @property
+    def learns_directions(self) -> bool:
+        return isinstance(self.spatial_pe, LearnablePosition)
+
+    @classmethod
+    def tiny_options(cls) -> Mapping[str, Any]:
+        """Two levels of one block each."""
+        return {"base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16}
+
+    def cropped(self, rows: Tensor, columns: Tensor) -> Self:
+        part = super().cropped(rows, columns)
+        if isinstance(part.spatial_pe, LearnablePosition):
+            part.spatial_pe.crop(*(n[::step] // step for n, step in zip((rows, columns), self.patch, strict=True)))
+        return part
+
     def _table(self, level: int) -> Tensor:
         return self.get_buffer(f"table_{level}")
 
@@ -139,6 +158,11 @@ class HDiT(Backbone):
         if level == self.levels - 1:
             return list(cast(Iterable[Block], self.mid_levels))
         return [*_level(self.down_levels, level), *_level(self.up_levels, level)]
+
+
+def time_embedding(channels: int, dropout: float) -> nn.Sequential:
+    """t (B,) to (B, channels): random Fourier features and a mapping network."""
+    return nn.Sequential(RandomFourierFeatures(channels), mapping_network(channels, dropout=dropout))
 
 
 def _level(side: nn.ModuleDict, level: int) -> Iterable["Block"]:
@@ -163,6 +187,12 @@ class LearnablePosition(nn.Module):
 
     def forward(self) -> Tensor:
         return self.embedding
+
+    def crop(self, rows: Tensor, columns: Tensor) -> None:
+        """Keep the tokens of these rows and columns, as a constant."""
+        rows, columns = rows.to(self.embedding.device), columns.to(self.embedding.device)
+        kept = self.embedding.detach().index_select(1, rows).index_select(2, columns)
+        self.embedding = nn.Parameter(kept, requires_grad=False)
 
 
 class FeaturePosition(nn.Sequential):
@@ -206,30 +236,42 @@ def _position(name: str | None, tokens: tuple[int, int], channels: int, dropout:
     return FeaturePosition(name, tokens, channels, dropout)
 
 
-class Block(nn.Module):
-    """x + attention(x), then x + feed-forward(x), both normed under the condition.
+class Neighbourhood(NamedTuple):
+    """Options of `neighbourhood_attention`."""
 
-    Args:
+    window: tuple[int, int]
+    ring: bool
+    backend: str
+
+
+@dataclass(frozen=True)
+class BlockOptions:
+    """What all blocks of a level have in common.
+
+    Attributes:
         channels: Width C.
         heads: Attention heads N.
         condition_channels: Width of the condition.
         highest: Highest harmonics of the rotation in elevation and azimuth.
-        local: Window, ring and backend of neighbourhood attention; None for global attention.
+        neighbourhood: What a token attends to; None for all tokens.
         dropout: See `HDiT`.
     """
 
-    def __init__(
-        self,
-        channels: int,
-        heads: int,
-        condition_channels: int,
-        highest: tuple[int, int],
-        local: tuple[tuple[int, int], bool, str] | None,
-        dropout: float,
-    ) -> None:
+    channels: int
+    heads: int
+    condition_channels: int
+    highest: tuple[int, int]
+    neighbourhood: Neighbourhood | None
+    dropout: float
+
+
+class Block(nn.Module):
+    """x + attention(x), then x + feed-forward(x), both normed under the condition."""
+
+    def __init__(self, options: BlockOptions) -> None:
         super().__init__()
-        self.residual_attn = Attention(channels, heads, condition_channels, highest, local, dropout)
-        self.residual_ffn = FeedForward(channels, condition_channels, dropout)
+        self.residual_attn = Attention(options)
+        self.residual_ffn = FeedForward(options)
 
     def forward(self, x: Tensor, condition: Tensor, table: Tensor) -> Tensor:
         """x (B, H, W, C), condition (B or 1, K), table of `Rotary`."""
@@ -244,36 +286,42 @@ LARGEST_LOG_SCALE = math.log(100.0)
 class Attention(nn.Module):
     """Cosine attention: logits s (q / |q|) . (k / |k|), rotated, with a learned scale s <= 100 per head."""
 
-    def __init__(
-        self,
-        channels: int,
-        heads: int,
-        condition_channels: int,
-        highest: tuple[int, int],
-        local: tuple[tuple[int, int], bool, str] | None,
-        dropout: float,
-    ) -> None:
+    def __init__(self, options: BlockOptions) -> None:
         super().__init__()
+        channels, heads = options.channels, options.heads
         if channels % (4 * heads):
             raise InputError(
                 f"{channels} channels cannot be shared by {heads} heads: each needs a multiple of 4 for its rotation."
             )
-        self.heads, self.local = heads, local
+        self.heads, self.neighbourhood = heads, options.neighbourhood
         self.scale = nn.Parameter(torch.full((heads, 1), math.log(10.0)))
-        self.norm = AdaRMSNorm(channels, condition_channels)
+        self.norm = AdaRMSNorm(channels, options.condition_channels)
         self.qkv_proj = nn.Linear(channels, 3 * channels, bias=False)
-        self.rope = Rotary(heads, channels // heads, highest)
-        self.dropout = nn.Dropout(dropout)
+        self.rope = Rotary(heads, channels // heads, options.highest)
+        self.dropout = nn.Dropout(options.dropout)
         self.out_proj = zero_initialised(nn.Linear(channels, channels, bias=False))
 
     def forward(self, x: Tensor, condition: Tensor, table: Tensor) -> Tensor:
         q, k, v = in_bands(lambda x, table: self._project(x, condition, table), x, table)
-        if self.local is None:
+        if self.neighbourhood is None:
             out = _global_attention(q, k, v)
         else:
-            window, ring, backend = self.local
-            out = neighbourhood_attention(q, k, v, window, ring, backend)
+            out = neighbourhood_attention(q, k, v, *self.neighbourhood)
         return self.out_proj(self.dropout(out.flatten(-2)))
+
+    def open_ring(self) -> None:
+        """Windows are moved inside at the left and right ends too, from now on."""
+        if self.neighbourhood is not None:
+            self.neighbourhood = self.neighbourhood._replace(ring=False)
+
+    def macs(self, inputs: tuple[Tensor, ...], output: Tensor) -> int:
+        """Both products of neighbourhood attention on the map padded by half a window at both sides of the ring."""
+        if self.neighbourhood is None:
+            return 0
+        rows, columns = self.neighbourhood.window
+        batch, height, width, channels = output.shape
+        padded = width + 2 * (columns // 2) if self.neighbourhood.ring else width
+        return 2 * batch * height * padded * rows * columns * channels
 
     def _project(self, x: Tensor, condition: Tensor, table: Tensor) -> tuple[Tensor, ...]:
         """q, k and v, each (B, H, W, N, D), q and k scaled and rotated."""
@@ -298,12 +346,13 @@ def _global_attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
 class FeedForward(nn.Module):
     """W_2 GEGLU(W_1 ada_rms_norm(x)), three times as wide inside."""
 
-    def __init__(self, channels: int, condition_channels: int, dropout: float) -> None:
+    def __init__(self, options: BlockOptions) -> None:
         super().__init__()
-        self.adarms = AdaRMSNorm(channels, condition_channels)
+        channels = options.channels
+        self.adarms = AdaRMSNorm(channels, options.condition_channels)
         self.gegelu = nn.Linear(channels, 2 * 3 * channels, bias=False)
         self.glu = GEGLU()
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = nn.Dropout(options.dropout)
         self.linear = zero_initialised(nn.Linear(3 * channels, channels, bias=False))
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:

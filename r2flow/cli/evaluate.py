@@ -12,21 +12,20 @@ import typer
 
 from r2flow.cli.app import app, report
 from r2flow.cli.groups import ReadingOptions, WorkOptions, grouped
-from r2flow.cli.options import OutOption, build_sized, choose_device
+from r2flow.cli.options import SETS, OutOption, choose_device, choose_reading
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.checkpoints import Checkpoint
+    from r2flow.data.sets import ScanSet
+    from r2flow.data.sources import Reading
     from r2flow.evaluation.measuring import Work
-    from r2flow.evaluation.processes import Place
-    from r2flow.evaluation.reading import Reading
-    from r2flow.evaluation.sets import ScanSet
+    from r2flow.evaluation.processes import Process
     from r2flow.metrics.base import ScanMetric
     from r2flow.reports.speed_quality import Drawing
 
 log = logging.getLogger(__name__)
 
-SETS = "a folder of scans or range images, prepared shards, LAYOUT:FOLDER, simulated:SEED"
 EMBEDDED = "frechet_embedded"
 DEFAULT = ("jsd", "mmd", EMBEDDED)
 
@@ -107,7 +106,6 @@ def evaluate(
     """
     from r2flow.evaluation.measuring import check_reflectance
     from r2flow.evaluation.processes import joined
-    from r2flow.evaluation.sets import sampled_set
     from r2flow.reports.speed_quality import Drawing
 
     _check_evaluation(generated, checkpoint, measured, output)
@@ -117,22 +115,18 @@ def evaluate(
         flows = _load_flows(
             [*(checkpoint or []), *([Path(generated)] if generated and _is_flow(generated) else [])], place.device
         )
-        reading = reading_of(real, list(flows.values()), generated, how)
+        judged_scans = None if _is_flow(generated) else generated
+        reading = reading_of([real, judged_scans], list(flows.values()), how)
         if built is not None:  # where no metric reads reflectance, its scale does not matter
-            reading = replace(
-                reading, reflectance=any(m.needs_reflectance or m.uses_reflectance for m in built.values())
-            )
+            looks = any(m.needs_reflectance or m.uses_reflectance for m in built.values())
+            reading = replace(reading, reflectance=reading.reflectance if looks else False)
         truth = _open(real, reading, scans.split, scans.real_num)
         judged: ScanSet | None = None
         if _is_flow(generated):
-            (label, flow), *_ = flows.items()
-            sampler = flow.generator.sampler.changed(
-                steps=_one(sampling.steps), method=sampling.solver, tolerance=sampling.tolerance
-            )
-            judged = sampled_set(flow, label, num, sampler, sampling.seed)
+            judged = _sampled(flows, num, sampling)
         elif generated is not None:
-            scale = how.reflectance_scale if scans.generated_scale is None else scans.generated_scale
-            judged = _open(generated, replace(reading, reflectance_scale=scale), scans.generated_split, scans.num)
+            own = _rescaled(generated, reading, scans.generated_scale)
+            judged = _open(generated, own, scans.generated_split, scans.num)
         sets = [truth, *([judged] if judged else [])]
         if built is None:
             reflectance = all(s.about["reflectance"] for s in sets)
@@ -277,7 +271,8 @@ def neighbours(
     from r2flow.reports.pages import prepare_folder
 
     where = choose_device(work.device)
-    reading = replace(reading_of(train, [], generated, how), reflectance=by != "pixels")
+    reading = reading_of([train, generated, held_out.real], [], how)
+    reading = replace(reading, reflectance=False) if by == "pixels" else reading
     trained = _open(train, reading, split, None)
     judged = _open(generated, reading, None, held_out.num)
     held = None if held_out.real is None else _open(held_out.real, reading, held_out.real_split, held_out.num)
@@ -311,57 +306,50 @@ def _load_flows(paths: list[Path], device: str) -> "dict[str, Checkpoint]":
 
 
 def reading_of(
-    real: str,
+    specs: "Sequence[str | None]",
     flows: "Sequence[Checkpoint]" = (),
-    generated: str | None = None,
     how: ReadingOptions | None = None,
 ) -> "Reading":
-    """How scans become images: as asked for, else as the flow's or a prepared set's were, else the default."""
-    from r2flow.evaluation.reading import Reading
-    from r2flow.evaluation.sets import is_prepared, prepared_reading
-    from r2flow.lidar.projection import CONVENTIONS, PROJECTIONS
+    """How scans become images: as asked for, else as the flow's or one of the named sets' were, else the usual way."""
+    from r2flow.evaluation.sets import reading_of_flow
 
-    how = how or ReadingOptions()
-    prepared = [prepared_reading(text) for text in (real, generated) if text is not None and is_prepared(text)]
-    if flows:
-        data = flows[0].config.get("data", {})
-        found = Reading(flows[0].sensor, data.get("projection", "spherical"), data.get("convention", "centre"))
-    elif prepared:
-        found = prepared[0]
-    else:
-        found = Reading(build_sized(how.sensor or "hdl64e", how.size))
-    if how.sensor is not None or how.size is not None:
-        chosen = build_sized(how.sensor or found.sensor.name, how.size)
-        if flows and chosen.shape != found.sensor.shape:
-            asked, own = ("x".join(map(str, one.shape)) for one in (chosen, found.sensor))
-            raise InputError(f"the flow's images are {own}, not {asked}; leave --sensor and --size out.")
-        if flows and chosen.elevations != found.sensor.elevations:
-            raise InputError(f"the flow looks through {found.sensor.name}, not {chosen.name}; leave --sensor out.")
-        found = found if flows else replace(found, sensor=chosen)
-    given: dict[str, Any] = {"reflectance_scale": how.reflectance_scale}
-    for option, known in (("projection", PROJECTIONS), ("convention", CONVENTIONS)):
-        value = getattr(how, option)
-        if value is not None and value not in known:
-            raise InputError(f"--{option} must be one of {', '.join(known)}; found {value!r}.")
-        if value is not None:
-            given[option] = value
-    return replace(found, **given)
+    flow = reading_of_flow(flows[0]) if flows else None
+    return choose_reading(specs, **vars(how or ReadingOptions()), flow=flow)
+
+
+def _rescaled(generated: str, reading: "Reading", scale: float | None) -> "Reading":
+    """The reading with the scale of reflectance that was asked for, else the generated scans' own."""
+    from r2flow.data.opening import own_reading
+
+    own = own_reading(generated)
+    if scale is None:
+        scale = reading.reflectance_scale if own is None else own.reflectance_scale
+    return replace(reading, reflectance_scale=scale)
 
 
 def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> "ScanSet":
-    from r2flow.evaluation.sets import open_set
+    from r2flow.data.opening import open_scans
 
-    return open_set(text, reading, split, num)
+    return open_scans(text, reading, split, num)
 
 
-def _build(names: Sequence[str], bootstrap: int, place: "Place") -> "dict[str, ScanMetric]":
+def _sampled(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOptions) -> "ScanSet":
+    """Scans of the one flow that is judged."""
+    from r2flow.evaluation.sets import sampled_set
+
+    (label, flow), *_ = flows.items()
+    changes = {"steps": _one(sampling.steps), "method": sampling.solver, "tolerance": sampling.tolerance}
+    return sampled_set(flow, label, num, flow.generator.sampler.changed(**changes), sampling.seed)
+
+
+def _build(names: Sequence[str], bootstrap: int, place: "Process") -> "dict[str, ScanMetric]":
     from r2flow.metrics import METRICS
 
     options = {"keep": bootstrap > 0, "folder": place.folder}
     return {name: METRICS[name](**options).to(place.device) for name in dict.fromkeys(names)}
 
 
-def _build_default(reflectance: bool, bootstrap: int, place: "Place") -> "dict[str, ScanMetric]":
+def _build_default(reflectance: bool, bootstrap: int, place: "Process") -> "dict[str, ScanMetric]":
     """The default metrics; a warning says which of them cannot be computed here."""
     built: dict[str, ScanMetric] = {}
     for name in DEFAULT:

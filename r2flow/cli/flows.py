@@ -131,12 +131,12 @@ def backbones(
     json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
     """Parameters, multiply-accumulates and measured latency of every configuration: the paper's table II."""
-    from r2flow.backbones import CONFIGURATIONS
+    from r2flow.backbones import configurations
     from r2flow.progress import track
     from r2flow.reports.backbones import backbone_costs, print_costs
 
     chosen, where = build_sized(sensor, size), choose_device(device)
-    names = only.split(",") if only else list(CONFIGURATIONS)
+    names = only.split(",") if only else list(configurations())
     rows = backbone_costs(chosen, names, channels, repeats, where)
     measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
     if json:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from r2flow.cli.options import SizeOption
+from r2flow.cli.options import ConventionChoice, ProjectionChoice, ScaleChoice, SensorChoice, SizeOption
 
 if TYPE_CHECKING:
     from r2flow.generators import Sampler
@@ -50,17 +50,11 @@ def grouped(verb: Callable[..., None]) -> Callable[..., None]:
 class ReadingOptions:
     """How scans become images: as the flow or the prepared scans say where an option is left out."""
 
-    sensor: Annotated[
-        str | None, typer.Option(help="Name of the sensor; the flow's, the prepared scans', or hdl64e if left out.")
-    ] = None
+    sensor: SensorChoice = None
     size: SizeOption = None
-    projection: Annotated[str | None, typer.Option(help="spherical or unfolding; theirs, or spherical.")] = None
-    convention: Annotated[
-        str | None, typer.Option(help="centre, or reference for the published models'; theirs, or centre.")
-    ] = None
-    reflectance_scale: Annotated[
-        float, typer.Option(min=1e-6, help="Value in scan files that means full reflectance.")
-    ] = 1.0
+    projection: ProjectionChoice = None
+    convention: ConventionChoice = None
+    reflectance_scale: ScaleChoice = None
 
 
 @dataclass(frozen=True)

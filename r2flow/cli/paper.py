@@ -75,9 +75,9 @@ def real_set(text: str, split: str | None, run: Path) -> "ScanSet":
     """The real scans as a run's flow sees them."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.evaluate import reading_of
-    from r2flow.evaluation.sets import open_set
+    from r2flow.data.opening import open_scans
 
-    return open_set(text, reading_of(text, [load_checkpoint(run)]), split)
+    return open_scans(text, reading_of([text], [load_checkpoint(run)]), split)
 
 
 def build_metrics(names: list[str] | None, keep: bool, reflectance: bool, device: str) -> "PaperMetrics":

@@ -1,4 +1,4 @@
-"""`r2flow sensor`: a user's own sensor, estimated from scans."""
+"""`r2flow sensor`: your own sensor, estimated from its scans."""
 
 import re
 from pathlib import Path
@@ -17,11 +17,9 @@ if TYPE_CHECKING:
 @app.command(epilog="Example: r2flow sensor my/scans --out conf/sensor/mine.yaml")
 def sensor(
     scans: Annotated[list[Path], typer.Argument(help="Scan files, or folders of them, of one sensor.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The .yaml to write; none is written if left out.")
-    ] = None,
-    name: Annotated[str | None, typer.Option(help="The sensor's name; by default that of the file.")] = None,
-    most: Annotated[int, typer.Option(min=1, help="The most scans to look at of a folder.")] = 8,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="The .yaml to write; none if left out.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the sensor; by default that of the file.")] = None,
+    most: Annotated[int, typer.Option(min=1, help="The most scans to read of a folder.")] = 8,
 ) -> None:
     """Estimate a sensor from scans: beams, resolution, limits, height, reflectance; write it as YAML.
 
@@ -35,10 +33,10 @@ def sensor(
     from r2flow.reports.views import scans_of
 
     if out is not None and (out.suffix.lower() not in ENDINGS or out.is_dir()):
-        raise InputError(f"--out must be a .yaml file, by which --sensor knows it; found {out}.")
+        raise InputError(f"--out must be a .yaml file, as --sensor expects; found {out}.")
     name = name or (out.stem if out is not None else "mine")
     if name in SENSORS or not re.fullmatch(r"[A-Za-z]\w*", name):
-        raise InputError(f"--name must be letters, digits and _, and no sensor's of the table; found {name!r}.")
+        raise InputError(f"--name must be letters, digits and _, and not that of a built-in sensor; found {name!r}.")
     paths = [path for scan in scans for path in scans_of(scan, most)]
     points = [read_points(path) for path in track(paths, "reading", "scans", least=16)]
     estimate = estimate_sensor(points)
@@ -62,17 +60,21 @@ def _print(estimate: "Estimate") -> None:
     rows.append(("beams", f"{len(e)}, {_sureness(beams)}"))
     rows.append(("elevations", " ".join("..." if one is None else f"{one:+.2f}" for one in shown) + " degrees"))
     if (known := estimate.nearest_known()) is not None:
-        rows.append(("", f"of the table {known[0]} is nearest, {known[1]:.2f} degrees off in the median"))
+        rows.append(("", f"nearest built-in sensor: {known[0]}, median distance {known[1]:.2f} degrees"))
     rows.append(("resolution", f"{estimate.steps:,.0f} steps a turn; images of {estimate.columns} columns"))
     rows.append(("range", f"{near:.2f} to {far:.2f} m"))
     if estimate.near_share > 0.05:
         share = f"{estimate.near_share:.0%} of the returns lie within 1 m"
-        rows.append(("", f"{share}: the vehicle itself? Then raise min_range in the YAML."))
+        rows.append(("", f"{share}; if that is the vehicle itself, raise min_range in the YAML"))
     if estimate.height is None:
-        rows.append(("height", "no ground found; the usual 1.73 m is taken"))
+        rows.append(("height", "no ground found; 1.73 m, the default, is used"))
     else:
-        above = f"{estimate.height:.2f} m above the ground, where {estimate.ground_share:.0%} of them lie"
-        rows.append(("height", above))
+        rows.append(
+            (
+                "height",
+                f"{estimate.height:.2f} m above the ground, which {estimate.ground_share:.0%} of the returns are on",
+            )
+        )
     if (found := estimate.reflectance) is None:
         rows.append(("reflectance", "none: encoding.reflectance=false"))
     else:
@@ -83,12 +85,12 @@ def _print(estimate: "Estimate") -> None:
 
 
 def _sureness(beams: "Beams") -> str:
-    """How well the beams are known, in words."""
+    """How the beams were found and how exactly, in words."""
     worst = int(beams.residuals.argmax())
     spread = (
         f"median residual {sorted(beams.residuals)[len(beams.residuals) // 2]:.3f} degrees, "
         f"worst {beams.residuals[worst]:.3f} (row {worst})"
     )
     if beams.stable is None:
-        return f"told by the files; {spread}"
-    return f"told by their elevations alone, the same number over {beams.stable:.1f}-fold bandwidths; {spread}"
+        return f"lasers known from the files; {spread}"
+    return f"from elevations alone, the same number over a {beams.stable:.1f}-fold range of bandwidths; {spread}"

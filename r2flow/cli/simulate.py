@@ -1,4 +1,4 @@
-"""The verb that makes scans out of nothing."""
+"""`r2flow simulate`: scans of simulated street scenes."""
 
 import os
 from typing import Annotated
@@ -25,7 +25,7 @@ def simulate(
         int | None, typer.Option(min=1, help="Processes; one a core if left out.", show_default=False)
     ] = None,
 ) -> None:
-    """Simulate scans of streets, as many as asked for. Stopped or killed, the same command goes on."""
+    """Simulate scans of street scenes. After a stop or a kill, the same command goes on."""
     from r2flow.progress import Bar
     from r2flow.simulator.folder import SimulatedFolder, write_folder
 
@@ -34,5 +34,5 @@ def simulate(
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with Bar("simulating", num, "scans") as advance:
         made = write_folder(folder, range(first, first + num), workers or cores, advance)
-    kept = f", {num - made} were there" if made < num else ""
+    kept = f", {num - made} were there already" if made < num else ""
     print(f"{made} scans ({', '.join(formats)}{', labels' if labels else ''}) in {out}{kept}")

@@ -1,4 +1,4 @@
-"""What a velocity estimate is held to. Each loss maps (v_t, u_t) of shape (B, ...) to one value per sample, (B,)."""
+"""Losses of a velocity estimate: each maps (v_t, u_t) of shape (B, ...) to one value per sample, (B,)."""
 
 import math
 from collections.abc import Callable
@@ -21,13 +21,13 @@ def mse(v_t: Tensor, u_t: Tensor) -> Tensor:
 def pseudo_huber(v_t: Tensor, u_t: Tensor) -> Tensor:
     """(sqrt(|r|^2 + c^2) - c) / sqrt(d) with r = v_t - u_t, c = 0.00054 sqrt(d): the paper's eq. 3 over sqrt(d).
 
-    The division leaves the minimiser alone and brings gradients to the scale of the other losses; without
-    it they are sqrt(d) = 362 times those of the element-wise form, and clipping at 1 would always bite.
+    The division does not move the minimum and brings gradients to the scale of the other losses; without it they are
+    sqrt(d) = 362 times those of the element-wise form, and every gradient would be clipped at 1.
     """
     r = (v_t.float() - u_t.float()).flatten(1)
     d = r.shape[1]
-    # vector_norm has gradient 0 at r = 0, where sqrt of a sum of squares has NaN. Dividing first keeps
-    # |r|^2 finite; the quotient form has no cancellation at small r.
+    # vector_norm has gradient 0 at r = 0, where sqrt of a sum of squares has NaN. Dividing first keeps |r|^2 finite;
+    # the quotient has no cancellation at small r.
     rms = torch.linalg.vector_norm(r, dim=1) / math.sqrt(d)
     return rms.square() / ((rms.square() + PSEUDO_HUBER_SCALE**2).sqrt() + PSEUDO_HUBER_SCALE)
 

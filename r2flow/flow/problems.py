@@ -1,9 +1,9 @@
-"""Flows whose solution is known: what a solver gives is held against mathematics, not against another solver.
+"""Flows with a known solution, against which solvers are tested.
 
 All act on states of any shape (B, ...). `Gaussian`, `Anisotropic`, the mixtures and `PointMass` are rectified flows:
-x_0 ~ N(0, 1), x_1 drawn independently of it, v(t, x) = E[x_1 - x_0 | x_t = x]. `Straight` is such a flow reflowed, x_0
-and x_1 a pair. `Rotating`, `StiffLinear`, `Discontinuous` and `NarrowJet` carry no data: equations that are hard on a
-solver, each in a way of its own.
+x_0 ~ N(0, 1), x_1 drawn independently of it, v(t, x) = E[x_1 - x_0 | x_t = x]. `Straight` is such a flow reflowed: x_0
+and x_1 are a pair. `Rotating`, `StiffLinear`, `Discontinuous` and `NarrowJet` model no data; each is hard for a solver
+in another way.
 """
 
 import functools
@@ -19,14 +19,14 @@ from r2flow.registry import Registry
 
 
 class Problem:
-    """A velocity and the exact way from x_0 along it."""
+    """A velocity and its exact paths."""
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
         """v(t, x) in x's type, with t of shape () or (B,) and x (B, ...)."""
         raise NotImplementedError
 
     def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        """x_t, (B, ...) float64, of the path that is at x_0 at time 0; t of shape () or (B,)."""
+        """x_t, (B, ...) float64, of the path that starts at x_0; t of shape () or (B,)."""
         raise NotImplementedError
 
     def straightness(self, x_0: Tensor, t: Tensor | float) -> Tensor:
@@ -61,7 +61,7 @@ class Gaussian(Problem):
 
 
 class Anisotropic(Gaussian):
-    """Every element has a Gaussian of its own, std from `narrowest` to `widest` in equal ratios."""
+    """Every element has a Gaussian of its own, with std from `narrowest` to `widest` in equal ratios."""
 
     def __init__(self, narrowest: float = 1e-4, widest: float = 10.0) -> None:
         super().__init__(mean=0.0)
@@ -72,12 +72,12 @@ class Anisotropic(Gaussian):
         return torch.logspace(*ends, x[0].numel(), dtype=x.dtype, device=x.device).view(x.shape[1:])
 
 
-class Mixture(Problem):
-    """x_1 from a mixture of Gaussians, in every element by itself.
+class GaussianMixture(Problem):
+    """x_1 from a mixture of Gaussians, independently in every element.
 
-    Of component i, x_t has mean t m_i and variance c_i = (1 - t)^2 + t^2 s_i^2, and x_1 - x_0 the conditional mean
-    m_i + (t s_i^2 - (1 - t)) (x - t m_i) / c_i; v is their mean over the posterior of i. The flow of a scalar keeps
-    the order of its paths, hence the share F_t of paths below: x_t solves F_t(x_t) = F_0(x_0).
+    In component i, x_t has mean t m_i and variance c_i = (1 - t)^2 + t^2 s_i^2, and x_1 - x_0 the conditional mean
+    m_i + (t s_i^2 - (1 - t)) (x - t m_i) / c_i; v is their mean over the posterior of i. Paths of a scalar do not
+    cross, so that the distribution function is constant along a path: x_t solves F_t(x_t) = F_0(x_0).
     """
 
     def __init__(self, weights: Sequence[float], means: Sequence[float], stds: Sequence[float]) -> None:
@@ -94,12 +94,12 @@ class Mixture(Problem):
         return (torch.stack(scores).softmax(0) * torch.stack(slopes)).sum(0)
 
     def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        """x_t by bisection, to the last digits: the quantile of a mixture lies between those of its components."""
+        """x_t by bisection, to full precision: the quantile of a mixture lies between those of its components."""
         x_0, t = _exact(x_0, t)
         means = torch.stack([t * mean + torch.zeros_like(x_0) for mean in self.means])
         stds = torch.stack([((1 - t) ** 2 + (t * std) ** 2).sqrt() + torch.zeros_like(x_0) for std in self.stds])
         weights = torch.tensor(self.weights, dtype=torch.float64, device=x_0.device).view(-1, *(1,) * x_0.ndim)
-        # The tail in which x_0 lies, of which no digit is lost: 1 - F(x) would lose those of a small remainder.
+        # The tail in which x_0 lies: 1 - F(x) would lose digits.
         side = torch.where(x_0 < 0, 1.0, -1.0)
         level = torch.special.ndtr(side * x_0)
         low, high = (means + stds * x_0).amin(0), (means + stds * x_0).amax(0)
@@ -111,22 +111,22 @@ class Mixture(Problem):
         return (low + high) / 2
 
 
-class TwoModes(Mixture):
-    """Half of the paths go to -apart, half to +apart; between them they part ever more sharply."""
+class TwoModes(GaussianMixture):
+    """Half of the paths go to -apart, half to +apart."""
 
     def __init__(self, apart: float = 0.5, std: float = 0.05) -> None:
         super().__init__((0.5, 0.5), (-apart, apart), (std, std))
 
 
-class RayDrop(Mixture):
-    """A pixel of a scan: -1 up to `std` where the ray was dropped, else a range around .3."""
+class RayDrop(GaussianMixture):
+    """A pixel of a scan: -1 (within `std`) where the ray was dropped, else a range around 0.3."""
 
     def __init__(self, dropped: float = 0.3, std: float = 1e-3) -> None:
         super().__init__((dropped, 1 - dropped), (-1.0, 0.3), (std, 0.3))
 
 
 class PointMass(Problem):
-    """x_1 = point: v = (point - x) / (1 - t), a straight line whose velocity is 0 / 0 at t = 1."""
+    """x_1 = point: v = (point - x) / (1 - t), a straight path whose velocity is 0 / 0 at t = 1."""
 
     def __init__(self, point: float = 0.5) -> None:
         self.point = point
@@ -158,7 +158,7 @@ class Straight(Problem):
 
 
 class Rotating(Problem):
-    """x' = w J x: the first half of a scene's elements turns against the second, `turns` full circles until t = 1."""
+    """x' = w J x: elements of the first half rotate with those of the second, `turns` full circles until t = 1."""
 
     def __init__(self, turns: float = 0.5) -> None:
         self.speed = 2 * math.pi * turns
@@ -176,7 +176,7 @@ class Rotating(Problem):
 
 
 class StiffLinear(Problem):
-    """x' = -rate (x - sin t) + cos t: a slow path that everything nearby falls onto within 1 / rate.
+    """x' = -rate (x - sin t) + cos t: a slow path that all others approach within 1 / rate.
 
     Prothero, Robinson, On the stability and accuracy of one-step methods for solving stiff systems, 1974.
     """
@@ -208,7 +208,7 @@ class Discontinuous(Problem):
 
 
 class NarrowJet(Problem):
-    """x' = -x + N(t; at, width^2): a kick of 1 within a few widths, which no step that passes over it notices."""
+    """x' = -x + N(t; at, width^2): an impulse of 1 within a few widths, which a long step misses."""
 
     def __init__(self, width: float = 2e-3, at: float = 0.6) -> None:
         self.width, self.at = width, at
@@ -225,7 +225,7 @@ class NarrowJet(Problem):
 
 
 class Mixed(Problem):
-    """A batch in which every scene has a problem of its own; `select` lets it follow scenes out of the batch.
+    """A batch in which every scene has a problem of its own; `select` is for solvers whose scenes leave the batch.
 
     Args:
         problems: One for each scene.

@@ -1,4 +1,4 @@
-"""A scene that is straight takes one step; the others go on with an adaptive solver."""
+"""Scenes whose path is straight take one step; the others go on with an adaptive solver."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,22 +9,22 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.solvers import solve
+from r2flow.flow.solvers import check_tolerance, solve
 from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite
 
-NARROWING = 10.0  # each probe is so many times nearer to t = 1 than the one before it
+NARROWING = 10.0  # factor by which the distance to t = 1 shrinks from one probe to the next
 
 
 def probes(tolerance: float) -> list[float]:
-    """Times at which a path is compared with its first direction: 0.5, 0.95, 0.995, ...
+    """Times at which v on the straight line is compared with v(0, x): 0.5, 0.95, 0.995, ...
 
-    Data of width s bends the paths within about s of t = 1 and moves their ends by s. Along the line the velocity of
-    N(m, s^2) is off by t s^2 / ((1 - t)^2 + t^2 s^2) |x_0|: a last probe at 1 - t = d sees widths down to
-    sqrt(d tolerance / 10) in the sum of `straight_scenes`, so that none above 3 tolerances passes where d is below
-    90 of them. At tolerance 1e-3 that is two probes, at 1e-5 four.
+    Data of standard deviation s bends the paths within about s of t = 1 and moves their ends by s. Along the line the
+    velocity of N(m, s^2) differs by t s^2 / ((1 - t)^2 + t^2 s^2) |x_0|: a last probe at 1 - t = d detects s down to
+    sqrt(d tolerance / 10) in the sum of `straight_scenes`, so that no s above 3 tolerances passes where d is below 90
+    tolerances. At tolerance 1e-3 that is two probes, at 1e-5 four.
     """
     left = [0.5]
-    while left[-1] > 90 * tolerance and left[-1] > 1e-6:  # float32 knows no finer distance from 1
+    while left[-1] > 90 * tolerance and left[-1] > 1e-6:  # the resolution of float32 near 1
         left.append(left[-1] / NARROWING)
     if len(left) == 1:
         left.append(left[-1] / NARROWING)
@@ -39,28 +39,27 @@ def solve_straight_first(
     progress: Callable[[], None] | None = None,
     **options: Any,
 ) -> Solution:
-    """Solve dx/dt = v(t, x) from t = 0 to 1: by x + v(0, x) where that is the end, by `method` elsewhere.
+    """Solve dx/dt = v(t, x) from t = 0 to 1: by x + v(0, x) where the path is straight, by `method` elsewhere.
 
-    Forward only: towards noise the flow of narrow data expands so much that no probe along a line bounds its error.
+    Forward only: towards noise the flow of narrow data expands so much that probes along a line do not bound its error.
 
     Args:
         velocity: v(t, x) with t of shape () or (B,).
         x: State at t = 0, (B, ...).
-        tolerance: Absolute and relative tolerance, of the decision as of the solver.
+        tolerance: Absolute and relative tolerance of both the probes and the solver.
         method: An adaptive solver for the scenes that are not straight; v(0, x) is not evaluated for it again.
         progress: Called after every evaluation.
-        options: Further keywords of `solve`, except `global_error`: the step of a straight scene has no estimate.
+        options: Further keywords of `solve`, except `global_error`: a straight scene's step has no estimate.
 
     Returns:
-        As of `solve`; the probes are among the evaluations, and a straight scene has taken one step.
+        As `solve` does; the probes count as evaluations, and a straight scene has taken one step.
 
     Raises:
-        InputError: as of `solve`, or `global_error` asked for.
+        InputError: as `solve` does, or `global_error` is asked for.
     """
     if options.get("global_error"):
-        raise InputError("straight scenes are found by probes that give no estimate: ask `solve` for a global error.")
-    if not tolerance > 0:
-        raise InputError(f"a solver's tolerance must be positive, found {tolerance}.")
+        raise InputError("straight scenes have no estimate of their global error; call `solve` for it.")
+    check_tolerance(tolerance)
     x = x if x.dtype == torch.float64 else x.float()
     v = Evaluations(velocity, len(x), progress)
     k = v(x.new_zeros(()), x)
@@ -76,11 +75,12 @@ def solve_straight_first(
 
 @torch.no_grad()
 def straight_scenes(v: Evaluations, x: Tensor, k: Tensor, tolerance: float) -> Tensor:
-    """Which scenes keep the direction k = v(0, x) all the way, (B,) bool.
+    """Which scenes keep the velocity k = v(0, x) along the whole path, (B,) bool.
 
-    The error of one Euler step is the integral of v along the path less k. It is bounded from probes x + t k by an
-    upper sum, on each interval between two of them the larger deviation, and held to the tolerance in the root mean
-    square over elements, each on the scale of 1 + its own size. A scene that has failed is not probed again.
+    The error of one Euler step is the integral of v - k along the path. It is bounded by an upper sum over the probes
+    x + t k: on each interval between two of them, the larger |v - k|. A scene is straight where the root mean square of
+    the bound over its elements, each divided by tolerance (1 + |x|), is at most 1. A scene that has failed is not
+    probed again.
     """
     scale = tolerance * (1 + torch.maximum(x.abs(), (x + k).abs()))
     straight = finite(x) & finite(k)
@@ -104,10 +104,10 @@ def straight_scenes(v: Evaluations, x: Tensor, k: Tensor, tolerance: float) -> T
 
 
 class _Rest:
-    """The velocity of the scenes that go on, which knows its first answer already, in the state's type.
+    """The velocity of the scenes that go on. Its first value, v(0, x), is known and not computed again.
 
     Args:
-        precision: What that answer was computed in.
+        precision: The type that this value was computed in.
     """
 
     def __init__(self, velocity: Velocity, scenes: Tensor, start: Tensor, k: Tensor, precision: torch.dtype) -> None:

@@ -1,13 +1,12 @@
-"""How straight a flow's own paths are: the paper's s(t) (eq. 5), its integral, and who bends.
+"""Straightness of a flow's paths: the paper's s(t) (eq. 5), its integral, and the pixels that bend most.
 
     s(t) = |d - v_t|^2,  d = Phi(x_0, 1) - x_0,  v_t = v(t, Phi(x_0, t)),
 
-0 everywhere on a straight path, which one Euler step follows exactly. Along n equal Euler steps d is the mean of
-v_t, so that the integral of s is the variance of v_t over the path, pixel by pixel. That needs one pass; s(t)
-itself needs d at every step, which is known at the end: `straightness` goes along the path a second time instead of
-keeping n images, twice the evaluations for a memory that does not grow with n.
+which is 0 on a straight path, where one Euler step is exact. Along n equal Euler steps d is the mean of v_t, so that
+the integral of s is the variance of v_t over the path, pixel by pixel: one pass. s(t) itself needs d, which is known
+only at the end: `straightness` makes a second pass instead of keeping n images; its memory does not grow with n.
 
-An untrained flow that answers 0 is perfectly straight and goes nowhere: read s beside s / |d|^2.
+An untrained flow with v = 0 is perfectly straight: read s together with s / |d|^2.
 """
 
 import math
@@ -24,11 +23,11 @@ Progress = Callable[[], None] | None
 
 @dataclass(frozen=True)
 class Curvature:
-    """What one pass along the path tells.
+    """The integral of s over the paths of a batch.
 
     Attributes:
-        x_0: Where it began, (B, ...).
-        x_1: Where it ended, (B, ...).
+        x_0: Start of each path, (B, ...).
+        x_1: End of each path, (B, ...).
         per_pixel: int_0^1 (d - v_t)^2 dt of every element, (B, ...), float64.
     """
 
@@ -59,9 +58,9 @@ class Straightness:
     Attributes:
         t: The times 0, 1/n, ..., (n - 1)/n, (n,), float64.
         s: s(t), (B, n), float64.
-        curvature: What the first pass told.
-        pixels: Which elements of the flattened batch bend most, the most bent first, (k,); none of a path that is
-            not finite, unless there are too few others.
+        curvature: The integral of s, from the first pass.
+        pixels: Elements of the flattened batch that bend most, the most bent first, (k,); those of a path that is not
+            finite come last.
         trajectories: Their values at 0, 1/n, ..., 1, (k, n + 1).
     """
 
@@ -99,7 +98,7 @@ def curvature(velocity: Velocity, x_0: Tensor, steps: int = 256, progress: Progr
 
     def accumulate(t: Tensor, x: Tensor, v: Tensor) -> None:
         nonlocal first
-        # Deviations from the first velocity: of v^2 itself, a nearly straight path's variance is the last digits.
+        # Deviations from the first velocity: with v^2 itself, a small variance would be lost in the last digits.
         first = v if first is None else first
         deviation = (v - first).double()
         mean.add_(deviation / steps)
@@ -142,7 +141,7 @@ def straightness(
 def _walk(
     velocity: Velocity, x_0: Tensor, steps: int, watch: Callable[[Tensor, Tensor, Tensor], None], progress: Progress
 ) -> Tensor:
-    """x_1 by Euler steps, `watch(t, x_t, v_t)` called at each: the solver evaluates once a step, at its start."""
+    """x_1 by Euler steps; `watch(t, x_t, v_t)` is called at each evaluation, which is at the start of a step."""
 
     def watched(t: Tensor, x: Tensor) -> Tensor:
         v = velocity(t, x).to(x.dtype)

@@ -1,7 +1,7 @@
-"""Where on the path to train: densities of t, each given by its inverse CDF.
+"""Time densities: p(t) of the times at which a flow is trained, each given by its inverse CDF.
 
-A time sampler maps u ~ Uniform[0, 1) to t. The uniform draw comes from outside (counter-based, one per
-image), so the time of image k depends on k alone.
+A density maps u ~ Uniform[0, 1) to t. The uniform draw comes from outside (counter-based, one per image), so that the
+time of image k depends on k alone.
 """
 
 import math
@@ -13,7 +13,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.registry import Registry
 
-TimeSampler = Callable[[Tensor], Tensor]
+TimeDensity = Callable[[Tensor], Tensor]
 
 
 class Uniform:
@@ -54,12 +54,12 @@ class LogitNormal:
         return torch.sigmoid(self.mean + self.std * normal).to(u.dtype)
 
 
-class Grid:
-    """t uniform on {0, 1/k, ..., (k-1)/k}, the times that k Euler steps visit (timestep distillation)."""
+class Discrete:
+    """t uniform on {0, 1/k, ..., (k-1)/k}, the times at which k Euler steps begin (timestep distillation)."""
 
     def __init__(self, k: int) -> None:
         if k < 1:
-            raise InputError(f"a time grid needs at least one step, found k={k}.")
+            raise InputError(f"the discrete time density needs at least one time, found k={k}.")
         self.k = k
 
     def __call__(self, u: Tensor) -> Tensor:
@@ -67,4 +67,6 @@ class Grid:
         return torch.floor(u * self.k).clamp(max=self.k - 1) / self.k
 
 
-TIMES = Registry("time density", uniform=Uniform, u_shaped=UShaped, logit_normal=LogitNormal, grid=Grid)
+TIMES: Registry[Callable[..., TimeDensity]] = Registry(
+    "time density", uniform=Uniform, u_shaped=UShaped, logit_normal=LogitNormal, discrete=Discrete
+)

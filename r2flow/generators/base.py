@@ -167,6 +167,11 @@ class Generator(nn.Module):
         self.load_state_dict(parent.state_dict())
 
     @property
+    def learns_directions(self) -> bool:
+        """Whether it learns a vector for each direction, so that scans must not be turned in training."""
+        return False
+
+    @property
     def device(self) -> torch.device:
         """Where its weights are."""
         return next(self.parameters()).device

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from copy import copy
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -84,9 +84,15 @@ class RectifiedFlow(Flow):
         backbone: Name and options, as in conf/backbone.
     """
 
+    condition_channels: ClassVar[int] = 0  # further input channels of the backbone, for a subclass with a condition
+    second_time: ClassVar[bool] = False  # whether the backbone takes a second time, for a subclass that is a flow map
+
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space)
-        self.backbone = build_backbone(backbone, space.rays, space.shape[0])
+        channels = space.shape[0]
+        self.backbone = build_backbone(
+            backbone, space.rays, channels + self.condition_channels, channels, self.second_time
+        )
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         if condition is not None:
@@ -94,20 +100,26 @@ class RectifiedFlow(Flow):
         v: Tensor = self.backbone(t, x)
         return v
 
+    def start_from(self, parent: Generator) -> None:
+        """Take over a flow's weights; what a second time adds keeps its own, which change nothing at first."""
+        own = self.backbone.state_dict()
+        new = {f"backbone.{name}": own[name] for name in self.backbone.second_time_names()}
+        self.load_state_dict({**new, **parent.state_dict()})
+
     @property
     def unit(self) -> tuple[int, int]:
-        from r2flow.backbones.crop import unit_of
+        return self.backbone.unit
 
-        return unit_of(self.backbone)
+    @property
+    def learns_directions(self) -> bool:
+        return self.backbone.learns_directions
 
     def part(self, region: Region) -> "RectifiedFlow":
         """The flow on a region alone: its network does not see the rest of the image."""
-        from r2flow.backbones.crop import cropped
-
         if region.share == 1:
             return self
         part = copy(self)
-        part._modules = {"backbone": cropped(self.backbone, region.rows, region.columns)}
+        part._modules = {"backbone": self.backbone.cropped(region.rows, region.columns)}
         return part
 
 

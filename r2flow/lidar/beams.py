@@ -1,4 +1,4 @@
-"""The beams of a sensor, found in its scans: which laser fired each point, where that can be told, and how it looks."""
+"""The beams of a sensor, found in its scans."""
 
 import math
 from collections.abc import Sequence
@@ -10,12 +10,12 @@ from r2flow.errors import InputError
 from r2flow.lidar.scan_files import Points
 from r2flow.lidar.unfolding import elevations_of, median_of_seen, rings_from_order, scatter_of
 
-FEWEST, MOST = 4, 256  # beams that are looked for
-TIGHT = 0.1  # scatter, see `scatter_of`, below which points belong to one laser each
+FEWEST, MOST = 4, 256  # beams of a sensor
+TIGHT = 0.1  # scatter (`scatter_of`) below which each column is one laser
 BANDWIDTHS = np.geomspace(0.015, 2.0, 50)  # degrees
 BIN = 0.005  # degrees
-FAINT = 0.02  # share of the usual peak's height below which a peak is no beam
-STABLE = 1.5  # factor of bandwidth over which the number of peaks must not change
+FAINT = 0.02  # share of the median peak's height below which a peak is no beam
+STABLE = 1.5  # range of bandwidths, as a factor, over which the number of peaks must be constant
 
 RINGS = "a ring number at each point"
 FIRINGS = "firing after firing, rays without return kept"
@@ -32,11 +32,11 @@ class Beams:
         elevations: Median elevation of each in degrees, the top one first, (H,).
         residuals: Median distance of its points from that, in degrees, (H,).
         counts: Points of each, (H,).
-        order: How the scans are stored.
-        firing: Row of laser 0, 1, ... of ring numbers or whole firings, where that is neither from the top nor from
-            the bottom.
-        stable: Where the points tell no lasers and the beams are peaks of their elevations: the factor by which the
-            bandwidth can change without changing the number of peaks; None where the file tells the lasers.
+        order: How the scans are stored: `RINGS`, `FIRINGS`, ...
+        firing: Row of laser 0, 1, ... of ring numbers or whole firings; None where lasers are counted from the top or
+            from the bottom.
+        stable: Where the beams are peaks of the elevations: the factor by which the bandwidth can change without
+            changing their number; None where the files say which laser fired each point.
         of_point: Row of each point of each scan; -1 for a ray without return.
     """
 
@@ -50,7 +50,7 @@ class Beams:
 
 
 def find_beams(scans: Sequence[Points]) -> Beams:
-    """The beams by ring numbers, else by the order of storage, else by the elevations alone.
+    """The beams by ring numbers, else by the order of the points, else by their elevations alone.
 
     Raises:
         InputError: no beams can be told apart.
@@ -64,13 +64,13 @@ def find_beams(scans: Sequence[Points]) -> Beams:
     if (rings := _rings(scans, elevations)) is not None:
         by_ring = _by_laser(elevations, rings, RING_AFTER_RING)
         peaks = _by_elevation(elevations, RING_AFTER_RING)
-        # Where a ring has few returns its beginning is missed and it runs into the next; exact elevations tell them.
+        # A ring with few returns may be taken as part of the next; exact elevations separate the two.
         return peaks if peaks is not None and len(peaks.counts) > len(by_ring.counts) else by_ring
     found = _by_elevation(elevations, LOSSY_FIRINGS if _is_swept(scans) else UNORDERED)
     if found is None:
         raise InputError(
-            "the elevations of the points run into each other, and the files have neither ring numbers nor an order "
-            "that tells the lasers. Are they one sensor's scans, in its own frame? If so, use a sensor of the table."
+            "the beams cannot be told apart: the files have no ring numbers, the points are in no known order, and "
+            "their elevations form no peaks. Are they scans of one sensor, in its own frame? If so, use a built-in one."
         )
     return found
 
@@ -95,18 +95,19 @@ def _by_laser(elevations: list[np.ndarray], lasers: list[np.ndarray], order: str
         np.where(np.isfinite(e) & (one >= 0), table[np.maximum(one, 0)], -1)
         for e, one in zip(elevations, lasers, strict=True)
     ]
-    return _measured(together, np.concatenate(of_point), len(known), order, firing, None, of_point)
+    return _measured(elevations, of_point, len(known), order, firing=firing)
 
 
 def _measured(
-    elevation: np.ndarray,
-    row: np.ndarray,
+    elevations: list[np.ndarray],
+    of_point: list[np.ndarray],
     rows: int,
     order: str,
-    firing: tuple[int, ...] | None,
-    stable: float | None,
-    of_point: list[np.ndarray],
+    firing: tuple[int, ...] | None = None,
+    stable: float | None = None,
 ) -> Beams:
+    """The beams from the elevation and the row of each point of each scan."""
+    elevation, row = np.concatenate(elevations), np.concatenate(of_point)
     middles, residuals, counts = np.zeros(rows), np.zeros(rows), np.bincount(row[row >= 0], minlength=rows)
     by_row = np.argsort(row, kind="stable")[np.count_nonzero(row < 0) :]
     for beam, points in enumerate(np.split(by_row, np.cumsum(counts)[:-1])):
@@ -124,7 +125,7 @@ def _lasers_of_firings(elevations: list[np.ndarray]) -> int | None:
         if all(scatter_of(table)[1] < TIGHT for table in tables):
             table = np.concatenate(tables)
             distances[count] = float(np.nanmean(np.abs(table - median_of_seen(table))))
-    # Half the lasers pass as well where the others see only sky: then a few returns lie far from the medians.
+    # Half the lasers fit too where the others see only sky, but then a few returns are far from the medians.
     fitting = [count for count, distance in distances.items() if distance <= 1.5 * min(distances.values()) + 1e-3]
     return min(fitting, default=None)
 
@@ -138,7 +139,7 @@ def _some(table: np.ndarray) -> np.ndarray:
 
 
 def _rings(scans: Sequence[Points], elevations: list[np.ndarray]) -> list[np.ndarray] | None:
-    """Ring of each point, counted from the bottom, of files stored ring after ring; None where they are not."""
+    """Ring of each point, counted from the bottom, where files are stored ring after ring; else None."""
     rings = []
     for scan, elevation in zip(scans, elevations, strict=True):
         ring = rings_from_order(scan.xyz)
@@ -156,7 +157,7 @@ def _rings(scans: Sequence[Points], elevations: list[np.ndarray]) -> list[np.nda
         falls = np.mean(np.diff(middles) < 0)
         if 0.1 < falls < 0.9:
             return None
-        # Rings that see only sky are missing at the top: scans agree about the lowest.
+        # Counted from the bottom, since rings that see only sky are missing at the top.
         rings.append(np.where(ring < 0, -1, count - 1 - ring if falls >= 0.9 else ring))
     return rings
 
@@ -171,15 +172,12 @@ def _is_swept(scans: Sequence[Points]) -> bool:
 
 
 def _by_elevation(elevations: list[np.ndarray], order: str) -> Beams | None:
-    """Beams as the peaks of the elevations' density, at the bandwidths over which their number is most stable.
-
-    None where it is stable nowhere.
-    """
+    """Beams as peaks of the density of elevations, at bandwidths where their number is most stable; None without."""
     together = np.concatenate(elevations)
     seen = together[np.isfinite(together)]
     low, high = np.quantile(seen, [1e-4, 1 - 1e-4])
     edges = np.arange(low - 3, high + 3 + BIN, BIN)
-    size = 2 << len(edges).bit_length()  # the transforms of other sizes can take many times as long
+    size = 2 << len(edges).bit_length()  # other sizes can take many times as long to transform
     density = np.fft.rfft(np.histogram(seen, edges)[0], size)
     frequency = np.fft.rfftfreq(size, BIN)
     found = []
@@ -187,7 +185,7 @@ def _by_elevation(elevations: list[np.ndarray], order: str) -> Beams | None:
         smooth = np.fft.irfft(density * np.exp(-2 * (np.pi * bandwidth * frequency) ** 2))[: len(edges) - 1]
         peaks = np.flatnonzero((smooth[1:-1] > smooth[:-2]) & (smooth[1:-1] >= smooth[2:])) + 1
         heights = smooth[peaks]
-        # Returns from the vehicle itself lie anywhere, few at any one elevation.
+        # Returns from the vehicle itself have any elevation, few of each.
         peaks = peaks[heights > FAINT * np.median(heights[heights > 0.01 * heights.max()])]
         found.append(edges[peaks] + BIN / 2)
     numbers = np.array([len(peaks) for peaks in found])
@@ -201,4 +199,4 @@ def _by_elevation(elevations: list[np.ndarray], order: str) -> Beams | None:
     peaks = found[start + (length - 1) // 2][::-1]
     edges = (peaks[:-1] + peaks[1:]) / 2
     of_point = [np.where(np.isfinite(e), np.searchsorted(-edges, -np.nan_to_num(e)), -1) for e in elevations]
-    return _measured(together, np.concatenate(of_point), len(peaks), order, None, stable, of_point)
+    return _measured(elevations, of_point, len(peaks), order, stable=stable)

@@ -1,4 +1,4 @@
-"""A sensor estimated from its scans: beams, resolution, limits, height, and what its reflectance means."""
+"""A sensor estimated from its scans: beams, resolution, limits, height, scale of reflectance."""
 
 import math
 from collections.abc import Sequence
@@ -19,12 +19,12 @@ FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # values in use for it
 
 @dataclass(frozen=True)
 class Reflectance:
-    """What a file's reflectances look like.
+    """The reflectance values of scans.
 
     Attributes:
-        highest: The highest value found.
-        levels: How many values were found.
-        scale: The value that means full reflectance, as far as these scans tell.
+        highest: Highest value.
+        levels: Number of different values.
+        scale: Estimate of the value of full reflectance.
     """
 
     highest: float
@@ -34,18 +34,18 @@ class Reflectance:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What scans tell of their sensor.
+    """A sensor estimated from its scans.
 
     Attributes:
         beams: Its beams.
         steps: Azimuth steps of a full turn, not rounded.
-        ranges: Nearest and farthest range in metres, but for one return in ten thousand at either end.
-        near_share: Share of the returns that lie within a metre: often the vehicle itself.
+        ranges: Nearest and farthest range in metres, without one return in ten thousand at either end.
+        near_share: Share of the returns within a metre, often from the vehicle itself.
         height: Height above the ground in metres; None where no ground was found.
-        ground_share: Share of the returns that lie on that ground.
+        ground_share: Share of the returns on that ground.
         reflectance: None where the files have none.
-        scans: How many scans were looked at.
-        returns: How many returns they hold.
+        scans: Number of scans.
+        returns: Number of their returns.
     """
 
     beams: Beams
@@ -60,11 +60,11 @@ class Estimate:
 
     @property
     def columns(self) -> int:
-        """Columns of an image that no return needs to share: the largest multiple of 64 within the steps."""
+        """Columns of an image: the largest multiple of 64 that is not above the steps."""
         return max(int((self.steps + 0.5) // COLUMNS), 1) * COLUMNS
 
     def sensor(self, name: str) -> Sensor:
-        """The sensor itself, its limits rounded outwards."""
+        """The sensor, its range limits rounded outwards."""
         near, far = self.ranges
         return Sensor(
             name,
@@ -77,7 +77,7 @@ class Estimate:
         )
 
     def nearest_known(self) -> tuple[str, float] | None:
-        """The sensor of the table with as many beams that these are nearest to, and the median distance in degrees."""
+        """The built-in sensor of as many beams with the nearest elevations, and their median distance in degrees."""
         found = [
             (float(np.median(np.abs(np.asarray(sensor.elevations) - self.beams.elevations))), name)
             for name, sensor in SENSORS.items()
@@ -87,7 +87,7 @@ class Estimate:
 
 
 def estimate_sensor(scans: Sequence[Points]) -> Estimate:
-    """What scans of one sensor, in its own frame, tell of it.
+    """Estimate a sensor from its scans, which are in its own frame.
 
     Raises:
         InputError: too few returns, or no beams in them.
@@ -96,8 +96,8 @@ def estimate_sensor(scans: Sequence[Points]) -> Estimate:
     r = np.concatenate([one[one > 0] for one in ranges])
     if len(r) < FEWEST_RETURNS:
         raise InputError(
-            f"{len(scans)} scan{'s' * (len(scans) != 1)} with {len(r)} returns in all tell too little of a sensor: "
-            f"it takes {FEWEST_RETURNS}, and better several whole scans."
+            f"{len(scans)} scan{'s' * (len(scans) != 1)} with {len(r)} returns in all are too few for an estimate: "
+            f"give several whole scans, with at least {FEWEST_RETURNS} returns."
         )
     beams = find_beams(scans)
     height, ground_share = _height(np.concatenate([scan.xyz for scan in scans]))
@@ -115,7 +115,7 @@ def estimate_sensor(scans: Sequence[Points]) -> Estimate:
 
 
 def _falling(elevations: list[float]) -> tuple[float, ...]:
-    """Elevations as a `Sensor` has them; two that rounding made equal are set a thousandth of a degree apart."""
+    """Elevations as a `Sensor` has them; equal ones after rounding are set a thousandth of a degree apart."""
     for row, (above, below) in enumerate(pairwise(elevations)):
         if below >= above:
             elevations[row + 1] = round(above - 1e-3, 3)
@@ -125,8 +125,8 @@ def _falling(elevations: list[float]) -> tuple[float, ...]:
 def steps_of_a_turn(scans: Sequence[Points], beams: Beams) -> float:
     """Azimuth steps of a full turn, 360 / step.
 
-    A first guess is the 30th percentile of the gaps between neighbouring returns of one beam, since most rays next to
-    a return have one too; then the sum of all gaps of up to three steps over the number of steps in them.
+    The first estimate is the 30th percentile of the gaps between neighbouring returns of one beam, since most rays next
+    to a return have one too; then the sum of all gaps of up to three steps divided by the number of steps in them.
     """
     gaps = []
     for scan, row in zip(scans, beams.of_point, strict=True):
@@ -146,7 +146,7 @@ def steps_of_a_turn(scans: Sequence[Points], beams: Beams) -> float:
 
 
 def _height(xyz: np.ndarray) -> tuple[float | None, float]:
-    """Height above the ground, a plane fitted to the most frequent height between 3 and 20 m away; its share."""
+    """Height above the ground, a plane fitted to the most frequent height 3 to 20 m away, and its share of returns."""
     distance = np.hypot(xyz[:, 0], xyz[:, 1])
     around = xyz[(distance > 3) & (distance < 20) & (xyz[:, 2] < -0.2)].astype(np.float64)
     if len(around) < FEWEST_RETURNS / 4:
@@ -164,7 +164,7 @@ def _height(xyz: np.ndarray) -> tuple[float | None, float]:
 
 
 def _reflectance(scans: Sequence[Points]) -> Reflectance | None:
-    """None where a file has no reflectance, or the same one everywhere."""
+    """None where a file has no reflectance, or only one value."""
     if any(scan.reflectance is None for scan in scans):
         return None
     values = np.unique(np.concatenate([scan.reflectance for scan in scans]))

@@ -1,8 +1,8 @@
-"""Between metres and model space: what a network sees of a range image."""
+"""Range images between metres and model space, [-1, 1]."""
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -12,8 +12,20 @@ from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Sensor
 from r2flow.registry import Registry, check_options
 
-# Decoding may miss a range limit by float32's rounding; within this share of it, it is the limit.
+# Decoding may miss a range limit by float32's rounding: within this relative distance a range is the limit.
 LIMIT_TOLERANCE = 1e-5
+
+
+class RangeFormat(Protocol):
+    """A range r in metres as `channels` values y of [0, 1]."""
+
+    channels: int
+
+    def forward(self, r: Tensor) -> Tensor:
+        """(..., 1, H, W) -> (..., channels, H, W)."""
+
+    def inverse(self, y: Tensor) -> Tensor:
+        """(..., channels, H, W) -> (..., 1, H, W)."""
 
 
 class LogScale:
@@ -77,14 +89,16 @@ class Cartesian:
         return torch.linalg.vector_norm(2 * y - 1, dim=-3, keepdim=True) * self.max_range
 
 
-FORMATS = Registry("range format", logscale=LogScale, inverse=Inverse, metric=Metric, cartesian=Cartesian)
+FORMATS: Registry[Callable[[Sensor], RangeFormat]] = Registry(
+    "range format", logscale=LogScale, inverse=Inverse, metric=Metric, cartesian=Cartesian
+)
 
 
 class Encoding:
     """Range images in metres to model space, [-1, 1] in every channel, and back.
 
     Args:
-        sensor: Its range limits decide what counts as a return.
+        sensor: Its range limits say which ranges are returns.
         format: `logscale` (the paper's), `inverse`, `metric`, or `cartesian` (three channels).
         reflectance: Whether reflectance is a channel; without it a model is of range alone.
     """
@@ -92,7 +106,7 @@ class Encoding:
     def __init__(self, sensor: Sensor, format: str = "logscale", reflectance: bool = True) -> None:
         self.sensor = sensor
         self.reflectance = reflectance
-        self.format: Any = FORMATS[format](sensor)
+        self.format = FORMATS[format](sensor)
 
     @property
     def channels(self) -> int:
@@ -123,7 +137,7 @@ class Encoding:
     def decode(self, x: Tensor) -> Tensor:
         """(..., channels, H, W) -> range in metres and reflectance, (..., 2 or 1, H, W).
 
-        Whatever lies outside [min_range, max_range] is a dropped ray, 0 in both; reflectance is held in [0, 1].
+        A range outside [min_range, max_range] is a dropped ray, 0 in both; reflectance is clamped to [0, 1].
         """
         y = (x + 1) / 2
         ranges = self.format.channels

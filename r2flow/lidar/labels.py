@@ -1,4 +1,4 @@
-"""Semantic labels beside scans: SemanticKITTI's `.label` files, and what their ids mean."""
+"""Semantic labels beside scans: SemanticKITTI's `.label` files and the names of their ids."""
 
 from pathlib import Path
 
@@ -7,10 +7,10 @@ import numpy as np
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import Points, read_points
 
-# SemanticKITTI's ids: name, and the colour that a picture gives it (ground grey to violet, vehicles blue, people red,
-# plants green, buildings and fences brown; moving things take the colour of standing ones).
+# SemanticKITTI's ids: name, and the colour in pictures (ground grey to violet, vehicles blue, people red, plants green,
+# buildings and fences brown; moving things have the colour of standing ones).
 CLASSES = {
-    0: ("unlabelled", "#6b727c"), 1: ("outlier", "#454b54"),
+    0: ("unlabeled", "#6b727c"), 1: ("outlier", "#454b54"),
     10: ("car", "#3f8efc"), 11: ("bicycle", "#7fd1ff"), 13: ("bus", "#2a5bd7"), 15: ("motorcycle", "#58b4e8"),
     16: ("on-rails", "#1b3a9e"), 18: ("truck", "#5c7cfa"), 20: ("other vehicle", "#8aa2ff"),
     30: ("person", "#ff4d4d"), 31: ("bicyclist", "#ff8787"), 32: ("motorcyclist", "#d6336c"),
@@ -24,7 +24,10 @@ CLASSES = {
     258: ("moving truck", "#5c7cfa"), 259: ("moving other vehicle", "#8aa2ff"),
 }  # fmt: skip
 
-# No data set in use counts its classes beyond this (SemanticKITTI: 259); other bytes read as labels do.
+# Ids by SemanticKITTI's own spelling of the names.
+LABELS = {name.replace(" ", "-"): label for label, (name, _) in CLASSES.items()}
+
+# No data set in use has larger ids (SemanticKITTI: 259); other bytes read as labels do.
 LARGEST_CLASS = 1023
 
 LAYOUT = "labels of little-endian uint32, one a point"
@@ -35,7 +38,7 @@ def labels_beside(scan: str | Path) -> Path | None:
     scan = Path(scan)
     name = f"{scan.stem}.label"
     for path in (scan.parent.parent / "labels" / name, scan.with_name(name)):
-        if path.exists() or path.is_symlink():  # a dangling link was meant to be one: reading it says so
+        if path.exists() or path.is_symlink():  # a link to nothing is found too: reading it says so
             return path
     return None
 

@@ -82,7 +82,7 @@ def project_indices(
         hit, chosen = _nearest_by_sorting(pixel, r)
         hit, chosen = hit[within[chosen]], chosen[within[chosen]]
     else:
-        # What is left out shares one pixel behind the last: cheaper than taking the others out of every array.
+        # Points that are left out share one pixel behind the last: faster than removing them from every array.
         pixel[(row < 0) | (row >= rows) | ~within] = rows * columns
         hit, chosen = _nearest(pixel, r, rows * columns)
     return hit, chosen, r[chosen]
@@ -139,7 +139,7 @@ def _nearest(pixel: np.ndarray, r: np.ndarray, pixels: int) -> tuple[np.ndarray,
 
 
 def _nearest_by_sorting(pixel: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same as the reference does it: written from far to near, so that the nearest is written last.
+    """The same in the way of the reference: written from far to near, so that the nearest is written last.
 
     KITTI stores coordinates in millimetres, and under 1 % of the pixels hold two points of one range; which of them
     the reference keeps is decided by numpy's unstable sort, so the same sort is used here.

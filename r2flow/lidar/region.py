@@ -1,4 +1,4 @@
-"""A part of the image: an azimuth sector, a block of rows. Pure geometry."""
+"""A part of the image: an azimuth sector, a block of rows."""
 
 import math
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ Rectangle = tuple[int, int]
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle of an image whose columns are a ring.
+    """A rectangle of an image whose columns are a full turn.
 
     Attributes:
         shape: Rows and columns (H, W) of the whole image.
         top: First row.
         height: Number of rows.
         left: First column.
-        width: Number of columns from there on, round the ring where they pass its end.
+        width: Number of columns, which go on at column 0 behind the last.
     """
 
     shape: tuple[int, int]
@@ -57,16 +57,16 @@ class Region:
         return image
 
     def rounded(self, unit: tuple[int, int]) -> "Region":
-        """The smallest region around this one that whole units of so many rows and columns make up.
+        """The smallest region around this one that is made of whole units of rows and columns.
 
         Raises:
-            InputError: the image itself is not made up of them.
+            InputError: the image is not made of them.
         """
         if any(size % step for size, step in zip(self.shape, unit, strict=True)):
-            raise InputError(f"an image of {self.shape} is not made up of units of {unit} pixels.")
+            raise InputError(f"an image of {self.shape} is not made of units of {unit} pixels.")
         top, height = _outward(self.top, self.height, unit[0])
         left, width = _outward(self.left, self.width, unit[1])
-        if width >= self.shape[1]:  # a unit at the seam may be met from both sides
+        if width >= self.shape[1]:  # both ends may lie in one unit
             left, width = 0, self.shape[1]
         return Region(self.shape, top, height, left, width)
 
@@ -87,14 +87,14 @@ def region(
 
     Args:
         shape: Rows and columns (H, W) of the image; column 0 begins at +180 degrees and azimuth falls with w.
-        sector: Azimuths in degrees, from the first counter-clockwise to the second: (-45, 45) is the quarter
-            ahead, (135, -135) the one behind. A pixel that the sector touches belongs to it. Two azimuths that are
-            whole turns apart, as (180, -180), are the full turn. None for all.
+        sector: Azimuths in degrees, counter-clockwise from the first to the second: (-45, 45) is the quarter ahead,
+            (135, -135) the one behind. Pixels that are partly inside belong to it. Two azimuths a whole turn apart,
+            such as (180, -180), are the full turn. None for all.
         rows: First and last row, both included, 0 at the top. None for all.
 
     Raises:
-        InputError: an empty sector, or one narrower than a column; angles that are no angles, or rows that the
-            image has not.
+        InputError: an empty sector, or one narrower than a column; angles beyond 360 degrees, or rows that the image
+            does not have.
     """
     height, width = shape
     first_row, last_row = rows or (0, height - 1)
@@ -115,7 +115,7 @@ def _columns(width: int, sector: tuple[float, float]) -> tuple[int, int]:
         raise InputError(
             f"the sector {begin:.15g},{end:.15g} is narrower than a column, {360 / width:g} degrees; make it wider."
         )
-    fuzz = 1e-9 * width  # an edge that falls between two pixels belongs to one of them, whatever the rounding
+    fuzz = 1e-9 * width  # rounding must not add a pixel where the sector ends between two
     left = math.floor((180 - (begin + turn)) / 360 * width + fuzz)
     right = math.ceil((180 - begin) / 360 * width - fuzz)
     return (0, width) if right - left >= width else (left % width, right - left)

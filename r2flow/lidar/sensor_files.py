@@ -1,8 +1,10 @@
-"""A sensor of one's own as a dozen lines of YAML: read by the verbs, composed by train.py as conf/sensor/NAME.yaml."""
+"""Your own sensor as a dozen lines of YAML, for the verbs and, in conf/sensor/, for training."""
 
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
+
+import yaml
 
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
@@ -14,16 +16,14 @@ LARGEST_FILE = 1 << 20  # bytes; a sensor is a dozen lines
 
 
 def read_sensor(path: str | Path, rows: int | None = None, columns: int | None = None) -> Sensor:
-    """A sensor out of a YAML file with the options of `build_sensor`.
+    """A sensor from a YAML file with the options of `build_sensor`.
 
     Args:
-        rows, columns: Another image size than the file's.
+        rows, columns: Image size, if not the file's.
 
     Raises:
-        InputError: the file is missing or no such YAML, or describes no possible sensor.
+        InputError: the file is missing, cannot be read as YAML or describes no possible sensor.
     """
-    import yaml
-
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} is not a file. A sensor is a name ({', '.join(SENSORS)}) or a YAML file of your own.")
@@ -37,7 +37,7 @@ def read_sensor(path: str | Path, rows: int | None = None, columns: int | None =
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
     if not isinstance(options, dict) or not all(isinstance(key, str) for key in options):
         raise InputError(f"{path} is no sensor: it needs lines as `name: mine` and `elevations: [15.0, 13.0, ...]`.")
-    options.pop("rays", None)  # the rays of a model, which training chooses
+    options.pop("rays", None)  # the ray convention of a model, an option of training
     sized = {"rows": rows, "columns": columns}
     options.update({key: value for key, value in sized.items() if value is not None})
     check_options(str(path), build_sensor, options)
@@ -48,10 +48,10 @@ def read_sensor(path: str | Path, rows: int | None = None, columns: int | None =
 
 
 def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
-    """Write such a file, whole or not at all.
+    """Write a sensor as a YAML file.
 
     Args:
-        comment: What stands above it: where the numbers come from.
+        comment: First lines of the file: where the numbers come from.
     """
     lines = [
         *(f"# {line}" for line in comment.splitlines()),

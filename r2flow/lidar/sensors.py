@@ -1,10 +1,10 @@
-"""Spinning LiDARs, each described by its rays: what every other room needs to know of a sensor."""
+"""Sensors: spinning LiDARs, each described by its rays."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import chain, pairwise
+from types import UnionType
 from typing import Any, Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ from r2flow.registry import Registry
 
 Convention = Literal["centre", "reference"]
 
-MOST_PIXELS = 1 << 24  # of an image, 128 x 131,072: beyond any sensor, and what memory still holds
+MOST_PIXELS = 1 << 24  # of an image, 128 x 131,072: more than any sensor has, and it still fits into memory
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Sensor:
         min_range: Nearest valid range in metres.
         max_range: Farthest valid range in metres.
         height: Usual height of the sensor above the ground in metres.
-        firing: Row of laser 0, 1, ... in the order in which the sensor's packets list them, where that is neither
-            from the top row down nor from the bottom up; None where it is. Scan unfolding needs it.
+        firing: Row of laser 0, 1, ... in the order of the sensor's packets, which scan unfolding needs; None where that
+            is from the top row down or from the bottom up.
 
     Raises:
         InputError: fewer than two rows or one column, more than `MOST_PIXELS`, elevations that do not fall or leave
@@ -49,7 +49,7 @@ class Sensor:
 
     def __post_init__(self) -> None:
         e = self.elevations
-        # Written so that NaN, which compares false, is refused too.
+        # Comparisons with NaN are false: it is refused too.
         if len(e) < 2 or not all(a > b for a, b in pairwise(e)) or not (e[0] < 90 and e[-1] > -90):
             raise InputError(
                 f"sensor {self.name!r}: elevations must be two or more, fall from the top row down and lie "
@@ -81,9 +81,9 @@ class Sensor:
 
     @property
     def row_edges(self) -> np.ndarray:
-        """Elevations in degrees that part the rows, (H + 1,), falling; float64.
+        """Elevations in degrees between the rows, (H + 1,), falling; float64.
 
-        Half-way between neighbouring beams; the outer two lie as far outside as the inner ones inside.
+        Half-way between neighbouring beams; the outer two are as far from the first and last beam as the inner ones.
         """
         e = np.asarray(self.elevations, dtype=np.float64)
         inner = (e[:-1] + e[1:]) / 2
@@ -92,9 +92,8 @@ class Sensor:
     def rays(self, convention: Convention = "centre") -> Tensor:
         """Elevation e and azimuth a of every pixel in radians, (2, H, W), float32.
 
-        `centre` looks through the middle of each bin: e is the beam's elevation and
-        a = pi - 2 pi (w + 1/2) / W. `reference` is the bin's upper left corner, a = pi - 2 pi w / W, as the
-        published R2Flow weights were trained with: biased by half a bin, kept for them alone.
+        `centre` is the middle of each bin: e is the beam's elevation and a = pi - 2 pi (w + 1/2) / W. `reference` is
+        the bin's upper left corner, a = pi - 2 pi w / W, half a bin off, as the published R2Flow weights need.
         """
         if convention == "centre":
             elevation, shift = np.asarray(self.elevations, dtype=np.float64), 0.5
@@ -109,8 +108,8 @@ class Sensor:
     def resized(self, rows: int | None = None, columns: int | None = None) -> "Sensor":
         """The same field of view in another number of rows and columns.
 
-        New row edges are interpolated between the old ones, so that each new row looks at an equal
-        share of the old rows, whether these are evenly spaced or not.
+        New row edges are interpolated between the old ones: each new row covers an equal share of the old rows, whether
+        these are evenly spaced or not.
         """
         sensor = self if columns is None else replace(self, columns=columns)
         old = len(self.elevations)
@@ -123,11 +122,11 @@ class Sensor:
             )
         edges = np.interp(np.linspace(0, old, rows + 1), np.arange(old + 1), self.row_edges)
         middle = (edges[:-1] + edges[1:]) / 2
-        return replace(sensor, elevations=tuple(middle.tolist()), firing=None)  # rows are no lasers any more
+        return replace(sensor, elevations=tuple(middle.tolist()), firing=None)  # a row is no longer one laser
 
 
 def evenly_spaced(top: float, bottom: float, rows: int) -> tuple[float, ...]:
-    """Elevations in degrees of `rows` bins that share the field of view [bottom, top]: their middles."""
+    """Middles in degrees of `rows` equal bins of the field of view [bottom, top]."""
     step = (top - bottom) / rows
     return tuple(top - step * (row + 0.5) for row in range(rows))
 
@@ -137,13 +136,13 @@ def _beams(top: float, step: float, count: int) -> Sequence[float]:
 
 
 def _halves_in_turn(rows: int) -> tuple[int, ...]:
-    """Firing order of Velodyne's 16 and 32 evenly spaced lasers: a lower and an upper half in turn, both upwards."""
+    """Firing order of Velodyne's 16 and 32 evenly spaced lasers: lower and upper half alternate, both upwards."""
     middle = rows // 2
     return tuple(chain.from_iterable(zip(range(rows - 1, middle - 1, -1), range(middle - 1, -1, -1), strict=True)))
 
 
 def _by_laser(elevations: Sequence[float]) -> dict[str, Any]:
-    """Elevations and firing order of a sensor whose manual lists its lasers in another order than from the top."""
+    """Elevations and firing order of a sensor from the elevations of its lasers in the manual's order."""
     order = sorted(range(len(elevations)), key=lambda laser: -elevations[laser])
     return {"elevations": tuple(elevations[laser] for laser in order), "firing": tuple(np.argsort(order).tolist())}
 
@@ -167,7 +166,7 @@ VLP32C_LASERS = (
 )  # fmt: skip
 
 # Pandar64, from the correction table of the maker's open driver (Hesai): elevation of channel 1, 2, ..., 64, the top
-# one first. A unit's own calibration file departs from it by some hundredths of a degree.
+# one first. A unit's own calibration file differs from it by some hundredths of a degree.
 PANDAR64_CHANNELS = (
     14.882, 11.032, 8.059, 5.057, 3.04, 2.028, 1.86, 1.688, 1.522, 1.351, 1.184,
     1.013, 0.846, 0.675, 0.508, 0.337, 0.169, 0.0, -0.169, -0.337, -0.508, -0.675,
@@ -180,8 +179,8 @@ PANDAR64_CHANNELS = (
 # Ranges and beams by the manuals: HDL-32E 63-9113, VLP-16 63-9243, VLP-32C 63-9325 (Velodyne); OS1 datasheet of its
 # first generation, whose 64 beams span +-16.6 degrees and whose 128 span +-22.5 (Ouster); Pandar64 640-en (Hesai).
 # An OS1's beams are calibrated unit by unit, up to half a degree off these: `r2flow sensor` finds a unit's own.
-# hdl64e is the image of the paper: 64 equal bins between +3 and -25 degrees, 1.45 to 80 m. Its lasers have no firing
-# order here: packets list them by laser number, whose elevation every unit's calibration tells anew.
+# hdl64e is the image of the paper: 64 equal bins between +3 and -25 degrees, 1.45 to 80 m. It has no firing order:
+# packets list its lasers by number, and every unit has its own calibration of their elevations.
 SENSORS: Registry[Sensor] = Registry(
     "sensor",
     hdl64e=Sensor("hdl64e", evenly_spaced(3.0, -25.0, 64)),
@@ -202,21 +201,6 @@ SENSORS: Registry[Sensor] = Registry(
 )
 
 
-@lru_cache(maxsize=32)
-def _build(
-    name: str,
-    elevations: tuple[float, ...] | None,
-    firing: tuple[int, ...] | None,
-    rows: int | None,
-    columns: int | None,
-    changes: tuple[tuple[str, float], ...],
-) -> Sensor:
-    sensor = SENSORS[name] if elevations is None else Sensor(name, elevations)
-    if firing is not None:
-        sensor = replace(sensor, firing=firing)
-    return replace(sensor.resized(rows, columns), **dict(changes))  # type: ignore[arg-type]
-
-
 def build_sensor(
     name: str,
     rows: int | None = None,
@@ -227,21 +211,25 @@ def build_sensor(
     elevations: Sequence[float] | None = None,
     firing: Sequence[int] | None = None,
 ) -> Sensor:
-    """A sensor at an image size, its limits overridden where given: one of the table, or one's own by `elevations`.
+    """A built-in sensor by its name, or your own by `elevations`, with the size and limits that are given.
 
     Raises:
-        InputError: no such name in the table; a name of the table with elevations of its own; or no possible sensor.
+        InputError: an unknown name; elevations with the name of a built-in sensor; or no possible sensor.
     """
     if elevations is not None and name in SENSORS:
-        raise InputError(f"the name {name!r} is {name}'s of the table; give a sensor of your own another one.")
-    beams = None if elevations is None else tuple(map(float, _numbers(name, "elevations", elevations, int | float)))
-    lasers = None if firing is None else _numbers(name, "firing", firing, int)
-    changes = {"min_range": min_range, "max_range": max_range, "height": height}
-    given = tuple((key, float(value)) for key, value in changes.items() if value is not None)
-    return _build(name, beams, lasers, rows, columns, given)
+        raise InputError(f"{name!r} is the name of a built-in sensor; give your own sensor another one.")
+    if elevations is None:
+        sensor = SENSORS[name]
+    else:
+        sensor = Sensor(name, tuple(map(float, _numbers(name, "elevations", elevations, int | float))))
+    if firing is not None:
+        sensor = replace(sensor, firing=_numbers(name, "firing", firing, int))
+    limits = {"min_range": min_range, "max_range": max_range, "height": height}
+    given = {key: float(value) for key, value in limits.items() if value is not None}
+    return replace(sensor.resized(rows, columns), **given)  # type: ignore[arg-type]
 
 
-def _numbers(name: str, key: str, values: Sequence[Any], kind: Any) -> tuple[Any, ...]:
+def _numbers(name: str, key: str, values: Sequence[Any], kind: type | UnionType) -> tuple[Any, ...]:
     for value in values:
         if not isinstance(value, kind) or isinstance(value, bool):
             what = "whole numbers" if kind is int else "numbers"

@@ -1,24 +1,23 @@
-"""Scan unfolding: the row of a point by the laser that fired it, told by the file rather than by its elevation."""
+"""Scan unfolding: the row of a point by the laser that fired it, from the file instead of its elevation."""
 
 import numpy as np
 
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Convention, Sensor
 
-SAMPLE = 256  # firings that are looked at to tell their order
-SURE = 0.9  # share of neighbouring lasers whose elevations must fall in the order taken
+SAMPLE = 256  # firings from which their order is found
+SURE = 0.9  # share of neighbouring lasers whose elevations must fall in that order
 
 
 def unfolded_rows(xyz: np.ndarray, sensor: Sensor, convention: Convention, ring: np.ndarray | None) -> np.ndarray:
     """Row of every point, (N,) int64; outside [0, H) where the image does not hold it.
 
-    A file tells its lasers in one of three ways, tried in this order: a ring number at each point; whole firings,
-    H points after H points with rays without return kept, each firing in one order of the lasers; or ring after ring
-    (`rings_from_order`), aligned at the bottom because rings that see only sky are missing at the top. `reference`
-    knows the last alone.
+    The lasers are found in one of three ways, tried in this order: by ring numbers; by whole firings of H points each,
+    rays without return included, all in one order of the lasers; or ring after ring (`rings_from_order`), aligned at
+    the bottom because rings that see only sky are missing at the top. `reference` uses the last way only.
 
     Raises:
-        InputError: the file tells them in none of these ways, or of other lasers than the sensor's.
+        InputError: the file allows none of these ways, or its lasers are not the sensor's.
     """
     rows = sensor.shape[0]
     if ring is not None:
@@ -85,7 +84,7 @@ def rows_from_field(xyz: np.ndarray, ring: np.ndarray, sensor: Sensor) -> np.nda
 
 
 def rows_from_firings(xyz: np.ndarray, sensor: Sensor) -> np.ndarray | None:
-    """The rows of a file of whole firings, (N,) int64; None where it is no such file."""
+    """The rows where the file holds whole firings, (N,) int64; else None."""
     rows = sensor.shape[0]
     firings = len(xyz) // rows
     if len(xyz) % rows or firings < 8:
@@ -107,10 +106,10 @@ def elevations_of(xyz: np.ndarray) -> np.ndarray:
 
 
 def scatter_of(elevation: np.ndarray) -> tuple[np.ndarray, float]:
-    """Median elevation of each column of firings (firings, lasers), NaN without return; and the columns' scatter.
+    """Median elevation of each column of (firings, lasers), NaN without return; and the scatter of the columns.
 
-    The scatter is the median distance from a column's median over that from the median of all: near 0 where each
-    column is one laser, near 1 where it is not. Medians, since returns from the vehicle itself lie anywhere.
+    The scatter is the median distance from a column's median divided by that from the median of all: near 0 where each
+    column is one laser, else near 1. Medians are not affected by returns from the vehicle itself.
     """
     middle = median_of_seen(elevation)
     about = np.abs(elevation - middle)
@@ -120,7 +119,7 @@ def scatter_of(elevation: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def median_of_seen(values: np.ndarray) -> np.ndarray:
-    """Median (the upper of two) of each column of what is not NaN, (W,); NaN where nothing is."""
+    """Median (the upper of two) of what is not NaN in each column, (W,); NaN where all is."""
     ordered = np.sort(values, axis=0)  # NaN last
     seen = np.isfinite(values).sum(axis=0)
     middle = ordered[np.minimum(seen // 2, len(values) - 1), np.arange(values.shape[1])]
@@ -128,12 +127,12 @@ def median_of_seen(values: np.ndarray) -> np.ndarray:
 
 
 def best_order(elevation: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, float]:
-    """Row of each laser by the order that suits their elevations best, and how well it does.
+    """Row of each laser in the order that fits their elevations best, and how well it fits.
 
-    From the top row down, from the bottom up, or the sensor's own firing order.
+    The orders are from the top row down, from the bottom up and the sensor's own firing order.
 
     Args:
-        elevation: Of laser 0, 1, ..., (H,); NaN for one without returns.
+        elevation: Elevation of laser 0, 1, ..., (H,); NaN for one without returns.
 
     Returns:
         (H,) int64, and the share of neighbouring lasers, in that order, whose elevations fall.

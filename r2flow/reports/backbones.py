@@ -1,4 +1,4 @@
-"""What each velocity estimator costs: the paper's table II, measured here."""
+"""What each backbone costs: the paper's table II, measured here."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -8,11 +8,10 @@ from typing import Any
 import torch
 from torch import nn
 
-from r2flow.backbones import CONFIGURATIONS, build_backbone
+from r2flow.backbones import build_backbone, configurations
 from r2flow.backbones.cost import RULE, count_macs, count_parameters
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Sensor
-from r2flow.registry import did_you_mean
 from r2flow.reports.tables import print_table
 
 
@@ -22,20 +21,23 @@ def backbone_costs(
     """Parameters, GMAC and median latency of every configuration for one image, one at a time.
 
     Args:
-        repeats: Timed evaluations after one warm-up; 0 leaves the latency out (None).
+        names: Of `configurations`; None for all.
+        repeats: Timed evaluations after one warm-up; with 0 the latency is None.
 
     Returns:
-        `{name, parameters, gmac, latency_ms}`; a configuration that cannot take the size has None for the last
-        two and says why under `error`.
+        `{name, parameters, gmac, latency_ms}`; a configuration that cannot take the size has None for all three and
+        says why under `error`.
+
+    Raises:
+        InputError: an unknown name.
     """
-    for name in names or CONFIGURATIONS:
-        if name not in CONFIGURATIONS:
-            known = ", ".join(CONFIGURATIONS)
-            raise InputError(f"no configuration named {name!r}; known: {known}.{did_you_mean(name, CONFIGURATIONS)}")
+    known = configurations()
+    for name in names or known:
+        options = known[name]
         row: dict[str, Any] = {"name": name, "parameters": None, "gmac": None, "latency_ms": None}
         try:
             with torch.device("cpu" if repeats > 0 else "meta"):  # counting needs no weights
-                model = build_backbone(CONFIGURATIONS[name], sensor.rays(), channels).eval()
+                model = build_backbone(options, sensor.rays(), channels).eval()
         except InputError as error:
             yield {**row, "error": str(error)}
             continue

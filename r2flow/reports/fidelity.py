@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from r2flow.data.sources import read_scan
-from r2flow.lidar.projection import Projection
-from r2flow.lidar.scan_files import read_points
+from r2flow.data.opening import open_scans
+from r2flow.data.sources import Reading
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.fidelity import PANEL, PER_PIXEL, controls, distances, nearest, panel
 from r2flow.progress import track
 from r2flow.reports.tables import table
-from r2flow.reports.views import range_image, scans_of
 
 Statistics = Mapping[str, np.ndarray]
 Distances = Mapping[str, Mapping[str, float]]
@@ -25,30 +23,20 @@ CLEARLY = 0.5  # a member tells controls from real scans where the floor is belo
 WITHIN = 2.0  # floors: as near to the real scans as can be asked of scans of other places
 
 
-def load_images(
-    path: str | Path,
-    sensor: Sensor,
-    projection: Projection = "spherical",
-    reflectance_scale: float = 1.0,
-    most: int = 1000,
-) -> np.ndarray:
-    """The scans of a file or folder, of any known format or range images, (N, 2 or 1, H, W).
+def load_scans(spec: str | Path, reading: Reading, most: int = 1000) -> tuple[np.ndarray, list[str]]:
+    """At most `most` of the scans that a name stands for (`open_scans`), evenly spread, and the drive of each.
 
-    Reflectance is there only where every scan has it. Of a folder with more than `most` scans, that many are taken,
-    evenly spread over it.
+    Returns:
+        Images, (N, 2 or 1, H, W), and names, (N,).
 
     Raises:
-        InputError: no scan there, or a range image of another size than the sensor's.
+        InputError: no scan there, or one that is not of the reading's sensor.
     """
-    images = []
-    paths = scans_of(Path(path), most)
-    for file in track(paths, f"reading {path}", "scans", least=32):
-        image = range_image(file, sensor)
-        if image is None:
-            reflectance = read_points(file).reflectance is not None
-            image = read_scan(file, sensor, projection, "centre", reflectance, reflectance_scale)
-        images.append(image)
-    return joined(images)
+    scans = open_scans(spec, reading).spread(most)
+    numbers = track(range(len(scans)), f"reading {spec}", "scans", least=32)
+    images = np.stack([scans.source[number] for number in numbers])
+    drives = {number: f"{spec}: {drive}" for drive, held in scans.drives.items() for number in held}
+    return images, [drives.get(number, str(spec)) for number in range(len(scans))]
 
 
 def joined(sets: Sequence[np.ndarray]) -> np.ndarray:
@@ -56,11 +44,6 @@ def joined(sets: Sequence[np.ndarray]) -> np.ndarray:
     sets = [s[None] if s.ndim == 3 else s for s in sets]
     channels = min(s.shape[1] for s in sets)
     return np.concatenate([s[:, :channels] for s in sets])
-
-
-def drives_of(path: str | Path, most: int = 1000) -> list[str]:
-    """The drive of each scan that `load_images` reads: the folder that the file lies in."""
-    return [str(file.parent) for file in scans_of(Path(path), most)]
 
 
 def compare_sets(

@@ -1,4 +1,4 @@
-"""Street scenes, ray-cast: LiDAR scans with labels, as many as one wants, from a seed.
+"""Simulated LiDAR scans with labels: procedural street scenes, ray-cast.
 
 `simulate(SENSORS["hdl64e"], seed=1, index=0).image` is range in metres and reflectance, (2, 64, 1024).
 """
@@ -9,14 +9,14 @@ import numpy as np
 
 from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator
-from r2flow.simulator.beams import beams_of
+from r2flow.simulator.lasers import lasers_of
 from r2flow.simulator.raycast import cast
 from r2flow.simulator.rays import Rays
 from r2flow.simulator.returns import report
 from r2flow.simulator.scene import Scene
 from r2flow.simulator.streets import draw_scene
 
-REVISION = 2  # of what is drawn: another number for every change after which a seed gives other scans
+REVISION = 2  # of the scans: rises with every change after which a seed gives other scans
 
 
 @dataclass(frozen=True)
@@ -33,17 +33,17 @@ class SimulatedScan:
 
 
 def simulate(sensor: Sensor, seed: int, index: int) -> SimulatedScan:
-    """Scan `index` of the run `seed`: a function of these alone, whoever computes it.
+    """Scan `index` of `seed`: a function of these and the sensor alone, bit for bit the same on every machine.
 
-    The scene is drawn before anything of the sensor, so that all sensors see the same places.
+    The scene is drawn before anything that depends on the sensor, so that all sensors see the same scenes.
     """
     rng = generator(seed, "simulator", index)
     return observe(draw_scene(rng), sensor, rng)
 
 
 def observe(scene: Scene, sensor: Sensor, rng: np.random.Generator) -> SimulatedScan:
-    """The scan that a sensor, at its usual height above the scene's origin, makes of a scene."""
-    rays = Rays(beams_of(sensor), sensor.columns, sensor.height)
+    """A sensor's scan of a scene, from its usual height above the scene's origin."""
+    rays = Rays(lasers_of(sensor), sensor.columns, sensor.height)
     image, labels = report(sensor, rays, cast(scene, rays, rng), scene.rig, rng)
     return SimulatedScan(image, labels)
 

@@ -1,8 +1,8 @@
-"""What the sensor's own car hides: roof, posts and instruments, as silhouettes around the head.
+"""What the sensor's own car hides: roof, posts and instruments, as silhouettes around the sensor.
 
-They stand about a metre away, nearer than any valid return, so all they leave in a scan is their shadow.
-Each is round or square in azimuth and inclination, its place and size read off two KITTI drives. Seen by
-a laser that sits beside the axis it is displaced: neighbouring rings are cut off alternately left and right.
+They are about a metre away, nearer than any valid return, so that a scan shows only their shadow. Each is an ellipse or
+a rounded rectangle in azimuth and inclination, read off two KITTI drives. A laser beside the axis sees it displaced:
+neighbouring rings are cut off alternately left and right.
 """
 
 from functools import lru_cache
@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from r2flow.simulator.beams import Beams
+from r2flow.simulator.lasers import Lasers
 
 
 class Silhouette(NamedTuple):
-    """|across|^p + |up|^p < 1, an ellipse or squarer, degrees; `grounded` ones reach straight down.
+    """|across|^p + |up|^p < 1 in degrees; a `grounded` one reaches straight down.
 
-    `away` is the distance in metres from the axis to what hides: it says how far neighbouring rings shift.
+    `away` is the distance in metres from the axis to the object, which sets how far neighbouring rings shift.
     """
 
     azimuth: float
@@ -42,7 +42,7 @@ _ROOF = (
     Silhouette(161, -17.0, 4.2, 4.0, 1.0, power=4),
     Silhouette(-158.5, -17.0, 4.2, 4.0, 1.0, power=4),
 )
-# A roof with its posts; with an instrument beside the head, and without.
+# A roof with its posts; with an instrument beside the sensor, and without.
 RIGS = ((*_ROOF, Silhouette(-69, -20.0, 11.0, 4.4, 0.55)), _ROOF)
 
 
@@ -61,6 +61,6 @@ def _hidden(elevation: tuple[float, ...], side: tuple[float, ...], columns: int,
     return hidden
 
 
-def hidden(beams: Beams, columns: int, rig: int) -> np.ndarray:
+def hidden(lasers: Lasers, columns: int, rig: int) -> np.ndarray:
     """Rays that end on the own car, (B, W), bool, for one of `RIGS`."""
-    return _hidden(tuple(beams.elevation.tolist()), tuple(beams.side.tolist()), columns, rig)
+    return _hidden(tuple(lasers.elevation.tolist()), tuple(lasers.side.tolist()), columns, rig)

@@ -1,8 +1,7 @@
-"""Functions whose bits do not depend on the machine: made of sums, products, roots and tables.
+"""Functions with the same bits on every machine, made of sums, products, roots and tables.
 
-IEEE arithmetic is the same everywhere; sine, exponential and their like are not: numpy takes one of several
-implementations by what the processor can do, and they differ in the last bit. One bit is enough to send a ray past
-an edge, and a scan that differs in a pixel is another scan.
+IEEE arithmetic is the same everywhere. Sine, exponential and others are not: numpy chooses an implementation by the
+processor, and these differ in the last bit. One bit can move a ray past an edge, and scans must be equal throughout.
 """
 
 import math
@@ -11,7 +10,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-_ENTRIES = 8192  # of a table of quantiles: its outermost ones are a Gaussian's at 3.8 deviations
+_ENTRIES = 8192  # of a table of quantiles; the outermost of a Gaussian lie at 3.8 standard deviations
 _TAYLOR = tuple((-1) ** k * (2 * math.pi) ** (2 * k + 1) / math.factorial(2 * k + 1) for k in range(7))
 
 
@@ -51,16 +50,16 @@ def exponential_quantiles() -> np.ndarray:
 
 
 def normals(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Gaussian draws, float32: quantiles by lot, of 8192."""
+    """Gaussian draws, float32: random entries of a table of 8192 quantiles."""
     return _normal_quantiles()[rng.integers(0, _ENTRIES, shape, dtype=np.uint16)]
 
 
 def exponentials(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Draws from Exp(1), float32: quantiles by lot, of 8192."""
+    """Draws from Exp(1), float32: random entries of a table of 8192 quantiles."""
     return exponential_quantiles()[rng.integers(0, _ENTRIES, shape, dtype=np.uint16)]
 
 
 def logistic(x: np.ndarray) -> np.ndarray:
-    """A smooth step from 0 to 1 with the slope of 1 / (1 + e^-x) at 0: t^2 (3 - 2 t), t = 1/2 + x / 6, clipped."""
+    """A smooth step from 0 to 1 with the slope of 1 / (1 + e^-x) at 0: t^2 (3 - 2 t), t = clip(1/2 + x / 6, 0, 1)."""
     t = np.clip(x * (1 / 6) + 0.5, 0, 1)
     return t * t * (3 - 2 * t)

@@ -1,4 +1,4 @@
-"""What a point on a solid finds: wall or window, bodywork or pane or number plate, and how deep it lies."""
+"""Details of surfaces: windows, panes and number plates, and how deep parts of a wall stand back."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from r2flow.simulator.shapes import Normal
 
 ALBEDO = column("albedo")
 STOREY = 2.9  # metres
-BAY = 1.6  # metres: walls stand back or out by pieces of this width
+BAY = 1.6  # metres: width of the parts of a wall that stand back or out
 
 
 def divided(surface: Surface, k: np.ndarray, normal: Normal, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -27,19 +27,19 @@ def divided(surface: Surface, k: np.ndarray, normal: Normal, z: np.ndarray) -> t
 
 
 def _hash(a: np.ndarray, b: np.ndarray, key: np.ndarray) -> np.ndarray:
-    """A share in [0, 1) of three whole numbers, the same on all machines."""
+    """A number in [0, 1) from three whole numbers."""
     mixed = a * 73856093 ^ b * 83492791 ^ key * 19349663
     mixed = mixed * 2654435761 & 0xFFFFFFFF
     return ((mixed >> 16) & 1023).astype(np.float32) / 1024
 
 
 def _key(albedo: np.ndarray) -> np.ndarray:
-    """A whole number that differs from house to house: albedo is the one thing drawn anew for each."""
+    """A whole number that differs from house to house, from the albedo, which is drawn anew for each."""
     return (albedo * 9973).astype(np.int64)
 
 
 def _window(rise: np.ndarray, along: np.ndarray, albedo: np.ndarray) -> np.ndarray:
-    """Rows of windows: a row each storey, at a spacing that differs from house to house; some left out."""
+    """Where windows are: a row in each storey, with a spacing that differs from house to house; some are left out."""
     key = _key(albedo)
     spacing = 2.0 + 2.4 * (key % 101) / 101
     column, storey = np.floor(along / spacing), np.floor(rise / STOREY)

@@ -1,4 +1,4 @@
-"""A folder of simulated scans: one file a scan, made again by the same command where one is missing."""
+"""A folder of simulated scans; the same command makes those that are missing."""
 
 import json
 import multiprocessing
@@ -23,16 +23,16 @@ from r2flow.simulator import REVISION, simulate
 
 FORMATS = ("bin", "pcd", "ply", "npy")  # npy is the range image itself
 MANIFEST = "simulated.json"
-_BATCH = 4  # scans that a worker makes between two reports of progress
+_BATCH = 4  # scans of a worker process between two updates of the progress
 
 
 @dataclass(frozen=True)
 class SimulatedFolder:
-    """What is in a folder of simulated scans.
+    """The scans of one folder.
 
     Attributes:
         path: The folder.
-        sensor: Whose scans they are.
+        sensor: Their sensor.
         seed: Scan i is a function of the sensor, the seed and i alone.
         formats: Endings of the files of a scan, some of `FORMATS`.
         labels: Whether each has a SemanticKITTI .label file, uint32 for each point in the order of the points.
@@ -49,7 +49,9 @@ class SimulatedFolder:
             if name not in FORMATS:
                 raise InputError(f"no format named {name!r} for simulated scans; known: {', '.join(FORMATS)}.")
         if self.labels and self.formats == ("npy",):
-            raise InputError("labels are one for each point, and a range image has none; add another format, as bin.")
+            raise InputError(
+                "labels are those of points, and .npy is a range image without any; add another format, such as bin."
+            )
 
     def files(self, index: int) -> list[Path]:
         """The files of a scan."""
@@ -57,14 +59,14 @@ class SimulatedFolder:
         return [self.path / f"{index:06d}.{ending}" for ending in endings]
 
     def missing(self, indices: Sequence[int]) -> list[int]:
-        """Scans of which a file is not there. Files are written whole or not at all."""
+        """Scans of which a file is missing. Files are written whole or not at all."""
         return [index for index in indices if not all(file.is_file() for file in self.files(index))]
 
     def begin(self) -> None:
-        """Make the folder, and leave a note of whose scans it holds.
+        """Make the folder and note seed, sensor and revision of the simulator in it.
 
         Raises:
-            InputError: it holds scans of another seed, sensor or revision of the simulator, or of nobody knows what.
+            InputError: it holds scans of another seed, sensor or revision, or scans and no note.
         """
         ours, note = _note(self.sensor, self.seed), self.path / MANIFEST
         if note.exists():
@@ -73,7 +75,7 @@ class SimulatedFolder:
             if wrong:
                 key = wrong[0]
                 raise InputError(
-                    f"{self.path} holds simulated scans with {key} {_short(found.get(key))}, asked for is "
+                    f"{self.path} holds simulated scans with {key} {_short(found.get(key))}, not "
                     f"{_short(ours[key])}; choose another folder, or the same {key}."
                 )
             return
@@ -84,7 +86,7 @@ class SimulatedFolder:
             json.dump(ours, file, indent=2)
 
     def write(self, index: int) -> None:
-        """Make one scan and write what of it is missing."""
+        """Make one scan and write its files."""
         scan = simulate(self.sensor, self.seed, index)
         rays = self.sensor.rays()
         xyz, reflectance = image_to_points(scan.image, rays)
@@ -93,7 +95,7 @@ class SimulatedFolder:
                 with atomic_write(path) as file:
                     np.save(file, scan.image)
             elif path.suffix == ".label":
-                # The points' own way through the image: ids are exact in float32.
+                # In the order of the points; ids are exact in float32.
                 _, labels = image_to_points(np.stack([scan.image[0], scan.labels.astype(np.float32)]), rays)
                 with atomic_write(path) as file:
                     file.write(labels.astype("<u4").tobytes())
@@ -104,13 +106,17 @@ class SimulatedFolder:
 def write_folder(
     folder: SimulatedFolder, indices: Sequence[int], workers: int, advance: Callable[[], None] = lambda: None
 ) -> int:
-    """Make the scans that are missing, in so many processes; returns how many those were.
+    """Make the scans that are missing.
 
     Args:
-        advance: Called once for each scan when it is there, and for those that were there.
+        workers: Number of processes.
+        advance: Called once for each scan, also for those that are there already.
+
+    Returns:
+        How many were made.
 
     Raises:
-        InputError: what `SimulatedFolder.begin` raises, or a process was killed.
+        InputError: as `SimulatedFolder.begin` does, or a process was killed.
     """
     folder.begin()
     missing = folder.missing(indices)
@@ -140,7 +146,7 @@ def write_folder(
 
 
 def _begin_worker() -> None:
-    """Leave Ctrl-C to the parent, and end when it ends: a pool's processes would wait for a killed one for ever."""
+    """Leave Ctrl-C to the parent process and end when it ends; after a kill the workers would wait for ever."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -174,7 +180,7 @@ def _read_note(path: Path) -> dict[str, Any]:
 
 
 def _short(value: Any) -> str:
-    """A seed or a revision as it is; of a sensor what people tell it by."""
+    """A seed or a revision as it is, a sensor by its name, size and range."""
     if isinstance(value, dict):
         rows = len(value.get("elevations", ()))
         return f"{value.get('name')} {rows}x{value.get('columns')}, {value.get('min_range')}-{value.get('max_range')} m"

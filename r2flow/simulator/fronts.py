@@ -1,4 +1,4 @@
-"""What stands behind the pavement: houses and the gardens before them, gaps, greens, car parks."""
+"""What is behind the pavement: houses, their gardens, gaps, greens, car parks."""
 
 import math
 
@@ -12,7 +12,7 @@ CLEAR = 3.2  # metres around the sensor that stay empty
 
 
 def free(b: SceneBuilder, x: float, y: float, room: float) -> bool:
-    """Whether a place is off all carriageways and pavements by so much room, within reach and not too near."""
+    """Whether a place is `room` metres off all carriageways and pavements, within reach and not too near."""
     if not CLEAR < math.hypot(x, y) < END + 5:
         return False
     pavement = max(street.pavement for street in b.ground.streets)
@@ -20,7 +20,7 @@ def free(b: SceneBuilder, x: float, y: float, room: float) -> bool:
 
 
 def line_front(b: SceneBuilder, kind: Kind, street: Street, side: int) -> None:
-    """Plots along one side of a street, one after the other."""
+    """Plots one after another along one side of a street."""
     draws = b.draws
     setback = draws.uniform(*kind.setback)
     edge = street.half_width + street.pavement
@@ -41,7 +41,7 @@ def line_front(b: SceneBuilder, kind: Kind, street: Street, side: int) -> None:
 
 
 def _house(b: SceneBuilder, kind: Kind, street: Street, side: int, u: float, length: float, edge: float) -> bool:
-    """A house, where there is room; and something behind it that closes the view."""
+    """A house, where there is room, and something behind it that limits the view."""
     draws = b.draws
     width, middle = draws.uniform(8, 12), u + length / 2
     x, y, heading = street.place(middle, side * (edge + width / 2))
@@ -58,7 +58,7 @@ def _house(b: SceneBuilder, kind: Kind, street: Street, side: int, u: float, len
 def _garden(
     b: SceneBuilder, kind: Kind, street: Street, side: int, u: float, length: float, edge: float, back: float
 ) -> None:
-    """What stands between pavement and house."""
+    """Hedge or fence and plants between pavement and house."""
     draws, middle = b.draws, u + length / 2
     x, y, heading = street.place(middle, side * (edge + 0.6))
     ends = [street.place(v, side * (edge + 0.6)) for v in (u, u + length)]
@@ -117,7 +117,7 @@ def _car_park(b: SceneBuilder, street: Street, side: int, middle: float, edge: f
 
 
 def beyond(b: SceneBuilder, street: Street, side: int, middle: float, lateral: float) -> None:
-    """The second row: a house or tall trees that close the view."""
+    """The second row: a house or tall trees that limit the view."""
     draws = b.draws
     x, y, heading = street.place(middle + draws.uniform(-8, 8), side * (lateral + draws.uniform(12, 28)))
     if draws.chance(0.5) and free(b, x, y, 9):
@@ -127,7 +127,7 @@ def beyond(b: SceneBuilder, street: Street, side: int, middle: float, lateral: f
 
 
 def close_street(b: SceneBuilder, street: Street) -> None:
-    """Something across the far ends, as streets bend out of sight: houses, or trees."""
+    """Houses or trees across the far ends, as where streets bend out of sight."""
     draws = b.draws
     for end, limit in ((-1, street.start), (1, street.stop)):
         if abs(limit) < END:
@@ -141,7 +141,7 @@ def close_street(b: SceneBuilder, street: Street) -> None:
 
 
 def close_view(b: SceneBuilder) -> None:
-    """Woods and houses all around, far away, wherever there is no street."""
+    """Woods and houses far away on all sides, wherever there is no street."""
     draws = b.draws
     for _ in range(22):
         turn, away = draws.uniform(-math.pi, math.pi), draws.uniform(38, 78)

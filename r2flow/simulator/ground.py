@@ -1,4 +1,4 @@
-"""The ground: a rolling surface with streets, kerbs, pavements and verges, and where rays meet it."""
+"""The ground: an uneven surface with streets, kerbs, pavements and verges, and where rays meet it."""
 
 import math
 from dataclasses import dataclass, field
@@ -6,21 +6,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from r2flow.lidar.labels import LABELS
 from r2flow.simulator.exact import sine
-from r2flow.simulator.labels import LABELS
 from r2flow.simulator.materials import INDEX, column
 from r2flow.simulator.rays import Rays
 
 SAMPLES = 72  # points of a column's profile; between them the ground is straight
-NEAREST = 1.5  # metres: the profile's first point; nearer the ground is level with it
+NEAREST = 1.5  # metres: the profile's first point; nearer, the ground is level
 REACH = 90.0  # metres: the profile's last point
 
-# A number or an array of them: places are asked one by one while a scene is drawn, by the thousand when seen.
+# A number while a scene is drawn, an array when it is scanned.
 Where = Any
 
 
 def _sin(x: Where) -> Where:
-    return math.sin(x) if isinstance(x, float) else sine(x)  # numpy takes ten times as long for a number
+    return math.sin(x) if isinstance(x, float) else sine(x)  # for a number numpy takes ten times as long
 
 
 def _larger(x: Where, y: Where) -> Where:
@@ -51,7 +51,7 @@ class Street(NamedTuple):
     lines: tuple[float, ...] = ()
 
     def locate(self, x: Where, y: Where) -> tuple[Where, Where]:
-        """(u, lateral): metres along the street, and to the left of its middle line."""
+        """(u, lateral): metres along the street and to the left of its middle line."""
         c, s = math.cos(self.heading), math.sin(self.heading)
         u = x * c + y * s
         return u, y * c - x * s - self.offset - (self.curvature / 2) * u * u
@@ -94,18 +94,18 @@ class GroundHit(NamedTuple):
 class Ground:
     """z = -drop + lean . p + sum_k A_k [sin(k . p + phi) - sin phi - cos phi (k . p)] + banks, and a kerb.
 
-    The bracket has neither height nor slope at the origin: the car stands level there, but for its springs.
+    The bracket has neither height nor slope at the origin, where the car stands.
 
     Attributes:
         waves: Rows (A in metres, k_x and k_y in radians / metre, phi).
-        lean: Slope of the ground along x and y as the car, on its springs, sees it.
-        drop: How much lower than usual the ground lies below the sensor, in metres.
-        streets: The streets; without any the ground is a plain surface of the verge.
+        lean: Slope of the ground along x and y relative to the car, which leans on its springs.
+        drop: How much lower than usual the ground is below the sensor, in metres.
+        streets: The streets; without any, all of the ground is verge.
         kerb: Height of the kerb in metres.
-        tufts: Height in metres of what grows or lies about beyond the pavements.
+        tufts: Height in metres of grass and rubble beyond the pavements.
         banks: Rise beside the first street, left and right, in metres.
         corner: Radius of the kerb where streets meet, in metres.
-        verge: (label, material) of what lies beyond the pavements.
+        verge: (label, material) of the ground beyond the pavements.
         patches: Rectangles of other surfaces beside the street.
         albedo: Reflectance reading of each material here, (M,).
     """
@@ -123,7 +123,7 @@ class Ground:
     albedo: np.ndarray = field(default_factory=lambda: column("albedo"))
 
     def height(self, x: Where, y: Where) -> Where:
-        """Height of the carriageway's level in metres; kerbs not included."""
+        """Height of the ground in metres, without kerbs."""
         z = self.lean[0] * x + self.lean[1] * y - self.drop
         for amplitude, kx, ky, phase in self.waves:
             t = kx * x + ky * y
@@ -166,7 +166,7 @@ class Ground:
             label[on], material[on] = LABELS["road"], INDEX["asphalt"]
             painted = self._painted(x, y)
             label[painted], material[painted] = LABELS["lane-marking"], INDEX["marking"]
-        # repairs, wear and damp: a reading that wanders over a few metres
+        # Repairs, wear and damp: reflectance that varies over a few metres.
         stains = 0.03 * sine(1.1 * x + 0.4 * y) * sine(0.5 * x - 1.3 * y) + 0.02 * sine(0.23 * x + 0.31 * y)
         return label, material, self.albedo[material] + stains
 
@@ -187,17 +187,17 @@ class Ground:
     def meet(self, rays: Rays) -> GroundHit:
         """First meeting of every ray with the ground, kerbs included.
 
-        The profile of each column is a chain of straight pieces; a ray first meets the piece up to whose
-        end the running maximum of (ground - laser) / s, the slope to the ground's skyline, exceeds its own.
+        The profile of each column is a chain of straight pieces. A ray meets the first piece at whose end the running
+        maximum of (ground - laser) / s, the slope to the ground's skyline, exceeds its own slope.
         """
         s = np.geomspace(NEAREST, REACH, SAMPLES).astype(np.float32)[:, None]
         z = self.height(s * rays.cos, s * rays.sin)
         distance = np.full(rays.shape, np.inf, np.float32)
         steepness = np.zeros(rays.shape, np.float32)
-        for block in np.unique(rays.beams.block):
-            rows = np.flatnonzero(rays.beams.block == block)
+        for block in np.unique(rays.lasers.block):
+            rows = np.flatnonzero(rays.lasers.block == block)
             distance[rows], steepness[rows] = _meet_profile(s, z, rays.slope[rows], rays.height[rows])
-        approach = steepness - rays.slope[:, None]  # how fast ray and ground close in, per metre of s
+        approach = steepness - rays.slope[:, None]  # how much ray and ground approach each other per metre of s
         cosine = approach / np.sqrt((1 + rays.slope[:, None] ** 2) * (1 + steepness**2))
         if self.kerb > 0 and self.streets:
             distance, cosine = self._step_up(rays, distance, approach, cosine)
@@ -208,10 +208,10 @@ class Ground:
     def _step_up(
         self, rays: Rays, low: np.ndarray, approach: np.ndarray, cosine: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Raise all that is not carriageway by the kerb.
+        """Raise everything but the carriageway by the kerb.
 
-        A ray comes first to the raised level, kerb / approach before the low one. Beside the street it stops
-        there; over the street it goes on, to the low level or to the kerb's face where that is nearer.
+        A ray reaches the raised level first, kerb / approach before the low one. Beside the street it stops there; over
+        the street it goes on to the low level, or to the kerb's face where that is nearer.
         """
         met = np.isfinite(low)
         s_low, c, s = (np.broadcast_to(q, met.shape)[met] for q in (low, rays.cos, rays.sin))
@@ -225,7 +225,7 @@ class Ground:
         return out, facing
 
     def _overgrown(self, rays: Rays, distance: np.ndarray, approach: np.ndarray) -> np.ndarray:
-        """Bring the verge nearer where grass and rubble stand up from it: h / approach before the ground."""
+        """Move the meeting with the verge forward by h / approach, where grass and rubble of height h stand on it."""
         met = np.isfinite(distance)
         s, c, sine_ = (np.broadcast_to(q, met.shape)[met] for q in (distance, rays.cos, rays.sin))
         x, y = s * c, s * sine_
@@ -241,9 +241,9 @@ class Ground:
 
 
 def _meet_profile(s: np.ndarray, z: np.ndarray, slope: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays of falling slopes T from about one height meet profiles z(s).
+    """Where rays of falling slopes T and nearly equal heights meet profiles z(s).
 
-    Which piece a ray meets is decided from the mean height, the place on the piece from its own.
+    The piece that a ray meets is found with the mean height of the lasers, the place on it with the ray's own.
 
     Args:
         s: Distances of the profile's points, (S, 1).
@@ -252,7 +252,7 @@ def _meet_profile(s: np.ndarray, z: np.ndarray, slope: np.ndarray, height: np.nd
         height: Height of each laser, (R,).
 
     Returns:
-        Distance of the first meeting, inf for none, and the ground's own slope there; (R, W) each.
+        Distance of the first meeting, inf for none, and the slope of the ground there; (R, W) each.
     """
     (samples, columns), rays = z.shape, len(slope)
     skyline = np.maximum.accumulate((z - height.mean()) / s, axis=0)

@@ -1,14 +1,14 @@
-"""Kinds of places, and the ground plan of one: where its streets run and how its ground rolls."""
+"""Kinds of places, and the ground plan of one: its streets and its uneven ground."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from r2flow.simulator.draws import Draws
+from r2flow.lidar.labels import LABELS
 from r2flow.simulator.ground import Ground, Patch, Street
-from r2flow.simulator.labels import LABELS
 from r2flow.simulator.materials import INDEX, MATERIALS
+from r2flow.simulator.scalar_draws import ScalarDraws
 
 Span = tuple[float, float]
 
@@ -30,7 +30,7 @@ class Kind(NamedTuple):
         fences: Share of fronts with a fence or wall.
         people: Mean number of people.
         traffic: Mean number of moving vehicles.
-        paved: Probability that what lies between pavement and houses is paved too, and no lawn.
+        paved: Probability that the ground between pavement and houses is paved, not lawn.
         crossing: Probability of a crossing street.
     """
 
@@ -72,8 +72,8 @@ KINDS = {
 }  # fmt: skip
 
 
-def draw_ground(draws: Draws, name: str) -> Ground:
-    """The ground plan of a place of a kind: its streets, slopes and surfaces."""
+def draw_ground(draws: ScalarDraws, name: str) -> Ground:
+    """The ground of a place of this kind: its streets, slopes and surfaces."""
     kind = KINDS[name]
     streets = _streets(draws, kind, straight=name == "highway")
     main = streets[0]
@@ -96,20 +96,20 @@ def draw_ground(draws: Draws, name: str) -> Ground:
     )
 
 
-TUFTS = 0.02, 0.18  # metres: how high verges are overgrown, from and to
+TUFTS = 0.02, 0.18  # metres: height of grass and rubble on verges, from and to
 
-# Length and height in metres of the waves that the ground is made of.
+# Length and height in metres of the waves that add up to the ground.
 _WAVES = ((7.0, 0.012), (16.0, 0.03), (38.0, 0.07), (80.0, 0.20), (170.0, 0.40))
 
 
-def _wave(draws: Draws, length: float, height: float) -> tuple[float, float, float, float]:
+def _wave(draws: ScalarDraws, length: float, height: float) -> tuple[float, float, float, float]:
     number, turn = 2 * math.pi / (length * draws.uniform(0.8, 1.25)), draws.uniform(0, 2 * math.pi)
     amplitude = height * draws.uniform(0.3, 1.5)
     return amplitude, number * math.cos(turn), number * math.sin(turn), draws.uniform(0, 2 * math.pi)
 
 
-def _streets(draws: Draws, kind: Kind, straight: bool) -> tuple[Street, ...]:
-    """The street that the car drives on, its right half, and perhaps one that crosses or joins it."""
+def _streets(draws: ScalarDraws, kind: Kind, straight: bool) -> tuple[Street, ...]:
+    """The street that the car drives on, in its right half, and perhaps one that crosses or joins it."""
     half = draws.uniform(*kind.half_width)
     lines = (0.0, half - 0.3, 0.3 - half) if straight or draws.chance(0.35) else ()
     main = Street(
@@ -125,7 +125,7 @@ def _streets(draws: Draws, kind: Kind, straight: bool) -> tuple[Street, ...]:
     return _crossed(draws, main)
 
 
-def _crossed(draws: Draws, main: Street) -> tuple[Street, ...]:
+def _crossed(draws: ScalarDraws, main: Street) -> tuple[Street, ...]:
     """A crossroads, a side street to one side, or the end of the main street at another."""
     at, half = draws.uniform(-40, 50), draws.uniform(2.6, 4.5)
     across = Street(
@@ -143,7 +143,7 @@ def _crossed(draws: Draws, main: Street) -> tuple[Street, ...]:
     return main, across
 
 
-def _drives(draws: Draws, main: Street) -> tuple[Patch, ...]:
+def _drives(draws: ScalarDraws, main: Street) -> tuple[Patch, ...]:
     """Paved drives and yards beside the street."""
     out = []
     for _ in range(draws.whole(1, 5)):

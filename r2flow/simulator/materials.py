@@ -1,6 +1,6 @@
-"""What surfaces are made of, and how each answers a laser.
+"""Materials and how they reflect.
 
-Reflectance is what a calibrated HDL-64E reports: of a rough wall about the same from 3 to 20 metres.
+Reflectance is what a calibrated HDL-64E reports: of a rough wall it is about the same from 3 to 20 metres.
 """
 
 from typing import NamedTuple
@@ -13,12 +13,12 @@ class Material(NamedTuple):
 
     Attributes:
         name: Name.
-        albedo: Usual reading of reflectance at perpendicular incidence.
+        albedo: Usual reflectance at perpendicular incidence.
         spread: Standard deviation of albedo from one object to the next.
-        texture: Standard deviation of the reading from one pixel to the next.
+        texture: Standard deviation of reflectance from one pixel to the next.
         gloss: g in the incidence falloff (1 + g) c / (c + g), c the cosine; a mirror has a large g.
-        swallow: Share of pulses that never come back, whatever the angle and distance.
-        depth: Mean depth in metres to which pulses enter (leaves, grass) before they are sent back.
+        swallow: Share of pulses that do not return, whatever the angle and distance.
+        depth: Mean depth in metres at which pulses return from inside (leaves, grass).
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The things of a street, built of solids: houses, plants, fences, poles, people."""
+"""Objects of a street, built of solids: houses, plants, fences, poles, people."""
 
 import math
 
@@ -34,7 +34,7 @@ def house(b: SceneBuilder, x: float, y: float, yaw: float, length: float, width:
 def _clumps(
     b: SceneBuilder, x: float, y: float, z: float, radius: float, height: float, size: float, count: int, path: float
 ) -> None:
-    """Leafy clumps of about one size, spread evenly over an ellipsoid around (x, y, z)."""
+    """Leafy clumps of similar size, spread evenly over an ellipsoid around (x, y, z)."""
     draws, albedo = b.draws, b.albedo("leaves")
     for _ in range(count):
         turn, up = draws.uniform(0, 2 * math.pi), draws.uniform(-1, 1)
@@ -54,7 +54,7 @@ def tree(b: SceneBuilder, x: float, y: float, size: float = 1.0) -> None:
     trunk, clear = draws.uniform(0.07, 0.20) * size, draws.uniform(1.5, 2.8)
     crown, tall = draws.uniform(1.2, 2.6) * size, draws.uniform(1.2, 2.2) * size
     b.add(Cylinders(x, y, trunk, ground - 0.5, ground + clear + tall), "trunk", "bark")
-    near = math.hypot(x, y) < 40  # far away there are fewer rays to tell clumps apart
+    near = math.hypot(x, y) < 40  # farther away, rays are too sparse to tell clumps apart
     count, clump = (draws.whole(13, 18), 0.30) if near else (draws.whole(6, 8), 0.42)
     _clumps(b, x, y, ground + clear + tall, crown, tall, clump * crown, count, draws.uniform(0.4, 1.3))
 
@@ -77,7 +77,7 @@ def thicket(b: SceneBuilder, x: float, y: float) -> None:
 
 
 def woods(b: SceneBuilder, x: float, y: float) -> None:
-    """Trees so far away that only their mass is seen."""
+    """Distant trees as a few large blobs."""
     draws, ground, albedo = b.draws, b.level(x, y), b.albedo("leaves")
     for _ in range(draws.whole(2, 4)):
         radius, height = draws.uniform(2.0, 4.5), draws.uniform(2.5, 5.0)
@@ -89,7 +89,7 @@ def woods(b: SceneBuilder, x: float, y: float) -> None:
 
 
 def hedge(b: SceneBuilder, x: float, y: float, yaw: float, length: float, height: float) -> None:
-    """A cut hedge, in pieces of uneven height and depth."""
+    """A trimmed hedge, in pieces of different height and depth."""
     albedo = b.albedo("leaves")
     c, s = math.cos(yaw), math.sin(yaw)
     pieces = max(1, round(length / 2.5))
@@ -121,10 +121,10 @@ def fence(b: SceneBuilder, x: float, y: float, yaw: float, length: float) -> Non
         b.add(Cylinders(x + u * c, y + u * s, 0.05, ground, ground + height + 0.08), "fence", "wood")
 
 
-def pole(b: SceneBuilder, x: float, y: float, tall: float | None = None) -> None:
+def pole(b: SceneBuilder, x: float, y: float) -> None:
     """A lamp post."""
     ground = b.level(x, y)
-    tall = b.draws.uniform(4.5, 8.5) if tall is None else tall
+    tall = b.draws.uniform(4.5, 8.5)
     b.add(Cylinders(x, y, b.draws.uniform(0.05, 0.11), ground - 0.3, ground + tall), "pole", "metal")
     if b.draws.chance(0.3):  # a foot with a door in it
         b.add(Cylinders(x, y, b.draws.uniform(0.10, 0.15), ground - 0.3, ground + 0.9), "pole", "metal")
@@ -155,7 +155,7 @@ def bin_(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
 
 
 def cabinet(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
-    """A switch box of the electricity works."""
+    """A utility cabinet."""
     ground = b.level(x, y)
     box = Boxes(x, y, yaw, b.draws.uniform(0.6, 1.4), 0.4, ground, ground + b.draws.uniform(0.9, 1.4))
     b.add(box, "other-structure", "concrete")

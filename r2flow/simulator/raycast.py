@@ -1,7 +1,7 @@
-"""Rays into a scene: the nearest meeting of each, and what it is with.
+"""Ray casting: what each ray of a scan meets first in a scene.
 
-Solids give fragments (pixel, distance); the nearest fragment of a pixel wins; only winners are looked at
-more closely (normal, material, window or wall).
+Solids give fragments (pixel, distance), of which a pixel keeps the nearest; normal, material and details such as
+windows are computed for these alone.
 """
 
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from r2flow.simulator.rays import Rays
 from r2flow.simulator.scene import Scene, Surface
 from r2flow.simulator.shapes import Fragments, Normal, Shape
 
-DRIFT = 0.03  # of half a bin, how far the firings move from one bin to the next
+DRIFT = 0.03  # of half a bin: shift of the firings from one bin to the next
 
 
 class Hits(NamedTuple):
@@ -25,7 +25,7 @@ class Hits(NamedTuple):
         cosine: Cosine of the angle between ray and surface normal.
         label: SemanticKITTI id.
         material: Index into `materials.MATERIALS`.
-        albedo: Reflectance reading at perpendicular incidence.
+        albedo: Reflectance at perpendicular incidence.
     """
 
     distance: np.ndarray
@@ -44,7 +44,7 @@ def cast(scene: Scene, rays: Rays, rng: np.random.Generator) -> Hits:
         np.minimum.at(distance, fragments.pixel, fragments.distance)
     hits = _on_ground(scene, rays, ground.distance.ravel(), ground.cosine.ravel())
     hits = hits._replace(distance=distance)
-    # All winners are found before any is written: writing moves some a little behind their surface.
+    # All nearest fragments are found before any is written, since writing moves some a little behind their surface.
     won = [fragments.distance == distance[fragments.pixel] for fragments in met]
     for fragments, first, (shape, surface) in zip(met, won, _tables(scene), strict=True):
         _on_solid(hits, rays, shape, surface, Fragments(*(q[first] for q in fragments)))
@@ -56,13 +56,13 @@ def _tables(scene: Scene) -> list[tuple[Shape, Surface]]:
 
 
 def _visible(shape: Shape, surface: Surface, rays: Rays, limit: np.ndarray, rng: np.random.Generator) -> Fragments:
-    """Fragments before the ground, less those that pass between slats."""
+    """Fragments nearer than the ground, without those that pass between slats."""
     fragments = shape.fragments(rays, rng)
     keep = fragments.distance < limit[fragments.pixel]
     fragments = Fragments(*(q[keep] for q in fragments))
     if (surface.closed == 1).all():
         return fragments
-    # Slats stand upright: a column passes or stops at all heights.
+    # Slats are upright: a column passes or stops at all heights.
     lots = rng.random(1 << 16, dtype=np.float32)
     slat = (fragments.pixel % rays.columns + fragments.solid.astype(np.int64) * 7919) & 0xFFFF
     keep = lots[slat] < surface.closed[fragments.solid]
@@ -82,7 +82,7 @@ def _on_ground(scene: Scene, rays: Rays, distance: np.ndarray, cosine: np.ndarra
 
 
 def _on_solid(hits: Hits, rays: Rays, shape: Shape, surface: Surface, fragments: Fragments) -> None:
-    """Write the winning fragments of one table into the hits."""
+    """Write the nearest fragments of one table into the hits."""
     pixel, s, k = fragments
     b, w = pixel // rays.columns, pixel % rays.columns
     x, y, z = s * rays.cos[w], s * rays.sin[w], rays.height[b] + s * rays.slope[b]
@@ -92,18 +92,18 @@ def _on_solid(hits: Hits, rays: Rays, shape: Shape, surface: Surface, fragments:
     hits.label[pixel] = surface.label[k]
     hits.material[pixel], hits.albedo[pixel] = divided(surface, k, normal, z)
     moved = s + relief(surface, k, normal, z) / np.maximum(np.abs(ahead), 0.5)
-    if not rays.beams.straight:
+    if not rays.lasers.straight:
         moved = moved * _between_columns(rays, b, w, normal, ahead)
     hits.distance[pixel] = moved
 
 
 def _between_columns(rays: Rays, b: np.ndarray, w: np.ndarray, normal: Normal, ahead: np.ndarray) -> np.ndarray:
-    """Factors of s for lasers that fire beside the middle of the bin, (N,).
+    """Factors of s for lasers that do not fire at the middle of the bin, (N,).
 
-    A plane n . p = const met along d at s is met along d' at s (n . d) / (n . d'). Each laser fires about
-    twice in a bin, and the nearer return is the one that the bin keeps.
+    A plane n . p = const met along d at s is met along d' at s (n . d) / (n . d'). Each laser fires about twice in a
+    bin, which keeps the nearer return.
     """
-    firing = (rays.beams.phase[b] + DRIFT * w) % 1
+    firing = (rays.lasers.phase[b] + DRIFT * w) % 1
     across = normal.y * rays.cos[w] - normal.x * rays.sin[w]  # d(n . d) / da
     turn = np.where(across * ahead > 0, firing, firing - 1) * (np.pi / rays.columns)
     other = ahead * cosine(turn) + across * sine(turn)

@@ -1,8 +1,8 @@
-"""A scan's rays as a product of lasers and azimuths, and the window of them that a thing can cover.
+"""A scan's rays as a product of lasers and azimuths, and the windows of rays that an object can cover.
 
-Every ray is p(s) = (s cos a, s sin a, z + s T): s the horizontal distance, a the azimuth of the column,
-T = tan E the slope of the laser and z its height. That product makes ray casting cheap: whatever
-stands upright is met at an s that depends on the column alone.
+Every ray is p(s) = (s cos a, s sin a, z + s T): s the horizontal distance, a the azimuth of the column, T = tan E the
+slope of the laser and z its height. This makes ray casting cheap: an upright surface is met at an s that depends on the
+column alone.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from r2flow.simulator.beams import Beams
+from r2flow.simulator.lasers import Lasers
 
 
 @dataclass(frozen=True)
@@ -18,19 +18,19 @@ class Rays:
     """B lasers by W azimuths.
 
     Attributes:
-        beams: The lasers, (B,).
+        lasers: The lasers, (B,).
         columns: Number W of azimuths; column w looks along a = pi - 2 pi (w + 1/2) / W.
         ground: Height of the sensor's origin above the scene's z = 0, in metres.
     """
 
-    beams: Beams
+    lasers: Lasers
     columns: int
     ground: float = 0.0
 
     @property
     def shape(self) -> tuple[int, int]:
         """(B, W)."""
-        return len(self.beams.elevation), self.columns
+        return len(self.lasers.elevation), self.columns
 
     @cached_property
     def azimuth(self) -> np.ndarray:
@@ -50,12 +50,12 @@ class Rays:
     @cached_property
     def slope(self) -> np.ndarray:
         """T = tan E, falling, (B,), float32."""
-        return np.tan(self.beams.elevation).astype(np.float32)
+        return np.tan(self.lasers.elevation).astype(np.float32)
 
     @cached_property
     def height(self) -> np.ndarray:
         """Height z of each laser above the scene's z = 0 in metres, (B,), float32."""
-        return (self.beams.height + self.ground).astype(np.float32)
+        return (self.lasers.height + self.ground).astype(np.float32)
 
 
 def expand(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -68,7 +68,7 @@ def expand(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def column_windows(azimuth: np.ndarray, half: np.ndarray, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (thing k, column w) whose azimuth lies within half_k of azimuth_k, (N,) each, int32."""
+    """Pairs (object k, column w) whose azimuth lies within half_k of azimuth_k, (N,) each, int32."""
     to_column = columns / (2 * np.pi)
     half = np.minimum(half, np.pi * (1 - 1e-9))
     first = np.ceil((np.pi - azimuth - half) * to_column - 0.5).astype(np.int64)

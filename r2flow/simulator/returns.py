@@ -1,36 +1,36 @@
-"""From what rays meet to what a sensor reports: noise, lost pulses, reflectance, the image."""
+"""What a sensor reports of its hits: noise, lost pulses, reflectance, the image."""
 
 from functools import cache
 
 import numpy as np
 
 from r2flow.lidar.sensors import Sensor
-from r2flow.simulator.beams import rows_of
 from r2flow.simulator.ego import hidden
 from r2flow.simulator.exact import exponentials, logistic, normals
+from r2flow.simulator.lasers import rows_of
 from r2flow.simulator.materials import column
 from r2flow.simulator.raycast import Hits
 from r2flow.simulator.rays import Rays
 
-NOISE = 0.006  # metres, scale of the noise of range near by
-NOISE_FAR = 0.0002  # and what each metre of range adds to it
+NOISE = 0.006  # metres, scale of the range noise at range 0
+NOISE_FAR = 0.0002  # added to it for each metre of range
 RANGE_STEP = 0.002  # metres: the unit in which ranges are reported
 LEVELS = 100  # reflectance is reported in steps of 1 / LEVELS
-# How wide each of the levels from 0.02 to 0.69 is, in steps: the head counts in other steps, some of which share
-# a hundredth while others have none. Shares of the levels in three drives, over what their neighbours have.
+# Width of each of the levels from 0.02 to 0.69, in steps: the sensor counts in steps of its own, some of which share a
+# hundredth while others have none. Frequencies of the levels in three drives, divided by those of their neighbours.
 _WIDTHS = (
     0.16, 0.58, 1.98, 1.58, 0.30, 0.71, 0.80, 1.14, 0.98, 1.25, 1.00, 0.48, 0.76, 0.59, 1.29, 0.93, 1.66, 1.02, 1.12,
     0.91, 0.58, 0.99, 0.64, 1.03, 0.73, 1.15, 0.93, 1.55, 1.38, 0.89, 1.24, 0.76, 1.14, 0.80, 1.21, 0.76, 1.17, 1.06,
     0.71, 1.08, 0.67, 1.10, 0.63, 1.15, 1.00, 0.75, 1.16, 0.71, 1.12, 0.72, 1.30, 0.84, 1.11, 1.20, 0.67, 1.05, 0.83,
     1.12, 0.68, 1.05, 1.10, 0.69, 1.06, 0.65, 1.09, 0.75, 1.10, 0.76,
 )  # fmt: skip
-CALIBRATED = 16.0  # metres up to which the head makes up for distance
-FADE = 0.0068  # reading lost per metre beyond
-FLOOR = 0.13  # readings below a threshold drawn up to this are reported as 0
-SOFT = 0.02  # how gradually, in the unit of readings
-PATCH = 3  # columns that are lost together: dark and slanting things are wider than a bin
-FAINT = -0.10  # what would read less than this is mostly not seen as a return at all, where it is far
-LOST = 0.012, 8.0  # share of faint returns lost for each metre of range beyond so many metres
+CALIBRATED = 16.0  # metres up to which the sensor compensates for distance
+FADE = 0.0068  # reflectance lost per metre beyond
+DARK = 0.13  # reflectance below a random threshold of at most this is reported as 0
+PATCH = 3  # columns that are lost together: dark and slanted surfaces are wider than a bin
+FAINT = -0.10  # far returns with a reflectance below this are mostly lost
+SOFT = 0.02  # how gradually, in units of reflectance
+LOST = 0.012, 8.0  # share of faint returns lost per metre of range, beyond so many metres
 
 TEXTURE, GLOSS, SWALLOW, DEPTH = (column(name) for name in ("texture", "gloss", "swallow", "depth"))
 
@@ -38,13 +38,13 @@ TEXTURE, GLOSS, SWALLOW, DEPTH = (column(name) for name in ("texture", "gloss", 
 def report(
     sensor: Sensor, rays: Rays, hits: Hits, rig: int | None, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The image and labels that a sensor makes of its hits.
+    """The image and labels that a sensor reports.
 
     Args:
-        sensor: Whose rows the returns are sorted into.
+        sensor: The sensor, for its rows and range limits.
         rays: The rays that were cast.
         hits: What they met, (B, W).
-        rig: Silhouettes of the own car, or None without.
+        rig: Number of the silhouettes of the own car, or None without.
         rng: Source of the noise.
 
     Returns:
@@ -57,14 +57,14 @@ def report(
     depth = DEPTH[hits.material] * exponentials(rng, rays.shape)
     s = np.where(np.isfinite(hits.distance), hits.distance, 0) + depth
     r = np.sqrt(s**2 + (rise + s * slope) ** 2)
-    r += (NOISE + NOISE_FAR * r) * noise[0] + rays.beams.bias.astype(np.float32)[:, None]
+    r += (NOISE + NOISE_FAR * r) * noise[0] + rays.lasers.bias.astype(np.float32)[:, None]
     r = np.round(r / RANGE_STEP) * np.float32(RANGE_STEP)
     reading = _reading(hits, r, noise[1], rays)
     seen = (hits.label > 0) & (uniforms > _lost(hits, r, reading))
     seen &= (r >= sensor.min_range) & (r <= sensor.max_range)
     if rig is not None:
-        seen &= ~hidden(rays.beams, rays.columns, rig)
-    reading[reading < FLOOR * rng.random(rays.shape, dtype=np.float32)] = 0
+        seen &= ~hidden(rays.lasers, rays.columns, rig)
+    reading[reading < DARK * rng.random(rays.shape, dtype=np.float32)] = 0
     reading = in_levels(reading)
     return _sorted_into_rows(sensor, rays, s, r, reading, hits.label, seen)
 
@@ -81,7 +81,7 @@ def _levels() -> np.ndarray:
 
 
 def in_levels(reading: np.ndarray) -> np.ndarray:
-    """Readings as they are reported: clipped to [0, 0.99], in hundredths."""
+    """Reflectance as reported: clipped to [0, 0.99], in hundredths."""
     return _levels()[np.rint(np.clip(reading, 0, 1) * 2000).astype(np.int32)]
 
 
@@ -90,12 +90,12 @@ def _reading(hits: Hits, r: np.ndarray, normal: np.ndarray, rays: Rays) -> np.nd
     g = GLOSS[hits.material]
     falloff = (1 + g) * hits.cosine / (hits.cosine + g + 1e-6)
     faded = FADE * np.maximum(r - CALIBRATED, 0)
-    gain = rays.beams.gain.astype(np.float32)[:, None]
+    gain = rays.lasers.gain.astype(np.float32)[:, None]
     return hits.albedo * falloff - faded + gain + TEXTURE[hits.material] * normal
 
 
 def _lost(hits: Hits, r: np.ndarray, reading: np.ndarray) -> np.ndarray:
-    """Probability that no return is reported: swallowed, or too faint, the more so the farther."""
+    """Probability that no return is reported: swallowed, or too faint, which grows with the distance."""
     faint = logistic((FAINT - reading) / np.float32(SOFT))
     swallow = SWALLOW[hits.material]
     return swallow + (1 - swallow) * faint * np.clip(LOST[0] * (r - LOST[1]), 0, 1)
@@ -118,9 +118,9 @@ def _sorted_into_rows(
     label: np.ndarray,
     seen: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Each return into the row of its apparent elevation; the nearest of several wins."""
+    """Each return in the row of its apparent elevation; a pixel keeps the nearest."""
     h, w = sensor.shape
-    if rays.beams.straight:
+    if rays.lasers.straight:
         row = np.broadcast_to(np.arange(h)[:, None], rays.shape)
     else:
         rise = rays.height[:, None] - np.float32(rays.ground)

@@ -1,4 +1,4 @@
-"""What stands and moves on carriageway and kerb: parked cars, traffic, people, lamps, signs, trees."""
+"""Objects on carriageway and kerb: parked cars, traffic, people, lamps, signs, trees."""
 
 import math
 
@@ -11,20 +11,20 @@ from r2flow.simulator.shapes import Boxes
 
 
 def _clear(b: SceneBuilder, street: Street, x: float, y: float, room: float) -> bool:
-    """Whether a place beside a street is within reach, not too near, and off the other streets by so much room."""
+    """Whether a place beside a street is within reach, not too near, and `room` metres off the other streets."""
     others = (other for other in b.ground.streets if other != street)
     return 2.6 < math.hypot(x, y) < END and all(other.away(x, y) > room for other in others)
 
 
 def _driven(b: SceneBuilder, x: float, y: float) -> bool:
-    """Whether a place is where the own car has driven or will."""
+    """Whether a place is on the own car's path."""
     main = b.ground.streets[0]
     u, lateral = main.locate(x, y)
     return abs(lateral + main.offset) < 2.6 and abs(u) < 30
 
 
 def park(b: SceneBuilder, kind: Kind, street: Street, side: int) -> None:
-    """Cars along the kerb, half on it, with free places between; or side by side, nose to the kerb."""
+    """Cars along the kerb, partly on it, with free places between; or side by side, facing the kerb."""
     draws = b.draws
     if draws.chance(0.2) or kind.parked == 0:
         return
@@ -86,7 +86,7 @@ def _clutter(b: SceneBuilder, street: Street, side: int, edge: float) -> None:
 
 
 def drive(b: SceneBuilder, kind: Kind, main: Street) -> None:
-    """Moving vehicles: ahead and behind in the own lane, coming in the other."""
+    """Moving vehicles: ahead and behind in the own lane, oncoming in the other."""
     draws = b.draws
     for _ in range(draws.poisson(kind.traffic)):
         own = draws.chance(0.5)

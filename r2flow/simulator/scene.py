@@ -1,29 +1,29 @@
-"""A scene: the ground and tables of solids, with what each solid is made of."""
+"""A scene: the ground and tables of solids with their surfaces."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from r2flow.simulator.draws import Draws
+from r2flow.lidar.labels import LABELS
 from r2flow.simulator.ground import Ground
-from r2flow.simulator.labels import LABELS
 from r2flow.simulator.materials import INDEX, MATERIALS
+from r2flow.simulator.scalar_draws import ScalarDraws
 from r2flow.simulator.shapes import Blobs, Boxes, Cylinders, Frusta, Shape
 
-PLAIN, FACADE, CABIN, BODY = range(4)  # patterns: how a solid's surface is divided among materials
+PLAIN, FACADE, CABIN, BODY = range(4)  # patterns that divide a surface among materials
 
 
 class Surface(NamedTuple):
-    """What solids are made of; every field (P,).
+    """The surfaces of solids; every field (P,).
 
     Attributes:
         label: SemanticKITTI id.
         material: Index into `materials.MATERIALS`.
-        albedo: Reflectance reading at perpendicular incidence.
-        closed: Share of the rays that the solid stops; a fence of slats is not wholly closed.
+        albedo: Reflectance at perpendicular incidence.
+        closed: Share of the rays that the solid stops, less than 1 for a fence of slats.
         pattern: PLAIN, FACADE (windows), CABIN (panes), BODY (number plates and lamps).
-        base: Height of the ground at the solid, from which patterns are measured.
+        base: Height of the ground at the solid, above which patterns are measured.
     """
 
     label: np.ndarray
@@ -36,20 +36,18 @@ class Surface(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything that rays can meet, in metres; z = 0 is the ground below the sensor.
+    """Everything that rays can meet, in metres; z = 0 is the usual ground below the sensor.
 
     Attributes:
         ground: The ground.
         solids: Tables of solids, one of each kind.
-        surfaces: What they are made of, one table for each of `solids`.
-        kind: Name of the kind of place.
-        rig: Which silhouettes of the own car stand in the view.
+        surfaces: Their surfaces, one table for each of `solids`.
+        rig: Number of the silhouettes of the own car, or None without.
     """
 
     ground: Ground
     solids: tuple[Shape, ...] = ()
     surfaces: tuple[Surface, ...] = ()
-    kind: str = "bare"
     rig: int | None = None
 
 
@@ -58,12 +56,12 @@ class SceneBuilder:
 
     Attributes:
         ground: What they stand on.
-        draws: Where whatever is random about them comes from.
+        draws: Source of their random numbers.
     """
 
     SHAPES = (Boxes, Frusta, Cylinders, Blobs)
 
-    def __init__(self, ground: Ground, draws: Draws) -> None:
+    def __init__(self, ground: Ground, draws: ScalarDraws) -> None:
         self.ground = ground
         self.draws = draws
         self._rows: dict[type, list[tuple[float, ...]]] = {shape: [] for shape in self.SHAPES}
@@ -75,7 +73,7 @@ class SceneBuilder:
         return float(self.ground.height(x, y)) + self.ground.kerb * raised
 
     def albedo(self, material: str) -> float:
-        """The reading of one object of a material, drawn around the usual one."""
+        """Reflectance of one object of a material, drawn around the usual one."""
         m = MATERIALS[INDEX[material]]
         return min(max(self.draws.normal(m.albedo, m.spread), 0.01), 0.99)
 
@@ -89,22 +87,22 @@ class SceneBuilder:
         pattern: int = PLAIN,
         base: float = 0.0,
     ) -> None:
-        """Put one solid, its fields numbers, into the scene."""
+        """Add one solid, whose fields are numbers, to the scene."""
         kind = type(solid)
         self._rows[kind].append(tuple(solid))
         albedo = self.albedo(material) if albedo is None else albedo
         self._surfaces[kind].append((LABELS[label], INDEX[material], albedo, closed, pattern, base))
 
-    def build(self, kind: str, rig: int | None) -> Scene:
+    def build(self, rig: int | None = None) -> Scene:
         """The scene as tables."""
         kinds = [shape for shape in self.SHAPES if self._rows[shape]]
         solids = tuple(shape(*_columns(self._rows[shape])) for shape in kinds)
         surfaces = tuple(_surface(_columns(self._surfaces[shape])) for shape in kinds)
-        return Scene(self.ground, solids, surfaces, kind, rig)
+        return Scene(self.ground, solids, surfaces, rig)
 
 
 def _columns(rows: list[tuple[float, ...]]) -> np.ndarray:
-    # Rounded to a 16384th: the last bit of a sine in their making is another on another machine.
+    # Rounded to a 16384th, since the last bit of a sine behind them depends on the machine.
     return np.ascontiguousarray((np.rint(np.array(rows) * 16384) / 16384).astype(np.float32).T)
 
 

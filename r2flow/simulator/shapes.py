@@ -1,8 +1,8 @@
-"""Solids that a scene is built of, each a table of many, met by all rays that can reach them at once.
+"""Shapes: tables of solids of one kind, and where rays meet them.
 
-A shape answers two questions: `fragments`, which rays meet which of its solids and where; and `normal`,
-which way the surface faces where one was met. Coordinates are metres in the scene's frame: x ahead and y
-left of the sensor's axis, z up. Solids turned by `yaw` have their length along (cos yaw, sin yaw).
+`fragments` says which rays meet which solids and where, `normal` which way the surface faces there. Coordinates are
+metres in the scene's frame: x ahead and y left of the sensor's axis, z up. A solid turned by `yaw` has its length along
+(cos yaw, sin yaw).
 """
 
 from typing import Any, NamedTuple, Protocol
@@ -12,12 +12,12 @@ import numpy as np
 from r2flow.simulator.exact import cosine, exponential_quantiles, hypotenuse, sine
 from r2flow.simulator.rays import Rays, column_windows, row_windows
 
-# A field of all solids of a table, (P,) float32; of a single one, on its way into a table, a number.
+# A field of all solids of a table, (P,) float32; a number for a single solid before it is in a table.
 Column = Any
 
-NEAR = 0.05  # metres: nothing is looked for nearer than this
-LEAF = 3  # columns over which leaves let all pulses through or none
-EDGE = 1e-6  # radians by which windows are wider than things, so that rounding in arctan and arcsin decides nothing
+NEAR = 0.05  # metres: nothing nearer is met
+LEAF = 3  # columns over which leaves pass all pulses or none
+EDGE = 1e-6  # radians by which windows are wider than objects, so that rounding in arctan and arcsin has no effect
 
 
 class Fragments(NamedTuple):
@@ -29,12 +29,12 @@ class Fragments(NamedTuple):
 
 
 class Normal(NamedTuple):
-    """How a surface lies where it was met; every field (N,).
+    """The orientation of a surface where it was met; every field (N,).
 
     Attributes:
         x, y, z: Outward unit normal.
-        along: Place along the face, metres from its middle; 0 where there is no face.
-        end: Whether it is the front or back of something long.
+        along: Metres along the face from its middle; 0 where there is no face.
+        end: Whether it is the front or back of a box.
         flat: Whether it is a plane.
     """
 
@@ -89,7 +89,7 @@ class Boxes(NamedTuple):
 
 
 class Frusta(NamedTuple):
-    """Boxes whose four sides lean inwards by so many metres (>= 0) a metre of height; every field a column."""
+    """Boxes whose four sides lean inwards by metres (>= 0) per metre of height; every field a column."""
 
     x: Column
     y: Column
@@ -172,11 +172,10 @@ class Cylinders(NamedTuple):
 
 
 class Blobs(NamedTuple):
-    """Ellipsoids of revolution, upright; every field a column.
+    """Upright ellipsoids of revolution; every field a column.
 
-    `path` is the mean free path of a pulse inside, in metres; 0 is solid. A pulse goes in, and is sent
-    back after a distance drawn from Exp(path) unless it has left by then: that is what lets rays through
-    a tree.
+    `path` is the mean free path of a pulse inside, in metres; 0 is solid. A pulse returns from a depth drawn from
+    Exp(path), or passes where it has left the ellipsoid before: rays pass through a tree.
     """
 
     x: Column
@@ -215,7 +214,7 @@ class Blobs(NamedTuple):
 
 
 def _depths(k: np.ndarray, b: np.ndarray, w: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draws from Exp(1), one for each solid and LEAF neighbouring columns of a laser: leaves hang in clusters."""
+    """Draws from Exp(1), one for each solid and LEAF neighbouring columns of a laser, as leaves come in clusters."""
     cell = (w + b * 7) // LEAF
     mixed = k * np.int64(73856093) ^ b * np.int64(19349663) ^ cell * np.int64(83492791)
     mixed = (mixed + int(rng.integers(1 << 31))) * 2654435761 & 0xFFFFFFFF
@@ -224,12 +223,12 @@ def _depths(k: np.ndarray, b: np.ndarray, w: np.ndarray, rng: np.random.Generato
 
 
 def _round(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
-    """A normal of something without faces."""
+    """A normal of a surface without faces."""
     return Normal(x, y, z, np.zeros_like(x), np.zeros(len(x), bool), np.zeros(len(x), bool))
 
 
 def _into(solids: "Boxes | Frusta", k: np.ndarray, x: Column, y: Column) -> tuple[np.ndarray, ...]:
-    """The points in the solids' own axes, and cos and sin of their yaw: (u, v, c, s), (N,) each."""
+    """The points in the axes of the solids, and cos and sin of their yaw: (u, v, c, s), (N,) each."""
     c, s = cosine(solids.yaw)[k], sine(solids.yaw)[k]
     dx, dy = x - solids.x[k], y - solids.y[k]
     return dx * c + dy * s, dy * c - dx * s, c, s

@@ -1,24 +1,18 @@
-"""Procedural places around a car that drives along x."""
+"""Procedural street scenes around a car that drives along x."""
 
 import numpy as np
 
 from r2flow.simulator import fronts, roadside
-from r2flow.simulator.draws import Draws
 from r2flow.simulator.ego import RIGS
 from r2flow.simulator.kinds import KINDS, draw_ground
+from r2flow.simulator.scalar_draws import ScalarDraws
 from r2flow.simulator.scene import Scene, SceneBuilder
 
 
-def draw_scene(rng: np.random.Generator, kind: str | None = None) -> Scene:
-    """A place of a kind, or of any kind by its share.
-
-    Args:
-        rng: Where all that is random about it comes from.
-        kind: A name in `kinds.KINDS`, or None to draw one.
-    """
-    draws = Draws(rng)
-    drawn = draws.pick(list(KINDS), [k.share for k in KINDS.values()])
-    name = kind or drawn
+def draw_scene(rng: np.random.Generator) -> Scene:
+    """A scene of one of `kinds.KINDS`, drawn by their shares."""
+    draws = ScalarDraws(rng)
+    name = draws.pick(list(KINDS), [k.share for k in KINDS.values()])
     b, k = SceneBuilder(draw_ground(draws, name), draws), KINDS[name]
     streets = b.ground.streets
     for street in streets:
@@ -32,4 +26,4 @@ def draw_scene(rng: np.random.Generator, kind: str | None = None) -> Scene:
     roadside.walk(b, k, streets[0])
     if name == "highway":
         roadside.guard(b, streets[0])
-    return b.build(name, rig=draws.pick(range(len(RIGS)), (0.7, 0.3)))
+    return b.build(rig=draws.pick(range(len(RIGS)), (0.7, 0.3)))

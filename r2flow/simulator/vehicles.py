@@ -1,4 +1,4 @@
-"""Vehicles: cars of several shapes, vans and lorries, bicycles."""
+"""Vehicles: cars of several shapes, vans, lorries, bicycles."""
 
 import math
 from typing import NamedTuple
@@ -8,7 +8,7 @@ from r2flow.simulator.shapes import Boxes, Frusta
 
 
 class Form(NamedTuple):
-    """Measures of a car in metres; leans are metres inwards for each metre up."""
+    """Dimensions of a car in metres; leans are metres inwards per metre of height."""
 
     share: float
     length: float

@@ -3,9 +3,6 @@
 from collections.abc import Mapping
 from typing import Any
 
-from torch import nn
-
-from r2flow.backbones.hdit import LearnablePosition
 from r2flow.data.augment import Augmentation
 from r2flow.errors import InputError
 from r2flow.generators import Generator, Sampler
@@ -17,13 +14,13 @@ from r2flow.stages.reflow import Distill, Reflow
 STAGES: Registry[type[Stage]] = Registry("stage", rectify=Rectify, reflow=Reflow, distill=Distill)
 
 
-def check_roll(augment: Augmentation, network: nn.Module) -> None:
-    """Refuse turned scans for a backbone that learns a vector for each direction.
+def check_roll(augment: Augmentation, generator: Generator) -> None:
+    """Refuse turned scans for a generator that learns a vector for each direction.
 
     Raises:
         InputError: both.
     """
-    if augment.roll and any(isinstance(module, LearnablePosition) for module in network.modules()):
+    if augment.roll and generator.learns_directions:
         raise InputError(
             "data.augment.roll makes all directions alike, and backbone.position=learnable (the paper's APE) learns a "
             "vector of its own for each; give backbone.position=none, whose attention knows differences in azimuth "

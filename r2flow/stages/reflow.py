@@ -37,5 +37,5 @@ class Distill(Reflow):
             raise InputError(
                 f"a distilled flow trains at the {steps} times that its steps visit; leave stage.time out."
             )
-        super().__init__(generator, loss, {"name": "grid", "k": steps}, **options)
+        super().__init__(generator, loss, {"name": "discrete", "k": steps}, **options)
         generator.sampler = Sampler("euler", steps, fixed=True)

@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from r2flow.backbones.attention import BACKENDS, _Axis, _flex_mask, neighbourhood_attention
+from r2flow.backbones.attention import BACKENDS, _Axis, _flex_mask, backend_name, neighbourhood_attention
 from r2flow.errors import InputError
 
-EVERYWHERE = ["tiles", "shifts"]  # flex and natten need CUDA kernels
+EVERYWHERE = ["tiles"]  # flex and natten need CUDA kernels
 # (rows, columns, window): tiled evenly or not, rings narrower than the window, fewer rows than the window
 MAPS = [
     (8, 24, (3, 9)),
@@ -117,7 +117,7 @@ def test_the_mask_for_flex_shows_what_dense_sees(rows, columns, window, wrap):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("backend", ["tiles", "shifts", "flex", "natten"])
+@pytest.mark.parametrize("backend", ["tiles", "flex", "natten"])
 def test_backends_agree_with_dense_on_a_gpu(backend):
     inputs = [x.float().cuda().requires_grad_() for x in qkv(16, 64, channels=32)]
     weights = torch.randn_like(inputs[0])
@@ -139,3 +139,8 @@ def test_an_even_window_is_refused():
 
 def test_every_backend_is_tested_or_needs_a_gpu():
     assert set(BACKENDS) == {"dense", *EVERYWHERE, "flex", "natten"}
+
+
+def test_a_config_of_version_0_1_0_may_name_a_backend_that_is_gone():
+    assert backend_name("shifts") == "tiles"
+    assert [backend_name(name) for name in ("auto", "dense")] == ["auto", "dense"]

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from test_backbones import read_config
+from plain_backbone import Plain
 from torch import nn
 
-from r2flow.backbones import build_backbone
+from r2flow.backbones import build_backbone, configurations
 from r2flow.backbones.cost import count_macs, count_parameters
 from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.lidar.sensors import build_sensor
@@ -23,7 +23,7 @@ TABLE_2 = {
 def test_the_papers_table(config):
     parameters, gmac = TABLE_2[config]
     with torch.device("meta"):
-        model = build_backbone(read_config(config), build_sensor("hdl64e").rays(), 2)
+        model = build_backbone(configurations()[config], build_sensor("hdl64e").rays(), 2)
     assert count_parameters(model) == parameters
     assert count_macs(model) / 1e9 == pytest.approx(gmac, rel=5e-3)
 
@@ -56,3 +56,31 @@ def test_a_convolution_by_hand():
     whole = count_macs(model)
     model.out_conv = nn.Identity()
     assert whole - count_macs(model) == 9 * 8 * 2 * 8 * 16
+
+
+def test_a_backbone_that_states_nothing_is_the_sum_of_its_layers():
+    """3 x 3 taps x 2 channels for 8 x 16 x 8 values, 8 of the time, and 3 x 3 x 8 for 8 x 16 x 3."""
+    model = Plain(torch.zeros(2, 8, 16), base_channels=8, in_channels=2, out_channels=3)
+    assert count_macs(model) == 9 * 2 * 8 * 16 * 8 + 8 + 9 * 8 * 8 * 16 * 3
+
+
+def test_a_module_says_its_own_multiplications():
+    class Twice(nn.Module):
+        def forward(self, x):
+            return 2 * x
+
+        def macs(self, inputs, output):
+            return output.numel()
+
+    model = Plain(torch.zeros(2, 8, 16))
+    before = count_macs(model)
+    model.last = nn.Sequential(model.last, Twice())
+    assert count_macs(model) - before == 2 * 8 * 16
+
+
+def test_a_transposed_convolution_by_hand():
+    """Each of 8 x 8 x 16 input values meets 2 x 2 taps of 3 channels."""
+    model = Plain(torch.zeros(2, 8, 16), base_channels=8, out_channels=3)
+    before = count_macs(model)
+    last, model.last = model.last, nn.ConvTranspose2d(8, 3, 2, stride=2)
+    assert count_macs(model) - (before - 9 * last.weight[0, :, 0, 0].numel() * 8 * 16 * 3) == 8 * 8 * 16 * 2 * 2 * 3

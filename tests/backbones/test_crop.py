@@ -2,35 +2,31 @@
 
 import pytest
 import torch
-from torch import nn
+from tiny_backbones import NAMES, PUBLISHED, rays
 
-from r2flow.backbones import BACKBONES, build_backbone
-from r2flow.backbones.crop import cropped, unit_of
+from r2flow.backbones import BACKBONES, Backbone, build_backbone
 from r2flow.errors import InputError
 from r2flow.lidar.region import Region
-from r2flow.lidar.sensors import SENSORS
 
-RAYS = SENSORS["hdl64e"].resized(16, 64).rays()
-SMALL = {
-    "hdit": {"base_channels": 8, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16, "patch": [2, 4]},
-    "adm_unet": {"base_channels": 8, "channel_multiplier": [1, 2], "num_residual_blocks": [1, 1], "num_heads": 2},
-    "efficient_unet": {"base_channels": 8, "channel_multiplier": [1, 2], "num_residual_blocks": [1, 1], "num_heads": 2},
-}
-PARTS = [Region((16, 64), 4, 8, 16, 24), Region((16, 64), 0, 16, 48, 32), Region((16, 64), 8, 8, 0, 64)]
+SHAPE = (16, 64)
+RAYS = rays(*SHAPE)
+PARTS = [Region(SHAPE, 4, 8, 16, 24), Region(SHAPE, 0, 16, 48, 32), Region(SHAPE, 8, 8, 0, 64)]
+CROPPABLE = [name for name, kind in BACKBONES.items() if kind.croppable]
 
 
-def backbone(name: str, rays: torch.Tensor = RAYS, **options):
-    model = build_backbone({"name": name, **SMALL[name], **options}, rays, 2).eval().requires_grad_(False)
+def backbone(name: str, rays: torch.Tensor = RAYS, **options) -> Backbone:
+    options = {"name": name, **BACKBONES[name].tiny_options(), **options}
+    model = build_backbone(options, rays, 2).eval().requires_grad_(False)
     torch.manual_seed(1)
     for parameter in model.parameters():  # nothing at zero, or there would be nothing to see
         parameter.copy_(0.3 * torch.randn_like(parameter))
     return model
 
 
-X, T = torch.randn(2, 2, 16, 64), torch.tensor([0.2, 0.9])
+X, T = torch.randn(2, 2, *SHAPE), torch.tensor([0.2, 0.9])
 
 
-@pytest.mark.parametrize("name", list(BACKBONES))
+@pytest.mark.parametrize("name", PUBLISHED)
 @pytest.mark.parametrize("part", PARTS, ids=str)
 def test_a_part_is_the_backbone_of_its_own_rays(name, part):
     position = "none" if name == "hdit" else "polar"  # whose shapes do not depend on the image's
@@ -39,21 +35,33 @@ def test_a_part_is_the_backbone_of_its_own_rays(name, part):
     weights = {key: value for key, value in whole.state_dict().items() if key != "coords"}
     own.load_state_dict({**weights, "coords": own.coords})
     with torch.no_grad():
-        torch.testing.assert_close(cropped(whole, part.rows, part.columns)(T, part.crop(X)), own(T, part.crop(X)))
+        torch.testing.assert_close(whole.cropped(part.rows, part.columns)(T, part.crop(X)), own(T, part.crop(X)))
 
 
-@pytest.mark.parametrize("name", list(BACKBONES))
+@pytest.mark.parametrize("name", CROPPABLE)
 def test_the_part_that_is_all_is_the_backbone_itself(name):
     whole = backbone(name)
     with torch.no_grad():
-        assert torch.equal(cropped(whole, torch.arange(16), torch.arange(64))(T, X), whole(T, X))
+        assert torch.equal(whole.cropped(torch.arange(16), torch.arange(64))(T, X), whole(T, X))
 
 
-@pytest.mark.parametrize("name", list(BACKBONES))
+@pytest.mark.parametrize("name", CROPPABLE)
+@pytest.mark.parametrize("part", PARTS, ids=str)
+def test_a_part_has_its_own_rays_and_the_whole_is_as_before(name, part):
+    whole = backbone(name)
+    seen = part.rounded(whole.unit)
+    with torch.no_grad():
+        before = whole(T, X)
+        piece = whole.cropped(seen.rows, seen.columns)
+        assert piece(T, seen.crop(X)).shape == seen.crop(X).shape
+        assert torch.equal(whole(T, X), before)
+    assert torch.equal(piece.coords, seen.crop(whole.coords))
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
 def test_what_is_derived_from_the_rays_follows_the_part(name):
     whole, part = backbone(name), PARTS[1]
-    piece = cropped(whole, part.rows, part.columns)
-    assert torch.equal(piece.coords, part.crop(whole.coords))
+    piece = whole.cropped(part.rows, part.columns)
     if name == "hdit":
         table, own = whole.get_buffer("table_0"), piece.get_buffer("table_0")
         assert torch.equal(own, torch.cat([table[:, :, 12:], table[:, :, :4]], 2))  # columns 48-63, 0-15 in fours
@@ -63,27 +71,35 @@ def test_what_is_derived_from_the_rays_follows_the_part(name):
         assert torch.equal(piece.features, part.crop(whole.features))
 
 
-@pytest.mark.parametrize("name", list(BACKBONES))
-def test_the_weights_are_shared_and_the_whole_is_as_before(name):
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_the_weights_are_shared(name):
     whole = backbone(name)
-    with torch.no_grad():
-        before = whole(T, X)
-        piece = cropped(whole, PARTS[0].rows, PARTS[0].columns)
-        piece(T, PARTS[0].crop(X))
-        assert torch.equal(whole(T, X), before)
+    piece = whole.cropped(PARTS[0].rows, PARTS[0].columns)
     own = {parameter.data_ptr() for parameter in piece.parameters()}
     shared = {parameter.data_ptr() for parameter in whole.parameters()}
     assert len(own - shared) == (1 if name == "hdit" else 0)  # the position embedding is a piece of the whole one
 
 
 def test_units_are_patches_halved_at_every_level():
-    assert unit_of(backbone("hdit")) == (4, 8)
-    assert unit_of(backbone("adm_unet")) == unit_of(backbone("efficient_unet")) == (2, 2)
-    assert unit_of(build_backbone({"name": "efficient_unet"}, RAYS, 2)) == (8, 8)
+    assert backbone("hdit", patch=[2, 4]).unit == (4, 8)
+    assert backbone("adm_unet").unit == backbone("efficient_unet").unit == (2, 2)
+    assert build_backbone({"name": "efficient_unet"}, RAYS, 2).unit == (8, 8)
 
 
-def test_what_cannot_be_cut_is_refused():
-    with pytest.raises(InputError, match="a Linear cannot be evaluated on a part of its image"):
-        unit_of(nn.Linear(2, 2))
-    with pytest.raises(InputError, match="not whole units of 8"):
-        cropped(backbone("hdit"), torch.arange(16), torch.arange(4, 20))
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in CROPPABLE])
+def test_what_cannot_be_cropped_is_refused(name):
+    with pytest.raises(InputError, match="cannot be evaluated on a part of its image"):
+        backbone(name).cropped(torch.arange(16), torch.arange(64))
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "message"),
+    [
+        (range(16), range(4, 20), "columns from 4, 16 of them, are not whole units of 8"),
+        (range(15), range(64), "rows from 0, 15 of them, are not whole units of 2"),
+        (range(0), range(64), "a part of the image needs rows, at least a unit of 2; found none"),
+    ],
+)
+def test_parts_that_are_not_whole_units_are_refused(rows, columns, message):
+    with pytest.raises(InputError, match=message):
+        backbone("hdit").cropped(torch.tensor(rows), torch.tensor(columns))

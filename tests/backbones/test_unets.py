@@ -6,7 +6,7 @@ from reference_cases import assert_gradients, load_case
 
 from r2flow.backbones import Backbone, build_backbone
 from r2flow.backbones.adm_unet import ADMBlock
-from r2flow.backbones.convolutions import Resample, SinusoidalTime
+from r2flow.backbones.convolutions import BlockOptions, Resample, SinusoidalTime
 from r2flow.backbones.efficient_unet import Level
 from r2flow.errors import InputError
 
@@ -66,6 +66,9 @@ def test_resampling_keeps_a_constant_ring_constant(window):
         torch.testing.assert_close(inner, torch.full_like(inner, 2.5))
 
 
+OPTIONS = BlockOptions(condition_channels=4, ring=True, dropout=0.0)
+
+
 def randomised(module: torch.nn.Module) -> torch.nn.Module:
     for parameter in module.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
@@ -75,9 +78,9 @@ def randomised(module: torch.nn.Module) -> torch.nn.Module:
 @pytest.mark.parametrize(
     "block",
     [
-        lambda: ADMBlock(8, 16, 4, True, 0.0, Resample((1, 1), up=False, ring=True), heads=2),
-        lambda: Level(8, 16, 1, 4, True, 0.0, heads=2, down=True),
-        lambda: Level(8, 8, 1, 4, True, 0.0, heads=2, up=True),
+        lambda: ADMBlock(8, 16, OPTIONS, Resample((1, 1), up=False, ring=True), heads=2),
+        lambda: Level(8, 16, 1, OPTIONS, heads=2, down=True),
+        lambda: Level(8, 8, 1, OPTIONS, heads=2, up=True),
     ],
     ids=["adm", "efficient down", "efficient up"],
 )
@@ -102,6 +105,7 @@ def test_gradcheck_of_a_block(block):
         ({"base_channels": 12}, "12 channels cannot be normed in 8 groups"),
         ({"base_channels": 8, "num_heads": 3}, "cannot be shared by 3 attention heads"),
         ({"num_residual_blocks": [1, 2]}, r"num_residual_blocks must be 4 integers of at least 1, found \[1, 2\]"),
+        ({"channel_multiplier": []}, "channel_multiplier must be 1 integers of at least 1, found"),
         ({"position": "learnable"}, "no position named 'learnable'; known: none, fourier_features"),
     ],
 )

@@ -1,4 +1,4 @@
-"""What solvers make of what should not happen: each case with its stated outcome, none of them an exception."""
+"""Solvers in extreme cases: each has a defined outcome, none an exception."""
 
 import logging
 import math
@@ -9,7 +9,7 @@ import torch
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, Mixed, PointMass, Rotating, StiffLinear, Straight
-from r2flow.flow.solvers import FLOOR, SOLVERS, solve
+from r2flow.flow.solvers import LEAST_TOLERANCE, SOLVERS, solve
 from r2flow.flow.straight_exit import solve_straight_first
 
 METHODS = [*SOLVERS, "torchdiffeq:dopri5", "torchdiffeq:rk4"]
@@ -68,7 +68,7 @@ def test_the_last_finite_state_is_kept():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_velocity_a_thousand_times_too_large_is_survived(method):
+def test_a_velocity_a_thousand_times_too_large_is_solved_or_flagged(method):
     # Blown up or solved, each scene says which; the state stays finite.
     problem = Rotating(turns=0.5 * 1e3)
     solution = solve(problem, X_0, method=method, steps=32, tolerance=1e-3, max_evaluations=1000)
@@ -87,7 +87,7 @@ def test_growth_beyond_float32_is_flagged(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_nowhere_to_go_is_the_start_at_no_cost(method):
+def test_an_empty_interval_returns_the_start_without_evaluations(method):
     for t in (0.0, 1.0):
         solution = solve(Gaussian(), X_0, t, t, method=method, global_error=True)
         assert torch.equal(solution.x, X_0)
@@ -97,19 +97,19 @@ def test_nowhere_to_go_is_the_start_at_no_cost(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_t_exactly_0_and_1_are_asked_for_and_answered(method):
+def test_velocities_are_evaluated_at_exactly_0_and_1(method):
     problem = Gaussian()
     there = solve(problem, X_0.double(), 0.0, 1.0, method=method, steps=128, tolerance=1e-7).x
     back = solve(problem, there, 1.0, 0.0, method=method, steps=128, tolerance=1e-7).x
     torch.testing.assert_close(back, X_0.double(), rtol=0, atol=0.2 if method == "euler" else 1e-2)
 
 
-def test_no_steps_no_budget_and_no_time_are_refused():
+def test_numbers_out_of_range_are_refused():
     for wrong, message in [
         ({"steps": 0}, "at least 1 step, found 0"),
         ({"tolerance": math.nan}, "must be positive"),
-        ({"finish": 1.0}, "shorter than the whole way"),
-        ({"finish": -1e-3}, "shorter than the whole way"),
+        ({"finish": 1.0}, "finish must be shorter than the interval"),
+        ({"finish": -1e-3}, "finish must be shorter than the interval"),
         ({"max_evaluations": 1}, "at least 2 evaluations, found 1"),
         ({"max_step": 0.0}, "a share of the interval"),
         ({"t_1": math.inf}, "needs two times"),
@@ -119,20 +119,20 @@ def test_no_steps_no_budget_and_no_time_are_refused():
 
 
 @pytest.mark.parametrize("method", [*ADAPTIVE, "torchdiffeq:dopri5"])
-def test_a_tolerance_that_float32_cannot_hold_is_floored_and_every_call_says_so(method, caplog):
+def test_a_tolerance_that_float32_cannot_hold_is_raised_with_a_warning_in_every_call(method, caplog):
     with caplog.at_level(logging.WARNING):
         floored = solve(Gaussian(), X_0, method=method, tolerance=1e-12)
         solve(Gaussian(), X_0, method=method, tolerance=1e-12, global_error=True)
     said = "a tolerance of 1e-12 is below what float32 can hold: 1e-07 is used."
     assert [record.message for record in caplog.records] == [said, said]
-    at_floor = solve(Gaussian(), X_0, method=method, tolerance=FLOOR[torch.float32])
+    at_floor = solve(Gaussian(), X_0, method=method, tolerance=LEAST_TOLERANCE[torch.float32])
     assert torch.equal(floored.x, at_floor.x)
     assert floored.converged.all()
     torch.testing.assert_close(floored.x.double(), Gaussian().solution(X_0, 1.0), rtol=0, atol=3e-6)
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_a_tolerance_below_the_noise_of_a_half_precision_network_is_floored(dtype, caplog):
+def test_a_tolerance_below_the_noise_of_a_half_precision_network_is_raised(dtype, caplog):
     problem = Rotating()
 
     def network(t, x):
@@ -140,7 +140,7 @@ def test_a_tolerance_below_the_noise_of_a_half_precision_network_is_floored(dtyp
 
     with caplog.at_level(logging.WARNING):
         noisy = solve(network, X_0, method="dopri5", tolerance=1e-7, global_error=True)
-    assert f"{FLOOR[dtype]:g} is used" in caplog.text
+    assert f"{LEAST_TOLERANCE[dtype]:g} is used" in caplog.text
     assert noisy.x.dtype == torch.float32
     error = (noisy.x.double() - problem.solution(X_0, 1.0)).square().mean(1).sqrt()
     assert (error < 0.05).all()
@@ -148,7 +148,7 @@ def test_a_tolerance_below_the_noise_of_a_half_precision_network_is_floored(dtyp
     assert (noisy.global_error < error * 5).all()
 
 
-def test_autocast_around_the_network_counts_as_its_precision(caplog):
+def test_autocast_sets_the_precision(caplog):
     weight = torch.eye(16)
     with torch.autocast("cpu", dtype=torch.bfloat16), caplog.at_level(logging.WARNING):
         solution = solve(lambda t, x: (x @ weight).float(), X_0, method="dopri5", tolerance=1e-6)
@@ -168,7 +168,7 @@ class Polite(torch.nn.Module):
 
 
 @pytest.mark.parametrize("method", [*ADAPTIVE, "torchdiffeq:dopri5"])
-def test_a_network_s_weights_tell_its_precision_where_its_answer_does_not(method, caplog):
+def test_the_type_of_the_weights_sets_the_precision(method, caplog):
     network = Polite(torch.bfloat16)
     with caplog.at_level(logging.WARNING):
         floored = solve(network, X_0, method=method, tolerance=1e-6)
@@ -193,7 +193,7 @@ def test_scenes_that_are_not_straight_keep_the_network_s_precision(network, capl
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
-def test_an_untrained_network_that_answers_0_is_one_step(method):
+def test_a_velocity_of_0_takes_one_step(method):
     solution = solve(lambda t, x: 0 * x, X_0, method=method, tolerance=1e-3)
     assert solution.accepted.tolist() == [1] * 4
     assert torch.equal(solution.x, X_0)
@@ -218,7 +218,7 @@ def test_a_network_that_is_being_trained_can_be_solved_straight_first():
 
 
 @pytest.mark.parametrize("method", [*ADAPTIVE, "torchdiffeq:dopri5"])
-def test_a_budget_is_kept_to_and_what_exhausts_it_is_flagged(method):
+def test_a_scene_that_exhausts_its_budget_is_flagged(method):
     easy = Straight()
     batch = Mixed([easy, StiffLinear(1e6), easy])
     solution = solve(batch, X_0[:3], method=method, tolerance=1e-3, max_evaluations=200)
@@ -229,7 +229,7 @@ def test_a_budget_is_kept_to_and_what_exhausts_it_is_flagged(method):
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
-def test_a_point_mass_needs_its_last_stretch_left_to_one_step(method):
+def test_a_point_mass_needs_an_euler_step_at_the_end(method):
     # (point - x) / (1 - t) is 0 / 0 at t = 1; from 1 - eps one Euler step is exact.
     problem, x_0 = PointMass(), X_0.double()
     finished = solve(problem, x_0, method=method, tolerance=1e-3, finish=1e-3)
@@ -242,11 +242,11 @@ def test_a_point_mass_needs_its_last_stretch_left_to_one_step(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_batch_of_no_scenes_is_solved(method):
+def test_an_empty_batch_is_solved(method):
     assert solve(Gaussian(), torch.zeros(0, 4), method=method).x.shape == (0, 4)
 
 
-def test_a_defect_of_the_network_is_raised_not_flagged():
+def test_an_exception_in_the_network_is_raised():
     def broken(t, x):
         raise RuntimeError("out of memory")
 

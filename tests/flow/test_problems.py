@@ -1,4 +1,4 @@
-"""Exact solutions are held to their velocities, their start and their marginals."""
+"""Exact solutions against their velocities, their start and their marginals."""
 
 import math
 
@@ -22,7 +22,7 @@ def test_the_solution_moves_with_the_velocity(name, t):
 
 
 @pytest.mark.parametrize("name", list(PROBLEMS))
-def test_the_solution_starts_where_it_should(name):
+def test_the_solution_at_time_0_is_x_0(name):
     torch.testing.assert_close(PROBLEMS[name]().solution(X_0, 0.0), X_0, rtol=0, atol=1e-14)
 
 
@@ -38,7 +38,7 @@ def test_a_time_for_each_scene_is_as_one_for_all(name):
         )
 
 
-def test_shapes_do_not_matter():
+def test_results_do_not_depend_on_the_shape():
     image = X_0.view(3, 2, 2, 2)
     for name in PROBLEMS:
         problem, t = PROBLEMS[name](), torch.full((3,), 0.4, dtype=torch.float64)
@@ -46,11 +46,11 @@ def test_shapes_do_not_matter():
         torch.testing.assert_close(problem.solution(image, 1.0).flatten(1), problem.solution(X_0, 1.0))
 
 
-def test_a_gaussian_is_carried_to_mean_plus_std_x_0():
+def test_a_gaussian_flow_ends_at_mean_plus_std_x_0():
     torch.testing.assert_close(Gaussian(0.7, 0.25).solution(X_0, 1.0), 0.7 + 0.25 * X_0)
 
 
-def test_a_mixture_keeps_the_share_of_paths_below():
+def test_the_distribution_function_is_constant_along_paths_of_a_mixture():
     # F_1(x_1) = Phi(x_0), with F_1 the distribution that x_1 is drawn from.
     problem = RayDrop(dropped=0.3, std=1e-3)
     x_1 = problem.solution(X_0, 1.0)
@@ -59,9 +59,11 @@ def test_a_mixture_keeps_the_share_of_paths_below():
 
 
 def test_a_mixture_of_one_is_a_gaussian():
-    from r2flow.flow.problems import Mixture
+    from r2flow.flow.problems import GaussianMixture
 
-    torch.testing.assert_close(Mixture([1.0], [0.7], [0.25]).solution(X_0, 0.6), Gaussian(0.7, 0.25).solution(X_0, 0.6))
+    torch.testing.assert_close(
+        GaussianMixture([1.0], [0.7], [0.25]).solution(X_0, 0.6), Gaussian(0.7, 0.25).solution(X_0, 0.6)
+    )
 
 
 def test_two_modes_are_symmetric():
@@ -89,7 +91,7 @@ def test_a_half_turn_negates():
         Rotating()(torch.tensor(0.0), torch.zeros(1, 3))
 
 
-def test_a_wide_jet_is_solved_to_the_last_digits():
+def test_a_wide_jet_has_its_exact_solution():
     # Where the jet is wide, the error function at its start is not that of -infinity.
     problem = NarrowJet(width=0.3, at=0.3)
     assert (problem.solution(X_0, 0.0) - X_0).abs().max() < 1e-14

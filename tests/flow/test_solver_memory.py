@@ -1,4 +1,4 @@
-"""How many states a solver keeps does not depend on how many steps it takes."""
+"""The memory of a solver does not grow with the number of steps."""
 
 import weakref
 

@@ -8,7 +8,7 @@ import torch
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, RayDrop
-from r2flow.flow.solvers import GRIDS, SOLVERS, FixedStep, Pair, calibrated_grid, solve
+from r2flow.flow.solvers import GRIDS, SOLVERS, EmbeddedMethod, FixedStep, calibrated_grid, solve
 from r2flow.flow.solvers.external import is_fixed, torchdiffeq_methods
 
 
@@ -25,7 +25,7 @@ X_0 = torch.tensor([[0.1], [0.3], [0.6]], dtype=torch.float64)
 
 
 FIXED = [name for name, entry in SOLVERS.items() if isinstance(entry, FixedStep)]
-ADAPTIVE = [name for name, entry in SOLVERS.items() if isinstance(entry, Pair)]
+ADAPTIVE = [name for name, entry in SOLVERS.items() if isinstance(entry, EmbeddedMethod)]
 
 
 @pytest.mark.parametrize("method", FIXED)
@@ -97,7 +97,7 @@ def test_a_calibrated_grid_puts_its_steps_where_the_velocity_turns():
 
 
 @pytest.mark.parametrize("method", [*FIXED, *ADAPTIVE, "torchdiffeq:dopri5", "torchdiffeq:rk4"])
-def test_the_last_stretch_is_one_euler_step(method):
+def test_the_finish_is_one_euler_step(method):
     # x' = e^t: exact to 1 - eps, then eps e^(1 - eps), which lacks eps^2 / 2 e.
     eps = 0.1
     solution = solve(
@@ -126,7 +126,7 @@ def test_the_global_error_is_estimated_and_its_cost_counted(method):
 @pytest.mark.parametrize(("problem", "finish"), [
     (Gaussian(std=1e-2), 1e-2), (Gaussian(std=1e-3), 1e-3), (Gaussian(std=1e-4), 1e-3), (RayDrop(), 1e-2),
 ], ids=str)  # fmt: skip
-def test_the_estimate_sees_the_error_of_the_last_stretch(method, problem, finish):
+def test_the_error_estimate_includes_the_finish(method, problem, finish):
     # At this tolerance the one Euler step at the end makes nearly all of the error.
     x_0 = torch.randn(3, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     end = solve(problem, x_0, method=method, steps=512, tolerance=1e-7, finish=finish, global_error=True)
@@ -136,7 +136,7 @@ def test_the_estimate_sees_the_error_of_the_last_stretch(method, problem, finish
     assert (end.global_error < error * 5).all()
 
 
-def test_what_the_estimate_costs_is_told_apart():
+def test_the_evaluations_of_the_estimate_are_counted_apart():
     for method in ("euler", "dopri5"):
         plain, owned = (solve(logistic, X_0, method=method, finish=0.1, global_error=asked) for asked in (False, True))
         assert plain.estimate_evaluations is None

@@ -1,4 +1,4 @@
-"""What per-scene steps owe: fewer evaluations, no influence of neighbours, nothing asked outside the interval."""
+"""Steps of every scene's own: fewer evaluations, no influence of other scenes, nothing outside the interval."""
 
 import math
 import statistics
@@ -61,7 +61,7 @@ def test_a_mixed_batch_takes_six_tenths_of_the_evaluations_of_one_common_step(to
 
 
 @pytest.mark.parametrize("hard", [TwoModes(), Gaussian(std=0.01)], ids=["two modes", "narrow"])
-def test_a_hard_scene_does_not_go_under_among_easy_ones(hard):
+def test_a_hard_scene_among_easy_ones_keeps_its_tolerance(hard):
     easy = Straight()
     batch, x_0 = Mixed([easy] * 255 + [hard]), noise(256, 64)
     exact = batch.solution(x_0, 1.0)
@@ -100,7 +100,7 @@ def test_a_scene_s_result_is_the_same_alone_in_any_batch_and_in_any_place(method
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
-def test_a_scene_that_has_arrived_is_asked_no_more(method):
+def test_a_scene_that_has_arrived_is_not_evaluated(method):
     seen = []
 
     class Watched(Mixed):
@@ -140,7 +140,7 @@ def test_nothing_is_evaluated_outside_the_interval(method, t_0, t_1, dtype):
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
-def test_evaluations_are_two_to_begin_with_and_the_stages_of_every_step(method):
+def test_evaluations_are_two_at_the_start_and_the_stages_of_every_step(method):
     # The last stage is the next step's first: 3 and 6 a step.
     solution = solve(TwoModes(), noise(3), method=method, tolerance=1e-5)
     steps = solution.accepted + solution.rejected
@@ -148,7 +148,7 @@ def test_evaluations_are_two_to_begin_with_and_the_stages_of_every_step(method):
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
-def test_a_tolerance_buys_accuracy(method):
+def test_smaller_tolerances_have_smaller_errors(method):
     x_0 = noise(4).double()
     problem = Rotating()
     errors = [
@@ -159,19 +159,19 @@ def test_a_tolerance_buys_accuracy(method):
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
-def test_what_is_stiff_is_flagged_and_what_is_smooth_is_not(method):
+def test_stiff_scenes_are_flagged_and_smooth_ones_are_not(method):
     problems = [StiffLinear(1e4), StiffLinear(1e6), Straight(), Gaussian(), Gaussian(std=0.01), TwoModes(), RayDrop()]
     solution = solve(Mixed(problems), noise(7).double(), method=method, tolerance=1e-3, max_evaluations=3000)
     assert solution.stiff.tolist() == [True, True, False, False, False, False, False]
 
 
-def test_moderate_stiffness_is_flagged_where_stability_holds_the_steps_short():
+def test_moderate_stiffness_is_flagged_where_stability_limits_the_steps():
     solution = solve(StiffLinear(1e2), noise(2).double(), method="dopri5", tolerance=1e-3)
     assert solution.stiff.all()
     assert solution.converged.all()
 
 
-def test_a_limit_on_the_step_finds_what_a_long_step_passes_over():
+def test_a_limit_on_the_step_finds_what_a_long_step_misses():
     # A kick of 1 at t = .5003 within 2e-3: x(1) = x_0 + 1.
     def kick(t, x):
         z = (expand_time(t, x) - 0.5003) / 2e-3

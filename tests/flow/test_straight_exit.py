@@ -1,4 +1,4 @@
-"""No scene that is claimed straight ends further than ten tolerances from the truth, however narrow its data."""
+"""A scene that passes as straight ends within ten tolerances of the exact solution, however narrow its data."""
 
 import math
 
@@ -49,7 +49,7 @@ def rms(x: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4, 1e-5, 1e-7])
 @pytest.mark.parametrize("width", [10 ** (-power / 4) for power in range(33)])
-def test_no_width_of_the_data_fools_the_probes(tolerance, width):
+def test_probes_detect_data_of_every_width(tolerance, width):
     flow = Mixture((1, 0.7, width))
     end = solve_straight_first(flow, X_0, tolerance)
     straight = end.evaluations == 1 + len(probes(tolerance))
@@ -60,7 +60,7 @@ def test_no_width_of_the_data_fools_the_probes(tolerance, width):
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-5])
 @pytest.mark.parametrize("flow", [GAUSSIAN, RAY_DROP, Mixture((0.5, -1, 0.05), (0.5, 1, 0.05))])
-def test_bent_scenes_go_on(flow, tolerance):
+def test_bent_scenes_are_solved_by_the_adaptive_method(flow, tolerance):
     end = solve_straight_first(flow, X_0, tolerance)
     alone = solve(flow, X_0, method="dopri5", tolerance=tolerance)
     assert torch.equal(end.x, alone.x)
@@ -70,7 +70,7 @@ def test_bent_scenes_go_on(flow, tolerance):
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4, 1e-5])
 @pytest.mark.parametrize("name", [name for name in PROBLEMS if name != "narrow_jet"])  # nothing looks where it is
-def test_no_exact_problem_is_claimed_straight_in_vain(name, tolerance):
+def test_only_straight_scenes_of_exact_problems_pass_the_probes(name, tolerance):
     problem = PROBLEMS[name]()
     end = solve_straight_first(problem, X_0, tolerance, max_evaluations=20)
     claimed = (end.evaluations == 1 + len(probes(tolerance))) & (end.accepted == 1) & end.converged
@@ -113,7 +113,7 @@ def straight(t, x):
     return torch.full_like(x, 0.25)
 
 
-def test_each_scene_is_decided_by_itself():
+def test_each_scene_is_judged_alone():
     flows = [straight, RAY_DROP, straight, GAUSSIAN, lambda t, x: x * math.nan, straight]
     order = torch.tensor([4, 1, 5, 0, 3, 2])
     mixed = solve_straight_first(Scenes(*flows), X_0, 1e-3)
@@ -126,7 +126,7 @@ def test_each_scene_is_decided_by_itself():
     assert torch.equal(mixed.x[1:2], solve(RAY_DROP, X_0[1:2], method="dopri5", tolerance=1e-3).x)
 
 
-def test_probes_come_as_near_to_the_end_as_the_tolerance_asks():
+def test_probes_approach_the_end_as_the_tolerance_shrinks():
     assert probes(1e-3) == pytest.approx([0.5, 0.95])
     assert probes(1e-5) == pytest.approx([0.5, 0.95, 0.995, 0.9995])
     assert probes(1.0) == pytest.approx([0.5, 0.95])
@@ -134,6 +134,6 @@ def test_probes_come_as_near_to_the_end_as_the_tolerance_asks():
         solve_straight_first(straight, X_0, 0)
 
 
-def test_an_estimate_is_refused_not_dropped():
-    with pytest.raises(InputError, match="ask `solve` for a global error"):
+def test_an_error_estimate_is_refused():
+    with pytest.raises(InputError, match="no estimate of their global error; call `solve`"):
         solve_straight_first(straight, X_0, 1e-3, global_error=True)

@@ -117,7 +117,7 @@ def test_a_path_without_length_has_no_normalised_straightness():
     assert found.s_normalised.isnan().all()
 
 
-def test_no_steps_are_refused():
+def test_fewer_than_one_step_is_refused():
     with pytest.raises(InputError, match="at least 1 step"):
         straightness(gaussian, X_0, steps=0)
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.flow.times import TIMES, Grid, LogitNormal, Uniform, UShaped
+from r2flow.flow.times import TIMES, Discrete, LogitNormal, Uniform, UShaped
 
 N = 400_000
 U = (torch.arange(N, dtype=torch.float64) + 0.5) / N  # every quantile once: no sampling error
@@ -30,22 +30,22 @@ def test_times_follow_their_distribution(time, cdf):
     assert (cdf(t.clamp(1e-15, 1 - 1e-15)) - empirical).abs().max() < 1e-4
 
 
-def test_a_grid_takes_each_of_its_times_equally_often():
+def test_the_discrete_density_takes_each_of_its_times_equally_often():
     for k in (1, 2, 4, 5):
-        values, counts = Grid(k)(U).unique(return_counts=True)
+        values, counts = Discrete(k)(U).unique(return_counts=True)
         assert values.tolist() == [i / k for i in range(k)]
         assert (counts / N - 1 / k).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize(
-    "options", [{"name": n} for n in ("uniform", "u_shaped", "logit_normal")] + [{"name": "grid", "k": 4}]
+    "options", [{"name": n} for n in ("uniform", "u_shaped", "logit_normal")] + [{"name": "discrete", "k": 4}]
 )
 def test_times_stay_on_the_path_in_float32(options):
     last = torch.tensor([0.0, 0.5, math.nextafter(0.5, 0), 1 - 2**-24], dtype=torch.float32)
     t = TIMES.build(options)(last)
     assert t.dtype == torch.float32
     assert ((t >= 0) & (t <= 1)).all()
-    if options["name"] == "grid":
+    if options["name"] == "discrete":
         assert (t < 1).all()
 
 
@@ -62,5 +62,5 @@ def test_the_reference_densities(shared):
 def test_bad_options_are_refused():
     with pytest.raises(InputError, match="a > 0"):
         UShaped(0)
-    with pytest.raises(InputError, match="at least one step"):
-        Grid(0)
+    with pytest.raises(InputError, match="at least one time"):
+        Discrete(0)

@@ -62,7 +62,7 @@ def test_a_known_sensor_is_found_again(name, how):
     assert found.beams.firing == (sensor.firing if how == FIRINGS else None)
 
 
-def test_what_is_found_projects_its_scans_as_the_sensor_itself_does():
+def test_an_estimated_sensor_projects_its_scans_like_the_true_one():
     sensor = SENSORS["vlp32c"].resized(columns=192)
     points = scan(sensor, FIRINGS)
     mine = estimate_sensor([points]).sensor("mine")
@@ -72,7 +72,7 @@ def test_what_is_found_projects_its_scans_as_the_sensor_itself_does():
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_ring_numbers_by_laser_tell_the_firing_order(first):
+def test_ring_numbers_by_laser_give_the_firing_order(first):
     sensor = SENSORS["vlp16"].resized(columns=192)
     whole = scan(sensor, FIRINGS)
     laser = np.tile(np.arange(16) + first, sensor.columns).astype(np.uint16)
@@ -84,7 +84,7 @@ def test_ring_numbers_by_laser_tell_the_firing_order(first):
     np.testing.assert_array_equal(image, project(points.xyz, points.reflectance, sensor))
 
 
-def test_beams_that_no_table_has():
+def test_unknown_beams_are_found():
     own = Sensor("own", (21.0, 12.5, 3.0, 2.0, 1.25, -0.5, -4.0, -9.0, -17.5), columns=128)
     found = estimate_sensor([scan(own, UNORDERED)])
     np.testing.assert_allclose(found.beams.elevations, own.elevations, atol=1e-3)
@@ -104,14 +104,14 @@ def test_beams_that_no_table_has():
         (np.zeros(5), None),
     ],
 )
-def test_what_full_reflectance_is(values, scale):
+def test_the_scale_of_reflectance_is_estimated(values, scale):
     points = scan(SENSORS["vlp16"].resized(columns=192), RING_AFTER_RING)
     found = estimate_sensor([Points(points.xyz, np.resize(values, len(points.xyz)).astype(np.float32))]).reflectance
     assert (None if found is None else found.scale) == scale
     assert estimate_sensor([Points(points.xyz)]).reflectance is None
 
 
-def test_limits_hold_all_but_stray_returns():
+def test_range_limits_include_all_but_stray_returns():
     sensor = SENSORS["vlp16"].resized(columns=1024)
     points = scan(sensor, RING_AFTER_RING)
     r = np.linalg.norm(points.xyz, axis=1)
@@ -121,10 +121,10 @@ def test_limits_hold_all_but_stray_returns():
     assert r.max() <= mine.max_range < r.max() + 1
 
 
-def test_too_little_is_refused():
-    with pytest.raises(InputError, match=r"1 scan with 1 returns in all tell too little of a sensor: it takes 200"):
+def test_too_few_returns_are_refused():
+    with pytest.raises(InputError, match=r"1 scan with 1 returns in all are too few for an estimate: .* at least 200"):
         estimate_sensor([Points(np.ones((1, 3), np.float32))])
-    with pytest.raises(InputError, match="run into each other"):
+    with pytest.raises(InputError, match="beams cannot be told apart"):
         estimate_sensor([Points(np.random.default_rng(0).normal(size=(5000, 3)).astype(np.float32))])
 
 
@@ -166,7 +166,7 @@ def test_the_beams_of_other_real_sensors(shared, scans, name, order, off, steps)
         assert filled[0] >= 0.99 * filled[1] > 0.2 * math.prod(mine.shape)
 
 
-def test_the_beams_of_a_real_unit_do_not_share_rows(shared):
+def test_every_beam_of_a_real_unit_has_its_own_row(shared):
     (points,) = real(shared, "other_sensors/rellis_os1_64/*.bin")
     mine = estimate_sensor([points]).sensor("mine")
     rows = lambda sensor: (project(points.xyz, None, sensor)[0] > 0).any(axis=1).sum()  # noqa: E731
@@ -177,5 +177,5 @@ def test_the_beams_of_a_real_unit_do_not_share_rows(shared):
 def test_real_scans_whose_order_was_lost_are_refused_not_guessed(shared):
     (points,) = real(shared, "kitti360/**/*.bin", 15)
     shuffled = np.random.default_rng(0).permutation(len(points.xyz))
-    with pytest.raises(InputError, match="run into each other"):
+    with pytest.raises(InputError, match="beams cannot be told apart"):
         estimate_sensor([Points(points.xyz[shuffled])])

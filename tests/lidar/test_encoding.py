@@ -20,7 +20,7 @@ def ramp(sensor, reflectance=True):
 
 @pytest.mark.parametrize("format", list(FORMATS))
 @pytest.mark.parametrize("reflectance", [True, False])
-def test_encode_then_decode_is_within_a_millimetre_or_what_float32_holds(sensor, format, reflectance):
+def test_encode_then_decode_is_exact_to_a_millimetre_or_to_float32(sensor, format, reflectance):
     image = ramp(sensor, reflectance)
     encoding = Encoding(sensor, format, reflectance)
     x = encoding.encode(image[None])
@@ -48,7 +48,7 @@ def test_logscale_is_the_paper_s():
     assert x[:, 0, 1].tolist() == pytest.approx([1, 1])
 
 
-def test_whatever_lies_outside_the_range_is_dropped():
+def test_returns_outside_the_range_limits_are_dropped():
     encoding = Encoding(HDL64E)
     x = torch.full((2, *HDL64E.shape), 0.3)
     x[0, 0, :4] = torch.tensor([-1.0, -0.6, 1.01, 7.0])  # none, 1.41 m, 82 m, absurd
@@ -57,13 +57,13 @@ def test_whatever_lies_outside_the_range_is_dropped():
     assert (decoded[:, 0, 4:] > 0).all()
 
 
-def test_reflectance_is_held_in_its_range():
+def test_reflectance_is_clamped():
     x = torch.zeros(2, *HDL64E.shape)
     x[1, 0, :2] = torch.tensor([-3.0, 3.0])
     assert Encoding(HDL64E).decode(x)[1, 0, :2].tolist() == [0, 1]
 
 
-def test_a_nan_is_a_dropped_ray_and_touches_no_other():
+def test_a_nan_is_a_dropped_ray_and_changes_no_other():
     x = torch.zeros(2, *HDL64E.shape)
     x[0, 0, 0] = math.nan
     decoded = Encoding(HDL64E).decode(x)
@@ -71,6 +71,6 @@ def test_a_nan_is_a_dropped_ray_and_touches_no_other():
     assert decoded.isfinite().all()
 
 
-def test_missing_reflectance_is_an_error_not_a_guess():
+def test_missing_reflectance_is_an_error():
     with pytest.raises(InputError, match="encoding.reflectance=false"):
         Encoding(HDL64E).encode(torch.ones(1, *HDL64E.shape))

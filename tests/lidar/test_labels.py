@@ -1,4 +1,4 @@
-"""Label files: the class of each pixel's return, and no damaged or foreign file taken for labels."""
+"""Label files: the class of each pixel's return; damaged and other files are refused."""
 
 import os
 from pathlib import Path
@@ -8,10 +8,9 @@ import pytest
 
 from r2flow.data.sources import read_labelled_scan
 from r2flow.errors import InputError
-from r2flow.lidar.labels import CLASSES, labels_beside, read_labels
+from r2flow.lidar.labels import LABELS, labels_beside, read_labels
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.simulator.labels import LABELS
 
 SENSOR = SENSORS["hdl64e"].resized(8, 16)
 COUNT = 200
@@ -39,7 +38,7 @@ def label(scan: Path) -> Path:
     return path
 
 
-def test_they_are_found_in_the_folder_of_labels_and_beside_the_scan(scan: Path, tmp_path: Path):
+def test_label_files_are_found_in_the_labels_folder_and_beside_the_scan(scan: Path, tmp_path: Path):
     assert labels_beside(scan) is None
     beside = scan.with_name("000000.label")
     beside.write_bytes(WHOLE)
@@ -66,14 +65,14 @@ def test_each_pixel_has_the_label_of_its_nearest_return(scan: Path, label: Path)
     assert (labels[image[0] == 0] == 0).all()
 
 
-def test_a_row_that_is_dropped_takes_its_label_along(scan: Path, label: Path):
+def test_labels_of_dropped_rows_are_dropped(scan: Path, label: Path):
     rows = np.fromfile(scan, "<f4").reshape(-1, 4)
     rows[17, 0], rows[90, 2] = np.nan, 1e30
     rows.tofile(scan)
     np.testing.assert_array_equal(read_labels(label, scan), np.delete(IDS, [17, 90]))
 
 
-def test_without_labels_there_are_none(scan: Path):
+def test_a_scan_without_a_label_file_has_no_labels(scan: Path):
     image, labels = read_labelled_scan(scan, SENSOR, reflectance=False)
     assert image.shape == (1, 8, 16)
     assert labels is None
@@ -112,7 +111,7 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_nothing_else_passes_for_labels(scan: Path, label: Path, name: str):
+def test_other_content_is_refused_as_labels(scan: Path, label: Path, name: str):
     label.write_bytes(FOREIGN[name])
     refused(label, scan)
 
@@ -135,7 +134,7 @@ def test_a_flipped_bit_changes_one_label_or_is_refused(scan: Path, label: Path):
     assert refusals > 15
 
 
-def test_what_is_no_file_is_said(scan: Path, label: Path, tmp_path: Path):
+def test_paths_that_are_not_regular_files_are_refused(scan: Path, label: Path, tmp_path: Path):
     label.unlink()
     assert "not a file" in refused(label, scan)
     label.mkdir()
@@ -153,8 +152,9 @@ def test_what_is_no_file_is_said(scan: Path, label: Path, tmp_path: Path):
     assert "need 800" in refused(label, scan)
 
 
-def test_the_simulators_classes_have_names_and_colours():
-    assert set(LABELS.values()) <= set(CLASSES)
+def test_ids_are_those_of_semantickitti():
+    ids = {"unlabeled": 0, "car": 10, "other-vehicle": 20, "lane-marking": 60, "other-object": 99, "moving-truck": 258}
+    assert {name: LABELS[name] for name in ids} == ids
 
 
 def test_real_labels(shared: Path):

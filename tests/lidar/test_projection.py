@@ -52,7 +52,7 @@ def test_azimuth_starts_behind_on_the_left_and_falls():
     assert columns == {1: 0, 2: 256, 3: 512, 4: 768, 5: 1023}
 
 
-def test_the_nearest_return_wins_in_any_order():
+def test_a_pixel_keeps_the_nearest_return_in_any_order():
     points = np.array([point(r, -5, 20) for r in (30, 12, 50)])
     for order in ([0, 1, 2], [1, 0, 2], [2, 0, 1]):
         image = project(points[order], np.array([0.3, 0.1, 0.5])[order], HDL64E)
@@ -100,7 +100,7 @@ def test_a_ring_column_in_the_file_gives_the_rows():
         np.testing.assert_allclose(again[0], image[0], rtol=1e-5)
 
 
-def test_a_scan_that_does_not_unfold_says_so():
+def test_a_scan_that_does_not_unfold_is_refused():
     draw = np.random.default_rng(0)
     with pytest.raises(InputError, match=r"unfolds into \d+ rings, but sensor 'hdl64e' has 64.*spherical"):
         project(draw.normal(size=(5000, 3)) * 10, None, HDL64E, "unfolding")
@@ -157,7 +157,7 @@ def test_the_reference_s_unfolding_on_real_scans(shared):
         ("vlp16", "other_sensors/vlp16/*.pcd"),
     ],
 )
-def test_a_real_point_lies_within_half_a_bin_of_where_its_pixel_looks(shared, name, scans):
+def test_a_real_point_lies_within_half_a_bin_of_its_pixel_s_ray(shared, name, scans):
     sensor = SENSORS[name]
     rows = np.deg2rad(sensor.row_edges)
     for path in sorted((shared / "real").glob(scans))[:2]:
@@ -194,7 +194,7 @@ def test_bin_centres_halve_the_reference_s_error_on_real_scans(shared):
     assert relative_error("centre") <= 0.0053 / 2
 
 
-def test_unfolded_real_scans_go_back_to_where_they_were(shared):
+def test_unfolded_real_scans_unproject_to_their_points(shared):
     sensor = SENSORS["hdl64e_rings"]
     for path in sorted((shared / "real" / "kitti360").rglob("*.bin"))[
         :3

@@ -54,7 +54,7 @@ def test_rounding_goes_outward_to_whole_units():
     assert (nearly_all.left, nearly_all.width, nearly_all.share) == (0, 72, 1)
 
 
-def test_everything_is_the_image_in_its_own_order():
+def test_the_whole_image_keeps_its_order():
     turns = [(-180, 180), (180, -180), (0, 360), (360, 0), (0, -360), (-360, 360), (10, -350)]
     for whole in (region((16, 72)), *(region((16, 72), turn, (0, 15)) for turn in turns)):
         assert whole == Region((16, 72), 0, 16, 0, 72)
@@ -73,6 +73,6 @@ def test_everything_is_the_image_in_its_own_order():
         (None, (-1, 3), "found -1-3"),
     ],
 )
-def test_what_is_no_region_is_refused(sector, rows, words):
+def test_impossible_regions_are_refused(sector, rows, words):
     with pytest.raises(InputError, match=words):
         region(SENSOR.shape, sector, rows)

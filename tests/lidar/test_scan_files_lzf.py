@@ -1,8 +1,6 @@
-"""LZF against streams made by hand, and against itself."""
+"""LZF against streams made by hand."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from r2flow.lidar.scan_files import lzf
 
@@ -30,18 +28,6 @@ def test_lzf_reaches_8192_bytes_back_and_no_farther():
     ("stream", "size"),
     [(STREAM[:-1], len(PLAIN)), (STREAM[:2], 3), (STREAM, len(PLAIN) + 1), (STREAM, 5), (b"\x20\x00", 3)],
 )
-def test_lzf_refuses_what_does_not_fit(stream, size):
+def test_lzf_refuses_damaged_streams(stream, size):
     with pytest.raises(ValueError, match=r"end in the middle|do not unpack|before the beginning"):
         lzf.decompress(stream, size)
-
-
-@given(st.lists(st.binary(max_size=40), max_size=40), st.integers(1, 60))
-def test_lzf_unpacks_what_it_packed(parts, repeats):
-    data = b"".join(parts) * repeats
-    packed = lzf.compress(data)
-    assert lzf.decompress(packed, len(data)) == data
-    assert len(packed) <= len(data) * 33 / 32 + 1
-
-
-def test_lzf_packs_what_repeats():
-    assert len(lzf.compress(bytes(26400))) < 26400 / 264 * 3 + 40

@@ -16,25 +16,25 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_what_is_written_is_read_again(sensor, tmp_path):
+def test_a_written_sensor_is_read_back(sensor, tmp_path):
     mine = Sensor(**{**vars(sensor), "name": "mine"})
     write_sensor(mine, tmp_path / "mine.yaml", "two\nlines")
     assert read_sensor(tmp_path / "mine.yaml") == mine
     assert read_sensor(tmp_path / "mine.yaml", 8, 64) == mine.resized(8, 64)
 
 
-def test_two_lines_are_enough(tmp_path):
+def test_name_and_elevations_are_enough(tmp_path):
     assert read_sensor(written(tmp_path, MINE)) == Sensor("mine", (10.0, 4.5, -3.0, -20.0))
 
 
-def test_all_that_can_be_written(tmp_path):
+def test_every_option_can_be_given(tmp_path):
     text = MINE + "rays: centre\nrows: 2\ncolumns: 64\nmin_range: 1\nmax_range: 50\nheight: 2\nfiring: [3, 1, 2, 0]\n"
     sensor = read_sensor(written(tmp_path, text))
     assert sensor == Sensor("mine", sensor.elevations, 64, 1.0, 50.0, 2.0)
     assert sensor.shape == (2, 64)
 
 
-def test_a_config_of_the_table_is_such_a_file():
+def test_the_configs_of_built_in_sensors_are_sensor_files():
     conf = Path(__file__).resolve().parents[2] / "conf" / "sensor"
     assert read_sensor(conf / "vlp32c.yaml") == SENSORS["vlp32c"]
 
@@ -61,7 +61,7 @@ def test_a_config_of_the_table_is_such_a_file():
         ("name: mine", "no sensor named 'mine'"),
     ],
 )
-def test_a_wrong_file_is_named_in_one_line(tmp_path, text, words):
+def test_a_wrong_file_is_one_line_with_its_name(tmp_path, text, words):
     with pytest.raises(InputError) as error:
         read_sensor(written(tmp_path, text))
     assert words in str(error.value)
@@ -69,7 +69,7 @@ def test_a_wrong_file_is_named_in_one_line(tmp_path, text, words):
     assert "\n" not in str(error.value)
 
 
-def test_what_is_no_file_is_refused(tmp_path):
+def test_files_that_are_not_yaml_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"is not a file\. A sensor is a name \(hdl64e"):
         read_sensor(tmp_path / "none.yaml")
     with pytest.raises(InputError, match="is not a file"):
@@ -82,7 +82,7 @@ def test_what_is_no_file_is_refused(tmp_path):
         read_sensor(tmp_path / "large.yaml")
 
 
-def test_it_is_yaml_that_others_read(tmp_path):
+def test_the_file_is_plain_yaml(tmp_path):
     write_sensor(SENSORS["vlp32c"], tmp_path / "x.yaml", "a comment")
     options = yaml.safe_load((tmp_path / "x.yaml").read_text())
     assert options["elevations"] == list(SENSORS["vlp32c"].elevations)

@@ -20,7 +20,7 @@ def test_hdl64e_is_the_paper_s_image():
     np.testing.assert_allclose(sensor.row_edges, 3 - 28 * np.arange(65) / 64, atol=1e-12)
 
 
-def test_rays_look_through_the_middle_of_their_bins(sensor):
+def test_rays_are_the_middles_of_their_bins(sensor):
     e, a = sensor.rays()
     height, width = sensor.shape
     torch.testing.assert_close(torch.rad2deg(e[:, 0]), torch.tensor(sensor.elevations), rtol=0, atol=1e-5)
@@ -122,7 +122,7 @@ def test_every_sensor_has_a_config_and_every_config_builds():
     assert set(built) == set(SENSORS)
 
 
-def test_a_sensor_of_one_s_own():
+def test_a_user_s_own_sensor_is_built():
     mine = build_sensor("mine", elevations=[2, 1.5, -1, -8], firing=[3, 1, 0, 2], columns=64, max_range=30, height=1)
     assert mine == Sensor("mine", (2.0, 1.5, -1.0, -8.0), 64, max_range=30.0, height=1.0, firing=(3, 1, 0, 2))
     assert build_sensor("mine", elevations=[2, 1.5, -1, -8], columns=64).rays()[0, :, 0].rad2deg().tolist() == (
@@ -150,7 +150,7 @@ def test_a_sensor_of_one_s_own():
         ({}, "no sensor named 'mine'"),
     ],
 )
-def test_an_impossible_sensor_of_one_s_own_is_refused(options, words):
+def test_an_impossible_sensor_of_a_user_is_refused(options, words):
     with pytest.raises(InputError) as error:
         build_sensor(**{"name": "mine", **options})
     assert words in str(error.value)

@@ -37,7 +37,7 @@ def test_whole_firings_unfold_whatever_their_order(name, how):
 
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("how", ["top", "bottom", "firing"])
-def test_ring_numbers_unfold_whatever_they_count(how, first):
+def test_ring_numbers_unfold_in_every_numbering(how, first):
     sensor = SENSORS["vlp32c"].resized(columns=48)
     firings, image = cloud(sensor)
     xyz = firings[:, packet_order(sensor, how)].reshape(-1, 3)
@@ -59,7 +59,7 @@ def test_a_ring_without_a_return_leaves_its_row_empty():
         np.testing.assert_allclose(again[0], expected, rtol=1e-6)
 
 
-def test_what_does_not_tell_its_lasers_is_refused_in_one_line():
+def test_scans_whose_lasers_cannot_be_found_are_refused_in_one_line():
     sensor = SENSORS["vlp32c"].resized(columns=64)
     xyz = cloud(sensor)[0][:, np.array(sensor.firing)].reshape(-1, 3)
     with pytest.raises(InputError, match=r"neither ring after ring nor in whole firings of 32.*spherical") as error:

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from r2flow.data.sources import Reading
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
 from r2flow.metrics.fidelity import PANEL, PER_PIXEL, controls, distances, nearest, panel
 from r2flow.reports.compare import read_fidelity
-from r2flow.reports.fidelity import compare_sets, drives_of, load_images, markdown
+from r2flow.reports.fidelity import compare_sets, load_scans, markdown
 from r2flow.reports.fidelity_page import fidelity_page
 from r2flow.reports.pages import write_page
 
@@ -91,7 +92,7 @@ def test_every_member_tells_real_drives_from_controls_and_no_other_statistic_doe
         [real / "kitti360", raw / "2011_09_26_drive_0048_sync", odometry / "08"],
         [odometry / "00", raw / "2011_09_26_drive_0005_sync", real / "object"],
     )
-    one, other = (np.concatenate([load_images(path, sensor) for path in half]) for half in halves)
+    one, other = (np.concatenate([load_scans(path, Reading(sensor))[0] for path in half]) for half in halves)
     result = judged(one, other, sensor, floor=other)
     assert result["blind"] == []
     per_pixel = result["per_pixel"]
@@ -131,9 +132,9 @@ def test_drives_are_the_folders_of_the_scans(tmp_path):
     for name in ("one/data/0.npy", "one/data/1.npy", "two/data/0.npy"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         np.save(tmp_path / name, walls(1, 0)[0])
-    found = drives_of(tmp_path)
-    assert found == [str(tmp_path / "one/data")] * 2 + [str(tmp_path / "two/data")]
-    assert len(found) == len(load_images(tmp_path, SENSOR))
+    images, drives = load_scans(tmp_path, Reading(SENSOR))
+    assert drives == [f"{tmp_path}: one/data"] * 2 + [f"{tmp_path}: two/data"]
+    assert len(images) == 3
 
 
 def test_the_page_holds_the_table_and_is_read_by_compare(tmp_path):

@@ -1,15 +1,12 @@
-from pathlib import Path
+import json
 
 import pytest
-import torch
-import yaml
 
-from r2flow.backbones import CONFIGURATIONS, build_backbone
+from r2flow.backbones import configurations
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.backbones import backbone_costs
-
-CONF = Path(__file__).resolve().parents[2] / "conf" / "backbone"
+from tests.test_cli import r2flow  # noqa: F401  a fixture
 
 # The paper's table II and its published models.
 PARAMETERS = {
@@ -35,28 +32,6 @@ def test_the_table_is_the_paper_s():
         assert row["gmac"] == pytest.approx(GMAC[name], rel=0.005)
 
 
-def composed(name: str) -> dict:
-    """conf/backbone/NAME.yaml over its defaults."""
-    own = yaml.safe_load((CONF / f"{name}.yaml").read_text())
-    base: dict = {}
-    for parent in own.pop("defaults", []):
-        base.update(composed(parent) if parent != "_self_" else {})
-    return {**base, **own}
-
-
-@pytest.mark.parametrize("path", sorted(CONF.glob("*.yaml")), ids=lambda path: path.stem)
-def test_the_table_of_configurations_is_that_of_conf(path: Path):
-    rays = SENSORS["hdl64e"].rays()
-    with torch.device("meta"):
-        ours = build_backbone(CONFIGURATIONS[path.stem], rays, 2).state_dict()
-        conf = build_backbone(composed(path.stem), rays, 2).state_dict()
-    assert {name: value.shape for name, value in ours.items()} == {name: value.shape for name, value in conf.items()}
-
-
-def test_every_configuration_is_in_conf():
-    assert {path.stem for path in CONF.glob("*.yaml")} == set(CONFIGURATIONS)
-
-
 def test_a_size_that_one_cannot_take_is_said_in_its_row():
     (row,) = backbone_costs(SENSORS["hdl64e"].resized(64, 1000), ["hdit"], repeats=0)
     assert row["latency_ms"] is None
@@ -71,4 +46,26 @@ def test_latency_is_measured():
 
 
 def test_every_configuration_takes_every_sensor_s_shape(sensor):
-    assert [row for row in backbone_costs(sensor, repeats=0) if "error" in row] == []
+    assert [row for row in backbone_costs(sensor, list(PARAMETERS), repeats=0) if "error" in row] == []
+
+
+def test_the_verb_prints_every_configuration(r2flow):  # noqa: F811
+    code, out, _ = r2flow("backbones", "--repeats", 0, "--device", "cpu")
+    assert code == 0
+    for name in configurations():
+        assert name in out
+    for words in ("64 x 1024", "GMAC", *(f"{count:,}" for count in PARAMETERS.values())):
+        assert words in out
+
+
+def test_the_verb_measures_what_it_is_asked_for(r2flow):  # noqa: F811
+    options = ("--only", "hdit_tiny,adm_unet_large", "--size", "16x64", "--channels", 1, "--repeats", 0, "--json")
+    code, out, _ = r2flow("backbones", *options)
+    assert code == 0
+    assert [row["name"] for row in json.loads(out)] == ["hdit_tiny", "adm_unet_large"]
+    code, out, _ = r2flow("backbones", "--only", "hdit_tiny", "--size", "16x64", "--repeats", 1, "--device", "cpu")
+    assert code == 0
+    assert "hdit_tiny" in out
+    code, _, err = r2flow("backbones", "--only", "hditt", "--repeats", 0)
+    assert code != 0
+    assert "Did you mean 'hdit'?" in err

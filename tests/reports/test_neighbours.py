@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from r2flow.data.opening import open_scans
+from r2flow.data.sources import Reading
 from r2flow.errors import InputError
 from r2flow.evaluation.measuring import Work
-from r2flow.evaluation.reading import Reading
-from r2flow.evaluation.sets import open_set
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.neighbours import find_neighbours, pair_rows, representation_of, sentences
 from tests.test_cli import r2flow  # noqa: F401  a fixture
@@ -23,7 +23,7 @@ def sets(tmp_path: Path):
     """Training scans, generated ones of which the last but one is a copy of number 5, and held-out ones."""
     made = {"training": images(9, 1), "generated": images(6, 2), "held": images(7, 3)}
     made["generated"][4] = made["training"][5]
-    return {name: open_set(str(folder(tmp_path / name, scans)), Reading(SENSOR)) for name, scans in made.items()}
+    return {name: open_scans(str(folder(tmp_path / name, scans)), Reading(SENSOR)) for name, scans in made.items()}
 
 
 def log_range(image: np.ndarray) -> np.ndarray:
@@ -73,7 +73,7 @@ def test_without_held_out_scans_training_scans_are_compared_to_the_others(sets):
 def test_scans_without_a_return_have_no_neighbour(sets, tmp_path):
     made = images(3, 2)
     made[1] = 0
-    with_empty = open_set(str(folder(tmp_path / "e", made)), Reading(SENSOR))
+    with_empty = open_scans(str(folder(tmp_path / "e", made)), Reading(SENSOR))
     representation = representation_of("pixels", [with_empty], "cpu")
     found = find_neighbours(with_empty, sets["training"], sets["held"], representation, Work())
     assert found.generated.numbers.tolist() == [0, 2]

@@ -1,4 +1,4 @@
-"""Sines, quantiles and lots that are the same on all machines, against the usual ones."""
+"""Machine-independent sines, quantiles and draws against those of the library."""
 
 import math
 
@@ -25,7 +25,7 @@ def test_sine_and_cosine_are_those_of_the_library():
     [(normals, 0.0, 1.0, 3.0), (exponentials, 1.0, 1.0, 9.0)],
     ids=["normal", "exponential"],
 )
-def test_lots_have_the_moments_of_their_law(draw, mean, deviation, fourth):
+def test_draws_have_the_moments_of_their_distribution(draw, mean, deviation, fourth):
     x = draw(np.random.default_rng(0), (N,)).astype(np.float64)
     assert x.mean() == pytest.approx(mean, abs=5 * deviation / math.sqrt(N))
     assert x.std() == pytest.approx(deviation, rel=0.02)

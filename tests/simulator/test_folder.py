@@ -1,4 +1,4 @@
-"""r2flow simulate: files that agree with each other and with the simulator, whoever writes them and when."""
+"""`r2flow simulate`: the files hold the simulator's scans, however many processes write them and in whatever order."""
 
 import json
 import sys
@@ -37,7 +37,7 @@ def test_files_hold_what_the_simulator_draws(tmp_path):
     np.testing.assert_array_equal(back, scan.labels)
 
 
-def test_what_is_there_is_kept_and_what_is_missing_made_again(tmp_path):
+def test_files_that_exist_are_kept_and_missing_ones_are_made(tmp_path):
     folder = SimulatedFolder(tmp_path, SMALL, 0)
     write_folder(folder, range(4), workers=1)
     whole, kept = contents(tmp_path), (tmp_path / "000001.bin").stat().st_mtime_ns
@@ -49,7 +49,7 @@ def test_what_is_there_is_kept_and_what_is_missing_made_again(tmp_path):
     assert (tmp_path / "000001.bin").stat().st_mtime_ns == kept
 
 
-def test_a_scan_does_not_depend_on_which_others_are_made(tmp_path):
+def test_a_scan_does_not_depend_on_the_others(tmp_path):
     write_folder(SimulatedFolder(tmp_path / "all", SMALL, 1), range(4), workers=1)
     for index in (3, 1):
         write_folder(SimulatedFolder(tmp_path / "some", SMALL, 1), [index], workers=1)
@@ -67,7 +67,7 @@ def test_two_processes_write_what_one_writes(tmp_path):
 @pytest.mark.parametrize(
     ("other", "words"),
     [
-        (SimulatedFolder(Path(), SMALL, 1), "seed 0, asked for is 1"),
+        (SimulatedFolder(Path(), SMALL, 1), "seed 0, not 1"),
         (SimulatedFolder(Path(), SENSORS["vlp16"], 0), "sensor hdl64e 16x128"),
     ],
     ids=["seed", "sensor"],
@@ -91,7 +91,8 @@ def test_other_peoples_scans_and_damaged_notes_are_left_alone(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("formats", "labels", "words"), [(("las",), False, "no format named 'las'"), (("npy",), True, "labels are one")]
+    ("formats", "labels", "words"),
+    [(("las",), False, "no format named 'las'"), (("npy",), True, "labels are those of points")],
 )
 def test_formats_that_cannot_be_written_are_named(tmp_path, formats, labels, words):
     with pytest.raises(InputError, match=words):

@@ -1,12 +1,12 @@
-"""The ground: slopes, waves, kerbs and streets, against what geometry says."""
+"""The ground: slopes, waves, kerbs and streets against geometry."""
 
 import numpy as np
 import pytest
 
+from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
-from r2flow.simulator.beams import along_rows
 from r2flow.simulator.ground import Ground, Street
-from r2flow.simulator.labels import LABELS
+from r2flow.simulator.lasers import along_rows
 from r2flow.simulator.rays import Rays
 
 HDL64E = SENSORS["hdl64e"]
@@ -28,17 +28,17 @@ def test_a_slope_is_met_where_ray_and_plane_cross(lean):
 def test_the_normal_of_a_slope_sets_the_angle_of_incidence():
     hit = Ground(lean=(0.1, 0.0)).meet(RAYS)
     column = HDL64E.columns // 2  # ahead, to within a fifth of a degree
-    e = RAYS.beams.elevation
+    e = RAYS.lasers.elevation
     met = np.isfinite(hit.distance[:, column])
     np.testing.assert_allclose(hit.cosine[met, column], np.sin(np.arctan(0.1) - e[met]), atol=1e-4)
 
 
-def test_on_waves_the_ray_ends_on_the_surface_and_passes_nothing_before():
+def test_on_waves_a_ray_ends_where_it_first_meets_the_surface():
     ground = Ground(waves=((0.4, 2 * np.pi / 60, 0.02, 1.0), (0.2, 0.0, 2 * np.pi / 45, 2.0)))
     hit = ground.meet(RAYS)
     met = np.isfinite(hit.distance)
     s, a = np.where(met, hit.distance, 1.0), np.broadcast_to(RAYS.azimuth, RAYS.shape)
-    slope = np.broadcast_to(np.tan(RAYS.beams.elevation)[:, None], RAYS.shape)
+    slope = np.broadcast_to(np.tan(RAYS.lasers.elevation)[:, None], RAYS.shape)
     for share, tolerance in ((1.0, 0.0), (0.9, 0.02), (0.6, 0.02), (0.3, 0.02)):
         above = HEIGHT + share * s * slope - ground.height(share * s * np.cos(a), share * s * np.sin(a))
         if share == 1:
@@ -61,7 +61,7 @@ def test_beside_the_street_the_ground_is_higher_by_the_kerb():
     np.testing.assert_allclose(np.abs(y[on_face]), 4.0, atol=0.02)
 
 
-def test_surfaces_lie_in_strips_beside_a_street():
+def test_surfaces_are_strips_beside_a_street():
     ground = Ground(streets=(STRAIGHT._replace(lines=(0.0, 3.5)),))
     y = np.array([3.0, 3.5, 3.9, 4.5, 5.9, 6.5])
     label, _, _ = ground.surface(np.full(6, 10.0), y)

@@ -1,16 +1,16 @@
-"""Ray casting against what geometry says."""
+"""Ray casting against geometry."""
 
 import numpy as np
 import pytest
 
+from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
-from r2flow.simulator.beams import along_rows, beams_of
-from r2flow.simulator.draws import Draws
 from r2flow.simulator.ground import Ground
-from r2flow.simulator.labels import LABELS
+from r2flow.simulator.lasers import along_rows, lasers_of
 from r2flow.simulator.materials import INDEX
 from r2flow.simulator.raycast import cast
 from r2flow.simulator.rays import Rays
+from r2flow.simulator.scalar_draws import ScalarDraws
 from r2flow.simulator.scene import SceneBuilder
 from r2flow.simulator.shapes import Blobs, Boxes, Cylinders, Frusta
 
@@ -18,36 +18,36 @@ HDL64E = SENSORS["hdl64e"]
 HEIGHT = HDL64E.height
 
 
-def look(*solids, ground=None, sensor=HDL64E, beams=None, material="concrete"):
+def look(*solids, ground=None, sensor=HDL64E, lasers=None, material="concrete"):
     """Hits of all rays on a few solids over flat ground, and r = s / cos e."""
-    b = SceneBuilder(ground or Ground(), Draws(np.random.default_rng(0)))
+    b = SceneBuilder(ground or Ground(), ScalarDraws(np.random.default_rng(0)))
     for label, solid in solids:
         b.add(solid, label, material)
-    rays = Rays(beams or along_rows(sensor), sensor.columns, sensor.height)
-    hits = cast(b.build("test", None), rays, np.random.default_rng(1))
-    return hits, hits.distance / np.cos(rays.beams.elevation)[:, None], rays
+    rays = Rays(lasers or along_rows(sensor), sensor.columns, sensor.height)
+    hits = cast(b.build(), rays, np.random.default_rng(1))
+    return hits, hits.distance / np.cos(rays.lasers.elevation)[:, None], rays
 
 
 def directions(rays):
     """Unit vectors of all rays, (3, B, W), float64."""
-    e, a = np.broadcast_arrays(rays.beams.elevation[:, None], rays.azimuth)
+    e, a = np.broadcast_arrays(rays.lasers.elevation[:, None], rays.azimuth)
     return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
 def test_a_sensor_above_flat_ground_measures_minus_h_over_sin_e():
     _, r, rays = look()
-    e = rays.beams.elevation[:, None]
+    e = rays.lasers.elevation[:, None]
     exact = np.where(np.sin(e) < -0.02, -HEIGHT / np.sin(e), np.inf)
     down = np.isfinite(exact[:, 0])
     np.testing.assert_allclose(r[down], np.broadcast_to(exact, r.shape)[down], rtol=1e-5)
-    assert np.isinf(r[rays.beams.elevation >= 0]).all()
+    assert np.isinf(r[rays.lasers.elevation >= 0]).all()
 
 
 def test_lasers_above_the_origin_see_flat_ground_at_their_own_height():
-    beams = beams_of(HDL64E)
-    hits, _, _ = look(beams=beams)
-    down = beams.elevation < -0.05
-    exact = -(HEIGHT + beams.height) / np.tan(beams.elevation)
+    lasers = lasers_of(HDL64E)
+    hits, _, _ = look(lasers=lasers)
+    down = lasers.elevation < -0.05
+    exact = -(HEIGHT + lasers.height) / np.tan(lasers.elevation)
     np.testing.assert_allclose(hits.distance[down], np.repeat(exact[down, None], HDL64E.columns, 1), rtol=1e-5)
 
 
@@ -86,7 +86,7 @@ def test_the_face_of_a_turned_box_is_met_in_its_plane(shape):
     on = np.argwhere(hits.label == LABELS["car"])
     assert len(on) > 200
     s = hits.distance[tuple(on.T)].astype(float)
-    a, z = rays.azimuth[on[:, 1]], HEIGHT + s * np.tan(rays.beams.elevation[on[:, 0]])
+    a, z = rays.azimuth[on[:, 1]], HEIGHT + s * np.tan(rays.lasers.elevation[on[:, 0]])
     p = np.stack([s * np.cos(a), s * np.sin(a)]) - middle[:, None]
     u, v = p[0] * np.cos(yaw) + p[1] * np.sin(yaw), p[1] * np.cos(yaw) - p[0] * np.sin(yaw)
     outside = np.max([np.abs(u) - length / 2, np.abs(v) - width / 2, z - 5.0, -z], axis=0)
@@ -97,13 +97,13 @@ def test_a_leaning_windscreen_is_met_in_its_plane():
     hits, _, rays = look(("car", Frusta(10.0, 0.0, np.pi, 4.0, 4.0, 0.0, 2.0, 0.5, 0.0, 0.0)))
     w = HDL64E.columns // 2
     rows = np.flatnonzero(hits.label[:, w] == LABELS["car"])
-    z = HEIGHT + hits.distance[rows, w] * np.tan(rays.beams.elevation[rows])
+    z = HEIGHT + hits.distance[rows, w] * np.tan(rays.lasers.elevation[rows])
     # its front looks at the sensor: at x = 8 on the ground, half a metre farther for each metre of height
     leaning = z < 2 - 1e-3
     np.testing.assert_allclose(hits.distance[rows, w][leaning], 8 + 0.5 * z[leaning], atol=0.02)
 
 
-def test_a_wall_hides_what_is_behind_it_and_nothing_before_it():
+def test_a_wall_hides_what_is_behind_it_only():
     wall = ("building", Boxes(12.0, 0.0, 0.0, 0.5, 200.0, -1.0, 50.0))
     near, far = Cylinders(8.0, 0.0, 0.3, 0.0, 4.0), Cylinders(20.0, 1.0, 0.3, 0.0, 4.0)
     with_wall, _, _ = look(wall, ("pole", near), ("trunk", far))
@@ -114,14 +114,14 @@ def test_a_wall_hides_what_is_behind_it_and_nothing_before_it():
     assert (with_wall.label == LABELS["pole"]).sum() == (without.label == LABELS["pole"]).sum()
 
 
-def test_the_nearest_of_many_overlapping_things_wins():
+def test_the_nearest_of_many_overlapping_solids_is_met():
     solids = [("car", Boxes(x, 0.3 * x, 0.2 * x, 1.5, 1.0, 0.0, 2.0)) for x in (5.0, 6.0, 7.0, 9.0, 14.0)]
     together, _, _ = look(*solids)
     apart = np.min([look(one)[0].distance for one in solids], axis=0)
     np.testing.assert_array_equal(together.distance, apart)
 
 
-def test_a_free_path_lets_through_the_share_that_an_exponential_says():
+def test_the_share_of_pulses_through_leaves_is_exponential_in_their_path():
     radius, path = 2.0, 1.5
     hits, _, rays = look(("vegetation", Blobs(15.0, 0.0, 1.7, radius, radius, path)))
     d, c = directions(rays), np.array([15.0, 0.0, 1.7 - HEIGHT])
@@ -136,7 +136,7 @@ def test_a_free_path_lets_through_the_share_that_an_exponential_says():
 def test_walls_seen_face_on_have_cosine_one_and_grazed_ground_sin_e():
     hits, _, rays = look(("building", Boxes(10.0, 0.0, 0.0, 1.0, 40.0, -1.0, 9.0)))
     middle = HDL64E.columns // 2
-    e = rays.beams.elevation
+    e = rays.lasers.elevation
     wall = hits.label[:, middle] == LABELS["building"]
     np.testing.assert_allclose(hits.cosine[wall, middle], np.cos(e[wall]), atol=1e-4)
     flat = (hits.label[:, 0] == LABELS["terrain"]) & (e < -0.05)

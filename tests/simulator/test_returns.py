@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
+from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator import observe
-from r2flow.simulator.beams import HDL64E, along_rows, beams_of, rows_of
-from r2flow.simulator.draws import Draws
 from r2flow.simulator.ego import RIGS, hidden
 from r2flow.simulator.ground import Ground
-from r2flow.simulator.labels import LABELS
+from r2flow.simulator.lasers import HDL64E, along_rows, lasers_of, rows_of
 from r2flow.simulator.materials import INDEX, MATERIALS
+from r2flow.simulator.scalar_draws import ScalarDraws
 from r2flow.simulator.scene import SceneBuilder
 from r2flow.simulator.shapes import Boxes, Cylinders
 
@@ -20,10 +20,10 @@ VLP16 = SENSORS["vlp16"]
 
 def wall(material: str, distance: float = 10.0, sensor=VLP16, albedo: float | None = None):
     """The scan of a wall ahead of the sensor, and the pixels that look at it within 30 degrees."""
-    b = SceneBuilder(Ground(), Draws(np.random.default_rng(0)))
+    b = SceneBuilder(Ground(), ScalarDraws(np.random.default_rng(0)))
     usual = MATERIALS[INDEX[material]].albedo if albedo is None else albedo
     b.add(Boxes(distance + 5, 0, 0, 10, 200, -1, 100), "building", material, usual)
-    scan = observe(b.build("test", None), sensor, np.random.default_rng(1))
+    scan = observe(b.build(), sensor, np.random.default_rng(1))
     return scan, np.abs(sensor.rays().numpy()[1]) < np.pi / 6
 
 
@@ -41,13 +41,13 @@ def test_lasers_of_an_hdl64e_fall_by_a_third_of_a_degree_above_and_half_below():
     assert (steps > 0).all()
     assert steps[:31].mean() == pytest.approx(1 / 3, abs=0.03)
     assert steps[32:].mean() == pytest.approx(1 / 2, abs=0.03)
-    assert beams_of(SENSOR.resized(32, 256)) is HDL64E
+    assert lasers_of(SENSOR.resized(32, 256)) is HDL64E
 
 
 def test_other_sensors_fire_along_their_rows():
-    beams = beams_of(VLP16)
-    np.testing.assert_allclose(np.rad2deg(beams.elevation), VLP16.elevations)
-    assert beams.straight
+    lasers = lasers_of(VLP16)
+    np.testing.assert_allclose(np.rad2deg(lasers.elevation), VLP16.elevations)
+    assert lasers.straight
 
 
 def test_a_wall_is_measured_to_within_the_noise():
@@ -71,7 +71,7 @@ def test_ranges_come_in_steps_of_two_millimetres_and_reflectance_in_hundredths()
 @pytest.mark.parametrize(
     ("material", "low", "high"), [("retro", 0.85, 1.0), ("plaster", 0.35, 0.5), ("rubber", 0.0, 0.1)]
 )
-def test_materials_read_as_bright_as_they_are(material, low, high):
+def test_materials_have_their_albedo(material, low, high):
     scan, ahead = wall(material)
     seen = ahead & (scan.image[0] > 0) & (scan.labels == LABELS["building"])
     assert low <= scan.image[1][seen].mean() <= high
@@ -104,10 +104,10 @@ def test_grazing_incidence_darkens_a_glossy_wall():
 
 
 @pytest.mark.parametrize("rig", range(len(RIGS)))
-def test_the_own_car_hides_what_is_below_and_nothing_above(rig):
-    beams = along_rows(SENSOR)
-    mask = hidden(beams, 1024, rig)
-    assert not mask[beams.elevation > np.deg2rad(-10)].any()
+def test_the_own_car_hides_only_what_is_below(rig):
+    lasers = along_rows(SENSOR)
+    mask = hidden(lasers, 1024, rig)
+    assert not mask[lasers.elevation > np.deg2rad(-10)].any()
     assert mask[-1].mean() > 0.3
     assert mask[:, 512][-4:].all()  # the roof ahead
 
@@ -120,12 +120,12 @@ def test_neighbouring_lasers_see_the_own_car_from_either_side():
     assert (np.sign(np.diff(middle)) == -np.sign(np.diff(middle))[0] * (-1) ** np.arange(1, len(rows))).all()
 
 
-def test_the_nearest_of_several_lasers_in_a_pixel_wins():
+def test_a_pixel_keeps_the_nearest_of_several_lasers():
     # at 16 rows about four lasers share a row: a thin near bar must not be overwritten by what is behind
     coarse = SENSOR.resized(16, 1024)
-    b = SceneBuilder(Ground(), Draws(np.random.default_rng(0)))
+    b = SceneBuilder(Ground(), ScalarDraws(np.random.default_rng(0)))
     b.add(Boxes(20, 0, 0, 1, 200, -1, 50), "building", "plaster", 0.4)
     b.add(Cylinders(10, 0, 0.5, 1.6, 1.7), "pole", "plaster", 0.4)  # a bar seen by two lasers at most
-    scan = observe(b.build("test", None), coarse, np.random.default_rng(1))
+    scan = observe(b.build(), coarse, np.random.default_rng(1))
     column = scan.labels[:, 512]
     assert (column == LABELS["pole"]).sum() >= 1

@@ -8,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 
+from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.noise import generator
 from r2flow.simulator import draw_scene, simulate
-from r2flow.simulator.labels import LABELS
 
 HDL64E = SENSORS["hdl64e"]
 SMALL = HDL64E.resized(32, 256)
@@ -75,7 +75,7 @@ def test_the_scene_is_drawn_before_anything_of_the_sensor():
 
 
 @pytest.mark.parametrize("sensor", SENSORS_SEEN, ids=lambda s: f"{s.name}-{s.shape[0]}-{s.max_range:g}")
-def test_images_keep_to_the_sensors_limits(sensor: Sensor):
+def test_images_are_within_the_sensors_limits(sensor: Sensor):
     scan = simulate(sensor, 0, 0)
     r, reflectance = scan.image
     assert scan.image.shape == (2, *sensor.shape)
@@ -113,7 +113,7 @@ def test_images_keep_to_the_sensors_limits(sensor: Sensor):
     ],
     ids=lambda names: names[0],
 )
-def test_every_kind_of_thing_appears(scans, names):
+def test_every_kind_of_object_appears(scans, names):
     wanted = [LABELS[name] for name in names]
     assert sum(int(np.isin(scan.labels, wanted).sum()) for scan in scans) > 50
 

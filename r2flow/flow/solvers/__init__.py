@@ -1,16 +1,17 @@
-"""From one end of the flow to the other: dx = v(t, x) dt."""
+"""ODE solvers: dx/dt = v(t, x) from one end of the flow to the other."""
 
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.solvers.adaptive import FLOOR, solve_adaptive
-from r2flow.flow.solvers.clock import Limits
+from r2flow.flow.solvers.adaptive import LEAST_TOLERANCE, solve_adaptive
+from r2flow.flow.solvers.embedded import EmbeddedMethod, bosh3, dopri5
 from r2flow.flow.solvers.external import (
     TORCHDIFFEQ,
     check_torchdiffeq,
@@ -20,16 +21,16 @@ from r2flow.flow.solvers.external import (
 )
 from r2flow.flow.solvers.fixed import AB2, FixedStep, euler, heun2, heun3, midpoint, rk4, solve_fixed
 from r2flow.flow.solvers.grids import GRIDS, build_grid, calibrated_grid, extended, halved
-from r2flow.flow.solvers.pairs import Pair, bosh3, dopri5
 from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite
+from r2flow.flow.solvers.step_size import Limits
 from r2flow.registry import Registry
 
 __all__ = [
-    "FLOOR", "GRIDS", "SOLVERS", "TORCHDIFFEQ", "FixedStep", "Pair", "Solution", "Velocity",
+    "GRIDS", "LEAST_TOLERANCE", "SOLVERS", "TORCHDIFFEQ", "EmbeddedMethod", "FixedStep", "Solution", "Velocity",
     "adapts", "calibrated_grid", "check_method", "check_tolerance", "solve",
 ]  # fmt: skip
 
-SOLVERS: Registry[FixedStep | Pair] = Registry(
+SOLVERS: Registry[FixedStep | EmbeddedMethod] = Registry(
     "solver",
     euler=FixedStep(euler, order=1, evaluations=1),
     midpoint=FixedStep(midpoint, order=2, evaluations=2),
@@ -40,8 +41,8 @@ SOLVERS: Registry[FixedStep | Pair] = Registry(
     bosh3=bosh3,
     dopri5=dopri5,
 )
-# By so much is the second solution's tolerance below the first one's. At 10, and now and then at 30, its own error is
-# as large as the first one's where the velocity jumps in time; at 100 more scenes run out of their budget.
+# The second solution's tolerance is the first's divided by this. At 10, sometimes at 30, its own error is as large as
+# the first's where the velocity jumps in time; at 100 more scenes exceed their budget of evaluations.
 TIGHTER = 60.0
 
 
@@ -63,9 +64,9 @@ def solve(
 ) -> Solution:
     """Solve dx/dt = v(t, x) from x at t_0 to t_1, forward or backward in time.
 
-    The state and t stay in float32 (float64 when x is) whatever the network computes in; the memory does not grow
-    with the number of steps. Our own methods evaluate nothing outside t_0 to t_1, and with the adaptive ones a scene's
-    result does not depend on its neighbours. A scene that cannot be solved is flagged, never raised.
+    The state and t stay in float32 (float64 when x is) whatever the network computes in; the memory does not grow with
+    the number of steps. Our own methods evaluate v only between t_0 and t_1, and with the adaptive ones a scene's
+    result does not depend on the others. A scene that cannot be solved is flagged; no exception is raised.
 
     Args:
         velocity: v(t, x) with t of shape () in a fixed-step method, (B,) in an adaptive one, where B shrinks as scenes
@@ -73,22 +74,20 @@ def solve(
         x: State at t_0, (B, ...).
         method: A name in `SOLVERS`, or `torchdiffeq:NAME` for one of torchdiffeq's.
         steps: Steps of a fixed-step method on a named grid; an adaptive one ignores it.
-        tolerance: Absolute and relative tolerance of an adaptive method. Ours hold each step to it by the sixth-power
-            mean over a scene's elements, (mean |e / (tolerance + tolerance |x|)|^6)^(1/6) <= 1: between the root mean
-            square, in which the few elements that are hard at a time go under, and the largest. Floored, with a
-            warning, at what the state's type and that of the velocity can hold (`FLOOR`). It does not bound the error
-            at t_1. A fixed-step method ignores it.
+        tolerance: Absolute and relative tolerance of an adaptive method, for the local error e of a step:
+            (mean |e / (tolerance + tolerance |x|)|^6)^(1/6) <= 1 over a scene's elements. It does not bound the error
+            at t_1. Tolerances below `LEAST_TOLERANCE` of the state's or the velocity's type are raised to it, with a
+            warning.
         progress: Called after every evaluation.
-        grid: `uniform`, `quadratic` (denser towards t = 1) or the times themselves, (N + 1,) from t_0 to where
-            `finish` begins; for fixed steps.
-        finish: Length of a last stretch, before t_1, that is left to one Euler step: 1e-3 keeps clear of a velocity
-            that is singular at t_1.
-        max_evaluations: An adaptive method's budget for a scene, at least 2: the start's, and one to feel for the
-            first step.
-        max_step: Longest step of our adaptive methods, as a share of the interval: 1/64 looks for what is narrow in
-            time, at 64 steps at least.
-        global_error: Estimate it by a second solution, with twice the steps or a sixtieth of the tolerance, and
-            about a sixtieth of `finish`; its evaluations are counted.
+        grid: Time grid of a fixed-step method: `uniform`, `quadratic` (denser towards t = 1) or the times themselves,
+            (N + 1,) from t_0 to where `finish` begins.
+        finish: Length of the last part of the interval, which one Euler step takes: 1e-3 avoids a velocity that is
+            singular at t_1.
+        max_evaluations: Budget of a scene in an adaptive method, at least 2: at t_0 and for the first step size.
+        max_step: Longest step of our adaptive methods as a share of the interval: 1/64 makes at least 64 steps, so that
+            no change of that length is missed.
+        global_error: Estimate the error at t_1 by a second solution, with half the steps' lengths or a sixtieth of the
+            tolerance, and a sixtieth of `finish`; its evaluations are counted.
 
     Raises:
         InputError: an unknown method or grid, fewer than one step, or a number out of its range.
@@ -98,44 +97,74 @@ def solve(
     x = x if x.dtype == torch.float64 else x.float()
     if t_0 == t_1 or not len(x):
         return _at_rest(x, global_error)
-    sign = math.copysign(1.0, t_1 - t_0)
-    times = build_grid(grid, t_0, t_1 - sign * finish if finish else t_1, steps)
-    entry = None if method.startswith(TORCHDIFFEQ) else SOLVERS[method]
-    limits = Limits(tolerance, max_evaluations, max_step=max_step, finish=finish)
+    times = build_grid(grid, t_0, t_1 - math.copysign(finish, t_1 - t_0) if finish else t_1, steps)
+    run = _Run(method, t_0, t_1, times, Limits(tolerance, max_evaluations, max_step=max_step, finish=finish), progress)
+    solution = run.solve(velocity, x)
+    return _with_global_error(solution, run, velocity, x) if global_error else solution
 
-    def once(velocity: Velocity, x: Tensor, times: Tensor, limits: Limits) -> Solution:
-        v = Evaluations(velocity, len(x), progress)
-        if isinstance(entry, Pair):
-            return solve_adaptive(v, x, t_0, t_1, entry, limits)
-        last = torch.tensor(sign * limits.finish, dtype=torch.float64) if finish else None
-        if isinstance(entry, FixedStep):
-            return solve_fixed(v, x, times, entry, last)
-        return solve_torchdiffeq(v, x, times, method.removeprefix(TORCHDIFFEQ), limits, last)
 
-    solution = once(velocity, x, times, limits)
-    if not global_error:
-        return solution
-    # The Euler step at the end errs as well: the second solution must not share it.
-    closing = max(finish / TIGHTER, min(finish, 1e-6 * abs(t_1 - t_0)))
-    limits = limits._replace(tighter=TIGHTER, finish=closing)
-    times = extended(times if adapts(method) else halved(times), t_1, sign * closing) if finish else halved(times)
-    if not adapts(method):
-        # Two solutions whose steps differ by 2 differ by 1 - 2^-p of the coarser one's error.
-        tighter = once(velocity, x, times, limits)
-        return _estimated(solution, tighter, np.arange(len(x)), 1 - 2.0 ** -_order(method))
-    scenes = solution.converged.nonzero()[:, 0]
-    if not len(scenes):
-        nowhere = torch.full((len(x),), math.inf, dtype=torch.float64)
-        return replace(solution, global_error=nowhere, estimate_evaluations=torch.zeros_like(solution.evaluations))
-    select = getattr(velocity, "select", None)
-    if len(scenes) < len(x) and select is not None:
-        velocity = select(scenes)
-    tighter = once(velocity, x[scenes.to(x.device)], times, limits)
-    return _estimated(solution, tighter, scenes.numpy(), 1.0)
+class _Run(NamedTuple):
+    """Everything that a solution depends on but the velocity and the state.
+
+    Attributes:
+        times: Time grid of a fixed-step method, from t_0 to where `limits.finish` begins.
+    """
+
+    method: str
+    t_0: float
+    t_1: float
+    times: Tensor
+    limits: Limits
+    progress: Callable[[], None] | None
+
+    def solve(self, velocity: Velocity, x: Tensor) -> Solution:
+        v = Evaluations(velocity, len(x), self.progress)
+        method = None if self.method.startswith(TORCHDIFFEQ) else SOLVERS[self.method]
+        if isinstance(method, EmbeddedMethod):
+            return solve_adaptive(v, x, self.t_0, self.t_1, method, self.limits)
+        finish = torch.tensor(self._signed(self.limits.finish), dtype=torch.float64) if self.limits.finish else None
+        if isinstance(method, FixedStep):
+            return solve_fixed(v, x, self.times, method, finish)
+        return solve_torchdiffeq(v, x, self.times, self.method.removeprefix(TORCHDIFFEQ), self.limits, finish)
+
+    def tighter(self) -> "_Run":
+        """The run with smaller errors that the estimate of the global error compares with."""
+        times = self.times if adapts(self.method) else halved(self.times)
+        # The Euler step at the end has an error too: it must be smaller in the second solution.
+        finish = max(self.limits.finish / TIGHTER, min(self.limits.finish, 1e-6 * abs(self.t_1 - self.t_0)))
+        if finish:
+            times = extended(times, self.t_1, self._signed(finish))
+        return self._replace(times=times, limits=self.limits._replace(tighter=TIGHTER, finish=finish))
+
+    def _signed(self, length: float) -> float:
+        return math.copysign(length, self.t_1 - self.t_0)
+
+
+def _with_global_error(solution: Solution, run: _Run, velocity: Velocity, x: Tensor) -> Solution:
+    """The solution with an estimate of its error: the difference to a second, tighter one.
+
+    An adaptive method solves only those scenes again that have converged.
+    """
+    scenes = solution.converged.nonzero()[:, 0] if adapts(run.method) else torch.arange(len(x))
+    error = torch.full((len(x),), math.inf, dtype=torch.float64)
+    extra = torch.zeros_like(solution.evaluations)
+    if len(scenes):
+        select = getattr(velocity, "select", None)
+        if len(scenes) < len(x) and select is not None:
+            velocity = select(scenes)
+        here = scenes.to(x.device)
+        second = run.tighter().solve(velocity, x[here])
+        rms = (solution.x[here] - second.x).detach().double().square().flatten(1).mean(1).sqrt().cpu()
+        if not adapts(run.method):
+            rms = rms / (1 - 2.0 ** -_order(run.method))  # with h and h/2 the solutions differ by (1 - 2^-p) e_h
+        error[scenes] = torch.where(second.converged & solution.converged[scenes], rms, math.inf)
+        extra[scenes] = second.evaluations
+    evaluations = solution.evaluations + extra
+    return replace(solution, evaluations=evaluations, global_error=error, estimate_evaluations=extra)
 
 
 def check_method(method: str) -> None:
-    """Know a solver by its name before it is needed.
+    """Check the name of a solver.
 
     Raises:
         InputError: an unknown method.
@@ -147,7 +176,7 @@ def check_method(method: str) -> None:
 
 
 def check_tolerance(tolerance: float) -> None:
-    """Know a tolerance before it is needed.
+    """Check a tolerance.
 
     Raises:
         InputError: it is not positive and finite.
@@ -160,7 +189,7 @@ def adapts(method: str) -> bool:
     """Whether a method chooses its steps by a tolerance."""
     if method.startswith(TORCHDIFFEQ):
         return not is_fixed(method.removeprefix(TORCHDIFFEQ))
-    return isinstance(SOLVERS[method], Pair)
+    return isinstance(SOLVERS[method], EmbeddedMethod)
 
 
 def _order(method: str) -> int:
@@ -168,20 +197,8 @@ def _order(method: str) -> int:
     return int(torchdiffeq_methods()[name].order) if name != method else SOLVERS[method].order
 
 
-def _estimated(solution: Solution, tighter: Solution, scenes: np.ndarray, share: float) -> Solution:
-    """The error of the first solution, as far as the second one, of these scenes, can tell."""
-    difference = torch.full((len(solution.x),), math.inf, dtype=torch.float64)
-    extra = torch.zeros_like(solution.evaluations)
-    extra[scenes] = tighter.evaluations
-    first = solution.x[torch.from_numpy(scenes).to(solution.x.device)]
-    rms = (first - tighter.x).detach().double().square().flatten(1).mean(1).sqrt().cpu() / share
-    difference[scenes] = torch.where(tighter.converged & solution.converged[scenes], rms, math.inf)
-    evaluations = solution.evaluations + extra
-    return replace(solution, evaluations=evaluations, global_error=difference, estimate_evaluations=extra)
-
-
 def _at_rest(x: Tensor, global_error: bool) -> Solution:
-    """The solution where there is nowhere to go."""
+    """The solution of an empty interval or an empty batch."""
     solution = Solution.build(x, np.zeros(len(x)), 0, 0, False, finite(x).cpu().numpy())
     if not global_error:
         return solution
@@ -198,7 +215,7 @@ def _check_numbers(
         raise InputError(f"a solver needs at least 1 step, found {steps}.")
     check_tolerance(tolerance)
     if not (finish == 0 or 0 < finish < abs(t_1 - t_0)):
-        raise InputError(f"the last stretch must be shorter than the whole way from {t_0} to {t_1}, found {finish}.")
+        raise InputError(f"finish must be shorter than the interval from {t_0} to {t_1}, found {finish}.")
     if max_evaluations < 2:
         raise InputError(f"a scene needs a budget of at least 2 evaluations, found {max_evaluations}.")
     if not 0 < max_step <= 1:

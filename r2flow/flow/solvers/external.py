@@ -9,28 +9,29 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.solvers.adaptive import floored
-from r2flow.flow.solvers.clock import Limits
+from r2flow.flow.solvers.adaptive import attainable
 from r2flow.flow.solvers.fixed import euler
 from r2flow.flow.solvers.solution import Evaluations, Solution
+from r2flow.flow.solvers.step_size import Limits
 
 log = logging.getLogger(__name__)
 
 TORCHDIFFEQ = "torchdiffeq:"
-# Its Adams methods need equal steps without saying so: on others their order falls to 2. Of order 12, its default, the
-# explicit one errs even more with every halving of equal ones (measured: order -2). SciPy's count no steps.
+# Its Adams methods need equal steps, which it does not check: on others their order falls to 2. With its default order
+# of 12 the error of the explicit one grows with every halving of equal steps (measured: order -2). SciPy's count no
+# steps.
 LEFT_OUT = ("explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver")
 
 
 def torchdiffeq_methods() -> dict[str, Any]:
-    """torchdiffeq's table of solvers, but for those in `LEFT_OUT`."""
+    """torchdiffeq's table of solvers without those in `LEFT_OUT`."""
     from torchdiffeq._impl.odeint import SOLVERS
 
     return {name: method for name, method in SOLVERS.items() if name not in LEFT_OUT}
 
 
 def check_torchdiffeq(name: str) -> None:
-    """Know a method of torchdiffeq by its name.
+    """Check the name of a torchdiffeq method.
 
     Raises:
         InputError: an unknown method, or one that is left out.
@@ -55,14 +56,14 @@ def is_fixed(name: str) -> bool:
 def solve_torchdiffeq(
     v: Evaluations, x: Tensor, times: Tensor, name: str, limits: Limits, finish: Tensor | None
 ) -> Solution:
-    """Scene after scene: torchdiffeq takes a batch for one state with one error norm, in which a hard scene among
-    easy ones goes under.
+    """Solve one scene after another, since torchdiffeq has one error norm for a batch, which hides a hard scene.
 
     Args:
-        times: The grid of a fixed-step method; an adaptive one goes from its first to its last time.
+        times: The time grid of a fixed-step method; an adaptive one goes from its first to its last time.
     """
     total = len(x)
-    tolerance = limits.tolerance if is_fixed(name) else floored(limits, v.coarsest(x))  # before any answer
+    # By the state's type: the velocity has not been called yet.
+    tolerance = limits.tolerance if is_fixed(name) else attainable(limits, v.coarsest(x))
     ends, taken, lost, converged = [], [], [], []
     for index in range(total):
         v.only(np.array([index]))
@@ -79,11 +80,11 @@ def solve_torchdiffeq(
 
 
 class _Spent(Exception):
-    """The budget of a scene is used up."""
+    """A scene has used its budget of evaluations."""
 
 
 class _Scene:
-    """One scene's velocity, and what torchdiffeq reports about it."""
+    """One scene's velocity, and what torchdiffeq reports on the way."""
 
     def __init__(self, v: Evaluations, x: Tensor, max_evaluations: int) -> None:
         self._v, self._left = v, max_evaluations
@@ -103,7 +104,7 @@ class _Scene:
         self.rejected += 1
 
     def callbacks(self, known: set[str]) -> Callable[[Tensor, Tensor], Tensor]:
-        """The field with those callbacks that the method knows: torchdiffeq warns about others."""
+        """The velocity with the callbacks that the method knows; torchdiffeq warns about others."""
 
         def field(t: Tensor, x: Tensor) -> Tensor:
             return self(t, x)
@@ -115,7 +116,7 @@ class _Scene:
 
 
 def _end(field: _Scene, times: Tensor, name: str, tolerance: float, finish: Tensor | None) -> tuple[Tensor, bool]:
-    """State at the end and True, or the last finite one and False."""
+    """The state at the end and True, or the last finite state and False."""
     import torchdiffeq
 
     method, x = torchdiffeq_methods()[name], field.last

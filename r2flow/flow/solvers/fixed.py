@@ -1,4 +1,4 @@
-"""Solvers that take the steps of a grid, whatever the scene."""
+"""Solvers that take the steps of a time grid."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -16,7 +16,7 @@ Step = Callable[[Velocity, Tensor, Tensor, Tensor], Tensor]
 class FixedStep(NamedTuple):
     """One step x(t) -> x(t + h), the order of its global error, and its evaluations of the velocity.
 
-    A method that remembers earlier steps is a class: every solution makes a step of its own from it.
+    A multistep method is a class: every solution makes an instance, which remembers the earlier steps.
     """
 
     step: Step | type
@@ -58,8 +58,8 @@ def rk4(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
 class AB2:
     """Two-step Adams-Bashforth, x + h ((1 + w/2) v_n - w/2 v_(n-1)) with w = h_n / h_(n-1); Euler first.
 
-    Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, III.5: steps of different length are allowed.
-    The error of the one Euler step is of second order itself.
+    Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, III.5: steps may differ in length. The one Euler
+    step has an error of second order, so that the order stays 2.
     """
 
     def __init__(self) -> None:
@@ -78,9 +78,9 @@ class AB2:
 
 
 def solve_fixed(v: Evaluations, x: Tensor, times: Tensor, method: FixedStep, finish: Tensor | None) -> Solution:
-    """Step through `times`, float64 (N + 1,), then take an Euler step of length `finish` if there is one.
+    """Take the steps of a time grid, (N + 1,) float64, then an Euler step of length `finish` if there is one.
 
-    A scene whose state is no longer finite keeps its last finite one; the others do not notice.
+    A scene whose state is no longer finite keeps its last finite one; the others are not affected.
     """
     step = method.step() if isinstance(method.step, type) else method.step
     steps = [(t, following - t, step) for t, following in pairwise(times)]

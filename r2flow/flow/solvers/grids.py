@@ -1,4 +1,4 @@
-"""Where fixed steps fall between t_0 and t_1."""
+"""Time grids: the times between t_0 and t_1 at which fixed steps begin and end."""
 
 import math
 from itertools import pairwise
@@ -51,7 +51,7 @@ def build_grid(grid: str | Tensor, t_0: float, t_1: float, steps: int) -> Tensor
 
 
 def halved(times: Tensor) -> Tensor:
-    """Every step in two; (N + 1,) -> (2 N + 1,)."""
+    """Every step divided into two; (N + 1,) -> (2 N + 1,)."""
     finer = times.new_empty(2 * len(times) - 1)
     finer[::2] = times
     finer[1::2] = (times[1:] + times[:-1]) / 2
@@ -59,7 +59,7 @@ def halved(times: Tensor) -> Tensor:
 
 
 def extended(times: Tensor, t_1: float, closing: float) -> Tensor:
-    """The times and further ones that halve the way to t_1, up to `closing` (with its sign) before it."""
+    """The times and further ones that halve the distance to t_1, until it is `closing` (which has a sign)."""
     left = [t_1 - float(times[-1])]
     while abs(left[-1]) > 2 * abs(closing):
         left.append(left[-1] / 2)
@@ -67,41 +67,33 @@ def extended(times: Tensor, t_1: float, closing: float) -> Tensor:
     return torch.cat([times, times.new_tensor(further)])
 
 
-def calibrated_grid(
-    velocity: Velocity,
-    x_0: Tensor,
-    steps: int,
-    t_0: float = 0.0,
-    t_1: float = 1.0,
-    order: int = 1,
-    fine: int = 256,
-) -> Tensor:
-    """The times at which `steps` steps of a method of this order make equal local errors.
+def calibrated_grid(velocity: Velocity, x_0: Tensor, steps: int, order: int = 1, fine: int = 256) -> Tensor:
+    """The time grid on which `steps` steps of a method of this order make equal local errors.
 
-    Along a fine solution from x_0 the derivative D(t) = RMS |d^order v / dt^order| is taken by differences. A local
-    error is proportional to h^(order + 1) D, so that the density of steps goes with D^(1 / (order + 1)): the
+    D(t) = RMS |d^order v / dt^order| is estimated by differences along a fine solution from x_0. The local error is
+    proportional to h^(order + 1) D, so that the density of steps is proportional to D^(1 / (order + 1)): the
     equidistribution of de Boor, Good approximation by splines with variable knots II, 1973.
 
     Args:
         velocity: v(t, x) with t of shape ().
-        x_0: Starts of the scenes to calibrate on, (B, ...).
-        steps: Steps of the grid wanted.
-        order: Order of the method that will use the grid.
-        fine: Evaluations spent; more than a few times `steps`.
+        x_0: Noise of the scenes to calibrate on, (B, ...).
+        steps: Steps of the grid.
+        order: Order of the method that will use it.
+        fine: Steps of the fine solution, one evaluation each; more than a few times `steps`.
 
     Returns:
-        Times from t_0 to t_1, (steps + 1,) float64 on the CPU: `solve(..., grid=times)`.
+        Times from 0 to 1, (steps + 1,) float64 on the CPU: `solve(..., grid=times)`.
 
     Raises:
         InputError: no step, or a solution along which the velocity is not finite.
     """
     if steps < 1 or order < 1 or fine <= order:
         raise InputError(f"needs a step, an order and more than {order} fine steps; found {steps}, {order}, {fine}.")
-    times = uniform(t_0, t_1, fine)
+    times = uniform(0.0, 1.0, fine)
     density = _derivatives(velocity, x_0, times, order) ** (1 / (order + 1))
     if not density.isfinite().all():
         raise InputError("the velocity is not finite along the fine solution: no grid can be calibrated on it.")
-    # A stretch that looks straight to these scenes still gets a tenth of the steps that equal ones would give it.
+    # Where these scenes have straight paths, the grid still has a tenth of the steps of a uniform one.
     density = density + 0.1 * density.mean() if density.any() else torch.ones_like(density)
     reached = torch.cat([torch.zeros(1, dtype=torch.float64), density.cumsum(0)])
     return _inverse(reached / reached[-1], times, steps)
@@ -127,7 +119,7 @@ def _derivatives(velocity: Velocity, x: Tensor, times: Tensor, order: int) -> Te
     for t, following in pairwise(times):
         x = step(noted, t.to(x), (following - t).to(x), x)
     rms = torch.stack(found).cpu()
-    # Difference number i spans the nodes i to i + order: it belongs in the middle of them.
+    # Difference i spans the nodes i to i + order and belongs in their middle.
     lead = order // 2
     return torch.cat([rms[:1].expand(lead), rms, rms[-1:].expand(len(times) - 1 - lead - len(rms))])
 

@@ -1,31 +1,31 @@
-"""What every solver takes and gives back."""
+"""The arguments and results that all solvers share."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
+PerScene = np.ndarray | Sequence[int] | Sequence[bool] | int | bool
 
 
 @dataclass(frozen=True)
 class Solution:
-    """The end of the path, what it cost and how far it can be trusted.
+    """The state at t_1, its cost and its accuracy.
 
     Attributes:
-        x: State at t_1, (B, ...), float32 (float64 when the start was); of a scene that has not converged, its last
-            finite state.
+        x: State at t_1, (B, ...), float32 (float64 when x_0 was); the last finite state of a scene that has not
+            converged.
         evaluations: Network evaluations per scene, (B,) int64, those of the error estimate included.
         accepted: Steps taken per scene, (B,) int64.
-        rejected: Steps tried in vain per scene, (B,) int64; 0 for fixed steps.
-        stiff: Scenes whose steps stability rather than accuracy held short, (B,) bool; False where not looked for.
+        rejected: Steps rejected per scene, (B,) int64; 0 for fixed steps.
+        stiff: Scenes whose steps were limited by stability, not by accuracy, (B,) bool; False where not looked for.
         converged: Scenes that reached t_1 with finite values, (B,) bool.
-        global_error: Estimated root mean square error over a scene's elements, (B,) float64; inf where no estimate
-            could be had; None when not asked for.
-        estimate_evaluations: What the estimate cost of these evaluations, (B,) int64; None when not asked for.
+        global_error: Estimated root mean square error over a scene's elements, (B,) float64; inf where there is no
+            estimate; None when not asked for.
+        estimate_evaluations: Those of the evaluations that the estimate took, (B,) int64; None when not asked for.
     """
 
     x: Tensor
@@ -38,26 +38,30 @@ class Solution:
     estimate_evaluations: Tensor | None = None
 
     @classmethod
-    def build(cls, x: Tensor, evaluations: np.ndarray, accepted: Any, rejected: Any, stiff: Any, converged: Any):  # type: ignore[no-untyped-def]
-        """From one number for all scenes or an array of them."""
+    def build(
+        cls,
+        x: Tensor,
+        evaluations: np.ndarray,
+        accepted: PerScene,
+        rejected: PerScene,
+        stiff: PerScene,
+        converged: PerScene,
+    ) -> "Solution":
+        """From one value for all scenes or one for each."""
         of = len(x)
         counts = [torch.from_numpy(np.broadcast_to(n, of).astype(np.int64)) for n in (evaluations, accepted, rejected)]
         flags = [torch.from_numpy(np.broadcast_to(flag, of).astype(bool)) for flag in (stiff, converged)]
         return cls(x, *counts, *flags)
 
-    def shaped(self, shape: torch.Size) -> "Solution":
-        """The same with the scenes of x in another shape."""
-        return replace(self, x=self.x.view(shape))
-
 
 class Evaluations:
-    """The velocity as solvers call it: counted per scene, in the state's type whatever the network computes in.
+    """The velocity as solvers call it: evaluations are counted per scene, and v has the state's type.
 
-    A velocity that treats every scene in a way of its own has a method `select(scenes)`, which returns the velocity
-    of these scenes alone, int64 indices into the batch that it was made for. It is called when scenes leave.
+    A velocity that differs between scenes has a method `select(scenes)`, which returns the velocity of these scenes
+    alone, given as int64 indices into the batch that it was made for. It is called when scenes leave the batch.
 
-    What it was computed in is the coarsest of its type, the autocast around it, the parameters of a module (whose
-    answer may come in x's type) and, where it has one, its attribute `precision`.
+    The precision is the coarsest type among that of v, the surrounding autocast, the parameters of a module (whose
+    output may have the type of x) and, where it has one, the velocity's attribute `precision`.
 
     Args:
         velocity: v(t, x) with x of shape (B, ...) and t of shape () or (B,).
@@ -66,8 +70,8 @@ class Evaluations:
 
     Attributes:
         counts: Evaluations of every scene of the batch, (B,).
-        scenes: Those that the state holds at present, indices into the batch.
-        precision: What the velocity was last computed in.
+        scenes: The scenes that the state holds now, indices into the batch.
+        precision: The precision of the last evaluation.
     """
 
     def __init__(self, velocity: Velocity, scenes: int, progress: Callable[[], None] | None = None) -> None:
@@ -92,13 +96,13 @@ class Evaluations:
         return v.to(x.dtype)
 
     def coarsest(self, *tensors: Tensor) -> torch.dtype:
-        """The type with the fewest digits, among those of the tensors and of what is at work behind the velocity."""
+        """The type with the fewest digits among those of the tensors, the autocast and the velocity itself."""
         kind = tensors[0].device.type
         around = [torch.get_autocast_dtype(kind)] if torch.is_autocast_enabled(kind) else []
         return max([*(x.dtype for x in tensors), *around, *self._own_types], key=lambda dtype: torch.finfo(dtype).eps)
 
     def only(self, scenes: np.ndarray) -> None:
-        """From now on the state holds these scenes, indices into the original batch."""
+        """The state now holds these scenes, indices into the original batch."""
         self.scenes = scenes
         select = getattr(self._whole, "select", None)
         if select is not None:
@@ -106,7 +110,7 @@ class Evaluations:
 
 
 def _own_types(velocity: Velocity) -> set[torch.dtype]:
-    """The types that a velocity shows without being asked: of a module's parameters, and what it says itself."""
+    """The types of a module's parameters and of the attribute `precision`."""
     said = getattr(velocity, "precision", None)
     types = {said} if isinstance(said, torch.dtype) else set()
     module = velocity if isinstance(velocity, torch.nn.Module) else getattr(velocity, "__self__", None)

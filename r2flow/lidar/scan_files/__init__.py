@@ -1,21 +1,21 @@
-"""Scan files read and written: KITTI .bin, nuScenes .pcd.bin, PCD, PLY and NPY.
+"""Scan files: KITTI .bin, nuScenes .pcd.bin, PCD, PLY and NPY are read; .bin, PCD, PLY and NPY are written.
 
     points = read_points("000000.bin")
     write_points("000000.ply", points.xyz, points.reflectance)
 
-No library stands behind this: plyfile is under the GPL and allocates whatever a header declares, pypcd4
-returns half a scan where half a file is given, and the bindings to LZF need a compiler.
+The readers are our own: plyfile is under the GPL and allocates whatever a header declares, pypcd4 returns half a scan
+from half a file, and the bindings to LZF need a compiler.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import IO
 
 import numpy as np
 
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.lidar.scan_files.arrays import read_kitti, read_npy, read_nuscenes, write_kitti, write_npy
+from r2flow.lidar.scan_files.arrays import read_kitti, read_npy, read_nuscenes
 from r2flow.lidar.scan_files.pcd import read_pcd, write_pcd
 from r2flow.lidar.scan_files.ply import read_ply, write_ply
 from r2flow.lidar.scan_files.points import NoPointsError, Points
@@ -23,43 +23,40 @@ from r2flow.lidar.scan_files.points import NoPointsError, Points
 __all__ = ["SCAN_ENDINGS", "NoPointsError", "Points", "read_points", "write_points"]
 
 _READERS: dict[str, Callable[[Path], Points]] = {
-    "pcd.bin": read_nuscenes,  # before "bin", which it ends with
-    "bin": read_kitti,
-    "pcd": read_pcd,
-    "ply": read_ply,
-    "npy": read_npy,
+    ".pcd.bin": read_nuscenes,  # before ".bin", which it ends with
+    ".bin": read_kitti,
+    ".pcd": read_pcd,
+    ".ply": read_ply,
+    ".npy": read_npy,
 }
-_WRITERS: dict[str, Callable[..., None]] = {
-    "bin": write_kitti,
-    "pcd": write_pcd,
-    "ply": write_ply,
-    "npy": write_npy,
+_WRITERS: dict[str, Callable[[IO[bytes], np.ndarray], object]] = {
+    ".bin": lambda file, table: file.write(table.tobytes()),
+    ".pcd": write_pcd,
+    ".ply": write_ply,
+    ".npy": np.save,
 }
 
-SCAN_ENDINGS = tuple(f".{name}" for name in _READERS)
+SCAN_ENDINGS = tuple(_READERS)
 
 LARGEST_FILE = 1 << 30  # bytes: 67 million points, hundreds of scans; reading more exhausts the memory
 
 
-def read_points(path: str | Path, format: str | None = None) -> Points:
+def read_points(path: str | Path) -> Points:
     """The points of one scan file, in the file's order; rows that are not finite are dropped and counted.
 
-    Args:
-        path: The file.
-        format: One of `SCAN_ENDINGS`, with or without its first dot; by default the file name decides.
-            .bin: KITTI's float32 rows x y z reflectance. .pcd.bin: nuScenes' x y z intensity ring.
-            .pcd, .ply: fields x y z and, where present, intensity (or reflectance, reflectivity,
-            remission, i) and ring, of any type. .npy: float (N, 3) or (N, 4).
+    The ending tells the format. .bin: KITTI's float32 rows x y z reflectance. .pcd.bin: nuScenes' x y z intensity ring.
+    .pcd, .ply: fields x y z and, where present, intensity (or reflectance, reflectivity, remission, i) and ring, of any
+    type. .npy: float (N, 3) or (N, 4).
 
     Returns:
         xyz float32 (N, 3) in metres, reflectance float32 (N,) as stored or None, ring uint16 (N,) or None.
 
     Raises:
-        InputError: the file is missing, of an unknown format, damaged, without a finite point, or holds
-            values that no LiDAR measures. The message names it.
+        InputError: the file is missing, of an unknown format, damaged, without a finite point, or holds values that no
+            LiDAR measures. The message names the file.
     """
     path = Path(path)
-    reader = _READERS[_format(path, format, _READERS)]
+    reader = _READERS[_ending(path, _READERS)]
     try:
         _refuse_unreadable(path)
         return reader(path)
@@ -67,54 +64,38 @@ def read_points(path: str | Path, format: str | None = None) -> Points:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
 
 
-def write_points(
-    path: str | Path,
-    xyz: np.ndarray,
-    reflectance: np.ndarray | None = None,
-    format: str | None = None,
-    encoding: str | None = None,
-) -> None:
-    """Write one scan as float32, whole or not at all.
+def write_points(path: str | Path, xyz: np.ndarray, reflectance: np.ndarray | None = None) -> None:
+    """Write one scan as little-endian float32, whole or not at all.
 
     Args:
-        path: The file; its folder is made when missing, an existing file is replaced.
+        path: The file, its format told by the ending: .bin, .pcd or .ply (binary), or .npy. Its folder is made when
+            missing, an existing file is replaced.
         xyz: Points in metres, (N, 3), sensor frame.
         reflectance: (N,), or None for none.
-        format: `bin`, `pcd`, `ply` (binary, little-endian) or `npy`; by default the file name decides.
-        encoding: For PCD: `binary` (default), `ascii` or `binary_compressed`.
 
     Raises:
-        InputError: an unknown format or encoding, a .bin without reflectance, shapes that do not fit,
-            values that are not finite in float32, or a path that cannot be written.
+        InputError: an unknown format, a .bin without reflectance, shapes that do not fit, values that are not finite in
+            float32, or a path that cannot be written.
     """
     path = Path(path)
-    name = _format(path, format, _WRITERS)
-    if name == "bin" and reflectance is None:
+    ending = _ending(path, _WRITERS)
+    if ending == ".bin" and reflectance is None:
         raise InputError(f"{path}: KITTI's .bin needs a reflectance; give one, or choose .ply, .pcd or .npy.")
-    if encoding is not None and name != "pcd":
-        raise InputError(f"{path}: only PCD has encodings, not .{name}; leave out encoding={encoding!r}.")
     table = _table(path, xyz, reflectance)
-    options: dict[str, Any] = {} if encoding is None else {"encoding": encoding}
     try:
         with atomic_write(path) as file:
-            _WRITERS[name](file, table, **options)
+            _WRITERS[ending](file, table)
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror or error}.") from None
 
 
-def _format(path: Path, format: str | None, table: dict[str, Callable[..., Any]]) -> str:
-    known = ", ".join(f".{name}" for name in table)
-    if format is not None:
-        name = format.lower().removeprefix(".")
-        if name not in table:
-            raise InputError(f"{path}: no scan format named {format!r} here; known: {known}.")
-        return name
-    for name in _READERS:
-        if path.name.lower().endswith(f".{name}"):
-            if name not in table:
-                raise InputError(f"{path}: .{name} is read but not written; choose one of {known}.")
-            return name
-    raise InputError(f"{path} has no ending of a scan file; known: {known}. Rename it or pass format=.")
+def _ending(path: Path, known: Iterable[str]) -> str:
+    ending = next((ending for ending in _READERS if path.name.lower().endswith(ending)), None)
+    if ending is None:
+        raise InputError(f"{path} has no ending of a scan file; known: {', '.join(known)}. Convert or rename it.")
+    if ending not in known:
+        raise InputError(f"{path}: {ending} is read but not written; choose one of {', '.join(known)}.")
+    return ending
 
 
 def _refuse_unreadable(path: Path) -> None:

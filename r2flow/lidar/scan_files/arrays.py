@@ -35,9 +35,9 @@ def _float_rows(path: Path, columns: int, layout: str) -> np.ndarray:
     if remainder:
         hint = ""
         if content.size % 20 == 0:
-            hint = " Its size fits nuScenes' rows of 5: if it is one, pass format='pcd.bin'."
+            hint = " Its size fits nuScenes' rows of 5: if it is one, name it .pcd.bin."
         elif content.size % 16 == 0:
-            hint = " Its size fits KITTI's rows of 4: if it is one, pass format='bin'."
+            hint = " Its size fits KITTI's rows of 4: if it is one, name it .bin."
         raise InputError(
             f"{path} is not a whole number of {layout}: {rows} rows of {width} bytes and {remainder} bytes more. "
             f"Is it cut short, or another layout?{hint}"
@@ -48,16 +48,9 @@ def _float_rows(path: Path, columns: int, layout: str) -> np.ndarray:
 def _refuse_other_content(path: Path, head: bytes, layout: str) -> None:
     for signature, name in _SIGNATURES.items():
         if head.startswith(signature):
-            raise InputError(
-                f"{path} is not {layout}: it begins like a .{name} file; rename it or pass format={name!r}."
-            )
+            raise InputError(f"{path} is not {layout}: it begins like a .{name} file; rename it.")
     if all(32 <= byte < 127 or byte in b"\t\r\n" for byte in head):
         raise InputError(f"{path} is not {layout}: it is text, beginning with {head[:24].decode()!r}.")
-
-
-def write_kitti(file: IO[bytes], table: np.ndarray) -> None:
-    """Rows of x, y, z, reflectance out of a table (N, 4)."""
-    file.write(table.tobytes())
 
 
 def read_npy(path: Path) -> Points:
@@ -85,15 +78,15 @@ def read_npy(path: Path) -> Points:
 def _npy_header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     """The declared shape, whether it is in Fortran's order, and the type.
 
-    Not `np.load`, which allocates what is declared; nor a memory map, which kills the process when
-    somebody shortens the file meanwhile.
+    Not by `np.load`, which allocates what is declared, nor by a memory map, which kills the process when the file gets
+    shorter meanwhile.
     """
     try:
         version = np.lib.format.read_magic(file)
         if version == (1, 0):
             return np.lib.format.read_array_header_1_0(file)
-        return np.lib.format.read_array_header_2_0(file)  # 3.0 is for field names, which points have not
-    except Exception as error:  # NumPy evaluates the header and promises no particular exception
+        return np.lib.format.read_array_header_2_0(file)  # 3.0 is for field names, which points do not have
+    except Exception as error:  # NumPy evaluates the header and may raise anything
         reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
         raise InputError(f"{path} is not a readable .npy file ({reason[:160]}). Is it damaged?") from None
 
@@ -104,8 +97,3 @@ def _shape_hint(shape: tuple[int, ...]) -> str:
     if len(shape) == 2 and shape[0] in (3, 4):
         return " It looks transposed."
     return ""
-
-
-def write_npy(file: IO[bytes], table: np.ndarray) -> None:
-    """The table itself, (N, 3) or (N, 4)."""
-    np.save(file, table, allow_pickle=False)

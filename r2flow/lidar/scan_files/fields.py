@@ -1,4 +1,4 @@
-"""Named fields, which PCD and PLY share: finding x, y, z among them, and taking them out of rows."""
+"""Named fields of PCD and PLY: finding x, y, z among them and reading their columns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import numpy as np
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files.points import Points, checked_points
 
-# The first name that is there wins: Ouster writes both an intensity and a calibrated reflectivity.
+# The first name that a file has is taken: Ouster writes both an intensity and a calibrated reflectivity.
 ROLES: Mapping[str, tuple[str, ...]] = {
     "x": ("x",),
     "y": ("y",),
@@ -19,7 +19,7 @@ ROLES: Mapping[str, tuple[str, ...]] = {
     "ring": ("ring",),
 }
 
-HEADER_LIMIT = 1 << 16  # bytes; a header is a few hundred, and a damaged one must not be looked for forever
+HEADER_LIMIT = 1 << 16  # bytes; a header has a few hundred
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Field:
 
 
 def split_header(path: Path, data: bytes, last: str) -> tuple[list[list[str]], int]:
-    """The words of each line of a text header, the line that begins with `last` being its end.
+    """The words of each line of a text header, which ends with the line that begins with `last`.
 
     Returns:
-        The lines that are not blank, `last` included, and the offset of the first byte behind them.
+        The lines that are not blank, with the last one, and the offset of the first byte behind them.
 
     Raises:
         InputError: there is no such line within the first `HEADER_LIMIT` bytes.
@@ -57,10 +57,10 @@ def split_header(path: Path, data: bytes, last: str) -> tuple[list[list[str]], i
 
 
 def whole_number(path: Path, what: str, word: str) -> int:
-    """A count out of a header.
+    """A count from a header.
 
     Raises:
-        InputError: not decimal digits, or more of them than any count has.
+        InputError: it is not made of decimal digits, or of more than any count has.
     """
     if not (word.isascii() and word.isdigit() and len(word) <= 18):
         raise InputError(f"{path} declares {what} {word[:24]!r}, which is not a whole number. Is it damaged?")
@@ -106,7 +106,7 @@ def find_roles(path: Path, fields: Sequence[Field]) -> dict[str, int]:
 def binary_columns(
     payload: memoryview, count: int, fields: Sequence[Field], roles: Mapping[str, int]
 ) -> dict[str, np.ndarray]:
-    """Views of the wanted columns, (count,) each, of rows that `payload` is known to hold in full."""
+    """Views of the wanted columns, (count,) each, of `count` rows in `payload`, whose size has been checked."""
     offsets = list(accumulate((field.nbytes for field in fields), initial=0))
     rows = np.dtype(
         {
@@ -130,7 +130,7 @@ def text_columns(
     """
     offsets = list(accumulate((field.count for field in fields), initial=0))
     try:
-        # Every word is parsed, also of unwanted fields, because that is what finds a damaged line.
+        # Every word is parsed, also of unwanted fields, so that a damaged line is found.
         table = np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2)
     except ValueError as error:
         reason = str(error).split(";")[0].rstrip(".")

@@ -1,7 +1,6 @@
-"""PCD, the Point Cloud Library's format, version 0.7: ascii, binary and binary_compressed."""
+"""PCD, the Point Cloud Library's format, version 0.7: three encodings are read, binary is written."""
 
 import struct
-from collections.abc import Callable
 from itertools import accumulate
 from pathlib import Path
 from typing import IO
@@ -22,11 +21,11 @@ from r2flow.lidar.scan_files.fields import (
     whole_number,
 )
 from r2flow.lidar.scan_files.points import Points
-from r2flow.registry import Registry
 
 _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 _OLD_KEYS = {"COLUMNS": "FIELDS"}  # before version 0.7
 _TYPES = {f"{kind}{size}" for kind in "IU" for size in (1, 2, 4, 8)} | {"F4", "F8"}
+_ENCODINGS = ("ascii", "binary", "binary_compressed")
 _PADDING = b"\0\r\n "  # some writers fill the last memory page, or end with a newline
 
 Header = dict[str, list[str]]
@@ -43,8 +42,8 @@ def read_pcd(path: Path) -> Points:
     roles = find_roles(path, fields)
     count = _read_count(path, header)
     encoding = " ".join(header["DATA"])
-    if encoding not in _ENCODERS:
-        raise InputError(f"{path} declares DATA {encoding[:24]!r}; known: {', '.join(_ENCODERS)}.")
+    if encoding not in _ENCODINGS:
+        raise InputError(f"{path} declares DATA {encoding[:24]!r}; known: {', '.join(_ENCODINGS)}.")
     if encoding == "ascii":
         lines = text_lines(path, data[start:])
         if len(lines) != count:
@@ -70,7 +69,7 @@ def _read_header(path: Path, data: bytes) -> tuple[Header, int]:
         if key.startswith("#"):
             continue
         key = _OLD_KEYS.get(key, key)
-        # Not skipped: a COUNT that a flipped bit has renamed would change every row in silence.
+        # Not skipped: where a flipped bit has renamed COUNT, every row would be wrong.
         if key not in _KEYS or key in header:
             state = "repeats the" if key in header else "has an unknown"
             raise InputError(f"{path} {state} header line {key[:24]!r}; known: {', '.join(_KEYS)}.")
@@ -134,9 +133,8 @@ def _unpack(path: Path, payload: memoryview, size: int) -> bytes:
         raise InputError(f"{path} cannot be decompressed: {error}. Is it damaged?") from None
 
 
-def write_pcd(file: IO[bytes], table: np.ndarray, encoding: str = "binary") -> None:
-    """Fields x, y, z and, from a table (N, 4), intensity, as float32, in one of the three encodings."""
-    encode = _ENCODERS[encoding]
+def write_pcd(file: IO[bytes], table: np.ndarray) -> None:
+    """Fields x, y, z and, from a table (N, 4), intensity, as binary float32."""
     count, width = table.shape
     header = {
         "VERSION": "0.7",
@@ -148,26 +146,7 @@ def write_pcd(file: IO[bytes], table: np.ndarray, encoding: str = "binary") -> N
         "HEIGHT": 1,
         "VIEWPOINT": "0 0 0 1 0 0 0",
         "POINTS": count,
-        "DATA": encoding,
+        "DATA": "binary",
     }
     file.write("".join(f"{key} {value}\n" for key, value in header.items()).encode())
-    encode(file, table)
-
-
-def _write_ascii(file: IO[bytes], table: np.ndarray) -> None:
-    np.savetxt(file, table, fmt="%.9g")  # nine digits tell any two float32 apart
-
-
-def _write_binary(file: IO[bytes], table: np.ndarray) -> None:
     file.write(table.tobytes())
-
-
-def _write_compressed(file: IO[bytes], table: np.ndarray) -> None:
-    columns = table.T.tobytes()
-    packed = lzf.compress(columns)
-    file.write(struct.pack("<II", len(packed), len(columns)) + packed)
-
-
-_ENCODERS: Registry[Callable[[IO[bytes], np.ndarray], None]] = Registry(
-    "PCD encoding", ascii=_write_ascii, binary=_write_binary, binary_compressed=_write_compressed
-)

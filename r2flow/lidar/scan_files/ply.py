@@ -1,7 +1,5 @@
-"""PLY, the Stanford polygon format: ascii, binary_little_endian and binary_big_endian."""
+"""PLY, the Stanford polygon format: ascii and binary of either byte order are read, binary_little_endian is written."""
 
-import struct
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -23,56 +21,70 @@ from r2flow.lidar.scan_files.fields import (
 from r2flow.lidar.scan_files.points import Points
 
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
-# Codes that struct and NumPy share once a byte order stands before them.
-_CODES = {
+_CODES = {  # NumPy's codes of PLY's types
     "char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I",
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
     "float": "f", "double": "d", "float32": "f", "float64": "d",
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Property:
-    """One number a row or, with a type for its length, a list of them."""
-
-    name: str
-    code: str
-    length: str | None = None
-
-
-@dataclass(frozen=True)
+@dataclass
 class _Element:
+    """`count` rows of properties; `codes` are those of its numbers by name, `lists` the names of its lists."""
+
     name: str
     count: int
-    properties: list[_Property] = field(default_factory=list)
-
-    @property
-    def has_lists(self) -> bool:
-        return any(p.length for p in self.properties)
+    codes: list[tuple[str, str]] = field(default_factory=list)
+    lists: list[str] = field(default_factory=list)
 
     def fields(self, order: str) -> list[Field]:
-        return [Field(p.name, np.dtype(order + p.code)) for p in self.properties]
+        return [Field(name, np.dtype(order + code)) for name, code in self.codes]
+
+    @property
+    def nbytes(self) -> int:
+        return self.count * sum(field.nbytes for field in self.fields("<"))
 
 
 def read_ply(path: Path) -> Points:
     """Properties x, y, z of `vertex` and, where present, reflectance and ring; see `read_points`.
 
-    Other properties and elements are skipped, but all of them must be there.
+    Rows of other elements are passed over. Lists make rows of unequal length: only elements behind the points, such as
+    the faces of a mesh, may have them.
     """
     data = path.read_bytes()
     kind, elements, start = _read_header(path, data)
-    vertices = [element for element in elements if element.name == "vertex"]
-    if len(vertices) != 1:
-        raise InputError(f"{path} declares {len(vertices)} 'vertex' elements, which hold the points; one is needed.")
-    point_count(path, vertices[0].count)
-    roles = find_roles(path, vertices[0].fields("<"))
-    listed = [p.name for k, p in enumerate(vertices[0].properties) if p.length and k in roles.values()]
+    names = [element.name for element in elements]
+    if names.count("vertex") != 1:
+        raise InputError(
+            f"{path} declares {names.count('vertex')} 'vertex' elements, which hold the points; one is needed."
+        )
+    index = names.index("vertex")
+    before, vertex = elements[:index], elements[index]
+    count = point_count(path, vertex.count)
+    listed = [name for element in (*before, vertex) for name in element.lists]
     if listed:
-        raise InputError(f"{path} declares {', '.join(listed)} as lists; one number a point is needed.")
+        raise InputError(f"{path} has lists ({', '.join(listed)}) in or before its points; write it without them.")
+    fields = vertex.fields(_ORDERS[kind])
+    roles = find_roles(path, fields)
     if kind == "ascii":
-        return column_points(path, _text_vertices(path, text_lines(path, data[start:]), elements, roles))
+        lines = text_lines(path, data[start:])
+        declared = sum(element.count for element in elements)
+        if declared != len(lines):
+            raise InputError(f"{path} declares {declared} rows but holds {len(lines)}. Is it whole?")
+        first = sum(element.count for element in before)
+        return column_points(path, text_columns(path, lines[first : first + count], fields, roles))
     payload = memoryview(data)[start:]
-    return column_points(path, _binary_vertices(path, payload, elements, roles, _ORDERS[kind]))
+    _check_size(path, payload, elements)
+    offset = sum(element.nbytes for element in before)
+    return column_points(path, binary_columns(payload[offset:], count, fields, roles))
+
+
+def _check_size(path: Path, payload: memoryview, elements: list[_Element]) -> None:
+    size = sum(element.nbytes for element in elements)
+    if len(payload) < size:
+        raise InputError(f"{path} is cut short: its header declares {size} bytes, {len(payload)} follow it.")
+    if not any(element.lists for element in elements) and bytes(payload[size:]).strip(b"\r\n"):
+        raise InputError(f"{path} holds {len(payload) - size} bytes more than its header declares. Is it damaged?")
 
 
 def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
@@ -83,117 +95,22 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
     kind = ""
     elements: list[_Element] = []
     for words in lines[1:-1]:
-        if words[0] == "format" and not kind and words[1:] in [[known, "1.0"] for known in _ORDERS]:
-            kind = words[1]
-        elif words[0] == "element" and len(words) == 3:
-            count = whole_number(path, f"the number of {words[1]!r} as", words[2])
-            elements.append(_Element(words[1], count))
-        elif words[0] == "property" and elements:
-            elements[-1].properties.append(_read_property(path, words))
-        elif words[0] not in ("comment", "obj_info"):
-            raise InputError(f"{path} has a header line that PLY does not know: {' '.join(words)[:60]!r}.")
+        match words:
+            case ["format", encoding, "1.0"] if encoding in _ORDERS and not kind:
+                kind = encoding
+            case ["element", name, number]:
+                elements.append(_Element(name, whole_number(path, f"the number of {name!r} as", number)))
+            case ["property", code, name] if elements and code in _CODES:
+                elements[-1].codes.append((name, _CODES[code]))
+            case ["property", "list", length, code, name] if elements and {length, code} <= _CODES.keys():
+                elements[-1].lists.append(name)
+            case ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise InputError(f"{path} has a header line that PLY does not know: {' '.join(words)[:60]!r}.")
     if not kind:
         raise InputError(f"{path} has no 'format' line in its header; known: {', '.join(_ORDERS)}, each 1.0.")
     return kind, elements, end
-
-
-def _read_property(path: Path, words: list[str]) -> _Property:
-    match words[1:]:
-        case [kind, name] if kind in _CODES:
-            return _Property(name, _CODES[kind])
-        case ["list", length, kind, name] if kind in _CODES and length in _CODES:
-            if _CODES[length] not in "fd":
-                return _Property(name, _CODES[kind], _CODES[length])
-    raise InputError(f"{path} has a property that PLY does not know: {' '.join(words)[:60]!r}.")
-
-
-def _binary_vertices(
-    path: Path, payload: memoryview, elements: Sequence[_Element], roles: Mapping[str, int], order: str
-) -> dict[str, np.ndarray]:
-    """The wanted columns, (N,) each; every element is walked, so that a wrong count is found."""
-    columns: dict[str, np.ndarray] = {}
-    cursor = 0
-    for element in elements:
-        wanted = roles if element.name == "vertex" else {}
-        if element.has_lists:
-            found, cursor = _walk(path, payload, cursor, element, wanted, order)
-        else:
-            fields = element.fields(order)
-            end = cursor + element.count * sum(f.nbytes for f in fields)
-            if end > len(payload):
-                raise _cut(path, element)
-            found = binary_columns(payload[cursor:end], element.count, fields, wanted) if wanted else {}
-            cursor = end
-        columns |= found
-    if bytes(payload[cursor:]).strip(b"\r\n"):
-        raise InputError(f"{path} holds {len(payload) - cursor} bytes more than its header declares. Is it damaged?")
-    return columns
-
-
-def _walk(
-    path: Path, payload: memoryview, cursor: int, element: _Element, wanted: Mapping[str, int], order: str
-) -> tuple[dict[str, np.ndarray], int]:
-    """Row by row, because lists make rows of unequal length; each row takes a byte or more, so it ends."""
-    values: dict[int, list[float]] = {index: [] for index in wanted.values()}
-    plan = [(struct.Struct(order + (p.length or p.code)), struct.calcsize("<" + p.code)) for p in element.properties]
-    try:
-        for _ in range(element.count):
-            for index, (number, size) in enumerate(plan):
-                (value,) = number.unpack_from(payload, cursor)
-                cursor += number.size
-                if element.properties[index].length:
-                    if value < 0:
-                        raise InputError(f"{path} has a list of {value} numbers in {element.name!r}. Is it damaged?")
-                    cursor += value * size
-                elif index in values:
-                    values[index].append(value)
-    except struct.error:
-        raise _cut(path, element) from None
-    if cursor > len(payload):
-        raise _cut(path, element)
-    return {role: np.array(values[index]) for role, index in wanted.items()}, cursor
-
-
-def _cut(path: Path, element: _Element) -> InputError:
-    return InputError(f"{path} is cut short: it declares {element.count} of {element.name!r} and holds fewer.")
-
-
-def _text_vertices(
-    path: Path, lines: Sequence[str], elements: Sequence[_Element], roles: Mapping[str, int]
-) -> dict[str, np.ndarray]:
-    """The wanted columns, (N,) each; an element is a line."""
-    declared = sum(element.count for element in elements if element.properties)
-    if declared != len(lines):
-        raise InputError(f"{path} declares {declared} rows but holds {len(lines)}. Is it whole?")
-    start = 0
-    for element in elements:
-        if element.name == "vertex":
-            break
-        start += element.count if element.properties else 0
-    rows = lines[start : start + element.count]
-    if element.has_lists:
-        rows = [_without_lists(path, row, element) for row in rows]
-        places = [index for index, p in enumerate(element.properties) if not p.length]
-        roles = {role: places.index(index) for role, index in roles.items()}
-    fields = [Field(p.name, np.dtype("<f8")) for p in element.properties if not p.length]
-    return text_columns(path, rows, fields, roles)
-
-
-def _without_lists(path: Path, row: str, element: _Element) -> str:
-    """The row's single numbers; each list, a length and as many numbers, is passed over."""
-    words = row.split()
-    kept, cursor = [], 0
-    for prop in element.properties:
-        if cursor >= len(words):
-            break
-        if prop.length:
-            cursor += whole_number(path, "a list's length as", words[cursor])
-        else:
-            kept.append(words[cursor])
-        cursor += 1
-    if cursor != len(words) or prop is not element.properties[-1]:
-        raise InputError(f"{path} has a row that does not fit its properties: {row.strip()[:60]!r}. Is it damaged?")
-    return " ".join(kept)
 
 
 def write_ply(file: IO[bytes], table: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""Points as a scan file gave them, and the checks that tell a scan from something else."""
+"""The points of a scan file, and the checks that they are a scan."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -7,17 +7,17 @@ import numpy as np
 
 from r2flow.errors import InputError
 
-# No LiDAR reaches 10 km, and none returns from within a millimetre: bytes read in the wrong order or
-# width land beyond these limits nearly everywhere, because they move the exponent of a float.
+# No LiDAR measures 10 km or less than a millimetre: nearly all bytes read in the wrong order or width are beyond these
+# limits, because the exponent of a float changes.
 FARTHEST = 1e4
 NEAREST = 1e-3
-SAMPLE = 4096  # rows that are looked at
+SAMPLE = 4096  # rows that are checked
 
 _OTHER_LAYOUTS = "Is it big-endian, float64, text, or another row layout?"
 
 
 class NoPointsError(InputError):
-    """A scan file that is whole and has no point: an empty scan to who judges a generator, a mistake to others."""
+    """A scan file that is whole and has no point; a generator may well write one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Points:
         xyz: Coordinates in metres, (N, 3), float32, sensor frame: x ahead, y left, z up.
         reflectance: As stored, (N,), float32, not rescaled; None when the file has none.
         ring: Number of the beam, (N,), uint16; None when the file has none.
-        dropped: Rows that were left out because a coordinate or the reflectance was NaN or infinite, or a coordinate
+        dropped: Number of rows left out because a coordinate or the reflectance was NaN or infinite, or a coordinate
             beyond `FARTHEST`.
         kept: Index in the file of each row that is left, (N,); None when all are.
     """
@@ -47,15 +47,15 @@ def checked_points(
     ring: np.ndarray | None = None,
     layout: str | None = None,
 ) -> Points:
-    """Drop what is not finite or no LiDAR reaches, refuse what is not a scan.
+    """Drop points that are not finite or beyond `FARTHEST`, refuse what is not a scan.
 
     Args:
         path: The file, for messages.
         xyz: Coordinates in metres, (N, 3), any number type.
         reflectance: (N,), any number type, or None.
         ring: (N,), any number type, or None.
-        layout: The row that was assumed, where the file has no header to say so. Such a file is
-            also refused for a majority of rows that are not finite, or for negative reflectance.
+        layout: The assumed row, where the file has no header. Such a file is also refused where most rows are not
+            finite or reflectance is negative.
 
     Raises:
         NoPointsError: no point.
@@ -65,7 +65,7 @@ def checked_points(
         raise NoPointsError(f"{path} is well-formed but holds no points; leave it out, or fetch it again.")
     total = len(xyz)
     with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, and so dropped
-        # Copied, since these may be views of a file's bytes, which cannot be written to.
+        # Copied, since these may be read-only views of a file's bytes.
         xyz = np.array(xyz, dtype=np.float32, order="C")
         reflectance = None if reflectance is None else np.array(reflectance, dtype=np.float32)
     points = Points(xyz, reflectance, ring)
@@ -95,7 +95,7 @@ def _only(points: Points, keep: np.ndarray) -> Points:
 
 
 def _all_finite(values: np.ndarray) -> bool:
-    # Two reductions, no temporary: NaN and infinity both survive a minimum and a maximum.
+    # Two reductions, no temporary: NaN and infinity remain in a minimum or a maximum.
     with np.errstate(invalid="ignore"):
         return bool(np.isfinite(values.min()) and np.isfinite(values.max()))
 
@@ -103,16 +103,15 @@ def _all_finite(values: np.ndarray) -> bool:
 def _refuse_implausible(path: Path, xyz: np.ndarray, layout: str | None) -> None:
     if not xyz.any():
         raise InputError(f"{path} holds {len(xyz)} points, all at (0, 0, 0): no ray returned. Is it whole?")
-    # A wrong layout is wrong all over, so that some thousand rows tell; all of them would cost as much
-    # time as reading the file.
+    # A wrong layout is wrong everywhere, so that some thousand rows show it; all of them would take as long as reading.
     size = np.abs(xyz[:: max(1, len(xyz) // SAMPLE)])
     largest = np.maximum(np.maximum(size[:, 0], size[:, 1]), size[:, 2])
     largest = largest[largest > 0]  # an organised scan keeps rays without return as (0, 0, 0)
     returns = len(largest)
     far = np.count_nonzero(largest > FARTHEST)
     near = np.count_nonzero(largest < NEAREST)
-    # A twentieth, not one: a few flipped bits must not cost the scan, only their own points.
-    # A file of float64 read as float32 has a third of its rows out there, so the margin is wide.
+    # A twentieth, so that a few flipped bits cost only their own points, not the scan. A file of float64 read as
+    # float32 has a third of its rows beyond the limits.
     if far <= returns / 20 and near <= returns / 2:
         return
     found = f"of {returns} points, {far} lie beyond {FARTHEST:g} m and {near} within {NEAREST:g} m"

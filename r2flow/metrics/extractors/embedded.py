@@ -55,7 +55,7 @@ def inputs(scans: Scans, reflectance: bool) -> Tensor:
         [
             torch.log2(r + 1) / 6,
             returned.to(r),
-            scans.images[:, 1:] if reflectance else torch.zeros_like(r),
+            scans.reflectance if reflectance else torch.zeros_like(r),
             known,
             height / 4,
             (e * 4).expand_as(r),
@@ -173,13 +173,7 @@ class Embedded(Extractor):
 
     @torch.no_grad()
     def features(self, scans: Scans) -> Tensor:
-        """(B, 256), float32: bands x sectors x channels; a row of NaN for a scan without a single return.
-
-        Raises:
-            InputError: scans without reflectance, where it is needed.
-        """
-        if self.needs_reflectance and not scans.has_reflectance:
-            raise InputError(f"'{self.name}' needs reflectance and the scans have none; use 'embedded_range'.")
+        """(B, 256), float32: bands x sectors x channels; a row of NaN for a scan without a single return."""
         features = pooled(self.network.map(inputs(scans, self.needs_reflectance)), scans.returned)
         features[~scans.returned.flatten(1).any(1)] = torch.nan
         return features

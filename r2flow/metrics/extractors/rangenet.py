@@ -129,19 +129,9 @@ class RangeNet(Extractor):
         return x
 
     def image(self, scans: Scans) -> Tensor:
-        """Range, x, y, z and, for a network of five channels, reflectance: (B, 4 or 5, H, W), 0 where missing.
-
-        Raises:
-            InputError: scans without the reflectance that the network looks at.
-        """
-        if self.needs_reflectance and not scans.has_reflectance:
-            raise InputError(
-                f"{self.name} looks at reflectance, and these scans have none; ask for a metric without it, as frid."
-            )
-        parts = [scans.images[:, :1], scans.xyz]
-        if self.needs_reflectance:
-            parts.append(scans.images[:, 1:])
-        return torch.cat(parts, 1).to(self.device)
+        """Range, x, y, z and, for a network of five channels, reflectance: (B, 4 or 5, H, W), 0 where missing."""
+        reflectance = [scans.reflectance] if self.needs_reflectance else []
+        return torch.cat([scans.images[:, :1], scans.xyz, *reflectance], 1).to(self.device)
 
     @torch.inference_mode()
     def features(self, scans: Scans) -> Tensor:

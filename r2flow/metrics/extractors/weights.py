@@ -23,7 +23,8 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, state_hash
+from r2flow.files import atomic_write
+from r2flow.hashing import state_hash
 from r2flow.metrics.extractors import extractor_class
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.registry import Registry

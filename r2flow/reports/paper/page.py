@@ -1,4 +1,4 @@
-"""The page: tables and figures in the paper's order, each with what it is to be compared with."""
+"""The page of the paper's report: tables and figures in the paper's order, beside the printed ones."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ from r2flow.reports.speed_quality import BETWEEN
 
 @dataclass(frozen=True)
 class PaperResults:
-    """All that the page is made of.
+    """Everything that the page is made of.
 
     Attributes:
         subjects: The runs.
@@ -71,10 +71,10 @@ def paper_page(
     text = [
         f"{len(measured.subjects)} runs; {num} scans of each flow and number of Euler steps, all from the same noise, "
         f"against {len(measured.real)} scans ({measured.real.label}).",
-        "## What the paper says, and what came out here",
+        "## The paper's claims, judged here",
         tally(found),
         claims_table(found),
-        "*Holds* and *does not hold* are said where seeds, or for one seed the intervals over scans, leave no doubt.",
+        "*Holds* and *does not hold* are decided by the intervals over seeds or, for one seed, over scans.",
         "## What differs from the paper",
         "\n".join(f"- {part}" for part in parts),
         "## Table I: methods and metrics",
@@ -106,7 +106,7 @@ def paper_page(
 
 
 def remarks_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What a reader of the figures must know, each once: too few scans for a covariance, empty scans."""
+    """The remarks on the figures, each once."""
     said = dict.fromkeys(remark for row in rows for remark in str(row.get("remarks") or "").split(BETWEEN) if remark)
     return ["\n".join(f"- {remark}" for remark in said)] if said else []
 
@@ -120,7 +120,7 @@ def _placed(figures: Mapping[str, Figure], name: str, title: str) -> list[str]:
 
 
 def curved_rows(measured: PaperResults) -> list[dict[str, Any]]:
-    """What `claims` needs of the paths."""
+    """The rows on the paths that `claims` takes."""
     known = {one.label: one for one in measured.subjects}
     return [
         {**summary(paths), "role": known[label].role, "family": known[label].family}
@@ -131,7 +131,7 @@ def curved_rows(measured: PaperResults) -> list[dict[str, Any]]:
 def figures_of(
     measured: PaperResults, rows: Sequence[dict[str, Any]], headings: Mapping[str, str]
 ) -> dict[str, Figure]:
-    """By name; one that has nothing to show is left out."""
+    """The figures by name; one without data is left out."""
     rays = measured.real.sensor.rays()
     figures: dict[str, Figure] = {}
     if measured.between is not None:
@@ -148,7 +148,7 @@ def figures_of(
 
 
 def from_above(measured: PaperResults) -> dict[str, np.ndarray]:
-    """Points of every kind of 1-RF at the most evaluations, those of its seeds added."""
+    """The bird's-eye histogram of every kind of 1-RF at the most evaluations, added up over its seeds."""
     known = {one.label: one for one in measured.subjects}
     roots = [cell for cell in measured.cells if cell.row["role"] == "1-RF"]
     most = max(cell.row["steps"] for cell in roots)
@@ -187,7 +187,7 @@ def data_in_words(subjects: Sequence[PaperRun]) -> str:
 
 
 def images_seen(subjects: Sequence[PaperRun]) -> list[int]:
-    """Images that each 1-RF took its steps on."""
+    """Training images of each 1-RF."""
     return [
         int(one.config["trainer"]["max_steps"]) * int(one.config["data"]["batch_size"])
         for one in subjects

@@ -21,7 +21,7 @@ from r2flow.metrics.base import ScanMetric
 from r2flow.reports.compare import cost
 from r2flow.reports.curvature import Paths, measure_paths
 from r2flow.reports.pages import Page
-from r2flow.reports.paper.cells import SEED, Bench, Cell, counts_of, measure_cells
+from r2flow.reports.paper.cells import SEED, Cell, CellSettings, counts_of, measure_cells
 from r2flow.reports.paper.figures import marginals_apart
 from r2flow.reports.paper.page import PaperResults, paper_page
 from r2flow.reports.paper.subjects import PaperRun
@@ -88,7 +88,7 @@ def report(
     real = real or held_out(first)
     check_reflectance(metrics, [real])
     gathered = gather_real(metrics, real, work, Cache())
-    bench = Bench(real, metrics, gathered, budget.num, budget.bootstrap, work, out / "cells", device)
+    settings = CellSettings(real, metrics, gathered, budget.num, budget.bootstrap, work, out / "cells", device)
     cells: list[Cell] = []
     paths: dict[str, Paths] = {}
     architectures: list[dict[str, Any]] = []
@@ -99,7 +99,7 @@ def report(
     ends = np.stack([real.source[index] for index in (len(real) // 4, 3 * len(real) // 4)])  # far apart in the set
     for subject in subjects:
         flow = load_checkpoint(subject.run, device)
-        own = list(measure_cells(bench, flow, subject, budget.steps))
+        own = list(measure_cells(settings, flow, subject, budget.steps))
         cells += own
         if budget.curved and subject.steps is None:
             paths[subject.label] = _paths(flow, subject, budget, work)

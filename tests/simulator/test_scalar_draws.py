@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from r2flow.simulator.draws import Draws
+from r2flow.simulator.scalar_draws import ScalarDraws
 
 N = 20_000
 
 
 @pytest.fixture
-def draws() -> Draws:
-    return Draws(np.random.default_rng(0))
+def draws() -> ScalarDraws:
+    return ScalarDraws(np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(

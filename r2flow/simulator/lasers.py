@@ -1,13 +1,12 @@
-"""The lasers behind a range image: where each starts, how it is inclined, and the row it falls into.
+"""The lasers of a sensor: where each starts, its inclination, and the row of the image that a return falls into.
 
-A range image has evenly shared rows; a real head has lasers of its own calibration, fired from two
-blocks of lenses that sit above the origin of the points. A return at range r from a laser of
-inclination E and height z appears under the elevation
+The rows of a range image are evenly spaced; the lasers of a real sensor are not, and fire from two blocks of lenses
+above the origin of the points. A return at range r from a laser of inclination E and height z has the elevation
 
     e = asin((z + s tan E) / r),    s the horizontal distance,
 
-which changes with r: near returns move up by whole rows. Lasers therefore fall irregularly into rows,
-which is why real projected scans show rows that are empty here and full there.
+which depends on r: near returns move up by whole rows. That is why rows of real projected scans are empty in some
+places and full in others.
 """
 
 from dataclasses import dataclass
@@ -19,17 +18,17 @@ from r2flow.lidar.sensors import Sensor
 
 
 @dataclass(frozen=True)
-class Beams:
+class Lasers:
     """B lasers on a spinning head.
 
     Attributes:
         elevation: Inclination E in radians, falling, (B,).
         height: Height z of each laser above the sensor's origin in metres, (B,).
         side: Distance of each laser to the left of the axis, seen outwards, in metres, (B,).
-        block: Number of the lens block that each laser fires from, (B,); lasers of one are close together.
+        block: Number of the lens block of each laser, (B,); the lasers of one block are close together.
         phase: Where in its first azimuth bin each laser fires first, as a share of half a bin, (B,).
-        bias: What each laser measures too much of range in metres, (B,).
-        gain: What each laser reports too much of reflectance, (B,).
+        bias: Error of each laser's range in metres, (B,).
+        gain: Error of each laser's reflectance, (B,).
         straight: Whether laser b looks along the middles of the bins of the image's row b.
     """
 
@@ -54,7 +53,7 @@ _HDL64E_LOWER = (
     -16.18, -16.55, -17.19, -17.73, -18.32, -18.80, -19.32, -19.74, -20.22, -20.79, -21.32, -21.94, -22.44, -22.86,
     -23.32, -23.97, -24.51, -25.00,
 )  # fmt: skip
-# What each laser reads more or less than its neighbours, of the same road and walls.
+# Difference of each laser's reflectance from its neighbours', on the same road and walls.
 _HDL64E_GAIN = (
     0.00, -0.04, -0.06, -0.10, -0.01, -0.04, 0.04, -0.02, 0.05, -0.04, 0.02, 0.04, 0.08, 0.03, -0.01, 0.00,
     0.01, 0.00, 0.04, -0.05, 0.00, -0.13, 0.00, 0.01, -0.05, -0.02, 0.00, 0.02, 0.02, -0.06, 0.02, 0.03,
@@ -62,9 +61,9 @@ _HDL64E_GAIN = (
     -0.06, 0.03, 0.06, -0.21, 0.00, -0.06, -0.07, 0.00, 0.02, 0.04, -0.11, -0.10, -0.11, -0.02, 0.02, 0.00,
 )  # fmt: skip
 
-# What each laser measures too far, in metres. Upper block: steps between neighbouring rings on upright walls, summed;
-# they agree from drive to drive (correlation 0.96). Lower block, where walls are rare: distances of the rings from
-# one smooth surface through the road from 4 to 11 metres, medians over three drives, which agree within a centimetre.
+# Error of each laser's range in metres. Upper block: steps between neighbouring rings on upright walls, summed; drives
+# agree (correlation 0.96). Lower block, where walls are rare: distances of the rings from a smooth surface through the
+# road 4 to 11 metres away, medians over three drives, which agree within a centimetre.
 _HDL64E_BIAS = (
     0.006, -0.025, 0.024, -0.031, 0.007, -0.085, 0.051, -0.015, -0.022, 0.012, 0.046, 0.006, 0.042, 0.015, -0.012,
     -0.021, 0.036, -0.005, 0.064, -0.005, 0.003, -0.033, -0.023, -0.027, 0.022, -0.022, 0.009, -0.050, 0.035,
@@ -75,34 +74,29 @@ _HDL64E_BIAS = (
 )  # fmt: skip
 
 
-HDL64E = Beams(
+HDL64E = Lasers(
     elevation=np.deg2rad(np.array(_HDL64E_UPPER + _HDL64E_LOWER)),
     height=np.concatenate([np.linspace(0.209, 0.198, 32), np.linspace(0.126, 0.116, 32)]),
     side=np.tile([0.026, -0.026], 32),  # neighbours sit left and right of the axis
     block=np.repeat([0, 1], 32),
-    phase=np.modf(0.618 * np.arange(64))[0],  # not known; only that neighbours differ
+    phase=np.modf(0.618 * np.arange(64))[0],  # not known, but neighbours differ
     bias=np.array(_HDL64E_BIAS),
     gain=np.array(_HDL64E_GAIN),
     straight=False,
 )
 
 
-BEAMS = {"hdl64e": HDL64E}  # by sensor name, whatever the image's size; others fire along their rows
-
-
 @lru_cache(maxsize=16)
-def beams_of(sensor: Sensor) -> Beams:
-    """The lasers of a sensor: calibrated ones where known, else one along the middle of each row."""
-    if sensor.name in BEAMS:
-        return BEAMS[sensor.name]
-    return along_rows(sensor)
+def lasers_of(sensor: Sensor) -> Lasers:
+    """The lasers of a sensor: calibrated ones of an HDL-64E, whatever its image size, else one along each row."""
+    return HDL64E if sensor.name == "hdl64e" else along_rows(sensor)
 
 
-def along_rows(sensor: Sensor) -> Beams:
+def along_rows(sensor: Sensor) -> Lasers:
     """Lasers exactly along `sensor.rays("centre")`, all from the origin."""
     elevation = np.deg2rad(np.asarray(sensor.elevations, dtype=np.float64))
     zero = np.zeros_like(elevation)
-    return Beams(elevation, zero, zero, zero.astype(int), zero, zero, zero, straight=True)
+    return Lasers(elevation, zero, zero, zero.astype(int), zero, zero, zero, straight=True)
 
 
 def rows_of(sensor: Sensor, slope: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Random numbers one at a time, as scenes want them, from a generator that is fast only in bulk."""
+"""Random numbers one at a time, from a generator that is fast only in bulk."""
 
 import math
 from collections.abc import Sequence
@@ -8,11 +8,11 @@ import numpy as np
 
 T = TypeVar("T")
 
-_BULK = 4096  # a scene takes about three times as many
+_BULK = 4096  # a scene takes about 12,000
 
 
-class Draws:
-    """Scalar draws, each made of uniform ones that are fetched in bulk."""
+class ScalarDraws:
+    """Random numbers, each computed from uniform ones that are drawn in bulk."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -42,7 +42,7 @@ class Draws:
         return -mean * math.log(1 - self.unit())
 
     def poisson(self, mean: float) -> int:
-        """Poisson: how many exponential waits fit into `mean`."""
+        """Poisson: the number of exponential waiting times that fit into `mean`."""
         count, waited = 0, self.exponential(1.0)
         while waited < mean:
             count, waited = count + 1, waited + self.exponential(1.0)
@@ -57,7 +57,7 @@ class Draws:
         return 1 if self.unit() < 0.5 else -1
 
     def pick(self, options: Sequence[T], shares: Sequence[float]) -> T:
-        """One of the options, each by its share."""
+        """One of the options, with probabilities proportional to `shares`."""
         left = self.unit() * sum(shares)
         for option, share in zip(options, shares, strict=True):
             left -= share

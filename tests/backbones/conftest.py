@@ -1,0 +1,10 @@
+import pytest
+from plain_backbone import Plain
+
+from r2flow.backbones import BACKBONES
+
+
+@pytest.fixture(autouse=True)
+def _plain_in_the_table(monkeypatch):
+    """The table with one backbone more, which states nothing about itself."""
+    monkeypatch.setitem(BACKBONES._entries, "plain", Plain)

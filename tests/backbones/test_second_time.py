@@ -1,0 +1,120 @@
+"""u(x, t, s): a network of two times is the network of one time that it starts from, until it learns otherwise."""
+
+import pytest
+import torch
+from tiny_backbones import NAMES, TWO_TIMES, image, tiny, untrained
+
+from r2flow.errors import InputError
+
+
+def grown(name: str) -> tuple[torch.nn.Module, torch.nn.Module]:
+    """A network of one time, and one of two times with its weights: (one, two)."""
+    one, two = tiny(name), untrained(name, second_time=True).eval()
+    missing, unexpected = two.load_state_dict(one.state_dict(), strict=False)
+    assert set(missing) == two.second_time_names()
+    assert not unexpected
+    return one, two
+
+
+@pytest.mark.parametrize("name", TWO_TIMES)
+@pytest.mark.parametrize("autocast", [False, True])
+def test_with_the_weights_of_one_time_it_is_that_network_for_every_s(name, autocast):
+    one, two = grown(name)
+    x = image()
+    with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16, enabled=autocast):
+        for t in (torch.tensor([0.2, 0.7]), 0.3):
+            expected = one(t, x)
+            assert expected.any()
+            assert torch.equal(two(t, x), expected)
+            for s in (0.0, 0.3, 1.0):
+                s = torch.tensor([s, 1 - s]) if isinstance(t, torch.Tensor) else s
+                assert torch.equal(two(t, x, s), expected)
+
+
+@pytest.mark.parametrize("name", TWO_TIMES)
+def test_only_the_new_names_are_new(name):
+    one, two = untrained(name), untrained(name, second_time=True)
+    assert set(two.state_dict()) - set(one.state_dict()) == two.second_time_names()
+    assert set(one.state_dict()) <= set(two.state_dict())
+    assert one.second_time_names() == frozenset()
+    assert len(two.second_time_names()) > 0
+
+
+@pytest.mark.parametrize("name", TWO_TIMES)
+def test_a_seed_gives_both_the_same_weights(name):
+    states = []
+    for second_time in (False, True):
+        torch.manual_seed(1)
+        states.append(untrained(name, second_time=second_time).state_dict())
+    assert all(torch.equal(value, states[1][key]) for key, value in states[0].items())
+
+
+@pytest.mark.parametrize("name", TWO_TIMES)
+def test_training_reaches_the_second_time(name):
+    """The zero matrix learns first, then what is before it; by then s matters."""
+    _, two = grown(name)
+    x, t, s = image(), torch.tensor([0.2, 0.7]), torch.tensor([0.9, 0.8])
+    zero = [p for n, p in two.named_parameters() if n in two.second_time_names() and not p.any()]
+    assert len(zero) == 1
+    new = [p for n, p in two.named_parameters() if n in two.second_time_names()]
+    for reached in (zero, new):
+        two.zero_grad()
+        two(t, x, s).square().mean().backward()
+        assert all(p.grad.isfinite().all() and p.grad.any() for p in reached)
+        with torch.no_grad():
+            for p in zero:
+                p.sub_(p.grad / p.grad.norm())
+    with torch.no_grad():
+        assert (two(t, x, s) - two(t, x)).abs().max() > 1e-4
+        assert torch.equal(two(t, x), two(t, x, t))
+
+
+@pytest.mark.parametrize("name", TWO_TIMES)
+def test_scalar_and_batched_second_times_agree(name):
+    model, x, t = tiny(name, second_time=True), image(3), torch.tensor([0.1, 0.5, 0.9])
+    with torch.no_grad():
+        batched = model(t, x, torch.full((3,), 0.6))
+        for s in (0.6, torch.tensor(0.6), torch.tensor([0.6])):
+            torch.testing.assert_close(model(t, x, s), batched, rtol=0, atol=1e-5)
+        torch.testing.assert_close(model(0.5, x, t)[1:], model(0.5, x[1:], t[1:]), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", TWO_TIMES)
+def test_gradcheck_of_both_times(name):
+    model, x = tiny(name, second_time=True).double(), image().double()
+    weights = torch.randn_like(x)
+    times = [torch.rand(2, dtype=torch.float64, requires_grad=True) for _ in range(2)]
+    assert torch.autograd.gradcheck(lambda t, s: (model(t, x, s) * weights).sum(), times)
+
+
+@pytest.mark.parametrize("name", TWO_TIMES)
+def test_nearby_second_times_are_told_apart_under_autocast(name):
+    """bfloat16 would round 0.9985 to 1."""
+    model, x = tiny(name, second_time=True), image(1)
+    with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
+        assert not torch.equal(model(0.0, x, 1.0), model(0.0, x, 0.9985))
+
+
+@pytest.mark.parametrize("name", TWO_TIMES)
+def test_forward_and_backward_in_time_differ(name):
+    model, x = tiny(name, second_time=True), image(1)
+    with torch.no_grad():
+        assert (model(0.5, x, 0.8) - model(0.5, x, 0.2)).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("name", TWO_TIMES)
+def test_a_second_time_of_another_shape_is_refused(name):
+    with pytest.raises(ValueError, match=r"s must be a scalar or of shape \(2,\), found \(3,\)"):
+        tiny(name, second_time=True)(0.5, image(), torch.rand(3))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_network_of_one_time_says_what_to_do_with_a_second_one(name):
+    with pytest.raises(InputError, match="takes no s: build it with second_time=True"):
+        tiny(name)(0.5, image(), 1.0)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in TWO_TIMES])
+def test_a_backbone_that_takes_one_time_says_so_when_it_is_built(name):
+    with pytest.raises(InputError, match="takes no second time: choose a backbone that does"):
+        untrained(name, second_time=True)
