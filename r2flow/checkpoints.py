@@ -297,6 +297,9 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
         with atomic_write(path) as file:
             file.write(data)
     elif path.suffix == ".pth":
+        if type(checkpoint.generator) is not RectifiedFlow:
+            what = type(checkpoint.generator).__name__
+            raise InputError(f"{path}: the published format cannot hold a {what}; convert to .safetensors instead.")
         weights = _plain(checkpoint.model)
         cfg = published_cfg(checkpoint.config)
         images = checkpoint.step * int(cfg.get("training", {}).get("batch_size", 1))
