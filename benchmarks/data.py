@@ -20,11 +20,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from r2flow.data.layouts import Drive, find_drives
+from r2flow.data.layouts import Drive
 from r2flow.data.loader import FlowDataset
 from r2flow.data.manifest import Manifest, Recipe, ShardEntry, checksum, describe_sensor, shard_name, write_manifest
+from r2flow.data.opening import find_drives, open_prepared
 from r2flow.data.plans import plan_files
-from r2flow.data.prepared import open_prepared
 from r2flow.data.preparing import Preparation
 from r2flow.data.quantise import RangeCodes
 from r2flow.data.sources import read_scan, spread
@@ -183,13 +183,12 @@ def shard_head(scans: int) -> tuple[bytes, int]:
 OPENING = """
 import logging, sys, time
 from pathlib import Path
-from r2flow.data.opening import SourceOptions, open_source
-from r2flow.lidar.sensors import SENSORS
+from r2flow.data.opening import open_scans
 def memory():  # of this process, now; the peak is that of the imports
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20
 logging.disable()  # that train and test drives are opened together
 before, start = memory(), time.perf_counter()
-source, _ = open_source(SourceOptions("prepared", sys.argv[1]), SENSORS["hdl64e"], 0, True)
+source = open_scans(sys.argv[1]).source
 names = source.names
 print(f"{len(names)} scans: {time.perf_counter() - start:.2f} s, {memory() - before:.0f} MiB")
 """

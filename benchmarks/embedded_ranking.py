@@ -30,7 +30,7 @@ from rich.progress import track
 from torch import Tensor
 
 from r2flow.checkpoints import checkpoints_of, load_checkpoint, step_of
-from r2flow.data.sources import SimulatedScans
+from r2flow.data.sources import Reading, SimulatedScans
 from r2flow.lidar.projection import project
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -41,7 +41,7 @@ from r2flow.metrics.fidelity import controls
 from r2flow.metrics.frechet import frechet_distance
 from r2flow.metrics.scans import Scans
 from r2flow.noise import generator
-from r2flow.reports.fidelity import load_images
+from r2flow.reports.fidelity import load_scans
 from r2flow.reports.pages import STYLES, Page, blank_figure, prepare_folder, write_page
 from r2flow.reports.tables import table
 from r2flow.reports.views import scans_of
@@ -310,7 +310,7 @@ def main() -> None:
     seen: list[dict[str, Any]] = []
     if arguments.real:
         paths = [path for folder in arguments.real for path in scans_of(folder, 10**6)]
-        real = torch.from_numpy(np.concatenate([load_images(path, SENSOR) for path in paths]))
+        real = torch.from_numpy(np.concatenate([load_scans(path, Reading(SENSOR))[0] for path in paths]))
         found = ranking("real", real, real, real)
         others = {
             name: distance(*(features(load_extractor(name), q, SENSOR) for q in (real, reference[: len(real)])))  # type: ignore[arg-type]

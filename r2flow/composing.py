@@ -23,7 +23,7 @@ CONF = Path(__file__).resolve().parent / "conf"
 REGISTRIES = {
     "stage": ("r2flow.stages", "STAGES", ("batch_size", "seed")),
     "backbone": ("r2flow.backbones", "BACKBONES", ("in_channels", "out_channels", "second_time")),
-    "data": ("r2flow.data.layouts", "LAYOUTS", ()),
+    "data": ("r2flow.data.opening", "SOURCES", ()),
 }
 
 

@@ -7,8 +7,9 @@ from typing import Any
 
 from r2flow.checkpoints import Checkpoint, load_checkpoint, weights_hash
 from r2flow.config import flatten, groups_of, key_of, rule
-from r2flow.data.opening import AUTO
-from r2flow.data.pairs import PairOptions, default_folder
+from r2flow.data.options import PairOptions
+from r2flow.data.pairs import default_folder
+from r2flow.data.sources import AUTO
 from r2flow.errors import InputError
 from r2flow.registry import check_options
 from r2flow.stages import STAGES

@@ -3,20 +3,19 @@
 import logging
 import os
 import platform
-import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
+from filelock import FileLock, Timeout
 
 from r2flow.checkpoints import FOLDER, checkpoints_of, read_checkpoint
 from r2flow.config import flatten, rule
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.locks import Lock
 
 log = logging.getLogger(__name__)
 
@@ -36,31 +35,24 @@ def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 @contextmanager
 def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
-    """One process at a time in a run's folder; the lock goes with its holder, however that ends.
+    """Let one process at a time work in a run's folder. The lock ends with its holder, also when that is killed.
 
     Raises:
         InputError: another process still trains there after `patience` seconds.
     """
-    path, until = Path(run, ".lock"), time.monotonic() + patience
+    path, holder = Path(run, ".lock"), Path(run, ".lock.holder")
     path.parent.mkdir(parents=True, exist_ok=True)
-    while True:
-        try:
-            lock = Lock(path)
-            break
-        except BlockingIOError:
-            if time.monotonic() > until:
-                holder = path.read_text(encoding="utf-8").strip() or "unknown"
-                raise InputError(
-                    f"{run} is being trained by another process ({holder}). Wait for it, or give name=OTHER."
-                ) from None
-            time.sleep(0.2)
     try:
-        lock.file.truncate(0)
-        lock.file.write(f"pid {os.getpid()} on {platform.node()}".encode())
-        lock.file.flush()
+        lock = FileLock(path, timeout=patience).acquire(poll_interval=0.2)
+    except Timeout:
+        found = holder.read_text(encoding="utf-8") if holder.is_file() else "unknown"
+        raise InputError(
+            f"{run} is being trained by another process ({found}). Wait for it, or give name=OTHER."
+        ) from None
+    with lock:
+        # Not in the lock's own file: who tries to take that may empty it.
+        holder.write_text(f"pid {os.getpid()} on {platform.node()}", encoding="utf-8")
         yield
-    finally:
-        lock.release()
 
 
 def read_config(run: str | Path) -> dict[str, Any] | None:

@@ -23,7 +23,9 @@ from r2flow.callbacks.stopping import Stopping
 from r2flow.checkpoints import checkpoints_of, step_of
 from r2flow.composing import compose
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.opening import AUTO, resolve_reflectance
+from r2flow.data.opening import resolve_reflectance
+from r2flow.data.options import DataOptions
+from r2flow.data.sources import AUTO
 from r2flow.errors import InputError
 from r2flow.generators import Generator, build_generator
 from r2flow.lineage import Parent, find_parent, inherit
@@ -138,7 +140,7 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
         generator = build_generator(config)
     run = _assembled(config, generator)
     if run.data.pairs is not None:
-        run.data.pairs.recipe(run.data.encoding.shape)
+        run.data.pairs.recipe(run.data.encoding.shape, run.data.noise_shape)
     check_run(run.folder, config)
     return config
 
@@ -153,15 +155,13 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
         raise InputError(f"seed must be a whole number of at least 0, found {seed!r}.")
     with made_with(parent.config if parent else {}, "the run that it starts from"):
         config = inherit(config, asked, parent)
-    check_options("data", ScanDataModule, config["data"], given=3)
+    check_options("data", DataOptions, config["data"])
     return config
 
 
 def _assembled(config: dict[str, Any], generator: Generator) -> Run:
     space = generator.space
-    data = ScanDataModule(
-        space.sensor, space.encoding, config["seed"], noise_shape=generator.noise_shape, **config["data"]
-    )
+    data = ScanDataModule(space.sensor, space.encoding, config["seed"], generator.noise_shape, **config["data"])
     check_roll(data.augment, generator)
     stage = build_stage(config, generator)
     trainer = _build_trainer(config, stage)

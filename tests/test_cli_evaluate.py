@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.evaluation.sets import open_set, prepared_reading
+from r2flow.data.opening import open_scans
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.metrics import METRICS
@@ -58,7 +58,7 @@ def test_prepared_shards_are_the_scans_that_they_were_made_of(r2flow, generated,
     for number, image in enumerate(images(6, 1)):
         write_points(tmp_path / "drives" / str(number // 3) / f"{number}.bin", *image_to_points(image, SENSOR.rays()))
     assert r2flow("prepare", "folder", tmp_path / "drives", "--size", "8x64", "--out", tmp_path / "shards")[0] == 0
-    found = open_set(str(tmp_path / "shards"), prepared_reading(str(tmp_path / "shards")))
+    found = open_scans(tmp_path / "shards")
     assert {name: list(numbers) for name, numbers in found.drives.items()} == {"0": [0, 1, 2], "1": [3, 4, 5]}
     np.testing.assert_allclose(found.source[4], images(6, 1)[4], atol=5e-3)
     code, said, _ = r2flow("evaluate", tmp_path / "shards", generated, *QUICK[:2], "--workers", 0, "--floor")
@@ -230,7 +230,7 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
     ("arguments", "message"),
     [
         (("{real}", "{generated}", "--metrics", "jds", *QUICK[2:]), "Did you mean 'jsd'"),
-        (("{real}", "nowhere", *QUICK), "nowhere is not a folder"),
+        (("{real}", "nowhere", *QUICK), "nowhere does not exist"),
         (("{real}", "{generated}", *QUICK[:2]), "give --size 8x64"),
         (("{real}", "{generated}", *QUICK, "--split", "test"), "has no standard split"),
         (("{real}", *QUICK), "give GENERATED, --checkpoint RUN or --floor"),
@@ -272,3 +272,25 @@ def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path
     assert run(tmp_path / "many.json", *shared) == pytest.approx(expected, rel=1e-10)
     again = run(tmp_path / "many.json", *shared)  # from the cache
     assert again == pytest.approx(expected, rel=1e-10)
+
+
+def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):  # noqa: F811
+    run = saved[0].parent.parent
+    assert r2flow("sample", "-c", run, "--num", 2, "--steps", 2, "-o", run / "samples", "--pictures", 0)[0] == 0
+    note = json.loads((run / "samples" / "scans.json").read_text())
+    assert (len(note["sensor"]["elevations"]), note["sensor"]["columns"], note["projection"]) == (8, 64, "spherical")
+    assert (note["seed"], note["sampler"]["steps"], note["encoding"]["max_range"]) == (0, 2, 80.0)
+    quick = ("--metrics", "jsd", "--workers", 0)
+    code, said, _ = r2flow("evaluate", real, run / "samples", *quick)
+    assert (code, "(2 : 12)" in said) == (0, True)
+    for wrong in (("--size", "16x64"), ("--sensor", "vlp16", "--size", "8x64")):
+        code, _, said = r2flow("evaluate", real, run / "samples", *quick, *wrong)
+        assert code == 2
+        assert "holds images of hdl64e 8x64 (its scans.json says so)" in said
+        assert len(said.splitlines()) == 1
+    assert r2flow("show", run, "--out", tmp_path / "views")[0] == 0
+    assert sorted(path.name for path in (tmp_path / "views").iterdir()) == ["000000.png", "000001.png"]
+    code, said, _ = r2flow("report", "fidelity", real, run)
+    assert (code, "Scans: 12 real, 2 other" in said) == (0, True)
+    assert r2flow("invert", run, "-c", run, "-o", tmp_path / "noise", "--solver", "euler", "--steps", 2)[0] == 0
+    assert {path.name for path in (tmp_path / "noise").glob("*.npy")} == {"000000.x_0.npy", "000001.x_0.npy"}

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from r2flow.checkpoints import load_checkpoint, weights_hash
-from r2flow.data.pairs import PairOptions, PairSource
+from r2flow.data.options import PairOptions
+from r2flow.data.pairs import PairSource
 from r2flow.data.shards import PairStore
 from r2flow.lineage import pairs_of
 from r2flow.reports.pairs import place

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from r2flow.data.manifest import read_manifest
-from r2flow.data.prepared import open_prepared
+from r2flow.data.opening import open_prepared
 from r2flow.data.sources import read_scan
 from r2flow.lidar.sensors import SENSORS
 from tests.data.conftest import kitti_360, write_scan  # noqa: F401  a fixture
@@ -92,7 +92,7 @@ def test_simulated_scans_are_prepared_by_number_and_seed(r2flow, tmp_path):  # n
         (["simulated", "ROOT", "--out", "OUT"], "simulated scans are no files: leave out ROOT."),
         (["simulated", "--out", "OUT", "--split", "test"], "simulated scans are no files: leave out --split."),
         (["folder", "ROOT", "--out", "OUT", "--num", "3"], "--num is for simulated scans"),
-        (["folders", "ROOT", "--out", "OUT"], "no data layout named 'folders'"),
+        (["folders", "ROOT", "--out", "OUT"], "no data set named 'folders'"),
         (["folder", "ROOT", "--out", "OUT", "--reflectance-levels", "300"], "must lie in [1, 256]"),
         (["folder", "ROOT", "--out", "OUT", "--on-bad-scan", "ignore"], "must be 'error' or 'skip', found 'ignore'"),
         (["folder", "ROOT", "--out", "FILE/below"], "Not a directory"),

@@ -13,8 +13,7 @@ from r2flow.callbacks import CALLBACKS
 from r2flow.composing import CONF, choices, compose
 from r2flow.config import RULES, Key, flatten, key_of, rule
 from r2flow.data.augment import Augmentation
-from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.pairs import PairOptions
+from r2flow.data.options import DataOptions, PairOptions
 from r2flow.registry import options_of
 from r2flow.stages import STAGES
 
@@ -71,7 +70,7 @@ def entries() -> list[tuple[str, Callable[..., Any], dict[str, Any], set[str]]]:
         added = set(list(inspect.signature(entry.constructor).parameters)[:given])
         found.append((f"callbacks.{name}", entry.constructor, options, added))
     data = CONFIG["data"]
-    found.append(("data", ScanDataModule, data, {"sensor", "encoding", "seed"}))
+    found.append(("data", DataOptions, data, set()))
     found.append(("data.augment", Augmentation, data["augment"], set()))
     found.append(("data.pairs", PairOptions, data["pairs"], {"parent"}))
     found.append(("trainer", L.Trainer, CONFIG["trainer"], {"callbacks", "logger", "plugins"}))

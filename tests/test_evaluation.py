@@ -11,12 +11,13 @@ import pytest
 import torch
 
 from r2flow.checkpoints import Checkpoint
+from r2flow.data.opening import open_scans
+from r2flow.data.sources import Reading
 from r2flow.errors import InputError
 from r2flow.evaluation import measuring
 from r2flow.evaluation.floor import floor_sets
 from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
-from r2flow.evaluation.reading import Reading
-from r2flow.evaluation.sets import ScanSet, fixed_choice, open_set, sampled_set
+from r2flow.evaluation.sets import ScanSet, fixed_choice, sampled_set
 from r2flow.evaluation.statistics import Cache, key_of
 from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
@@ -83,7 +84,7 @@ def histograms(scans: np.ndarray) -> np.ndarray:
 
 def test_the_figures_are_the_formulas(real, generated):
     p, q = histograms(images(12, 1)), histograms(images(10, 2))
-    found = figures(open_set(str(real), READING), open_set(str(generated), READING), work=Work(batch_size=5))
+    found = figures(open_scans(str(real), READING), open_scans(str(generated), READING), work=Work(batch_size=5))
     a, b = p.sum(0) / p.sum(), q.sum(0) / q.sum()
     m = (a + b) / 2
     entropy = [-(x[x > 0] * np.log(x[x > 0])).sum() for x in (a, b, m)]
@@ -97,19 +98,19 @@ def test_the_figures_are_the_formulas(real, generated):
 
 
 def test_neither_order_nor_batches_nor_reading_processes_are_seen(real, generated, tmp_path):
-    there = open_set(str(real), READING)
-    expected = figures(there, open_set(str(generated), READING))
+    there = open_scans(str(real), READING)
+    expected = figures(there, open_scans(str(generated), READING))
     backwards = folder(tmp_path / "backwards", images(10, 2)[::-1])
-    found = figures(there.part(range(11, -1, -1), "backwards"), open_set(str(backwards), READING), work=Work(3, 1))
+    found = figures(there.part(range(11, -1, -1), "backwards"), open_scans(str(backwards), READING), work=Work(3, 1))
     assert found == pytest.approx(expected, rel=1e-10)
 
 
 class TestCache:
     def test_what_is_kept_gives_the_same_figures_and_is_not_read_again(self, real, generated, tmp_path, monkeypatch):
-        cache, other = Cache(tmp_path / "cache"), open_set(str(generated), READING)
-        fresh = figures(open_set(str(real), READING), other)
-        assert figures(open_set(str(real), READING), other, cache) == fresh
-        truth = open_set(str(real), READING)
+        cache, other = Cache(tmp_path / "cache"), open_scans(str(generated), READING)
+        fresh = figures(open_scans(str(real), READING), other)
+        assert figures(open_scans(str(real), READING), other, cache) == fresh
+        truth = open_scans(str(real), READING)
         monkeypatch.setattr(ScanSet, "batches", lambda *_: pytest.fail("the real scans were read again"))
         gathered = gather_real({"jsd": JSD(), "mmd": MMD()}, truth, Work(), cache)
         assert gathered.kept == {"jsd", "mmd"}
@@ -118,7 +119,7 @@ class TestCache:
 
     def test_any_change_of_what_made_them_misses_it(self, real, tmp_path, monkeypatch):
         def key(root: Path = real, reading: Reading = READING, metric: JSD | None = None, rule: str = "all") -> str:
-            found = key_of(metric or JSD(), open_set(str(root), reading), rule)
+            found = key_of(metric or JSD(), open_scans(str(root), reading), rule)
             assert found is not None
             return found
 
@@ -128,7 +129,7 @@ class TestCache:
             first,
             key(rule="10 of 12"),
             key(metric=JSD(keep=True)),
-            key_of(MMD(), open_set(str(real), READING), "all"),
+            key_of(MMD(), open_scans(str(real), READING), "all"),
         ]
 
         class Other(JSD):
@@ -140,7 +141,7 @@ class TestCache:
             key(reading=Reading(SENSOR, convention="reference")),
             key(reading=Reading(SENSOR, reflectance_scale=2)),
         ]
-        keys.append(key_of(JSD(), open_set(str(real), READING, num=7), "all"))
+        keys.append(key_of(JSD(), open_scans(str(real), READING, num=7), "all"))
         monkeypatch.setattr("r2flow.evaluation.statistics.FORMAT", 2)
         keys.append(key())
         monkeypatch.undo()
@@ -154,7 +155,11 @@ class TestCache:
         assert len(set(keys)) == len(keys)
 
     def test_a_damaged_file_is_gathered_again(self, real, generated, tmp_path, caplog):
-        cache, there, other = Cache(tmp_path / "cache"), open_set(str(real), READING), open_set(str(generated), READING)
+        cache, there, other = (
+            Cache(tmp_path / "cache"),
+            open_scans(str(real), READING),
+            open_scans(str(generated), READING),
+        )
         expected = figures(there, other, cache)
         for path in cache.folder.iterdir():
             path.write_bytes(path.read_bytes()[:100])
@@ -169,7 +174,7 @@ class TestCache:
 def test_the_field_s_subset_is_read_first_and_every_scan_once(real, generated, monkeypatch):
     monkeypatch.setattr(measuring, "REAL_SCANS", 5)
     read: list[int] = []
-    there = open_set(str(real), READING)
+    there = open_scans(str(real), READING)
     fetch = type(there.source).__getitem__
     monkeypatch.setattr(type(there.source), "__getitem__", lambda self, i: (read.append(i), fetch(self, i))[1])
     everything = CountReturns()
@@ -223,7 +228,7 @@ class TestSets:
             ending = ("ply", "bin", "npy", "pcd")[number % 4]
             xyz, reflectance = image_to_points(image, SENSOR.rays())
             write_points(files / f"{number}.{ending}", xyz, reflectance)
-        found = open_set(str(files), READING)
+        found = open_scans(str(files), READING)
         assert found.about["reflectance"]
         for index, name in enumerate(found.source.names):
             np.testing.assert_allclose(found.source[index], made[int(Path(name).stem)], atol=1e-4)
@@ -231,10 +236,10 @@ class TestSets:
     def test_one_of_each_where_a_sample_lies_in_several_formats(self, generated):
         for number, image in enumerate(images(10, 2)):
             write_points(generated / f"{number:06d}.ply", *image_to_points(image, SENSOR.rays()))
-        assert open_set(str(generated), READING).source.names == [f"{n:06d}.npy" for n in range(10)]
+        assert open_scans(str(generated), READING).source.names == [f"{n:06d}.npy" for n in range(10)]
 
     def test_a_layout_with_its_split_and_drives(self, kitti_360):  # noqa: F811
-        found = open_set(f"kitti_360:{kitti_360}", READING, "test")
+        found = open_scans(f"kitti_360:{kitti_360}", READING, "test")
         assert len(found) == 6
         assert {drive[-9:-5]: list(numbers) for drive, numbers in found.drives.items()} == {
             "0000": [0, 1, 2], "0002": [3, 4, 5]
@@ -243,10 +248,10 @@ class TestSets:
         assert found.source[4][0].max() == pytest.approx(5 + 2 * 3 + 1, abs=0.02)
 
     def test_simulated_scenes_are_numbered_by_their_seed(self):
-        found = open_set("simulated:3", READING, num=2)
+        found = open_scans("simulated:3", READING, num=2)
         assert len(found) == 2
         assert found.about["seed"] == 3
-        np.testing.assert_array_equal(found.source[1], open_set("simulated:3", READING, num=3).source[1])
+        np.testing.assert_array_equal(found.source[1], open_scans("simulated:3", READING, num=3).source[1])
 
     def test_a_flow_is_sampled_from_the_noise_of_evaluations(self):
         drawn = sampled_set(flow(), "flow", 5, Sampler("euler", 1), seed=9)
@@ -261,7 +266,7 @@ class TestSets:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("nowhere", "nowhere is not a folder"),
+            ("nowhere", "nowhere does not exist"),
             ("kitti360:x", "Did you mean 'kitti_360'"),
             ("simulated:x", "named by their seed"),
         ],
@@ -269,11 +274,11 @@ class TestSets:
     def test_what_is_not_there_is_said(self, text, message, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         with pytest.raises(InputError, match=message):
-            open_set(text, READING)
+            open_scans(text, READING)
 
     def test_another_size_names_the_option(self, real):
         with pytest.raises(InputError, match=r"000000\.npy is a range image of 8x64, .* 16x64; give --size 8x64"):
-            next(open_set(str(real), Reading(SENSOR.resized(16, 64))).batches([0], 1))
+            next(open_scans(str(real), Reading(SENSOR.resized(16, 64))).batches([0], 1))
 
 
 class TestExtremes:
@@ -288,7 +293,7 @@ class TestExtremes:
 
     def test_points_out_of_view_are_an_empty_scan_and_no_points_a_clear_error(self, real, tmp_path):
         write_points(tmp_path / "g" / "0.ply", np.array([[0, 0, 9.0]]), np.array([0.5]))
-        assert not open_set(str(tmp_path / "g"), READING).source[0].any()
+        assert not open_scans(str(tmp_path / "g"), READING).source[0].any()
         found = self.measured(real, tmp_path / "g")
         for one in found:
             assert any(math.isnan(value) for value in one.figures.values()) <= bool(one.remarks)
@@ -298,24 +303,24 @@ class TestExtremes:
         found = self.measured(real, folder(tmp_path / "g", images(1, 2)))
         assert all("a single generated scan" in " ".join(one.remarks) for one in found)
 
-    def measured(self, real: Path, generated: Path) -> Sequence[measuring.Measured]:
+    def measured(self, real: Path, generated: Path) -> Sequence[measuring.MetricResult]:
         metrics = {"jsd": JSD(), "mmd": MMD()}
-        gathered = gather_real(metrics, open_set(str(real), READING), Work())
-        return measure(metrics, gathered, open_set(str(generated), READING), Work())
+        gathered = gather_real(metrics, open_scans(str(real), READING), Work())
+        return measure(metrics, gathered, open_scans(str(generated), READING), Work())
 
 
 def test_intervals_hold_their_figure(real, generated):
     metrics = {"jsd": JSD(keep=True)}
-    gathered = gather_real(metrics, open_set(str(real), READING), Work())
-    (found,) = measure(metrics, gathered, open_set(str(generated), READING), Work(), draws=30)
+    gathered = gather_real(metrics, open_scans(str(real), READING), Work())
+    (found,) = measure(metrics, gathered, open_scans(str(generated), READING), Work(), draws=30)
     low, high = found.intervals["jsd"]
     assert low < found.figures["jsd"] < high
     assert found.protocol["interval"] == {"bootstrap draws": 30, "level": 0.95, "seed": 0}
 
 
 def test_the_floor_is_halves_by_block_and_two_drives(kitti_360, tmp_path):  # noqa: F811
-    real = open_set(f"kitti_360:{kitti_360}", READING, "train")
-    other = open_set(str(folder(tmp_path / "g", images(8, 2))), READING)
+    real = open_scans(f"kitti_360:{kitti_360}", READING, "train")
+    other = open_scans(str(folder(tmp_path / "g", images(8, 2))), READING)
     found = floor_sets(real, other)
     assert list(found) == ["real halves", "generated, as many", "real drives"]
     names = real.source.names
@@ -331,12 +336,12 @@ def test_the_floor_is_halves_by_block_and_two_drives(kitti_360, tmp_path):  # no
 
 
 def test_identity_is_plain_and_holds_no_path(real):
-    found = open_set(str(real), READING)
+    found = open_scans(str(real), READING)
     assert str(real) not in json.dumps(found.identity)
     assert str(real) not in json.dumps(dict(found.about))
 
 
 def test_another_revision_of_the_simulator_draws_other_scans(monkeypatch):
-    before = open_set("simulated:0", READING, num=3).identity
+    before = open_scans("simulated:0", READING, num=3).identity
     monkeypatch.setattr("r2flow.simulator.REVISION", 10**6)
-    assert open_set("simulated:0", READING, num=3).identity != before
+    assert open_scans("simulated:0", READING, num=3).identity != before

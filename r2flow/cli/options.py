@@ -1,5 +1,7 @@
 """Options that several verbs share, and what becomes of them."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -8,6 +10,7 @@ import typer
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
+    from r2flow.data.sources import Reading
     from r2flow.lidar.sensors import Sensor
 
 CheckpointOption = Annotated[
@@ -18,6 +21,17 @@ SensorOption = Annotated[str, typer.Option(help="Name of the sensor, or the YAML
 SizeOption = Annotated[str | None, typer.Option(help="Rows x columns, as 64x1024; the sensor's own if left out.")]
 ProjectionOption = Annotated[str, typer.Option(help="spherical or unfolding.")]
 ConventionOption = Annotated[str, typer.Option(help="centre, or reference for the published models'.")]
+SETS = "a folder of scans, samples, a run, prepared shards, NAME:FOLDER, simulated:SEED"
+SensorChoice = Annotated[
+    str | None, typer.Option(help="Name of the sensor; that of the flow or the scans, or hdl64e, if left out.")
+]
+ProjectionChoice = Annotated[str | None, typer.Option(help="spherical or unfolding; theirs, or spherical.")]
+ConventionChoice = Annotated[
+    str | None, typer.Option(help="centre, or reference for the published models'; theirs, or centre.")
+]
+ScaleChoice = Annotated[
+    float | None, typer.Option(min=1e-6, help="Value in scan files that means full reflectance; their usual one, or 1.")
+]
 ScaleOption = Annotated[float, typer.Option(min=1e-6, help="Value in the file that means full reflectance, often 255.")]
 
 
@@ -30,6 +44,54 @@ def build_sized(sensor: str, size: str | None) -> "Sensor":
     if sensor.lower().endswith(ENDINGS):
         return read_sensor(sensor, rows, columns)
     return build_sensor(sensor, rows, columns)
+
+
+def choose_reading(
+    specs: Sequence[str | Path | None],
+    sensor: str | None = None,
+    size: str | None = None,
+    projection: str | None = None,
+    convention: str | None = None,
+    reflectance_scale: float | None = None,
+    flow: "Reading | None" = None,
+) -> "Reading":
+    """How named scans become images of one sensor: as asked for; else as a flow's or one of theirs were; else usual.
+
+    Args:
+        specs: Names of scans, as for `open_scans`; None is passed over.
+        flow: That of the flow that the scans are compared with.
+
+    Raises:
+        InputError: an unknown name, or another sensor or size than the flow's.
+    """
+    from r2flow.data.opening import own_reading, parse, refuse_other_samples, usual_reading
+    from r2flow.data.options import FOLDER
+    from r2flow.lidar.projection import CONVENTIONS, PROJECTIONS
+
+    named = [spec for spec in specs if spec is not None]
+    own = [reading for spec in named if (reading := own_reading(spec)) is not None]
+    usual = usual_reading(named[0])
+    found = replace(flow or next(iter(own), None) or usual, reflectance_scale=usual.reflectance_scale)
+    if flow is not None and (sensor is not None or size is not None):
+        chosen = build_sized(sensor or flow.sensor.name, size)
+        if chosen.shape != flow.sensor.shape:
+            asked, there = ("x".join(map(str, one.shape)) for one in (chosen, flow.sensor))
+            raise InputError(f"the flow's images are {there}, not {asked}; leave --sensor and --size out.")
+        if chosen.elevations != flow.sensor.elevations:
+            raise InputError(f"the flow looks through {flow.sensor.name}, not {chosen.name}; leave --sensor out.")
+    elif sensor is not None:
+        found = replace(found, sensor=build_sized(sensor, size))
+    elif size is not None:
+        found = replace(found, sensor=found.sensor.resized(*_rows_and_columns(size)))
+    for option, value, known in (("projection", projection, PROJECTIONS), ("convention", convention, CONVENTIONS)):
+        if value is not None and value not in known:
+            raise InputError(f"--{option} must be one of {', '.join(known)}; found {value!r}.")
+    for spec in named:  # before anything is read
+        options, _ = parse(str(spec))
+        if options.name == FOLDER:
+            refuse_other_samples(Path(options.folder), found.sensor)
+    asked_for = {"projection": projection, "convention": convention, "reflectance_scale": reflectance_scale}
+    return replace(found, **{key: value for key, value in asked_for.items() if value is not None})  # type: ignore[arg-type]
 
 
 def _rows_and_columns(size: str | None) -> tuple[int | None, int | None]:

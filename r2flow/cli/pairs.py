@@ -38,7 +38,8 @@ def pairs(
     SLURM array, with the settings of `data.pairs`.
     """
     from r2flow.checkpoints import load_checkpoint, weights_hash
-    from r2flow.data.pairs import PairOptions, default_folder
+    from r2flow.data.options import PairOptions
+    from r2flow.data.pairs import default_folder
     from r2flow.data.shards import PairStore
     from r2flow.lineage import check_finished, pairs_of
     from r2flow.reports.pairs import make_and_tell, place
@@ -63,7 +64,9 @@ def pairs(
         "num": num, "method": solver, "steps": steps, "tolerance": tolerance, "batch_size": batch_size,
         "shard_mib": shard_mib, "seed": seed, "first": first,
     }  # fmt: skip
-    recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(flow.encoding.shape)
+    recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(
+        flow.encoding.shape, flow.generator.noise_shape
+    )
     store = PairStore(out or default_folder(flow.path), recipe)
     make_and_tell(store, flow, num, rank, ranks, where)
     lacking = len(store.missing(num))

@@ -15,9 +15,6 @@ if TYPE_CHECKING:
     from r2flow.data.manifest import Manifest
     from r2flow.data.preparing import Preparation
 
-# Of a layout, where they are not hdl64e and 1: what conf/data says for training from the files.
-SENSORS_AND_SCALES = {"nuscenes": ("hdl32e", 255.0)}
-
 
 @app.command(epilog="Example: r2flow prepare kitti_360 /data/KITTI-360 --out prepared/kitti_360")
 def prepare(
@@ -76,17 +73,18 @@ def prepare(
         raise InputError(f"r2flow prepare {layout} needs the folder of its scans: r2flow prepare {layout} ROOT --out.")
     elif num is not None:
         raise InputError("--num is for simulated scans; choose files by --split and --drives.")
+    from r2flow.data.opening import SOURCES
     from r2flow.data.plans import plan_files, plan_simulated
     from r2flow.data.preparing import Preparation
 
-    usual_sensor, usual_scale = SENSORS_AND_SCALES.get(layout, ("hdl64e", 1.0))
-    chosen = build_sized(sensor or usual_sensor, size)
+    usual = SOURCES[layout]
+    chosen = build_sized(sensor or usual.sensor, size)
     if root is None:
         plan = plan_simulated(num or 512, seed, chosen, reflectance_levels, shard_scans)
     else:
         wanted = drives.split(",") if drives else None
         plan = plan_files(
-            layout, root, chosen, projection, convention, split, wanted, reflectance_scale or usual_scale,
+            layout, root, chosen, projection, convention, split, wanted, reflectance_scale or usual.reflectance_scale,
             reflectance_levels, shard_scans,
         )  # fmt: skip
     _run(Preparation(out, plan), on_bad_scan, workers)

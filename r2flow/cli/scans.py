@@ -7,10 +7,12 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.options import (
+    SETS,
     ConventionOption,
     OutOption,
     ProjectionOption,
     ScaleOption,
+    SensorChoice,
     SensorOption,
     SizeOption,
     build_sized,
@@ -20,9 +22,9 @@ from r2flow.errors import InputError
 
 @app.command(epilog="Example: r2flow show scans/000000.ply velodyne/0000000100.bin --out views")
 def show(
-    files: Annotated[list[Path], typer.Argument(help="Scan files, range images (.npy), or folders of them.")],
+    scans: Annotated[list[str], typer.Argument(help=f"Scan files, range images (.npy), or {SETS}.")],
     out: OutOption,
-    sensor: SensorOption = "hdl64e",
+    sensor: SensorChoice = None,
     size: SizeOption = None,
     projection: ProjectionOption = "spherical",
     reflectance_scale: Annotated[
@@ -33,17 +35,17 @@ def show(
 ) -> None:
     """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each."""
     from r2flow.reports.pictures import save_figure, scan_figure
-    from r2flow.reports.views import label_view, open_view, scans_of
+    from r2flow.reports.views import label_view, views_of
 
-    if projection == "unfolding" and sensor == "hdl64e":
+    if projection == "unfolding" and sensor in (None, "hdl64e"):
         sensor = "hdl64e_rings"  # rows are rings then, and these are not evenly spaced
-    chosen = build_sized(sensor, size)
-    paths = [path for file in files for path in scans_of(file, most)]
-    for path in paths:
-        image, rays = open_view(path, chosen, projection, reflectance_scale)
-        classes = label_view(path, chosen, projection) if labels else None
-        written = save_figure(scan_figure(image, rays, path.name, classes), out / f"{unique_stem(path, paths)}.png")
-        print(written)
+    chosen = None if sensor is None and size is None else build_sized(sensor or "hdl64e", size)
+    views = [view for spec in scans for view in views_of(spec, chosen, projection, reflectance_scale, most)]
+    paths = [view.path for view in views]
+    for view in views:
+        classes = label_view(view.path, view.scans.sensor, projection) if labels else None
+        figure = scan_figure(view.image, view.rays, view.path.name, classes)
+        print(save_figure(figure, out / f"{unique_stem(view.path, paths)}.png"))
 
 
 @app.command(
@@ -61,13 +63,17 @@ def project(
     """Project a scan to a range image: float32 (2, H, W), range in metres and reflectance, 0 where missing."""
     import numpy as np
 
+    from r2flow.data.opening import open_scans
+    from r2flow.data.sources import Reading
     from r2flow.files import atomic_write
-    from r2flow.reports.views import project_file
 
     chosen = build_sized(sensor, size)
     if out.suffix != ".npy":
         raise InputError(f"--out {out}: a range image is written as .npy; r2flow show draws pictures.")
-    image = project_file(scan, chosen, projection, convention, reflectance_scale)
+    if scan.is_dir():
+        raise InputError(f"{scan} is a folder, not a scan file; name a file in it.")
+    reading = Reading(chosen, projection, convention, reflectance_scale, on_bad_scan="error")  # type: ignore[arg-type]
+    image = open_scans(scan, reading).source[0]
     image = image if len(image) > 1 else np.concatenate([image, np.zeros_like(image)])
     with atomic_write(out) as file:
         np.save(file, image)

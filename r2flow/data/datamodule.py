@@ -2,8 +2,7 @@
 
 import hashlib
 import logging
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import lightning as L
@@ -13,19 +12,12 @@ from torch.utils.data import DataLoader, Dataset
 from r2flow import simulator
 from r2flow.data.augment import Augmentation
 from r2flow.data.loader import FixedSampler, FlowDataset, Item, Order, Permutations, RunLoader, RunSampler
-from r2flow.data.mixture import MixedOrder, Mixture, refuse_shared_scans, scan_places
-from r2flow.data.opening import (
-    MIXED,
-    SIMULATED,
-    PartOptions,
-    SourceOptions,
-    open_source,
-    split_parts,
-    validation_source,
-)
-from r2flow.data.pairs import PairDataset, PairOptions, PairSource
+from r2flow.data.mixture import MixedOrder, Mixture, refuse_shared_scans
+from r2flow.data.opening import held_out_options, open_scans, split_parts
+from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
+from r2flow.data.pairs import PairDataset, PairSource
 from r2flow.data.shards import PairStore
-from r2flow.data.sources import InMemory, ScanFiles, ScanSource, SimulatedScans, holdout_block, spread
+from r2flow.data.sources import Reading, ScanSource, holdout_block, spread
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
@@ -35,88 +27,48 @@ from r2flow.signals import outlive_the_signal
 
 log = logging.getLogger(__name__)
 
-PAIRS = "pairs"
-
 
 class ScanDataModule(L.LightningDataModule):
     """Projected scans with their noise, or pairs that a flow has drawn, for training and validation.
+
+    What a batch holds is said by `r2flow.data.loader.FlowDataset`.
 
     Args:
         sensor: What the scans are projected through.
         encoding: Metres to model space.
         seed: Run seed; noise, times and order derive from it (`r2flow.noise`).
-        name: `simulated`, `pairs`, `prepared` (what `r2flow prepare` wrote), `mixed`, or a layout of
-            `r2flow.data.layouts.LAYOUTS`.
-        root: Folder of the data set, or of the pairs.
-        split: Part of the layout's standard split; None takes all.
-        drives: Drives to take; None takes all.
-        scenes: Number of simulated training scenes.
-        projection: `spherical` or `unfolding`.
-        convention: `centre` or `reference`.
-        reflectance_scale: The value in the files that means full reflectance.
-        on_bad_scan: `error` or `skip`.
-        parts: Of `mixed`: its data sets, each `{name, root, split, drives, ..., weight}`. The weights are the shares of
-            the run's images; without any, all scans are one set.
-        augment: Options of `r2flow.data.augment.Augmentation`, done to training scans.
-        batch_size: Images in one optimiser step, over all devices and accumulated batches.
-        workers: Loader processes a device.
-        memory_gib: Training scans are kept in memory where they fit into this, else read when needed.
-        validation: `{share, scans, data}`: the share of the scans held out as one contiguous block, the most
-            scans to validate on, or `data`, another data config (name, root, split, drives, ...) to hold out instead.
-        pairs: Options of `r2flow.data.pairs.PairOptions`, where the data are pairs.
+        noise_shape: Shape of the noise x_0 that one scan is made of; the encoding's (C, H, W) if left out.
+        keys: The keys of `r2flow.data.options.DataOptions`.
+
+    Raises:
+        InputError: an unknown key, or values that cannot be.
     """
 
     def __init__(
-        self,
-        sensor: Sensor,
-        encoding: Encoding,
-        seed: int,
-        name: str = SIMULATED,
-        root: str | int | None = None,
-        split: str | None = None,
-        drives: list[str | int] | None = None,
-        scenes: int = 512,
-        projection: str = "spherical",
-        convention: str = "centre",
-        reflectance_scale: float = 1.0,
-        on_bad_scan: str = "error",
-        parts: Sequence[Mapping[str, Any]] | None = None,
-        augment: Mapping[str, Any] | None = None,
-        batch_size: int = 8,
-        workers: int = 0,
-        memory_gib: float = 2.0,
-        validation: Mapping[str, Any] | None = None,
-        pairs: Mapping[str, Any] | None = None,
-        noise_shape: Sequence[int] | None = None,
+        self, sensor: Sensor, encoding: Encoding, seed: int, noise_shape: Sequence[int] | None = None, **keys: Any
     ) -> None:
         super().__init__()
-        self.noise_shape = noise_shape
-        if batch_size < 1 or workers < 0:
-            raise InputError(
-                f"data.batch_size must be at least 1 and data.workers at least 0; found {batch_size} and {workers}."
-            )
+        check_options("data", DataOptions, keys)
         self.sensor, self.encoding, self.seed = sensor, encoding, seed
-        self.options = SourceOptions(
-            name, root, split, drives, scenes, projection, convention, reflectance_scale, on_bad_scan
-        )
-        if parts is not None and name != MIXED:
-            raise InputError(f"data.parts are those of data=mixed, found data={name}; leave them out, or give it.")
-        self.parts = split_parts(self.options, parts) if name == MIXED else [self.options]
-        self.batch_size, self.workers, self.memory_gib = batch_size, workers, memory_gib
-        check_options("data.augment", Augmentation, augment or {})
-        self.augment = Augmentation(**(augment or {}))
-        self.validation = dict(validation or {})
-        check_options("data.validation", _validation_options, self.validation)
+        self.noise_shape = tuple(noise_shape or encoding.shape)
+        self.options = DataOptions(**keys)
+        self.batch_size = self.options.batch_size
+        self.parts = [] if self.options.name == PAIRS else split_parts(self.options)
+        augment = self.options.augment or {}
+        check_options("data.augment", Augmentation, augment)
+        self.augment = Augmentation(**augment)
+        self.validation = self.options.held
         self.names: list[str] = []
         self.training_source: ScanSource | PairSource | None = None
         self.validation_source: ScanSource | PairSource | None = None
-        self.pairs = self._pair_options(pairs or {}) if name == PAIRS else None
+        self.pairs = self._pair_options() if self.options.name == PAIRS else None
 
-    def _pair_options(self, options: Mapping[str, Any]) -> PairOptions:
+    def _pair_options(self) -> PairOptions:
+        options = self.options.pairs or {}
         check_options("data.pairs", PairOptions, options)
         if self.augment:
             raise InputError("data.augment changes scans, and a changed pair is none of the flow's; leave it out.")
-        if self.validation.get("data") is not None:
+        if self.validation.data is not None:
             raise InputError("data.validation.data cannot be held out from pairs; leave it out.")
         if self.options.root is None:
             raise InputError("data=pairs needs the flow that draws them: stage.init=RUN.")
@@ -126,8 +78,7 @@ class ScanDataModule(L.LightningDataModule):
     def pair_store(self) -> PairStore:
         """The folder of the run's pairs, whatever it holds yet."""
         assert self.pairs is not None
-        shape = self.encoding.shape
-        return PairStore(self.options.folder, self.pairs.recipe(shape))
+        return PairStore(self.options.folder, self.pairs.recipe(self.encoding.shape, self.noise_shape))
 
     def setup(self, stage: str | None = None) -> None:
         if self.training_source is not None:
@@ -145,33 +96,40 @@ class ScanDataModule(L.LightningDataModule):
 
         Without other data to hold out, each part of a mixture holds out its own block.
         """
-        share, most, other = _validation_options(**self.validation)
-        opened = [self._open(options) for options in self.parts]
-        whole = [source for source, _ in opened]
+        whole = [self._open(options) for options in self.parts]
         if len(whole) > 1:
             refuse_shared_scans(whole)
         self.names = [
             f"{label}{name}" for label, source in zip(self._labels(), whole, strict=True) for name in source.names
         ]
-        if other is None:
-            blocks = [holdout_block(len(source), share, starts) for source, starts in opened]
+        other = held_out_options(self.options)
+        if not other:
+            blocks = [self._blocks(source) for source in whole]
             training = [source.subset(first) for source, (first, _) in zip(whole, blocks, strict=True)]
             held = [source.subset(last) for source, (_, last) in zip(whole, blocks, strict=True)]
         else:
             # Scenes that are held out beside simulated training ones come after them.
             first_scene = max((part.scenes for part in self.parts if part.name == SIMULATED), default=0)
-            training, held = whole, [self._open(validation_source(self.options, other), first_scene)[0]]
-            shared = scan_places(held[0]) & set().union(*map(scan_places, whole))
+            training, held = whole, [self._open(options, first_scene) for options in other]
+            shared = held[0].places() & set().union(*(source.places() for source in whole))
             if shared:
                 log.warning(
                     "data.validation.data holds %d scans that are trained on, as %s: give it its own split or drives",
                     len(shared), min(shared),
                 )  # fmt: skip
         validation = self._joined(held)
-        return self._joined(training), validation.subset(spread(len(validation), most))
+        return self._joined(training), validation.subset(spread(len(validation), self.validation.scans))
 
-    def _open(self, options: SourceOptions, first_scene: int = 0) -> tuple[ScanSource, list[int]]:
-        return open_source(options, self.sensor, self.seed, self.encoding.reflectance, first_scene)
+    def _blocks(self, source: ScanSource) -> tuple[range, range]:
+        starts = sorted(numbers[0] for numbers in source.drives.values() if len(numbers))
+        return holdout_block(len(source), self.validation.share, starts)
+
+    def _open(self, options: SourceOptions, first_scene: int = 0) -> ScanSource:
+        reading = Reading(
+            self.sensor, options.projection, options.convention, options.reflectance_scale,  # type: ignore[arg-type]
+            self.encoding.reflectance, options.on_bad_scan, within_limits=True,
+        )  # fmt: skip
+        return open_scans(options, reading, seed=self.seed, first_scene=first_scene).source
 
     def _labels(self) -> list[str]:
         """What goes before the names of each part's scans: they are told apart by it."""
@@ -182,8 +140,9 @@ class ScanDataModule(L.LightningDataModule):
 
     def _order(self, source: ScanSource | PairSource) -> Order:
         """Which scan is image k of the run."""
-        weights = [part.weight for part in self.parts if isinstance(part, PartOptions) and part.weight is not None]
-        if isinstance(source, Mixture) and weights:
+        weights = [part.weight for part in self.parts if part.weight is not None]
+        if len(weights) > 1:
+            assert isinstance(source, Mixture)
             return MixedOrder(source.sizes, weights, self.seed)
         return Permutations(len(source), self.seed)
 
@@ -199,19 +158,11 @@ class ScanDataModule(L.LightningDataModule):
 
     def _kept(self, source: ScanSource, what: str) -> ScanSource:
         """The source in memory where all that is slow to get of it fits there, read with a progress bar."""
-        parts = source.parts if isinstance(source, Mixture) else [source]
         height, width = self.sensor.shape
-        scans = sum(len(part) for part in parts if isinstance(part, ScanFiles | SimulatedScans))
-        if scans * (1 + self.encoding.reflectance) * height * width * 4 > self.memory_gib * 2**30:
+        size = source.slow_scans() * (1 + self.encoding.reflectance) * height * width * 4
+        if size > self.options.memory_gib * 2**30:
             return source
-
-        def read(part: ScanSource) -> ScanSource:
-            # What was prepared is mapped from its files, which the system keeps in memory as it sees fit.
-            if not isinstance(part, ScanFiles | SimulatedScans) or len(part) == 0:
-                return part
-            return InMemory(part, lambda numbers: track(numbers, f"reading {what}", least=16))
-
-        return Mixture([read(part) for part in parts]) if isinstance(source, Mixture) else read(source)
+        return source.kept(lambda numbers: track(numbers, f"reading {what}", least=16))
 
     def _ranks(self) -> tuple[int, int]:
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
@@ -256,11 +207,10 @@ class ScanDataModule(L.LightningDataModule):
         """
         self.setup()
         if self.pairs is not None and self.training_source is None:
-            share, most, _ = _validation_options(**self.validation)
             pairs = PairSource(self.pair_store, self.pairs.num)
-            first, last = holdout_block(len(pairs), share)
+            first, last = holdout_block(len(pairs), self.validation.share)
             self.training_source = pairs.subset(first)
-            self.validation_source = pairs.subset([last[i] for i in spread(len(last), most)])
+            self.validation_source = pairs.subset([last[i] for i in spread(len(last), self.validation.scans)])
 
     def _dataset(self, source: ScanSource | PairSource, purpose: str) -> Dataset[Item]:
         if isinstance(source, PairSource):
@@ -285,16 +235,8 @@ class ScanDataModule(L.LightningDataModule):
 
     def _loader_options(self) -> dict[str, Any]:
         return {
-            "num_workers": self.workers,
-            "persistent_workers": self.workers > 0,
+            "num_workers": self.options.workers,
+            "persistent_workers": self.options.workers > 0,
             "worker_init_fn": outlive_the_signal,
             "pin_memory": torch.cuda.is_available(),
         }
-
-
-def _validation_options(
-    share: float = 0.1, scans: int = 64, data: Mapping[str, Any] | None = None
-) -> tuple[float, int, Mapping[str, Any] | None]:
-    if not (isinstance(scans, int) and scans >= 0 and math.isfinite(share)):
-        raise InputError(f"data.validation.scans must be a whole number, found {scans!r}.")
-    return share, scans, data

@@ -1,27 +1,22 @@
 """Where the scans of a data set lie: each layout finds its drives, in order."""
 
+import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
-from types import MappingProxyType
 
+from r2flow.data.options import SourceOptions
+from r2flow.data.sources import Reading, ScanFiles, ScanSource, lacks_reflectance
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import SCAN_ENDINGS
-from r2flow.registry import Registry
+
+log = logging.getLogger(__name__)
 
 KITTI_360_SPLIT = {"train": (3, 4, 5, 6, 7, 9, 10), "test": (0, 2)}
-ODOMETRY_SPLIT = {
-    "train": (0, 1, 2, 3, 4, 5, 6, 7, 9, 10),
-    "validation": (8,),
-    "test": tuple(range(11, 22)),
-}
+ODOMETRY_SPLIT = {"train": (0, 1, 2, 3, 4, 5, 6, 7, 9, 10), "validation": (8,), "test": tuple(range(11, 22))}
 OBJECT_SPLIT = {"train": ("training",), "test": ("testing",)}
-
-# What a layout's `split` may be; those that are not here have no standard split.
-SPLITS: Mapping[str, Mapping[str, Sequence[int | str]]] = MappingProxyType(
-    {"kitti_360": KITTI_360_SPLIT, "odometry": ODOMETRY_SPLIT, "object": OBJECT_SPLIT}
-)
 
 
 @dataclass(frozen=True)
@@ -37,44 +32,137 @@ class Drive:
     scans: tuple[str, ...]
 
 
-def kitti_360(root: Path, split: str | None = None) -> list[Drive]:
-    """`data_3d_raw/2013_05_28_drive_XXXX_sync/velodyne_points/data/*.bin` and its standard split."""
+class SourceKind:
+    """A kind of scans that a name opens, `data=NAME` in a run and `NAME:ROOT` in a verb; an entry of `SOURCES`.
+
+    Attributes:
+        splits: The data set's standard split: names or numbers of the drives of each part; empty where it has none.
+        sensor: Name of the usual sensor.
+        reflectance_scale: The usual value that means full reflectance.
+    """
+
+    splits: Mapping[str, Sequence[int | str]] = {}
+    sensor = "hdl64e"
+    reflectance_scale = 1.0
+
+    def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
+        """The scans in their order, none of them read yet.
+
+        Args:
+            reading: How they become images; `reflectance` is True or False.
+            seed, first_scene: Of simulated scans, the seed and the number of the first.
+
+        Raises:
+            InputError: there are no such scans, or they cannot become such images.
+        """
+        raise NotImplementedError
+
+    def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
+        """Why the scans count as scans without reflectance; None where they have it.
+
+        Raises:
+            InputError: there are no such scans, or they cannot be read.
+        """
+        return None
+
+    def find_drives(self, options: SourceOptions) -> list[Drive]:
+        """The drives, in order.
+
+        Raises:
+            InputError: there are none, or the scans are no files.
+        """
+        raise InputError(f"{options.name} scans are no files in drives.")
+
+    def split_of(self, drive: str) -> str | None:
+        """The part of the standard split that a drive belongs to, by its name; None where it is in none."""
+        names = {drive, *_numbers(drive)}
+        return next((part for part, members in self.splits.items() if names & set(members)), None)
+
+
+@dataclass(frozen=True)
+class Layout(SourceKind):
+    """A data set of scan files.
+
+    Attributes:
+        find: All drives below the data set's folder, in order. Its docstring's first line says what it looks for.
+    """
+
+    find: Callable[[Path], list[Drive]]
+    splits: Mapping[str, Sequence[int | str]] = field(default_factory=dict)
+    sensor: str = "hdl64e"
+    reflectance_scale: float = 1.0
+
+    def find_drives(self, options: SourceOptions) -> list[Drive]:
+        """Those of the split and the drives that `options` names; a drive without a scan is none.
+
+        Raises:
+            InputError: a root that is missing or holds no such scan, an unknown split, or a drive that is not there.
+        """
+        name, split, root = options.name, options.split, Path(options.folder).expanduser()
+        if split is not None and not self.splits:
+            raise InputError(f"{name} has no standard split, found split={split!r}; name data.drives=[...] instead.")
+        if split is not None and split not in self.splits:
+            raise InputError(f"no split named {split!r}; known: {', '.join(self.splits)}.")
+        if not root.is_dir():
+            raise InputError(f"{root} is not a folder. Give the folder of your {name} scans (data.root=FOLDER).")
+        found = [d for d in self.find(root) if d.scans and (split is None or self.split_of(d.name) == split)]
+        if not found:
+            part = f" of its {split} split" if split else ""
+            where = (self.find.__doc__ or "").splitlines()[0]
+            raise InputError(f"{root} holds no scan{part}. Looked for ({name}): {where}")
+        return found if options.drives is None else [named_drive(found, str(one)) for one in options.drives]
+
+    def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanFiles:
+        if reading.projection == "unfolding" and reading.sensor.name == "hdl64e":
+            log.warning(
+                "unfolded rows are the sensor's rings, which are not evenly spaced: sensor=hdl64e_rings has their "
+                "elevations, sensor=hdl64e is up to 6 degrees off"
+            )
+        found = self.find_drives(options)
+        ends = list(accumulate(len(drive.scans) for drive in found))
+        drives = {d.name: range(end - len(d.scans), end) for d, end in zip(found, ends, strict=True)}
+        about = {"kind": options.name, **({"split": options.split or "all"} if self.splits else {})}
+        root = Path(options.folder).expanduser()  # as the paths begin that are found in it, however it was written
+        return ScanFiles([path for drive in found for path in drive.scans], reading, root, drives, about)
+
+    def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
+        paths = (path for drive in self.find_drives(options) for path in drive.scans)
+        return lacks_reflectance(paths, on_bad_scan)
+
+
+def kitti_360(root: Path) -> list[Drive]:
+    """`data_3d_raw/2013_05_28_drive_XXXX_sync/velodyne_points/data/*.bin`."""
     base = root / "data_3d_raw" if (root / "data_3d_raw").is_dir() else root
     folders = sorted(base.glob("2013_05_28_drive_*_sync/velodyne_points/data"))
-    chosen = _of_split(folders, split, KITTI_360_SPLIT, lambda f: int(f.parent.parent.name.split("_")[4]))
-    return [_drive(folder.parent.parent.name, folder) for folder in chosen]
+    return [Drive(folder.parent.parent.name, _files(folder, (".bin",))) for folder in folders]
 
 
-def kitti_raw(root: Path, split: str | None = None) -> list[Drive]:
-    """`DATE/DATE_drive_XXXX_sync/velodyne_points/data/*.bin`; it has no standard split."""
-    _no_split("kitti_raw", split)
+def kitti_raw(root: Path) -> list[Drive]:
+    """`DATE/DATE_drive_XXXX_sync/velodyne_points/data/*.bin`."""
     below = "*_drive_*_sync/velodyne_points/data"
     folders = sorted([*root.glob(f"*/{below}"), *root.glob(below)])
-    return [_drive(folder.parent.parent.name, folder) for folder in folders]
+    return [Drive(folder.parent.parent.name, _files(folder, (".bin",))) for folder in folders]
 
 
-def odometry(root: Path, split: str | None = None) -> list[Drive]:
-    """`sequences/XX/velodyne/*.bin`, also below `dataset/`: KITTI odometry and SemanticKITTI, and its split."""
+def odometry(root: Path) -> list[Drive]:
+    """`sequences/XX/velodyne/*.bin`, also below `dataset/`: KITTI odometry and SemanticKITTI."""
     base = root / "dataset" if (root / "dataset" / "sequences").is_dir() else root
     folders = sorted(f for f in base.glob("sequences/*/velodyne") if f.parent.name.isdigit())
-    chosen = _of_split(folders, split, ODOMETRY_SPLIT, lambda f: int(f.parent.name))
-    return [_drive(folder.parent.name, folder) for folder in chosen]
+    return [Drive(folder.parent.name, _files(folder, (".bin",))) for folder in folders]
 
 
-def kitti_object(root: Path, split: str | None = None) -> list[Drive]:
+def kitti_object(root: Path) -> list[Drive]:
     """`training/velodyne/*.bin` and `testing/velodyne/*.bin`: KITTI object, each scan another place."""
     folders = [folder for name in ("training", "testing") if (folder := root / name / "velodyne").is_dir()]
-    chosen = _of_split(folders, split, OBJECT_SPLIT, lambda f: f.parent.name)
-    return [_drive(folder.parent.name, folder) for folder in chosen]
+    return [Drive(folder.parent.name, _files(folder, (".bin",))) for folder in folders]
 
 
-def nuscenes(root: Path, split: str | None = None) -> list[Drive]:
+def nuscenes(root: Path) -> list[Drive]:
     """`samples/LIDAR_TOP/*.pcd.bin` and `sweeps/LIDAR_TOP/*.pcd.bin`, or such files in the folder itself.
 
     A drive is a log, named at the head of each file: n015-2018-07-24-11-22-45+0800. Samples are the annotated scans
     among its sweeps; here they follow each other as they were recorded.
     """
-    _no_split("nuscenes", split)
     logs: dict[str, list[tuple[str, str]]] = {}
     for folder in (root / "samples" / "LIDAR_TOP", root / "sweeps" / "LIDAR_TOP", root):
         for path in _files(folder, (".pcd.bin",)) if folder.is_dir() else ():
@@ -83,49 +171,18 @@ def nuscenes(root: Path, split: str | None = None) -> list[Drive]:
     return [Drive(log, tuple(path for _, path in sorted(scans))) for log, scans in sorted(logs.items())]
 
 
-def folder(root: Path, split: str | None = None) -> list[Drive]:
-    """Any folder of scans; each folder below it that holds some is a drive."""
-    _no_split("folder", split)
-    below = sorted(Path(place) for place, _, _ in os.walk(root))
-    return [Drive(str(place.relative_to(root)), _files(place, SCAN_ENDINGS)) for place in below]
+def folder(root: Path) -> list[Drive]:
+    """Any folder of .bin, .pcd.bin, .pcd, .ply, .npy files; each folder below it that holds some is a drive.
 
-
-Layout = Callable[[Path, str | None], list[Drive]]
-LAYOUTS: Registry[Layout] = Registry(
-    "data layout",
-    kitti_360=kitti_360,
-    kitti_raw=kitti_raw,
-    odometry=odometry,
-    object=kitti_object,
-    nuscenes=nuscenes,
-    folder=folder,
-)
-
-
-def find_drives(
-    layout: str, root: str | Path, split: str | None = None, drives: Sequence[str | int] | None = None
-) -> list[Drive]:
-    """The drives of a data set, in order.
-
-    Args:
-        layout: A name in `LAYOUTS`.
-        root: Folder of the data set.
-        split: A part of the layout's standard split; None takes all.
-        drives: Names or numbers of the drives to take; None takes all.
-
-    Raises:
-        InputError: a root that is missing or holds no scan in this layout, an unknown split, or a drive
-            that is not there.
+    Of a scan that lies there in several formats, one file is taken: its range image, else the last by its ending.
     """
-    find, root = LAYOUTS[layout], Path(root).expanduser()
-    if not root.is_dir():
-        raise InputError(f"data.root={root} is not a folder. Give the folder of your {layout} scans.")
-    found = [drive for drive in find(root, split) if drive.scans]
-    if not found:
-        part = f" of its {split} split" if split else ""
-        where = (find.__doc__ or "").splitlines()[0]
-        raise InputError(f"data.root={root} holds no {layout} scan{part}. Looked for: {where}")
-    return found if drives is None else [named_drive(found, str(name)) for name in drives]
+    below = sorted(Path(place) for place, _, _ in os.walk(root))
+    return [Drive(str(place.relative_to(root)), _one_of_each(_files(place, SCAN_ENDINGS))) for place in below]
+
+
+def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:
+    chosen = {os.path.splitext(path)[0]: path for path in sorted(paths, key=lambda p: p.endswith(".npy"))}
+    return paths if len(chosen) == len(paths) else tuple(sorted(chosen.values()))
 
 
 def named_drive(drives: list[Drive], name: str) -> Drive:
@@ -142,12 +199,6 @@ def named_drive(drives: list[Drive], name: str) -> Drive:
     return matches[0]
 
 
-def split_of(layout: str, drive: str) -> str | None:
-    """The part of a layout's standard split that a drive belongs to, by its name; None where it is in none."""
-    names = {drive, *_numbers(drive)}
-    return next((part for part, members in SPLITS.get(layout, {}).items() if names & set(members)), None)
-
-
 def _numbers(name: str) -> set[int]:
     """The drive number in a KITTI name: the digits after 'drive', or the whole name."""
     parts = name.split("_")
@@ -155,29 +206,7 @@ def _numbers(name: str) -> set[int]:
     return {int(digits)} if digits.isdigit() else set()
 
 
-def _drive(name: str, folder: Path) -> Drive:
-    return Drive(name, _files(folder, (".bin",)))
-
-
 def _files(folder: Path, endings: tuple[str, ...]) -> tuple[str, ...]:
     """The files of a folder by their endings, in order; hidden ones (macOS leaves ._NAME beside NAME) are none."""
     names = sorted(n for n in os.listdir(folder) if n.lower().endswith(endings) and not n.startswith("."))
     return tuple(os.path.join(folder, name) for name in names)
-
-
-def _of_split(
-    folders: list[Path],
-    split: str | None,
-    parts: Mapping[str, Sequence[int | str]],
-    number: Callable[[Path], int | str],
-) -> list[Path]:
-    if split is None:
-        return folders
-    if split not in parts:
-        raise InputError(f"no split named {split!r}; known: {', '.join(parts)}.")
-    return [folder for folder in folders if number(folder) in parts[split]]
-
-
-def _no_split(layout: str, split: str | None) -> None:
-    if split is not None:
-        raise InputError(f"{layout} has no standard split, found split={split!r}; name data.drives=[...] instead.")

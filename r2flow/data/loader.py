@@ -10,20 +10,26 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from r2flow import noise
 from r2flow.data.augment import Augmentation
-from r2flow.data.sources import ScanSource, encoded
+from r2flow.data.sources import ScanSource
 from r2flow.lidar.encoding import Encoding
 
 Item = dict[str, Tensor]
 
 
 class FlowDataset(Dataset[Item]):
-    """Image k of a run as a training item: {x_1, x_0, u, k}.
+    """Image k of a run as a training item.
 
-    x_1 (C, H, W) is the encoded scan, x_0 (C, H, W) its noise and u () the uniform draw that becomes t;
-    noise and u depend on (seed, purpose, k) alone.
+    A batch has these keys; each depends on (seed, purpose, k) and on the scan alone:
+
+    - x_1, (B, C, H, W): scans in model space, where t = 1;
+    - x_0, (B, *noise_shape): standard normal noise, where t = 0;
+    - u, (B,): uniform in [0, 1); the stage makes t of it;
+    - k, (B,): number of the image in the run. A stage that needs more draws or conditions for an image derives them
+      from (seed, purpose, k).
 
     Args:
         augment: What is done to scan k before it is encoded.
+        noise_shape: Shape of x_0 for one scan; the encoding's (C, H, W) if left out.
     """
 
     def __init__(
@@ -37,7 +43,7 @@ class FlowDataset(Dataset[Item]):
     ) -> None:
         self.noise_shape = tuple(noise_shape or encoding.shape)
         self.source, self.encoding, self.seed, self.purpose = source, encoding, seed, purpose
-        self.augment = augment
+        self.augment, self.noise_shape = augment, tuple(noise_shape or encoding.shape)
 
     def __len__(self) -> int:
         return len(self.source)
@@ -51,7 +57,7 @@ class FlowDataset(Dataset[Item]):
             image = self.augment(self.source[index], self.seed, k)
             x_1 = self.encoding.encode(torch.from_numpy(image))
         else:
-            x_1 = encoded(self.source, index, self.encoding)
+            x_1 = self.source.encoded(index, self.encoding)
         return {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
 
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import r2flow
 from r2flow.data.layouts import Drive
+from r2flow.data.store import MANIFEST, shard_count, shard_items
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.lidar.sensors import Sensor
 
-MANIFEST = "manifest.json"
 FORMAT = "r2flow scans 1"
 
 
@@ -60,11 +60,11 @@ class Recipe:
 
     @property
     def shards(self) -> int:
-        return -(-self.scans // self.shard_scans)
+        return shard_count(self.scans, self.shard_scans)
 
     def numbers_of(self, shard: int) -> range:
         """The scans of the data set that a shard is made of."""
-        return range(shard * self.shard_scans, min((shard + 1) * self.shard_scans, self.scans))
+        return shard_items(shard, self.scans, self.shard_scans)
 
 
 @dataclass(frozen=True)
@@ -178,23 +178,3 @@ def _damaged(path: Path) -> InputError:
 def read_entry(content: Mapping[str, Any]) -> ShardEntry:
     entry = ShardEntry(**content)
     return replace(entry, left_out=tuple(entry.left_out))
-
-
-def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str | None:
-    """The first thing in which two recipes or sensors differ, in words; None where they are one."""
-    for key in {**there, **here}:
-        old, new = there.get(key), here.get(key)
-        if old == new:
-            continue
-        if isinstance(old, dict) and isinstance(new, dict):
-            return f"{key}: {difference(old, new)}"
-        if key == "names":
-            return "the names of the scans are others"
-        if isinstance(old, list) or isinstance(new, list):
-            return f"{key} are others ({_count(old)} there, {_count(new)} here)"
-        return f"{key} is {old} there, {new} here"
-    return None
-
-
-def _count(value: Any) -> str:
-    return f"{len(value)} values" if isinstance(value, list) else str(value)

@@ -1,22 +1,20 @@
 """Several data sets in one run: their scans end to end, and whose turn it is at each image."""
 
-import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from torch import Tensor
 
 from r2flow import noise
 from r2flow.data.loader import Permutations
-from r2flow.data.prepared import PreparedScans
-from r2flow.data.sources import ScanFiles, ScanSource, encoded
+from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 
 BLOCK = 1 << 16  # images whose parts are drawn at once
 
 
-class Mixture:
+class Mixture(ScanSource):
     """Sources end to end, numbered through."""
 
     def __init__(self, parts: Sequence[ScanSource]) -> None:
@@ -47,7 +45,7 @@ class Mixture:
 
     def encoded(self, index: int, encoding: Encoding) -> Tensor:
         part, number = self.locate(index)
-        return encoded(self.parts[part], number, encoding)
+        return self.parts[part].encoded(number, encoding)
 
     def subset(self, indices: Sequence[int]) -> "Mixture":
         """Some of the scans, named in ascending order, as a mixture of the same parts."""
@@ -57,17 +55,11 @@ class Mixture:
             chosen[part].append(number)
         return Mixture([part.subset(own) for part, own in zip(self.parts, chosen, strict=True)])
 
+    def slow_scans(self) -> int:
+        return sum(part.slow_scans() for part in self.parts)
 
-def scan_places(source: ScanSource) -> set[str]:
-    """Where the scans of a source lie, by which two sources are known to share some; of simulated ones nowhere."""
-    if isinstance(source, ScanFiles):
-        folder = source.root
-    elif isinstance(source, PreparedScans):
-        folder = source.folder
-    else:
-        return set()
-    real = os.path.realpath(folder)  # once for all of them: on a network disk it takes its time
-    return {os.path.join(real, name) for name in source.names}
+    def kept(self, track: Callable[[range], Iterable[int]]) -> "Mixture":
+        return Mixture([part.kept(track) for part in self.parts])
 
 
 def refuse_shared_scans(parts: Sequence[ScanSource]) -> None:
@@ -78,7 +70,7 @@ def refuse_shared_scans(parts: Sequence[ScanSource]) -> None:
     """
     before: set[str] = set()
     for number, part in enumerate(parts):
-        own = scan_places(part)
+        own = part.places()
         if shared := own & before:
             raise InputError(
                 f"data.parts[{number}] has {len(shared)} scans that a part before it has too, as {min(shared)}: they "

@@ -1,7 +1,6 @@
 """Reflow pairs (x_0, x_1): noise and where a flow carries it."""
 
 import copy
-import math
 import os
 import platform
 import random
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -20,69 +20,12 @@ from r2flow import noise
 from r2flow.data.loader import Item
 from r2flow.data.shards import Block, PairStore, Recipe, read_notes
 from r2flow.errors import InputError
-from r2flow.flow.solvers import check_method, check_tolerance
 from r2flow.generators import Generator, Sampler
-
-MIB = 2**20
-
-
-@dataclass(frozen=True)
-class PairOptions:
-    """The choices behind a set of pairs (`data.pairs`).
-
-    Attributes:
-        num: Pairs in all.
-        method, steps, tolerance: The solver's (`r2flow.flow.solvers.solve`); the paper takes dopri5 at 1e-5.
-        batch_size: Pairs solved at once. It is part of what a pair is, in its last bits.
-        shard_mib: Size of a shard.
-        seed: Of the noise. Not the run's: runs of several seeds can share one set of pairs.
-        first: Index of the first pair; None takes the one behind the pairs that the flow itself was trained on.
-        parent: Hash of the flow; filled in by the run.
-    """
-
-    num: int = 1_000_000
-    method: str = "dopri5"
-    steps: int = 32
-    tolerance: float = 1e-5
-    batch_size: int = 16
-    shard_mib: float = 256.0
-    seed: int = 0
-    first: int | None = None
-    parent: str | None = None
-
-    def recipe(self, shape: tuple[int, int, int]) -> Recipe:
-        """What the pairs of a flow with scans of this shape are a function of.
-
-        Raises:
-            InputError: a number out of its range or an unknown solver.
-        """
-        if min(self.num, self.batch_size, self.steps) < 1 or not 0 < self.shard_mib < math.inf:
-            raise InputError(
-                "data.pairs: num, batch_size, steps must be at least 1 and shard_mib positive; "
-                f"found {self.num}, {self.batch_size}, {self.steps} and {self.shard_mib}."
-            )
-        first = self.first or 0
-        if not (0 <= self.seed < 2**63 and 0 <= first < 2**63):
-            raise InputError(f"data.pairs: seed and first must be at least 0, found {self.seed} and {first}.")
-        check_tolerance(self.tolerance)
-        check_method(self.method)
-        batch_bytes = self.batch_size * 2 * int(np.prod(shape))
-        return Recipe(
-            parent=self.parent or "",
-            shape=shape,
-            seed=self.seed,
-            first=first,
-            method=self.method,
-            steps=self.steps,
-            tolerance=float(self.tolerance),  # 1 and 1.0 are one recipe
-            batch_size=self.batch_size,
-            shard_batches=max(round(self.shard_mib * MIB / batch_bytes), 1),
-        )
 
 
 def pair_noise(recipe: Recipe, index: int) -> Tensor:
-    """x_0 of a pair, (C, H, W), drawn again from its index."""
-    return noise.standard_normal(recipe.shape, recipe.seed, "pairs", index)
+    """x_0 of a pair, of the recipe's noise shape or (C, H, W), drawn again from its index."""
+    return noise.standard_normal(recipe.noise_shape or recipe.shape, recipe.seed, "pairs", index)
 
 
 @dataclass
@@ -122,8 +65,8 @@ def make_pairs(
         InputError: no pair is usable: the flow is broken, or the tolerance out of its reach; or the folder cannot be
             written, or holds other pairs.
     """
-    if generator.noise_shape != store.recipe.shape:
-        raise InputError(f"pairs need noise of the scans' shape {store.recipe.shape}, found {generator.noise_shape}.")
+    if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
+        raise InputError(f"these pairs are of another noise than the generator's {generator.noise_shape}.")
     generator.check_sampler(sampler_of(store.recipe))
     store.begin()
     # Shards are checked by turns; who finds one damaged makes its batches, which the others hold to be there.
@@ -219,8 +162,6 @@ class PairSource:
         return part
 
     def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
-        from safetensors import SafetensorError, safe_open
-
         recipe = self.store.recipe
         number = int(self.indices[index])
         shard, offset = divmod(number, recipe.shard_batches * recipe.batch_size)
@@ -237,7 +178,7 @@ class PairSource:
 
 
 class PairDataset(Dataset[Item]):
-    """Pair as a training item: {x_1, x_0, u, k}; u is drawn by (seed, purpose, k) alone, as in `FlowDataset`."""
+    """A pair as a training item, with the keys of `FlowDataset`; u is a function of (seed, purpose, k) alone."""
 
     def __init__(self, source: PairSource, seed: int, purpose: str) -> None:
         self.source, self.seed, self.purpose = source, seed, purpose

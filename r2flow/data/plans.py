@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from r2flow import simulator
-from r2flow.data.layouts import Drive, find_drives
+from r2flow.data.layouts import Drive
 from r2flow.data.manifest import Recipe, checksum, describe_sensor
-from r2flow.data.opening import SIMULATED
+from r2flow.data.opening import find_drives
+from r2flow.data.options import SIMULATED
 from r2flow.data.quantise import OTHER_LEVELS, RangeCodes, ReflectanceCodes, find_levels
-from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, spread
+from r2flow.data.sources import Reading, ScanFiles, ScanSource, SimulatedScans, spread, stored_reflectance
 from r2flow.errors import InputError
-from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import Sensor
 
 log = logging.getLogger(__name__)
@@ -58,11 +58,8 @@ def plan_files(
     named = tuple(Drive(d.name, tuple(Path(os.path.relpath(p, root)).as_posix() for p in d.scans)) for d in found)
     known = _reflectance_levels(paths, reflectance_scale, levels)
     recipe = _recipe(layout, named, sensor, projection, convention, reflectance_scale, known, shard_scans)
-    source = ScanFiles(
-        paths, sensor, projection=projection, convention=convention,
-        reflectance=known is not None, reflectance_scale=reflectance_scale,
-    )  # fmt: skip
-    return Plan(recipe, named, source)
+    reading = Reading(sensor, projection, convention, reflectance_scale, known is not None, "error", within_limits=True)  # type: ignore[arg-type]
+    return Plan(recipe, named, ScanFiles(paths, reading))
 
 
 def plan_simulated(
@@ -96,12 +93,12 @@ def _reflectance_levels(paths: Sequence[str], scale: float, levels: int | None) 
     found = []
     for index in spread(len(paths), PROBED):
         try:
-            points = read_points(paths[index])
+            reflectance = stored_reflectance(paths[index])
         except InputError:  # it is met again, and dealt with, when its turn comes
             continue
-        if points.reflectance is None:
+        if reflectance is None:
             return None
-        found.append(points.reflectance / np.float32(scale))
+        found.append(reflectance / np.float32(scale))
     if found and not any(one.any() for one in found):
         return None
     if levels is not None:

@@ -1,6 +1,6 @@
 """Prepared scans: projected once by `r2flow prepare`, then read from memory-mapped shards.
 
-    source = open_prepared("prepared/kitti_360", sensor)
+    source = open_scans("prepared/kitti_360").source
     source[0]                       range in metres and reflectance, (2, H, W)
     source.encoded(0, encoding)     the same in model space
 
@@ -11,8 +11,10 @@ A shard is a safetensors file of `range` uint16 (n, H, W), `reflectance` uint8 (
 import hashlib
 import json
 import mmap
+import os
 import zlib
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from io import BufferedReader
 from pathlib import Path
 from typing import IO, Any
@@ -21,10 +23,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.data.layouts import SPLITS, named_drive, split_of
-from r2flow.data.manifest import Manifest, ShardEntry, describe_sensor, difference, read_manifest, shard_name
+from r2flow.data.manifest import Manifest, ShardEntry, describe_sensor, read_manifest, shard_name
 from r2flow.data.quantise import RangeCodes, ReflectanceCodes
-from r2flow.data.shards import Damaged
+from r2flow.data.sources import ScanSource
+from r2flow.data.store import MANIFEST, Damaged, difference
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
@@ -32,33 +34,20 @@ from r2flow.lidar.sensors import Sensor
 AGAIN = "The same r2flow prepare command makes it again."
 
 
-def open_prepared(
-    root: str | Path,
-    sensor: Sensor,
-    split: str | None = None,
-    drives: Sequence[str | int] | None = None,
-    reflectance: bool = True,
-    projection: str = "spherical",
-    convention: str = "centre",
-) -> "PreparedScans":
-    """The scans of a folder that `r2flow prepare` has written; only the heads of its shards are read.
+def find_prepared(folder: Path, sensor: Sensor, projection: str, convention: str) -> Manifest:
+    """The manifest of a folder that `r2flow prepare` has written; of its shards only the heads are read.
 
     Args:
         sensor, projection, convention: The run's. Nothing is projected here: they must be those of the shards.
-        split, drives: As in `r2flow.data.layouts.find_drives`.
-        reflectance: Whether the images need reflectance.
 
     Raises:
-        InputError: no prepared scans, unfinished or damaged ones, ones of another sensor, size, projection or
-            convention, without reflectance where it is needed, or without the split or a drive.
+        InputError: no prepared scans, unfinished or damaged ones, or ones of another sensor, size, projection or
+            convention.
     """
-    folder = Path(root).expanduser()
     manifest = read_manifest(folder)
     if manifest.shards is None:
         raise InputError(f"{folder} is not finished: the same r2flow prepare command goes on.")
     _refuse_other_images(folder, manifest, sensor, projection, convention)
-    if reflectance and manifest.recipe.levels is None:
-        raise InputError(f"{folder} holds scans without reflectance. Set encoding.reflectance=false for range alone.")
     for shard, entry in enumerate(manifest.shards):
         path = folder / shard_name(shard)
         try:
@@ -66,7 +55,7 @@ def open_prepared(
                 pass
         except Damaged as error:
             raise InputError(f"{path} is damaged ({error}). {AGAIN}") from None
-    return PreparedScans(folder, manifest, _chosen(manifest, split, drives), reflectance)
+    return manifest
 
 
 def check_prepared(folder: Path, advance: Callable[[], None] = lambda: None) -> dict[Path, str]:
@@ -143,45 +132,29 @@ def _refuse_other_images(folder: Path, manifest: Manifest, sensor: Sensor, proje
         )
 
 
-def _chosen(manifest: Manifest, split: str | None, drives: Sequence[str | int] | None) -> np.ndarray:
-    """The scans of a split and of some drives, numbered as they lie in the shards, (n,) int64."""
-    ends = np.cumsum([len(drive.scans) for drive in manifest.drives])
-    found = [(d, np.arange(end - len(d.scans), end)) for d, end in zip(manifest.drives, ends, strict=True)]
-    if split is not None:
-        layout = manifest.recipe.layout
-        if split not in SPLITS.get(layout, {}):
-            known = ", ".join(SPLITS.get(layout, {})) or "none"
-            raise InputError(f"no split named {split!r} in prepared {layout} scans; known: {known}.")
-        found = [pair for pair in found if split_of(layout, pair[0].name) == split]
-    if drives is not None:
-        named = [named_drive([drive for drive, _ in found], str(name)) for name in drives]
-        found = [pair for drive in named for pair in found if pair[0] is drive]
-    usable = np.ones(manifest.recipe.scans, dtype=bool)
-    usable[list(manifest.left_out)] = False
-    numbers = np.concatenate([np.empty(0, dtype=np.int64), *(span for _, span in found)])
-    chosen: np.ndarray = (np.cumsum(usable) - 1)[numbers[usable[numbers]]]
-    if len(chosen) == 0:
-        raise InputError(f"none of the {int(usable.sum())} prepared scans is of split={split!r}, drives={drives}.")
-    return chosen
-
-
-class PreparedScans:
-    """Scans of shards as a source: every scan that is read is held to its checksum.
+class PreparedScans(ScanSource):
+    """Scans of shards as a source. Every scan that is read is compared with its checksum.
 
     Attributes:
         folder: Where the shards lie.
         manifest: What they are.
         rows: Number of each scan among all that the shards hold.
+
+    Raises:
+        InputError: reflectance is wanted, and the shards have none.
     """
 
     def __init__(self, folder: Path, manifest: Manifest, rows: np.ndarray, reflectance: bool = True) -> None:
         assert manifest.shards is not None
+        if reflectance and manifest.recipe.levels is None:
+            raise InputError(
+                f"{folder} holds scans without reflectance. Set encoding.reflectance=false for range alone."
+            )
         self.folder, self.manifest, self.rows, self.reflectance = folder, manifest, rows, reflectance
         recipe = manifest.recipe
         self._ends = np.cumsum([entry.scans for entry in manifest.shards])
         self._metres = [RangeCodes(recipe.sensor["min_range"], recipe.sensor["max_range"]).metres]
-        if reflectance:
-            assert recipe.levels is not None
+        if reflectance and recipe.levels is not None:
             self._metres.append(ReflectanceCodes(recipe.levels).values)
         self._encoding: Encoding | None = None
         self._model: list[np.ndarray] = []
@@ -203,6 +176,28 @@ class PreparedScans:
     def subset(self, indices: Sequence[int]) -> "PreparedScans":
         rows = self.rows[np.asarray(indices, dtype=np.int64)]
         return PreparedScans(self.folder, self.manifest, rows, self.reflectance)
+
+    @property
+    def drives(self) -> dict[str, list[int]]:  # type: ignore[override]
+        place = {name: number for number, name in enumerate(self.names)}
+        found = {d.name: [place[n] for n in d.scans if n in place] for d in self.manifest.drives}
+        return {drive: numbers for drive, numbers in found.items() if numbers}
+
+    def about(self) -> dict[str, Any]:
+        kind = f"prepared {self.manifest.recipe.layout}"
+        return {"kind": kind, "manifest": self._digest[:12], "reflectance": self.reflectance}
+
+    def identity(self) -> dict[str, Any]:
+        rows = hashlib.sha256(self.rows.astype(np.int64).tobytes()).hexdigest()
+        return {"manifest": self._digest, "rows": rows, "reflectance": self.reflectance}
+
+    @cached_property
+    def _digest(self) -> str:
+        return hashlib.sha256((self.folder / MANIFEST).read_bytes()).hexdigest()
+
+    def places(self) -> set[str]:
+        real = os.path.realpath(self.folder)
+        return {os.path.join(real, name) for name in self.names}
 
     def __getitem__(self, index: int) -> np.ndarray:
         """Range in metres and, where wanted, reflectance: (2 or 1, H, W) float32."""

@@ -6,22 +6,21 @@ import logging
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from filelock import BaseFileLock
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from r2flow.data.manifest import (
-    MANIFEST,
     Manifest,
     Recipe,
     ShardEntry,
     checksum,
-    difference,
     read_entry,
     read_manifest,
     shard_name,
@@ -30,15 +29,12 @@ from r2flow.data.manifest import (
 from r2flow.data.plans import Plan
 from r2flow.data.prepared import check_shard, read_head, scan_crc
 from r2flow.data.quantise import RangeCodes, ReflectanceCodes
-from r2flow.data.shards import Damaged
 from r2flow.data.sources import ScanSource
+from r2flow.data.store import MANIFEST, Damaged, clear_leftovers, lock_file, refuse_other, shard_bytes, warn_damaged
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.locks import Lock
 
 log = logging.getLogger(__name__)
-
-MANIFEST_LOCK = "manifest.lock"
 
 
 class Coded(NamedTuple):
@@ -102,17 +98,23 @@ class Preparation:
         self._look()
         missing = []
         for shard in range(self.recipe.shards):
-            if not self._is_whole(shard, log.warning):
+            if not self._is_whole(shard, logging.WARNING):
                 missing.append(shard)
             advance(len(self.recipe.numbers_of(shard)))
         return missing
 
     def _take(self) -> None:
         self._making.mkdir(parents=True, exist_ok=True)
-        lock = Lock(self._making / MANIFEST_LOCK, wait=True)
-        try:
+        with self._manifest_lock():
             if not self._is_taken():
                 write_manifest(self.folder, Manifest(self.recipe, self.plan.drives))
+
+    @contextmanager
+    def _manifest_lock(self) -> Iterator[None]:
+        lock = lock_file(self._making / "manifest.lock", wait=True)
+        assert lock is not None
+        try:
+            yield
         finally:
             lock.release()
 
@@ -190,11 +192,7 @@ class Preparation:
     def _look(self) -> None:
         """Read the manifest again: another process may have finished it."""
         manifest = read_manifest(self.folder)
-        found = difference(asdict(manifest.recipe), asdict(self.recipe))
-        if found:
-            raise InputError(
-                f"{self.folder} holds other scans: {found}. Give the same settings, or another folder by --out FOLDER."
-            )
+        refuse_other(self.folder, "scans", asdict(manifest.recipe), asdict(self.recipe), "--out FOLDER")
         self.finished = manifest.shards
 
     def _entry(self, shard: int) -> ShardEntry | None:
@@ -210,22 +208,20 @@ class Preparation:
     def _note(self, shard: int) -> Path:
         return self._making / f"{shard:06d}.json"
 
-    def _is_whole(self, shard: int, tell: Callable[..., None] = log.debug) -> bool:
+    def _is_whole(self, shard: int, level: int = logging.DEBUG) -> bool:
         entry = self._entry(shard)
         if entry is None:
             return False
         try:
             check_shard(self.folder / shard_name(shard), entry)
         except Damaged as error:
-            tell("%s is damaged (%s): it is made again.", self.folder / shard_name(shard), error)
+            warn_damaged(self.folder / shard_name(shard), error, level)
             return False
         return True
 
-    def claim(self, shard: int) -> "Lock | None":
+    def claim(self, shard: int) -> BaseFileLock | None:
         """The lock of a shard, None where another process holds it."""
-        with suppress(BlockingIOError):
-            return Lock(self._making / f"{shard:06d}.lock")
-        return None
+        return lock_file(self._making / f"{shard:06d}.lock")
 
     def _is_free(self, shard: int) -> bool:
         lock = self.claim(shard)
@@ -241,8 +237,7 @@ class Preparation:
 
     def clear(self, shard: int) -> None:
         """Remove what a killed process was writing; to be done with the shard's lock held."""
-        for leftover in self.folder.glob(f".{shard_name(shard)}.*.part"):
-            leftover.unlink(missing_ok=True)
+        clear_leftovers(self.folder.glob(f".{shard_name(shard)}.*.part"))
 
     def _write(self, shard: int, scans: Sequence[Coded], left_out: Sequence[int]) -> None:
         data = self._serialised(shard, [scan.codes for scan in scans])
@@ -277,29 +272,25 @@ class Preparation:
         return 1 if self.recipe.levels is None else 2
 
     def _serialised(self, shard: int, scans: Sequence[Sequence[np.ndarray]]) -> bytes:
-        from safetensors.numpy import save
-
         crc = np.array([scan_crc(codes) for codes in scans], dtype=np.uint32)
         tensors = {"crc32": crc}
         for channel, (name, kind) in enumerate((("range", np.uint16), ("reflectance", np.uint8))[: self._channels]):
             tensors[name] = np.empty((len(scans), *self.recipe.image_shape), dtype=kind)
             for row, codes in enumerate(scans):
                 tensors[name][row] = codes[channel]
-        # One key: several would come in an order that changes from process to process.
         notes = {
             "recipe": self.recipe.digest,
             "shard": shard,
             "ranges": {"min_range": self.recipe.sensor["min_range"], **self.recipe.ranges},
             "levels": self.recipe.levels,
         }
-        return save(tensors, metadata={"scans": json.dumps(notes)})
+        return shard_bytes(tensors, "scans", notes)
 
     def _finish(self) -> Manifest:
         """Turn the notes into the manifest, unless another process has, and clear away what was needed for it."""
         if self.finished is not None and not self._making.exists():
             return read_manifest(self.folder)
-        lock = Lock(self._making / MANIFEST_LOCK, wait=True)
-        try:
+        with self._manifest_lock():
             self._look()
             if self.finished is None:
                 entries = [self._entry(shard) for shard in range(self.recipe.shards)]
@@ -315,8 +306,6 @@ class Preparation:
                 for path in (*self.folder.glob(f".{MANIFEST}.*.part"), *self._making.iterdir()):
                     path.unlink(missing_ok=True)
                 self._making.rmdir()
-        finally:
-            lock.release()
         return read_manifest(self.folder)
 
 
@@ -336,7 +325,7 @@ class _Claims(Sampler[int]):
     def __init__(self, work: Preparation, shards: Sequence[int]) -> None:
         self.work, self.shards = work, shards
         self.elsewhere: set[int] = set()
-        self._locks: dict[int, Lock] = {}
+        self._locks: dict[int, BaseFileLock] = {}
 
     def __iter__(self) -> Iterator[int]:
         for shard in self.shards:

@@ -2,23 +2,30 @@
 
 import hashlib
 import json
-import logging
-import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from safetensors import SafetensorError, safe_open
 
+from r2flow.data.store import (
+    MANIFEST,
+    Damaged,
+    clear_leftovers,
+    refuse_other,
+    shard_bytes,
+    shard_count,
+    shard_items,
+    warn_damaged,
+)
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 
-log = logging.getLogger(__name__)
-
-MANIFEST = "manifest.json"
+ELSEWHERE = "data.root=FOLDER (r2flow pairs --out FOLDER)"  # how another folder is given
 STALE = 3600  # seconds after which a temporary file has no writer any more
 
 
@@ -33,7 +40,8 @@ class Recipe:
         first: Index of the first pair.
         method, steps, tolerance: The solver's.
         batch_size: Consecutive indices that are solved together.
-        shard_batches: Batches a shard.
+        shard_batches: Batches in a shard.
+        noise_shape: Of x_0, where it is not the scan's.
     """
 
     parent: str
@@ -45,10 +53,15 @@ class Recipe:
     tolerance: float
     batch_size: int
     shard_batches: int
+    noise_shape: tuple[int, ...] | None = None
+
+    def describe(self) -> dict[str, Any]:
+        """All of it as plain values; `noise_shape` only where it is not that of the scan."""
+        return {key: value for key, value in asdict(self).items() if key != "noise_shape" or value is not None}
 
     @cached_property
     def digest(self) -> str:
-        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
+        return hashlib.sha256(json.dumps(self.describe(), sort_keys=True).encode()).hexdigest()[:16]
 
 
 class Block(NamedTuple):
@@ -57,10 +70,6 @@ class Block(NamedTuple):
     x_1: np.ndarray
     evaluations: np.ndarray
     usable: np.ndarray
-
-
-class Damaged(Exception):
-    """A file that is not what was written."""
 
 
 class _Unwanted(Exception):
@@ -84,16 +93,10 @@ class PairStore:
         if not path.is_file():
             return
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))["recipe"]
+            found = dict(json.loads(path.read_text(encoding="utf-8"))["recipe"])
         except (ValueError, KeyError, TypeError):
             raise InputError(f"{path} is damaged. Delete it: the shards beside it know their recipe.") from None
-        for key, value in asdict(self.recipe).items():
-            there = tuple(found.get(key)) if key == "shape" and found.get(key) else found.get(key)
-            if there != value:
-                raise InputError(
-                    f"{self.folder} holds other pairs: {key} is {there} there, {value} here. "
-                    "Give the same settings, or another folder by data.root=FOLDER (r2flow pairs --out FOLDER)."
-                )
+        refuse_other(self.folder, "pairs", found, self.recipe.describe(), ELSEWHERE)
 
     def begin(self) -> None:
         """Write the manifest where there is none, and clear away what killed writers left.
@@ -101,21 +104,16 @@ class PairStore:
         Raises:
             InputError: the folder cannot be written, or another process has begun other pairs in it.
         """
-        content = {"format": "r2flow pairs 1", "recipe": asdict(self.recipe), "digest": self.recipe.digest}
+        content = {"format": "r2flow pairs 1", "recipe": self.recipe.describe(), "digest": self.recipe.digest}
         try:
             if not (self.folder / MANIFEST).is_file():
                 with atomic_write(self.folder / MANIFEST, "w") as file:
                     json.dump(content, file, indent=2)
         except PermissionError:
-            raise InputError(
-                f"{self.folder} cannot be written to; give another folder by data.root=FOLDER "
-                "(r2flow pairs --out FOLDER)."
-            ) from None
+            raise InputError(f"{self.folder} cannot be written to; give another folder by {ELSEWHERE}.") from None
         self._check_manifest()
-        for leftover in (*self.folder.glob(".*.part"), *self._staging.glob(".*.part")):
-            with suppress(FileNotFoundError):
-                if time.time() - leftover.stat().st_mtime > STALE:  # another process may be writing it
-                    leftover.unlink()
+        # Another process may be writing the younger ones.
+        clear_leftovers((*self.folder.glob(".*.part"), *self._staging.glob(".*.part")), STALE)
 
     @property
     def _staging(self) -> Path:
@@ -129,15 +127,14 @@ class PairStore:
 
     def batches(self, num: int) -> range:
         """The batches that hold the first `num` pairs; the last one is made whole."""
-        return range(-(-num // self.recipe.batch_size))
+        return range(shard_count(num, self.recipe.batch_size))
 
     def shards(self, num: int) -> range:
-        return range(-(-len(self.batches(num)) // self.recipe.shard_batches))
+        return range(shard_count(len(self.batches(num)), self.recipe.shard_batches))
 
     def batches_of(self, shard: int, num: int) -> range:
         """The batches of one shard."""
-        size = self.recipe.shard_batches
-        return range(shard * size, min((shard + 1) * size, len(self.batches(num))))
+        return shard_items(shard, len(self.batches(num)), self.recipe.shard_batches)
 
     def held(self, shard: int) -> int:
         """How many batches a shard's file holds; only its head is read.
@@ -181,7 +178,7 @@ class PairStore:
         except FileNotFoundError:
             pass
         except Damaged as error:
-            log.warning("%s is damaged (%s): it is made again.", path, error)
+            warn_damaged(path, error)
             path.unlink(missing_ok=True)
             lost += list(self.batches_of(shard, num))
         for batch in self.batches_of(shard, num):
@@ -190,7 +187,7 @@ class PairStore:
             except FileNotFoundError:
                 continue
             except Damaged as error:
-                log.warning("%s is damaged (%s): it is made again.", self.batch_path(batch), error)
+                warn_damaged(self.batch_path(batch), error)
                 self.batch_path(batch).unlink(missing_ok=True)
                 lost.append(batch)
         return sorted({batch for batch in lost if not self.has(batch)})
@@ -234,17 +231,14 @@ class PairStore:
             self._staging.rmdir()
 
     def _write(self, path: Path, batch: int, block: Block, unless: Callable[[], bool] = lambda: False) -> None:
-        from safetensors.numpy import save
-
         tensors = {"evaluations": block.evaluations, "x_1": block.x_1}
-        # One key: several would come in an order that changes from process to process.
         notes = {
             "recipe": self.recipe.digest,
             "first": self.recipe.first + batch * self.recipe.batch_size,
             "usable": [int(one) for one in block.usable],
             "sha256": _checksum(tensors, block.usable),
         }
-        data = save(tensors, metadata={"pairs": json.dumps(notes)})
+        data = shard_bytes(tensors, "pairs", notes)
         with suppress(_Unwanted), atomic_write(path) as file:
             file.write(data)
             if unless():
@@ -254,21 +248,14 @@ class PairStore:
         if notes["recipe"] != self.recipe.digest:
             raise InputError(
                 f"{path} holds pairs of another recipe. Give the settings that they were made with, or another folder "
-                "by data.root=FOLDER (r2flow pairs --out FOLDER)."
+                f"by {ELSEWHERE}."
             )
 
     def _read(self, path: Path, batch: int) -> Block:
         """A file, every byte of it checked."""
-        from safetensors import SafetensorError, safe_open
-
         notes = read_notes(path)
-        try:
-            with safe_open(path, framework="numpy") as file:
-                tensors = {name: file.get_tensor(name) for name in ("evaluations", "x_1")}
-        except FileNotFoundError:
-            raise
-        except (SafetensorError, OSError, ValueError, KeyError) as error:
-            raise Damaged(str(error)) from None
+        with _opened(path) as file:
+            tensors = {name: file.get_tensor(name) for name in ("evaluations", "x_1")}
         self._check_recipe(path, notes)
         if notes["first"] != self.recipe.first + batch * self.recipe.batch_size:
             raise Damaged(f"it begins with pair {notes['first']}")
@@ -285,15 +272,20 @@ def read_notes(path: Path) -> dict[str, Any]:
         FileNotFoundError: no such file.
         Damaged: not a file of pairs, or not whole.
     """
-    from safetensors import SafetensorError, safe_open
+    with _opened(path) as file:
+        notes: dict[str, Any] = json.loads((file.metadata() or {})["pairs"])
+        notes["recipe"], notes["first"], notes["usable"], notes["sha256"]
+        return notes
 
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A safetensors file; whatever goes wrong in reading it is damage."""
     if not path.is_file():
         raise FileNotFoundError(path)
     try:
         with safe_open(path, framework="numpy") as file:
-            notes: dict[str, Any] = json.loads((file.metadata() or {})["pairs"])
-            notes["recipe"], notes["first"], notes["usable"], notes["sha256"]
-            return notes
+            yield file
     except FileNotFoundError:
         raise
     except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:

@@ -1,11 +1,16 @@
 """Range images in metres, by number: from scan files, from the simulator, from memory."""
 
+import hashlib
+import json
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,28 +20,108 @@ from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.labels import labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, project, project_indices
-from r2flow.lidar.scan_files import Points, read_points
+from r2flow.lidar.scan_files import NoPointsError, Points, read_points
 from r2flow.lidar.scan_files.points import FARTHEST
 from r2flow.lidar.sensors import Sensor
 
 log = logging.getLogger(__name__)
 
+AUTO = "auto"
 
-class ScanSource(Protocol):
-    """Numbered range images, (2, H, W) float32: range in metres and reflectance of [0, 1], 0 where missing."""
 
+@dataclass(frozen=True)
+class Reading:
+    """How scans of any kind become images of one sensor.
+
+    Attributes:
+        sensor: Its rays and its size.
+        projection, convention: As in `r2flow.lidar.projection.project`.
+        reflectance_scale: The value in the files that means full reflectance; None guesses it from each file, which is
+            good enough for a picture and for nothing else.
+        reflectance: Whether images have reflectance: True needs it of every scan, False leaves it out, `auto` decides
+            by `lacks_reflectance` when the scans are opened.
+        on_bad_scan: What is done with a scan that cannot be used. `error` stops; `skip` takes the next usable scan in
+            its place; `empty` stops too, but a scan without a return in the sensor's view is an empty image: a
+            generator that makes such scans is judged by them.
+        within_limits: Whether a range beyond the sensor's limits in a range image is a dropped ray, as it is in a file
+            of points: what a model is given.
+    """
+
+    sensor: Sensor
+    projection: Projection = "spherical"
+    convention: Convention = "centre"
+    reflectance_scale: float | None = 1.0
+    reflectance: bool | str = AUTO
+    on_bad_scan: str = "empty"
+    within_limits: bool = False
+
+    def identity(self) -> dict[str, Any]:
+        """All of it, as plain values."""
+        return asdict(self)
+
+
+class ScanSource(ABC):
+    """Numbered range images, (2 or 1, H, W) float32: range in metres and reflectance of [0, 1], 0 where missing.
+
+    A source of your own needs the four abstract methods; the others say what it can do besides.
+
+    Attributes:
+        slow: Whether an image takes long to get, so that those that fit are kept in memory.
+        drawn: Whether a network draws the images when they are asked for: in this process alone, and no image twice
+            where once will do.
+        drives: Numbers of the scans of each recording, by its name, where recordings are known.
+    """
+
+    slow = False
+    drawn = False
+    drives: Mapping[str, Sequence[int]] = {}
+
+    @abstractmethod
     def __len__(self) -> int: ...
 
+    @abstractmethod
     def __getitem__(self, index: int) -> np.ndarray: ...
 
     @property
+    @abstractmethod
     def names(self) -> Sequence[str]:
         """What each scan is called, wherever the data set lies."""
-        ...
 
+    @abstractmethod
     def subset(self, indices: Sequence[int]) -> "ScanSource":
         """Some of the scans as a source of their own, which never reaches for the others."""
-        ...
+
+    def batch(self, indices: Sequence[int]) -> Tensor:
+        """Several scans at once, (B, 2 or 1, H, W)."""
+        return torch.from_numpy(np.stack([self[index] for index in indices]))
+
+    def encoded(self, index: int, encoding: Encoding) -> Tensor:
+        """A scan in model space, (C, H, W)."""
+        return encoding.encode(torch.from_numpy(self[index]))
+
+    def about(self) -> dict[str, Any]:
+        """What a reader of a figure must know of the scans, as plain values; no path is among them."""
+        return {}
+
+    def identity(self) -> dict[str, Any] | None:
+        """All that decides what the images are; None where nobody knows, and nothing of them is worth keeping."""
+        return None
+
+    def places(self) -> set[str]:
+        """Where the scans lie, by which two sources are known to share some; empty where they lie nowhere."""
+        return set()
+
+    def slow_scans(self) -> int:
+        """How many of the scans are worth keeping in memory."""
+        return len(self) if self.slow else 0
+
+    def kept(self, track: Callable[[range], Iterable[int]]) -> "ScanSource":
+        """The source with all that is slow to get of it in memory.
+
+        Args:
+            track: Wraps the numbers while they are read, for a progress bar.
+        """
+        return InMemory(self, track) if self.slow_scans() else self
 
 
 def read_scan(
@@ -45,17 +130,17 @@ def read_scan(
     projection: Projection = "spherical",
     convention: Convention = "centre",
     reflectance: bool = True,
-    reflectance_scale: float = 1.0,
+    reflectance_scale: float | None = 1.0,
 ) -> np.ndarray:
     """One scan file as a range image.
 
     Args:
         reflectance: Whether the image needs reflectance; without it, (1, H, W) is returned.
-        reflectance_scale: The value in the file that means full reflectance (1 in KITTI, often 255).
+        reflectance_scale: The value in the file that means full reflectance (1 in KITTI, often 255); None guesses it.
 
     Raises:
-        InputError: the file cannot be read, no point of it lies in the sensor's view and range, or it has
-            no reflectance, or one beyond the scale, where it is needed.
+        InputError: the file cannot be read, no point of it lies in the sensor's view and range (`NoPointsError`), or it
+            has no reflectance, or one beyond the scale, where it is needed.
     """
     points = read_points(path)
     if points.dropped:
@@ -67,7 +152,7 @@ def read_scan(
     image = project(points.xyz, scaled, sensor, projection, convention, points.ring)
     if not image[0].any():
         r = np.linalg.norm(points.xyz, axis=1)
-        raise InputError(
+        raise NoPointsError(
             f"{path}: none of its {len(r)} points lies within {sensor.min_range:g}-{sensor.max_range:g} m and the "
             f"view of sensor '{sensor.name}' (ranges found: {r.min():.3g}-{r.max():.3g} m). "
             "Are its units metres and its sensor the configured one?"
@@ -99,49 +184,145 @@ def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tupl
     return image, labels.reshape(sensor.shape)
 
 
-def _scaled_reflectance(path: str | Path, points: Points, scale: float) -> np.ndarray:
+def _no_reflectance(path: str | Path) -> InputError:
+    return InputError(
+        f"{path} has no reflectance and the config, the model or the first scan of its set has it. For range alone "
+        "give encoding.reflectance=false in training (auto lets the scans decide), metrics of range in measuring."
+    )
+
+
+def _scaled_reflectance(path: str | Path, points: Points, scale: float | None) -> np.ndarray:
     if points.reflectance is None:
-        raise InputError(
-            f"{path} has no reflectance and the config wants it. "
-            "Set encoding.reflectance=false for a model of range alone, or auto to let the scans decide."
-        )
+        raise _no_reflectance(path)
+    highest = float(np.nan_to_num(points.reflectance).max(initial=0))
+    if scale is None:
+        scale = 1.0 if highest <= 1 else max(highest, 255.0)
     scaled = points.reflectance / np.float32(scale)
-    highest = float(scaled.max(initial=0))
     # NaN compares false: it is refused like a value out of scale.
-    if not (highest <= 1 + 1e-3 and float(scaled.min(initial=0)) >= 0):
-        found = float(points.reflectance.max(initial=0))
+    if not (float(scaled.max(initial=0)) <= 1 + 1e-3 and float(scaled.min(initial=0)) >= 0):
         raise InputError(
-            f"{path}: reflectance must lie in [0, {scale:g}], found up to {found:g}. "
+            f"{path}: reflectance must lie in [0, {scale:g}], found up to {highest:g}. "
             "Say what means full reflectance there, often 255: data.reflectance_scale=255, or the reflectance_scale of "
             "its part of data.parts, or --reflectance-scale 255."
         )
     return scaled
 
 
-class ScanFiles:
-    """Scan files, projected when asked for.
+def range_image(path: Path, shape: tuple[int, int] | None = None) -> np.ndarray | None:
+    """The range image in a .npy of shape (2 or 1, H, W), what is not finite as 0; None where the file is another.
 
-    A file that cannot be used stops the run (`on_bad_scan="error"`) or is left out with a warning
-    (`"skip"`): the next usable file of this source takes its place, the same one in every process.
+    Args:
+        shape: (H, W) that it must have.
+
+    Raises:
+        InputError: it has another size.
+    """
+    if path.suffix.lower() != ".npy":
+        return None
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError):
+        return None  # the reader of points explains what is wrong with it
+    if array.ndim != 3 or array.shape[0] not in (1, 2) or array.dtype.kind != "f":
+        return None
+    if shape is not None and array.shape[1:] != shape:
+        found, wanted = ("x".join(map(str, one)) for one in (array.shape[1:], shape))
+        raise InputError(f"{path} is a range image of {found}, the sensor's is {wanted}; give --size {found}.")
+    return np.nan_to_num(array.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def read_image(path: Path, reading: Reading) -> np.ndarray:
+    """A scan file or a range image as an image, (2 or 1, H, W).
+
+    Raises:
+        InputError: it cannot be read, has another size, or no reflectance where that is needed; it has no return in the
+            sensor's view and `reading.on_bad_scan` is not `empty`.
+    """
+    sensor, channels = reading.sensor, 1 + bool(reading.reflectance)
+    image = range_image(path, sensor.shape)
+    if image is None:
+        how = (reading.projection, reading.convention, bool(reading.reflectance), reading.reflectance_scale)
+        try:
+            return read_scan(path, sensor, *how)
+        except NoPointsError:
+            if reading.on_bad_scan != "empty":
+                raise
+            return np.zeros((channels, *sensor.shape), np.float32)
+    if len(image) < channels:
+        raise _no_reflectance(path)
+    image = image[:channels]
+    if reading.within_limits:
+        seen = (image[0] >= sensor.min_range) & (image[0] <= sensor.max_range)
+        image = np.where(seen, image, np.float32(0))
+        image[1:] = image[1:].clip(0, 1)
+    return image
+
+
+def lacks_reflectance(paths: Iterable[str | Path], on_bad_scan: str = "error") -> str | None:
+    """Why scan files count as files without reflectance; None where they have it.
+
+    The one rule, for training, measuring and pictures: the first scan that has a return decides, and reflectance that
+    is 0 throughout is none, because a KITTI .bin has a column for it whatever the sensor reports.
+
+    Args:
+        on_bad_scan: As in `Reading`: whether a scan that cannot be read is passed over (`skip`), or one alone that has
+            no point (`empty`).
+
+    Raises:
+        InputError: a scan that cannot be read.
+    """
+    for path in paths:
+        try:
+            found = stored_reflectance(path)
+        except InputError as error:
+            if on_bad_scan == "error" or (on_bad_scan == "empty" and not isinstance(error, NoPointsError)):
+                raise
+            continue
+        if found is None:
+            return f"{path} has no reflectance"
+        if found.size:
+            return None if found.any() else f"the reflectance in {path} is 0 throughout"
+    return "no scan has a return"
+
+
+def stored_reflectance(path: str | Path) -> np.ndarray | None:
+    """The reflectance of all returns of a scan file or a range image, as it is stored; None where there is none.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    image = range_image(Path(path))
+    if image is None:
+        return read_points(path).reflectance
+    return image[1][image[0] > 0] if len(image) > 1 else None
+
+
+class ScanFiles(ScanSource):
+    """Scan files of any format and range images, side by side, each read when it is asked for.
+
+    With `on_bad_scan="skip"` a file that cannot be used is left out with a warning: the next usable file of this source
+    takes its place, the same one in every process.
 
     Args:
         paths: The files.
+        reading: How they become images.
         root: The folder of the data set; a scan is named by its path below it.
-        options: Keyword options of `read_scan`.
+        drives: Numbers of the scans of each drive.
+        about: What a reader must know of the data set.
     """
+
+    slow = True
 
     def __init__(
         self,
         paths: Sequence[str | Path],
-        sensor: Sensor,
-        on_bad_scan: str = "error",
+        reading: Reading,
         root: str | Path = "",
-        **options: Any,
+        drives: Mapping[str, Sequence[int]] | None = None,
+        about: Mapping[str, Any] | None = None,
     ) -> None:
-        if on_bad_scan not in ("error", "skip"):
-            raise InputError(f"data.on_bad_scan must be 'error' or 'skip', found {on_bad_scan!r}.")
-        self.paths, self.sensor, self.on_bad_scan, self.options = list(paths), sensor, on_bad_scan, options
-        self.root = root
+        self.paths, self.reading, self.root = list(paths), reading, root
+        self.drives, self.described = drives or {}, about or {}
         self.bad: set[int] = set()
 
     @property
@@ -150,28 +331,49 @@ class ScanFiles:
         return [str(path).removeprefix(below) for path in self.paths]
 
     def subset(self, indices: Sequence[int]) -> "ScanFiles":
-        return ScanFiles([self.paths[i] for i in indices], self.sensor, self.on_bad_scan, self.root, **self.options)
+        return ScanFiles([self.paths[i] for i in indices], self.reading, self.root, about=self.described)
+
+    def about(self) -> dict[str, Any]:
+        return {**self.described, "files": self._digest[:12], "reflectance": bool(self.reading.reflectance)}
+
+    def identity(self) -> dict[str, Any]:
+        return {"files": self._digest, **self.reading.identity()}
+
+    @cached_property
+    def _digest(self) -> str:
+        stats = [
+            (n, s.st_size, s.st_mtime_ns) for n, p in zip(self.names, self.paths, strict=True) if (s := os.stat(p))
+        ]
+        # Some contents, too: unpacked archives have equal names, sizes and times.
+        some = [hashlib.sha256(Path(self.paths[i]).read_bytes()).hexdigest() for i in spread(len(self.paths), 8)]
+        return hashlib.sha256(json.dumps([stats, some]).encode()).hexdigest()
+
+    def places(self) -> set[str]:
+        real = os.path.realpath(self.root)  # once for all of them: on a network disk it takes its time
+        return {os.path.join(real, name) for name in self.names}
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
+        if self.reading.on_bad_scan != "skip":
+            return read_image(Path(self.paths[index]), self.reading)
         for offset in range(len(self.paths)):
             candidate = (index + offset) % len(self.paths)
             if candidate in self.bad:
                 continue
             try:
-                return read_scan(self.paths[candidate], self.sensor, **self.options)
+                return read_image(Path(self.paths[candidate]), self.reading)
             except InputError as error:
-                if self.on_bad_scan == "error":
-                    raise
                 self.bad.add(candidate)
                 log.warning("left out: %s", error)
         raise InputError(f"all {len(self.paths)} scans were left out as unusable; see the warnings above.")
 
 
-class SimulatedScans:
+class SimulatedScans(ScanSource):
     """Scenes of the simulator under one seed, by their numbers."""
+
+    slow = True
 
     def __init__(self, sensor: Sensor, seed: int, scenes: Sequence[int], reflectance: bool = True) -> None:
         self.sensor, self.seed, self.scenes, self.reflectance = sensor, seed, scenes, reflectance
@@ -183,6 +385,15 @@ class SimulatedScans:
     def subset(self, indices: Sequence[int]) -> "SimulatedScans":
         return SimulatedScans(self.sensor, self.seed, [self.scenes[i] for i in indices], self.reflectance)
 
+    def about(self) -> dict[str, Any]:
+        return {"kind": "simulated", "seed": self.seed, "scenes": len(self), "reflectance": self.reflectance}
+
+    def identity(self) -> dict[str, Any]:
+        from r2flow import simulator
+
+        numbers = hashlib.sha256(np.asarray(self.scenes, dtype=np.int64).tobytes()).hexdigest()[:16]
+        return {**self.about(), "numbers": numbers, "simulator": simulator.REVISION, "sensor": asdict(self.sensor)}
+
     def __len__(self) -> int:
         return len(self.scenes)
 
@@ -192,13 +403,7 @@ class SimulatedScans:
         return simulate(self.sensor, self.seed, self.scenes[index]).image[: 1 + self.reflectance]
 
 
-def encoded(source: ScanSource, index: int, encoding: Encoding) -> Tensor:
-    """A scan in model space, (C, H, W); a source that knows a shorter way there than by metres goes it."""
-    shorter = getattr(source, "encoded", None)
-    return encoding.encode(torch.from_numpy(source[index])) if shorter is None else shorter(index, encoding)
-
-
-class InMemory:
+class InMemory(ScanSource):
     """A source read once and kept; what it gives in memory is what it gives from its files.
 
     Args:
@@ -207,11 +412,15 @@ class InMemory:
 
     def __init__(self, source: ScanSource, track: Callable[[range], Iterable[int]] = lambda numbers: numbers) -> None:
         self.images = np.stack([source[index] for index in track(range(len(source)))])
-        self.names: Sequence[str] = source.names
+        self._names = source.names
+
+    @property
+    def names(self) -> Sequence[str]:
+        return self._names
 
     def subset(self, indices: Sequence[int]) -> "InMemory":
         chosen = InMemory.__new__(InMemory)
-        chosen.images, chosen.names = self.images[list(indices)], [self.names[i] for i in indices]
+        chosen.images, chosen._names = self.images[list(indices)], [self.names[i] for i in indices]
         return chosen
 
     def __len__(self) -> int:

@@ -1,154 +1,21 @@
-"""Sets of scans to be measured: whatever a user names, as numbered range images that are read when they are needed."""
+"""Sets of scans that a flow draws when they are asked for."""
 
-import hashlib
-import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
 
-from r2flow import simulator
 from r2flow.checkpoints import Checkpoint, checkpoints_of, weights_hash
-from r2flow.data.layouts import LAYOUTS, find_drives
-from r2flow.data.manifest import MANIFEST, read_manifest
-from r2flow.data.prepared import open_prepared
-from r2flow.data.sources import ScanSource, SimulatedScans, spread
+from r2flow.data.sets import ScanSet, fixed_choice
+from r2flow.data.sources import Reading, ScanSource
 from r2flow.errors import InputError
-from r2flow.evaluation.reading import FolderScans, Reading, has_reflectance, scan_paths
 from r2flow.generators import Sampler
-from r2flow.lidar.sensors import Sensor
-from r2flow.noise import generator
-from r2flow.registry import did_you_mean
 from r2flow.sampling import draw
 
-SIMULATED = "simulated"
+__all__ = ["SampledScans", "ScanSet", "fixed_choice", "is_checkpoint", "reading_of_flow", "sampled_set"]
+
 CHECKPOINTS = (".ckpt", ".pth", ".safetensors")
-
-
-@dataclass(frozen=True)
-class ScanSet:
-    """Scans to be measured.
-
-    Attributes:
-        label: As the user named it.
-        source: The scans by number.
-        sensor: Whose images they are.
-        about: What a reader of a figure must know of them.
-        identity: All that decides what the images are; None where they are drawn anew and nothing is worth keeping.
-        drives: Numbers of the scans of each recording, where recordings are known.
-    """
-
-    label: str
-    source: ScanSource
-    sensor: Sensor
-    about: Mapping[str, Any]
-    identity: Mapping[str, Any] | None = None
-    drives: Mapping[str, Sequence[int]] = field(default_factory=dict)
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def part(self, numbers: Sequence[int], name: str) -> "ScanSet":
-        """Some of the scans, in the given order; `name` says which for a reader."""
-        chosen = hashlib.sha256(np.asarray(numbers, dtype=np.int64).tobytes()).hexdigest()[:16]
-        place = {number: i for i, number in enumerate(numbers)}
-        drives = {
-            drive: kept for drive, held in self.drives.items() if (kept := [place[n] for n in held if n in place])
-        }
-        return replace(
-            self,
-            source=self.source.subset(numbers),
-            about={**self.about, "part": name},
-            identity=None if self.identity is None else {**self.identity, "part": chosen},
-            drives=drives,
-        )
-
-    def limited(self, most: int | None) -> "ScanSet":
-        """At most `most` scans, by `fixed_choice`."""
-        if most is None or most >= len(self):
-            return self
-        return self.part(fixed_choice(len(self), most), f"{most} of {len(self)}, fixed shuffle, seed 0")
-
-    def batches(self, numbers: Sequence[int], batch_size: int, workers: int = 0) -> Iterator[Tensor]:
-        """The scans of these numbers in order, each batch (B, 2 or 1, H, W), read by `workers` further processes."""
-        chunks = [list(numbers[i : i + batch_size]) for i in range(0, len(numbers), batch_size)]
-        # Processes cost seconds to start; and what is drawn is drawn where the network is.
-        alone = isinstance(self.source, SampledScans) or len(chunks) < 8
-        loader: DataLoader[Tensor] = DataLoader(
-            _Batches(self.source),
-            batch_size=None,
-            sampler=chunks,  # each key is a batch's numbers
-            num_workers=0 if alone else workers,
-        )
-        return iter(loader)
-
-
-class _Batches(Dataset[Tensor]):
-    """Batches by the numbers of their scans."""
-
-    def __init__(self, source: ScanSource) -> None:
-        self.source = source
-
-    def __getitem__(self, numbers: list[int]) -> Tensor:
-        if isinstance(self.source, SampledScans):
-            return self.source.draw(numbers)
-        return torch.from_numpy(np.stack([self.source[number] for number in numbers]))
-
-
-def fixed_choice(count: int, most: int) -> list[int]:
-    """`most` of `count` numbers, the first of a fixed shuffle (Philox, seed 0), in rising order."""
-    return sorted(generator(0, "shuffle", 0).permutation(count)[:most].tolist())
-
-
-def open_set(text: str, reading: Reading, split: str | None = None, num: int | None = None) -> ScanSet:
-    """The scans that a user names.
-
-    Args:
-        text: A folder of scan files or range images, a folder of prepared shards, `LAYOUT:ROOT` or `simulated:SEED`.
-        split: A part of the layout's standard split.
-        num: At most so many, by a fixed shuffle; the number of simulated scenes, 1000 if left out.
-
-    Raises:
-        InputError: nothing is there, or what is there does not fit the sensor.
-    """
-    kind, colon, rest = text.partition(":")
-    if colon and kind == SIMULATED:
-        if not rest.isdigit():
-            raise InputError(f"simulated scans are named by their seed, as simulated:0; found {text!r}.")
-        return _simulated(int(rest), 1000 if num is None else num, reading)
-    if colon and kind in LAYOUTS:
-        found = _layout(text, kind, rest, split, reading)
-    elif colon and not Path(text).exists() and "/" not in kind and "\\" not in kind:
-        known = [*LAYOUTS, SIMULATED]
-        raise InputError(f"no data layout named {kind!r}; known: {', '.join(known)}.{did_you_mean(kind, known)}")
-    elif is_prepared(text):
-        found = _prepared(text, split, reading)
-    elif split is not None:
-        raise InputError(f"{text} is a folder and has no standard split, found {split!r}; name it as LAYOUT:FOLDER.")
-    else:
-        found = _folder(text, reading)
-    return found.limited(num)
-
-
-def is_prepared(text: str) -> bool:
-    """Whether a name is that of a folder of `r2flow prepare`."""
-    return (Path(text).expanduser() / MANIFEST).is_file()
-
-
-def prepared_reading(text: str) -> Reading:
-    """How the scans in a folder of `r2flow prepare` were projected.
-
-    Raises:
-        InputError: a manifest that cannot be read.
-    """
-    recipe = read_manifest(Path(text).expanduser()).recipe
-    fields = {key: tuple(value) if isinstance(value, list) else value for key, value in recipe.sensor.items()}
-    return Reading(Sensor(**fields), recipe.projection, recipe.convention, recipe.reflectance_scale)  # type: ignore[arg-type]
 
 
 def is_checkpoint(text: str) -> bool:
@@ -157,6 +24,13 @@ def is_checkpoint(text: str) -> bool:
     if path.is_dir():
         return bool(checkpoints_of(path)) or any(path.glob("step-*.ckpt"))
     return path.suffix in CHECKPOINTS
+
+
+def reading_of_flow(flow: Checkpoint) -> Reading:
+    """How a generator's training scans became images."""
+    data = flow.config.get("data", {})
+    projection, convention = data.get("projection", "spherical"), data.get("convention", "centre")
+    return Reading(flow.sensor, projection, convention, data.get("reflectance_scale", 1.0))
 
 
 def sampled_set(flow: Checkpoint, label: str, num: int, sampler: Sampler | None = None, seed: int = 0) -> ScanSet:
@@ -181,7 +55,7 @@ def sampled_set(flow: Checkpoint, label: str, num: int, sampler: Sampler | None 
     return ScanSet(label, SampledScans(flow, range(num), sampler, seed), flow.sensor, about)
 
 
-class SampledScans:
+class SampledScans(ScanSource):
     """Scans of a generator by their numbers; what one is depends on (seed, number) alone.
 
     Attributes:
@@ -189,6 +63,8 @@ class SampledScans:
         evaluations: Network evaluations of each.
         seconds: Of the generation of a scan, for each batch.
     """
+
+    drawn = True
 
     def __init__(self, flow: Checkpoint, numbers: Sequence[int], sampler: Sampler, seed: int) -> None:
         self.flow, self.numbers, self.sampler, self.seed = flow, numbers, sampler, seed
@@ -211,66 +87,13 @@ class SampledScans:
         part.__dict__.update(self.__dict__, numbers=[self.numbers[i] for i in indices])
         return part
 
+    def batch(self, indices: Sequence[int]) -> Tensor:
+        return self.draw(indices)
+
     def draw(self, indices: Sequence[int]) -> Tensor:
         """The scans of a batch together, (B, 2 or 1, H, W). One that is not solved is taken as it is, and counted."""
-        drawn = draw(self.flow.generator, [self.numbers[i] for i in indices], self.seed, self.sampler)
-        self.seconds.append(drawn.seconds / len(indices))
-        self.evaluations += drawn.evaluations.tolist()
-        self.unsolved += int((~drawn.converged).sum())
-        return drawn.images.nan_to_num(0.0)
-
-
-def _of_files(label: str, root: Path, paths: list[Path], reading: Reading, about: dict[str, Any]) -> ScanSet:
-    """Files of which the first that has a return says whether the set has reflectance."""
-    reading = replace(reading, reflectance=reading.reflectance and has_reflectance(paths))
-    drives: dict[str, list[int]] = {}
-    for number, path in enumerate(paths):
-        drives.setdefault(str(path.parent.relative_to(root)), []).append(number)
-    stats = [(str(path.relative_to(root)), s.st_size, s.st_mtime_ns) for path in paths if (s := path.stat())]
-    # Some contents, too: unpacked archives have equal names, sizes and times.
-    some = [hashlib.sha256(paths[number].read_bytes()).hexdigest() for number in spread(len(paths), 8)]
-    files = hashlib.sha256(json.dumps([stats, some]).encode()).hexdigest()
-    identity = {"files": files, **reading.identity()}
-    about = {**about, "files": files[:12], "reflectance": reading.reflectance}
-    source = FolderScans(root, paths, reading)
-    _ = source[0]  # what does not fit is better known now than after the other set was read
-    return ScanSet(label, source, reading.sensor, about, identity, drives)
-
-
-def _folder(text: str, reading: Reading) -> ScanSet:
-    root = Path(text).expanduser()
-    return _of_files(text, root, scan_paths(root), reading, {"kind": "folder"})
-
-
-def _layout(text: str, layout: str, root: str, split: str | None, reading: Reading) -> ScanSet:
-    drives = find_drives(layout, root, split)
-    paths = [Path(path) for drive in drives for path in drive.scans]
-    found = _of_files(text, Path(root).expanduser(), paths, reading, {"kind": layout, "split": split or "all"})
-    ends = np.cumsum([0, *(len(drive.scans) for drive in drives)]).tolist()
-    return replace(found, drives={d.name: range(a, b) for d, a, b in zip(drives, ends[:-1], ends[1:], strict=True)})
-
-
-def _prepared(text: str, split: str | None, reading: Reading) -> ScanSet:
-    root = Path(text).expanduser()
-    manifest = read_manifest(root)
-    reflectance = reading.reflectance and manifest.recipe.levels is not None
-    source = open_prepared(root, reading.sensor, split, None, reflectance, reading.projection, reading.convention)
-    digest = hashlib.sha256((root / MANIFEST).read_bytes()).hexdigest()
-    place = {name: number for number, name in enumerate(source.names)}
-    drives = {d.name: numbers for d in manifest.drives if (numbers := [place[n] for n in d.scans if n in place])}
-    about = {
-        "kind": f"prepared {manifest.recipe.layout}", "split": split or "all", "manifest": digest[:12],
-        "reflectance": reflectance,
-    }  # fmt: skip
-    identity = {"manifest": digest, "split": split, "reflectance": reflectance}
-    return ScanSet(text, source, reading.sensor, about, identity, drives)
-
-
-def _simulated(seed: int, num: int, reading: Reading) -> ScanSet:
-    if num < 1:
-        raise InputError(f"needs at least one scene to simulate, found {num}.")
-    scenes = range(num)
-    about = {"kind": SIMULATED, "seed": seed, "scenes": num, "reflectance": reading.reflectance}
-    identity = {**about, "simulator": simulator.REVISION, **reading.identity()}
-    source = SimulatedScans(reading.sensor, seed, scenes, reading.reflectance)
-    return ScanSet(f"{SIMULATED}:{seed}", source, reading.sensor, about, identity)
+        made = draw(self.flow.generator, [self.numbers[i] for i in indices], self.seed, self.sampler)
+        self.seconds.append(made.seconds / len(indices))
+        self.evaluations += made.evaluations.tolist()
+        self.unsolved += int((~made.converged).sum())
+        return made.images.nan_to_num(0.0)

@@ -95,18 +95,19 @@ def _by_laser(elevations: list[np.ndarray], lasers: list[np.ndarray], order: str
         np.where(np.isfinite(e) & (one >= 0), table[np.maximum(one, 0)], -1)
         for e, one in zip(elevations, lasers, strict=True)
     ]
-    return _measured(together, np.concatenate(of_point), len(known), order, firing, None, of_point)
+    return _measured(elevations, of_point, len(known), order, firing=firing)
 
 
 def _measured(
-    elevation: np.ndarray,
-    row: np.ndarray,
+    elevations: list[np.ndarray],
+    of_point: list[np.ndarray],
     rows: int,
     order: str,
-    firing: tuple[int, ...] | None,
-    stable: float | None,
-    of_point: list[np.ndarray],
+    firing: tuple[int, ...] | None = None,
+    stable: float | None = None,
 ) -> Beams:
+    """The beams from the elevation and the row of each point of each scan."""
+    elevation, row = np.concatenate(elevations), np.concatenate(of_point)
     middles, residuals, counts = np.zeros(rows), np.zeros(rows), np.bincount(row[row >= 0], minlength=rows)
     by_row = np.argsort(row, kind="stable")[np.count_nonzero(row < 0) :]
     for beam, points in enumerate(np.split(by_row, np.cumsum(counts)[:-1])):
@@ -198,4 +199,4 @@ def _by_elevation(elevations: list[np.ndarray], order: str) -> Beams | None:
     peaks = found[start + (length - 1) // 2][::-1]
     edges = (peaks[:-1] + peaks[1:]) / 2
     of_point = [np.where(np.isfinite(e), np.searchsorted(-edges, -np.nan_to_num(e)), -1) for e in elevations]
-    return _measured(together, np.concatenate(of_point), len(peaks), order, None, stable, of_point)
+    return _measured(elevations, of_point, len(peaks), order, stable=stable)

@@ -1,8 +1,8 @@
 """Range images between metres and model space, [-1, 1]."""
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -14,6 +14,18 @@ from r2flow.registry import Registry, check_options
 
 # Decoding may miss a range limit by float32's rounding: within this relative distance a range is the limit.
 LIMIT_TOLERANCE = 1e-5
+
+
+class RangeFormat(Protocol):
+    """A range r in metres as `channels` values y of [0, 1]."""
+
+    channels: int
+
+    def forward(self, r: Tensor) -> Tensor:
+        """(..., 1, H, W) -> (..., channels, H, W)."""
+
+    def inverse(self, y: Tensor) -> Tensor:
+        """(..., channels, H, W) -> (..., 1, H, W)."""
 
 
 class LogScale:
@@ -77,7 +89,9 @@ class Cartesian:
         return torch.linalg.vector_norm(2 * y - 1, dim=-3, keepdim=True) * self.max_range
 
 
-FORMATS = Registry("range format", logscale=LogScale, inverse=Inverse, metric=Metric, cartesian=Cartesian)
+FORMATS: Registry[Callable[[Sensor], RangeFormat]] = Registry(
+    "range format", logscale=LogScale, inverse=Inverse, metric=Metric, cartesian=Cartesian
+)
 
 
 class Encoding:
@@ -92,7 +106,7 @@ class Encoding:
     def __init__(self, sensor: Sensor, format: str = "logscale", reflectance: bool = True) -> None:
         self.sensor = sensor
         self.reflectance = reflectance
-        self.format: Any = FORMATS[format](sensor)
+        self.format = FORMATS[format](sensor)
 
     @property
     def channels(self) -> int:

@@ -4,6 +4,8 @@ import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
+import yaml
+
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
@@ -22,8 +24,6 @@ def read_sensor(path: str | Path, rows: int | None = None, columns: int | None =
     Raises:
         InputError: the file is missing, cannot be read as YAML or describes no possible sensor.
     """
-    import yaml
-
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} is not a file. A sensor is a name ({', '.join(SENSORS)}) or a YAML file of your own.")

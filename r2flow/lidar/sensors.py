@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
+from types import UnionType
 from typing import Any, Literal
 
 import numpy as np
@@ -228,7 +229,7 @@ def build_sensor(
     return replace(sensor.resized(rows, columns), **given)  # type: ignore[arg-type]
 
 
-def _numbers(name: str, key: str, values: Sequence[Any], kind: Any) -> tuple[Any, ...]:
+def _numbers(name: str, key: str, values: Sequence[Any], kind: type | UnionType) -> tuple[Any, ...]:
     for value in values:
         if not isinstance(value, kind) or isinstance(value, bool):
             what = "whole numbers" if kind is int else "numbers"

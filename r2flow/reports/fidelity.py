@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from r2flow.data.sources import read_scan
-from r2flow.lidar.projection import Projection
-from r2flow.lidar.scan_files import read_points
+from r2flow.data.opening import open_scans
+from r2flow.data.sources import Reading
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.fidelity import PANEL, PER_PIXEL, controls, distances, nearest, panel
 from r2flow.progress import track
 from r2flow.reports.tables import table
-from r2flow.reports.views import range_image, scans_of
 
 Statistics = Mapping[str, np.ndarray]
 Distances = Mapping[str, Mapping[str, float]]
@@ -25,30 +23,20 @@ CLEARLY = 0.5  # a member tells controls from real scans where the floor is belo
 WITHIN = 2.0  # floors: as near to the real scans as can be asked of scans of other places
 
 
-def load_images(
-    path: str | Path,
-    sensor: Sensor,
-    projection: Projection = "spherical",
-    reflectance_scale: float = 1.0,
-    most: int = 1000,
-) -> np.ndarray:
-    """The scans of a file or folder, of any known format or range images, (N, 2 or 1, H, W).
+def load_scans(spec: str | Path, reading: Reading, most: int = 1000) -> tuple[np.ndarray, list[str]]:
+    """At most `most` of the scans that a name stands for (`open_scans`), evenly spread, and the drive of each.
 
-    Reflectance is there only where every scan has it. Of a folder with more than `most` scans, that many are taken,
-    evenly spread over it.
+    Returns:
+        Images, (N, 2 or 1, H, W), and names, (N,).
 
     Raises:
-        InputError: no scan there, or a range image of another size than the sensor's.
+        InputError: no scan there, or one that is not of the reading's sensor.
     """
-    images = []
-    paths = scans_of(Path(path), most)
-    for file in track(paths, f"reading {path}", "scans", least=32):
-        image = range_image(file, sensor)
-        if image is None:
-            reflectance = read_points(file).reflectance is not None
-            image = read_scan(file, sensor, projection, "centre", reflectance, reflectance_scale)
-        images.append(image)
-    return joined(images)
+    scans = open_scans(spec, reading).spread(most)
+    numbers = track(range(len(scans)), f"reading {spec}", "scans", least=32)
+    images = np.stack([scans.source[number] for number in numbers])
+    drives = {number: f"{spec}: {drive}" for drive, held in scans.drives.items() for number in held}
+    return images, [drives.get(number, str(spec)) for number in range(len(scans))]
 
 
 def joined(sets: Sequence[np.ndarray]) -> np.ndarray:
@@ -56,39 +44,6 @@ def joined(sets: Sequence[np.ndarray]) -> np.ndarray:
     sets = [s[None] if s.ndim == 3 else s for s in sets]
     channels = min(s.shape[1] for s in sets)
     return np.concatenate([s[:, :channels] for s in sets])
-
-
-def drives_of(path: str | Path, most: int = 1000) -> list[str]:
-    """The drive of each scan that `load_images` reads: the folder that the file lies in."""
-    return [str(file.parent) for file in scans_of(Path(path), most)]
-
-
-def fidelity(
-    real: np.ndarray,
-    other: np.ndarray,
-    sensor: Sensor,
-    training: np.ndarray | None = None,
-    seed: int = 0,
-    floor: np.ndarray | None = None,
-    drives: Sequence[str] = (),
-) -> dict[str, Any]:
-    """Distances from `real` of `other`, of other real scans where there are any, and of four controls.
-
-    The controls are made of the training scans; without these of the floor's; without these of the real ones, which
-    flatters them. The floor, what a set of real scans of other places comes to, is the distance of the floor's
-    scans; without these of the training scans; without these the mean distance of two of the real drives.
-
-    Args:
-        floor: Further real scans, of other places than `real`.
-        drives: For each real scan the name of its drive; drives of fewer than 4 scans are not compared.
-
-    Returns:
-        `{sets: {name: {line: distance}}, floor: {line: distance}, floor_is: name, blind: [line], won: [line],
-        lost: [line], beyond: [line], per_pixel: {name: {line: distance}}, nearest: {name: (median, least)}}`.
-        A line is won where `other` is nearer to `real` than every control, and beyond where it is more than twice
-        the floor away; lines that do not tell this floor from the controls are blind and neither won nor lost.
-    """
-    return compare_sets(real, other, sensor, training, seed, floor, drives)[0]
 
 
 def compare_sets(
@@ -100,7 +55,23 @@ def compare_sets(
     floor: np.ndarray | None = None,
     drives: Sequence[str] = (),
 ) -> tuple[dict[str, Any], dict[str, Statistics]]:
-    """What `fidelity` returns, and the statistics of every set that it comes from."""
+    """Distances from `real` of `other`, of other real scans where there are any, and of four controls.
+
+    The controls are made of the training scans; without these of the floor's; without these of the real ones, which
+    flatters them. The floor is the distance between real scans of different places: that of the `floor` scans; without
+    these that of the training scans; without these the mean distance of two of the real drives.
+
+    Args:
+        floor: Further real scans, of other places than `real`.
+        drives: For each real scan the name of its drive; drives of fewer than 4 scans are not compared.
+
+    Returns:
+        `{sets: {name: {line: distance}}, floor: {line: distance}, floor_is: name, blind: [line], won: [line],
+        lost: [line], beyond: [line], per_pixel: {name: {line: distance}}, nearest: {name: (median, least)}}`, and the
+        statistics of every set. A line is won where `other` is nearer to `real` than every control, and beyond where
+        it is more than twice the floor away; lines that do not tell the floor from the controls are blind and neither
+        won nor lost.
+    """
     given = {"real": real, "other": other, "other real scans": floor, "training scans": training}
     sets = {name: images for name, images in given.items() if images is not None}
     channels = min(images.shape[1] for images in sets.values())

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
+from r2flow.errors import InputError
 from r2flow.generators import Sampler, as_flow
 from r2flow.inversion import TIGHT, interpolate_scans
-from r2flow.reports.inversion import errors_of, scan_of, unique_names
+from r2flow.reports.inversion import Real, errors_of
 from r2flow.reports.outputs import ScanBar, formats_of, write_scan
 from r2flow.reports.pages import Page, prepare_folder
 from r2flow.reports.tables import table
@@ -24,15 +25,14 @@ MOST = 8  # frames in the figure, evenly chosen
 
 def interpolation(
     checkpoint: Checkpoint,
-    paths: Sequence[Path],
+    scans: Sequence[Real],
     frames: int,
     out: str | Path,
     sampler: Sampler = TIGHT,
     batch_size: int = 1,
-    reflectance_scale: float | None = None,
     command: str = "",
 ) -> Page:
-    """Write `frames` scans on the way from one file to another as `out/frames/NNN.ply` and `.npy`.
+    """Write `frames` scans on the way from one scan to another as `out/frames/NNN.ply` and `.npy`.
 
     Returns:
         The page with the figure, still to be written.
@@ -41,9 +41,11 @@ def interpolation(
         InputError: a scan or a solver that cannot be used, before anything is written; a scan without its noise.
     """
     as_flow(checkpoint.generator, "interpolation").check_sampler(sampler)
-    pair = torch.stack([scan_of(path, checkpoint, reflectance_scale) for path in paths])
+    if len(scans) != 2:
+        raise InputError(f"needs the two scans to go between, found {len(scans)}; name two files.")
+    pair = torch.stack([scan.image for scan in scans])
     prepare_folder(out)
-    names = unique_names(paths)
+    names = [scan.name for scan in scans]
     rays = checkpoint.sensor.rays()
     # both ends go there and back
     with ScanBar("interpolating", frames, (frames + 2) * checkpoint.generator.evaluations_of(sampler)) as bar:

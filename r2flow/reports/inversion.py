@@ -1,23 +1,23 @@
 """Real scans turned into their noise and back: files, a table, a page."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
-from r2flow.data.sources import read_scan
-from r2flow.errors import InputError
+from r2flow.data.opening import open_scans
+from r2flow.evaluation.sets import reading_of_flow
 from r2flow.files import atomic_write
 from r2flow.generators import Sampler, as_flow
 from r2flow.inversion import TIGHT, Inversion, invert, round_trip
 from r2flow.reports.outputs import ScanBar
 from r2flow.reports.pages import Page, prepare_folder
 from r2flow.reports.tables import print_table, table
-from r2flow.reports.views import range_image
 
 COLUMNS = {
     "scan": "scan",
@@ -33,42 +33,42 @@ COLUMNS = {
 SHOWN = 4  # scans in the figure
 
 
-def scan_of(path: Path, checkpoint: Checkpoint, reflectance_scale: float | None = None) -> Tensor:
-    """A scan as the checkpoint's flow sees it: range in metres and reflectance, (2 or 1, H, W).
+class Real(NamedTuple):
+    """A real scan as a flow sees it: its name, and its range in metres and reflectance, (2 or 1, H, W)."""
+
+    name: str
+    image: Tensor
+
+
+def real_scans(
+    checkpoint: Checkpoint, specs: Sequence[str | Path], reflectance_scale: float | None = None, most: int = 16
+) -> list[Real]:
+    """Scans as the checkpoint's flow sees them, projected as its training scans were.
 
     Args:
-        path: A scan file of any format, projected as the flow's training scans were; or a range image, .npy of shape
-            (2 or 1, H, W), in which what is not finite or beyond the sensor's limits is a dropped ray.
-        reflectance_scale: The value in the file that means full reflectance; None for the one of the training.
+        specs: As for `r2flow.data.opening.open_scans`.
+        reflectance_scale: The value in the files that means full reflectance; None for the one of the training.
+        most: Scans to take of a set, evenly spread over it.
 
     Raises:
-        InputError: a file that cannot be read, a range image of another size, or one without needed reflectance.
+        InputError: a scan that cannot be read, has another size, or no reflectance where the flow needs it.
     """
-    sensor, needed = checkpoint.sensor, checkpoint.encoding.reflectance
-    image = range_image(path)
-    if image is None:
-        data = checkpoint.config.get("data", {})
-        scale = data.get("reflectance_scale", 1.0) if reflectance_scale is None else reflectance_scale
-        projection, convention = data.get("projection", "spherical"), data.get("convention", "centre")
-        return torch.from_numpy(read_scan(path, sensor, projection, convention, needed, scale))
-    if image.shape[1:] != sensor.shape:
-        found, wanted = ("x".join(map(str, shape)) for shape in (image.shape[1:], sensor.shape))
-        raise InputError(f"{path} is a range image of {found}, the checkpoint's are {wanted}.")
-    if len(image) < 1 + needed:
-        raise InputError(f"{path} has no reflectance, and this flow was trained with it.")
-    seen = (image[0] >= sensor.min_range) & (image[0] <= sensor.max_range)
-    image = np.where(seen, image[: 1 + needed], np.float32(0))
-    image[1:] = image[1:].clip(0, 1)
-    return torch.from_numpy(image)
+    own = reading_of_flow(checkpoint)
+    scale = own.reflectance_scale if reflectance_scale is None else reflectance_scale
+    needed = checkpoint.encoding.reflectance
+    reading = replace(own, reflectance=needed, reflectance_scale=scale, on_bad_scan="error", within_limits=True)
+    sets = [open_scans(spec, reading).spread(most) for spec in specs]
+    images = [torch.from_numpy(scans.source[i]) for scans in sets for i in range(len(scans))]
+    names = unique_names([Path(name) for scans in sets for name in scans.source.names])
+    return [Real(name, image) for name, image in zip(names, images, strict=True)]
 
 
 def invert_scans(
     checkpoint: Checkpoint,
-    paths: Sequence[Path],
+    scans: Sequence[Real],
     out: str | Path,
     sampler: Sampler = TIGHT,
     batch_size: int = 1,
-    reflectance_scale: float | None = None,
     command: str = "",
 ) -> Page:
     """Write the noise of every scan as `out/NAME.x_0.npy`, float32 (C, H, W) in model space.
@@ -77,18 +77,18 @@ def invert_scans(
         The page of round-trip errors, still to be written.
 
     Raises:
-        InputError: a scan or a solver that cannot be used, before anything is written.
+        InputError: a solver that cannot be used, before anything is written.
     """
     as_flow(checkpoint.generator, "inversion").check_sampler(sampler)
-    scans, names = [scan_of(path, checkpoint, reflectance_scale) for path in paths], unique_names(paths)
+    names = [scan.name for scan in scans]
     prepare_folder(out)
     rows: list[dict[str, Any]] = []
     pairs: list[tuple[str, np.ndarray]] = []
-    way = 2 * checkpoint.generator.evaluations_of(sampler) * -(-len(paths) // batch_size)
-    with ScanBar("inverting", len(paths), way) as bar:
-        for first in range(0, len(paths), batch_size):
+    way = 2 * checkpoint.generator.evaluations_of(sampler) * -(-len(scans) // batch_size)
+    with ScanBar("inverting", len(scans), way) as bar:
+        for first in range(0, len(scans), batch_size):
             some = slice(first, first + batch_size)
-            images = torch.stack(scans[some])
+            images = torch.stack([scan.image for scan in scans[some]])
             found = invert(checkpoint, images, sampler, bar.evaluated)
             for name, x_0 in zip(names[some], found.x_0.numpy(), strict=True):
                 with atomic_write(Path(out, f"{name}.x_0.npy")) as file:
@@ -116,7 +116,7 @@ def errors_of(checkpoint: Checkpoint, found: Inversion, names: Sequence[str], im
 
 def unique_names(paths: Sequence[Path]) -> list[str]:
     """Stems of the files, with a number where two share one."""
-    stems = [path.name.split(".")[0] for path in paths]
+    stems = [path.name.split(".")[0].replace(" ", "_") for path in paths]
     return [
         stem if stems.count(stem) == 1 else f"{stem}_{stems[:index].count(stem) + 1}"
         for index, stem in enumerate(stems)

@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
+from r2flow.data.opening import write_samples_note
 from r2flow.errors import InputError
+from r2flow.evaluation.sets import reading_of_flow
 from r2flow.files import atomic_write
 from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
@@ -88,6 +90,8 @@ def write_samples(
                 if len(shown) < pictures:
                     shown.append(image)
             bar.finished(min(drawn.first + batch_size, num))
+    if channels != "reflectance":
+        keep_note(checkpoint, out, seed, **sampler.asdict())
     if shown:
         parts = shown if region is None else [region.crop(torch.from_numpy(image)).numpy() for image in shown]
         if channels == "reflectance":
@@ -95,6 +99,17 @@ def write_samples(
         else:
             draw_pages(parts, rays if region is None else region.crop(rays), out)
     return shown
+
+
+def keep_note(checkpoint: Checkpoint, out: Path, seed: int, **sampler: Any) -> None:
+    """Leave beside samples what they are, so that nobody has to say their size or sensor."""
+    sensor = checkpoint.sensor
+    encoding = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
+    limits = {"min_range": sensor.min_range, "max_range": sensor.max_range}
+    write_samples_note(
+        out, reading_of_flow(checkpoint), encoding={**encoding, **limits}, seed=seed, sampler=sampler,
+        step=checkpoint.step,
+    )  # fmt: skip
 
 
 def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str) -> None:

@@ -1,18 +1,37 @@
-"""Scans and range images from disk, ready to be drawn."""
+"""Scans and range images, ready to be drawn."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from torch import Tensor
 
-from r2flow.data.sources import read_labelled_scan, read_scan, spread
+from r2flow.data.opening import find_drives, open_scans, own_reading, parse, usual_reading
+from r2flow.data.options import FOLDER
+from r2flow.data.sets import ScanSet
+from r2flow.data.sources import range_image, read_labelled_scan, spread
 from r2flow.errors import InputError
-from r2flow.evaluation.reading import range_image, scan_paths
-from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import Sensor
 
 log = logging.getLogger(__name__)
+
+
+class View(NamedTuple):
+    """One scan to be drawn: its path, and its number in an opened set."""
+
+    path: Path
+    scans: ScanSet
+    number: int
+
+    @property
+    def image(self) -> np.ndarray:
+        return self.scans.source[self.number]
+
+    @property
+    def rays(self) -> Tensor:
+        return self.scans.sensor.rays()
 
 
 def scans_of(path: Path, most: int) -> list[Path]:
@@ -25,40 +44,46 @@ def scans_of(path: Path, most: int) -> list[Path]:
         raise InputError(f"{path} does not exist.")
     if not path.is_dir():
         return [path]
-    chosen = scan_paths(path)
-    return [chosen[index] for index in spread(len(chosen), most)]
+    found = [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans]
+    return [found[index] for index in spread(len(found), most)]
 
 
-def project_file(
-    path: Path, sensor: Sensor, projection: str, convention: str, reflectance_scale: float = 1.0
-) -> np.ndarray:
-    """A scan as (2, H, W), range in metres and reflectance; (1, H, W) where the file has none."""
-    with_reflectance = read_points(path).reflectance is not None
-    return read_scan(path, sensor, projection, convention, with_reflectance, reflectance_scale)  # type: ignore[arg-type]
+def views_of(
+    spec: str | Path,
+    sensor: Sensor | None = None,
+    projection: str = "spherical",
+    reflectance_scale: float | None = None,
+    most: int = 16,
+) -> list[View]:
+    """At most `most` of the scans that a name stands for (`open_scans`), evenly spread.
 
+    Files that say nothing of themselves are opened one by one: each has its own reflectance or none, and a range image
+    its own size.
 
-def open_view(
-    path: Path, sensor: Sensor, projection: str = "spherical", reflectance_scale: float | None = None
-) -> tuple[np.ndarray, Tensor]:
-    """(image, rays) of a scan file, or of a range image in a .npy of shape (2 or 1, H, W).
+    Args:
+        sensor: Of scans that do not say theirs; None takes the usual one.
+        reflectance_scale: As in `Reading`; None guesses it.
 
-    Without a reflectance scale, 1 is taken where the file stays below it, else 255, else its highest value: good
-    enough for a picture, and for nothing else.
+    Raises:
+        InputError: nothing is there, or it is not of this sensor.
     """
-    image = range_image(path)
-    if image is not None:
-        return image, sensor.resized(*image.shape[1:]).rays()
-    if reflectance_scale is None:
-        found = read_points(path).reflectance
-        highest = 0.0 if found is None else float(np.nan_to_num(found).max(initial=0))
-        reflectance_scale = 1.0 if highest <= 1 else max(highest, 255.0)
-    return project_file(path, sensor, projection, "centre", reflectance_scale), sensor.rays()
+    options, file = parse(str(spec))
+    own = own_reading(spec)
+    reading = own or replace(usual_reading(spec), projection=projection)  # type: ignore[arg-type]
+    reading = replace(
+        reading, sensor=sensor or reading.sensor, reflectance_scale=reflectance_scale, on_bad_scan="error"
+    )
+    if own is None and options.name == FOLDER:
+        loose = scans_of(file or Path(options.folder), most)
+        return [View(path, open_scans(path, reading, own_size=True), 0) for path in loose]
+    scans = open_scans(spec, reading).spread(most)
+    return [View(Path(options.folder, name), scans, number) for number, name in enumerate(scans.source.names)]
 
 
 def label_view(path: Path, sensor: Sensor, projection: str = "spherical") -> np.ndarray | None:
-    """The classes, (H, W), that `open_view` has no place for; None, with a warning, where the scan has no labels."""
+    """The class of each pixel, (H, W); None, with a warning, where the scan has no labels."""
     labels = None
-    if range_image(path) is None:
+    if path.is_file() and range_image(path) is None:
         _, labels = read_labelled_scan(path, sensor, projection=projection, reflectance=False)
     if labels is None:
         log.warning("%s: no .label file lies beside it", path)

@@ -6,6 +6,7 @@ import torch
 
 from r2flow.data.augment import Augmentation, upgraded
 from r2flow.data.loader import FlowDataset
+from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points, project
@@ -15,7 +16,12 @@ SENSOR = SENSORS["hdl64e"].resized(8, 32)
 KINDS = {"flip": True, "roll": True, "beam_dropout": 0.25, "ray_dropout": 0.25}
 
 
-class Slope:
+class Slope(ScanSource):
+    names = ("slope",)
+
+    def subset(self, indices):
+        raise NotImplementedError
+
     """Every pixel has a range of its own, so that it can be found again."""
 
     names = ("slope",)

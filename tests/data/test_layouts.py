@@ -2,7 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from r2flow.data.layouts import LAYOUTS, find_drives, split_of
+from r2flow.data.layouts import Layout
+from r2flow.data.opening import SOURCES, find_drives
 from r2flow.errors import InputError
 from tests.data.conftest import write_scan
 
@@ -77,17 +78,17 @@ def test_what_a_mac_leaves_beside_a_scan_is_none(tmp_path: Path):
 
 
 def test_a_drive_is_in_one_part_of_the_standard_split():
-    assert split_of("kitti_360", "2013_05_28_drive_0002_sync") == "test"
-    assert split_of("odometry", "08") == "validation"
-    assert split_of("object", "training") == "train"
-    assert split_of("kitti_raw", "2011_09_26_drive_0002_sync") is None
+    assert SOURCES["kitti_360"].split_of("2013_05_28_drive_0002_sync") == "test"
+    assert SOURCES["odometry"].split_of("08") == "validation"
+    assert SOURCES["object"].split_of("training") == "train"
+    assert SOURCES["kitti_raw"].split_of("2011_09_26_drive_0002_sync") is None
 
 
-@pytest.mark.parametrize("layout", list(LAYOUTS))
+@pytest.mark.parametrize("layout", [name for name, kind in SOURCES.items() if isinstance(kind, Layout)])
 def test_a_missing_or_empty_root_says_what_was_looked_for(layout: str, tmp_path: Path):
     with pytest.raises(InputError, match="is not a folder"):
         find_drives(layout, tmp_path / "missing")
-    with pytest.raises(InputError, match=f"holds no {layout} scan"):
+    with pytest.raises(InputError, match=rf"holds no scan\. Looked for \({layout}\)"):
         find_drives(layout, tmp_path)
 
 

@@ -5,13 +5,19 @@ import pytest
 import torch
 
 from r2flow.data.loader import FixedSampler, FlowDataset, Permutations, RunLoader, RunSampler
+from r2flow.data.sources import ScanSource
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
 
 SENSOR = SENSORS["hdl64e"].resized(4, 8)
 
 
-class Scans:
+class Scans(ScanSource):
+    names = tuple(str(number) for number in range(10))
+
+    def subset(self, indices):
+        raise NotImplementedError
+
     def __len__(self):
         return 10
 

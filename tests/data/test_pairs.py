@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
+from r2flow.data.options import PairOptions
 from r2flow.data.pairs import (
     PairDataset,
-    PairOptions,
     PairSource,
     default_folder,
     make_pairs,

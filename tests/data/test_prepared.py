@@ -18,13 +18,15 @@ import torch
 
 from r2flow.data import preparing
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.layouts import Drive, find_drives
-from r2flow.data.manifest import MANIFEST, read_manifest
+from r2flow.data.layouts import Drive
+from r2flow.data.manifest import read_manifest
+from r2flow.data.opening import find_drives, open_prepared
 from r2flow.data.plans import Plan, plan_files, plan_simulated
-from r2flow.data.prepared import PreparedScans, check_prepared, open_prepared
+from r2flow.data.prepared import PreparedScans, check_prepared
 from r2flow.data.preparing import Preparation
 from r2flow.data.quantise import RangeCodes, ReflectanceCodes, find_levels
-from r2flow.data.sources import ScanFiles, SimulatedScans
+from r2flow.data.sources import Reading, ScanFiles, SimulatedScans
+from r2flow.data.store import MANIFEST
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import FORMATS, Encoding
 from r2flow.lidar.scan_files import write_points
@@ -66,7 +68,7 @@ def make(folder: Path, plan: Plan, **options) -> Path:
 
 def raw_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", **options) -> ScanFiles:
     paths = [path for drive in find_drives(layout, root) for path in drive.scans]
-    return ScanFiles(paths, sensor, root=root, **options)
+    return ScanFiles(paths, Reading(sensor, reflectance=True, **options), root)
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -181,8 +183,8 @@ def test_real_scans_keep_their_reflectance_to_the_bit(
 def test_training_from_shards_is_training_from_the_files(clouds: Path, tmp_path: Path):
     make(tmp_path, plan_of(clouds))
     encoding = Encoding(SMALL)
-    raw = ScanDataModule(SMALL, encoding, 0, "folder", str(clouds))
-    prepared = ScanDataModule(SMALL, encoding, 0, "prepared", str(tmp_path))
+    raw = ScanDataModule(SMALL, encoding, 0, name="folder", root=str(clouds))
+    prepared = ScanDataModule(SMALL, encoding, 0, name="prepared", root=str(tmp_path))
     for module in (raw, prepared):
         module.setup()
     assert prepared.fingerprint() == raw.fingerprint()
@@ -295,7 +297,7 @@ def test_splits_and_drives_are_those_of_the_data_set(kitti_360: Path, tmp_path: 
     make(tmp_path / "out", plan_files("kitti_360", kitti_360, SMALL, shard_scans=4))
     for options in ({"split": "train"}, {"split": "test"}, {"drives": [10, "2013_05_28_drive_0002_sync"]}, {}):
         drives = find_drives("kitti_360", kitti_360, **options)
-        raw = ScanFiles([p for d in drives for p in d.scans], SMALL, root=kitti_360)
+        raw = ScanFiles([p for d in drives for p in d.scans], Reading(SMALL, reflectance=True), kitti_360)
         prepared = open_prepared(tmp_path / "out", SMALL, **options)
         assert prepared.names == raw.names
         for index in (0, len(raw) - 1):

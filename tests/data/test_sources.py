@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.data.sources import InMemory, ScanFiles, holdout_block, read_scan, spread
+from r2flow.data.sources import InMemory, Reading, ScanFiles, holdout_block, read_scan, spread
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
@@ -19,7 +19,8 @@ def ranges(source) -> list[int]:
 
 
 def files(folder: Path, **options) -> ScanFiles:
-    return ScanFiles(sorted(folder.glob("*.bin")), SENSOR, **options)
+    reading = Reading(SENSOR, reflectance=True, **{"on_bad_scan": "error", **options})
+    return ScanFiles(sorted(folder.glob("*.bin")), reading)
 
 
 def test_a_bad_file_stops_the_run_and_is_named(numbered: Path):
@@ -110,7 +111,7 @@ def test_whole_drives_are_held_out_where_they_come_within_half_of_the_share():
 
 
 def test_names_are_told_below_the_root(numbered: Path):
-    source = ScanFiles([str(path) for path in sorted(numbered.glob("*.bin"))], SENSOR, root=numbered.parent)
+    source = ScanFiles([str(path) for path in sorted(numbered.glob("*.bin"))], Reading(SENSOR), numbered.parent)
     assert source.names[:2] == ["scans/000000.bin", "scans/000001.bin"]
     assert source.subset([3]).names == ["scans/000003.bin"]
 

@@ -11,7 +11,7 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
 from r2flow.reports.interpolation import interpolation, interpolation_figure
-from r2flow.reports.inversion import errors_of, invert_scans, print_rows, scan_of, unique_names
+from r2flow.reports.inversion import errors_of, invert_scans, print_rows, real_scans, unique_names
 from r2flow.reports.pictures import figure_pixels
 from tests.test_sampling import SENSOR, GaussianFlow, flow, scans
 
@@ -45,7 +45,8 @@ def test_a_page_says_what_was_measured(tmp_path):
     paths = [tmp_path / "one.npy", tmp_path / "two.npy"]
     for path, image in zip(paths, scans(2).numpy(), strict=True):
         np.save(path, image)
-    page = interpolation(flow(), paths, 3, tmp_path / "o", Sampler("dopri5", tolerance=1e-4), batch_size=2)
+    sampler = Sampler("dopri5", tolerance=1e-4)
+    page = interpolation(flow(), real_scans(flow(), paths), 3, tmp_path / "o", sampler, batch_size=2)
     assert [row["frame"] for row in page.rows] == [0, 1, 2]
     assert page.rows[1]["evaluations"] < page.rows[0]["evaluations"]
     assert "one" in page.text[1]
@@ -65,7 +66,8 @@ def test_a_frame_that_is_not_solved_is_said_to_be(tmp_path, caplog):
     paths = [tmp_path / "one.npy", tmp_path / "two.npy"]
     for path, image in zip(paths, scans(2).numpy(), strict=True):
         np.save(path, image)
-    page = interpolation(flow(LostBetween()), paths, 4, tmp_path / "o", Sampler("rk4", 4), batch_size=2)
+    checkpoint = flow(LostBetween())
+    page = interpolation(checkpoint, real_scans(checkpoint, paths), 4, tmp_path / "o", Sampler("rk4", 4), batch_size=2)
     assert [row["converged"] for row in page.rows] == [True, False, False, True]
     assert "not solved, and no scans of this flow: 1, 2;" in caplog.text
     assert "| no |" in page.text[2]
@@ -92,9 +94,9 @@ def test_a_scan_that_is_not_solved_is_said_to_be(tmp_path, capsys):
 def test_inversion_refuses_before_it_writes(tmp_path):
     np.save(tmp_path / "scan.npy", scans(1)[0].numpy())
     with pytest.raises(InputError, match="Did you mean 'dopri5'"):
-        invert_scans(flow(), [tmp_path / "scan.npy"], tmp_path / "o", Sampler("dopri"))
+        invert_scans(flow(), real_scans(flow(), [tmp_path / "scan.npy"]), tmp_path / "o", Sampler("dopri"))
     with pytest.raises(InputError, match="does not exist"):
-        invert_scans(flow(), [tmp_path / "scan.npy", tmp_path / "none.bin"], tmp_path / "o")
+        real_scans(flow(), [tmp_path / "scan.npy", tmp_path / "none.bin"])
     assert not (tmp_path / "o").exists()
 
 
@@ -104,7 +106,8 @@ def test_a_range_image_is_held_to_the_sensor_s_limits(tmp_path):
     np.save(tmp_path / "image.npy", image.reshape(2, 2, 4))
     checkpoint = flow()
     checkpoint.generator.space = ModelSpace(sensor, Encoding(sensor), sensor.rays())
-    seen = scan_of(tmp_path / "image.npy", checkpoint)
+    ((name, seen),) = real_scans(checkpoint, [tmp_path / "image.npy"])
+    assert name == "image"
     np.testing.assert_allclose(seen[0].flatten(), [0, 1.45, 40, 80, 0, 0, 0, 0])
     np.testing.assert_allclose(seen[1].flatten(), [0, 0.5, 0, 1, 0, 0, 0, 0])
 

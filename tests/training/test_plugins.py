@@ -1,15 +1,19 @@
 """Modules from outside: by name, by path, by entry point; never because a file names them."""
 
+import copy
+import importlib
 import importlib.metadata
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hydra.core.config_store import ConfigStore
 
 from r2flow import plugins
 from r2flow.checkpoints import checkpoints_of
-from r2flow.composing import compose
+from r2flow.composing import REGISTRIES, choices, compose
 from r2flow.errors import InputError
 from r2flow.plugins import load_plugins, made_with, take_plugins
 from r2flow.registry import Registry
@@ -157,14 +161,13 @@ def test_every_verb_takes_plugins(tmp_path: Path):
         assert done.stderr == f"error: the plug-in {path} cannot be imported: RuntimeError: here it is\n"
 
 
-def test_a_plugin_reaches_the_links_of_a_chain(eager: Path, scans: Path, tmp_path: Path):
-    chain = "+chain={one: {stage: {name: eager}}}"
-    in_process(
-        tmp_path,
-        tiny(scans, f"--plugin={eager}", "name=chain", "trainer.max_steps=2", "samples.num=0", chain),
-        check=False,
-    )
-    config = read_config(tmp_path / "runs" / "chain" / "one")
-    assert config is not None
-    assert config["plugins"] == [str(eager)]
-    assert checkpoints_of(tmp_path / "runs" / "chain" / "one")[0].stem == "step-00000002"
+@pytest.mark.parametrize("group", list(REGISTRIES))
+def test_what_is_in_a_registry_without_a_yaml_file_becomes_a_choice(group: str, monkeypatch: pytest.MonkeyPatch):
+    module, table, _ = REGISTRIES[group]
+    registry: Registry[Any] = getattr(importlib.import_module(module), table)
+    original = next(iter(registry.items()))[1]
+    monkeypatch.setattr(registry, "_entries", {**registry._entries, "somebodys": original})
+    monkeypatch.setattr(ConfigStore.instance(), "repo", copy.deepcopy(ConfigStore.instance().repo))
+    config = compose([f"{group}=somebodys"])
+    assert config[group]["name"] == "somebodys"
+    assert set(choices(group)) >= {"somebodys"}

@@ -1,14 +1,14 @@
 """The arguments and results that all solvers share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
+PerScene = np.ndarray | Sequence[int] | Sequence[bool] | int | bool
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,16 @@ class Solution:
     estimate_evaluations: Tensor | None = None
 
     @classmethod
-    def build(cls, x: Tensor, evaluations: np.ndarray, accepted: Any, rejected: Any, stiff: Any, converged: Any):  # type: ignore[no-untyped-def]
-        """From one number for all scenes or an array of them."""
+    def build(
+        cls,
+        x: Tensor,
+        evaluations: np.ndarray,
+        accepted: PerScene,
+        rejected: PerScene,
+        stiff: PerScene,
+        converged: PerScene,
+    ) -> "Solution":
+        """From one value for all scenes or one for each."""
         of = len(x)
         counts = [torch.from_numpy(np.broadcast_to(n, of).astype(np.int64)) for n in (evaluations, accepted, rejected)]
         flags = [torch.from_numpy(np.broadcast_to(flag, of).astype(bool)) for flag in (stiff, converged)]

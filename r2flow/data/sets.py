@@ -1,0 +1,105 @@
+"""A set of scans as a verb or a report sees it: numbered range images, and what is known of them."""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from r2flow.data.sources import ScanSource, spread
+from r2flow.lidar.sensors import Sensor
+from r2flow.noise import generator
+
+
+class ScanSet:
+    """Scans with a name.
+
+    Attributes:
+        label: As the user named it.
+        source: The scans by number.
+        sensor: Whose images they are.
+        about: What a reader of a figure must know of them; the source's own if left out.
+        identity: All that decides what the images are; None where they are drawn anew and nothing is worth keeping. The
+            source's own if left out.
+        drives: Numbers of the scans of each recording, where recordings are known; the source's own if left out.
+    """
+
+    def __init__(
+        self,
+        label: str,
+        source: ScanSource,
+        sensor: Sensor,
+        about: Mapping[str, Any] | None = None,
+        identity: Mapping[str, Any] | None = None,
+        drives: Mapping[str, Sequence[int]] | None = None,
+    ) -> None:
+        self.label, self.source, self.sensor = label, source, sensor
+        self._about, self._identity = about, identity
+        self.drives = source.drives if drives is None else drives
+
+    @cached_property
+    def about(self) -> Mapping[str, Any]:
+        return self.source.about() if self._about is None else self._about
+
+    @cached_property
+    def identity(self) -> Mapping[str, Any] | None:
+        return self.source.identity() if self._identity is None else self._identity
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def part(self, numbers: Sequence[int], name: str) -> "ScanSet":
+        """Some of the scans, in the given order; `name` says which for a reader."""
+        chosen = hashlib.sha256(np.asarray(numbers, dtype=np.int64).tobytes()).hexdigest()[:16]
+        about = {**self.about, "part": name}
+        identity = None if self.identity is None else {**self.identity, "part": chosen}
+        return ScanSet(self.label, self.source.subset(numbers), self.sensor, about, identity, self._drives_of(numbers))
+
+    def _drives_of(self, numbers: Sequence[int]) -> dict[str, list[int]]:
+        place = {number: i for i, number in enumerate(numbers)}
+        found = {drive: [place[n] for n in held if n in place] for drive, held in self.drives.items()}
+        return {drive: kept for drive, kept in found.items() if kept}
+
+    def limited(self, most: int | None) -> "ScanSet":
+        """At most `most` scans, by `fixed_choice`."""
+        if most is None or most >= len(self):
+            return self
+        return self.part(fixed_choice(len(self), most), f"{most} of {len(self)}, fixed shuffle, seed 0")
+
+    def spread(self, most: int) -> "ScanSet":
+        """At most `most` scans, evenly spread over all."""
+        if most >= len(self):
+            return self
+        numbers = spread(len(self), most)
+        return ScanSet(self.label, self.source.subset(numbers), self.sensor, drives=self._drives_of(numbers))
+
+    def batches(self, numbers: Sequence[int], batch_size: int, workers: int = 0) -> Iterator[Tensor]:
+        """The scans of these numbers in order, each batch (B, 2 or 1, H, W), read by `workers` further processes."""
+        chunks = [list(numbers[i : i + batch_size]) for i in range(0, len(numbers), batch_size)]
+        # Processes cost seconds to start; and what is drawn is drawn where the network is.
+        alone = self.source.drawn or len(chunks) < 8
+        loader: DataLoader[Tensor] = DataLoader(
+            _Batches(self.source),
+            batch_size=None,
+            sampler=chunks,  # each key is a batch's numbers
+            num_workers=0 if alone else workers,
+        )
+        return iter(loader)
+
+
+class _Batches(Dataset[Tensor]):
+    """Batches by the numbers of their scans."""
+
+    def __init__(self, source: ScanSource) -> None:
+        self.source = source
+
+    def __getitem__(self, numbers: list[int]) -> Tensor:
+        return self.source.batch(numbers)
+
+
+def fixed_choice(count: int, most: int) -> list[int]:
+    """`most` of `count` numbers, the first of a fixed shuffle (Philox, seed 0), in rising order."""
+    return sorted(generator(0, "shuffle", 0).permutation(count)[:most].tolist())

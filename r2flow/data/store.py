@@ -1,0 +1,117 @@
+"""What the two stores of shards share: prepared scans (`preparing`, `prepared`) and pairs (`shards`).
+
+Both cut numbered items into shards of equal size, write every file under a temporary name that takes its place when it
+is whole, know a damaged file by its checksum and make it again, and refuse a folder that holds something else.
+"""
+
+import json
+import logging
+import time
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import BaseFileLock, FileLock, Timeout
+from safetensors.numpy import save
+
+from r2flow.errors import InputError
+
+log = logging.getLogger(__name__)
+
+MANIFEST = "manifest.json"
+
+
+class Damaged(Exception):
+    """A file that is not what was written."""
+
+
+def shard_count(items: int, size: int) -> int:
+    """The number of shards of `size` items, the last one perhaps shorter."""
+    return -(-items // size)
+
+
+def shard_items(shard: int, items: int, size: int) -> range:
+    """The numbers of the items of one shard."""
+    return range(shard * size, min((shard + 1) * size, items))
+
+
+def shard_bytes(tensors: dict[str, np.ndarray], key: str, notes: Mapping[str, Any]) -> bytes:
+    """A shard as a safetensors file, its notes as JSON under one key: several keys come in no fixed order."""
+    return save(tensors, metadata={key: json.dumps(notes)})
+
+
+def lock_file(path: Path, wait: bool = False) -> BaseFileLock | None:
+    """Hold a lock until its `release`, or until this process ends, however it ends.
+
+    Args:
+        wait: Whether to wait for another holder.
+
+    Returns:
+        The lock; None where another process holds it and `wait` is false.
+    """
+    lock = FileLock(path, timeout=-1 if wait else 0)
+    while True:
+        path.parent.mkdir(exist_ok=True)
+        try:
+            lock.acquire()
+            return lock
+        except Timeout:
+            return None
+        except FileNotFoundError:  # another process has finished, and removed the folder
+            continue
+
+
+def warn_damaged(path: Path, error: Damaged, level: int = logging.WARNING) -> None:
+    log.log(level, "%s is damaged (%s): it is made again.", path, error)
+
+
+def clear_leftovers(files: Iterable[Path], older: float = 0.0) -> None:
+    """Remove the temporary files of killed writers, those that nobody has written to for `older` seconds."""
+    for leftover in files:
+        with suppress(FileNotFoundError):
+            if not older or time.time() - leftover.stat().st_mtime > older:
+                leftover.unlink()
+
+
+def refuse_other(folder: Path, what: str, there: Mapping[str, Any], here: Mapping[str, Any], option: str) -> None:
+    """Refuse a folder that was begun with other settings.
+
+    Args:
+        what: What the folder holds, as `pairs`.
+        option: How another folder is given.
+
+    Raises:
+        InputError: the settings differ.
+    """
+    found = difference(there, here)
+    if found:
+        raise InputError(
+            f"{folder} holds other {what}: {found}. Give the same settings, or another folder by {option}."
+        )
+
+
+def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str | None:
+    """The first setting that differs, in words; None where all are equal."""
+    for key in {**there, **here}:
+        old, new = _plain(there.get(key)), _plain(here.get(key))
+        if old == new:
+            continue
+        if isinstance(old, dict) and isinstance(new, dict):
+            return f"{key}: {difference(old, new)}"
+        if key == "names":
+            return "the names of the scans are others"
+        if isinstance(old, list) or isinstance(new, list):
+            return f"{key} are others ({_count(old)} there, {_count(new)} here)"
+        return f"{key} is {old} there, {new} here"
+    return None
+
+
+def _plain(value: Any) -> Any:
+    """A tuple as the list that JSON makes of it."""
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _count(value: Any) -> str:
+    return f"{len(value)} values" if isinstance(value, list) else str(value)

@@ -1,0 +1,296 @@
+"""One opener: what a name may be, whether scans have reflectance, and kinds of scans that a user adds."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.data.datamodule import ScanDataModule
+from r2flow.data.layouts import Drive, Layout, SourceKind
+from r2flow.data.opening import (
+    SAMPLES,
+    SOURCES,
+    open_scans,
+    own_reading,
+    resolve_reflectance,
+    usual_reading,
+    write_samples_note,
+)
+from r2flow.data.options import PairOptions, SourceOptions
+from r2flow.data.pairs import PairSource, make_pairs, pair_noise
+from r2flow.data.plans import plan_files
+from r2flow.data.preparing import Preparation
+from r2flow.data.shards import PairStore
+from r2flow.data.sources import Reading, ScanSource
+from r2flow.errors import InputError
+from r2flow.generators import Field
+from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.sensors import SENSORS
+from r2flow.noise import standard_normal
+from tests.data.conftest import write_scan
+
+SENSOR = SENSORS["hdl64e"].resized(8, 32)
+READING = Reading(SENSOR)
+
+
+def write_image(path: Path, number: int, channels: int = 2, size: tuple[int, int] = (8, 32)) -> Path:
+    """A range image whose farthest return lies at 5 + number metres, with reflectance 0.5."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = np.zeros((channels, *size), np.float32)
+    image[0, 1:, :4] = 5 + number
+    image[1:, 1:, :4] = 0.5
+    np.save(path, image)
+    return path
+
+
+def numbers(scans) -> list[int]:
+    return [round(float(scans.source[i][0].max())) - 5 for i in range(len(scans))]
+
+
+class TestNames:
+    """Every name that the README knows opens as numbered images."""
+
+    def test_a_file_and_a_folder(self, numbered: Path):
+        assert numbers(open_scans(numbered / "000003.bin", READING)) == [3]
+        assert numbers(open_scans(numbered, READING)) == list(range(12))
+        assert open_scans(numbered, READING).spread(3).source.names == ["000002.bin", "000006.bin", "000010.bin"]
+
+    def test_a_data_set_with_its_root(self, kitti_360: Path):
+        assert numbers(open_scans(f"kitti_360:{kitti_360}", READING, "test")) == [0, 1, 2, 6, 7, 8]
+
+    def test_simulated_scenes(self):
+        scans = open_scans("simulated:4", READING, num=2)
+        assert scans.source.names == ["scene 0", "scene 1"]
+        assert scans.source[1][0].any()
+
+    def test_prepared_shards_say_their_sensor(self, numbered: Path, tmp_path: Path):
+        work = Preparation(tmp_path / "shards", plan_files("folder", numbered, SENSOR))
+        work.make(work.begin())
+        scans = open_scans(tmp_path / "shards")
+        assert scans.sensor == SENSOR
+        assert numbers(scans) == list(range(12))
+
+    def test_options_of_a_run(self, numbered: Path):
+        scans = open_scans(SourceOptions("folder", str(numbered)), READING)
+        assert numbers(scans) == list(range(12))
+
+    def test_one_file_of_each_scan_is_taken(self, tmp_path: Path):
+        write_scan(tmp_path / "a.bin", 1)
+        write_image(tmp_path / "a.npy", 2)
+        write_scan(tmp_path / "b.bin", 3)
+        assert open_scans(tmp_path, READING).source.names == ["a.npy", "b.bin"]
+
+    @pytest.mark.parametrize(
+        ("name", "said"),
+        [
+            ("nowhere", "nowhere does not exist. Give a scan file, a folder of scans"),
+            ("kitti_630:x", "no data set named 'kitti_630'.*Did you mean 'kitti_360'"),
+            ("simulated:x", "named by their seed"),
+            ("folder:nowhere", "nowhere is not a folder"),
+        ],
+    )
+    def test_what_is_not_there_is_one_line(self, name: str, said: str, tmp_path: Path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(InputError, match=said) as error:
+            open_scans(name, READING)
+        assert "\n" not in str(error.value)
+
+    def test_a_usual_sensor_is_the_data_set_s(self):
+        assert usual_reading("nuscenes:x") == Reading(SENSORS["hdl32e"], reflectance_scale=255.0)
+        assert usual_reading("kitti_raw:x") == Reading(SENSORS["hdl64e"])
+
+
+class TestSamples:
+    """Samples say their own size and sensor."""
+
+    def samples(self, folder: Path, size: tuple[int, int] = (8, 32)) -> Path:
+        write_image(folder / "000000.npy", 2, size=size)
+        write_samples_note(folder, Reading(SENSORS["hdl64e"].resized(*size)), seed=3)
+        return folder
+
+    def test_nobody_types_their_size(self, tmp_path: Path):
+        scans = open_scans(self.samples(tmp_path))
+        assert scans.sensor == SENSOR
+        assert numbers(scans) == [2]
+        assert own_reading(tmp_path / "000000.npy") == READING  # one of them, too
+        assert json.loads((tmp_path / SAMPLES).read_text())["seed"] == 3
+
+    def test_another_size_is_one_line(self, tmp_path: Path):
+        self.samples(tmp_path)
+        said = r"holds images of hdl64e 8x32 \(its scans.json says so\), not of hdl64e 16x64: leave --sensor and --size"
+        for name in (tmp_path, tmp_path / "000000.npy"):
+            with pytest.raises(InputError, match=said):
+                open_scans(name, Reading(SENSORS["hdl64e"].resized(16, 64)))
+        with pytest.raises(InputError, match="not of vlp16 8x32"):
+            open_scans(tmp_path, Reading(SENSORS["vlp16"].resized(8, 32)))
+
+    def test_a_run_stands_for_its_samples(self, tmp_path: Path, caplog):
+        (tmp_path / "config.yaml").touch()
+        with pytest.raises(InputError, match="is a run without samples; draw some: r2flow sample -c"):
+            open_scans(tmp_path)
+        self.samples(tmp_path / "more")
+        assert open_scans(tmp_path).source.places() == {str(tmp_path / "more" / "000000.npy")}
+        self.samples(tmp_path / "samples")
+        assert open_scans(tmp_path).source.places() == {str(tmp_path / "samples" / "000000.npy")}
+        assert "has several folders of samples (more, samples): samples is taken" in caplog.text
+        (tmp_path / "samples").rename(tmp_path / "others")
+        with pytest.raises(InputError, match=r"several folders of samples \(more, others\); name one of them"):
+            open_scans(tmp_path)
+
+    def test_a_folder_that_says_nothing_is_read_as_asked_for(self, tmp_path: Path):
+        write_image(tmp_path / "000000.npy", 2)
+        assert own_reading(tmp_path) is None
+        with pytest.raises(InputError, match="give --size 8x32"):
+            open_scans(tmp_path).source[0]
+        assert open_scans(tmp_path / "000000.npy", own_size=True).sensor.shape == (8, 32)
+
+    def test_a_damaged_note_is_one_line(self, tmp_path: Path):
+        self.samples(tmp_path)
+        for content in ("{", "[]", '{"sensor": {}}', '{"sensor": {"name": "a", "elevation": 3}}'):
+            (tmp_path / SAMPLES).write_text(content)
+            with pytest.raises(InputError, match=r"scans.json cannot be read .*; delete it") as error:
+                open_scans(tmp_path)
+            assert "\n" not in str(error.value)
+
+
+class TestReflectance:
+    """One rule: the first scan that has a return decides, and 0 throughout is none."""
+
+    @pytest.mark.parametrize(
+        ("case", "expected"),
+        [("some", True), ("zeros", False), ("none", False), ("image", True), ("bare image", False)],
+    )
+    def test_training_and_every_other_use_agree(self, case: str, expected: bool, tmp_path: Path):
+        if "image" in case:
+            np.save(tmp_path / "0.npy", np.zeros((2, 8, 32), np.float32))  # no return: it decides nothing
+            write_image(tmp_path / "1.npy", 1, channels=1 if case == "bare image" else 2)
+        elif case == "none":
+            write_points(tmp_path / "0.ply", np.array([[10, 0, -1]], np.float32))
+        else:
+            write_scan(tmp_path / "0.bin", 1, reflectance=0.5 if case == "some" else 0.0)
+        assert resolve_reflectance("auto", {"name": "folder", "root": str(tmp_path)}) == expected
+        for on_bad_scan in ("error", "empty", "skip"):
+            scans = open_scans(tmp_path, Reading(SENSOR, on_bad_scan=on_bad_scan))
+            assert scans.about["reflectance"] == expected
+            assert len(scans.source[len(scans) - 1]) == 1 + expected
+
+    def test_a_later_scan_without_it_is_one_line(self, tmp_path: Path):
+        write_image(tmp_path / "0.npy", 1)
+        write_image(tmp_path / "1.npy", 1, channels=1)
+        with pytest.raises(InputError, match="1.npy has no reflectance and .* the first scan of its set has it"):
+            open_scans(tmp_path, READING).source[1]
+
+
+def test_values_out_of_the_sensor_s_limits_are_dropped_for_a_model_alone(tmp_path: Path):
+    image = np.full((2, 8, 32), 0.5, np.float32)
+    image[0] = np.resize([1.0, 1.45, 40, 80, 81], (8, 32))
+    np.save(tmp_path / "0.npy", image)
+    assert open_scans(tmp_path, READING).source[0][0].max() == 81
+    seen = open_scans(tmp_path, Reading(SENSOR, within_limits=True)).source[0]
+    assert set(np.unique(seen[0]).round(2).tolist()) == {0, np.float32(1.45).round(2).item(), 40, 80}
+    assert np.array_equal(seen[1] > 0, seen[0] > 0)
+
+
+# Kinds of scans from outside
+
+
+@pytest.fixture
+def own_table(monkeypatch) -> None:
+    """What is added to the table is gone after the test."""
+    monkeypatch.setattr(SOURCES, "_entries", dict(SOURCES._entries))
+
+
+def find_weeks(root: Path) -> list[Drive]:
+    """`week-N/*.bin`."""
+    return [Drive(week.name, tuple(map(str, sorted(week.glob("*.bin"))))) for week in sorted(root.glob("week-*"))]
+
+
+@pytest.mark.usefixtures("own_table")
+def test_a_function_that_finds_drives_and_one_line_are_a_data_set(tmp_path: Path):
+    SOURCES.add("weeks", Layout(find_weeks, {"train": ("week-1", "week-2"), "test": ("week-3",)}))
+    for number in range(9):
+        write_scan(tmp_path / f"week-{1 + number // 3}" / f"{number}.bin", number)
+    assert numbers(open_scans(f"weeks:{tmp_path}", READING, "test")) == [6, 7, 8]
+    assert resolve_reflectance("auto", {"name": "weeks", "root": str(tmp_path)})
+    held = {"data": {"name": "weeks", "root": str(tmp_path), "split": "test"}}
+    data = ScanDataModule(SENSOR, Encoding(SENSOR), 0, name="weeks", root=str(tmp_path), split="train", validation=held)
+    data.setup()
+    assert [len(data.training_source), len(data.validation_source)] == [6, 3]
+    work = Preparation(tmp_path / "shards", plan_files("weeks", tmp_path, SENSOR))
+    work.make(work.begin())
+    assert numbers(open_scans(tmp_path / "shards", split="test")) == [6, 7, 8]
+
+
+class Walls(ScanSource):
+    """Scan i is a wall at i + 1 + the seed metres."""
+
+    def __init__(self, shape: tuple[int, int], walls: list[int]) -> None:
+        self.shape, self.walls = shape, walls
+
+    def __len__(self) -> int:
+        return len(self.walls)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        return np.full((1, *self.shape), self.walls[index], np.float32)
+
+    @property
+    def names(self) -> list[str]:
+        return [f"wall at {wall} m" for wall in self.walls]
+
+    def subset(self, indices) -> "Walls":
+        return Walls(self.shape, [self.walls[i] for i in indices])
+
+
+class WallKind(SourceKind):
+    def open(self, options, reading, seed=0, first_scene=0) -> Walls:
+        return Walls(reading.sensor.shape, list(range(2, 2 + int(options.root))))
+
+    def lacks_reflectance(self, options, on_bad_scan="error") -> str:
+        return "walls have no reflectance"
+
+
+@pytest.mark.usefixtures("own_table")
+def test_scans_that_are_no_files_are_a_kind_of_their_own():
+    SOURCES.add("walls", WallKind())
+    scans = open_scans("walls:5", READING, num=3)
+    assert len(scans) == 3
+    assert [tuple(batch.shape) for batch in scans.batches([0, 2], 1)] == [(1, 1, 8, 32)] * 2
+    assert scans.identity is None  # nobody knows what decides them: no statistics of them are kept
+    assert not resolve_reflectance("auto", {"name": "walls", "root": "5"})
+    data = ScanDataModule(SENSOR, Encoding(SENSOR, reflectance=False), 0, name="walls", root=10, batch_size=2)
+    (batch,) = data.val_dataloader()
+    assert batch["x_1"].shape == (1, 1, 8, 32)
+    assert data.names == [f"wall at {i} m" for i in range(2, 12)]
+
+
+# The noise of a run
+
+
+@pytest.mark.parametrize("shape", [None, (5,), (2, 8, 32)])
+def test_noise_has_the_shape_that_the_module_is_told(numbered: Path, shape):
+    data = ScanDataModule(
+        SENSOR, Encoding(SENSOR), 7, shape, name="folder", root=str(numbered), validation={"share": 0.25}
+    )
+    (batch,) = data.val_dataloader()
+    expected = shape or (2, 8, 32)
+    assert set(batch) == {"x_1", "x_0", "u", "k"}
+    assert batch["x_1"].shape == (3, 2, 8, 32)
+    for k in range(3):
+        assert torch.equal(batch["x_0"][k], standard_normal(expected, 7, "validation", k))
+
+
+def test_pairs_are_made_of_noise_of_their_own_shape(tmp_path: Path):
+    plain, own = (PairOptions(num=4, batch_size=4).recipe((2, 4, 8), shape) for shape in ((2, 4, 8), (5,)))
+    assert "noise_shape" not in plain.describe()  # as before there were other shapes
+    assert pair_noise(plain, 3).shape == (2, 4, 8)
+    assert torch.equal(pair_noise(own, 3), standard_normal((5,), 0, "pairs", 3))
+    assert own.digest != plain.digest
+    store = PairStore(tmp_path, own)
+    make_pairs(store, Field(lambda t, x: torch.zeros_like(x), (5,)), 4)
+    x_0, x_1 = PairSource(PairStore(tmp_path, own), 4)[2]
+    assert torch.equal(x_1, x_0.half().float())
+    with pytest.raises(InputError, match="holds other pairs: noise_shape"):
+        PairStore(tmp_path, plain)
