@@ -164,12 +164,15 @@ def savings(
     """What a scan need not cost: own steps, leaving early, one step for the straight, regions, single channels."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.flow.solvers import check_tolerance
+    from r2flow.generators import as_flow
     from r2flow.progress import Bar
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.savings import evaluations_of_page, savings_page
 
     check_tolerance(tolerance)
     loaded = None if checkpoint is None else load_checkpoint(checkpoint, choose_device(device))
+    if loaded is not None:
+        as_flow(loaded.generator, "a savings report")
     prepare_folder(out)
     with Bar("measuring", evaluations_of_page(num, steps) if loaded else 0, "evaluations") as advance:
         page = savings_page(loaded, num, steps, tolerance, seed, command(), advance)
