@@ -1,5 +1,6 @@
 """A GAN, a DDPM, a conditional flow and a backbone from files outside the package, through every verb."""
 
+import ast
 import json
 import os
 import shutil
@@ -11,7 +12,19 @@ import pytest
 import torch
 
 from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint
-from tests.extension.conftest import BACKBONE, COMPLETION, DDPM, FAMILIES, GAN, TINY, Family, loaded, r2flow, train
+from tests.extension.conftest import (
+    BACKBONE,
+    COMPLETION,
+    DDPM,
+    FAMILIES,
+    GAN,
+    TINY,
+    Family,
+    loaded,
+    r2flow,
+    run_of,
+    train,
+)  # fmt: skip
 from tests.training.conftest import hold_at, let_go, start, wait_for
 from tests.training.test_train import assert_bit_equal
 
@@ -94,10 +107,8 @@ def test_weights_travel_as_safetensors(trained: tuple[Family, Path], tmp_path: P
 
 
 @pytest.mark.parametrize("family", [COMPLETION, BACKBONE], ids=str)
-def test_a_flow_is_straightened(family: Family, tmp_path: Path, request: pytest.FixtureRequest):
-    from tests.extension.conftest import run_of
-
-    run = Path(shutil.copytree(run_of(family, request.getfixturevalue("tmp_path_factory")), tmp_path / "run"))
+def test_a_flow_is_straightened(family: Family, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory):
+    run = Path(shutil.copytree(run_of(family, tmp_path_factory), tmp_path / "run"))
     pairs = ["data.pairs.num=6", "data.pairs.method=euler", "data.pairs.steps=2", "data.pairs.batch_size=3"]
     options = [family.plugin, *TINY, "sampler.steps=2", *pairs, f"stage.init={run}", f"run_dir={tmp_path / 'two'}"]
     done = r2flow("train", "experiment=reflow", *options)
@@ -155,3 +166,13 @@ def test_a_run_without_its_plugin_says_which_and_how(trained: tuple[Family, Path
         assert len(done.stderr.splitlines()) == 1
         assert f"no {kind} named '{name}'" in done.stderr
         assert f"give --plugin {FAMILIES / f'{family.file}.py'}." in done.stderr
+
+
+@pytest.mark.parametrize("file", sorted(FAMILIES.glob("*.py")), ids=lambda file: file.stem)
+def test_a_family_is_made_of_public_names(file: Path):
+    for node in ast.walk(ast.parse(file.read_text())):
+        names = [node.attr] if isinstance(node, ast.Attribute) else []
+        if isinstance(node, ast.ImportFrom):
+            names = [*(node.module or "").split("."), *(alias.name for alias in node.names)]
+        private = [name for name in names if name.startswith("_") and name != "__init__"]
+        assert not private
