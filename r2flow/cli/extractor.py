@@ -22,24 +22,22 @@ def train_extractor(
 ) -> None:
     """Train the embedded extractor on simulated scans: the same seed gives the same weights, bit for bit.
 
-    Without --sensor and --size, sensors and sizes take turns, as for the shipped weights. A training that was stopped
-    goes on when the same command is given again.
+    Without --sensor and --size, sensors and sizes take turns, as for the shipped weights.
     """
-    from r2flow.metrics.extractors.training import VIEWS, Settings, Training
+    from r2flow.metrics.extractors.training import VIEWS, Settings, judge_held_out, train, write_weights
     from r2flow.reports.pages import prepare_folder
+    from r2flow.reports.tables import print_table
 
     views = VIEWS
     if sensor is not None or size is not None:
         one = build_sized(sensor or "hdl64e", size)
         views = (f"{one.name} {one.shape[0]}x{one.shape[1]}",)
     prepare_folder(out.parent)
-    training = Training(Settings(seed, steps, batch_size, views), out)
-    if training.step:
-        print(f"goes on after step {training.step}")
-    with Bar("training", steps - training.step, "steps") as advance:
-        training.run(workers, advance)
-    judged = training.finish()
-    print("on held-out simulated scans: accuracy of pixels, mean intersection over union")
-    for view, figures in judged.items():
-        print(f"  {view:45s} {figures['accuracy']:.3f} {figures['mean_iou']:.3f} ({figures['classes']} classes)")
+    settings = Settings(seed, steps, batch_size, views)
+    with Bar("training", steps, "steps") as advance:
+        network = train(settings, workers, advance)
+    judged = judge_held_out(network, settings)
+    write_weights(out, network, settings, judged)
+    rows = [(view, figures["accuracy"], figures["mean_iou"], figures["classes"]) for view, figures in judged.items()]
+    print_table(rows, ("held-out simulated scans", "accuracy", "mean IoU", "classes"))
     print(f"{out}: {out.stat().st_size / 2**20:.2f} MiB")

@@ -7,23 +7,22 @@ from typing import Annotated
 import typer
 
 from r2flow.cli.app import report
-from r2flow.cli.options import SETS, ProjectionChoice, ScaleChoice, SensorChoice, SizeOption, choose_reading
+from r2flow.cli.groups import ReadingOptions, grouped
+from r2flow.cli.options import SETS, choose_reading
 
 
 @report.command(epilog="Example: r2flow report fidelity kitti360/test runs/real/samples --train raw --out reports")
+@grouped
 def fidelity(
     real: Annotated[str, typer.Argument(help=f"Real scans: {SETS}.")],
     other: Annotated[str, typer.Argument(help="Scans to judge: likewise.")],
+    how: ReadingOptions,
     also: Annotated[list[str] | None, typer.Option(help="More real scans, one set each time.")] = None,
     floor: Annotated[
         list[str] | None, typer.Option(help="Real scans of other places, to see what real scans come to.")
     ] = None,
     train: Annotated[str | None, typer.Option(help="The scans that were learned from.")] = None,
     name: Annotated[str, typer.Option(help="What the judged set is called on the page.")] = "judged",
-    sensor: SensorChoice = None,
-    size: SizeOption = None,
-    projection: ProjectionChoice = None,
-    reflectance_scale: ScaleChoice = None,
     most: Annotated[int, typer.Option(min=1, help="The most scans of a set, evenly spread over it.")] = 1000,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page and its figures.")] = None,
 ) -> None:
@@ -35,8 +34,7 @@ def fidelity(
 
     folders = [real, *(also or [])]
     named = [*folders, other, *(floor or []), train]
-    reading = choose_reading(named, sensor, size, projection, None, reflectance_scale)
-    reading = replace(reading, on_bad_scan="error")
+    reading = replace(choose_reading(named, **vars(how)), on_bad_scan="error")
     if out is not None:
         prepare_folder(out)
     training = None if train is None else load_scans(train, reading, most)[0]

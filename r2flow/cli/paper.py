@@ -1,44 +1,52 @@
 """`r2flow report paper`: the paper's tables and figures from run folders."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from r2flow.cli.app import report
+from r2flow.cli.groups import WorkOptions, grouped
 from r2flow.cli.options import OutOption, choose_device
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.evaluation.sets import ScanSet
-    from r2flow.metrics.base import ScanMetric
+    from r2flow.reports.paper.report import PaperMetrics
 
 EMBEDDED = "frechet_embedded"
 
 
+@dataclass(frozen=True)
+class BudgetOptions:
+    """How much is measured."""
+
+    num: Annotated[int, typer.Option(min=2, help="Scans of each flow and number of steps; the paper: 10000.")] = 1000
+    steps: Annotated[str, typer.Option(help="Euler steps of flows that are not distilled.")] = (
+        "1,2,4,8,16,32,64,128,256"
+    )
+    curved: Annotated[int, typer.Option(min=0, help="Scenes whose paths are followed for figure 8.")] = 4
+    repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each network; 0 leaves latency out.")] = 3
+    bootstrap: Annotated[int, typer.Option(min=0, help="Resamples for intervals of the figures; 0 for none.")] = 100
+    tolerance: Annotated[float, typer.Option(min=0, help="Of the inversion in figure 3; 0 leaves it out.")] = 1e-3
+
+
 @report.command(epilog="Example: r2flow report paper --runs runs/r2flow --runs runs/sweep --out paper")
+@grouped
 def paper(
     runs: Annotated[
         list[Path], typer.Option("--runs", help="Run folders, or folders of them: chains, sweeps; may be repeated.")
     ],
     out: OutOption,
+    budget: BudgetOptions,
+    work: WorkOptions,
     real: Annotated[
         str | None,
         typer.Option(help="Scans to compare with, as `r2flow evaluate` takes them; held-out ones if left out."),
     ] = None,
     split: Annotated[str | None, typer.Option(help="Of the real scans' standard split.")] = None,
     metrics: Annotated[str | None, typer.Option(help="By name; all that can be computed here if left out.")] = None,
-    num: Annotated[int, typer.Option(min=2, help="Scans of each flow and number of steps; the paper: 10000.")] = 1000,
-    steps: Annotated[
-        str, typer.Option(help="Euler steps of flows that are not distilled.")
-    ] = "1,2,4,8,16,32,64,128,256",
-    curved: Annotated[int, typer.Option(min=0, help="Scenes whose paths are followed for figure 8.")] = 4,
-    repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each network; 0 leaves latency out.")] = 3,
-    bootstrap: Annotated[int, typer.Option(min=0, help="Resamplings for intervals of the figures; 0 for none.")] = 100,
-    tolerance: Annotated[float, typer.Option(min=0, help="Of the inversion in figure 3; 0 leaves it out.")] = 1e-3,
-    batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 8,
-    workers: Annotated[int, typer.Option(min=0, help="Further processes that read.")] = 0,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto",
 ) -> None:
     """The paper's tables I and II and figures 3, 5, 6, 7, 8 from runs, its printed numbers and claims beside ours.
 
@@ -46,22 +54,20 @@ def paper(
     """
     from r2flow.cli.evaluate import work_of
     from r2flow.cli.output import command, finish, numbers
-    from r2flow.evaluation.statistics import Cache
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.paper.report import Budget, report
     from r2flow.reports.paper.subjects import find_subjects
 
-    where = choose_device(device)
-    euler = tuple(sorted(set(numbers("steps", steps, int))))
+    where = choose_device(work.device)
+    euler = tuple(sorted(set(numbers("steps", budget.steps, int))))
+    amount = Budget(budget.num, euler, budget.curved, budget.repeats, budget.bootstrap, budget.tolerance or None)
     subjects = find_subjects(runs)
     truth = None if real is None else real_set(real, split, subjects[0].run)
     reflectance = bool(subjects[0].config["encoding"]["reflectance"])
-    built, missing = build_metrics(metrics.split(",") if metrics else None, bootstrap > 0, reflectance, where)
+    chosen = build_metrics(metrics.split(",") if metrics else None, amount.bootstrap > 0, reflectance, where)
     prepare_folder(out)
-    budget = Budget(num, euler, curved, repeats, bootstrap, tolerance or None)
-    page = report(
-        subjects, out, built, missing, budget, work_of(batch_size, workers), truth, Cache(), where, command(), print
-    )
+    print(f"{len(subjects)} runs: {', '.join(f'{one.label} ({one.role})' for one in subjects)}")
+    page = report(subjects, out, chosen, amount, work_of(work.batch_size, work.workers), truth, where, command())
     finish(page, out, page.text[2:4])
 
 
@@ -74,15 +80,14 @@ def real_set(text: str, split: str | None, run: Path) -> "ScanSet":
     return open_scans(text, reading_of([text], [load_checkpoint(run)]), split)
 
 
-def build_metrics(
-    names: list[str] | None, keep: bool, reflectance: bool, device: str
-) -> "tuple[dict[str, ScanMetric], dict[str, str]]":
+def build_metrics(names: list[str] | None, keep: bool, reflectance: bool, device: str) -> "PaperMetrics":
     """The metrics, `jsd` always among them; of the paper's those that are missing, and why.
 
     Without names: whatever of the paper's can be computed here, and the embedded network's distance.
     """
     from r2flow.metrics import METRICS
     from r2flow.reports.paper.printed import COLUMNS
+    from r2flow.reports.paper.report import PaperMetrics
 
     embedded = EMBEDDED if reflectance else f"{EMBEDDED}_range"
     asked = list(dict.fromkeys(["jsd", *(names or ["mmd", embedded, *COLUMNS])]))
@@ -95,4 +100,4 @@ def build_metrics(
                 raise
             missing[name] = str(error)
     left_out = {name: "not asked for" for name in COLUMNS if name not in asked}
-    return built, {name: why for name, why in {**missing, **left_out}.items() if name in COLUMNS}
+    return PaperMetrics(built, {name: why for name, why in {**missing, **left_out}.items() if name in COLUMNS})

@@ -1,22 +1,22 @@
-"""Real scans against real ones: how near to them a generator could come at all."""
+"""The floor of a distance: what it is between real scans, which a generator cannot be expected to go below."""
 
 from r2flow.data.sets import ScanSet
 from r2flow.errors import InputError
 
 
 def floor_sets(real: ScanSet, generated: ScanSet | None = None) -> dict[str, tuple[ScanSet, ScanSet]]:
-    """Two halves of the real scans, and one drive against another where there are two; by name.
+    """The two halves of the real scans, and two drives where there are two; by name.
 
-    Halves are contiguous blocks: neighbours in a drive are near-duplicates, and random halves would share places. The
-    two drives are those with most scans. Generated scans, where they need not be drawn again, are set against the first
-    half too, as many as the second half has: distances fall with the number of scans, and this one is like for like.
+    Halves are contiguous blocks: neighbouring scans of a drive are near-duplicates, and random halves would share
+    places. The two drives are those with most scans. Distances fall with the number of scans, so generated scans that
+    need not be sampled again are compared with the first half as well, as many as the second half has.
 
     Raises:
         InputError: fewer than two real scans.
     """
     count = len(real)
     if count < 2:
-        raise InputError(f"{real.label} holds {count} scan; a floor needs at least two real ones.")
+        raise InputError(f"{real.label} holds {count} scan; --floor needs at least two real ones.")
     first, second = range(count // 2), range(count // 2, count)
     half, other = real.part(first, "first half"), real.part(second, "second half")
     found = {"real halves": (half, other)}

@@ -1,4 +1,4 @@
-"""Figures of generated scans against real ones, metric by metric, each with the protocol that it holds under."""
+"""The metrics' figures of generated scans against real ones, each with its protocol."""
 
 import hashlib
 import json
@@ -17,7 +17,7 @@ from r2flow.metrics.bootstrap import bootstrap
 from r2flow.metrics.scans import Scans
 from r2flow.progress import Bar
 
-# The field compares single-scan histograms with so many real scans, by a fixed shuffle, and features with all.
+# The field compares histograms of single scans with this many real scans, by a fixed shuffle, and features with all.
 REAL_SCANS = 10_000
 
 LEVEL = 0.95  # of intervals
@@ -25,12 +25,12 @@ LEVEL = 0.95  # of intervals
 
 @dataclass(frozen=True)
 class Work:
-    """How the work is done, which no figure depends on beyond rounding.
+    """How the work is done; figures do not depend on it beyond rounding.
 
     Attributes:
         batch_size: Scans at once.
         workers: Further processes that read.
-        rank, ranks: This process among those that share the batches by turns.
+        rank, ranks: Number of this process among those that take batches by turns, and how many there are.
         watched: Whether progress bars are shown.
     """
 
@@ -46,15 +46,15 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What one metric says of one comparison.
+class MetricResult:
+    """One metric's figures of one comparison.
 
     Attributes:
         metric: Its name.
-        figures: By name; NaN where there is none, and a remark says why.
-        intervals: (low, high) of a figure, where it was asked for.
-        protocol: The metric's, with the numbers of scans and the rule that chose the real ones.
+        figures: By name; NaN where one does not exist, and a remark says why.
+        protocol: The metric's, with the numbers of scans and the rule by which the real ones were chosen.
         remarks: What a reader must know.
+        intervals: (low, high) of a figure, where intervals were asked for.
     """
 
     metric: str
@@ -66,7 +66,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Gathered:
-    """The statistics of a real set by metric, the rule of each's subset, and whether they were at hand already."""
+    """The statistics of a real set by metric, the rule of each one's subset, and which of them the cache held."""
 
     statistics: Mapping[str, Statistics]
     rules: Mapping[str, str]
@@ -74,26 +74,26 @@ class Gathered:
 
 
 def real_rule(metric: ScanMetric, count: int) -> tuple[list[int] | None, str]:
-    """Which of `count` real scans a metric is given: numbers, None for all, and the rule in words."""
+    """The real scans, of `count`, that a metric is given: their numbers, or None for all, and the rule in words."""
     if metric.protocol.extractor is not None or count <= REAL_SCANS:
         return None, f"all {count}"
     return fixed_choice(count, REAL_SCANS), f"{REAL_SCANS} of {count}, fixed shuffle, seed 0"
 
 
 def check_reflectance(metrics: Mapping[str, ScanMetric], sets: Iterable[ScanSet]) -> None:
-    """Know before the reading whether every metric will find what it looks at.
+    """Refuse, before anything is read, a set without the reflectance that a metric needs.
 
     Raises:
-        InputError: a metric of reflectance, and a set without.
+        InputError: there is one.
     """
     needing = [name for name, metric in metrics.items() if metric.needs_reflectance]
     for scans in sets:
         if needing and not scans.about.get("reflectance", True):
-            raise InputError(f"{scans.label} has no reflectance, which {', '.join(needing)} looks at; leave it out.")
+            raise InputError(f"{scans.label} has no reflectance, which {', '.join(needing)} needs; leave it out.")
 
 
 def gather_real(metrics: Mapping[str, ScanMetric], real: ScanSet, work: Work, cache: Cache | None = None) -> Gathered:
-    """What each metric needs of the real scans, from the cache where it is there.
+    """Each metric's statistics of the real scans, from the cache where it holds them.
 
     Raises:
         InputError: no real scan, or one that cannot be read.
@@ -111,14 +111,14 @@ def gather_real(metrics: Mapping[str, ScanMetric], real: ScanSet, work: Work, ca
     missing = {name: metric for name, metric in metrics.items() if name not in found}
     for metric in missing.values():
         metric.reset()
-    # First the subset, for every metric, then the rest for those that take all: every scan is read once.
+    # The subset first, for every metric, then the rest, for those that take all scans: every scan is read once.
     some = next((numbers for name, (numbers, _) in chosen.items() if name in missing and numbers is not None), [])
-    greedy = {name: metric for name, metric in missing.items() if chosen[name][0] is None}
-    rest = sorted(set(range(len(real))) - set(some)) if greedy else []
+    whole_set = {name: metric for name, metric in missing.items() if chosen[name][0] is None}
+    rest = sorted(set(range(len(real))) - set(some)) if whole_set else []
     first = _update(missing, real, some, 0, True, work)
-    second = _update(greedy, real, rest, len(some), True, work)
+    second = _update(whole_set, real, rest, len(some), True, work)
     counts = {name: (len(some), first) for name in missing}
-    counts |= {name: (len(real), first + second) for name in greedy}
+    counts |= {name: (len(real), first + second) for name in whole_set}
     for name, metric in missing.items():
         found[name] = Statistics(metric.real_state(), *counts[name])
         if cache is not None and work.rank == 0:
@@ -128,12 +128,12 @@ def gather_real(metrics: Mapping[str, ScanMetric], real: ScanSet, work: Work, ca
 
 def measure(
     metrics: Mapping[str, ScanMetric], gathered: Gathered, generated: ScanSet, work: Work, draws: int = 0
-) -> list[Measured]:
+) -> list[MetricResult]:
     """Every metric's figures of a generated set.
 
     Args:
         metrics: Built with `keep=True` where there are draws.
-        draws: Bootstrap resamples for 95 % intervals; 0 for none. The first process alone has intervals.
+        draws: Bootstrap resamples for 95 % intervals; 0 for none. Only the first process computes intervals.
 
     Raises:
         InputError: no generated scan, or one that cannot be read.
@@ -147,9 +147,7 @@ def measure(
     source, results = generated.source, []
     unsolved = []
     if isinstance(source, SampledScans) and source.unsolved:
-        unsolved = [
-            f"{source.unsolved} of {len(generated)} scans are not solved to the tolerance, and taken as they are."
-        ]
+        unsolved = [f"{source.unsolved} of {len(generated)} scans are not solved to the tolerance."]
     for name, metric in metrics.items():
         real = gathered.statistics[name]
         figures = {key: float(value) for key, value in metric.compute().items()}
@@ -166,17 +164,16 @@ def measure(
         elif draws and work.rank == 0:
             protocol["interval"] = {"bootstrap draws": draws, "level": LEVEL, "seed": 0}
             with work.bar("resampling", draws, "sets") as advance:
-                found = bootstrap(metric, draws, LEVEL, advance=advance)
-            intervals = {key: (one.low, one.high) for key, one in found.items()}
-        results.append(Measured(name, figures, protocol, remarks, intervals))
+                intervals = bootstrap(metric, draws, LEVEL, advance=advance)
+        results.append(MetricResult(name, figures, protocol, remarks, intervals))
     return results
 
 
 def point_key(real: ScanSet, metrics: Mapping[str, ScanMetric], **sampling: Any) -> str:
-    """16 hex digits of all that figures of a sampled flow depend on: what differs in any of it is measured again.
+    """16 hex digits of everything that the figures of a sampled flow depend on.
 
     Args:
-        sampling: How the flow is sampled: its weights, steps, number of scans, seed, device, ...
+        sampling: How the flow is sampled: weights, steps, number of scans, seed, device, ...
     """
     protocols = {name: metric.protocol.asdict() for name, metric in metrics.items()}
     parts = {"real": real.identity or real.label, "metrics": protocols, **sampling}
@@ -186,7 +183,7 @@ def point_key(real: ScanSet, metrics: Mapping[str, ScanMetric], **sampling: Any)
 def _update(
     metrics: Mapping[str, ScanMetric], scans: ScanSet, numbers: Sequence[int], first: int, real: bool, work: Work
 ) -> int:
-    """Give scans to metrics, those of this process; how many of all had no return within the mask."""
+    """Give this process's share of the scans to the metrics; returns how many of all have no return within the mask."""
     if not metrics or not numbers:
         return 0
     device = next(iter(metrics.values())).device
@@ -204,9 +201,9 @@ def _update(
 
 
 def _remarks(real: Statistics, generated: int, figures: Mapping[str, float]) -> list[str]:
-    """What holds for any metric and is not said by it."""
+    """Remarks that hold for any metric."""
     sides = ((real.scans, "real"), (generated, "generated"))
-    said = [f"a single {whose} scan says nothing of a distribution." for total, whose in sides if total == 1]
+    said = [f"a single {whose} scan is no distribution." for total, whose in sides if total == 1]
     lost = [name for name, value in figures.items() if math.isnan(value)]
     return [*said, f"no figure for {', '.join(lost)}."] if lost else said
 
@@ -220,7 +217,7 @@ def _sum_over_processes(count: int, work: Work) -> int:
 
 
 def _common(names: set[str], work: Work) -> set[str]:
-    """What every process has found in the cache: all of them read, or none."""
+    """The names that every process has found in the cache: a metric is read from it by all of them or by none."""
     if work.ranks == 1:
         return names
     all_names: list[set[str] | None] = [None] * work.ranks

@@ -1,4 +1,4 @@
-"""What metrics keep of the real scans: gathered once, and kept on the disk under a hash of all that made it."""
+"""The metrics' statistics of real scans, kept on disk under a hash of everything that they depend on."""
 
 import hashlib
 import json
@@ -19,7 +19,7 @@ from r2flow.metrics.base import ScanMetric
 
 log = logging.getLogger(__name__)
 
-FORMAT = 1  # to be raised when what a metric makes of the same scans changes without its protocol saying so
+FORMAT = 1  # to be raised when statistics of the same scans change under the same protocol
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Statistics:
     """A metric's states after one set of scans, and how many it has seen.
 
     Attributes:
-        states: What `ScanMetric.real_state` gives.
-        scans: How many scans it was given.
-        empty: How many of them had no return within the mask.
+        states: From `ScanMetric.real_state`.
+        scans: Number of scans.
+        empty: How many of them have no return within the mask.
     """
 
     states: Mapping[str, Tensor] = field(repr=False)
@@ -38,7 +38,7 @@ class Statistics:
 
 
 class Cache:
-    """Statistics of real scans in a folder, each file named by a hash of all that it is a function of.
+    """Statistics of real scans in a folder, each file named by a hash of everything that it depends on.
 
     Args:
         folder: Where; `default_folder()` if left out.
@@ -53,7 +53,7 @@ class Cache:
         return self.folder / f"{metric}-{hashlib.sha256(key.encode()).hexdigest()[:24]}.safetensors"
 
     def read(self, key: str | None) -> Statistics | None:
-        """What was kept under a key; None where there is nothing, or nothing that can be read."""
+        """The statistics of a key; None where there are none that can be read."""
         if key is None or not (path := self.path(key)).is_file():
             return None
         from safetensors import SafetensorError, safe_open
@@ -70,7 +70,7 @@ class Cache:
             return None
 
     def write(self, key: str | None, statistics: Statistics) -> None:
-        """Keep statistics; a disk that cannot take them costs a warning and no figure."""
+        """Keep statistics; a disk that cannot be written to costs a warning, but no figure."""
         if key is None:
             return
         from safetensors.torch import save
@@ -92,10 +92,10 @@ def default_folder() -> Path:
 
 
 def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str | None:
-    """All that a metric's statistics of a set are a function of, as JSON; None where the set is drawn anew.
+    """Everything that a metric's statistics of a set depend on, as JSON; None for a set that is sampled.
 
-    The scans' files with sizes and times (or seed, or manifest), sensor, projection, mask, subset, the metric's
-    protocol with its weights' hash, the kind of device, and the format of these files.
+    The files of the scans with sizes and times (or seed, or manifest), sensor, projection, mask, subset, the metric's
+    protocol with the hash of its weights, the kind of device, and the format of these files.
     """
     if scans.identity is None:
         return None

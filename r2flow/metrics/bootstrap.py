@@ -1,7 +1,6 @@
 """Bootstrap intervals of a metric's figures, from resampling the scans."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,32 +14,13 @@ DRAWS = 2**63  # index of the first draw; indices from 0 on are the noise of sca
 AT_ONCE = 20  # draws that a metric is asked for together
 
 
-@dataclass(frozen=True)
-class Interval:
-    """The bootstrap interval of a figure.
-
-    Attributes:
-        low: Lower end.
-        high: Upper end.
-        level: Share of resampled figures between them.
-        draws: How many there were.
-        bias: Their mean less the figure, which is taken from both ends.
-    """
-
-    low: float
-    high: float
-    level: float
-    draws: int
-    bias: float
-
-
 def bootstrap(
     metric: ScanMetric,
     draws: int = 200,
     level: float = 0.95,
     seed: int = 0,
     advance: Callable[[], None] | None = None,
-) -> dict[str, Interval]:
+) -> dict[str, tuple[float, float]]:
     """Percentile intervals of a metric's figures, from resampling the scans of both sides, Efron (1979).
 
     A draw is N of the N scans, with repetition, as weights of the kept rows: nothing is copied and no network runs
@@ -59,7 +39,7 @@ def bootstrap(
         advance: Called after every draw.
 
     Returns:
-        An interval for each figure that exists; none for a metric that cannot be resampled (`resamples`).
+        (low, high) of each figure that exists; none for a metric that cannot be resampled (`resamples`).
 
     Raises:
         InputError: a metric that keeps no rows; fewer than two draws; a level outside (0, 1).
@@ -96,7 +76,7 @@ def _weights(sizes: dict[Side, int], draws: range, seed: int) -> dict[Side, Tens
     return {side: torch.from_numpy(np.stack(rows)).double() for side, rows in drawn.items()}
 
 
-def _interval(value: float, drawn: np.ndarray, level: float) -> Interval:
-    bias = float(drawn.mean()) - value
-    low, high = np.quantile(drawn, [(1 - level) / 2, (1 + level) / 2]) - bias
-    return Interval(max(float(low), min(value, 0.0)), float(high), level, len(drawn), bias)
+def _interval(value: float, drawn: np.ndarray, level: float) -> tuple[float, float]:
+    excess = float(drawn.mean()) - value
+    low, high = np.quantile(drawn, [(1 - level) / 2, (1 + level) / 2]) - excess
+    return max(float(low), min(value, 0.0)), float(high)

@@ -1,12 +1,13 @@
-"""How far one set of scans lies from another, line by line: statistics that need no trained network.
+"""The fidelity panel: distances between two sets of scans by statistics that need no trained network.
 
-Each member of the panel turns a set of range images into a histogram (or a profile over rows) and compares
-two sets by Jensen-Shannon distance (or the mean absolute difference). Every member looks at more than one pixel
-at a time: what counts pixels one by one, `PER_PIXEL`, cannot tell a real drive from pixels shuffled across the
-scans of another, and judges nothing. Read them together, and next to the controls, which know nothing of scenes.
+Each member of the panel turns a set of range images into a histogram (or a profile over rows) and compares two sets by
+Jensen-Shannon distance (or the mean absolute difference). Every member looks at more than one pixel at a time:
+statistics of single pixels, `PER_PIXEL`, cannot tell a real drive from pixels shuffled across the scans of another, and
+judge nothing. Read the members together, and beside the controls, which are made without knowledge of scenes.
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,16 +18,42 @@ from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
 from r2flow.metrics.surfaces import bridged, drop_rate, normals
 from r2flow.noise import generator, standard_normal
 
-Statistic = Callable[[np.ndarray, Sensor], np.ndarray]
-Member = tuple[Statistic, Callable[[np.ndarray, np.ndarray], float]]
-
 GRADIENTS = np.concatenate([[0], np.geomspace(0.01, 80, 24)])  # metres
 RUNS = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 256, 512, 1025, 4097])  # pixels
 REFLECTANCES = np.linspace(0, 1.0001, 26)
 INCIDENCES = np.cos(np.linspace(np.pi / 2, 0, 11))  # cosines, in steps of 9 degrees
 DENSITIES = np.array([0.5, 1.5, 2.5, 4.5, 8.5, 16.5, 32.5, 64.5, 128.5, 256.5, np.inf])  # points
+NORMALS, COSINES, HEIGHTS = np.linspace(-1, 1, 21), np.linspace(0, 1, 21), np.linspace(-3.5, 4, 31)
 APART = 128, 512  # parts of a turn between the two pixels of a pair: of ranges, of reflectances
-AT_ONCE = 32  # scans: normals of a thousand at once would fill the memory
+AT_ONCE = 32  # scans; the normals of a thousand would fill the memory
+
+
+@dataclass(frozen=True)
+class Member:
+    """A statistic of a set of scans, and the distance between two of them.
+
+    Attributes:
+        statistic: Of range images, (N, 2 or 1, H, W), and their sensor.
+        distance: Between the statistics of two sets; 0 is equal.
+        label: What its bins are, in words.
+        edges: Of its bins, or how a sensor gives them; None where they are rows, or of two dimensions.
+        log: Whether the bins are drawn on a logarithmic axis.
+        needs_reflectance: Whether it is left out for scans of range alone.
+    """
+
+    statistic: Callable[[np.ndarray, Sensor], np.ndarray]
+    distance: Callable[[np.ndarray, np.ndarray], float]
+    label: str = "bin"
+    edges: np.ndarray | Callable[[Sensor], np.ndarray] | None = None
+    log: bool = False
+    needs_reflectance: bool = False
+
+    def places(self, bins: int, sensor: Sensor) -> np.ndarray:
+        """The middles of the bins, in the unit of the label."""
+        edges = self.edges(sensor) if callable(self.edges) else self.edges
+        if edges is None:
+            return np.arange(bins)
+        return np.sqrt(edges[1:] * np.maximum(edges[:-1], 0.005)) if self.log else (edges[1:] + edges[:-1]) / 2
 
 
 def gradient_azimuth(images: np.ndarray, sensor: Sensor) -> np.ndarray:
@@ -53,7 +80,7 @@ def run_lengths(images: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 
 def changes_row(images: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Share of each row's neighbours of which one returned and the other did not, (H,)."""
+    """Share of neighbouring pixels of each row of which only one returned, (H,)."""
     returned = images[:, 0] > 0
     return (returned != np.roll(returned, -1, axis=-1)).mean((0, 2))
 
@@ -61,19 +88,19 @@ def changes_row(images: np.ndarray, sensor: Sensor) -> np.ndarray:
 def drop_range(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Share of rays lost in each of 12 logarithmic bins of range from 3 m on, (12,); 0 where a bin has no rays.
 
-    The range of a lost ray is the mean of its neighbours' in the row; gaps of more than 16 columns are no losses.
+    The range of a lost ray is the mean of its neighbours' in the row; longer gaps than 16 columns are not counted.
     """
     r = images[:, 0]
     return _share(drop_rate(bridged(r, r > 0), r == 0, range_bins(sensor)))
 
 
 def range_bins(sensor: Sensor) -> np.ndarray:
-    """Edges of the bins of `drop_range` in metres, (13,); nearer than 3 m there is little but the own car."""
+    """Edges of the bins of `drop_range` in metres, (13,); nearer than 3 m there is mostly the own car."""
     return np.geomspace(3.0, sensor.max_range, 13)
 
 
 def drop_incidence(images: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Share of rays lost in each of 10 bins of the angle of incidence, (10,); where it is as in `drop_range`."""
+    """Share of rays lost in each of 10 bins of the angle of incidence, (10,), which is estimated as in `drop_range`."""
     counts = np.zeros((2, len(INCIDENCES) - 1))
     for r in _chunks(images):
         _, cosine = normals(r, sensor)
@@ -87,13 +114,13 @@ def _share(counts: np.ndarray) -> np.ndarray:
 
 def surface_normals(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Upward parts n_z of the surfaces' normals, -1 to 1, in 20 bins."""
-    found = [np.histogram(normals(r, sensor)[0], np.linspace(-1, 1, 21))[0] for r in _chunks(images)]
+    found = [np.histogram(normals(r, sensor)[0], NORMALS)[0] for r in _chunks(images)]
     return np.sum(found, axis=0)
 
 
 def incidence(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Cosines of the angle at which rays meet surfaces, in 20 bins."""
-    found = [np.histogram(normals(r, sensor)[1], np.linspace(0, 1, 21))[0] for r in _chunks(images)]
+    found = [np.histogram(normals(r, sensor)[1], COSINES)[0] for r in _chunks(images)]
     return np.sum(found, axis=0)
 
 
@@ -132,9 +159,11 @@ def fill_row(images: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 def range_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Ranges in 32 bins of equal logarithmic width."""
-    r = images[:, 0][images[:, 0] > 0]
-    edges = np.linspace(np.log(sensor.min_range), np.log(sensor.max_range), 33)
-    return np.histogram(np.log(r), edges)[0]
+    return np.histogram(np.log(images[:, 0][images[:, 0] > 0]), _log_ranges(sensor))[0]
+
+
+def _log_ranges(sensor: Sensor) -> np.ndarray:
+    return np.linspace(np.log(sensor.min_range), np.log(sensor.max_range), 33)
 
 
 def reflectance_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
@@ -145,7 +174,7 @@ def reflectance_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
 def height_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Heights z of the points from 3.5 m below the sensor to 4 m above, in 25 cm bins."""
     z = images[:, 0] * np.sin(sensor.rays()[0].numpy())
-    return np.histogram(z[images[:, 0] > 0], np.linspace(-3.5, 4, 31))[0]
+    return np.histogram(z[images[:, 0] > 0], HEIGHTS)[0]
 
 
 def birds_eye(images: np.ndarray, sensor: Sensor) -> np.ndarray:
@@ -163,49 +192,51 @@ def mean_difference(a: np.ndarray, b: np.ndarray) -> float:
 
 
 PANEL: dict[str, Member] = {
-    "gradient, azimuth": (gradient_azimuth, js_distance),
-    "gradient, elevation": (gradient_elevation, js_distance),
-    "run lengths": (run_lengths, js_distance),
-    "changes per row": (changes_row, mean_difference),
-    "drop rate by range": (drop_range, mean_difference),
-    "drop rate by incidence": (drop_incidence, mean_difference),
-    "surface normals": (surface_normals, js_distance),
-    "incidence": (incidence, js_distance),
-    "range pairs": (range_pairs, js_distance),
-    "reflectance pairs": (reflectance_pairs, js_distance),
-    "bird's-eye density": (birds_eye_density, js_distance),
+    "gradient, azimuth": Member(gradient_azimuth, js_distance, "metres", GRADIENTS, log=True),
+    "gradient, elevation": Member(gradient_elevation, js_distance, "metres", GRADIENTS, log=True),
+    "run lengths": Member(run_lengths, js_distance, "pixels", RUNS, log=True),
+    "changes per row": Member(changes_row, mean_difference, "row"),
+    "drop rate by range": Member(drop_range, mean_difference, "metres", range_bins, log=True),
+    "drop rate by incidence": Member(drop_incidence, mean_difference, "degrees", np.linspace(90, 0, 11)),
+    "surface normals": Member(surface_normals, js_distance, "upward part of the normal", NORMALS),
+    "incidence": Member(incidence, js_distance, "cosine", COSINES),
+    "range pairs": Member(range_pairs, js_distance),
+    "reflectance pairs": Member(reflectance_pairs, js_distance, needs_reflectance=True),
+    "bird's-eye density": Member(birds_eye_density, js_distance, "bin of points in a cell, 1 to over 256"),
 }
 
-# Dropped from the panel: sums over pixels one by one, which pixels shuffled across real scans have as real ones do.
+# Dropped from the panel: sums over single pixels, which are the same for pixels shuffled across real scans.
 PER_PIXEL: dict[str, Member] = {
-    "fill per row": (fill_row, mean_difference),
-    "range histogram": (range_histogram, js_distance),
-    "reflectance histogram": (reflectance_histogram, js_distance),
-    "height histogram": (height_histogram, js_distance),
-    "bird's-eye JSD": (birds_eye, js_distance),
+    "fill per row": Member(fill_row, mean_difference, "row"),
+    "range histogram": Member(
+        range_histogram, js_distance, "metres", lambda sensor: np.exp(_log_ranges(sensor)), log=True
+    ),
+    "reflectance histogram": Member(
+        reflectance_histogram, js_distance, "reflectance", REFLECTANCES, needs_reflectance=True
+    ),
+    "height histogram": Member(height_histogram, js_distance, "metres above the sensor", HEIGHTS),
+    "bird's-eye JSD": Member(birds_eye, js_distance),
 }
-
-_OF_REFLECTANCE = ("reflectance pairs", "reflectance histogram")
 
 
 def panel(images: np.ndarray, sensor: Sensor, members: Mapping[str, Member] = PANEL) -> dict[str, np.ndarray]:
     """Every statistic of a set of range images, (N, 2 or 1, H, W); reflectance only where there is some."""
-    chosen = {n: s for n, (s, _) in members.items() if images.shape[1] > 1 or n not in _OF_REFLECTANCE}
-    return {name: statistic(images, sensor) for name, statistic in chosen.items()}
+    chosen = {name: one for name, one in members.items() if images.shape[1] > 1 or not one.needs_reflectance}
+    return {name: one.statistic(images, sensor) for name, one in chosen.items()}
 
 
 def distances(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Line by line, the distance between two sets' statistics; 0 is equal."""
     known = PANEL | PER_PIXEL
-    return {name: known[name][1](a[name], b[name]) for name in a if name in b}
+    return {name: known[name].distance(a[name], b[name]) for name in a if name in b}
 
 
 def controls(training: np.ndarray, sensor: Sensor, num: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Sets that know nothing of scenes, (num, 2 or 1, H, W) each.
+    """Sets made without knowledge of scenes, (num, 2 or 1, H, W) each.
 
     `noise` is x_0 ~ N(0, I) decoded as if it were a scan; `flat ground` measures r = -height / sin e;
     `mean scan` is the mean of the training scans where over half of them returned; `shuffled pixels` takes
-    every pixel from a training scan chosen for it alone.
+    each pixel from a training scan of its own.
     """
     channels = training.shape[1]
     encoding = Encoding(sensor, reflectance=channels > 1)

@@ -45,6 +45,17 @@ class Scans:
     def has_reflectance(self) -> bool:
         return self.images.shape[1] > 1
 
+    @property
+    def reflectance(self) -> Tensor:
+        """Reflectance of every pixel, (B, 1, H, W); 0 where missing.
+
+        Raises:
+            InputError: the scans have none.
+        """
+        if not self.has_reflectance:
+            raise InputError("these scans have no reflectance; use a network of range alone, as embedded_range.")
+        return self.images[:, 1:]
+
     @cached_property
     def returned(self) -> Tensor:
         """Pixels with a return, (B, 1, H, W), bool."""

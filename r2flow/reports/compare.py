@@ -1,4 +1,4 @@
-"""Runs side by side: what each is, what it learned, how straight it is and what it costs."""
+"""Runs side by side: settings, losses, straightness, fidelity and cost."""
 
 import json
 import logging
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 LOSSES = ("train/loss", "val/loss")
 CURVATURE = ("curvature/s_normalised", "curvature/s")
 
-# Column -> heading. What is averaged over seeds, and what has to be equal among them.
+# Column -> heading: what is averaged over seeds, and what must be the same for all of them.
 MEASURED = {
     "train_loss": "train loss, last tenth",
     "val_best": "val loss, best",
@@ -53,15 +53,15 @@ FIXED = {
 
 @dataclass(frozen=True)
 class Run:
-    """What a run's folder says of it.
+    """A run, read from its folder.
 
     Attributes:
         label: Its name in tables and figures.
         path: Its folder.
-        config: As it was begun.
-        values: By the columns of `FIXED` and `MEASURED`; None where the folder does not say.
+        config: The config that it was started with.
+        values: By the columns of `FIXED` and `MEASURED`; None where the folder does not hold one.
         curves: (steps, values) by logged name.
-        fidelity: Distance to the real scans by line of the panel, where it was measured into the folder.
+        fidelity: Distance to the real scans by member of the panel, if `r2flow report fidelity` wrote it there.
     """
 
     label: str
@@ -75,7 +75,7 @@ class Run:
 def find_runs(paths: Sequence[Path]) -> list[Path]:
     """Run folders: those given, and for a folder of runs (a chain's, a sweep's, a sweep's of chains) those in it.
 
-    What is neither is passed over where others are, as `runs/sweep/*` brings: a folder with a warning.
+    Paths that are neither are skipped where there are others, as in `runs/sweep/*`; folders with a warning.
 
     Raises:
         InputError: a path that does not exist, or not one of them a run.
@@ -92,7 +92,7 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
         raise InputError(f"{others[0]} is no run: it has no {CONFIG}. Give folders that train.py has written.")
     for path in others:
         if path.is_dir():
-            log.warning("%s holds no run and is passed over.", path)
+            log.warning("%s holds no run and is skipped.", path)
     return list(dict.fromkeys(found))
 
 
@@ -259,12 +259,12 @@ def _same_parents(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
     if not one or not other or one["weights"] == other["weights"]:
         return bool(one) == bool(other)
     configs = [read_config(Path(parent["path"]).parent.parent) for parent in (one, other)]
-    # Where a parent's folder has gone nothing says what it was: kept apart.
+    # Without a parent's folder its config is not known, and the runs stay apart.
     return bool(configs[0] and configs[1] and same_but_seed(configs[0], configs[1]))
 
 
 def group_label(runs: Sequence[Run]) -> str:
-    """What the names of several runs have in common, the word seed left out."""
+    """The common part of several runs' names, without the word seed."""
     if len(runs) == 1:
         return runs[0].label
     words = zip(*(re.split(r"([-_.,/= ]+)", run.label) for run in runs), strict=False)
@@ -339,7 +339,7 @@ NOTES = (
     "Losses are those that were logged: of validation, with the averaged weights; compare them only between runs with "
     "the same loss and the same data. s / length^2 is the last `curvature/s_normalised`; an untrained flow is straight "
     "too. Seconds are between the first and last entry of TensorBoard's logs, on whatever machine each run had. "
-    "'-': the folder does not say."
+    "'-': the folder does not hold the value."
 )
 
 

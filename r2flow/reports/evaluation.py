@@ -1,4 +1,4 @@
-"""Figures of generated scans beside those of real ones: in the terminal, as JSON, as a page."""
+"""The figures of an evaluation in the terminal, as JSON and as a page."""
 
 import json
 import math
@@ -9,7 +9,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from r2flow.evaluation.measuring import Measured
+from r2flow.evaluation.measuring import MetricResult
 from r2flow.evaluation.sets import ScanSet
 from r2flow.files import atomic_write
 from r2flow.reports.pages import STYLES, Page, blank_figure, plain, provenance
@@ -28,19 +28,19 @@ class Comparison:
     Attributes:
         name: "generated", "real halves", ...
         real, generated: The two sets.
-        measured: What each metric says.
-        seconds: That it took, the real side's share included where it was gathered for this one.
+        measured: Each metric's figures.
+        seconds: That it took, with the statistics of the real set if they were gathered for it.
     """
 
     name: str
     real: ScanSet
     generated: ScanSet
-    measured: Sequence[Measured]
+    measured: Sequence[MetricResult]
     seconds: float
 
 
 def heading(metric: str, figure: str) -> tuple[str, float]:
-    """How a figure is headed in a table, and by what it is multiplied there."""
+    """The heading of a figure in a table, and the factor that it is printed with."""
     return PRINTED[metric] if metric in PRINTED and figure == metric else (figure, 1.0)
 
 
@@ -62,7 +62,7 @@ def rows_of(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
 
 
 def print_comparisons(comparisons: Sequence[Comparison]) -> None:
-    """A line for each figure, a column for each comparison, and what must be known of them."""
+    """Print a line for each figure, a column for each comparison, and the remarks."""
     columns, lines = _table(comparisons, "\n")
     print_table(lines, columns)
     for remark in _remarks(comparisons):
@@ -70,7 +70,7 @@ def print_comparisons(comparisons: Sequence[Comparison]) -> None:
 
 
 def write_json(page: Page, comparisons: Sequence[Comparison], path: Path) -> None:
-    """Every figure with its protocol, remarks and origin, as strict JSON: what does not exist is null."""
+    """Write every figure with its protocol, remarks and origin, as strict JSON; one that does not exist is null."""
     content = {
         "format": FORMAT,
         "origin": provenance(page),
@@ -81,7 +81,7 @@ def write_json(page: Page, comparisons: Sequence[Comparison], path: Path) -> Non
 
 
 def evaluation_page(comparisons: Sequence[Comparison], command: str, device: str, seeds: Mapping[str, int]) -> Page:
-    """The page of an evaluation: table, protocols, and each figure beside its floor."""
+    """The page of an evaluation: table, sets, protocols, and a picture."""
     columns, lines = _table(comparisons)
     remarks = "\n".join(f"- {remark}" for remark in _remarks(comparisons))
     text = [
@@ -94,11 +94,11 @@ def evaluation_page(comparisons: Sequence[Comparison], command: str, device: str
                 for one in comparisons
                 for whose, s in (("real", one.real), ("generated", one.generated))
             ],
-            {"comparison": "comparison", "whose": "as", "set": "set", "scans": "scans", "about": "what they are"},
+            {"comparison": "comparison", "whose": "as", "set": "set", "scans": "scans", "about": "details"},
         ),
         "## Protocols",
-        "Returns nearer or farther than the mask are dropped on both sides before every metric. Figures of protocols "
-        "that differ in anything are not comparable.",
+        "Before every metric, returns beyond the mask are dropped from both sets. Figures of different protocols are "
+        "not comparable.",
         table(
             [_protocol_row(measured) for measured in comparisons[0].measured],
             {
@@ -138,7 +138,7 @@ def _cell(value: float, interval: tuple[float, float] | None, factor: float, bet
 
 
 def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
-    """Each said once, with the metrics and comparisons that it is said of."""
+    """Each remark once, with the comparison and the metrics that it holds for."""
     found: dict[tuple[str, str], list[str]] = {}
     for one in comparisons:
         for measured in one.measured:
@@ -147,7 +147,7 @@ def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
     everything = {one.name: len(one.measured) for one in comparisons}
     sizes = {one.name: (len(one.real), len(one.generated)) for one in comparisons}
     uneven = (
-        ["Distances of fewer scans are larger: compare columns of equal sizes alone."]
+        ["Distances of fewer scans are larger: compare only columns of equal sizes."]
         if len(set(sizes.values())) > 1
         else []
     )
@@ -169,7 +169,7 @@ def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
     ]
 
 
-def _protocol_row(measured: Measured) -> dict[str, Any]:
+def _protocol_row(measured: MetricResult) -> dict[str, Any]:
     protocol = measured.protocol
     return {
         **{key: protocol[key] for key in ("metric", "representation", "extractor", "weights", "layer")},
@@ -209,7 +209,7 @@ def _plain_comparison(one: Comparison) -> dict[str, Any]:
 
 
 def _figure(comparisons: Sequence[Comparison]) -> Figure:
-    """A panel for each metric's first figure, a mark for each comparison; the floor is what real scans reach."""
+    """A panel for each metric's first figure, with a mark for each comparison."""
     first = {m.metric: next(iter(m.figures)) for m in comparisons[0].measured if m.figures}
     columns = max(min(len(first), 4), 1)
     lines = max(math.ceil(len(first) / columns), 1)

@@ -46,34 +46,6 @@ def joined(sets: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([s[:, :channels] for s in sets])
 
 
-def fidelity(
-    real: np.ndarray,
-    other: np.ndarray,
-    sensor: Sensor,
-    training: np.ndarray | None = None,
-    seed: int = 0,
-    floor: np.ndarray | None = None,
-    drives: Sequence[str] = (),
-) -> dict[str, Any]:
-    """Distances from `real` of `other`, of other real scans where there are any, and of four controls.
-
-    The controls are made of the training scans; without these of the floor's; without these of the real ones, which
-    flatters them. The floor, what a set of real scans of other places comes to, is the distance of the floor's
-    scans; without these of the training scans; without these the mean distance of two of the real drives.
-
-    Args:
-        floor: Further real scans, of other places than `real`.
-        drives: For each real scan the name of its drive; drives of fewer than 4 scans are not compared.
-
-    Returns:
-        `{sets: {name: {line: distance}}, floor: {line: distance}, floor_is: name, blind: [line], won: [line],
-        lost: [line], beyond: [line], per_pixel: {name: {line: distance}}, nearest: {name: (median, least)}}`.
-        A line is won where `other` is nearer to `real` than every control, and beyond where it is more than twice
-        the floor away; lines that do not tell this floor from the controls are blind and neither won nor lost.
-    """
-    return compare_sets(real, other, sensor, training, seed, floor, drives)[0]
-
-
 def compare_sets(
     real: np.ndarray,
     other: np.ndarray,
@@ -83,7 +55,23 @@ def compare_sets(
     floor: np.ndarray | None = None,
     drives: Sequence[str] = (),
 ) -> tuple[dict[str, Any], dict[str, Statistics]]:
-    """What `fidelity` returns, and the statistics of every set that it comes from."""
+    """Distances from `real` of `other`, of other real scans where there are any, and of four controls.
+
+    The controls are made of the training scans; without these of the floor's; without these of the real ones, which
+    flatters them. The floor is the distance between real scans of different places: that of the `floor` scans; without
+    these that of the training scans; without these the mean distance of two of the real drives.
+
+    Args:
+        floor: Further real scans, of other places than `real`.
+        drives: For each real scan the name of its drive; drives of fewer than 4 scans are not compared.
+
+    Returns:
+        `{sets: {name: {line: distance}}, floor: {line: distance}, floor_is: name, blind: [line], won: [line],
+        lost: [line], beyond: [line], per_pixel: {name: {line: distance}}, nearest: {name: (median, least)}}`, and the
+        statistics of every set. A line is won where `other` is nearer to `real` than every control, and beyond where
+        it is more than twice the floor away; lines that do not tell the floor from the controls are blind and neither
+        won nor lost.
+    """
     given = {"real": real, "other": other, "other real scans": floor, "training scans": training}
     sets = {name: images for name, images in given.items() if images is not None}
     channels = min(images.shape[1] for images in sets.values())

@@ -1,14 +1,14 @@
 """The page of `r2flow report fidelity`: distances against the floor, histograms, scans side by side."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from r2flow.lidar.sensors import Sensor
-from r2flow.metrics.fidelity import GRADIENTS, RUNS, range_bins
-from r2flow.reports.fidelity import WITHIN, Statistics, markdown, per_pixel_table
+from r2flow.metrics.fidelity import mean_difference
+from r2flow.reports.fidelity import MEMBERS, WITHIN, Statistics, markdown, per_pixel_table
 from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.pictures import draw_range, draw_reflectance
 
@@ -93,21 +93,21 @@ def histogram_figure(statistics: Mapping[str, Statistics], sensor: Sensor, name:
     columns = 4
     figure = blank_figure(14, 2.5 * -(-len(drawn) // columns), "")
     for index, line in enumerate(drawn):
+        member = MEMBERS[line]
         axes = figure.add_subplot(-(-len(drawn) // columns), columns, index + 1)
         for style, key in zip(STYLES, sets, strict=False):
             value = np.asarray(statistics[key][line], dtype=float)
-            profile = line in ("fill per row", "changes per row") or line.startswith("drop rate")
-            value = value if profile else value / max(value.sum(), 1)
+            value = value if member.distance is mean_difference else value / max(value.sum(), 1)
             axes.plot(
-                _places(line, len(value), sensor), value, color=style["color"], linestyle=style["linestyle"], lw=1.3,
+                member.places(len(value), sensor), value, color=style["color"], linestyle=style["linestyle"], lw=1.3,
                 label=name if key == "other" else key,
             )  # fmt: skip
         axes.set_title(line, fontsize=9)
         axes.tick_params(labelsize=7)
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.25)
-        axes.set_xlabel(_LABELS.get(line, "bin"), fontsize=7)
-        if line.startswith("gradient") or line in ("run lengths", "drop rate by range", "range histogram"):
+        axes.set_xlabel(member.label, fontsize=7)
+        if member.log:
             axes.set_xscale("log")
             axes.xaxis.set_minor_formatter("")
             axes.xaxis.set_major_formatter("{x:g}")
@@ -117,38 +117,6 @@ def histogram_figure(statistics: Mapping[str, Statistics], sensor: Sensor, name:
         if index == 0:
             axes.legend(fontsize=7)
     return figure
-
-
-_LABELS = {
-    "gradient, azimuth": "metres", "gradient, elevation": "metres", "run lengths": "pixels", "changes per row": "row",
-    "fill per row": "row", "drop rate by range": "metres", "drop rate by incidence": "degrees",
-    "surface normals": "upward part of the normal", "incidence": "cosine", "range histogram": "metres",
-    "bird's-eye density": "bin of points in a cell, 1 to over 256", "reflectance histogram": "reflectance",
-    "height histogram": "metres above the sensor",
-}  # fmt: skip
-
-
-def _places(line: str, bins: int, sensor: Sensor) -> np.ndarray:
-    """Where the bins of a statistic lie: their middles, in the unit of its label."""
-    edges: Sequence[float] | np.ndarray = np.arange(bins + 1) - 0.5
-    if line.startswith("gradient"):
-        return np.sqrt(GRADIENTS[1:] * np.maximum(GRADIENTS[:-1], 0.005))
-    if line == "run lengths":
-        return np.sqrt(RUNS[1:] * RUNS[:-1])
-    if line == "drop rate by range":
-        edges = range_bins(sensor)
-    elif line == "range histogram":
-        edges = np.geomspace(sensor.min_range, sensor.max_range, bins + 1)
-    elif line == "drop rate by incidence":
-        edges = np.linspace(90, 0, bins + 1)
-    elif line == "surface normals":
-        edges = np.linspace(-1, 1, bins + 1)
-    elif line == "height histogram":
-        edges = np.linspace(-3.5, 4, bins + 1)
-    elif line in ("incidence", "reflectance histogram"):
-        edges = np.linspace(0, 1, bins + 1)
-    edges = np.asarray(edges)
-    return (edges[1:] + edges[:-1]) / 2
 
 
 def scans_figure(real: np.ndarray, other: np.ndarray, name: str) -> Figure:

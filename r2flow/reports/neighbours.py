@@ -1,4 +1,4 @@
-"""Generated scans beside the training scans that are nearest to them: whether a flow has learned or memorised."""
+"""Generated scans beside the training scans that are nearest to them: is anything memorised?"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,18 +20,19 @@ from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_birds_eye, draw_range
 from r2flow.reports.tables import Row, shown, table
 
-LIKENESSES = ("embedded", "pixels")
+REPRESENTATIONS = ("embedded", "pixels")
 COPY = 0.1  # of the usual distance
 
 
 @dataclass(frozen=True)
-class Likeness:
-    """By what scans are near to each other: Euclidean distance between what `describe` gives, (B, D).
+class Representation:
+    """What of two scans is compared, by Euclidean distance.
 
     Attributes:
-        name: One of `LIKENESSES`.
+        name: One of `REPRESENTATIONS`.
         words: The same for a reader.
-        device: Where `describe` wants its scans.
+        describe: Gives it, (B, D); a row of NaN for a scan without a return.
+        device: Where `describe` takes scans.
     """
 
     name: str
@@ -46,9 +47,9 @@ class Nearest:
 
     Attributes:
         scans: The set.
-        numbers: Of its scans that have a return, (N,).
-        distances: To the nearest training scan, (N,) float64.
-        neighbours: Its number, (N,).
+        numbers: Its scans that have a return, (N,).
+        distances: From each to the nearest training scan, (N,) float64.
+        neighbours: Number of the nearest training scan, (N,).
     """
 
     scans: ScanSet
@@ -66,39 +67,37 @@ class Neighbours:
     """Generated scans and real ones, each with its nearest training scan.
 
     Attributes:
-        generated: The judged ones.
-        real: Held-out scans, or training scans each against the others.
-        training: What all of them are compared with.
+        generated: The scans that are judged.
+        real: Held-out scans; without these, training scans, each compared with the others.
+        training: The scans that all of them are compared with.
         held_out: Whether `real` was held out.
     """
 
     generated: Nearest
     real: Nearest
     training: ScanSet
-    likeness: Likeness
+    representation: Representation
     held_out: bool
 
 
-def likeness_of(name: str | None, sets: Sequence[ScanSet], device: str) -> Likeness:
-    """A likeness by its name; without one, the embedded network's where it is there, else that of pixels.
+def representation_of(name: str | None, sets: Sequence[ScanSet], device: str) -> Representation:
+    """The representation of a name; features of the embedded network if left out.
 
     Raises:
-        InputError: no such name, or the network asked for is not there.
+        InputError: no such name, or no network.
     """
-    if name is not None and name not in LIKENESSES:
-        raise InputError(f"--by must be {' or '.join(LIKENESSES)}, found {name!r}.")
+    if name is not None and name not in REPRESENTATIONS:
+        raise InputError(f"--by must be {' or '.join(REPRESENTATIONS)}, found {name!r}.")
     sensor = sets[0].sensor
     if name != "pixels":
         from r2flow.metrics.extractors import load_extractor
 
         kind = "embedded" if all(s.about["reflectance"] for s in sets) else "embedded_range"
-        try:
-            network = load_extractor(kind).to(device)
-            return Likeness("embedded", f"features of '{kind}' ({network.layer})", network.features, device)
-        except InputError:
-            if name is not None:
-                raise
-    return Likeness("pixels", "RMS difference of log-range in model space, pixel by pixel", _pixels(sensor), device)
+        network = load_extractor(kind).to(device)
+        return Representation("embedded", f"features of '{kind}' ({network.layer})", network.features, device)
+    return Representation(
+        "pixels", "RMS difference of log-range in model space, pixel by pixel", _pixels(sensor), device
+    )
 
 
 def _pixels(sensor: Sensor) -> Callable[[Scans], Tensor]:
@@ -113,7 +112,7 @@ def _pixels(sensor: Sensor) -> Callable[[Scans], Tensor]:
 
 
 def find_neighbours(
-    generated: ScanSet, training: ScanSet, held: ScanSet | None, likeness: Likeness, work: Work
+    generated: ScanSet, training: ScanSet, held: ScanSet | None, representation: Representation, work: Work
 ) -> Neighbours:
     """The nearest training scan of each generated and each held-out scan.
 
@@ -127,7 +126,7 @@ def find_neighbours(
     real = held if held is not None else training.part(chosen or [], "training scans, each without itself")
     if len(training) < (2 if held is None else 1):
         raise InputError(f"{training.label} holds {len(training)} training scans; needs at least two, or --real HELD.")
-    described = [_describe(s, likeness, work) for s in (generated, real)]
+    described = [_describe(s, representation, work) for s in (generated, real)]
     for (numbers, _), s in zip(described, (generated, real), strict=True):
         if len(numbers) == 0:
             raise InputError(f"none of the {len(s)} scans of {s.label} has a return: there is nothing to compare.")
@@ -135,8 +134,7 @@ def find_neighbours(
     with work.bar("reading training scans", len(training)) as advance, torch.no_grad():
         first = 0
         for images in training.batches(range(len(training)), work.batch_size, work.workers):
-            there = likeness.describe(Scans(images.to(likeness.device), training.sensor)).float().cpu()
-            there = there.nan_to_num(torch.inf)
+            there = representation.describe(Scans(images.to(representation.device), training.sensor)).float().cpu()
             for own, (queries, x) in enumerate(described):
                 d = _square_distances(x, there)
                 if own == 1 and chosen is not None:
@@ -147,18 +145,18 @@ def find_neighbours(
             first += len(there)
             advance(len(there))
     found = [
-        Nearest(s, queries, _exact(x, nearest, training, likeness, work), nearest.numpy())
+        Nearest(s, queries, _exact(x, nearest, training, representation, work), nearest.numpy())
         for s, (queries, x), (_, nearest) in zip((generated, real), described, best, strict=True)
     ]
-    return Neighbours(found[0], found[1], training, likeness, held is not None)
+    return Neighbours(found[0], found[1], training, representation, held is not None)
 
 
-def _describe(scans: ScanSet, likeness: Likeness, work: Work) -> tuple[np.ndarray, Tensor]:
-    """Numbers of the scans that have a return, and what they are compared by."""
+def _describe(scans: ScanSet, representation: Representation, work: Work) -> tuple[np.ndarray, Tensor]:
+    """Numbers of the scans that have a return, and their descriptions."""
     rows = []
     with work.bar("describing", len(scans)) as advance, torch.no_grad():
         for images in scans.batches(range(len(scans)), work.batch_size, work.workers):
-            rows.append(likeness.describe(Scans(images.to(likeness.device), scans.sensor)).float().cpu())
+            rows.append(representation.describe(Scans(images.to(representation.device), scans.sensor)).float().cpu())
             advance(len(images))
     x = torch.cat(rows)
     kept = x.isfinite().all(1)
@@ -166,15 +164,13 @@ def _describe(scans: ScanSet, likeness: Likeness, work: Work) -> tuple[np.ndarra
 
 
 def _square_distances(x: Tensor, y: Tensor) -> Tensor:
-    """|x - y|^2 by one product, (N, M): near enough to tell which is nearest; infinite where y is."""
-    away = y.isinf().any(1)
-    y = torch.where(away[:, None], 0.0, y)
+    """|x - y|^2 by one product, (N, M): exact enough to find the nearest; infinite where y is NaN."""
     d = x.square().sum(1)[:, None] + y.square().sum(1) - 2 * x @ y.T
-    return d.masked_fill(away, torch.inf)
+    return d.nan_to_num(torch.inf)
 
 
-def _exact(x: Tensor, nearest: Tensor, training: ScanSet, likeness: Likeness, work: Work) -> np.ndarray:
-    """|x - y| of each scan and its nearest training scan: the product's rounding would hide a copy."""
+def _exact(x: Tensor, nearest: Tensor, training: ScanSet, representation: Representation, work: Work) -> np.ndarray:
+    """|x - y| of each scan and its nearest training scan: the rounding of the product would hide a copy."""
     wanted = sorted(set(nearest.tolist()))
     place = {number: i for i, number in enumerate(wanted)}
     own = torch.tensor([place[number] for number in nearest.tolist()])
@@ -182,7 +178,7 @@ def _exact(x: Tensor, nearest: Tensor, training: ScanSet, likeness: Likeness, wo
     first = 0
     with torch.no_grad():
         for images in training.batches(wanted, work.batch_size, work.workers):
-            there = likeness.describe(Scans(images.to(likeness.device), training.sensor)).double().cpu()
+            there = representation.describe(Scans(images.to(representation.device), training.sensor)).double().cpu()
             mine = torch.nonzero((own >= first) & (own < first + len(there)))[:, 0]
             d[mine] = torch.linalg.vector_norm(x[mine].double() - there[own[mine] - first], dim=1)
             first += len(there)
@@ -190,7 +186,7 @@ def _exact(x: Tensor, nearest: Tensor, training: ScanSet, likeness: Likeness, wo
 
 
 def neighbours_page(found: Neighbours, pairs: int, command: str, device: str) -> Page:
-    """The sheet, the distances' distributions, and what they say."""
+    """The pairs, the distributions of the distances, and what these say."""
     usual = _usual(found)
     sets = [
         {
@@ -201,7 +197,7 @@ def neighbours_page(found: Neighbours, pairs: int, command: str, device: str) ->
         for name, one in (("generated", found.generated), (usual, found.real))
     ]  # fmt: skip
     near = "" if found.held_out else " Neighbouring frames of one drive are near-duplicates of each other: give --real."
-    how = f"Distance: {found.likeness.words}; to the nearest of {len(found.training)} training scans.{near}"
+    how = f"Distance: {found.representation.words}; to the nearest of {len(found.training)} training scans.{near}"
     text = [*sentences(found), how, table(sets, {key: key for key in sets[0]})]
     figures = {"neighbours": _sheet(found, pairs), "neighbours_distances": _distances(found, usual)}
     title = "Generated scans and their nearest training scans"
@@ -250,7 +246,7 @@ def _sheet(found: Neighbours, pairs: int) -> Figure:
     lines = max(map(len, chosen))
     height = 1.62 * lines + 0.2
     figure = blank_figure(17, height)
-    figure.set_layout_engine("none")  # the layout is a grid already, and working it out again takes seconds
+    figure.set_layout_engine("none")  # the grid is a layout already, and a computed one takes seconds
     figure.set_facecolor(BACKGROUND)
     grid = figure.add_gridspec(
         lines, 9, width_ratios=[2.3, 1, 2.3, 1, 0.12, 2.3, 1, 2.3, 1], wspace=0.03, hspace=0.16,
@@ -298,7 +294,7 @@ def _distances(found: Neighbours, usual: str) -> Figure:
         d = np.sort(one.distances)
         look: dict[str, Any] = {key: style[key] for key in ("linestyle", "color")}
         axes.step(d, np.arange(1, len(d) + 1) / len(d), where="post", **look, lw=1.6, label=f"{name} ({len(d)})")
-    axes.set(xlabel=found.likeness.words, ylabel="share of the scans", ylim=(0, 1.02))
+    axes.set(xlabel=found.representation.words, ylabel="share of the scans", ylim=(0, 1.02))
     axes.set_xlim(left=0)
     axes.grid(True, color="0.88", lw=0.6)
     axes.legend(fontsize=8, frameon=False)

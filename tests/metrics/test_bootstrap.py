@@ -41,11 +41,10 @@ def test_the_interval_of_a_mean_is_as_wide_as_statistics_say(scans_of):
         images = torch.full((n, 1, *sensor.shape), 10.0)
         images[:dropped] = 0
         metric.update(Scans(images, sensor), real)
-    found = bootstrap(metric, draws=2000, level=0.95)["drop_rate"]
+    low, high = bootstrap(metric, draws=2000, level=0.95)["drop_rate"]
     spread = 1.96 * math.sqrt(0.3 * 0.7 / 100 + 0.3 * 0.7 / 60)
-    assert found.low == pytest.approx(0.4 - spread, abs=0.1 * spread)
-    assert found.high == pytest.approx(0.4 + spread, abs=0.1 * spread)
-    assert abs(found.bias) < 0.01
+    assert low == pytest.approx(0.4 - spread, abs=0.1 * spread)
+    assert high == pytest.approx(0.4 + spread, abs=0.1 * spread)
 
 
 def test_every_metric_has_an_interval_around_its_figure_or_says_that_it_has_none(scans_of, summary, coarse):
@@ -55,9 +54,8 @@ def test_every_metric_has_an_interval_around_its_figure_or_says_that_it_has_none
         metric.update(scans_of(20, 2, scale=25), real=False)
         found = bootstrap(metric, draws=20)
         assert set(found) == (set(metric.compute()) if metric.resamples else set()), name
-        for figure, interval in found.items():
-            assert interval.low <= metric.compute()[figure] <= interval.high, figure
-            assert interval.low >= 0, figure
+        for figure, (low, high) in found.items():
+            assert 0 <= low <= metric.compute()[figure] <= high, figure
 
 
 def test_draws_are_the_seeds_alone(scans_of):

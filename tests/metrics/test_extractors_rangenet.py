@@ -140,7 +140,7 @@ def test_sizes_and_channels_that_the_network_cannot_take_are_said(network):
         subsample(torch.zeros(1, 32, 2, 32))
     with torch.device("meta"):
         with_reflectance = RangeNet53()
-    with pytest.raises(InputError, match="rangenet53 looks at reflectance"):
+    with pytest.raises(InputError, match="have no reflectance"):
         with_reflectance.features(scans(1, channels=1))
 
 

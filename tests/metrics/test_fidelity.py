@@ -9,7 +9,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
 from r2flow.metrics.fidelity import PANEL, PER_PIXEL, controls, distances, nearest, panel
 from r2flow.reports.compare import read_fidelity
-from r2flow.reports.fidelity import compare_sets, fidelity, load_scans, markdown
+from r2flow.reports.fidelity import compare_sets, load_scans, markdown
 from r2flow.reports.fidelity_page import fidelity_page
 from r2flow.reports.pages import write_page
 
@@ -28,6 +28,10 @@ def walls(count: int, seed: int) -> np.ndarray:
         r = np.where((r < 78) & (draw.random(r.shape) < 0.95), r, 0)
         images.append(np.stack([r, (r > 0) * draw.beta(2, 5, r.shape)]))
     return np.stack(images).astype(np.float32)
+
+
+def judged(*sets, **options):
+    return compare_sets(*sets, **options)[0]
 
 
 def test_js_distance_of_known_histograms():
@@ -59,7 +63,7 @@ def test_a_set_is_at_no_distance_from_itself_and_its_order_does_not_matter():
 
 def test_scenes_of_the_same_sort_beat_every_control():
     training = walls(40, 1)
-    result = fidelity(walls(40, 2), walls(40, 3), SENSOR, training)
+    result = judged(walls(40, 2), walls(40, 3), SENSOR, training)
     # Losses and reflectances are independent from pixel to pixel here, as the shuffled ones are.
     alike = {"changes per row", "run lengths", "drop rate by range", "drop rate by incidence", "reflectance pairs"}
     assert set(result["won"]) >= set(PANEL) - alike
@@ -89,7 +93,7 @@ def test_every_member_tells_real_drives_from_controls_and_no_other_statistic_doe
         [odometry / "00", raw / "2011_09_26_drive_0005_sync", real / "object"],
     )
     one, other = (np.concatenate([load_scans(path, Reading(sensor))[0] for path in half]) for half in halves)
-    result = fidelity(one, other, sensor, floor=other)
+    result = judged(one, other, sensor, floor=other)
     assert result["blind"] == []
     per_pixel = result["per_pixel"]
     for line in PER_PIXEL:
@@ -99,17 +103,17 @@ def test_every_member_tells_real_drives_from_controls_and_no_other_statistic_doe
 
 def test_the_floor_is_what_real_scans_come_to():
     real, other, elsewhere = walls(24, 2), walls(24, 3), walls(24, 4)
-    given = fidelity(real, other, SENSOR, floor=elsewhere)
+    given = judged(real, other, SENSOR, floor=elsewhere)
     assert given["floor_is"] == "other real scans"
     assert given["floor"] == distances(panel(elsewhere, SENSOR), panel(real, SENSOR))
     assert given["beyond"] == [line for line in PANEL if line not in given["blind"]
                                and given["sets"]["other"][line] > 2 * given["floor"][line]]  # fmt: skip
     # three drives, one of them of three scans, which is left out: the mean over pairs is that of one pair
     drives = ["a"] * 12 + ["b"] * 9 + ["c"] * 3
-    split = fidelity(real, other, SENSOR, drives=drives)
+    split = judged(real, other, SENSOR, drives=drives)
     assert split["floor_is"] == "drive against drive"
     assert split["floor"] == distances(panel(real[:12], SENSOR), panel(real[12:21], SENSOR))
-    alone = fidelity(real, other, SENSOR, drives=["a"] * 24)
+    alone = judged(real, other, SENSOR, drives=["a"] * 24)
     assert alone["floor"] == {}
     assert alone["floor_is"] is None
     assert "No floor" in markdown(alone)
@@ -118,7 +122,7 @@ def test_the_floor_is_what_real_scans_come_to():
 def test_a_member_that_does_not_tell_the_floor_from_controls_judges_nothing():
     real = walls(16, 2)
     rng = np.random.default_rng(0)
-    result = fidelity(real, walls(16, 3), SENSOR, floor=(real * rng.permuted(real > 0, axis=-1)).astype(np.float32))
+    result = judged(real, walls(16, 3), SENSOR, floor=(real * rng.permuted(real > 0, axis=-1)).astype(np.float32))
     assert "run lengths" in result["blind"]
     assert not set(result["blind"]) & {*result["won"], *result["lost"], *result["beyond"]}
     assert "Not judged" in markdown(result)
@@ -171,6 +175,6 @@ def test_a_copy_is_seen():
 def test_range_alone_leaves_reflectance_out():
     images = walls(4, 0)[:, :1]
     assert "reflectance pairs" not in panel(images, SENSOR)
-    result = fidelity(images, images, SENSOR)
+    result = judged(images, images, SENSOR)
     assert "reflectance pairs" not in result["sets"]["noise"]
     assert "reflectance histogram" not in result["per_pixel"]["noise"]

@@ -44,7 +44,7 @@ def measure(rank, ranks, folder):
             else:
                 metric.load_real_state(kept)
             give(metric, images(seed, 11), False, rank, ranks)
-            intervals = {name: [i.low, i.high] for name, i in bootstrap(metric, draws=5).items()}
+            intervals = {name: list(ends) for name, ends in bootstrap(metric, draws=5).items()}
             found.append([metric.compute(), metric.remarks(), intervals])
     return found
 

@@ -11,7 +11,7 @@ from r2flow.data.sources import Reading
 from r2flow.errors import InputError
 from r2flow.evaluation.measuring import Work
 from r2flow.lidar.sensors import SENSORS
-from r2flow.reports.neighbours import find_neighbours, likeness_of, pair_rows, sentences
+from r2flow.reports.neighbours import find_neighbours, pair_rows, representation_of, sentences
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_evaluation import folder, images
 
@@ -34,7 +34,7 @@ def log_range(image: np.ndarray) -> np.ndarray:
 
 def test_each_is_beside_its_nearest_by_the_rms_of_log_range(sets):
     found = find_neighbours(
-        sets["generated"], sets["training"], sets["held"], likeness_of("pixels", [*sets.values()], "cpu"), Work(2)
+        sets["generated"], sets["training"], sets["held"], representation_of("pixels", [*sets.values()], "cpu"), Work(2)
     )
     for one, name in ((found.generated, "generated"), (found.real, "held")):
         a, b = (
@@ -51,7 +51,7 @@ def test_each_is_beside_its_nearest_by_the_rms_of_log_range(sets):
 @pytest.mark.parametrize("by", ["pixels", "embedded"])
 def test_a_copy_is_told(sets, by):
     found = find_neighbours(
-        sets["generated"], sets["training"], sets["held"], likeness_of(by, [*sets.values()], "cpu"), Work()
+        sets["generated"], sets["training"], sets["held"], representation_of(by, [*sets.values()], "cpu"), Work()
     )
     nearer, copies = sentences(found)
     assert by == "embedded" or nearer.startswith("1 of 6 generated scans lie nearer")
@@ -63,7 +63,7 @@ def test_a_copy_is_told(sets, by):
 
 def test_without_held_out_scans_training_scans_are_compared_to_the_others(sets):
     found = find_neighbours(
-        sets["generated"], sets["training"], None, likeness_of("pixels", [*sets.values()], "cpu"), Work(4)
+        sets["generated"], sets["training"], None, representation_of("pixels", [*sets.values()], "cpu"), Work(4)
     )
     assert (found.real.neighbours != found.real.numbers).all()
     assert (found.real.distances > 0.1).all()
@@ -74,14 +74,14 @@ def test_scans_without_a_return_have_no_neighbour(sets, tmp_path):
     made = images(3, 2)
     made[1] = 0
     with_empty = open_scans(str(folder(tmp_path / "e", made)), Reading(SENSOR))
-    likeness = likeness_of("pixels", [with_empty], "cpu")
-    found = find_neighbours(with_empty, sets["training"], sets["held"], likeness, Work())
+    representation = representation_of("pixels", [with_empty], "cpu")
+    found = find_neighbours(with_empty, sets["training"], sets["held"], representation, Work())
     assert found.generated.numbers.tolist() == [0, 2]
     nothing = with_empty.part([1], "empty")
     with pytest.raises(InputError, match="none of the 1 scans"):
-        find_neighbours(nothing, sets["training"], sets["held"], likeness, Work())
+        find_neighbours(nothing, sets["training"], sets["held"], representation, Work())
     # nor are they one
-    found = find_neighbours(sets["generated"], with_empty, sets["held"], likeness, Work())
+    found = find_neighbours(sets["generated"], with_empty, sets["held"], representation, Work())
     assert 1 not in found.generated.neighbours
 
 

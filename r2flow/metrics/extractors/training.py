@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,6 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 import r2flow
-from r2flow.checkpoints import read_checkpoint
-from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.hashing import state_hash
 from r2flow.lidar.labels import LABELS
@@ -29,11 +27,10 @@ from r2flow.stages.base import learning_rate_factor
 IGNORED = -1  # class of pixels that are not learned from
 LEARNING_RATE, WARMUP, WEIGHT_DECAY = 2e-3, 100, 1e-2
 RANGE_ALONE = 1 / 3  # share of scans that are shown without reflectance
-# Share of scans whose ranges are disturbed, and by how much: metres, standard deviation, log-uniform. A network that is
-# shown the simulator's few millimetres alone reads them, and takes a wall with 3 cm of noise for grass.
+# Share of scans with noise on their ranges, and its standard deviation in metres, log-uniform. A network that only ever
+# sees the simulator's few millimetres of noise takes a wall with 3 cm of it for grass.
 NOISY, NOISE = 1 / 2, (0.003, 1.0)
 MOMENTUM = 0.02  # of batch norm's averages, slow because sensors take turns
-SAVE_EVERY = 100  # steps
 COUNTED = 32  # scans that the frequencies of classes are counted on
 HELD_OUT, HELD_OUT_FROM = 16, 2**32  # scenes of each sensor to judge on, and where they begin: beyond any training's
 
@@ -45,7 +42,7 @@ VIEWS: tuple[str, ...] = (
 
 @dataclass(frozen=True)
 class Settings:
-    """What the weights depend on.
+    """The settings that the weights depend on.
 
     Attributes:
         seed: Of scenes, initial weights and augmentation.
@@ -66,7 +63,7 @@ class Settings:
         return build_sensor(name, rows, columns)
 
     def command(self) -> str:
-        """What is typed for them; --out and --workers change nothing of the weights."""
+        """The command that trains them; --out and --workers do not change the weights."""
         words = f"r2flow train-extractor --seed {self.seed} --steps {self.steps} --batch-size {self.batch_size}"
         if self.views == VIEWS:
             return words
@@ -74,12 +71,12 @@ class Settings:
         return f"{words} --sensor {name} --size {size}"
 
     def simulator(self) -> str:
-        """What the simulator makes of a seed: 12 digits of the SHA-256 of one scan."""
+        """The simulator's version: 12 digits of the SHA-256 of one scan."""
         scan = simulate(SENSORS["hdl64e"], self.seed, 0)
         return hashlib.sha256(scan.image.tobytes() + scan.labels.tobytes()).hexdigest()[:12]
 
     def notes(self) -> dict[str, Any]:
-        """What makes the weights again: command, settings, simulator and versions, as plain values."""
+        """Everything that is needed to train the weights again, as plain values."""
         return {
             "command": self.command(),
             "settings": {**asdict(self), "views": list(self.views)},
@@ -110,9 +107,7 @@ def labelled(sensor: Sensor, seed: int, scenes: Sequence[int]) -> tuple[Tensor, 
 
 
 class Batches(Dataset[tuple[Tensor, Tensor]]):
-    """The batch of each step: scenes that were never shown before, every other one mirrored, each turned at random, and
-    every other one's ranges disturbed by noise of a level of its own.
-    """
+    """The batch of each step: new scenes, turned at random, half of them mirrored, half with noise on their ranges."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -152,103 +147,63 @@ def class_weights(settings: Settings) -> Tensor:
     return (weights / (weights * share).sum()).float()
 
 
-class Training:
-    """One training, which can be killed and goes on from `OUT.progress` when it is made again.
+def train(settings: Settings, workers: int = 0, advance: Callable[[], None] = lambda: None) -> SegmentationNetwork:
+    """A trained network, in evaluation mode.
 
-    Raises:
-        InputError: the progress found is that of other settings.
+    Args:
+        workers: Processes that simulate beside this one; the weights do not depend on it.
+        advance: Called after each step.
     """
-
-    def __init__(self, settings: Settings, out: str | Path) -> None:
-        self.settings, self.out = settings, Path(out)
-        self.progress = self.out.with_name(f"{self.out.name}.progress")
-        self.notes = settings.notes()
-        with torch.random.fork_rng(devices=[]):
-            seed_torch(settings.seed, "weights")
-            self.network = SegmentationNetwork()
-        for module in self.network.modules():
-            if isinstance(module, torch.nn.BatchNorm2d):
-                module.momentum = MOMENTUM
-        self.optimizer = torch.optim.AdamW(self.network.parameters(), LEARNING_RATE, weight_decay=WEIGHT_DECAY)
-        self.step = 0
-        if self.progress.is_file():
-            self._resume()
-        self.weights = class_weights(settings)
-
-    def _resume(self) -> None:
-        state = read_checkpoint(self.progress)
-        if state.get("notes") != self.notes:
-            raise InputError(
-                f"{self.progress} belongs to a training with other settings, versions, threads or simulator; delete it "
-                "to begin anew, or give another --out."
-            )
-        self.network.load_state_dict(state["network"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.step = state["step"]
-
-    def run(self, workers: int = 0, advance: Callable[[], None] = lambda: None) -> None:
-        """Train to the end.
-
-        Args:
-            workers: Processes that simulate beside this one; the weights do not depend on it.
-            advance: Called after each step.
-        """
-        self.network.train()
-        for images, classes in self._batches(workers):
-            self._step(images, classes)
-            self.step += 1
-            if self.step % SAVE_EVERY == 0:
-                self._save_progress()
-            advance()
-        self._save_progress()
-
-    def _batches(self, workers: int) -> Iterator[tuple[Tensor, Tensor]]:
-        steps = range(self.step, self.settings.steps)
-        return iter(DataLoader(Batches(self.settings), batch_size=None, sampler=steps, num_workers=workers))
-
-    def _step(self, images: Tensor, classes: Tensor) -> None:
-        for group in self.optimizer.param_groups:
-            group["lr"] = LEARNING_RATE * learning_rate_factor(self.step + 1, WARMUP, self.settings.steps + 1)
-        scans = Scans(images, self.settings.sensor(self.step))
+    with torch.random.fork_rng(devices=[]):
+        seed_torch(settings.seed, "weights")
+        network = SegmentationNetwork()
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.momentum = MOMENTUM
+    optimizer = torch.optim.AdamW(network.parameters(), LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+    weights = class_weights(settings)
+    network.train()
+    for step, (images, classes) in enumerate(DataLoader(Batches(settings), batch_size=None, num_workers=workers)):
+        for group in optimizer.param_groups:
+            group["lr"] = LEARNING_RATE * learning_rate_factor(step + 1, WARMUP, settings.steps + 1)
+        scans = Scans(images, settings.sensor(step))
         x = inputs(scans, reflectance=True)
-        # Scan by scan, not step by step: batch norm must meet the same mixture that its averages describe.
-        hidden = generator(self.settings.seed, "dropout", self.step).random(len(scans)) < RANGE_ALONE
+        # Drawn for each scan, not for each step: batch norm then sees the mixture that its averages describe.
+        hidden = generator(settings.seed, "dropout", step).random(len(scans)) < RANGE_ALONE
         x[torch.from_numpy(hidden), REFLECTANCE] = 0
-        loss = F.cross_entropy(self.network(x), targets(scans, classes), self.weights, ignore_index=IGNORED)
-        self.optimizer.zero_grad()
+        loss = F.cross_entropy(network(x), targets(scans, classes), weights, ignore_index=IGNORED)
+        optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self.optimizer.step()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimizer.step()
+        advance()
+    return network.eval()
 
-    def _save_progress(self) -> None:
-        state = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict()}
-        with atomic_write(self.progress) as file:
-            torch.save({**state, "step": self.step, "notes": self.notes}, file)
 
-    def finish(self) -> dict[str, dict[str, float]]:
-        """Judge the network on held-out scenes and write it.
+def judge_held_out(network: SegmentationNetwork, settings: Settings) -> dict[str, dict[str, float]]:
+    """Accuracy of pixels and mean intersection over union on held-out scenes, by view and by what is shown of it."""
+    judged = {}
+    for view in dict.fromkeys(settings.views):
+        sensor = settings.sensor(settings.views.index(view))
+        images, classes = labelled(sensor, settings.seed, range(HELD_OUT_FROM, HELD_OUT_FROM + HELD_OUT))
+        for reflectance in (True, False):
+            shown = "range and reflectance" if reflectance else "range alone"
+            judged[f"{view}, {shown}"] = judge(network, Scans(images, sensor), classes, reflectance)
+    return judged
 
-        Returns:
-            By view and what is shown of it: accuracy of pixels and mean intersection over union.
-        """
-        from safetensors.torch import save
 
-        self.network.eval()
-        judged = {}
-        for view in dict.fromkeys(self.settings.views):
-            sensor = self.settings.sensor(list(self.settings.views).index(view))
-            images, classes = labelled(sensor, self.settings.seed, range(HELD_OUT_FROM, HELD_OUT_FROM + HELD_OUT))
-            for reflectance in (True, False):
-                shown = "range and reflectance" if reflectance else "range alone"
-                judged[f"{view}, {shown}"] = judge(self.network, Scans(images, sensor), classes, reflectance)
-        state = {name: value.contiguous() for name, value in self.network.state_dict().items()}
-        notes = {**self.notes, "held_out": judged, "weights_sha256": state_hash(state)}
-        # one entry: the order of several would change from one writing to the next
-        data = save(state, metadata={"r2flow-extractor": json.dumps(notes)})
-        with atomic_write(self.out) as file:
-            file.write(data)
-        self.progress.unlink(missing_ok=True)
-        return judged
+def write_weights(
+    path: str | Path, network: SegmentationNetwork, settings: Settings, judged: Mapping[str, Mapping[str, float]]
+) -> None:
+    """Write a network with the notes on its training."""
+    from safetensors.torch import save
+
+    state = {name: value.contiguous() for name, value in network.state_dict().items()}
+    notes = {**settings.notes(), "held_out": judged, "weights_sha256": state_hash(state)}
+    # One entry: several would be written in changing order.
+    data = save(state, metadata={"r2flow-extractor": json.dumps(notes)})
+    with atomic_write(path) as file:
+        file.write(data)
 
 
 def targets(scans: Scans, classes: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Every flow at every number of evaluations, measured once and kept: a report that was stopped goes on."""
+"""Every flow at every number of evaluations, measured once and kept, so that a stopped report goes on."""
 
 import json
 import statistics
@@ -16,7 +16,7 @@ from r2flow.files import atomic_write
 from r2flow.metrics.base import ScanMetric, Side
 from r2flow.metrics.birds_eye import BINS
 from r2flow.metrics.jsd import JSD
-from r2flow.reports.paper.subjects import Subject
+from r2flow.reports.paper.subjects import PaperRun
 from r2flow.reports.speed_quality import BETWEEN
 from r2flow.sampling import sample
 
@@ -41,16 +41,16 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Bench:
-    """What all cells have in common.
+class CellSettings:
+    """What is the same for all cells.
 
     Attributes:
         real: The scans that all are compared with.
         metrics: By name, `jsd` among them.
         gathered: Their statistics of the real scans.
         num: Scans of each flow.
-        bootstrap: Resamplings for the interval of a figure; 0 for none.
-        work: How it is done.
+        bootstrap: Resamples for the intervals of the figures; 0 for none.
+        work: How the work is done.
         folder: Where finished cells are kept.
         device: What the networks run on.
     """
@@ -64,8 +64,8 @@ class Bench:
     folder: Path
     device: str
 
-    def path(self, subject: Subject, steps: int) -> Path:
-        """A cell's file, named by all that it is a function of."""
+    def path(self, subject: PaperRun, steps: int) -> Path:
+        """A cell's file, named by everything that it depends on."""
         key = point_key(
             self.real, self.metrics, weights=subject.weights, steps=steps, num=self.num, seed=SEED,
             bootstrap=self.bootstrap, device=self.device,
@@ -73,32 +73,32 @@ class Bench:
         return self.folder / f"{key}.safetensors"
 
 
-def steps_of(subject: Subject, steps: Sequence[int]) -> list[int]:
-    """A distilled flow is measured at its own number of steps alone; it was not trained for another."""
+def steps_of(subject: PaperRun, steps: Sequence[int]) -> list[int]:
+    """A distilled flow is measured at its own number of steps only; it was trained for no other."""
     return list(steps) if subject.steps is None else [subject.steps]
 
 
-def measure_cells(bench: Bench, flow: Checkpoint, subject: Subject, steps: Sequence[int]) -> Iterator[Cell]:
-    """The cells of one flow, kept as each is done."""
+def measure_cells(settings: CellSettings, flow: Checkpoint, subject: PaperRun, steps: Sequence[int]) -> Iterator[Cell]:
+    """The cells of one flow, each kept when it is done."""
     for count in steps_of(subject, steps):
-        path = bench.path(subject, count)
+        path = settings.path(subject, count)
         cell = _read(path)
         if cell is None:
-            cell = _measure(bench, flow, subject, count)
+            cell = _measure(settings, flow, subject, count)
             _write(path, cell)
-        # Names and places, and which other runs there are, may have changed since.
+        # The run's name and folder, and the other runs of its chain, may have changed since.
         row = {**cell.row, "label": subject.label, "role": subject.role, "family": subject.family, "kind": subject.kind}
         yield Cell(row, cell.birds_eye, cell.images)
 
 
-def _measure(bench: Bench, flow: Checkpoint, subject: Subject, steps: int) -> Cell:
+def _measure(settings: CellSettings, flow: Checkpoint, subject: PaperRun, steps: int) -> Cell:
     sampler = flow.generator.sampler.changed(steps=steps)
-    drawn = sampled_set(flow, f"{subject.label}, {steps} steps", bench.num, sampler, SEED)
-    found = measure(bench.metrics, bench.gathered, drawn, bench.work, bench.bootstrap)
+    drawn = sampled_set(flow, f"{subject.label}, {steps} steps", settings.num, sampler, SEED)
+    found = measure(settings.metrics, settings.gathered, drawn, settings.work, settings.bootstrap)
     assert isinstance(drawn.source, SampledScans)
     row: dict[str, Any] = {
         "label": subject.label, "role": subject.role, "family": subject.family, "seed": subject.seed, "steps": steps,
-        "scans": bench.num, "seconds": statistics.median(drawn.source.seconds),
+        "scans": settings.num, "seconds": statistics.median(drawn.source.seconds),
     }  # fmt: skip
     for one in found:
         first = next(iter(one.figures))
@@ -106,13 +106,13 @@ def _measure(bench: Bench, flow: Checkpoint, subject: Subject, steps: int) -> Ce
         if first in one.intervals:
             row[f"{one.metric}_low"], row[f"{one.metric}_high"] = one.intervals[first]
     row["remarks"] = BETWEEN.join(dict.fromkeys(remark for one in found for remark in one.remarks))
-    counts = counts_of(bench.metrics["jsd"], "generated")
-    images = np.concatenate([s.images.numpy() for s in sample(flow, min(SHOWN, bench.num), SEED, sampler=sampler)])
+    counts = counts_of(settings.metrics["jsd"], "generated")
+    images = np.concatenate([s.images.numpy() for s in sample(flow, min(SHOWN, settings.num), SEED, sampler=sampler)])
     return Cell(row, counts, images)
 
 
 def counts_of(jsd: ScanMetric, side: Side) -> np.ndarray:
-    """Points from above of one side's scans together, (100, 100), which the JSD compares."""
+    """The bird's-eye histogram of all scans of a side, (100, 100), which the JSD compares."""
     assert isinstance(jsd, JSD)
     total = jsd.real_sum if side == "real" else jsd.generated_sum
     return total.cpu().numpy().reshape(BINS, BINS)

@@ -1,4 +1,4 @@
-"""The paper's qualitative claims, each judged on our own figures: holds, does not hold, cannot tell."""
+"""The paper's qualitative claims, each judged by our own figures: holds, does not hold, cannot tell."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -11,23 +11,23 @@ from r2flow.reports.tables import Row, shown
 HOLDS, FAILS, UNKNOWN = "holds", "does not hold", "cannot tell"
 
 CLOSE = 1.1  # a distance up to a tenth larger counts as comparable; the paper's own lie at 0.99 to 1.26
-MANY = 16  # evaluations at least that stand for the paper's 256
+MANY = 16  # evaluations; at least this many stand for the paper's 256
 FEW = (1, 2, 4)  # evaluations at which the paper's figure 6 is read
 
 # Two-sided 95 % quantiles of Student's t by degrees of freedom.
 _T = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
-_T_MORE = 2.201  # from eleven degrees on: a little too wide for more
+_T_MORE = 2.201  # for eleven degrees or more: slightly too wide for more than eleven
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim and what became of it.
+    """One claim and its verdict.
 
     Attributes:
         text: What the paper says.
         source: Where it says so.
         verdict: `HOLDS`, `FAILS` or `UNKNOWN`.
-        evidence: The figures that decided, or what is missing.
+        evidence: The figures that decide, or what is missing.
     """
 
     text: str
@@ -38,7 +38,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class At:
-    """A flow at a number of evaluations, as `At("2-RF", 1)`; None stands for the most, where they are many."""
+    """A flow at a number of evaluations, as `At("2-RF", 1)`; None stands for its most, if at least `MANY`."""
 
     role: str
     steps: int | None
@@ -50,9 +50,9 @@ class At:
 def judge_less(rows: Sequence[Row], a: At, b: At, metric: str) -> tuple[str, str]:
     """Whether a's distance is below b's: the verdict and its figures.
 
-    Flows of one chain are compared with each other. Of several chains the mean of log(b / a) is held against its 95 %
-    interval by Student's t. A single chain has only the bootstrap's intervals over scans: where they overlap, or were
-    not asked for, nothing can be told.
+    Flows of one chain are compared with each other. For several chains the 95 % interval of the mean of log(b / a), by
+    Student's t, decides. A single chain has only the bootstrap intervals over scans: where they overlap or are missing,
+    there is no verdict.
     """
     left, right = _by_family(rows, a, metric), _by_family(rows, b, metric)
     families = sorted(left.keys() & right.keys())
@@ -93,7 +93,7 @@ def _sign(low: float, high: float) -> str:
 
 
 def _by_family(rows: Sequence[Row], at: At, metric: str) -> dict[str, Row]:
-    """The chain's row for each chain that has it measured; of several runs in one role, the mean of their figures."""
+    """A row for each chain that has the flow; for several runs in one role, the mean of their figures."""
     mine = [row for row in rows if row["role"] == at.role and _known(row.get(metric))]
     if at.steps is None and mine:
         most = max(row["steps"] for row in mine)
@@ -112,7 +112,7 @@ def _known(value: Any) -> bool:
 
 
 def together(verdicts: Mapping[str, tuple[str, str]]) -> tuple[str, str]:
-    """One verdict from one for each metric: it holds where no metric contradicts it and one at least says so."""
+    """One verdict from those of the metrics: it holds where none contradicts it and at least one confirms it."""
     words = {verdict for verdict, _ in verdicts.values()}
     overall = FAILS if FAILS in words else HOLDS if HOLDS in words else UNKNOWN
     names: dict[tuple[str, str], list[str]] = {}
@@ -127,7 +127,7 @@ def together(verdicts: Mapping[str, tuple[str, str]]) -> tuple[str, str]:
 
 
 def all_of(verdicts: Mapping[str, tuple[str, str]]) -> tuple[str, str]:
-    """One verdict from several comparisons, all of which have to hold."""
+    """One verdict from several comparisons, all of which must hold."""
     words = [verdict for verdict, _ in verdicts.values()]
     overall = FAILS if FAILS in words else UNKNOWN if UNKNOWN in words else HOLDS
     if len(verdicts) == 1:
@@ -148,7 +148,7 @@ def claims(
         curved: A row for each flow: family, role, integral_normalised, first_tenth, last_tenth, paths_dropped,
             dropped_share.
         architectures: A row for each 1-RF at the most evaluations: seed, steps, backbone, gmac, position, the metrics
-            and marginals, how far those of figure 5 lie from the data's.
+            and marginals, the distance of figure 5's marginals from the data's.
     """
 
     def less(text: str, source: str, *pairs: tuple[At, At]) -> Claim:
@@ -171,7 +171,7 @@ def claims(
 
 
 def comparable(rows: Sequence[Row], metrics: Sequence[str]) -> Claim:
-    """Whether a distilled flow's few steps come near its parent's many on some metric."""
+    """Whether a distilled flow's few steps come close to its parent's many on some metric."""
     text = "On some metrics 2-TD or 4-TD come close to many evaluations of the 2-RF."
     ratios: dict[str, tuple[float, float]] = {}
     for metric in metrics:
@@ -192,7 +192,7 @@ def comparable(rows: Sequence[Row], metrics: Sequence[str]) -> Claim:
 
 
 def _ratio(pairs: Sequence[tuple[Row, Row]], metric: str) -> tuple[float, float]:
-    """Where x / y lies, by seeds or, of one, by its intervals over scans; anywhere where it has none."""
+    """The interval of x / y: over seeds or, for one seed, from its intervals over scans; (0, inf) without these."""
     if len(pairs) > 1:
         low, high = _interval([math.log(x[metric] / y[metric]) for x, y in pairs])
         return math.exp(low), math.exp(high)
@@ -225,7 +225,7 @@ def _drops_bend(row: Row) -> tuple[float, str]:
 
 
 def _of_role(curved: Sequence[Row], role: str, margin: Callable[[Row], tuple[float, str]]) -> tuple[str, str]:
-    """Whether the flows of a role lie above 0 by a margin, whose 95 % interval is over seeds."""
+    """Whether a margin is above 0 for the flows of a role, by its 95 % interval over seeds."""
     found = [margin(row) for row in curved if row["role"] == role]
     if not found:
         return UNKNOWN, f"no run of {role}"

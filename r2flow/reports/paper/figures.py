@@ -1,4 +1,4 @@
-"""The paper's figures 5 and 6 from what was measured; 3, 7 and 8 are drawn where they are drawn for one run."""
+"""The paper's figures 5 and 6; figures 3, 7 and 8 are drawn by the reports on single runs."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,11 +6,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from r2flow.metrics.birds_eye import js_distance
+from r2flow.metrics.birds_eye import EXTENT, js_distance
 from r2flow.reports.pages import STYLES, blank_figure, few_log_ticks
 from r2flow.reports.tables import Row
-
-REACH = 80  # metres from the sensor to each side of a bird's-eye histogram
 
 
 def marginals(birds_eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -36,7 +34,7 @@ def birds_eye_figure(real: np.ndarray, flows: Mapping[str, np.ndarray]) -> Figur
         share = counts / max(counts.sum(), 1)
         # Ahead is up and left is left, as in every other picture from above.
         picture = np.log10(share[::-1, ::-1] + 1e-7)
-        extent = (REACH, -REACH, -REACH, REACH)
+        extent = (EXTENT, -EXTENT, -EXTENT, EXTENT)
         axes.imshow(picture, extent=extent, cmap="magma", vmin=-6, vmax=-2, aspect="auto")
         axes.set(xlabel="y, m", ylabel="x, m" if place == 0 else "", xticks=(60, 0, -60), yticks=(-60, 0, 60))
         axes.tick_params(labelsize=7, labelleft=place == 0)
@@ -49,7 +47,7 @@ def birds_eye_figure(real: np.ndarray, flows: Mapping[str, np.ndarray]) -> Figur
 
 def _draw_marginals(above: Any, beside: Any, counts: np.ndarray, real: np.ndarray) -> None:
     """Shares along y above and along x beside, the data's dotted."""
-    centres = (np.arange(100) + 0.5) / 100 * 2 * REACH - REACH
+    centres = (np.arange(100) + 0.5) / 100 * 2 * EXTENT - EXTENT
     for histogram, style in ((counts, {"color": "#1f6fb4", "lw": 1.0}), (real, {"color": "0.2", "lw": 0.8, "ls": ":"})):
         along_x, along_y = (m / max(m.sum(), 1) for m in marginals(histogram))
         above.plot(centres, along_y, **style)

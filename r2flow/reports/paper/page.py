@@ -1,4 +1,4 @@
-"""The page: tables and figures in the paper's order, each with what it is to be compared with."""
+"""The page of the paper's report: tables and figures in the paper's order, beside the printed ones."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from r2flow.reports.pages import Page, picture
 from r2flow.reports.paper.cells import Cell
 from r2flow.reports.paper.claims import FAILS, HOLDS, UNKNOWN, Claim, claims
 from r2flow.reports.paper.figures import birds_eye_figure, trade_off_figure
-from r2flow.reports.paper.subjects import Subject
+from r2flow.reports.paper.subjects import PaperRun
 from r2flow.reports.paper.tables import (
     architectures_table,
     beside,
@@ -30,8 +30,8 @@ from r2flow.reports.speed_quality import BETWEEN
 
 
 @dataclass(frozen=True)
-class Measured:
-    """All that the page is made of.
+class PaperResults:
+    """Everything that the page is made of.
 
     Attributes:
         subjects: The runs.
@@ -44,7 +44,7 @@ class Measured:
         between: Figure 3's frames, None where it was left out.
     """
 
-    subjects: Sequence[Subject]
+    subjects: Sequence[PaperRun]
     real: ScanSet
     cells: Sequence[Cell]
     birds_eye: np.ndarray
@@ -55,7 +55,7 @@ class Measured:
 
 
 def paper_page(
-    measured: Measured, metrics: Sequence[str], missing: Mapping[str, str], num: int, command: str, device: str,
+    measured: PaperResults, metrics: Sequence[str], missing: Mapping[str, str], num: int, command: str, device: str,
     seeds: Mapping[str, int],
 ) -> Page:  # fmt: skip
     """The page, still to be written."""
@@ -71,10 +71,10 @@ def paper_page(
     text = [
         f"{len(measured.subjects)} runs; {num} scans of each flow and number of Euler steps, all from the same noise, "
         f"against {len(measured.real)} scans ({measured.real.label}).",
-        "## What the paper says, and what came out here",
+        "## The paper's claims, judged here",
         tally(found),
         claims_table(found),
-        "*Holds* and *does not hold* are said where seeds, or for one seed the intervals over scans, leave no doubt.",
+        "*Holds* and *does not hold* are decided by the intervals over seeds or, for one seed, over scans.",
         "## What differs from the paper",
         "\n".join(f"- {part}" for part in parts),
         "## Table I: methods and metrics",
@@ -106,7 +106,7 @@ def paper_page(
 
 
 def remarks_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What a reader of the figures must know, each once: too few scans for a covariance, empty scans."""
+    """The remarks on the figures, each once."""
     said = dict.fromkeys(remark for row in rows for remark in str(row.get("remarks") or "").split(BETWEEN) if remark)
     return ["\n".join(f"- {remark}" for remark in said)] if said else []
 
@@ -119,8 +119,8 @@ def _placed(figures: Mapping[str, Figure], name: str, title: str) -> list[str]:
     return [title, picture(name)] if name in figures else []
 
 
-def curved_rows(measured: Measured) -> list[dict[str, Any]]:
-    """What `claims` needs of the paths."""
+def curved_rows(measured: PaperResults) -> list[dict[str, Any]]:
+    """The rows on the paths that `claims` takes."""
     known = {one.label: one for one in measured.subjects}
     return [
         {**summary(paths), "role": known[label].role, "family": known[label].family}
@@ -128,8 +128,10 @@ def curved_rows(measured: Measured) -> list[dict[str, Any]]:
     ]
 
 
-def figures_of(measured: Measured, rows: Sequence[dict[str, Any]], headings: Mapping[str, str]) -> dict[str, Figure]:
-    """By name; one that has nothing to show is left out."""
+def figures_of(
+    measured: PaperResults, rows: Sequence[dict[str, Any]], headings: Mapping[str, str]
+) -> dict[str, Figure]:
+    """The figures by name; one without data is left out."""
     rays = measured.real.sensor.rays()
     figures: dict[str, Figure] = {}
     if measured.between is not None:
@@ -145,8 +147,8 @@ def figures_of(measured: Measured, rows: Sequence[dict[str, Any]], headings: Map
     return figures
 
 
-def from_above(measured: Measured) -> dict[str, np.ndarray]:
-    """Points of every kind of 1-RF at the most evaluations, those of its seeds added."""
+def from_above(measured: PaperResults) -> dict[str, np.ndarray]:
+    """The bird's-eye histogram of every kind of 1-RF at the most evaluations, added up over its seeds."""
     known = {one.label: one for one in measured.subjects}
     roots = [cell for cell in measured.cells if cell.row["role"] == "1-RF"]
     most = max(cell.row["steps"] for cell in roots)
@@ -158,7 +160,7 @@ def from_above(measured: Measured) -> dict[str, np.ndarray]:
     return added
 
 
-def scans_figure(measured: Measured) -> Figure:
+def scans_figure(measured: PaperResults) -> Figure:
     """Figure 7: a real scan, then the first scan of every flow of the first chain at the steps that table I has."""
     family = measured.cells[0].row["family"]
     chain = [cell for cell in measured.cells if cell.row["family"] == family]
@@ -178,14 +180,14 @@ def tally(found: Sequence[Claim]) -> str:
     )
 
 
-def data_in_words(subjects: Sequence[Subject]) -> str:
+def data_in_words(subjects: Sequence[PaperRun]) -> str:
     """What the 1-RFs were trained on."""
     names = {str(one.config["data"]["name"]): one.config.get("scans", "") for one in subjects if one.role == "1-RF"}
     return "; ".join(f"{name} ({scans})" if scans else name for name, scans in names.items())
 
 
-def images_seen(subjects: Sequence[Subject]) -> list[int]:
-    """Images that each 1-RF took its steps on."""
+def images_seen(subjects: Sequence[PaperRun]) -> list[int]:
+    """Training images of each 1-RF."""
     return [
         int(one.config["trainer"]["max_steps"]) * int(one.config["data"]["batch_size"])
         for one in subjects

@@ -1,4 +1,4 @@
-"""What the paper prints: its tables I and II, to set our own figures beside.
+"""The figures that the paper prints: its tables I and II.
 
 *Fast LiDAR Data Generation with Rectified Flows* (R2Flow, ICRA 2025): KITTI-360, 10,000 generated scans of 64 x 1024
 against all real ones, Euler steps, NVIDIA RTX 6000 Ada.
@@ -6,7 +6,7 @@ against all real ones, Euler steps, NVIDIA RTX 6000 Ada.
 
 from typing import NamedTuple
 
-# Metric's name in `r2flow.metrics` -> (heading, what the paper multiplies it with).
+# Metric's name in `r2flow.metrics` -> (heading, the factor that the paper prints it with).
 COLUMNS = {
     "frd": ("FRD", 1.0),
     "frid": ("FRID", 1.0),
@@ -25,7 +25,7 @@ class Printed(NamedTuple):
         method: As the paper names it.
         role: "1-RF", "2-RF", "1-TD", ... for the paper's own flows, None for others' methods.
         evaluations: NFE.
-        figures: In the order of `COLUMNS`, None where the paper has none; JSD and MMD as multiplied there.
+        figures: In the order of `COLUMNS`, with its factors; None where the paper has none.
     """
 
     method: str

@@ -1,7 +1,7 @@
 """Measure what the paper's tables and figures show, flow by flow, and write the page."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,10 @@ from r2flow.metrics.base import ScanMetric
 from r2flow.reports.compare import cost
 from r2flow.reports.curvature import Paths, measure_paths
 from r2flow.reports.pages import Page
-from r2flow.reports.paper.cells import SEED, Bench, Cell, counts_of, measure_cells
+from r2flow.reports.paper.cells import SEED, Cell, CellSettings, counts_of, measure_cells
 from r2flow.reports.paper.figures import marginals_apart
-from r2flow.reports.paper.page import Measured, paper_page
-from r2flow.reports.paper.subjects import Subject
+from r2flow.reports.paper.page import PaperResults, paper_page
+from r2flow.reports.paper.subjects import PaperRun
 from r2flow.runs import read_config
 
 FRAMES = 6  # of figure 3, as in the paper: both ends' round trips and four between
@@ -51,37 +51,44 @@ class Budget:
     tolerance: float | None
 
 
+@dataclass(frozen=True)
+class PaperMetrics:
+    """Which distances are measured.
+
+    Attributes:
+        built: By name; `jsd` is among them.
+        missing: The paper's metrics that are not, and why.
+    """
+
+    built: Mapping[str, ScanMetric]
+    missing: Mapping[str, str]
+
+
 def report(
-    subjects: Sequence[Subject],
+    subjects: Sequence[PaperRun],
     out: Path,
-    metrics: Mapping[str, ScanMetric],
-    missing: Mapping[str, str],
+    chosen: PaperMetrics,
     budget: Budget,
     work: Work,
     real: ScanSet | None = None,
-    cache: Cache | None = None,
     device: str = "cpu",
     command: str = "",
-    said: Callable[[str], None] = lambda line: None,
 ) -> Page:
     """The page, still to be written; what is finished is kept in `out/cells`.
 
     Args:
-        subjects: Of `find_subjects`.
-        metrics: By name; `jsd` has to be among them.
-        missing: The paper's metrics that are not, and why.
+        subjects: From `find_subjects`.
         real: The scans to compare with; those that the first 1-RF held out if left out.
-        said: Told what is being done.
 
     Raises:
-        InputError: scans that cannot be read, or without what a metric looks at.
+        InputError: scans that cannot be read, or without the reflectance that a metric needs.
     """
+    metrics = chosen.built
     first = next(one for one in subjects if one.role == "1-RF")
     real = real or held_out(first)
     check_reflectance(metrics, [real])
-    said(f"{len(subjects)} runs: {', '.join(f'{one.label} ({one.role})' for one in subjects)}; real: {real.label}")
-    gathered = gather_real(metrics, real, work, cache)
-    bench = Bench(real, metrics, gathered, budget.num, budget.bootstrap, work, out / "cells", device)
+    gathered = gather_real(metrics, real, work, Cache())
+    settings = CellSettings(real, metrics, gathered, budget.num, budget.bootstrap, work, out / "cells", device)
     cells: list[Cell] = []
     paths: dict[str, Paths] = {}
     architectures: list[dict[str, Any]] = []
@@ -92,7 +99,7 @@ def report(
     ends = np.stack([real.source[index] for index in (len(real) // 4, 3 * len(real) // 4)])  # far apart in the set
     for subject in subjects:
         flow = load_checkpoint(subject.run, device)
-        own = list(measure_cells(bench, flow, subject, budget.steps))
+        own = list(measure_cells(settings, flow, subject, budget.steps))
         cells += own
         if budget.curved and subject.steps is None:
             paths[subject.label] = _paths(flow, subject, budget, work)
@@ -104,11 +111,11 @@ def report(
         if subject is first and budget.tolerance is not None and len(real) > 1:
             between = _interpolation(flow, ends, budget.tolerance, work)
         del flow
-    measured = Measured(subjects, real, cells, birds_eye, paths, architectures, ends, between)
-    return paper_page(measured, list(metrics), missing, budget.num, command, device, {"sampled scans": SEED})
+    measured = PaperResults(subjects, real, cells, birds_eye, paths, architectures, ends, between)
+    return paper_page(measured, list(metrics), chosen.missing, budget.num, command, device, {"sampled scans": SEED})
 
 
-def held_out(subject: Subject) -> ScanSet:
+def held_out(subject: PaperRun) -> ScanSet:
     """All scans that a run held out of its training."""
     config = read_config(subject.run) or subject.config  # the folder's own knows where the scans have moved
     flow = load_checkpoint(subject.run)
@@ -132,14 +139,14 @@ def _placeless(data: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _paths(flow: Checkpoint, subject: Subject, budget: Budget, work: Work) -> Paths:
+def _paths(flow: Checkpoint, subject: PaperRun, budget: Budget, work: Work) -> Paths:
     with work.bar(f"following paths of {subject.label}", 2 * max(budget.steps), "evaluations") as advance:
         return measure_paths(
             flow, subject.label, budget.curved, max(budget.steps), SEED, budget.curved, progress=advance
         )
 
 
-def _architecture(subject: Subject, cell: Cell, real: np.ndarray, metrics: Mapping[str, ScanMetric]) -> dict[str, Any]:
+def _architecture(subject: PaperRun, cell: Cell, real: np.ndarray, metrics: Mapping[str, ScanMetric]) -> dict[str, Any]:
     """A row of table II, but for what its network costs."""
     return {
         "label": subject.label, "family": subject.family, "seed": subject.seed, "steps": cell.row["steps"],

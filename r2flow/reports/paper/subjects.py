@@ -1,4 +1,4 @@
-"""Which run stands for which flow of the paper: 1-RF, 2-RF, 1-TD, 2-TD, 4-TD, and which belong together."""
+"""The runs of a report: which flow of the paper each one is (1-RF, 2-RF, 1-TD, ...), and which form a chain."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from r2flow.reports.compare import find_runs, labels
 
 
 @dataclass(frozen=True)
-class Subject:
+class PaperRun:
     """One run.
 
     Attributes:
@@ -19,9 +19,9 @@ class Subject:
         label: Its name on the page.
         role: "1-RF", "2-RF", "2-TD" for one that was distilled from a 2-RF, "2-TD of 1-RF" from another.
         family: The `weights_hash` of the 1-RF that it descends from: flows of one family are one chain.
-        weights: Its own.
-        config: As it was trained.
-        steps: k of a k-TD, which takes k; None of the others.
+        weights: Its own `weights_hash`.
+        config: The config that it was trained with.
+        steps: k of a k-TD; None for the others.
     """
 
     run: Path
@@ -53,7 +53,7 @@ class Subject:
         return f"hdit {({'learnable': 'with APE', 'none': 'without APE'}).get(self.position, self.position)}"
 
 
-def find_subjects(folders: Sequence[Path]) -> list[Subject]:
+def find_subjects(folders: Sequence[Path]) -> list[PaperRun]:
     """The runs in some folders, parents before their children.
 
     A child is known by its parent's weights, wherever the folders have moved.
@@ -64,10 +64,10 @@ def find_subjects(folders: Sequence[Path]) -> list[Subject]:
     runs = find_runs(folders)
     if not runs:
         raise InputError(f"no run in {', '.join(map(str, folders))}; give folders that train.py has written.")
-    found: dict[str, Subject] = {}
+    found: dict[str, PaperRun] = {}
     rest = [_read(run, label) for run, label in zip(runs, labels(runs), strict=True)]
     while rest:
-        # A parent that is not among the runs cannot be waited for: its child is a family by itself.
+        # A run whose parent is not among the runs is the first of a family.
         waiting = {one.weights for one in rest}
         known = [one for one in rest if one.family not in waiting] or rest
         for one in known:
@@ -80,21 +80,21 @@ def find_subjects(folders: Sequence[Path]) -> list[Subject]:
     return subjects
 
 
-def _read(run: Path, label: str) -> Subject:
-    """A run as it says of itself; its family is its parent's weights still, "" without a parent."""
+def _read(run: Path, label: str) -> PaperRun:
+    """A run by its own config; its family is still its parent's weights, "" without a parent."""
     checkpoint = load_checkpoint(run)
     config = checkpoint.config
     parent = (config.get("parent") or {}).get("weights", "")
     stage = config["stage"]["name"]
     own = checkpoint.generator.sampler
     steps = own.steps if own.fixed else None
-    return Subject(run, label, stage, parent, weights_hash(checkpoint), config, steps)
+    return PaperRun(run, label, stage, parent, weights_hash(checkpoint), config, steps)
 
 
-def _role(one: Subject, parent: Subject | None) -> str:
+def _role(one: PaperRun, parent: PaperRun | None) -> str:
     if one.role == "rectify":
         return "1-RF"
-    # A parent that is not there is known by its stage alone.
+    # Of a parent that is not among the runs only the stage is known.
     above = parent.role if parent else {"rectify": "1-RF", "reflow": "2-RF"}.get(one.config["parent"]["stage"], "")
     number, _, kind = above.partition("-")
     if one.role == "reflow" and kind == "RF":
@@ -104,7 +104,7 @@ def _role(one: Subject, parent: Subject | None) -> str:
     return f"{one.role} of {above}"
 
 
-def _check_comparable(subjects: Sequence[Subject]) -> None:
+def _check_comparable(subjects: Sequence[PaperRun]) -> None:
     if not any(one.role == "1-RF" for one in subjects):
         raise InputError(f"no 1-RF among the runs: {', '.join(f'{one.label} is {one.role}' for one in subjects)}.")
     first = subjects[0]

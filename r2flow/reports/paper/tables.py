@@ -1,4 +1,4 @@
-"""The paper's tables I and II: ours, the printed ones, and both side by side with what differs in words."""
+"""The paper's tables I and II: ours, the printed ones and both side by side, and what differs in words."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -9,9 +9,9 @@ from r2flow.reports.paper.claims import Claim
 from r2flow.reports.paper.printed import COLUMNS, TABLE_I, TABLE_II, Architecture
 from r2flow.reports.tables import Row, shown, table
 
-# The paper's numbers, by which ours are told apart.
+# The paper's settings.
 SCANS, REAL, IMAGES, SIZE = 10_000, 81_106, 2_560_000, (64, 1024)
-PAPER_KIND = "hdit with APE"  # of its chains
+PAPER_KIND = "hdit with APE"  # the network of its chains
 
 
 def over_seeds(rows: Sequence[Row], metrics: Sequence[str]) -> list[dict[str, Any]]:
@@ -142,7 +142,7 @@ def differences(
     images: Sequence[int],
     missing: Mapping[str, str],
 ) -> list[str]:
-    """What keeps our figures from being the paper's, a plain sentence each.
+    """The differences between our protocol and the paper's, a sentence each.
 
     Args:
         data: What the flows were trained on, in words.

@@ -1,0 +1,94 @@
+"""Options that belong together: a dataclass with an option a field, which a verb takes as one parameter."""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import wraps
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+import typer
+
+from r2flow.cli.options import ConventionChoice, ProjectionChoice, ScaleChoice, SensorChoice, SizeOption
+
+if TYPE_CHECKING:
+    from r2flow.generators import Sampler
+
+
+def grouped(verb: Callable[..., None]) -> Callable[..., None]:
+    """Let typer see every field of a verb's dataclass parameters as an option of its own.
+
+    @app.command()
+    @grouped
+    def evaluate(real: str, reading: ReadingOptions) -> None: ...   # r2flow evaluate REAL --sensor vlp16 --size 16x512
+    """
+    hints = get_type_hints(verb, include_extras=True)
+    groups: dict[str, Any] = {}
+    parameters: list[inspect.Parameter] = []
+    for name, positional in inspect.signature(verb).parameters.items():
+        parameter = positional.replace(kind=positional.KEYWORD_ONLY, annotation=hints[name])
+        if not is_dataclass(hints[name]):
+            parameters.append(parameter)
+            continue
+        groups[name] = hints[name]
+        types = get_type_hints(hints[name], include_extras=True)
+        for one in fields(groups[name]):
+            default = parameter.empty if one.default is MISSING else one.default
+            parameters.append(parameter.replace(name=one.name, default=default, annotation=types[one.name]))
+
+    @wraps(verb)
+    def call(**given: Any) -> None:
+        for name, group in groups.items():
+            given[name] = group(**{one.name: given.pop(one.name) for one in fields(group)})
+        verb(**given)
+
+    call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return call
+
+
+@dataclass(frozen=True)
+class ReadingOptions:
+    """How scans become images: as the flow or the prepared scans say where an option is left out."""
+
+    sensor: SensorChoice = None
+    size: SizeOption = None
+    projection: ProjectionChoice = None
+    convention: ConventionChoice = None
+    reflectance_scale: ScaleChoice = None
+
+
+@dataclass(frozen=True)
+class WorkOptions:
+    """How the work is done; the figures do not depend on it."""
+
+    batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 8
+    workers: Annotated[int, typer.Option(min=0, help="Further processes that read scans.")] = 2
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto"
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """How a generator is run: its own settings, or the verb's, where an option is left out."""
+
+    solver: Annotated[
+        str | None,
+        typer.Option(help="euler, midpoint, heun2, heun3, rk4, ab2; adaptive: dopri5, bosh3, torchdiffeq:NAME."),
+    ] = None
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps from noise to data, of a solver of fixed steps.")] = (
+        None
+    )
+    tolerance: Annotated[float | None, typer.Option(help="Of an adaptive solver.")] = None
+
+    def change(self, sampler: "Sampler") -> "Sampler":
+        """A sampler with what was asked for."""
+        return sampler.changed(method=self.solver, steps=self.steps, tolerance=self.tolerance)
+
+
+@dataclass(frozen=True)
+class DrawOptions:
+    """Which scans are drawn, and on what device."""
+
+    num: Annotated[int, typer.Option(min=1, help="Scans.")] = 4
+    seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0
+    batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto"
