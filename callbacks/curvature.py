@@ -3,11 +3,12 @@
 import lightning as L
 import torch
 
-from callbacks.ema import averaged_weights
 from r2flow.errors import InputError
 from r2flow.flow.straightness import curvature
 from r2flow.generators import Flow
 from r2flow.noise import Draws
+
+from .ema import averaged_weights
 
 
 class Curvature(L.Callback):

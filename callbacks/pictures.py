@@ -7,9 +7,10 @@ import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from callbacks.ema import averaged_weights
 from r2flow.generators import Generator
 from r2flow.sampling import draw
+
+from .ema import averaged_weights
 
 
 class SamplePictures(L.Callback):

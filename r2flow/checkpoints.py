@@ -1,16 +1,18 @@
 """A trained generator on disk, whatever its family: written whole, checked when read, no code from it run."""
 
 import json
+import math
 import pickle
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
@@ -19,6 +21,7 @@ from r2flow.generators import Generator, RectifiedFlow, Sampler, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
+from r2flow.plugins import made_with
 from r2flow.published import published_cfg, published_config, published_rings, published_step
 
 FOLDER = "checkpoints"
@@ -191,9 +194,9 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
             f"{path} is a torch file but not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
             f"(ours) nor 'cfg' and 'weights' (published); found {', '.join(map(repr, list(content)[:6]))}."
         )
-    with torch.device("meta"):  # sizes are compared before any memory is taken for them
-        check_weights(build_generator(config), weights, path)
-    generator = build_generator(config)
+    with made_with(config, str(path)), _Allowance(weights, path):
+        generator = build_generator(config)
+    check_weights(generator, weights, path)
     generator.load_state_dict(weights)
     if sampler is not None:
         generator.sampler = Sampler.of(sampler)
@@ -201,6 +204,35 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
         sensor = published_rings(generator.space.sensor, weights[BACKBONE + "coords"])
         generator.space = replace(generator.space, sensor=sensor)
     return Checkpoint(generator.eval().requires_grad_(False).to(device), config, step, path, kind)
+
+
+class _Allowance(TorchFunctionMode):
+    """Refuses tensors that the weights in a file cannot fill, before memory is taken for them.
+
+    The meta device would do the same, but its first use imports torch's compiler and sympy, which takes as long as
+    `import torch`.
+    """
+
+    FACTORIES = frozenset({torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.linspace})
+    SPARE = 2**24  # elements of buffers that a checkpoint does not hold, and of what is computed on the way
+
+    def __init__(self, weights: Mapping[str, Tensor], path: Path) -> None:
+        super().__init__()
+        self.path, self.held = path, sum(value.numel() for value in weights.values())
+        self.left = 2 * self.held + self.SPARE
+
+    def __torch_function__(
+        self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        if func in self.FACTORIES:
+            sizes = [part for arg in args for part in (arg if isinstance(arg, (tuple, list)) else (arg,))]
+            self.left -= math.prod(max(size, 1) for size in sizes if isinstance(size, int))
+            if self.left < 0:
+                raise InputError(
+                    f"the weights in {self.path} do not fit its config: they are {self.held:,} numbers, and the "
+                    "config asks for far more."
+                )
+        return func(*args, **(kwargs or {}))
 
 
 def _sampler_of_stage(stage: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -265,6 +297,9 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
         with atomic_write(path) as file:
             file.write(data)
     elif path.suffix == ".pth":
+        if type(checkpoint.generator) is not RectifiedFlow:
+            what = type(checkpoint.generator).__name__
+            raise InputError(f"{path}: the published format cannot hold a {what}; convert to .safetensors instead.")
         weights = _plain(checkpoint.model)
         cfg = published_cfg(checkpoint.config)
         images = checkpoint.step * int(cfg.get("training", {}).get("batch_size", 1))

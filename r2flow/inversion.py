@@ -81,14 +81,25 @@ class RoundTrip:
 
 
 def round_trip(checkpoint: Checkpoint, inversion: Inversion) -> RoundTrip:
-    """The errors of an inversion; NaN for a scene that is not finite, or in metres where no ray returns twice."""
+    """The errors of an inversion; NaN for a scan that is not finite, or in metres where no ray returns twice."""
     rms = (inversion.again - inversion.x_1).double().square().flatten(1).mean(1).sqrt()
-    before, after = (checkpoint.encoding.decode(x)[:, 0].double() for x in (inversion.x_1, inversion.again))
+    median_m, rms_m, dropped = metres_apart(*(checkpoint.encoding.decode(x) for x in (inversion.x_1, inversion.again)))
+    std = inversion.x_0.double().flatten(1).std(1)
+    return RoundTrip(rms, median_m, rms_m, dropped.masked_fill(rms.isnan(), math.nan), std)
+
+
+def metres_apart(image: Tensor, other: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """How far decoded images, (B, 2 or 1, H, W), are from others, scan by scan, each (B,) float64.
+
+    Returns:
+        Median and root mean square of |r' - r| in metres over the rays that return in both, NaN where none does; the
+        share of all rays that return in one alone.
+    """
+    before, after = image[:, 0].double(), other[:, 0].double()
     both = (before > 0) & (after > 0)
     apart = (after - before).abs().masked_fill(~both, math.nan).flatten(1)
-    dropped = ((before > 0) != (after > 0)).flatten(1).double().mean(1).masked_fill(rms.isnan(), math.nan)
-    metres = apart.nanmedian(1).values, apart.square().nanmean(1).sqrt()
-    return RoundTrip(rms, *metres, dropped, inversion.x_0.double().flatten(1).std(1))
+    dropped = ((before > 0) != (after > 0)).flatten(1).double().mean(1)
+    return apart.nanmedian(1).values, apart.square().nanmean(1).sqrt(), dropped
 
 
 def slerp(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:

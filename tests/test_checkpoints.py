@@ -2,6 +2,8 @@ import json
 import pickle
 import random
 import resource
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -238,3 +240,18 @@ def test_an_unfolding_checkpoint_brings_its_ring_angles(shared, tmp_path: Path):
     loaded = load_checkpoint(tmp_path / "unfolding.pth")
     torch.testing.assert_close(loaded.sensor.rays()[0, :, 0], rings, rtol=0, atol=1e-6)
     torch.testing.assert_close(loaded.model.coords[0, 0, :, 0], rings, rtol=0, atol=0)
+
+
+def test_loading_and_sampling_import_nothing_that_they_do_not_need(saved):
+    code = f"""
+import sys
+from r2flow.checkpoints import load_checkpoint
+from r2flow.sampling import sample
+
+(made,) = sample(load_checkpoint({str(saved[0])!r}), num=1, steps=2)
+assert made.images.shape == (1, 2, 8, 64)
+heavy = "lightning", "tensorboard", "matplotlib", "torchmetrics", "hydra", "torchdiffeq", "sympy", "torch._dynamo"
+print([name for name in heavy if name in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -13,7 +13,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.reports.savings import scene_rows
+from r2flow.reports.savings import scan_rows
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_sampling import Lost, flow, network, scans
@@ -143,8 +143,8 @@ def test_savings_of_exact_problems_need_no_checkpoint(r2flow, tmp_path):  # noqa
 
 
 def test_savings_need_a_flow_that_can_be_solved():
-    with pytest.raises(InputError, match="does not solve scene 1 of this flow"):
-        scene_rows(flow(Lost()), 2, 1e-3, seed=0, advance=lambda: None)
+    with pytest.raises(InputError, match="does not solve scan 1 of this flow"):
+        scan_rows(flow(Lost()), 2, 1e-3, seed=0)
 
 
 @pytest.mark.parametrize("verb", ["invert", "interpolate", "calibrate", "report savings"])

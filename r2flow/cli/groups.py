@@ -4,11 +4,14 @@ import inspect
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
-from typing import Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
 from r2flow.cli.options import ConventionChoice, ProjectionChoice, ScaleChoice, SensorChoice, SizeOption
+
+if TYPE_CHECKING:
+    from r2flow.generators import Sampler
 
 
 def grouped(verb: Callable[..., None]) -> Callable[..., None]:
@@ -60,4 +63,32 @@ class WorkOptions:
 
     batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 8
     workers: Annotated[int, typer.Option(min=0, help="Further processes that read scans.")] = 2
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto"
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """How a generator is run: its own settings, or the verb's, where an option is left out."""
+
+    solver: Annotated[
+        str | None,
+        typer.Option(help="euler, midpoint, heun2, heun3, rk4, ab2; adaptive: dopri5, bosh3, torchdiffeq:NAME."),
+    ] = None
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps from noise to data, of a solver of fixed steps.")] = (
+        None
+    )
+    tolerance: Annotated[float | None, typer.Option(help="Of an adaptive solver.")] = None
+
+    def change(self, sampler: "Sampler") -> "Sampler":
+        """A sampler with what was asked for."""
+        return sampler.changed(method=self.solver, steps=self.steps, tolerance=self.tolerance)
+
+
+@dataclass(frozen=True)
+class DrawOptions:
+    """Which scans are drawn, and on what device."""
+
+    num: Annotated[int, typer.Option(min=1, help="Scans.")] = 4
+    seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0
+    batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto"

@@ -1,4 +1,4 @@
-"""What a scene need not cost: evaluations and seconds saved, and the error that is paid for it."""
+"""What a scan need not cost: evaluations and seconds saved, and the error that this adds."""
 
 import tempfile
 import time
@@ -10,29 +10,34 @@ from statistics import median
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from matplotlib.figure import Figure
+from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
 from r2flow.flow.problems import PROBLEMS, Mixed, Problem
 from r2flow.flow.straight_exit import probes
 from r2flow.generators import Field, Flow, Sampler, as_flow
+from r2flow.generators.base import Progress
 from r2flow.lidar.region import Region, region
 from r2flow.noise import Draws
 from r2flow.reports.outputs import formats_of, write_scan
+from r2flow.reports.pages import Page, blank_figure
+from r2flow.reports.tables import shown, table
 from r2flow.sampling import evaluated_region
 
 Row = dict[str, Any]
-Progress = Callable[[], None]
 
-# Scenes of the mixed batch by kind: their number and their problem.
+NAME = "a savings report"
+# Scans of the mixed batch by kind: their number and their problem.
 MIXED = {"straight": 8, "gaussian": 4, "two_modes": 3, "ray_drop": 1}
 LONE = {"straight": 255, "ray_drop": 1}
-ELEMENTS = 256  # of an exact scene
+ELEMENTS = 256  # of an exact scan
 FIXED = 32  # steps of the fixed-step rows
 REPEATS = 3  # of every timing
 TOLERANCES = (1e-3, 1e-5)
-TIGHT = 1e-6  # tolerance of the solution that a trained flow is held against
+TIGHT = 1e-6  # tolerance of the solution that a trained flow is compared with
+WHOLE = "the whole image"
 
 EULER, AB2 = f"euler, {FIXED} steps", f"ab2, {FIXED} steps"
 ONE_STATE = "dopri5, the batch as one state (torchdiffeq)"
@@ -43,14 +48,17 @@ STRAIGHT = "the same, and one step for the straight"
 
 @dataclass(frozen=True)
 class Solved:
-    """Ends of all scenes, (B, ...), their evaluations, (B,), and the seconds of it all."""
+    """Ends of all scans, (B, ...), their evaluations, (B,), and the seconds for all of them."""
 
     x: Tensor
     evaluations: Tensor
     seconds: float
 
 
-def one_state(flow: Flow, x: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+Way = Callable[[Flow, Tensor, float, Progress], tuple[Tensor, Tensor]]
+
+
+def one_state(flow: Flow, x: Tensor, tolerance: float, progress: Progress = None) -> tuple[Tensor, Tensor]:
     """torchdiffeq's dopri5 as it is usually called: one step and one error norm for the whole batch."""
     import torchdiffeq
 
@@ -59,6 +67,8 @@ def one_state(flow: Flow, x: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
     def counted(t: Tensor, state: Tensor) -> Tensor:
         nonlocal calls
         calls += 1
+        if progress is not None:
+            progress()
         return velocity(t, state).to(state.dtype)
 
     span = torch.tensor([0.0, 1.0], dtype=x.dtype, device=x.device)
@@ -66,15 +76,15 @@ def one_state(flow: Flow, x: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
     return end, torch.full((len(x),), calls)
 
 
-def _by(sampler: Sampler) -> Callable[[Flow, Tensor, float], tuple[Tensor, Tensor]]:
-    def way(flow: Flow, x: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
-        end = flow.solve(x, sampler=sampler.changed(tolerance=tolerance))
+def _by(sampler: Sampler) -> Way:
+    def way(flow: Flow, x: Tensor, tolerance: float, progress: Progress = None) -> tuple[Tensor, Tensor]:
+        end = flow.solve(x, sampler=sampler.changed(tolerance=tolerance), progress=progress)
         return end.x, end.evaluations
 
     return way
 
 
-WAYS: dict[str, Callable[[Flow, Tensor, float], tuple[Tensor, Tensor]]] = {
+WAYS: dict[str, Way] = {
     EULER: _by(Sampler("euler", FIXED)),
     AB2: _by(Sampler("ab2", FIXED)),
     ONE_STATE: one_state,
@@ -83,75 +93,77 @@ WAYS: dict[str, Callable[[Flow, Tensor, float], tuple[Tensor, Tensor]]] = {
 }
 
 
-def solve_in_all_ways(flow: Flow, x: Tensor, tolerance: float, repeats: int = REPEATS) -> dict[str, Solved]:
-    """Every row of the scenes' table, in its order; seconds are medians of `repeats`."""
+def solve_in_all_ways(
+    flow: Flow, x: Tensor, tolerance: float, repeats: int = REPEATS, progress: Progress = None
+) -> dict[str, Solved]:
+    """The end of x at t = 1 by each of `WAYS`; seconds are medians of `repeats`."""
     ends: dict[str, tuple[Tensor, Tensor]] = {}
     seconds: dict[str, list[float]] = {name: [] for name in WAYS}
     for _ in range(repeats):
         for name, way in WAYS.items():
             begin = time.perf_counter()
-            ends[name] = way(flow, x, tolerance)
+            ends[name] = way(flow, x, tolerance, progress)
             _wait(x)
             seconds[name].append(time.perf_counter() - begin)
     found = {}
     for name, (end, evaluations) in ends.items():
-        if name == LEAVING:  # what per-scene solvers that keep the batch whole spend (torchode): same ends
+        if name == LEAVING:  # what solvers with own steps spend that keep the batch whole (torchode): same ends
             found[STAYING] = Solved(end, torch.full_like(evaluations, int(evaluations.max())), float("nan"))
         found[name] = Solved(end, evaluations, median(seconds[name]))
     return found
 
 
 def exact_rows(kinds: Mapping[str, int], batch: str, tolerances: Sequence[float], seed: int) -> list[Row]:
-    """Scenes whose ends are known: evaluations and errors by kind, a row for each way and tolerance."""
+    """Scans whose ends are known: evaluations and errors by kind, a row for each way and tolerance."""
     problems: list[Problem] = []
     places: dict[str, slice] = {}
     for kind, count in kinds.items():
         places[kind] = slice(len(problems), len(problems) + count)
         problems += [PROBLEMS[kind]()] * count
-    # float64: the solver's error, not rounding, is what we measure
+    # float64: the solver's error, not rounding, is measured
     x_0 = Draws(seed, range(len(problems))).start((ELEMENTS,)).double()
     mixed = Mixed(problems)
     truth, flow = mixed.solution(x_0, 1.0), Field(mixed, (ELEMENTS,))
     rows = []
     for tolerance in tolerances:
-        for way, solved in solve_in_all_ways(flow, x_0, tolerance).items():
-            errors = (solved.x - truth).square().mean(1).sqrt()
-            row: Row = {"part": batch, "way": way, "tolerance": None if way in (EULER, AB2) else tolerance}
-            row |= {"evaluations": int(solved.evaluations.sum()), "seconds": solved.seconds}
-            row["worst_error"] = float(errors.max())
-            for kind, scenes in places.items():
-                row[f"evaluations_{kind}"] = float(solved.evaluations[scenes].double().mean())
-                row[f"error_{kind}"] = float(errors[scenes].max())
+        for way, solved in solve_in_all_ways(flow, x_0, tolerance, REPEATS).items():
+            row, errors = _row(batch, way, tolerance, solved, truth)
+            for kind, scans in places.items():
+                row[f"evaluations_{kind}"] = float(solved.evaluations[scans].double().mean())
+                row[f"error_{kind}"] = float(errors[scans].max())
             rows.append(row)
     return [row for i, row in enumerate(rows) if row["tolerance"] or i < len(WAYS)]  # fixed steps: once
 
 
-def scene_rows(checkpoint: Checkpoint, num: int, tolerance: float, seed: int, advance: Progress) -> list[Row]:
-    """The same ways on scenes of a trained flow, held against its own tight solution.
+def _row(part: str, way: str, tolerance: float, solved: Solved, truth: Tensor) -> tuple[Row, Tensor]:
+    errors = (solved.x - truth).double().square().flatten(1).mean(1).sqrt()
+    row: Row = {"part": part, "way": way, "tolerance": None if way in (EULER, AB2) else tolerance}
+    row |= {"evaluations": int(solved.evaluations.sum()), "seconds": solved.seconds}
+    return row | {"worst_error": float(errors.max())}, errors
+
+
+def scan_rows(checkpoint: Checkpoint, num: int, tolerance: float, seed: int, progress: Progress = None) -> list[Row]:
+    """The same ways on scans of a trained flow, compared with its own tight solution.
 
     Raises:
         InputError: the flow has none.
     """
-    flow = as_flow(checkpoint.generator, "a savings report")
+    flow = as_flow(checkpoint.generator, NAME)
     x_0 = Draws(seed, range(num)).start(flow.noise_shape).to(flow.device)
-    counted = Field(_Counted(flow, advance), flow.noise_shape)
     with torch.inference_mode():
-        tight = counted.solve(x_0, sampler=Sampler("dopri5", tolerance=TIGHT))
+        tight = flow.solve(x_0, sampler=Sampler("dopri5", tolerance=TIGHT), progress=progress)
         if not tight.converged.all():
-            lost = ", ".join(str(scene) for scene in (~tight.converged).nonzero()[:, 0].tolist())
+            lost = ", ".join(str(number) for number in (~tight.converged).nonzero()[:, 0].tolist())
             raise InputError(
-                f"dopri5 at {TIGHT:g} does not solve scene {lost} of this flow: there is nothing to hold its scenes "
-                "against. Leave the checkpoint out for the exact problems alone."
+                f"dopri5 at {TIGHT:g} does not solve scan {lost} of this flow, so there is no solution to compare "
+                "with. Leave the checkpoint out for the exact problems alone."
             )
-        truth = tight.x
-        found = solve_in_all_ways(counted, x_0, tolerance, repeats=1)
+        found = solve_in_all_ways(flow, x_0, tolerance, repeats=1, progress=progress)
     rows = []
     for way, solved in found.items():
-        errors = (solved.x - truth).double().square().flatten(1).mean(1).sqrt()
-        row: Row = {"part": "scenes of the flow", "way": way, "tolerance": None if way in (EULER, AB2) else tolerance}
-        row |= {"evaluations": int(solved.evaluations.sum()), "seconds": solved.seconds}
+        row, errors = _row("scenes of the flow", way, tolerance, solved, tight.x)
         row["straight"] = int((solved.evaluations == 1 + len(probes(tolerance))).sum()) if way == STRAIGHT else None
-        rows.append({**row, "worst_error": float(errors.max()), "median_error": float(errors.median())})
+        rows.append({**row, "median_error": float(errors.median())})
     return rows
 
 
@@ -171,31 +183,36 @@ def regions_to_measure(shape: tuple[int, int]) -> dict[str, tuple[Region, Region
     }
 
 
-def region_rows(checkpoint: Checkpoint, num: int, steps: int, seed: int, advance: Progress) -> list[Row]:
+def region_rows(checkpoint: Checkpoint, num: int, steps: int, seed: int, progress: Progress = None) -> list[Row]:
     """Parts of the image against the same pixels of the whole one, from the same noise and in the same steps."""
-    flow = as_flow(checkpoint.generator, "a savings report")
+    flow = as_flow(checkpoint.generator, NAME)
     x_0 = Draws(seed, range(num)).start(flow.noise_shape)
     wanted = regions_to_measure(checkpoint.sensor.shape)
-    regions = {"the whole image": region(checkpoint.sensor.shape)}
+    regions = {WHOLE: region(checkpoint.sensor.shape)}
     regions |= {name: evaluated_region(flow, generated) for name, (_, generated) in wanted.items()}
-    parts = {name: as_flow(flow.part(seen), "a part") for name, seen in regions.items()}
-    ends = {name: _sampled(parts[name], seen.crop(x_0), steps, advance) for name, seen in regions.items()}
+    parts = {name: as_flow(flow.part(seen), NAME) for name, seen in regions.items()}
+    ends = {name: _sampled(parts[name], seen.crop(x_0), steps, progress) for name, seen in regions.items()}
     t, first = torch.tensor(0.5), x_0[:1]
     calls = {name: partial(parts[name].velocity, t, seen.crop(first).to(flow.device)) for name, seen in regions.items()}
     seconds = _in_turns(calls, 1.0)
-    whole = ends["the whole image"]
     rows: list[Row] = []
     for name, seen in regions.items():
         row: Row = {"part": "regions", "way": name, "share": seen.share, "seconds": steps * seconds[name]}
-        row["time"] = seconds[name] / seconds["the whole image"]
+        row["time"] = seconds[name] / seconds[WHOLE]
         if name in wanted:
             asked, _ = wanted[name]
-            truth = asked.crop(whole)
+            truth = asked.crop(ends[WHOLE])
             row |= _apart(checkpoint, asked.crop(seen.place(ends[name])), truth)
-            # how far it would be if the noise told nothing of the scene
+            # how far it would be if the noise told nothing of the scan
             row["unrelated"] = _rms(truth, truth.roll(1, 0)) if num > 1 else None
         rows.append(row)
     return rows
+
+
+def _sampled(flow: Flow, x_0: Tensor, steps: int, progress: Progress) -> Tensor:
+    """Scans one by one, (B, ...) on the CPU."""
+    sampler = Sampler("ab2", steps)
+    return torch.cat([flow.solve(scan, sampler=sampler, progress=progress).x.cpu() for scan in x_0.split(1)])
 
 
 def channel_rows(checkpoint: Checkpoint, budget: float = 1.0) -> list[Row]:
@@ -224,24 +241,6 @@ def channel_rows(checkpoint: Checkpoint, budget: float = 1.0) -> list[Row]:
             row: Row = {"part": "channels", "way": name, "network": network[name], "decoding": decoding[name]}
             rows.append({**row, "writing": writing[name], "bytes": size})
     return rows
-
-
-class _Counted(nn.Module):
-    """A flow's velocity that tells of its evaluations."""
-
-    def __init__(self, flow: Flow, advance: Progress) -> None:
-        super().__init__()
-        self.flow, self.advance = flow, advance
-
-    def forward(self, t: Tensor, x: Tensor) -> Tensor:
-        self.advance()
-        return self.flow.velocity(t, x)
-
-
-def _sampled(flow: Flow, x_0: Tensor, steps: int, advance: Progress) -> Tensor:
-    """Scenes one by one, (B, ...) on the CPU."""
-    sampler = Sampler("ab2", steps)
-    return torch.cat([flow.solve(scene, sampler=sampler, progress=advance).x.cpu() for scene in x_0.split(1)])
 
 
 def _in_turns(calls: Mapping[str, Callable[[], Any]], budget: float) -> dict[str, float]:
@@ -277,3 +276,142 @@ def _apart(checkpoint: Checkpoint, mine: Tensor, truth: Tensor) -> Row:
     both = (a > 0) & (b > 0)
     metres = float((a - b).abs()[both].median()) if both.any() else float("nan")
     return {"error": _rms(mine, truth), "median_m": metres, "dropped": float(((a > 0) != (b > 0)).double().mean())}
+
+
+# The page: a part is its conditions in a sentence and its rows as a table.
+
+KIND_NAMES = {"straight": "straight", "gaussian": "smooth", "two_modes": "two modes", "ray_drop": "ray-drop"}
+OF_KINDS = {"evaluations": "evaluations, all", "share": "of one state's", "worst_error": "worst error"}
+OF_KINDS |= {f"evaluations_{kind}": f"a {name} scan" for kind, name in KIND_NAMES.items()}
+OF_KINDS |= {f"error_{kind}": f"error, {name}" for kind, name in KIND_NAMES.items()}
+OF_SCANS = {"evaluations": "evaluations", "share": "of one state's", "seconds": "seconds"}
+OF_SCANS |= {"median_error": "median error", "worst_error": "worst error", "straight": "straight scans"}
+OF_REGIONS = {"share": "of the pixels", "seconds": "seconds a scan", "time": "of the time", "error": "RMS, model space"}
+OF_REGIONS |= {"unrelated": "unrelated scans", "median_m": "median, m", "dropped": "rays lost or gained"}
+OF_CHANNELS = {"network": "network, s", "decoding": "decoding, s", "writing": "writing, s", "bytes": "bytes"}
+
+
+def savings_page(
+    checkpoint: Checkpoint | None,
+    num: int = 4,
+    steps: int = 16,
+    tolerance: float = 1e-3,
+    seed: int = 0,
+    command: str = "",
+    progress: Progress = None,
+) -> Page:
+    """All of it as a page.
+
+    Args:
+        checkpoint: None leaves out what needs one.
+        num: Scans of the checkpoint's flow.
+        steps: AB2 steps of the regions.
+        tolerance: Of the checkpoint's adaptive solutions.
+        progress: Called after every evaluation of the checkpoint's network.
+    """
+    mixed = exact_rows(MIXED, "mixed", TOLERANCES, seed)
+    lone = [row for row in exact_rows(LONE, "one among 255", (1e-3,), seed) if row["tolerance"]]
+    kinds = ", ".join(f"{count} {KIND_NAMES[kind]}" for kind, count in MIXED.items())
+    text = [
+        f"## Easy and hard scans in one batch\n\nExact problems, {ELEMENTS} elements a scan, float64: {kinds}. Seconds "
+        "are the solver's own work, without a network.",
+        table(_with_share(mixed), {"way": "way", "tolerance": "tolerance", **OF_KINDS, "seconds": "seconds"}),
+        "### One hard scan among 255 easy ones\n\nWhere the batch is one state, its error norm hides the hard one.",
+        table(_with_share(lone), {"way": "way", **{k: v for k, v in OF_KINDS.items() if any(k in r for r in lone)}}),
+    ]
+    figures, rows, device = {"savings_scenes": scans_figure(mixed)}, [*mixed, *lone], "cpu"
+    if checkpoint is not None:
+        device = str(checkpoint.generator.device)
+        scans = scan_rows(checkpoint, num, tolerance, seed, progress)
+        regions = region_rows(checkpoint, num, steps, seed, progress)
+        channels = channel_rows(checkpoint)
+        name = f"{checkpoint.config['backbone']['name']} at {'x'.join(map(str, checkpoint.sensor.shape))}"
+        text += [
+            f"## Scans of the flow\n\n{name}, {num} scans in one batch, tolerance {tolerance:g}; errors in model space "
+            f"against the flow's own dopri5 solution at {TIGHT:g}.",
+            table(_with_share(scans), {"way": "way", **OF_SCANS}),
+            f"## A part of the image\n\n{name}, {num} scans, {steps} AB2 steps; the part against the same pixels of "
+            "the whole image from the same noise. Seconds are an evaluation's, the least of several, times the steps. "
+            "The network sees the part alone, so it makes another scan, the more so the more is cut off. How "
+            "realistic that scan is, is not measured here.",
+            table(regions, {"way": "region", **OF_REGIONS}),
+        ]
+        figures["savings_regions"] = regions_figure(regions)
+        if channels:
+            text += [
+                "## One channel\n\nBoth channels share their tokens, so `--channels range` saves decoding, writing and "
+                "bytes (PLY and range image), but hardly anything of the network.",
+                table(channels, {"way": "channels", **OF_CHANNELS}),
+            ]
+        rows += scans + regions + channels
+    return Page("savings", "What a scan need not cost", text, rows, figures, command, {"noise": seed}, device)
+
+
+def evaluations_of_page(num: int, steps: int) -> int:
+    """About how many evaluations `savings_page` takes of a checkpoint: for a progress bar."""
+    return 2 * FIXED + 270 + num * 7 * steps
+
+
+def _with_share(rows: Sequence[Row]) -> list[Row]:
+    """With each row's evaluations as a share of those of the batch as one state, at the same tolerance."""
+    base = {row["tolerance"]: row["evaluations"] for row in rows if row["way"] == ONE_STATE}
+    return [{**row, "share": row["evaluations"] / base[row["tolerance"]] if row["tolerance"] else None} for row in rows]
+
+
+# Told apart without colour.
+HATCHES = {
+    "straight": ("#d9d9d9", ""), "gaussian": ("#9ecae1", "//"), "two_modes": ("#4a90c2", ".."),
+    "ray_drop": ("#1b3a57", ""),
+}  # fmt: skip
+
+
+def scans_figure(rows: Sequence[Row]) -> Figure:
+    """Evaluations of the mixed batch by way and kind of scan, the worst error beside them."""
+    figure = blank_figure(11, 4.4, "Easy and hard scans in one batch")
+    panels = figure.subplots(1, len(TOLERANCES), sharey=True)
+    for axes, tolerance in zip(panels, TOLERANCES, strict=True):
+        chosen = [row for row in rows if row["tolerance"] in (tolerance, None) and row["way"] != AB2]
+        ways, begin = [row["way"] for row in chosen], [0.0] * len(chosen)
+        for kind, count in MIXED.items():
+            length = [count * row[f"evaluations_{kind}"] for row in chosen]
+            colour, hatch = HATCHES[kind]
+            label = f"{count} {KIND_NAMES[kind]}"
+            axes.barh(ways, length, left=begin, color=colour, hatch=hatch, edgecolor="black", lw=0.5, label=label)
+            begin = [a + b for a, b in zip(begin, length, strict=True)]
+        notes = [f" {row['evaluations']}; worst error {shown(row['worst_error'])}" for row in chosen]
+        _annotate(axes, begin, notes)
+        axes.set(xlabel="evaluations, all 16 scans", xlim=(0, 1.65 * max(begin)), title=f"tolerance {tolerance:g}")
+    panels[0].invert_yaxis()  # shared: the first way on top
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(MIXED), fontsize=8)
+    return figure
+
+
+def regions_figure(rows: Sequence[Row]) -> Figure:
+    """Share of the time and distance from the whole image, region by region."""
+    figure = blank_figure(10, 3.6, "A part of the image instead of the whole")
+    left, right = figure.subplots(1, 2, sharey=True)
+    names, times = [row["way"] for row in rows], [row["time"] for row in rows]
+    left.barh(names, times, color="#9ecae1", edgecolor="black", lw=0.5)
+    _annotate(left, times, [f" {time:.2f}" for time in times])
+    left.set(xlabel="share of the whole image's time", xlim=(0, 1.15))
+    left.invert_yaxis()
+    errors = [row.get("error", 0.0) for row in rows]
+    right.barh(names, errors, color="#d9d9d9", edgecolor="black", hatch="//", lw=0.5)
+    metres = [f", median {row['median_m']:.2g} m" if "median_m" in row else "" for row in rows]
+    _annotate(right, errors, [f" {shown(error)}{more}" for error, more in zip(errors, metres, strict=True)])
+    unrelated = [(row["unrelated"], row["way"]) for row in rows if row.get("unrelated")]
+    if unrelated:
+        right.plot(*zip(*unrelated, strict=True), "k|", ms=13, mew=1.6, label="two unrelated scans")
+        right.legend(fontsize=8, loc="upper right")
+    furthest = max([*errors, *(value for value, _ in unrelated), 1e-9])
+    right.set(xlabel="RMS distance from the whole image, model space", xlim=(0, 1.3 * furthest))
+    return figure
+
+
+def _annotate(axes: Any, ends: Sequence[float], notes: Sequence[str]) -> None:
+    """A note at the end of each bar."""
+    for place, (end, note) in enumerate(zip(ends, notes, strict=True)):
+        axes.annotate(note, (end, place), va="center", fontsize=8)
+    axes.tick_params(labelsize=8)
+    axes.grid(alpha=0.3, axis="x")
+    axes.set_axisbelow(True)

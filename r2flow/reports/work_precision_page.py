@@ -1,9 +1,8 @@
-"""Error against work, told: figures, tables and which solver for which budget."""
+"""Error against work: figures, tables and which solver for which budget (the page)."""
 
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -11,13 +10,13 @@ from matplotlib.figure import Figure
 
 from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.tables import shown, table
-from r2flow.reports.work_precision import BUDGETS, METHODS, TRUST, Reference, best_within, reached
+from r2flow.reports.work_precision import METHODS, TRUST, Reference, best_within, reached
 
 Row = Mapping[str, Any]
 Axis = tuple[str, str]  # key of a row, label
 
-EVALUATIONS: Axis = ("evaluations", "network evaluations a scene")
-SECONDS: Axis = ("seconds", "seconds a scene")
+EVALUATIONS: Axis = ("evaluations", "network evaluations a scan")
+SECONDS: Axis = ("seconds", "seconds a scan")
 ERROR: Axis = ("error", "RMS error, model space")
 
 
@@ -25,113 +24,97 @@ def work_precision_page(
     rows: Sequence[Row],
     name: str | None,
     found: Reference | None,
+    budgets: Sequence[int],
     seeds: Mapping[str, int],
     command: str,
     device: str = "cpu",
-    budgets: Sequence[int] = BUDGETS,
 ) -> Page:
-    """The report, of a checkpoint, of exact problems or of both.
+    """The report, of a checkpoint, of exact problems or of both; the table of all configurations comes last.
 
     Args:
         name: The checkpoint's, as in its rows; None where there is none.
-        found: What it was judged against.
+        found: What its errors are measured against.
         budgets: Evaluations that were asked for.
     """
     of_checkpoint = [row for row in rows if row["problem"] == name]
     of_problems = [row for row in rows if row["problem"] != name]
     text, figures = [], {}
-    if name is not None and found is not None:
-        text += checkpoint_text(of_checkpoint, name, found, budgets)
-        figures["work_precision"] = checkpoint_figure(of_checkpoint, name)
     if of_problems:
         text += problems_text(of_problems, budgets)
         figures["exact_problems"] = problems_figure(of_problems, EVALUATIONS)
         figures["exact_problems_time"] = problems_figure(of_problems, SECONDS)
+    if name is not None and found is not None:
+        text = [*checkpoint_text(of_checkpoint, name, found, budgets), *text, NOTE, all_rows(of_checkpoint)]
+        figures = {"work_precision": checkpoint_figure(of_checkpoint, name), **figures}
     return Page("work_precision", "Error against work", text, rows, figures, command, seeds, device)
 
 
-def checkpoint_text(rows: Sequence[Row], name: str, found: Reference, budgets: Sequence[int] = BUDGETS) -> list[str]:
-    """Which solver for which budget on a checkpoint, and how far that can be trusted."""
-    scenes = rows[0]["scenes"]
-    intro = (
-        f"**{name}**, {scenes} scenes, against its own tight solution: rk4 in {found.steps} steps, which dopri5 at "
-        f"{found.tolerance:.0e} confirms to {shown(float(np.median(found.disagreement)))} (median RMS; worst scene "
-        f"{shown(float(found.disagreement.max()))}), both with a float64 state, {found.evaluations:.0f} "
-        "evaluations a scene."
-    )
+def checkpoint_text(rows: Sequence[Row], name: str, found: Reference, budgets: Sequence[int]) -> list[str]:
+    """Which solver for which budget on a checkpoint, and the least error that can be measured."""
     below = sum(not row["judged"] for row in rows)
-    trust = f"Errors above {shown(found.floor)}, {TRUST:g} times that, can be judged by it"
-    closer = f"; {below} of {len(rows)} configurations come closer: more --reference-steps may tell them apart."
-    trust += closer if below else ", and all are."
+    median, worst = shown(float(np.median(found.disagreement))), shown(float(found.disagreement.max()))
+    text = [
+        f"**{name}**, {rows[0]['scenes']} scans, against its own tight solution: rk4 in {found.steps} steps, both with "
+        f"a float64 state, {found.evaluations:.0f} evaluations a scan. dopri5 at {found.tolerance:.0e} differs from it "
+        f"by {median} (median RMS; worst scan {worst}). Errors above {shown(found.floor)}, {TRUST:g} times that, can "
+        f"be measured; {below} of {len(rows)} configurations are below: for these take more --reference-steps.",
+        "The most accurate solver by evaluations a scan:",
+        best_table(rows, {f"{budget:g}": budget for budget in sorted(budgets)}, "evaluations"),
+    ]
     # The upper quartile: as many evaluations of another solver fit into it, whatever the clock's noise.
     euler = {row["steps"]: row["seconds_three_quarters"] for row in rows if row["method"] == "euler"}
-    said = [f"{intro} {trust}", sentence(f"On **{name}**, by evaluations a scene:", rows, budgets, "evaluations")]
     if euler:
-        times = {euler[steps]: f"the time of {steps} Euler steps ({shown(euler[steps])} s)" for steps in sorted(euler)}
-        said.append(sentence(f"On **{name}**, by time a scene:", rows, list(times), "seconds", times))
+        times = {f"{steps} Euler steps' time ({shown(euler[steps])} s)": euler[steps] for steps in sorted(euler)}
+        text += ["By time a scan:", best_table(rows, times, "seconds")]
+    return text
+
+
+def best_table(rows: Sequence[Row], budgets: Mapping[str, float], work: str) -> str:
+    """The most accurate configuration within each budget of work; "none" where no solver gets nearer than x_0."""
+    lines = []
+    for name, budget in budgets.items():
+        best = best_within(rows, budget, work)
+        error = None if best is None else shown(reached(best)) + ("" if best["judged"] else " or less")
+        lines.append((name, "none" if best is None else best["label"], error))
+    return table(lines, ("within", "configuration", "error"))
+
+
+NOTE = (
+    "All configurations. Errors are RMS over the elements of a scan in model space; in metres, over the rays that both "
+    "solutions return, the median over scans. Seconds are for a scan, the median and quartiles over all its solutions, "
+    "which took turns with those of the other configurations."
+)
+
+
+def all_rows(rows: Sequence[Row]) -> str:
+    """Every configuration on a checkpoint."""
     columns = {
         "label": "configuration", "evaluations": "evaluations", "seconds": "seconds", "seconds_quarter": "quartile",
         "seconds_three_quarters": "quartile", "error": "error, median", "error_p95": "95th percentile",
-        "error_worst": "worst scene", "range_rms_m": "range, RMS m", "range_median_m": "range, median m",
+        "error_worst": "worst scan", "range_rms_m": "range, RMS m", "range_median_m": "range, median m",
         "drop_differs": "ray-drop differs", "front": "Pareto",
     }  # fmt: skip
-    few = "" if scenes >= 20 else f" With {scenes} scenes the 95th percentile is the worst scene."
-    note = (
-        "Errors are RMS over the elements of a scene in model space; in metres, over the rays that both solutions "
-        "return, the median over scenes; a share of 0 is not drawn. Seconds are for a scene, the median and quartiles "
-        "over all its solutions, "
-        f"which took turns with those of the other configurations.{few}"
-    )
-    return [*said, note, table([{**row, "front": _front(row)} for row in rows], columns)]
+    works = ("evaluations", "seconds")
+    fronts = [" and ".join(work for work in works if row[f"pareto_{work}"]) for row in rows]
+    return table([{**row, "front": front} for row, front in zip(rows, fronts, strict=True)], columns)
 
 
-def sentence(
-    begin: str,
-    rows: Sequence[Row],
-    budgets: Sequence[float],
-    work: str,
-    names: Mapping[float, str] | None = None,
-) -> str:
-    """'within 4 **ab2** (4 steps: 0.03); within 8 to 16 ...': the most accurate solver of each budget."""
-    best = [(budget, row) for budget in sorted(budgets) if (row := best_within(rows, budget, work))]
-    parts = []
-    for method, group in groupby(best, key=lambda pair: pair[1]["method"]):
-        run = list(group)
-        (first, _), (last, row) = run[0], run[-1]
-        first_name, last_name = (names[b] if names else f"{b:g}" for b in (first, last))
-        where = f"within {first_name}" if len(run) == 1 else f"within {first_name} to {last_name}"
-        setting = row["label"].removeprefix(f"{method}, ")
-        parts.append(f"{where} **{method}** ({setting}: {shown(reached(row))}{'' if row['judged'] else ' or less'})")
-    return f"{begin} {'; '.join(parts)}." if parts else f"{begin} no solver arrives within any budget."
-
-
-def problems_text(rows: Sequence[Row], budgets: Sequence[int] = BUDGETS) -> list[str]:
-    """The winner of every exact problem and budget, and which solver is nearest to the winners throughout."""
-    problems, budgets = list(dict.fromkeys(row["problem"] for row in rows)), sorted(set(budgets))
-    wins = []
-    for problem in problems:
-        own = [row for row in rows if row["problem"] == problem]
-        line: dict[str, Any] = {"problem": problem}
-        for budget in budgets:
-            line[str(budget)] = _winner(own, budget)
-        wins.append(line)
-    parts = []
-    for method, group in groupby(budgets, key=lambda budget: steadiest(rows, budget)):
-        of = list(group)
-        within = f"{of[0]:g}" + (f" to {of[-1]:g}" if len(of) > 1 else "")
-        parts.append(f"{within} evaluations " + ("no solver arrives" if method is None else f"**{method}**"))
-    scenes = rows[0]["scenes"]
-    said = (
-        f"On {len(problems)} exact problems, {scenes} scenes each, in float64. Nearest to the best solver of every "
-        f"problem (by the geometric mean of the ratio of their errors): within {'; '.join(parts)}."
-    )
-    lost = Counter(row["problem"] for row in rows if row["converged"] < row["scenes"])
-    trouble = ", ".join(f"{problem} ({count})" for problem, count in lost.items())
-    note = f"Configurations that left a scene unsolved, by problem: {trouble}." if lost else "Every scene was solved."
-    columns = {"problem": "problem", **{str(budget): f"within {budget}" for budget in budgets}}
-    heading = "The most accurate within a number of evaluations, and its median error; none where x_0 is as near:"
-    clock = f"Seconds are those of {scenes} scenes solved together, over their number; torchdiffeq takes one at a time."
-    return [said, f"{heading}\n\n{table(wins, columns)}", f"{note} {clock}"]
+def problems_text(rows: Sequence[Row], budgets: Sequence[int]) -> list[str]:
+    """The most accurate solver of every exact problem within every budget, and the one nearest to these throughout."""
+    problems = {row["problem"]: [r for r in rows if r["problem"] == row["problem"]] for row in rows}
+    budgets, scans = sorted(set(budgets)), rows[0]["scenes"]
+    lines = [[name, *(_winner(own, budget) for budget in budgets)] for name, own in problems.items()]
+    lines.append(["**nearest to the best**", *(steadiest(rows, budget) or "none" for budget in budgets)])
+    unsolved = Counter(row["problem"] for row in rows if row["converged"] < row["scenes"])
+    trouble = ", ".join(f"{problem} ({count})" for problem, count in unsolved.items()) or "none"
+    return [
+        f"{len(problems)} exact problems, {scans} scans each, in float64: the most accurate solver within a number of "
+        "evaluations and its median error; none where x_0 is as near. Last line: the solver that is nearest to the "
+        "best one of every problem, by the geometric mean of the ratio of their errors.",
+        table(lines, ["problem", *(f"within {budget}" for budget in budgets)]),
+        f"Configurations that left a scan unsolved, by problem: {trouble}. Seconds are those of {scans} scans solved "
+        "together, over their number; torchdiffeq takes one at a time.",
+    ]
 
 
 def _winner(rows: Sequence[Row], budget: float) -> str:
@@ -147,8 +130,8 @@ def _winner(rows: Sequence[Row], budget: float) -> str:
 def steadiest(rows: Sequence[Row], budget: float) -> str | None:
     """The method whose error is nearest to that of each problem's best, within a budget of evaluations.
 
-    By the geometric mean over problems of (its error / the best error); where it does not get nearer than x_0, its
-    error is that of x_0. None where no method solves any problem within the budget.
+    By the geometric mean over problems of (its error / the best error), where its error is at most that of x_0. None
+    where no method solves any problem within the budget.
     """
     problems = {row["problem"]: [r for r in rows if r["problem"] == row["problem"]] for row in rows}
     regret: dict[str, float] = {}
@@ -162,11 +145,6 @@ def steadiest(rows: Sequence[Row], budget: float) -> str | None:
         if arrives:
             regret[method] = sum(ratios) / len(ratios)
     return min(regret, key=lambda method: regret[method], default=None)
-
-
-def _front(row: Row) -> str:
-    fronts = [name for name in ("evaluations", "seconds") if row[f"pareto_{name}"]]
-    return " and ".join(fronts)
 
 
 def checkpoint_figure(rows: Sequence[Row], name: str) -> Figure:
@@ -183,7 +161,7 @@ def checkpoint_figure(rows: Sequence[Row], name: str) -> Figure:
         _draw(axes, rows, work, error)
         if error is ERROR and math.isfinite(rows[0]["floor"]):
             _draw_floor(axes, rows[0]["floor"])
-    _legend(figure, rows, f"{name}: error against work, median of {rows[0]['scenes']} scenes")
+    _legend(figure, rows, f"{name}: error against work, median of {rows[0]['scenes']} scans")
     return figure
 
 
@@ -201,7 +179,7 @@ def problems_figure(rows: Sequence[Row], work: Axis) -> Figure:
         axes.set_xlabel(work[1].replace("network ", "") if place >= len(problems) - columns else "")
     missing = [row["problem"] for row in rows if row["problem"] not in problems]
     unsolved = f"; unsolved: {', '.join(dict.fromkeys(missing))}" if missing else ""
-    _legend(figure, rows, f"Exact problems, median of {rows[0]['scenes']} scenes{unsolved}")
+    _legend(figure, rows, f"Exact problems, median of {rows[0]['scenes']} scans{unsolved}")
     return figure
 
 
@@ -242,10 +220,10 @@ def _powers_of_two(axes: Any) -> None:
 
 
 def _draw_floor(axes: Any, floor: float) -> None:
-    """Where the reference is not good enough to judge."""
+    """The errors that cannot be measured."""
     low = min(axes.get_ylim()[0], floor / 2)
     axes.axhspan(low, floor, facecolor="0.93", hatch="///", edgecolor="0.75", lw=0)
-    axes.text(0.02, 0.02, "too close to the reference to be judged", fontsize=8, transform=axes.transAxes, color="0.25")
+    axes.text(0.02, 0.02, "closer than can be measured", fontsize=8, transform=axes.transAxes, color="0.25")
     axes.set_ylim(bottom=low)
 
 
@@ -257,7 +235,7 @@ def _legend(figure: Figure, rows: Sequence[Row], title: str) -> None:
     ring: dict[str, Any] = {"marker": "o", "ls": "", "mfc": "none", "mec": "black", "ms": 9}
     handles.append(Line2D([], [], **ring, label="Pareto front"))
     handles.append(
-        Line2D([], [], color="0.4", lw=0.8, label="in the solver's colour: to the worst scene; quartiles of time")
+        Line2D([], [], color="0.4", lw=0.8, label="in the solver's colour: to the worst scan; quartiles of time")
     )
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=11)

@@ -1,4 +1,4 @@
-"""The issue's figures for own steps, and rows that add up."""
+"""What own steps save, and rows that add up."""
 
 import math
 
@@ -20,9 +20,9 @@ from r2flow.reports.savings import (
     exact_rows,
     region_rows,
     regions_to_measure,
-    scene_rows,
+    savings_page,
+    scan_rows,
 )
-from r2flow.reports.savings_page import savings_page
 from tests.test_sampling import flow, network
 
 
@@ -36,7 +36,7 @@ def by_way(rows: list, tolerance: float | None = None) -> dict:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_own_steps_take_at_most_six_tenths_of_one_state_s_evaluations(seed):
+def test_own_steps_take_at_most_0_6_of_the_evaluations_of_one_state(seed):
     rows = exact_rows(MIXED, "mixed", (1e-3, 1e-5), seed)
     for tolerance in (1e-3, 1e-5):
         ways = by_way(rows, tolerance)
@@ -52,15 +52,15 @@ def test_own_steps_take_at_most_six_tenths_of_one_state_s_evaluations(seed):
     assert ways[EULER]["evaluations"] == 16 * 32
 
 
-def test_the_lone_hard_scene_is_not_hidden_by_the_easy_ones():
+def test_one_hard_scan_among_easy_ones_is_solved():
     ways = by_way(exact_rows(LONE, "lone", (1e-3,), seed=0))
     assert ways[LEAVING]["error_ray_drop"] < 5e-3 < ways[ONE_STATE]["error_ray_drop"]
     assert ways[STRAIGHT]["evaluations"] < 0.3 * ways[ONE_STATE]["evaluations"]
 
 
-def test_scenes_of_a_flow_are_held_against_its_tight_solution():
+def test_scans_of_a_flow_are_compared_with_its_tight_solution():
     calls: list[int] = []
-    ways = by_way(scene_rows(flow(), 2, 1e-3, seed=0, advance=lambda: calls.append(1)))
+    ways = by_way(scan_rows(flow(), 2, 1e-3, seed=0, progress=lambda: calls.append(1)))
     # the exact flow of a Gaussian: a solution at 1e-6 is the truth to that
     assert ways[LEAVING]["worst_error"] < 1e-2
     assert ways[EULER]["worst_error"] > ways[LEAVING]["median_error"]
@@ -70,7 +70,7 @@ def test_scenes_of_a_flow_are_held_against_its_tight_solution():
 
 
 def test_regions_cost_their_share_and_are_measured_where_they_were_asked_for():
-    rows = region_rows(network(), 2, steps=2, seed=0, advance=lambda: None)
+    rows = region_rows(network(), 2, steps=2, seed=0)
     whole, *parts = rows
     assert (whole["share"], whole["time"]) == (1.0, 1.0)
     assert {row["way"] for row in parts} == set(regions_to_measure((8, 64)))
@@ -84,11 +84,11 @@ def test_regions_cost_their_share_and_are_measured_where_they_were_asked_for():
     assert by_name["sector of 90 degrees"]["share"] == 0.25
 
 
-def test_a_field_that_looks_at_no_neighbour_loses_nothing_by_a_cut(monkeypatch):
+def test_a_velocity_pixel_by_pixel_is_the_same_on_a_part(monkeypatch):
     # the exact Gaussian flow acts on each pixel by itself: any region of it is that of the whole
     monkeypatch.setattr(Field, "unit", (1, 1))
     monkeypatch.setattr(Field, "part", lambda generator, region: generator)
-    for row in region_rows(flow(), 2, steps=4, seed=0, advance=lambda: None)[1:]:
+    for row in region_rows(flow(), 2, steps=4, seed=0)[1:]:
         assert row["error"] == pytest.approx(0, abs=1e-6)
         assert row["median_m"] == pytest.approx(0, abs=1e-4)
 
@@ -108,7 +108,7 @@ def test_the_page_is_written_with_and_without_a_checkpoint(tmp_path):
         "savings_scenes.png", "savings_regions.png", "savings.csv", "savings.json", "savings.md"
     }  # fmt: skip
     text = (tmp_path / "savings.md").read_text()
-    for words in ("One hard scene among 255", "A part of the image", "One channel", "r2flow report savings run"):
+    for words in ("One hard scan among 255", "A part of the image", "One channel", "r2flow report savings run"):
         assert words in text
     assert not any(math.isnan(row.get("evaluations", 0)) for row in page.rows)
     torch.manual_seed(0)
