@@ -7,16 +7,17 @@ from typing import Any, NamedTuple
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
-from callbacks.curvature import Curvature
-from callbacks.ema import EMA
-from callbacks.guard import Guard
-from callbacks.pictures import SamplePictures
-from callbacks.progress import Progress
-from callbacks.reflow_pairs import ReflowPairs
-from callbacks.requeue import Requeue
 from r2flow.checkpoints import FOLDER
 from r2flow.errors import InputError
 from r2flow.registry import Registry, check_options
+
+from .curvature import Curvature
+from .ema import EMA
+from .guard import Guard
+from .pictures import SamplePictures
+from .progress import Progress
+from .reflow_pairs import ReflowPairs
+from .stopping import Stopping
 
 
 class Entry(NamedTuple):
@@ -80,7 +81,7 @@ CALLBACKS = Registry(
     ),
     curvature=Entry(Curvature, lambda config: (config["seed"],)),
     guard=Entry(Guard, lambda config: (config["run_dir"],)),
-    requeue=Entry(Requeue, lambda config: (config["run_dir"],)),
+    requeue=Entry(Stopping, lambda config: (config["run_dir"],)),
     checkpoint=Entry(keep_checkpoints, lambda config: (Path(config["run_dir"], FOLDER),)),
     progress=Entry(Progress),
 )
@@ -110,8 +111,8 @@ __all__ = [
     "Guard",
     "Progress",
     "ReflowPairs",
-    "Requeue",
     "SamplePictures",
+    "Stopping",
     "build_callbacks",
     "build_loggers",
     "keep_checkpoints",

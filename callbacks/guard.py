@@ -27,6 +27,8 @@ class Guard(L.Callback):
     half precision are how the loss scale finds its place: such a step is skipped too, but it is no defect unless
     the scale falls below `lowest_scale` or it goes on for `skips` steps.
 
+    A stage with several optimisers loses the step of the one whose gradients are not finite.
+
     A checkpoint with weights that are not finite is not written: the run ends there.
 
     Args:
@@ -48,6 +50,7 @@ class Guard(L.Callback):
         self.run_dir, self.skips, self.lowest_scale = Path(run_dir), skips, lowest_scale
         self.in_a_row = self.total = 0
         self._losses: list[Tensor] = []
+        self._found: list[bool] = []  # of each optimiser in this step, whether its gradients are finite
 
     def on_before_backward(self, trainer: L.Trainer, pl_module: L.LightningModule, loss: Tensor) -> None:
         value = loss.detach()
@@ -57,20 +60,31 @@ class Guard(L.Callback):
         loss.register_hook(lambda gradient: gradient + (value - value))
 
     def on_before_optimizer_step(self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: Any) -> None:
-        gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
-        if bool(torch.isfinite(get_total_norm(gradients))):  # the one wait for the device
-            self.in_a_row = 0
-        else:
-            self._skip(trainer, pl_module)
-        self._losses.clear()
+        parameters = [p for group in optimizer.param_groups for p in group["params"]]
+        gradients = [p.grad for p in parameters if p.grad is not None]
+        finite = bool(torch.isfinite(get_total_norm(gradients)))  # the one wait for the device
+        if not finite:
+            self._skip(trainer, pl_module, first=all(self._found))
+            for parameter in parameters:
+                parameter.grad = None  # which AdamW passes over, its averages untouched
+        self._found.append(finite)
 
-    def _skip(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: object, batch: object, batch_idx: int
+    ) -> None:
+        if self._found:  # else the batch was accumulated
+            self.in_a_row = 0 if all(self._found) else self.in_a_row
+            self._losses.clear()
+            self._found.clear()
+
+    def _skip(self, trainer: L.Trainer, pl_module: L.LightningModule, first: bool) -> None:
+        """Count a step, once for all of its optimisers, and end the run where there were too many."""
         scaler = getattr(trainer.precision_plugin, "scaler", None)
         scale = None if scaler is None else float(scaler.get_scale())
         loss = float(trainer.strategy.reduce(torch.stack(self._losses).sum(), reduce_op="mean")) / (scale or 1.0)
         overflow = scale is not None and loss - loss == 0
-        self.in_a_row += 1
-        self.total += not overflow
+        self.in_a_row += first
+        self.total += first and not overflow
         if self.in_a_row >= self.skips or (scale is not None and scale < self.lowest_scale):
             raise self._stop(trainer, pl_module, loss, scale)
         if trainer.is_global_zero and not overflow:
@@ -79,8 +93,6 @@ class Guard(L.Callback):
                 "step %d skipped: non-finite %s (%d in a row; the run ends at %d)",
                 trainer.global_step + 1, what, self.in_a_row, self.skips,
             )  # fmt: skip
-        for parameter in pl_module.parameters():
-            parameter.grad = None  # which AdamW passes over, its averages untouched
 
     def _stop(self, trainer: L.Trainer, pl_module: L.LightningModule, loss: float, scale: float | None) -> InputError:
         what = f"{self.in_a_row} steps in a row were" if self.in_a_row > 1 else "the step was"

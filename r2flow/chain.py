@@ -8,22 +8,17 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
-from r2flow.checkpoints import checkpoints_of
+from r2flow.checkpoints import checkpoints_of, step_of
+from r2flow.config import flatten, key_of, rule
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.runs import flatten
+from r2flow.runs import read_config
+from r2flow.signals import LATER, code_of, listening
 
 RECORD = "link.json"
-
-# Of the command line: what the chain itself is, and what concerns only the link that reads scans.
-CHAIN_KEYS = ("experiment", "name", "run_dir", "chain", "hydra")
-SCAN_KEYS = (
-    "backbone", "sensor", "encoding", "data", "data.root", "data.split", "data.drives", "data.scenes",
-    "data.projection", "data.convention", "data.reflectance_scale", "data.on_bad_scan",
-    "data.augment", "data.parts", "data.validation.data",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -34,11 +29,13 @@ class Link:
         name: Its name in the chain, and of its folder.
         run_dir: Where it lives.
         overrides: Its command line.
+        parent: The link that it starts from, if any.
     """
 
     name: str
     run_dir: Path
     overrides: tuple[str, ...]
+    parent: str | None = None
 
 
 def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: Sequence[str]) -> list[Link]:
@@ -52,7 +49,7 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
     Raises:
         InputError: a link starts from one that does not come before it, or the command line says where all do.
     """
-    if any(one.lstrip("+~").partition("=")[0] == "stage.init" for one in given):
+    if any(key_of(one) == "stage.init" for one in given):
         raise InputError("stage.init is each link's own: give +chain.LINK.stage.init=RUN to one of them.")
     links: list[Link] = []
     for name, difference in chain.items():
@@ -64,13 +61,14 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
                 raise InputError(f"chain.{name}.init={parent}: no link of that name comes before it.")
             overrides.append(override("stage.init", str(Path(folder, parent))))
         reads_scans = parent is None and (own.get("stage") or {}).get("init") is None
-        overrides += [one for one in given if _concerns(one, reads_scans)]
+        concerning = ("all", "scans" if reads_scans else "pairs")
+        overrides += [one for one in given if rule(key_of(one)).links in concerning]
         # What the user gave to this link alone comes last, for it is what the link's own has become.
         mine = f"chain.{name}."
         alone = [one.lstrip("+").removeprefix(mine) for one in given if one.lstrip("+").startswith(mine)]
         overrides += [one for one in alone if not one.startswith("init=")]
         run_dir = Path(folder, name)
-        links.append(Link(name, run_dir, (*overrides, override("run_dir", str(run_dir)))))
+        links.append(Link(name, run_dir, (*overrides, override("run_dir", str(run_dir))), parent))
     return links
 
 
@@ -86,24 +84,14 @@ def override(key: str, value: Any) -> str:
     return f"{key}={value}"
 
 
-def _concerns(given: str, reads_scans: bool) -> bool:
-    key = given.lstrip("+~").partition("=")[0]
-    if _within(key, CHAIN_KEYS):
-        return False
-    if reads_scans:
-        return not _within(key, ("data.pairs",))
-    return key not in SCAN_KEYS and not _within(key, ("backbone", "sensor", "encoding", "data.validation.data"))
-
-
-def _within(key: str, groups: Sequence[str]) -> bool:
-    return any(key == group or key.startswith(f"{group}.") for group in groups)
-
-
-def run_chain(links: Sequence[Link], train: Path) -> tuple[int, bool]:
+def run_chain(links: Sequence[Link], command: Sequence[str]) -> tuple[int, bool]:
     """Run what is not finished yet, each link as its own process.
 
+    Args:
+        command: How a run is started; a link's overrides follow.
+
     Returns:
-        The exit code of the first that fails, or 0, and whether any was run.
+        The exit code of the first that does not come to its end, or 0, and whether any was run.
     """
     skipping = True
     for number, link in enumerate(links, 1):
@@ -113,7 +101,7 @@ def run_chain(links: Sequence[Link], train: Path) -> tuple[int, bool]:
             continue
         skipping = False
         print(f"[{number}/{len(links)}] {link.name}: {link.run_dir}", flush=True)
-        code = _run(link, train)
+        code = run_process([*command, *link.overrides]) or (0 if has_ended(link.run_dir) else LATER)
         if code:
             if code != 2:  # which is the user's to mend, and has been said
                 print(f"the chain stopped in {link.name}; the same command goes on there", file=sys.stderr, flush=True)
@@ -123,13 +111,19 @@ def run_chain(links: Sequence[Link], train: Path) -> tuple[int, bool]:
     return 0, not skipping
 
 
+def has_ended(run: Path) -> bool:
+    """Whether a run's last checkpoint is that of the last step of its config."""
+    config, last = read_config(run), next(iter(checkpoints_of(run)), None)
+    return config is not None and last is not None and step_of(last) >= config["trainer"]["max_steps"]
+
+
 def is_finished(link: Link) -> bool:
-    """Whether a link ended well under the same command, and has not lost its checkpoint since."""
+    """Whether a link came to its end under the same command, and has not lost its checkpoint since."""
     try:
         record = json.loads((link.run_dir / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
-    return record == _record(link) and record["checkpoint"] is not None
+    return bool(record == _record(link)) and has_ended(link.run_dir)
 
 
 def _record(link: Link) -> dict[str, Any]:
@@ -152,17 +146,31 @@ def is_reported(links: Sequence[Link], out: Path) -> bool:
         return False
 
 
-def _run(link: Link, train: Path) -> int:
-    command = [sys.executable, str(train), *link.overrides]
-    with subprocess.Popen(command, preexec_fn=_die_with_parent if sys.platform == "linux" else None) as process:
-        try:
-            return process.wait()
-        except KeyboardInterrupt:  # the link has had it too, and says where it stopped
-            process.wait()
-            return 130
+def run_process(command: Sequence[str]) -> int:
+    """Run a command that hears the signals to stop which this process gets, and ends with it.
+
+    Returns:
+        Its exit code, as a shell would give it: 143 where SIGTERM ended it.
+    """
+    told: list[int] = []
+
+    def pass_on(number: int, frame: FrameType | None) -> None:
+        told.append(number)
+        if process is not None and process.poll() is None:
+            process.send_signal(number)
+
+    process: subprocess.Popen[bytes] | None = None
+    with listening(pass_on):
+        process = subprocess.Popen(command, preexec_fn=_die_with_parent if sys.platform == "linux" else None)
+        if told:
+            process.send_signal(told[0])
+        code = process.wait()
+    if code < 0:
+        return code_of(-code)
+    return code or (code_of(told[0]) if told else 0)
 
 
 def _die_with_parent() -> None:
-    """A link that outlives its killed chain would be in the way of the same command given again."""
+    """A run that outlives its killed chain or sweep would be in the way of the same command given again."""
     PR_SET_PDEATHSIG = 1
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -21,6 +21,7 @@ from r2flow.generators import Generator, RectifiedFlow, Sampler, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
+from r2flow.plugins import made_with
 from r2flow.published import published_cfg, published_config, published_rings, published_step
 
 FOLDER = "checkpoints"
@@ -193,7 +194,7 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
             f"{path} is a torch file but not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
             f"(ours) nor 'cfg' and 'weights' (published); found {', '.join(map(repr, list(content)[:6]))}."
         )
-    with _Allowance(weights, path):
+    with made_with(config, str(path)), _Allowance(weights, path):
         generator = build_generator(config)
     check_weights(generator, weights, path)
     generator.load_state_dict(weights)
@@ -296,6 +297,9 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
         with atomic_write(path) as file:
             file.write(data)
     elif path.suffix == ".pth":
+        if type(checkpoint.generator) is not RectifiedFlow:
+            what = type(checkpoint.generator).__name__
+            raise InputError(f"{path}: the published format cannot hold a {what}; convert to .safetensors instead.")
         weights = _plain(checkpoint.model)
         cfg = published_cfg(checkpoint.config)
         images = checkpoint.step * int(cfg.get("training", {}).get("batch_size", 1))

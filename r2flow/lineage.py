@@ -1,69 +1,93 @@
 """Flows that come from flows: what a run takes over from the one that it starts from."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from r2flow.checkpoints import Checkpoint, load_checkpoint, weights_hash
+from r2flow.config import flatten, groups_of, key_of, rule
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.sources import AUTO
 from r2flow.errors import InputError
 from r2flow.registry import check_options
-from r2flow.runs import flatten
 from r2flow.stages import STAGES
 
-# What a flow that starts from another's weights takes over from it.
-INHERITED = ("sensor", "encoding", "backbone")
-# Of these, what may differ all the same: the weights fit.
-OWN = ("backbone.attention", "backbone.dropout")
+
+@dataclass(frozen=True)
+class Parent:
+    """What a run needs to know of the one that it starts from.
+
+    Attributes:
+        config: Its config.
+        path: Its checkpoint or, while it has none, its folder.
+        step: Optimiser steps taken.
+        weights: `weights_hash` of its averaged weights; None while it is to be trained.
+    """
+
+    config: Mapping[str, Any]
+    path: Path
+    step: int = 0
+    weights: str | None = None
 
 
-def inherit(config: Mapping[str, Any], asked: Sequence[str]) -> tuple[dict[str, Any], Checkpoint | None]:
-    """The config of a run that starts from `stage.init`, completed by what its parent says, and that parent.
-
-    Sensor, encoding and backbone are the parent's; pairs are those of its averaged weights, in its folder.
-
-    Args:
-        asked: Keys that the command line gave, as `backbone` or `backbone.depths`.
+def find_parent(config: Mapping[str, Any]) -> tuple[Parent, Checkpoint] | None:
+    """The trained flow that a config's `stage.init` names, if it names one.
 
     Raises:
-        InputError: the command line asks for what the parent is not, the parent is not finished, or a stage that
-            needs a parent has none.
+        InputError: it is not there, not finished, or cannot be started from.
     """
-    config = {key: dict(value) if isinstance(value, Mapping) else value for key, value in config.items()}
     init = config["stage"].get("init")
     if init is None:
-        if STAGES[config["stage"]["name"]].needs_pairs:
-            raise InputError(f"stage={config['stage']['name']} starts from a trained flow: give stage.init=RUN.")
-        return config, None
-    parent = load_checkpoint(init)
-    check_finished(Path(init), parent)
-    if "published" in parent.config and parent.config["data"]["projection"] == "unfolding":
+        return None
+    found = load_checkpoint(init)
+    check_finished(Path(init), found)
+    if "published" in found.config and found.config["data"]["projection"] == "unfolding":
         raise InputError(
             f"{init} was trained on unfolded scans, whose rings a new run's sensor does not carry; "
             "start from a flow trained on spherical images."
         )
-    for key in asked:
+    return Parent(found.config, found.path, found.step, weights_hash(found)), found
+
+
+def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
+    """The config of a run, completed by what its parent says.
+
+    Sensor, encoding and backbone are the parent's; pairs are those of its averaged weights, in its folder.
+
+    Args:
+        asked: What the command line gave, as `backbone=hdit` or `backbone.depths=[1]`.
+
+    Raises:
+        InputError: the command line asks for what the parent is not, or a stage that needs a parent has none.
+    """
+    config = {key: dict(value) if isinstance(value, Mapping) else value for key, value in config.items()}
+    if parent is None:
+        if STAGES[config["stage"]["name"]].needs_pairs:
+            raise InputError(f"stage={config['stage']['name']} starts from a trained flow: give stage.init=RUN.")
+        return config
+    keys = [key_of(one) for one in asked]
+    for key in keys:
         _check_agrees(key, config, parent)
-    for group in INHERITED:
-        own = {key: value for key, value in flatten({group: config[group]}) if key in OWN and key in asked}
-        config[group] = {**parent.config[group], **{key.partition(".")[2]: value for key, value in own.items()}}
-    weights = weights_hash(parent)
-    config["parent"] = {
-        "path": str(parent.path),
-        "weights": weights,
-        "step": parent.step,
-        "stage": parent.config.get("stage", {}).get("name", "rectify"),
-    }
+    for group in groups_of(inherited="always"):
+        there = parent.config.get(group)
+        if not isinstance(there, Mapping):
+            config[group] = there
+            continue
+        given = [key for key in keys if rule(key).inherited == "unless_given" and key.startswith(f"{group}.")]
+        own = {key.partition(".")[2]: dict(flatten({group: config[group]}))[key] for key in given}
+        config[group] = {**there, **own}
+    stage = (parent.config.get("stage") or {}).get("name", "rectify")
+    config["parent"] = {"path": str(parent.path), "weights": parent.weights, "step": parent.step, "stage": stage}
     data = config["data"]
     if data["name"] == "pairs":
         data["root"] = data["root"] or str(default_folder(parent.path))
-        data["pairs"] = pairs_of(parent, data["pairs"] or {}, weights)
-    return config, parent
+        data["pairs"] = pairs_of(parent, data["pairs"] or {}, parent.weights)
+    return config
 
 
-def pairs_of(parent: Checkpoint, options: Mapping[str, Any], weights: str) -> dict[str, Any]:
+def pairs_of(parent: Checkpoint | Parent, options: Mapping[str, Any], weights: str | None) -> dict[str, Any]:
     """`data.pairs` for a parent of this `weights_hash`, and noise that it has not been trained on itself."""
     check_options("data.pairs", PairOptions, options)
     first = options.get("first")
@@ -87,19 +111,19 @@ def check_finished(init: Path, parent: Checkpoint) -> None:
         )
 
 
-def _check_agrees(key: str, config: Mapping[str, Any], parent: Checkpoint) -> None:
+def _check_agrees(key: str, config: Mapping[str, Any], parent: Parent) -> None:
     group = key.split(".")[0]
-    if group not in INHERITED:
+    theirs, ours = parent.config.get(group), config.get(group)
+    if rule(key).inherited != "always" or ours is None:
         return
-    there = dict(flatten({group: parent.config[group]}))
-    for leaf, value in flatten({group: config[group]}):
+    there = dict(flatten({group: theirs}))
+    for leaf, value in flatten({group: ours}):
         asked = leaf == key or leaf.startswith(f"{key}.")
         if leaf == "encoding.reflectance" and value == AUTO:
             continue
         unknown = leaf not in there and leaf == key
-        if asked and leaf not in OWN and (unknown or there.get(leaf, value) != value):
+        if asked and rule(leaf).inherited == "always" and (unknown or there.get(leaf, value) != value):
             raise InputError(
                 f"{leaf} is {value} here, but {there.get(leaf, 'not known')} in {parent.path}, whose weights this run "
-                "starts from. "
-                f"Leave {key} out: the {group} is the parent's."
+                f"starts from. Leave {key} out: the {group} is the parent's."
             )

@@ -21,6 +21,10 @@ def did_you_mean(name: str, known: Mapping[str, Any] | list[str]) -> str:
     return f" Did you mean '{close[0]}'?" if close else ""
 
 
+class UnknownName(InputError):
+    """A registry has no entry of this name."""
+
+
 class Registry(Generic[T]):
     """Named values of one kind.
 
@@ -43,7 +47,7 @@ class Registry(Generic[T]):
         if name not in self:
             known = ", ".join(sorted(self._entries))
             hint = did_you_mean(str(name), self._entries)
-            raise InputError(f"no {self.kind} named {name!r}; known: {known}.{hint}")
+            raise UnknownName(f"no {self.kind} named {name!r}; known: {known}.{hint}")
         return self._entries[name]
 
     def __iter__(self) -> Iterator[str]:

@@ -3,8 +3,7 @@
 import logging
 import os
 import platform
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import yaml
 from filelock import FileLock, Timeout
 
 from r2flow.checkpoints import FOLDER, checkpoints_of, read_checkpoint
+from r2flow.config import flatten, rule
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
@@ -20,57 +20,6 @@ from r2flow.files import atomic_write
 log = logging.getLogger(__name__)
 
 CONFIG = "config.yaml"
-
-# What may differ when a run goes on: where and how it computes, not what.
-FREE = (
-    "run_dir",
-    "name",
-    "loggers",
-    "samples",
-    "sampler",
-    "callbacks.pictures",
-    "callbacks.progress",
-    "callbacks.checkpoint",
-    "callbacks.curvature",
-    "callbacks.guard",
-    "callbacks.reflow_pairs",
-    "callbacks.requeue",
-    "data.root",
-    "data.parts.*.root",
-    "data.validation.data.root",
-    "stage.init",
-    "parent.path",
-    "chain",
-    "data.workers",
-    "data.memory_gib",
-    "trainer.accelerator",
-    "trainer.strategy",
-    "trainer.devices",
-    "trainer.num_nodes",
-    "trainer.precision",
-    "trainer.default_root_dir",
-    "trainer.enable_progress_bar",
-    "trainer.log_every_n_steps",
-    "trainer.max_time",
-    "trainer.profiler",
-    "trainer.val_check_interval",
-)
-
-
-def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """('a.b', value) for every leaf of a nested mapping; a list of groups counts them, 'a.0.b'."""
-    for key, value in config.items():
-        if isinstance(value, Sequence) and value and all(isinstance(one, Mapping) for one in value):
-            value = dict(enumerate(value))
-        if isinstance(value, Mapping):
-            yield from flatten(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-def _is_free(key: str) -> bool:
-    key = re.sub(r"\.\d+\.", ".*.", key)
-    return any(key == free or key.startswith(f"{free}.") for free in FREE)
 
 
 def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
@@ -80,7 +29,7 @@ def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     return [
         f"{key}={before.get(key)} there, {now.get(key)} here"
         for key in sorted(before.keys() | now.keys())
-        if before.get(key) != now.get(key) and not _is_free(key)
+        if before.get(key) != now.get(key) and rule(key).resume != "free"
     ]
 
 
@@ -141,8 +90,33 @@ def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
     if newest is None:  # nothing has been learned there yet
         write_config(run, config)
         return None
+    raise InputError(_another_config(run, differing))
+
+
+def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
+    """Refuse a run folder of another config; what only the data and a trained parent tell is left out.
+
+    Raises:
+        InputError: the folder holds a run of another config.
+    """
+    old = read_config(run)
+    if old is None or not checkpoints_of(run):
+        return
+    told_later = {"scans", "parent", "encoding.reflectance", "data.pairs.parent"}
+    differing = contradictions(
+        *({k: v for k, v in flatten(one) if not _within(k, told_later)} for one in (old, config))
+    )
+    if differing:
+        raise InputError(_another_config(run, differing))
+
+
+def _within(key: str, groups: Iterable[str]) -> bool:
+    return any(key == group or key.startswith(f"{group}.") for group in groups)
+
+
+def _another_config(run: str | Path, differing: list[str]) -> str:
     more = f" (and {len(differing) - 3} more)" if len(differing) > 3 else ""
-    raise InputError(
+    return (
         f"{run} holds a run of another config: {'; '.join(differing[:3])}{more}. "
         "Give the same command to go on with it, or name=OTHER for a new one."
     )

@@ -109,7 +109,10 @@ def draw(
     noise = draws.start(generator.noise_shape)
     seen = None if region is None else evaluated_region(generator, region)
     if seen is not None:
+        whole = generator.space.shape[1:]
         generator, noise = generator.part(seen), seen.crop(noise)
+        if condition is not None:  # what is known of each pixel
+            condition = {n: seen.crop(value) if value.shape[-2:] == whole else value for n, value in condition.items()}
     noise, start = noise.to(generator.device), time.perf_counter()
     made = generator.generate(noise, condition, sampler=sampler, draws=draws, progress=progress)
     x_1 = made.x.cpu()  # which also waits for a GPU

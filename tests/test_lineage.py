@@ -7,7 +7,7 @@ import pytest
 from r2flow.checkpoints import load_checkpoint
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
-from r2flow.lineage import inherit
+from r2flow.lineage import find_parent, inherit
 from r2flow.stages import build_stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 
@@ -35,15 +35,21 @@ def child(parent: Path, reflectance) -> dict:
     return {**CONFIG, "encoding": encoding, "stage": {"name": "rectify", "init": str(parent)}}
 
 
+def completed(config: dict, asked: list[str]) -> dict:
+    found = find_parent(config)
+    assert found is not None
+    return inherit(config, asked, found[0])
+
+
 @pytest.mark.parametrize("asked", [[], ["encoding"], ["encoding.reflectance"]])
 def test_auto_is_what_the_parent_is(parent: Path, asked: list[str]):
-    config, _ = inherit(child(parent, "auto"), asked)
+    config = completed(child(parent, "auto"), asked)
     assert config["encoding"] == {"format": "logscale", "reflectance": False}
 
 
 def test_a_channel_that_the_parent_lacks_is_refused(parent: Path):
     with pytest.raises(InputError, match="reflectance is True here, but False in"):
-        inherit(child(parent, True), ["encoding.reflectance"])
+        completed(child(parent, True), ["encoding.reflectance=true"])
 
 
 def test_a_checkpoint_of_before_is_read_in_todays_keys(parent: Path):

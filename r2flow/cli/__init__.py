@@ -21,20 +21,26 @@ from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     scans,
     sensors,
     simulate,
+    train,
     weights,
 )
 from r2flow.cli.app import app
 from r2flow.errors import InputError, explain_mistake
+from r2flow.plugins import load_plugins, take_plugins
 
 # Its home is click in older releases of typer and typer itself in newer ones.
 USAGE_ERROR: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 
 def main() -> None:
-    """Run a verb; what the user can mend is one line and exit code 2."""
+    """Run a verb, with `--plugin MODULE` anywhere; what the user can mend is one line and exit code 2."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", force=True)
     try:
-        code = app(standalone_mode=False)
+        arguments, plugins = take_plugins(sys.argv[1:])
+        load_plugins(plugins)
+        if arguments[:1] == ["train"]:  # which passes them on to its own processes
+            arguments += [f"--plugin={name}" for name in plugins]
+        code = app(arguments, prog_name="r2flow", standalone_mode=False)
     except BrokenPipeError:  # r2flow ... | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)

@@ -106,7 +106,7 @@ def evaluate(
     """
     from r2flow.evaluation.measuring import check_reflectance
     from r2flow.evaluation.processes import joined
-    from r2flow.reports.speed_quality import Drawing
+    from r2flow.reports.speed_quality import Drawing, steps_of
 
     _check_evaluation(generated, checkpoint, measured, output)
     num = scans.num or 1000
@@ -136,6 +136,8 @@ def evaluate(
         shared = work_of(work.batch_size, work.workers, place.rank, place.ranks)
         if checkpoint:
             drawing = Drawing(num, sampling.seed, sampling.solver, sampling.tolerance)
+            for label, flow in flows.items():
+                steps_of(flow, label, _many(sampling.steps), drawing)  # what it refuses is refused before reading
             _curve(truth, flows, built, _many(sampling.steps), drawing, shared, measured, output, place.device)
         else:
             _compare(truth, judged, built, measured, shared, output, place.device, sampling.seed)
@@ -330,7 +332,10 @@ def _rescaled(generated: str, reading: "Reading", scale: float | None) -> "Readi
 def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> "ScanSet":
     from r2flow.data.opening import open_scans
 
-    return open_scans(text, reading, split, num)
+    scans = open_scans(text, reading, split, num)
+    if len(scans):
+        _ = scans.source[0]  # what does not fit is better known now than after the other set was read
+    return scans
 
 
 def _sampled(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOptions) -> "ScanSet":

@@ -64,7 +64,8 @@ def choose_reading(
     Raises:
         InputError: an unknown name, or another sensor or size than the flow's.
     """
-    from r2flow.data.opening import own_reading, usual_reading
+    from r2flow.data.opening import own_reading, parse, refuse_other_samples, usual_reading
+    from r2flow.data.options import FOLDER
     from r2flow.lidar.projection import CONVENTIONS, PROJECTIONS
 
     named = [spec for spec in specs if spec is not None]
@@ -85,6 +86,10 @@ def choose_reading(
     for option, value, known in (("projection", projection, PROJECTIONS), ("convention", convention, CONVENTIONS)):
         if value is not None and value not in known:
             raise InputError(f"--{option} must be one of {', '.join(known)}; found {value!r}.")
+    for spec in named:  # before anything is read
+        options, _ = parse(str(spec))
+        if options.name == FOLDER:
+            refuse_other_samples(Path(options.folder), found.sensor)
     asked_for = {"projection": projection, "convention": convention, "reflectance_scale": reflectance_scale}
     return replace(found, **{key: value for key, value in asked_for.items() if value is not None})  # type: ignore[arg-type]
 

@@ -23,6 +23,7 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.progress import track
 from r2flow.registry import check_options
+from r2flow.signals import outlive_the_signal
 
 log = logging.getLogger(__name__)
 
@@ -236,5 +237,6 @@ class ScanDataModule(L.LightningDataModule):
         return {
             "num_workers": self.options.workers,
             "persistent_workers": self.options.workers > 0,
+            "worker_init_fn": outlive_the_signal,
             "pin_memory": torch.cuda.is_available(),
         }

@@ -41,6 +41,7 @@ class FlowDataset(Dataset[Item]):
         augment: Augmentation | None = None,
         noise_shape: Sequence[int] | None = None,
     ) -> None:
+        self.noise_shape = tuple(noise_shape or encoding.shape)
         self.source, self.encoding, self.seed, self.purpose = source, encoding, seed, purpose
         self.augment, self.noise_shape = augment, tuple(noise_shape or encoding.shape)
 

@@ -113,14 +113,14 @@ def open_scans(
     assert reading is not None
     kind = SOURCES[options.name]
     if file is not None:
-        _refuse_other_samples(file.parent, reading.sensor)
+        refuse_other_samples(file.parent, reading.sensor)
         if own_size and (image := range_image(file)) is not None:
             reading = replace(reading, sensor=reading.sensor.resized(*image.shape[1:]))
         if reading.reflectance == AUTO:
             reading = replace(reading, reflectance=lacks_reflectance([file], reading.on_bad_scan) is None)
         return ScanSet(label, ScanFiles([file], reading, file.parent, about={"kind": "file"}), reading.sensor)
     if options.name == FOLDER:
-        _refuse_other_samples(Path(options.folder), reading.sensor)
+        refuse_other_samples(Path(options.folder), reading.sensor)
     if reading.reflectance == AUTO:
         reading = replace(reading, reflectance=kind.lacks_reflectance(options, reading.on_bad_scan) is None)
     source = kind.open(options, reading, seed, first_scene)
@@ -240,7 +240,12 @@ def _sensor(described: Mapping[str, Any]) -> Sensor:
     return Sensor(**plain)
 
 
-def _refuse_other_samples(folder: Path, sensor: Sensor) -> None:
+def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
+    """Refuse a folder whose note says that its images are of another sensor or size.
+
+    Raises:
+        InputError: it does.
+    """
     own = _noted(folder)
     if own is None or (own.sensor.shape == sensor.shape and np.allclose(own.sensor.elevations, sensor.elevations)):
         return

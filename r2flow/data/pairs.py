@@ -67,6 +67,7 @@ def make_pairs(
     """
     if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
         raise InputError(f"these pairs are of another noise than the generator's {generator.noise_shape}.")
+    generator.check_sampler(sampler_of(store.recipe))
     store.begin()
     # Shards are checked by turns; who finds one damaged makes its batches, which the others hold to be there.
     shards = store.shards(num)
@@ -118,12 +119,16 @@ def _check_usable(made: Made, recipe: Recipe, patience: int = 64) -> None:
         )
 
 
+def sampler_of(recipe: Recipe) -> Sampler:
+    """How the generator is run."""
+    return Sampler(recipe.method, recipe.steps, recipe.tolerance)
+
+
 def solve_batch(recipe: Recipe, generator: Generator, batch: int) -> Block:
     """The pairs first + [b B, (b + 1) B) of batch b."""
     first = recipe.first + batch * recipe.batch_size
     x_0 = torch.stack([pair_noise(recipe, index) for index in range(first, first + recipe.batch_size)])
-    sampler = Sampler(recipe.method, recipe.steps, recipe.tolerance)
-    end = generator.generate(x_0.to(generator.device), sampler=sampler)
+    end = generator.generate(x_0.to(generator.device), sampler=sampler_of(recipe))
     x_1 = end.x.to(torch.float16).cpu()
     usable = end.converged.cpu() & x_1.isfinite().flatten(1).all(1)
     return Block(x_1.numpy(), end.evaluations.cpu().numpy().astype(np.int32), usable.numpy())

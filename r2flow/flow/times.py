@@ -68,5 +68,10 @@ class Discrete:
 
 
 TIMES: Registry[Callable[..., TimeDensity]] = Registry(
-    "time density", uniform=Uniform, u_shaped=UShaped, logit_normal=LogitNormal, discrete=Discrete
+    "time density",
+    uniform=Uniform,
+    u_shaped=UShaped,
+    logit_normal=LogitNormal,
+    discrete=Discrete,
+    grid=Discrete,  # its name in the configs of version 0.1.0
 )

@@ -88,6 +88,12 @@ class Generated:
     evaluations: Tensor
     converged: Tensor
 
+    @classmethod
+    def after(cls, x: Tensor, evaluations: int) -> Self:
+        """Scans of a method that always comes to its end, after the same number of evaluations for all."""
+        counted = torch.full((len(x),), evaluations, dtype=torch.int64, device=x.device)
+        return cls(x, counted, x.isfinite().flatten(1).all(1))
+
 
 class Generator(nn.Module):
     """Noise in, scan out. What training makes, a checkpoint holds and every verb, report and callback runs.
@@ -131,11 +137,17 @@ class Generator(nn.Module):
         raise NotImplementedError
 
     def check_sampler(self, sampler: Sampler) -> None:
-        """Refuse a sampler before it is needed.
+        """Refuse a sampler before it is needed. A generator that can be run in several ways says in which.
 
         Raises:
             InputError: this generator cannot be run so.
         """
+        own = self.sampler
+        if sampler != own:
+            raise InputError(
+                f"a {type(self).__name__} can be run in one way only, {own.method} with {own.steps} "
+                f"step{'s' * (own.steps > 1)}; found {sampler.method} with {sampler.steps}."
+            )
 
     def evaluations_of(self, sampler: Sampler) -> int:
         """Network evaluations of a batch, for a progress bar; 0 where they depend on the scans."""

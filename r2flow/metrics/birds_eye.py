@@ -1,4 +1,4 @@
-"""Scans from above: the histograms that the field's JSD and MMD compare."""
+"""Bird's-eye histograms, which the field's JSD and MMD compare."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ def birds_eye_histogram(xyz: np.ndarray) -> np.ndarray:
 def js_distance(a: np.ndarray, b: np.ndarray) -> float:
     """sqrt of the Jensen-Shannon divergence, natural logarithm: 0 for equal, sqrt(ln 2) = 0.833 for disjoint.
 
-    An empty histogram, a set without any return, is as far as can be from any other.
+    An empty histogram, of a set without any return, has the largest distance from any other.
     """
     if a.sum() == 0 or b.sum() == 0:
         return 0.0 if a.sum() == b.sum() else float(np.sqrt(np.log(2)))

@@ -1,12 +1,12 @@
-"""What a range image alone tells of the surfaces in it: how they lie, and how often a pulse on them is lost."""
+"""Surfaces in a range image: their normals, the angle of incidence, and how often a ray on them is lost."""
 
 import numpy as np
 
 from r2flow.lidar.sensors import Sensor
 
-SPAN = 2  # columns to either side over which a surface's direction is taken: over one it is lost in the noise of range
-STEP = 0.15  # of the range: neighbours farther apart than that lie on different things
-GAP = 16  # columns: what is missing for longer is sky, or hidden, and not a lost pulse
+SPAN = 2  # columns to either side over which a surface's direction is taken; over one, the noise of range hides it
+STEP = 0.15  # of the range; neighbours farther apart lie on different objects
+GAP = 16  # columns; longer gaps are sky or hidden, not lost rays
 
 
 def normals(r: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:

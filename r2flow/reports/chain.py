@@ -1,6 +1,7 @@
 """What straightening and distilling did: every flow of a chain at few and at many steps, from the same noise."""
 
 import json
+import math
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -15,7 +16,7 @@ from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.files import atomic_write
 from r2flow.flow.straightness import curvature
-from r2flow.generators import as_flow
+from r2flow.generators import Flow
 from r2flow.metrics.fidelity import distances, panel
 from r2flow.noise import Draws
 from r2flow.progress import track
@@ -112,8 +113,10 @@ def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
 
 
 def bend(flow: Checkpoint, num: int) -> float:
-    """int s(t) dt over |x_1 - x_0|^2, median over scenes: 0 is straight."""
-    followed = as_flow(flow.generator, "a chain's report")
+    """int s(t) dt over |x_1 - x_0|^2, median over scenes: 0 is straight; NaN where there is no path."""
+    followed = flow.generator
+    if not isinstance(followed, Flow):
+        return math.nan
     x_0 = Draws(0, range(num)).start(followed.noise_shape).to(followed.device)
     with torch.inference_mode():
         return float(curvature(followed.velocity, x_0, MANY).normalised.median())

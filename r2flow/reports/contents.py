@@ -3,21 +3,24 @@
 from pathlib import Path
 from typing import Any
 
+from r2flow.backbones import Backbone
 from r2flow.checkpoints import load_checkpoint
+from r2flow.config import flatten
 from r2flow.reports.tables import print_table
-from r2flow.runs import flatten
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """Backbone, parameters, sensor, encoding, step and config of a checkpoint file or run folder."""
+    """Generator, parameters, sensor, encoding, step and config of a checkpoint file or run folder."""
     loaded = load_checkpoint(path)
     rows, columns = loaded.sensor.shape
+    with_backbone = any(isinstance(module, Backbone) for module in loaded.generator.modules())
     return {
         "path": str(loaded.path),
         "format": loaded.format,
         "step": loaded.step,
         "stage": loaded.config.get("stage", {}).get("name", "unknown"),
-        "backbone": loaded.config["backbone"]["name"],
+        "generator": (loaded.config.get("generator") or {}).get("name", "rectified_flow"),
+        "backbone": loaded.config["backbone"]["name"] if with_backbone else None,
         "parameters": sum(p.numel() for p in loaded.generator.parameters()),
         "image": [loaded.encoding.channels, rows, columns],
         "sensor": loaded.sensor.name,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
-from r2flow.generators import Sampler
+from r2flow.generators import Sampler, as_flow
 from r2flow.inversion import TIGHT, interpolate_scans
 from r2flow.reports.inversion import Real, errors_of
 from r2flow.reports.outputs import ScanBar, formats_of, write_scan
@@ -40,7 +40,7 @@ def interpolation(
     Raises:
         InputError: a scan or a solver that cannot be used, before anything is written; a scan without its noise.
     """
-    checkpoint.generator.check_sampler(sampler)
+    as_flow(checkpoint.generator, "interpolation").check_sampler(sampler)
     if len(scans) != 2:
         raise InputError(f"needs the two scans to go between, found {len(scans)}; name two files.")
     pair = torch.stack([scan.image for scan in scans])

@@ -13,7 +13,7 @@ from r2flow.checkpoints import Checkpoint
 from r2flow.data.opening import open_scans
 from r2flow.evaluation.sets import reading_of_flow
 from r2flow.files import atomic_write
-from r2flow.generators import Sampler
+from r2flow.generators import Sampler, as_flow
 from r2flow.inversion import TIGHT, Inversion, invert, round_trip
 from r2flow.reports.outputs import ScanBar
 from r2flow.reports.pages import Page, prepare_folder
@@ -79,7 +79,7 @@ def invert_scans(
     Raises:
         InputError: a solver that cannot be used, before anything is written.
     """
-    checkpoint.generator.check_sampler(sampler)
+    as_flow(checkpoint.generator, "inversion").check_sampler(sampler)
     names = [scan.name for scan in scans]
     prepare_folder(out)
     rows: list[dict[str, Any]] = []

@@ -71,6 +71,24 @@ class Curve:
         )  # fmt: skip
 
 
+def steps_of(flow: Checkpoint, label: str, steps: Sequence[int], drawing: Drawing) -> list[int]:
+    """Those of some numbers of steps that a generator can be run with, as a GAN with 1 alone.
+
+    Raises:
+        InputError: it can be run with none of them.
+    """
+    found, refused = [], ""
+    for count in steps:
+        try:
+            flow.generator.check_sampler(drawing.sampler(flow, count))
+            found.append(count)
+        except InputError as error:
+            refused = str(error)
+    if not found:
+        raise InputError(f"{label}: {refused}")
+    return found
+
+
 def measure_curve(
     curve: Curve,
     flows: Mapping[str, Checkpoint],
@@ -92,7 +110,7 @@ def measure_curve(
     known = {row["key"]: dict(row) for row in done}
     rows: list[dict[str, Any]] = []
     for label, flow in flows.items():
-        for count in steps:
+        for count in steps_of(flow, label, steps, curve.drawing):
             key = curve.key(flow, count)
             if key in known:
                 rows.append({**known[key], "flow": label})

@@ -43,7 +43,8 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
         raise InputError(f"stage={options['name']} learns from scans, and data=pairs has none; give stage=reflow.")
     wanted = config.get("sampler") or {}
     check_options("sampler", Sampler, {key: value for key, value in wanted.items() if value is not None})
-    generator.sampler = generator.sampler.changed(**wanted)
-    generator.check_sampler(generator.sampler)
+    sampler = generator.sampler.changed(**wanted)
+    generator.check_sampler(sampler)
+    generator.sampler = sampler
     stage.config = dict(config)
     return stage

@@ -22,8 +22,8 @@ class Stage(L.LightningModule):
     `u` uniform draws in [0, 1), (B,); `k` the number of each image in the run, (B,), from which further draws are
     counted (`r2flow.noise`).
 
-    A run resumes at `global_step`, which must count batches: a stage with several optimisers takes them from
-    `own_optimizers`, of which the first alone counts.
+    A stage of several losses and optimisers sets `automatic_optimization = False`, makes them by `optimizers_for` and
+    takes a step of each in every `training_step`: `take_step(optimizer, loss)` for each of `own_optimizers()`.
 
     Args:
         generator: What learns. Its weights, and no others, are those of a checkpoint.
@@ -66,8 +66,12 @@ class Stage(L.LightningModule):
         seed_torch(self.seed, "dropout", position)
 
     def configure_optimizers(self) -> Any:
-        optimizer = self.optimizer_for(self.generator.parameters())
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self.schedule_for(optimizer), "interval": "step"}}
+        return self.optimizers_for(self.generator.parameters())
+
+    def optimizers_for(self, *groups: Iterable[torch.nn.Parameter]) -> Any:
+        """An optimiser with its schedule for each group of parameters, as `configure_optimizers` returns them."""
+        optimizers = [self.optimizer_for(group) for group in groups]
+        return optimizers, [{"scheduler": self.schedule_for(one), "interval": "step"} for one in optimizers]
 
     def optimizer_for(self, parameters: Iterable[torch.nn.Parameter]) -> torch.optim.AdamW:
         """AdamW with the stage's options."""
@@ -81,12 +85,29 @@ class Stage(L.LightningModule):
         return torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: learning_rate_factor(step, warmup, total))
 
     def own_optimizers(self) -> list[LightningOptimizer]:
-        """The optimisers of a stage with manual optimisation; a step of the first advances `global_step`."""
+        """The optimisers of a stage with manual optimisation, in the order of `optimizers_for`.
+
+        A step of the first advances `global_step`, at which a run resumes and which therefore must count batches.
+        """
         found = self.optimizers()
         several = found if isinstance(found, list) else [found]
         for other in several[1:]:  # Lightning would count a step of each
             other._on_before_step = other._on_after_step = lambda: None
         return several
+
+    def take_step(self, optimizer: LightningOptimizer, loss: Tensor) -> None:
+        """One step of one of `own_optimizers` down the gradient of a loss, clipped and scheduled as the run says.
+
+        Gradients of the loss by other optimisers' parameters are left; they are cleared before their own step.
+        """
+        optimizer.zero_grad()
+        self.manual_backward(loss)
+        self.clip_gradients(optimizer.optimizer, self.gradient_clip_val)
+        optimizer.step()
+        schedules = self.lr_schedulers() or []
+        for schedule in schedules if isinstance(schedules, list) else [schedules]:
+            if schedule.optimizer is optimizer.optimizer:
+                schedule.step()  # type: ignore[call-arg]
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["config"] = self.config

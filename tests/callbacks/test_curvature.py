@@ -7,8 +7,8 @@ import torch
 from lightning.pytorch.loggers import CSVLogger
 from torch import nn
 
-from callbacks.curvature import Curvature
-from callbacks.ema import EMA
+from r2flow.callbacks.curvature import Curvature
+from r2flow.callbacks.ema import EMA
 from r2flow.errors import InputError
 from r2flow.generators import Field
 from r2flow.noise import standard_normal

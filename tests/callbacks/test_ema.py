@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch import nn
 
-from callbacks.ema import EMA, averaged_weights, ema_decay
+from r2flow.callbacks.ema import EMA, averaged_weights, ema_decay
 
 
 def test_the_decay_is_the_reference_s(shared):

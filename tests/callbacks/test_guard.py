@@ -8,9 +8,9 @@ from lightning.pytorch.plugins import MixedPrecision
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
-from callbacks.ema import EMA
-from callbacks.guard import Guard
 from r2flow import noise
+from r2flow.callbacks.ema import EMA
+from r2flow.callbacks.guard import Guard
 from r2flow.checkpoints import checkpoints_of
 from r2flow.data.loader import Permutations, RunLoader, RunSampler
 from r2flow.errors import InputError
@@ -43,9 +43,10 @@ def batches(*values: float, offset: dict[int, float] | None = None) -> DataLoade
 
 
 def fit(module: L.LightningModule, loader, tmp_path, *callbacks: L.Callback, **options) -> L.Trainer:
-    options = {"max_steps": 100, "max_epochs": 1, **options}
+    clip = 1.0 if module.automatic_optimization else None
+    options = {"max_steps": 100, "max_epochs": 1, "gradient_clip_val": clip, **options}
     trainer = L.Trainer(
-        accelerator="cpu", callbacks=list(callbacks), default_root_dir=tmp_path, logger=False, gradient_clip_val=1.0,
+        accelerator="cpu", callbacks=list(callbacks), default_root_dir=tmp_path, logger=False,
         enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
         use_distributed_sampler=False, plugins=[AtomicCheckpointIO(), *options.pop("plugins", [])], **options,
     )  # fmt: skip
@@ -208,3 +209,40 @@ def test_broken_weights_are_never_written(tmp_path, averaged: bool):
 def test_a_limit_below_one_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"callbacks.guard.skips must be at least 1, found 0"):
         Guard(tmp_path, skips=0)
+
+
+class TwoLosses(Line):
+    """Each layer has an optimiser of its own; the gradient of the outer one is broken at the step of a negative x."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+
+    def training_step(self, batch, batch_idx):
+        x, _ = batch
+        for optimizer, layer in zip(self.optimizers(), (self.inner, self.outer), strict=True):
+            optimizer.zero_grad()
+            self.manual_backward(self.outer(self.inner(x)).square().mean())
+            if layer is self.outer and x < 0:
+                layer.weight.grad[0, 0] = NAN
+            optimizer.step()
+
+    def configure_optimizers(self):
+        return [torch.optim.AdamW(layer.parameters(), lr=0.05) for layer in (self.inner, self.outer)]
+
+
+def test_of_two_optimizers_the_one_with_broken_gradients_skips_its_step(tmp_path):
+    module, guard = TwoLosses(), Guard(tmp_path)
+    before = {name: p.detach().clone() for name, p in module.named_parameters()}
+    fit(module, batches(-1.0), tmp_path, guard)
+    changed = {name for name, p in module.named_parameters() if not torch.equal(p, before[name])}
+    assert changed == {"inner.weight", "inner.bias"}
+    assert (guard.total, guard.in_a_row) == (1, 1)
+
+
+def test_the_other_optimizer_s_steps_do_not_end_a_row(tmp_path):
+    with pytest.raises(InputError, match="3 steps in a row were skipped"):
+        fit(TwoLosses(), batches(1.0, -1.0, -1.0, -1.0, -1.0), tmp_path, Guard(tmp_path, skips=3))
+    guard = Guard(tmp_path, skips=3)
+    fit(TwoLosses(), batches(-1.0, -1.0, 1.0, -1.0, -1.0), tmp_path, guard)
+    assert (guard.total, guard.in_a_row) == (4, 2)

@@ -4,7 +4,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from callbacks import EMA, SamplePictures
+from r2flow.callbacks import EMA, SamplePictures
 from r2flow.errors import InputError
 from r2flow.generators import Field
 from r2flow.lidar.encoding import Encoding

@@ -64,3 +64,7 @@ def test_bad_options_are_refused():
         UShaped(0)
     with pytest.raises(InputError, match="at least one time"):
         Discrete(0)
+
+
+def test_a_config_of_version_0_1_0_has_the_discrete_density_by_its_old_name():
+    assert TIMES.build({"name": "grid", "k": 4})(U).unique().tolist() == [0, 0.25, 0.5, 0.75]

@@ -1,21 +1,33 @@
 """A run small enough for a test: 8 x 64 images of random walls, a flow of a few thousand weights."""
 
+import contextlib
 import functools
+import io
 import os
 import shutil
+import signal
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from r2flow.errors import InputError
+from r2flow.launch import main
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
+from r2flow.signals import LATER
+from r2flow.training import build, compose, fit
 
 ROOT = Path(__file__).resolve().parents[2]
+HOLDING = Path(__file__).with_name("holding.py")
+COMMAND = [sys.executable, str(ROOT / "train.py")]
 
 TINY = [
     "data=folder",
@@ -61,19 +73,85 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-Run = Callable[..., subprocess.CompletedProcess[str]]
+@dataclass(frozen=True)
+class Done:
+    """How a command ended."""
+
+    returncode: int
+    stdout: str
+    stderr: str
 
 
-def run_train(
-    cwd: Path, scans: Path, *overrides: str, check: bool = True, flags: tuple[str, ...] = ()
-) -> subprocess.CompletedProcess[str]:
-    """train.py on the tiny run, in its own process, from a folder of its own."""
-    command = [sys.executable, str(ROOT / "train.py"), *flags, *TINY, f"data.root={scans}", *overrides]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False)
-    if check and done.returncode:
-        raise AssertionError(f"{' '.join(command)} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}")
+Run = Callable[..., Done]
+
+
+def tiny(scans: Path, *overrides: str) -> list[str]:
+    return [*TINY, f"data.root={scans}", *overrides]
+
+
+def in_process(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
+    """`train.py ARGUMENTS` from a folder, in this process: it costs no import of torch."""
+    threads = torch.get_num_threads()
+    said, complained = io.StringIO(), io.StringIO()
+    torch.set_num_threads(1)  # as the processes of `start`, which are to end with the same bits
+    try:
+        with contextlib.chdir(cwd), contextlib.redirect_stdout(said), contextlib.redirect_stderr(complained):
+            code = main(arguments, COMMAND)
+    finally:
+        torch.set_num_threads(threads)
+    done = Done(code, said.getvalue(), complained.getvalue())
+    if check and code:
+        raise AssertionError(f"{' '.join(arguments)} ended with {code}:\n{done.stdout}\n{done.stderr}")
     return done
+
+
+def link_in_process(command: Sequence[str]) -> int:
+    """In place of `r2flow.chain.run_process`: a link without a process of its own."""
+    overrides = command[len(COMMAND) :]
+    try:
+        return 0 if fit(build(compose(overrides), overrides)).finished else LATER
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def run_train(cwd: Path, scans: Path, *overrides: str, check: bool = True, flags: tuple[str, ...] = ()) -> Done:
+    """The tiny run, a chain's links and a sweep's jobs too in this process."""
+    return run_links(cwd, [*flags, *tiny(scans, *overrides)], check)
+
+
+def run_links(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("r2flow.chain.run_process", link_in_process)
+        return in_process(cwd, arguments, check)
+
+
+def start(cwd: Path, arguments: Sequence[str], **variables: str) -> subprocess.Popen[str]:
+    """`train.py ARGUMENTS` from a folder, as a process group of its own."""
+    return subprocess.Popen(
+        [*COMMAND, *arguments], cwd=cwd, env={**os.environ, "OMP_NUM_THREADS": "1", **variables},
+        start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        # A shell's background job is started with Ctrl-C ignored, and hands that on.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+
+
+def hold_at(step: int, file: Path) -> list[str]:
+    """Options by which a run waits at a step until `let_go(file)`, when it has written the file."""
+    return [f"--plugin={HOLDING}", f"+callbacks.hold={{file: {file}, step: {step}}}"]
+
+
+def let_go(file: Path) -> None:
+    file.with_suffix(".go").touch()
+
+
+def wait_for(path: Path, process: subprocess.Popen[str], seconds: float = 200.0) -> None:
+    """Wait until a process has written a file."""
+    begin = time.monotonic()
+    while not path.exists():
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() - begin < seconds, f"{path} is not there after {seconds} s"
+        time.sleep(0.005)
 
 
 @pytest.fixture

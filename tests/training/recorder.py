@@ -14,10 +14,10 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-import train
-from callbacks import CALLBACKS, Entry
-from callbacks.ema import averaged_weights
+from r2flow.callbacks import CALLBACKS, Entry
+from r2flow.callbacks.ema import averaged_weights
 from r2flow.data.loader import FlowDataset
+from r2flow.launch import main
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 
 FOLDER = Path(os.environ["R2FLOW_RECORD"])
@@ -68,4 +68,4 @@ FlowDataset.__getitem__ = item_broken
 CALLBACKS.add("recorder", Entry(Recorder))
 
 if __name__ == "__main__":
-    sys.exit(train.main())
+    sys.exit(main(sys.argv[1:], [sys.executable, __file__]))

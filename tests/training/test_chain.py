@@ -1,24 +1,37 @@
 """1-RF, pairs, 2-RF, pairs, k-TD, report: as one command, and link by link."""
 
+import contextlib
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 import torch
 
-import train as train_script
 from r2flow.chain import Link, is_finished, links_of, override
 from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
 from r2flow.errors import InputError
-from tests.training.conftest import ROOT, TINY, Run, run_train
+from tests.training.conftest import (
+    TINY,
+    Done,
+    Run,
+    hold_at,
+    in_process,
+    let_go,
+    run_train,
+    start,
+    tiny,
+    wait_for,
+)  # fmt: skip
 
-CHAIN = ["experiment=demo", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8", "data.pairs.batch_size=4"]
+HELD = Path("held")  # in the folder that a chain is started from
+CHAIN = ["experiment=demo", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8", "data.pairs.batch_size=4",
+         *hold_at(5, HELD)]  # fmt: skip
 LINKS = ("rf1", "rf2", "td2")
 SCANS_ALONE = ("data=", "sensor", "backbone", "data.root")
 
@@ -28,16 +41,15 @@ def of_a_child(*overrides: str) -> list[str]:
     return [one for one in TINY if not one.startswith(SCANS_ALONE)] + list(overrides)
 
 
-def train_child(cwd: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(ROOT / "train.py"), *of_a_child(*overrides)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False)
+def train_child(cwd: Path, *overrides: str, check: bool = True) -> Done:
+    return in_process(cwd, of_a_child(*overrides), check)
 
 
 @pytest.fixture(scope="session")
 def chained(scans: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """(folder, what it printed) of the tiny chain that nobody disturbed."""
     cwd = tmp_path_factory.mktemp("chained")
+    let_go(cwd / HELD)
     done = run_train(cwd, scans, *CHAIN)
     return cwd / "runs" / "demo", done.stdout
 
@@ -85,48 +97,60 @@ def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Pat
     assert {path: path.stat().st_mtime_ns for path in run.rglob("*.ckpt")} == before
 
 
-def start(scans: Path, cwd: Path) -> subprocess.Popen:
-    command = [sys.executable, str(ROOT / "train.py"), *TINY, f"data.root={scans}", *CHAIN]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        command, cwd=cwd, env=environment, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-
-
-def kill(process: subprocess.Popen, all_of_it: bool) -> None:
+def kill(process: subprocess.Popen[str], all_of_it: bool) -> None:
     """The whole group, as a lost machine does, or the chain alone, as `kill -9 PID` does."""
-    if all_of_it:
-        os.killpg(process.pid, signal.SIGKILL)
-    else:
-        os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    with contextlib.suppress(ProcessLookupError):
+        if all_of_it:
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            os.kill(process.pid, signal.SIGKILL)
+    process.communicate(timeout=100)
+
+
+def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(
+    chained: tuple[Path, str], scans: Path, tmp_path: Path
+):
+    shutil.copytree(chained[0], tmp_path / "runs" / "demo")
+    run = tmp_path / "runs" / "demo"
+    shutil.rmtree(run / "td2")
+    shutil.rmtree(run / "report")
+    process = start(tmp_path, tiny(scans, *CHAIN))
+    wait_for(tmp_path / HELD, process)
+    process.send_signal(signal.SIGTERM)  # to the chain alone
+    said, _ = process.communicate(timeout=100)
+    assert process.returncode == 143, said
+    assert "stopped at step 6; the same command goes on from the last checkpoint" in said
+    assert "the chain stopped in td2; the same command goes on there" in said
+    assert not (run / "td2" / "link.json").exists()
+    assert not (run / "report").exists()
+    let_go(tmp_path / HELD)
+    run_train(tmp_path, scans, *CHAIN)
+    assert_alike(chained[0], run)
 
 
 @pytest.mark.slow
-def test_a_killed_chain_ends_as_the_one_left_alone(chained: tuple[Path, str], scans: Path, tmp_path: Path):
-    run = tmp_path / "runs" / "demo"
-    process, begin = start(scans, tmp_path), time.monotonic()
-    while not (run / "rf2" / "checkpoints" / "step-00000006.ckpt").exists():
-        assert process.poll() is None
-        assert time.monotonic() - begin < 200
-        time.sleep(0.005)
-    kill(process, all_of_it=False)
+@pytest.mark.parametrize("all_of_it", [True, False])
+def test_a_killed_chain_ends_as_the_one_left_alone(
+    chained: tuple[Path, str], scans: Path, tmp_path: Path, all_of_it: bool
+):
+    process = start(tmp_path, tiny(scans, *CHAIN))
+    wait_for(tmp_path / HELD, process)
+    kill(process, all_of_it)
+    let_go(tmp_path / HELD)
     run_train(tmp_path, scans, *CHAIN)
-    assert_alike(chained[0], run)
+    assert_alike(chained[0], tmp_path / "runs" / "demo")
 
 
 @pytest.mark.slow
 def test_a_chain_killed_at_ten_random_moments_ends_as_the_one_left_alone(
     chained: tuple[Path, str], scans: Path, tmp_path: Path
 ):
-    draw, killed = random.Random(1), 0
+    let_go(tmp_path / HELD)
+    draw = random.Random(1)
     for number in range(10):
-        process = start(scans, tmp_path)
+        process = start(tmp_path, tiny(scans, *CHAIN))
         time.sleep(draw.uniform(4, 8.5))
-        if process.poll() is None:
-            killed += 1
-            kill(process, all_of_it=number % 2 == 0)
-    assert killed >= 8  # else it had come to its end before
+        kill(process, all_of_it=number % 2 == 0)
     run_train(tmp_path, scans, *CHAIN)
     assert_alike(chained[0], tmp_path / "runs" / "demo")
 
@@ -149,27 +173,23 @@ def test_a_chain_killed_at_ten_random_moments_ends_as_the_one_left_alone(
     ],
 )
 def test_a_child_that_cannot_be_is_refused_in_one_line(
-    chained: tuple[Path, str], tmp_path: Path, monkeypatch, capfd, overrides: list[str], message: str
+    chained: tuple[Path, str], tmp_path: Path, overrides: list[str], message: str
 ):
-    overrides = [one.replace("RF1", str(chained[0] / "rf1")) for one in overrides]
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["train.py", *of_a_child(*overrides)])
-    assert train_script.main() == 2
-    said = capfd.readouterr().err.strip().splitlines()
+    done = train_child(tmp_path, *(one.replace("RF1", str(chained[0] / "rf1")) for one in overrides), check=False)
+    assert done.returncode == 2
+    said = done.stderr.strip().splitlines()
     assert len(said) == 1
     assert message in said[0]
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unfinished_parent_is_refused_and_its_checkpoint_taken(chained: tuple[Path, str], tmp_path: Path):
-    import shutil
-
     parent = Path(shutil.copytree(chained[0] / "rf1", tmp_path / "parent"))
     shutil.rmtree(parent / "pairs")
     last, before = checkpoints_of(parent)
     last.unlink()
     overrides = ["experiment=reflow", "data.pairs.num=4", "data.pairs.batch_size=4", "trainer.max_steps=2"]
-    done = train_child(tmp_path, *overrides, f"stage.init={parent}")
+    done = train_child(tmp_path, *overrides, f"stage.init={parent}", check=False)
     assert done.returncode == 2
     assert "has stopped at step 10 of 12: finish it, or name the checkpoint" in done.stderr
     done = train_child(tmp_path, *overrides, f"stage.init={before}")
@@ -207,6 +227,27 @@ def test_links_take_what_concerns_them():
     )  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    "given", ["data.augment.flip=true", "data.a_key_of_tomorrow=1", "data.validation.data.root=x", "sensor=vlp16"]
+)
+def test_what_concerns_scans_goes_to_the_link_that_reads_them(given: str):
+    first, second = links_of({"rf1": {}, "rf2": {"experiment": "reflow", "init": "rf1"}}, "runs", [given])
+    assert given in first.overrides
+    assert given not in second.overrides
+
+
+def test_every_link_of_the_paper_s_chain_is_built_before_the_first_one_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    ran: list[list[str]] = []
+    monkeypatch.setattr("r2flow.chain.run_process", lambda command: ran.append(command) or 2)
+    command = ["experiment=r2flow", "data.root=/nowhere", "data.augment.flip=true", "trainer.accelerator=cpu"]
+    assert in_process(tmp_path, command, check=False).returncode == 2
+    (first,) = ran  # the later ones have been built, and are not refused for the flip
+    assert {"data.augment.flip=true", "experiment=r2flow_1rf"} <= set(first)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_is_given_to_one_link_wins_over_what_is_given_to_all():
     given = ["chain.rf1.trainer.max_steps=5", "trainer.max_steps=9", "+chain.rf2.seed=2"]
     first, second = links_of({"rf1": {"trainer": {"max_steps": 5}}, "rf2": {"init": "rf1", "seed": 2}}, "runs", given)
@@ -232,21 +273,26 @@ def test_the_command_line_cannot_bypass_a_link():
         (["+chain.td2.trainer.max_step=5"], "no key 'trainer.max_step'. Did you mean 'trainer.max_steps'?"),
         (["trainer.fast_dev_run=true"], "fast_dev_run leaves none"),
         (["stage.init=x"], "stage.init is each link's own"),
+        # What only building finds out, in links that would run last.
+        (["+chain.td2.stage.loss=l3"], "chain.td2: no loss named 'l3'"),
+        (["chain.td2.stage.steps=0"], "chain.td2: stage.steps must be at least 1"),
+        (["chain.rf2.data.pairs.method=dopri"], "chain.rf2: no solver named 'dopri'"),
+        (["+chain.td2.data.augment.flip=true"], "chain.td2: data.augment changes scans"),
+        (["+chain.rf2.backbone.depths=[1,2]"], "chain.rf2: backbone.depths is [1, 2] here"),
+        (["+chain.td2.callbacks.ema.every=0"], "chain.td2: callbacks.ema.every must be at least 1"),
+        (["+chain.td2.data.batch_size=3", "trainer.accumulate_grad_batches=2"], "chain.td2: data.batch_size=3"),
     ],
 )
-def test_a_chain_that_cannot_run_is_refused_before_its_first_link(tmp_path, monkeypatch, capfd, overrides, message):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["train.py", "experiment=demo", *overrides])
-    assert train_script.main() == 2
-    said = capfd.readouterr().err.strip().splitlines()
+def test_a_chain_that_cannot_run_is_refused_before_its_first_link(tmp_path: Path, overrides: list[str], message: str):
+    done = in_process(tmp_path, ["experiment=demo", *overrides], check=False)
+    assert done.returncode == 2
+    said = done.stderr.strip().splitlines()
     assert len(said) == 1
     assert message in said[0]
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_link_that_lost_its_last_checkpoint_is_not_finished(chained: tuple[Path, str], tmp_path: Path):
-    import shutil
-
     run = Path(shutil.copytree(chained[0] / "rf1", tmp_path / "rf1"))
     record = json.loads((run / "link.json").read_text())
     link = Link("rf1", run, tuple(record["overrides"]))

@@ -1,16 +1,14 @@
 """One training step on real scans of other sensors, and on a sensor of one's own."""
 
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
 
-import train as train_script
 from r2flow.checkpoints import load_checkpoint
 from r2flow.lidar.sensor_files import write_sensor
 from r2flow.lidar.sensors import Sensor
-from tests.training.conftest import TINY
+from tests.training.conftest import TINY, in_process
 
 CASES = {
     "vlp16": ["sensor=vlp16", "encoding.reflectance=false"],
@@ -22,16 +20,14 @@ CASES = {
 SMALL = [part for part in TINY if not part.startswith(("sensor.", "data.validation", "trainer.val"))]
 
 
-def one_step(monkeypatch, folder: Path, *overrides: str) -> None:
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "argv", ["train.py", *overrides, "data.batch_size=1"])
-    assert train_script.main() == 0
+def one_step(folder: Path, *overrides: str) -> None:
+    in_process(folder, [*overrides, "data.batch_size=1"])
 
 
 @pytest.mark.parametrize("folder", list(CASES))
-def test_other_sensors_train_one_step(shared, tmp_path, monkeypatch, capfd, folder: str):
+def test_other_sensors_train_one_step(shared, tmp_path, folder: str):
     root = shared / "real" / "other_sensors" / folder
-    one_step(monkeypatch, tmp_path, *SMALL, f"data.root={root}", *CASES[folder], "trainer.fast_dev_run=true")
+    one_step(tmp_path, *SMALL, f"data.root={root}", *CASES[folder], "trainer.fast_dev_run=true")
 
 
 @pytest.mark.slow
@@ -39,19 +35,19 @@ def test_other_sensors_train_one_step(shared, tmp_path, monkeypatch, capfd, fold
     ("folder", "backbone"),
     [*((folder, "hdit_tiny") for folder in CASES), ("vlp16", "efficient_unet"), ("vlp16", "adm_unet")],
 )
-def test_other_sensors_train_one_step_of_a_whole_network(shared, tmp_path, monkeypatch, capfd, folder, backbone):
+def test_other_sensors_train_one_step_of_a_whole_network(shared, tmp_path, folder, backbone):
     root = shared / "real" / "other_sensors" / folder
     network = ["data=folder", f"backbone={backbone}", "trainer=cpu", "callbacks.pictures=null"]
-    one_step(monkeypatch, tmp_path, *network, f"data.root={root}", *CASES[folder], "trainer.fast_dev_run=true")
+    one_step(tmp_path, *network, f"data.root={root}", *CASES[folder], "trainer.fast_dev_run=true")
 
 
 MINE = Sensor("mine", (3.0, 1.0, 0.0, -1.0, -2.5, -6.0, -12.0, -24.0), columns=64, min_range=2.0, firing=(7, *range(7)))
 
 
-def test_a_sensor_of_one_s_own_trains_and_travels_in_the_checkpoint(scans: Path, tmp_path: Path, monkeypatch, capfd):
+def test_a_sensor_of_one_s_own_trains_and_travels_in_the_checkpoint(scans: Path, tmp_path: Path):
     write_sensor(MINE, tmp_path / "conf" / "sensor" / "mine.yaml", "a sensor of a test")
     one_step(
-        monkeypatch, tmp_path, "--config-dir", str(tmp_path / "conf"), *SMALL, f"data.root={scans}",
+        tmp_path, "--config-dir", str(tmp_path / "conf"), *SMALL, f"data.root={scans}",
         "sensor=mine", "name=own", "trainer.max_steps=1", "sampler.steps=1",
     )  # fmt: skip
     shutil.rmtree(tmp_path / "conf")

@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 import torch
 
-import train as train_script
-from callbacks.requeue import LEFT, slurm_job
+from r2flow.callbacks.stopping import slurm_job
 from r2flow.checkpoints import checkpoints_of, read_checkpoint
-from tests.training.conftest import ROOT, TINY, Run
+from r2flow.signals import LATER
+from tests.training.conftest import ROOT, TINY, Run, in_process
 from tests.training.test_train import assert_bit_equal, weights
 
 STEPS = 20
@@ -173,7 +173,7 @@ def test_a_job_told_to_leave_is_queued_again_and_ends_as_the_one_left_alone(
     run = tmp_path / "runs" / "queued"
     command = ["name=queued", "data.workers=1"]
     [(code, said)] = srun(tmp_path, scans, *command, leave_after=run / "checkpoints" / "step-00000002.ckpt")
-    assert code == LEFT, said
+    assert code == LATER, said
     assert (tmp_path / "scontrol.log").read_text() == "requeue 4711\n"
     left = [read_checkpoint(path)["global_step"] for path in checkpoints_of(run)]
     assert 2 <= left[0] < 12
@@ -193,7 +193,7 @@ def test_two_tasks_leave_together_when_one_is_told_to(one: Path, scans: Path, tm
     command = ["name=queued", *EXACT, *TWO, "callbacks.requeue.every=2"]
     first = run / "checkpoints" / "step-00000002.ckpt"
     for code, said in srun(tmp_path, scans, *command, tasks=2, leave_after=first):
-        assert code == LEFT, said
+        assert code == LATER, said
     assert (tmp_path / "scontrol.log").read_text() == "requeue 4711\n"
     assert len(checkpoints_of(run)) == 2
     assert read_checkpoint(checkpoints_of(run)[0])["global_step"] < STEPS
@@ -223,11 +223,10 @@ def test_what_is_queued_again_is_named_as_scontrol_names_it(monkeypatch, variabl
     assert slurm_job() == job
 
 
-def test_a_launcher_that_is_not_installed_says_how_to_get_it(tmp_path, monkeypatch, capfd):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["train.py", "-m", "hydra/launcher=submitit_of_tomorrow", "seed=1,2"])
-    assert train_script.main() == 2
-    said = capfd.readouterr().err.strip().splitlines()
+def test_a_launcher_that_is_not_installed_says_how_to_get_it(tmp_path: Path):
+    done = in_process(tmp_path, ["-m", "hydra/launcher=submitit_of_tomorrow", "seed=1,2"], check=False)
+    assert done.returncode == 2
+    said = done.stderr.strip().splitlines()
     assert len(said) == 1
     assert "pip install -e '.[slurm]'" in said[0]
 

@@ -1,20 +1,21 @@
-"""train.py as a user runs it: in a process, from a folder, with overrides."""
+"""train.py as a user runs it: from a folder, with overrides."""
 
+import contextlib
 import os
 import random
 import shutil
 import signal
-import subprocess
-import sys
 import time
+import warnings
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
+from hydra.core.global_hydra import GlobalHydra
 
-from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint
-from tests.training.conftest import ROOT, TINY, Run, run_train
+from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint, step_of
+from tests.training.conftest import Run, hold_at, let_go, run_train, start, tiny, wait_for
 
 
 def weights(run: Path) -> tuple[dict, dict]:
@@ -49,35 +50,30 @@ def test_a_finished_run_is_not_trained_again(train: Run, copied: Path):
     assert all(torch.equal(a[name], b[name]) for a, b in zip(before, weights(copied), strict=True) for name in a)
 
 
-def stop_when(
-    run: Path, step: int, scans: Path, cwd: Path, *overrides: str, by: int = signal.SIGKILL
-) -> tuple[int, str]:
-    """Start the run and send it a signal once it has written the checkpoint of a step: (exit code, output)."""
-    command = [sys.executable, str(ROOT / "train.py"), *TINY, f"data.root={scans}", *overrides]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(
-        command, cwd=cwd, env=environment, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        # A shell's background job is started with Ctrl-C ignored, and hands that on.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
-    waited = time.monotonic()
-    while not (run / "checkpoints" / f"step-{step:08d}.ckpt").exists():
-        assert process.poll() is None, process.stdout and process.stdout.read().decode()
-        assert time.monotonic() - waited < 200
-        time.sleep(0.005)
+def stop_held(held: Path, by: int, command: list[str]) -> tuple[int, str]:
+    """Start a run that waits (`hold_at`) and send its process group a signal there: (exit code, output)."""
+    process = start(held.parent, command)
+    wait_for(held, process)
     os.killpg(process.pid, by)
     said, _ = process.communicate(timeout=100)
-    return process.returncode, said.decode()
+    let_go(held)
+    return process.returncode, said
+
+
+def lines_of(said: str) -> list[str]:
+    """What a run says beside its progress and its log."""
+    return [line for line in said.splitlines() if not line.startswith(("INFO", "step "))]
 
 
 @pytest.mark.parametrize(("step", "workers"), [pytest.param(2, 0, marks=pytest.mark.slow), (6, 2)])
 def test_a_killed_run_ends_as_the_one_left_alone(
     train: Run, alone: tuple[Path, str], scans: Path, tmp_path: Path, step: int, workers: int
 ):
-    killed = tmp_path / "runs" / "killed"
-    stop_when(killed, step, scans, tmp_path, "name=killed", f"data.workers={workers}")
-    train("name=killed", f"data.workers={workers}")
-    assert_bit_equal(alone[0], killed)
+    options = ["name=killed", f"data.workers={workers}", *hold_at(step, tmp_path / "held")]
+    stop_held(tmp_path / "held", signal.SIGKILL, tiny(scans, *options))
+    done = train(*options)
+    assert "going on from" in done.stdout
+    assert_bit_equal(alone[0], tmp_path / "runs" / "killed")
 
 
 @pytest.mark.slow
@@ -85,25 +81,48 @@ def test_a_run_killed_at_ten_random_moments_ends_as_the_one_left_alone(
     alone: tuple[Path, str], scans: Path, tmp_path: Path
 ):
     draw = random.Random(2)
-    command = [sys.executable, str(ROOT / "train.py"), *TINY, f"data.root={scans}", "name=killed"]
     for _ in range(10):
-        process = subprocess.Popen(
-            command, cwd=tmp_path, env={**os.environ, "OMP_NUM_THREADS": "1"}, start_new_session=True,
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+        process = start(tmp_path, tiny(scans, "name=killed"))
         time.sleep(draw.uniform(4, 8))
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate(timeout=100)
     run_train(tmp_path, scans, "name=killed")
     assert_bit_equal(alone[0], tmp_path / "runs" / "killed")
 
 
-def test_ctrl_c_says_how_to_go_on(train: Run, scans: Path, tmp_path: Path):
+@pytest.mark.parametrize(
+    ("by", "code", "workers"), [(signal.SIGTERM, 143, 2), pytest.param(signal.SIGINT, 130, 2, marks=pytest.mark.slow)]
+)
+def test_a_run_told_to_stop_leaves_a_checkpoint_and_one_line(
+    train: Run, alone: tuple[Path, str], scans: Path, tmp_path: Path, by: int, code: int, workers: int
+):
+    # The regular checkpoints are those of steps 4, 8 and 12.
+    options = ["name=stopped", f"data.workers={workers}", "callbacks.checkpoint.every=4", "data.memory_gib=0"]
+    options += hold_at(5, tmp_path / "held")
+    found, said = stop_held(tmp_path / "held", by, tiny(scans, *options))
+    assert found == code, said
+    assert lines_of(said) == ["stopped at step 6; the same command goes on from the last checkpoint"]
     run = tmp_path / "runs" / "stopped"
-    code, said = stop_when(run, 2, scans, tmp_path, "name=stopped", "trainer.max_steps=500", by=signal.SIGINT)
-    assert code == 130
-    assert "the same command goes on from the last checkpoint" in said
-    assert "Traceback" not in said
+    assert [step_of(path) for path in checkpoints_of(run)] == [6, 4]
+    train(*options)
+    assert_bit_equal(alone[0], run)
+
+
+def test_a_run_told_to_stop_before_its_first_step_says_one_line(scans: Path, tmp_path: Path):
+    command = tiny(scans, "name=early", *hold_at(0, tmp_path / "held"))
+    code, said = stop_held(tmp_path / "held", signal.SIGINT, command)
+    assert code == 130, said
+    assert lines_of(said) == ["stopped; the same command starts it again: no checkpoint yet"]
+
+
+def test_handlers_and_hydra_are_as_they_were(train: Run, tmp_path: Path):
+    before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)]
+    filters = list(warnings.filters)
+    train("name=quick", "trainer.max_steps=1", "samples.num=0")
+    assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)] == before
+    assert warnings.filters == filters
+    assert not GlobalHydra.instance().is_initialized()
 
 
 def test_a_damaged_last_checkpoint_is_passed_over(train: Run, alone: tuple[Path, str], copied: Path):
@@ -148,6 +167,19 @@ def test_a_sweep_runs_every_job_and_reports_the_failed(train: Run, tmp_path: Pat
     finished = {path.parent.name for path in (tmp_path / "runs" / "sweep").glob("*/samples")}
     assert len(finished) == 1
     assert "mse" in finished.pop()
+
+
+@pytest.mark.slow
+def test_a_killed_sweep_takes_its_job_with_it(scans: Path, tmp_path: Path):
+    command = ["-m", *tiny(scans, "stage.loss=mse,pseudo_huber", *hold_at(3, tmp_path / "held"))]
+    process = start(tmp_path, command)
+    wait_for(tmp_path / "held", process)
+    (job,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    os.kill(process.pid, signal.SIGKILL)
+    # Its output, into which the job writes too, ends when both are gone; the job would wait for a minute.
+    process.communicate(timeout=30)
+    state = Path("/proc", job, "stat")
+    assert not state.exists() or " Z " in state.read_text()  # nobody has asked for its exit code
 
 
 @pytest.mark.parametrize("precision", ["bf16-mixed"])

@@ -1,9 +1,8 @@
 """The feature network that comes with the package: a small segmentation network for range images of any sensor.
 
-It was trained on simulated scans alone (`r2flow train-extractor`), so a Frechet distance exists without any download.
-It is not the field's RangeNet-53, and no figure of it is an FRD.
-
-How it ranks is measured by benchmarks/embedded_ranking.py and told in docs/metrics.md, limits included.
+It is trained on simulated scans only (`r2flow train-extractor`), so that a Frechet distance needs no download.
+It is not the field's RangeNet-53, and its distance is no FRD. benchmarks/embedded_ranking.py measures what it ranks
+correctly, docs/metrics.md has the results and its limits.
 """
 
 import hashlib
@@ -23,7 +22,7 @@ from r2flow.metrics.scans import Scans
 
 SHIPPED = Path(__file__).with_name("embedded.safetensors")
 
-# What the network tells apart: SemanticKITTI's classes, moving things and lane markings with their kin.
+# SemanticKITTI's classes; moving objects count with the others of their class, lane markings with the road.
 CLASSES = (
     "car", "bicycle", "motorcycle", "truck", "other-vehicle", "person", "bicyclist", "road", "parking", "sidewalk",
     "other-ground", "building", "fence", "vegetation", "trunk", "terrain", "pole", "traffic-sign",
@@ -36,7 +35,7 @@ STRIDE = 16  # columns that a scan must be rolled by for the map to be rolled ex
 
 
 def inputs(scans: Scans, reflectance: bool) -> Tensor:
-    """What the network is shown of each pixel, (B, 9, H, W); nothing of it knows where azimuth begins.
+    """The network's input, (B, 9, H, W), which does not depend on where azimuth begins.
 
     Log-range, return, reflectance, whether reflectance is known, height above the sensor, elevation; the second
     difference of range along the row, squashed; sine and cosine of the slope that rises from a pixel to the one below.
@@ -134,10 +133,10 @@ class SegmentationNetwork(nn.Module):
 
 
 class Embedded(Extractor):
-    """Features of range and reflectance: what the network saw in the returns of each eighth of a turn.
+    """Features of range and reflectance: means of the network's last map over sectors of azimuth.
 
-    The map before the last layer is summed over the returns of a cell and divided by the rays of it, in 2 bands of
-    rows and 8 sectors of columns: lost returns, and turned scans, are seen as well as what the returns are of.
+    The map before the last layer is summed over the returns of a cell and divided by its number of rays, in 2 bands of
+    rows and 8 sectors of columns, so that the features also depend on lost returns and on the turn of a scan.
 
     Attributes:
         notes: How the weights were trained: settings, versions, accuracy on held-out scans.
@@ -166,7 +165,7 @@ class Embedded(Extractor):
             extractor.network.load_state_dict(state)
         except RuntimeError:
             raise InputError(
-                f"{path} holds weights of another network; train it anew: r2flow train-extractor."
+                f"{path} holds weights of another network; train it again: r2flow train-extractor."
             ) from None
         extractor.weights = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
         return extractor.requires_grad_(False).eval()
@@ -180,7 +179,7 @@ class Embedded(Extractor):
 
 
 class EmbeddedRange(Embedded):
-    """The same of range alone, for scans without reflectance, or to leave it out: a distance of its own."""
+    """The same network on range only, for scans without reflectance: another distance."""
 
     name = "embedded_range"
     needs_reflectance = False

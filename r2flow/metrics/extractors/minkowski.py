@@ -1,10 +1,10 @@
 """MinkowskiNet (Choy et al., CVPR 2019), a sparse U-Net on voxels of 5 cm: FSVD's feature network.
 
-Layers, widths and parameter names are those that the LiDAR generative papers evaluate with (LiDM, R2DM, R2Flow), who
-have them from 2DPASS, on torchsparse. Checked here: the convolutions against dense ones, the order of the weights
-by hand, voxels and pooling against the published evaluation's figures. Not checked, for want of the weights: that
-they load by these names, that the widths are those below (768 features of 16 sectors leave 48 for the last one,
-which 2DPASS's table of widths has at half its size; sizes are read off the weights anyway), and the features.
+Layers, widths and parameter names are those of the evaluation of the LiDAR generative papers (LiDM, R2DM, R2Flow), from
+2DPASS, on torchsparse. Checked: the convolutions against dense ones, the order of the weights by hand, voxels and
+pooling against figures of the published evaluation. Not checked, as the weights are not at hand: that they load by
+these names, the widths below (768 features of 16 sectors leave 48 for the last one, half of 2DPASS's; sizes are taken
+from the weights anyway), and the features.
 """
 
 from collections.abc import Mapping
@@ -52,11 +52,11 @@ class Residual(nn.Module):
 
 
 class MinkowskiNet(Extractor):
-    """FSVD's: the last map's mean over 16 sectors of distance.
+    """FSVD's network; its features are the means of the last map over 16 sectors of distance.
 
     Args:
-        widths: Of the stem, of four levels down and of four up.
-        num_classes: Of the classifier, which features are taken before.
+        widths: Channels of the stem, of four levels down and of four up.
+        num_classes: Of the classifier; features are taken before it.
         channels: Of a voxel.
     """
 
@@ -87,7 +87,7 @@ class MinkowskiNet(Extractor):
         return maps
 
     def up(self, level: int, x: Sparse, kept: Sparse) -> Sparse:
-        """One level up, beside the map that was kept of that level."""
+        """One level up, joined with the map that was kept of that level."""
         x = self.get_submodule(f"up{level}.0")(x)
         return self.get_submodule(f"up{level}.1")(x.with_features(torch.cat([x.features, kept.features], 1)))
 
@@ -109,7 +109,7 @@ class MinkowskiNet(Extractor):
 
     @torch.inference_mode()
     def features(self, scans: Scans) -> Tensor:
-        # One scan at a time: memory is that of the fullest scan, and batching gains nothing.
+        # One scan at a time saves memory and is as fast as a batch.
         rows = [self._scan(points.to(self.device)) for points in scans.points]
         return torch.stack(rows) if rows else torch.zeros(0, self.dim, device=self.device)
 
@@ -130,7 +130,7 @@ class MinkowskiNet(Extractor):
             extractor = cls((stem.shape[2], *down, *up), len(tensors["classifier.0.bias"]), stem.shape[1])
         except (KeyError, IndexError):
             raise InputError(f"these are no weights of {cls.name}: it has other parameters.") from None
-        # They were saved in training: beside the network's parameters there may be those of the loss.
+        # Files saved in training may also hold parameters of the loss.
         known = {name for name, _ in extractor.named_children()}
         fill(extractor, {name: tensor for name, tensor in tensors.items() if name.split(".")[0] in known})
         return extractor

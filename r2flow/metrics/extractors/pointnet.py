@@ -36,7 +36,7 @@ class Points(nn.Module):
 
 
 class Transform(Points):
-    """The 3 x 3 matrix by which the points are turned first, near the identity: (B, 3, N) -> (B, 3, 3)."""
+    """The 3 x 3 matrix that the points are multiplied with first: (B, 3, N) -> (B, 3, 3)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -66,10 +66,10 @@ class Cloud(Points):
 
 
 class PointNet(Extractor):
-    """FPD's: the cloud's feature and the three layers of the classifier after it, one behind the other.
+    """FPD's network; its features are the cloud's and those of the classifier's three layers, concatenated.
 
     Args:
-        k: Kinds of objects that the classifier tells apart.
+        k: Classes of the classifier.
     """
 
     name = "pointnet"
@@ -94,10 +94,9 @@ class PointNet(Extractor):
 
     @torch.inference_mode()
     def features(self, scans: Scans) -> Tensor:
-        """As the field does, each pixel gives a point: a ray that did not come back gives the origin.
+        """As in the field, each pixel gives a point; a ray without a return gives the origin.
 
-        A maximum is taken over the points, so that one origin is as good as many, and a scan with no
-        ray dropped at all is the only one that lacks it.
+        Features are maxima over the points, so that one origin counts as much as many.
         """
         if not len(scans):
             return torch.zeros(0, self.dim, device=self.device)

@@ -1,8 +1,8 @@
 """RangeNet++ (Milioto et al., IROS 2019) as a feature network: FRD's RangeNet-53 and FRID's RangeNet-21.
 
-Darknet on range images: the width is halved five times, the height never; every level is added back on the
-way up. Parameters have the names of the generative papers' evaluation, `stem.0.weight` ... `head.1.bias`;
-the names of the original release (`conv1.weight`, `enc1.residual_0.bn2.bias` ...) are translated.
+Darknet on range images: the width is halved five times, the height never, and every level is added back on the way up.
+Parameters have the names of the generative papers' evaluation, `stem.0.weight` ... `head.1.bias`; those of the original
+release (`conv1.weight`, `enc1.residual_0.bn2.bias` ...) are translated.
 """
 
 import math
@@ -22,7 +22,7 @@ from r2flow.metrics.scans import Scans
 BLOCKS = {21: (1, 1, 2, 2, 1), 53: (1, 2, 8, 8, 4)}  # residual blocks of each level, by number of layers
 BANDS = 16
 
-# Of range, x, y, z in metres and reflectance over SemanticKITTI: what the published networks were trained with.
+# Of range, x, y, z in metres and reflectance on SemanticKITTI, with which the published networks were trained.
 MEAN = (12.12, 10.88, 0.23, -1.04, 0.21)
 STD = (12.32, 11.47, 6.91, 0.86, 0.16)
 
@@ -46,7 +46,7 @@ class Residual(nn.Module):
 
 
 class Level(nn.Module):
-    """A change of width, which halves or doubles the columns, and the residual blocks after it."""
+    """A convolution that halves or doubles the number of columns, and residual blocks."""
 
     def __init__(self, channels: int, out: int, blocks: int) -> None:
         super().__init__()
@@ -66,33 +66,32 @@ class Level(nn.Module):
 
 
 class RangeNet(Extractor):
-    """The network of either depth.
+    """RangeNet of 21 or 53 layers.
+
+    Attributes:
+        layers: 21 or 53.
+        channels: 4 for range, x, y, z; 5 with reflectance.
 
     Args:
-        channels: 4 for range, x, y, z; 5 with reflectance.
-        num_classes: Of the segmentation head, or None without one: features are taken before it.
-        layers: 21 or 53.
-        mean: Of each channel, or more of them than there are channels.
+        num_classes: Classes of the segmentation head, None without a head: features are taken before it.
+        mean: Of each channel; what exceeds the number of channels is ignored.
         std: The same.
     """
 
-    layers: ClassVar[int] = 53
-    channels: ClassVar[int] = 5
+    layers: ClassVar[int]
+    channels: ClassVar[int]
     mean: Tensor
     std: Tensor
 
     def __init__(
         self,
-        channels: int | None = None,
         num_classes: int | None = 20,
-        layers: int | None = None,
         mean: tuple[float, ...] = MEAN,
         std: tuple[float, ...] = STD,
     ) -> None:
         super().__init__()
-        channels = channels or self.channels
+        channels, blocks = self.channels, BLOCKS[self.layers]
         widths = [32 << level for level in range(6)]
-        blocks = BLOCKS[layers or self.layers]
         self.stem = _convolution(nn.Conv2d(channels, widths[0], 3, padding=1, bias=False), widths[0])
         for level in range(1, 6):
             self.add_module(f"enc{level}", Level(widths[level - 1], widths[level], blocks[level - 1]))
@@ -101,7 +100,7 @@ class RangeNet(Extractor):
         self.head = (
             nn.Sequential(nn.Identity(), nn.Conv2d(widths[0], num_classes, 3, padding=1)) if num_classes else None
         )
-        # Not persistent: the published weights hold parameters alone.
+        # Not persistent: the published files hold only parameters.
         self.register_buffer("mean", torch.tensor(mean[:channels]).view(-1, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(std[:channels]).view(-1, 1, 1), persistent=False)
 
@@ -184,7 +183,7 @@ class RangeNet21(RangeNet):
 
 @lru_cache(maxsize=8)
 def _draw(size: int, num: int) -> tuple[int, ...]:
-    # The published draw is of Python's own generator; ours would make another metric of it.
+    # The published draw is Python's own generator's; with another one it would be another metric.
     return tuple(random.Random(0).sample(range(size), num))
 
 

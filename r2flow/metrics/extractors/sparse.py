@@ -1,4 +1,4 @@
-"""Convolution on the voxels that hold something: gather, multiply, scatter; for inference, in plain PyTorch.
+"""Sparse convolution, on occupied voxels only: gather, multiply, scatter; for inference, in plain PyTorch.
 
     out(q) = sum_k W_k^T x(s q + o_k)
 
@@ -15,8 +15,8 @@ from typing import Self, cast
 import torch
 from torch import Tensor, nn
 
-# For each offset: numbers of the input voxels and, beside them, of the output voxels that they go to. Where it is one
-# and the same tensor, every voxel goes to itself.
+# For each offset: numbers of the input voxels, and of the output voxels that they contribute to. Where both are one
+# tensor, every voxel contributes to itself.
 KernelMap = list[tuple[Tensor, Tensor]]
 
 
@@ -33,7 +33,7 @@ def offsets(size: int) -> list[tuple[int, int, int]]:
 
 
 class VoxelGrid:
-    """Voxels of one size: distinct integer coordinates, and which of them lie where a kernel looks.
+    """Voxels of one size: distinct integer coordinates, and the neighbours of each within a kernel.
 
     Args:
         coords: Scan, x, y, z of each voxel, (N, 4), int64, in voxels of this size.
@@ -71,7 +71,7 @@ class VoxelGrid:
         return VoxelGrid(box.coords(box.keys(coords).unique()), finer=self)
 
     def around(self, size: int) -> KernelMap:
-        """Where a kernel of size^3 and stride 1 looks on this grid."""
+        """The map of a kernel of size^3 and stride 1 on this grid."""
         if size not in self._around:
             self._around[size] = self._map(self, size, 1)
         return self._around[size]
@@ -98,7 +98,7 @@ class VoxelGrid:
 
 
 class Box:
-    """The smallest box around coordinates (N, 4), whose places are numbered: the last axis runs fastest."""
+    """The bounding box of coordinates (N, 4); its cells are numbered, the last axis fastest."""
 
     def __init__(self, coords: Tensor) -> None:
         self.low, self.high = coords.amin(0), coords.amax(0)
@@ -133,7 +133,7 @@ class Sparse:
 
 
 class SparseConv3d(nn.Module):
-    """A convolution that looks at existing voxels alone, without bias.
+    """A sparse convolution without bias.
 
     Stride 1: onto the same voxels. Stride 2, with a kernel of 2: onto voxels twice as large. Transposed: back onto
     the voxels that these were made from, with the same map read the other way. A kernel of 1 is a matrix.
@@ -181,8 +181,8 @@ def convolve(features: Tensor, kernel: Tensor, where: KernelMap, num: int) -> Te
         if inputs is outputs:  # a kernel's own voxel: nothing to gather or scatter
             out.addmm_(features, weight)
             continue
-        # An output occurs once for each offset at most: reading and writing back is sure to add, and is the
-        # same at every run, which index_add_ is not on a GPU.
+        # For one offset an output occurs at most once, so that reading and writing back adds correctly. Unlike
+        # index_add_ on a GPU it is deterministic.
         part = torch.addmm(out.index_select(0, outputs), features.index_select(0, inputs), weight)
         out.index_copy_(0, outputs, part)
     return out

@@ -1,8 +1,7 @@
-"""SPVCNN (Tang et al., ECCV 2020): the sparse U-Net of MinkowskiNet with a branch of points beside it; FPVD's.
+"""SPVCNN (Tang et al., ECCV 2020), FPVD's feature network: MinkowskiNet's sparse U-Net with a second branch of points.
 
-The points of the published evaluation are the voxels themselves: it voxelises first and hands voxels' corners on as
-points. A point then lies on a corner of its own voxel of 5 cm, and going from points to these voxels and back
-changes nothing; at 0.8 m and at 0.2 m, where the branches meet, points are averaged in a voxel and voxels
+The published evaluation voxelises first and takes the corners of the voxels as points, so that points and voxels of
+5 cm are the same. At 0.8 m and at 0.2 m, where the branches meet, points are averaged in a voxel and voxels
 interpolated to a point. What is checked and what is not: see minkowski.py.
 """
 
@@ -14,7 +13,7 @@ from r2flow.metrics.extractors.sparse import Sparse, VoxelGrid, offsets
 
 
 class SPVCNN(MinkowskiNet):
-    """FPVD's: the points' features, mean over 16 sectors of distance."""
+    """FPVD's network; its features are the means of the points' over 16 sectors of distance."""
 
     name = "spvcnn"
     layer = "last features of points, mean over 16 sectors of distance"

@@ -1,7 +1,7 @@
-"""Weights of the published feature networks: where the field gets them, and how they come to this machine.
+"""Weights of the published feature networks: where they are published, and how they are added on this machine.
 
-Nothing is fetched here. A file from disk is read as tensors alone, held against its network, and kept as
-safetensors in a folder of ours, from where `Extractor.trained` reads it.
+Nothing is downloaded. A file from disk is read as tensors only, checked against its network and kept as safetensors in
+the folder of weights, from which `Extractor.trained` reads it.
 """
 
 import gzip
@@ -74,7 +74,7 @@ SOURCES: Registry[Source] = Registry(
     spvcnn=Source("FPVD", f"{R2FLOW}spvcnn_lidm.tar.gz"),
 )
 
-# Files of an archive that hold parameters, and the one that says what they were trained on.
+# Files of an archive that hold parameters, and its config.
 PARTS = ("backbone", "segmentation_decoder", "segmentation_head", "model.ckpt")
 CONFIG = "arch_cfg.yaml"
 LARGEST = 2**31  # bytes of a part: the largest of these networks has 0.2 GB
@@ -94,13 +94,13 @@ def kept_file(name: str) -> Path:
 
 @dataclass(frozen=True)
 class InstalledWeights:
-    """Weights that this machine has.
+    """Weights on this machine.
 
     Attributes:
-        weights: First 12 digits of the SHA-256 of the parameters themselves, whatever file they came from.
-        source: Name of the file that they came from.
-        sha256: Of that file; None where it was a folder.
-        published: Whether that file is the published one; None where its hash is not known.
+        weights: First 12 digits of the SHA-256 of the parameters, whatever file they come from.
+        source: Name of the file that they come from.
+        sha256: Hash of that file; None for a folder.
+        published: Whether it is the published file; None where the hash of that is not known.
     """
 
     weights: str
@@ -110,7 +110,7 @@ class InstalledWeights:
 
 
 def kept(name: str) -> InstalledWeights | None:
-    """What is kept of a network's weights, or None.
+    """The installed weights of a network, or None.
 
     Raises:
         InputError: a file that is not one of ours.
@@ -123,7 +123,7 @@ def kept(name: str) -> InstalledWeights | None:
 
 
 def add(name: str, path: Path) -> InstalledWeights:
-    """Take weights from a file, or an archive or folder of several, into the folder of weights.
+    """Copy weights from a file, or an archive or folder of several files, into the folder of weights.
 
     Raises:
         InputError: no network of that name, a file that cannot be read safely, or weights of another network.
@@ -163,18 +163,18 @@ def read_kept(cls: type[E]) -> E:
 
 
 def weights_hash(extractor: Extractor) -> str:
-    """First 12 digits of the SHA-256 of all that a network computes with, by name."""
+    """First 12 digits of the SHA-256 of a network's parameters and buffers."""
     return state_hash({**dict(extractor.named_parameters()), **dict(extractor.named_buffers())})[:12]
 
 
 def fill(extractor: Extractor, tensors: Mapping[str, Tensor]) -> None:
-    """Give a network its parameters, by name, none missing and none left over, and set it up for inference.
+    """Load a network's parameters, by name, none missing and none left over, and put it into evaluation mode.
 
     Raises:
         InputError: parameters of another network, or some that are not finite.
     """
     wanted = extractor.state_dict()
-    # A count of training steps that inference never reads; files older than it lack it.
+    # A count of training steps that inference does not read; older files lack it.
     counts = {name: value for name, value in wanted.items() if name.endswith("num_batches_tracked")}
     given = {**counts, **tensors}
     missing = [name for name in wanted if name not in given]
@@ -240,7 +240,7 @@ def _members(path: Path) -> dict[str, bytes]:
         if last in found:
             raise InputError(f"{path} holds several networks ('{last}' twice); unpack it and give the folder of one.")
         if size > LARGEST:
-            raise InputError(f"{path}: {name} is {size / 2**30:.1f} GiB, which no such network is.")
+            raise InputError(f"{path}: {name} is {size / 2**30:.1f} GiB, which is too large for such a network.")
         found[last] = file.read(LARGEST)
 
     try:
@@ -274,7 +274,7 @@ def _tensors(file: IO[bytes], what: str) -> dict[str, Tensor]:
             f"{what} is refused: it holds objects that would run code when loaded ({held[1]}). Save its 'state_dict' "
             "alone, where you trust it: torch.save(torch.load(FILE, weights_only=False)['state_dict'], 'weights.pth')."
         ) from None
-    except Exception:  # torch's reader raises nearly anything on bytes that are none of its own
+    except Exception:  # torch raises many kinds of errors on other files
         raise InputError(f"{what} is not a file of weights.") from None
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         content = content["state_dict"]
@@ -284,7 +284,7 @@ def _tensors(file: IO[bytes], what: str) -> dict[str, Tensor]:
 
 
 def _check_sums(file: IO[bytes], what: str) -> None:
-    """Hold a file of torch's against its check sums, which torch does not: a .zip has one for each of its members."""
+    """Verify the check sums of a file of torch's, a .zip, which torch itself does not."""
     if zipfile.is_zipfile(file):
         try:
             with zipfile.ZipFile(file) as archive:
@@ -297,7 +297,7 @@ def _check_sums(file: IO[bytes], what: str) -> None:
 
 
 def _plain(name: object, value: object) -> bool:
-    """Whether it is a name and a tensor of real numbers, all of them there."""
+    """Whether it is a name and a dense tensor of real numbers."""
     return (
         isinstance(name, str)
         and isinstance(value, Tensor)

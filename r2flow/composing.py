@@ -1,0 +1,147 @@
+"""From a command line to a config: `conf/` composed by Hydra, choices for what plug-ins add, mistakes in one line."""
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra import initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+
+from r2flow.registry import did_you_mean, options_of
+
+CONF = Path(__file__).resolve().parent / "conf"
+
+# What has a Hydra group: its registry, and what a config does not say because the run does.
+REGISTRIES = {
+    "stage": ("r2flow.stages", "STAGES", ("batch_size", "seed")),
+    "backbone": ("r2flow.backbones", "BACKBONES", ("in_channels", "out_channels", "second_time")),
+    "data": ("r2flow.data.opening", "SOURCES", ()),
+}
+
+
+def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -> dict[str, Any]:
+    """The config of a command line, as plain dicts: `compose(["data=kitti_raw", "data.root=FOLDER"])`.
+
+    Args:
+        folders: Further config folders, as `--config-dir` names one.
+
+    Raises:
+        HydraException: an unknown key or choice; `explain` has it in a line.
+    """
+    search = (
+        [f"hydra.searchpath=[{','.join(f'file://{Path(folder).resolve()}' for folder in folders)}]"] if folders else []
+    )
+    with _hydra():
+        try:
+            config = hydra.compose("train", [*overrides, *search], return_hydra_config=True)
+        except MissingConfigException as error:
+            if not add_choice(error):
+                raise
+            config = hydra.compose("train", [*overrides, *search], return_hydra_config=True)
+        HydraConfig.instance().set_config(config)
+        return plain(config)
+
+
+@contextmanager
+def _hydra() -> Iterator[None]:
+    """Hydra on `conf/` for the length of a block; the process's own, if it has one, is untouched."""
+    before, config = GlobalHydra.instance().hydra, HydraConfig.instance().cfg
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            yield
+    finally:
+        GlobalHydra.instance().hydra, HydraConfig.instance().cfg = before, config
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A composed config as plain dicts, all of it resolved but what is Hydra's own."""
+    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    own._set_parent(config._get_parent())
+    found = OmegaConf.to_container(own, resolve=True, throw_on_missing=True)
+    assert isinstance(found, dict)
+    return {str(key): value for key, value in found.items()}
+
+
+def add_choices(group: str) -> None:
+    """Make a Hydra choice of each entry of a group's registry that has no YAML file: its constructor's options."""
+    module, table, given_by_run = REGISTRIES[group]
+    store = ConfigStore.instance()
+    for name, entry in getattr(import_module(module), table).items():
+        if (CONF / group / f"{name}.yaml").is_file():
+            continue
+        if group == "data":
+            node: dict[str, Any] = {"defaults": ["base", "_self_"], "name": name}
+        else:
+            node = {key: value for key, value in options_of(entry, given=1).items() if key not in given_by_run}
+            if group == "stage":  # with the budget of the default stage
+                usual: Any = DictConfig(OmegaConf.load(CONF / "stage" / "rectify.yaml"))
+                budget: dict[str, Any] = {key: usual[key] for key in ("learning_rate", "warmup_images") if key in node}
+                node = {"init": None, **node, **budget}
+            node = {"name": name, **node}
+        store.store(name, node, group=group)
+
+
+def add_choice(error: MissingConfigException) -> bool:
+    """Whether a choice that Hydra did not find is one of a registry, as an installed plug-in may have entered it.
+
+    A name that looks like a misspelt file's is not looked for there: that would take the time to load torch.
+    """
+    group, _, name = str(error.missing_cfg_file or "").rpartition("/")
+    if group not in REGISTRIES or did_you_mean(name, choices(group)):
+        return False
+    module, table, _ = REGISTRIES[group]
+    if name not in getattr(import_module(module), table):
+        return False
+    add_choices(group)
+    return True
+
+
+def choices(group: str) -> list[str]:
+    """The names of a group's configs."""
+    known = {path.stem for path in (CONF / group).glob("*.yaml")} - {"base"}
+    stored = ConfigStore.instance().repo.get(group, {})
+    return sorted(known | {name.removesuffix(".yaml") for name in stored})
+
+
+def explain(error: Exception) -> str:
+    """Hydra's complaint in one line, with the nearest key that exists."""
+    text = str(error)
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    unknown = re.search(r"Could not override '([^']+)'", text)
+    if unknown:
+        key = unknown.group(1)
+        return f"the config has no key '{key}'.{did_you_mean(key, known_keys())} See --cfg job for all of them."
+    if "Could not find 'hydra/launcher/submitit" in text:
+        return "this launcher needs an extra of the project: python -m pip install -e '.[slurm]'"
+    choice = re.search(r"Could not find '([^/']+)/([^']+)'", text)
+    if choice:
+        group, name = choice.groups()
+        known = choices(group)
+        return f"no {group} config named '{name}'; known: {', '.join(known)}.{did_you_mean(name, known)}"
+    return " ".join(lines[:2])
+
+
+def known_keys() -> list[str]:
+    """Every key of the default config, and its groups."""
+    with _hydra():
+        composed = hydra.compose("train")
+    keys: list[str] = []
+
+    def walk(node: DictConfig, prefix: str) -> None:
+        for key in map(str, node):
+            keys.append(prefix + key)
+            value = node._get_node(key)
+            if isinstance(value, DictConfig) and not value._is_none():
+                walk(value, f"{prefix}{key}.")
+
+    walk(composed, "")
+    return keys

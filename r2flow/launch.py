@@ -1,0 +1,232 @@
+"""What `train.py` and `r2flow train` do: Hydra, sweeps, chains, exit codes, and mistakes in one line.
+
+Exit codes: 0 at the run's end, 2 for what the user can mend, 75 where the same command goes on (`trainer.max_time`,
+SLURM's time limit), 130 after Ctrl-C, 143 after SIGTERM.
+"""
+
+import functools
+import hashlib
+import logging
+import os
+import re
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from r2flow.composing import CONF, REGISTRIES, add_choice, add_choices, compose, explain, plain
+from r2flow.errors import InputError, explain_mistake
+from r2flow.plugins import load_plugins, take_plugins
+from r2flow.signals import LATER, Stopped, listening, stop_at_once
+
+log = logging.getLogger("r2flow")
+
+Task = Callable[[DictConfig], None]
+
+
+class JobFailed(RuntimeError):
+    """A job of a sweep ended badly; its own lines have said why."""
+
+
+def main(arguments: Sequence[str], command: Sequence[str]) -> int:
+    """Compose a command line's config and do what it says: a run, a chain of runs or a sweep.
+
+    Args:
+        arguments: Hydra's overrides and flags, and any number of `--plugin NAME`.
+        command: How this very program is started, for the processes of sweeps and chains.
+
+    Returns:
+        The exit code; what went wrong has been said in one line.
+    """
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints mistakes itself, over many lines, and exits with 1
+    failed: list[str] = []
+    try:
+        # SLURM signals every process of a job: a run answers, a chain waits for it.
+        ignored = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
+        with listening(stop_at_once), listening(signal.SIG_IGN, ignored):
+            arguments, plugins = _plugins_of(list(arguments) or ["experiment=demo"])
+            load_plugins(plugins)
+            for group in REGISTRIES if plugins else ():
+                add_choices(group)
+            _run_hydra(arguments, functools.partial(_job, arguments, command, failed))
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    except Stopped as stop:
+        if os.environ.get("LOCAL_RANK", "0") == "0":
+            print(stop, flush=True)
+        return stop.code
+    except KeyboardInterrupt:  # Ctrl-C where nobody listens: in a library's thread
+        print("stopped", flush=True)
+        return 130
+    except JobFailed as error:
+        names = failed or [f"{error}, the first of them"]  # of other processes only the first is heard
+        print(f"error: {len(failed) or 'some'} of the sweep's jobs failed: {'; '.join(names)}", file=sys.stderr)
+        return 2
+    except (HydraException, OmegaConfBaseException) as error:
+        print(f"error: {explain(error)}", file=sys.stderr)
+        return 2
+    except (InputError, OSError) as error:
+        print(f"error: {explain_mistake(error)}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _plugins_of(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """The command line with its plug-ins as one `plugins=[...]`, and these, however they were given."""
+    from r2flow.chain import override
+
+    others, names = take_plugins(arguments)
+    given = [one for one in others if one.lstrip("+").startswith("plugins=")]
+    for one in given:
+        names += [name.strip(" '\"") for name in one.partition("=")[2].strip("[]").split(",")]
+    names = list(dict.fromkeys(name for name in names if name))
+    rest = [one for one in others if one not in given]
+    return [*rest, *([override("plugins", names)] if names else [])], names
+
+
+def _run_hydra(arguments: Sequence[str], job: Task) -> None:
+    """Hydra's own main, on these arguments; a job sees the process's."""
+    original = sys.argv
+
+    def task(config: DictConfig) -> None:
+        sys.argv = original  # Lightning starts a run's other devices by it
+        job(config)
+
+    decorated = hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")(task)
+    resolver = functools.partial(job_folder, tuple(arguments))
+    OmegaConf.register_new_resolver("job_folder", resolver, replace=True)
+    try:
+        sys.argv = [original[0], *arguments]
+        try:
+            decorated()
+        except MissingConfigException as error:
+            if not add_choice(error):
+                raise
+            sys.argv = [original[0], *arguments]
+            decorated()
+    finally:
+        sys.argv = original
+
+
+def job_folder(arguments: Sequence[str], overrides: str) -> str:
+    """A folder name for a job of a sweep: the values that are swept, and a hash of all overrides."""
+    given = [argument.partition("=") for argument in arguments]
+    swept = {key.lstrip("+~") for key, _, value in given if "," in value}
+    parts = [part for part in overrides.split(",") if part.partition("=")[0].lstrip("+~") in swept]
+    readable = re.sub(r"[^\w.=+-]+", "_", ",".join(parts) or "job")[:80]
+    return f"{readable}-{hashlib.sha256(overrides.encode()).hexdigest()[:6]}"
+
+
+def _job(arguments: Sequence[str], command: Sequence[str], failed: list[str], config: DictConfig) -> None:
+    """What Hydra runs. Of the exceptions only `Exception` is caught by it: SystemExit says the code."""
+    given = list(HydraConfig.get().overrides.task)
+    try:
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            _sweep_job(command, given, failed)
+            return
+        settings = plain(config)
+        if settings["plugins"] and not any(one.startswith("plugins=") for one in given):
+            named = " ".join(f"--plugin {name}" for name in settings["plugins"])
+            raise InputError(f"plug-ins are named on the command line, never in a file: give {named}.")
+        code = _chain(settings, given, command) if settings["chain"] else _fit(settings, given)
+    except (InputError, OSError) as error:  # Hydra would print its own lines around it
+        print(f"error: {explain_mistake(error)}", file=sys.stderr)
+        raise SystemExit(2) from None
+    if code:
+        raise SystemExit(code)
+
+
+def _config_folders() -> list[str]:
+    """Where `--config-dir` points, for processes of our own."""
+    sources = HydraConfig.get().runtime.config_sources
+    return [source.path for source in sources if source.provider == "command-line"]
+
+
+def _restart(command: Sequence[str]) -> list[str]:
+    return [*command, *(part for folder in _config_folders() for part in ("--config-dir", folder))]
+
+
+def _sweep_job(command: Sequence[str], given: Sequence[str], failed: list[str]) -> None:
+    """One job of a sweep, as its own process: its failure or its DDP relaunch touches no other job."""
+    from r2flow.chain import override, run_process
+
+    run_dir = HydraConfig.get().runtime.output_dir
+    log.info("job %s: %s", HydraConfig.get().job.num, " ".join(given))
+    code = run_process([*_restart(command), *given, override("run_dir", str(run_dir))])
+    if code in (130, 143):
+        raise Stopped(code, "the sweep stopped; the same command goes on there")
+    if code:
+        failed.append(" ".join(given))
+        raise JobFailed(failed[-1])  # Hydra runs the other jobs first
+
+
+def _fit(settings: dict[str, Any], given: Sequence[str]) -> int:
+    # Imported here: a misspelt config answers at once, not after torch has loaded.
+    from r2flow.training import build, fit
+
+    return 0 if fit(build(settings, given)).finished else LATER
+
+
+def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str]) -> int:
+    """The runs that a config's `chain` names, and the report on them."""
+    from r2flow.chain import is_finished, is_reported, links_of, record_report, run_chain
+
+    if settings["trainer"]["fast_dev_run"]:
+        raise InputError("a chain's links start from the runs before them, and trainer.fast_dev_run leaves none.")
+    folder = Path(settings["run_dir"])
+    links = links_of(settings["chain"], folder, given)
+    if not all(map(is_finished, links)):
+        _check_links(links)
+    code, ran = run_chain(links, _restart(command))
+    if code:
+        return code
+    out = folder / "report"
+    if not ran and is_reported(links, out):
+        print(f"report: finished before, {out / 'chain.md'}")
+        return 0
+    import torch
+
+    from r2flow.reports.chain import report
+
+    device = "cuda" if torch.cuda.is_available() and settings["trainer"]["accelerator"] != "cpu" else "cpu"
+    report({link.name: link.run_dir for link in links}, out, device=device, command=" ".join(["python", *sys.argv]))
+    record_report(links, out)
+    return 0
+
+
+def _check_links(links: Sequence[Any]) -> None:
+    """Compose and build every link before the first one runs: what is refused is refused now.
+
+    Raises:
+        InputError: a link that cannot be composed or built.
+    """
+    folders = _config_folders()
+    configs = {}
+    for link in links:
+        try:
+            configs[link.name] = compose(link.overrides, folders)
+        except (HydraException, OmegaConfBaseException) as error:
+            raise InputError(f"chain.{link.name}: {explain(error)}") from None
+    from r2flow.checkpoints import FOLDER
+    from r2flow.lineage import Parent
+    from r2flow.training import check
+
+    for link in links:
+        parent = None
+        if link.parent is not None:
+            before = configs[link.parent]
+            steps = before["trainer"]["max_steps"]
+            path = Path(before["run_dir"], FOLDER, f"step-{steps:08d}.ckpt")
+            parent = Parent(before, path, steps)
+        try:
+            configs[link.name] = check(configs[link.name], link.overrides, parent)
+        except InputError as error:
+            raise InputError(f"chain.{link.name}: {error}") from None

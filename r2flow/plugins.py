@@ -1,0 +1,115 @@
+"""Modules of somebody else that enter their classes into our registries.
+
+    r2flow train --plugin my.module stage=my_stage
+    r2flow sample --plugin ./my_stage.py --checkpoint runs/NAME
+
+A package can say so itself, in the entry-point group `r2flow.plugins`: it is imported when a name is asked for that no
+registry knows. A config or a checkpoint names the plug-ins that it was made with, which is information: nothing that a
+file names is imported.
+"""
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from r2flow.errors import InputError
+from r2flow.registry import Registry, UnknownName
+
+GROUP = "r2flow.plugins"
+
+_loaded: set[str] = set()  # as sys.modules, in which a path has no name
+
+
+def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """(the other arguments, the plug-ins) of a command line with `--plugin NAME`, anywhere and any number of times.
+
+    Raises:
+        InputError: the last argument is `--plugin`.
+    """
+    others: list[str] = []
+    names: list[str] = []
+    rest = iter(arguments)
+    for argument in rest:
+        option, equals, value = argument.partition("=")
+        if option != "--plugin":
+            others.append(argument)
+            continue
+        name = value if equals else next(rest, "")
+        if not name:
+            raise InputError("--plugin needs the name of a module, or a path ending in .py.")
+        names.append(name)
+    return others, names
+
+
+def load_plugins(names: Sequence[str]) -> None:
+    """Import modules, named as in an import or by a path ending in `.py`, each once.
+
+    Raises:
+        InputError: a module that is not there, or whose import ends in an error.
+    """
+    for name in names:
+        if name in _loaded:
+            continue
+        try:
+            _import(name)
+        except Exception as error:  # whatever somebody's module raises
+            said = " ".join(str(error).split()) or "no more is known"
+            raise InputError(f"the plug-in {name} cannot be imported: {type(error).__name__}: {said}") from None
+        _loaded.add(name)
+
+
+def _import(name: str) -> None:
+    if not name.endswith(".py"):
+        here = str(Path.cwd())
+        if here not in sys.path and "" not in sys.path:
+            sys.path.append(here)  # as `python -m` does, but last
+        importlib.import_module(name)
+        return
+    path = Path(name).expanduser().resolve()
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is no file")
+    known = f"r2flow_plugin_{path.stem}"
+    spec = importlib.util.spec_from_file_location(known, path)
+    assert spec is not None and spec.loader is not None  # noqa: PT018
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[known] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[known]
+        raise
+
+
+def load_installed() -> None:
+    """Import what installed packages name in the entry-point group.
+
+    Raises:
+        InputError: one of them cannot be imported.
+    """
+    load_plugins([entry.value.partition(":")[0] for entry in entry_points(group=GROUP)])
+
+
+Registry.on_missing.append(load_installed)
+
+
+@contextmanager
+def made_with(config: Mapping[str, Any], what: str) -> Iterator[None]:
+    """Say of an unknown name in a config from a file which plug-in it may come from.
+
+    Args:
+        what: What the config belongs to, as "the checkpoint".
+    """
+    try:
+        yield
+    except UnknownName as error:
+        missing = [name for name in config.get("plugins") or () if name not in _loaded]
+        if not missing:
+            raise
+        give = " ".join(f"--plugin {name}" for name in missing)
+        known = str(error).rstrip(".")
+        raise UnknownName(f"{known}; {what} was made with the plug-in {', '.join(missing)}: give {give}.") from None

@@ -1,0 +1,73 @@
+"""Being told to stop: what a signal means to a run, and to a process that waits for one."""
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+
+Handler = Callable[[int, FrameType | None], None] | signal.Handlers
+
+STOPPING = (signal.SIGTERM, signal.SIGINT)
+
+LATER = 75  # exit code, "try again later" among the system's: the run is not at its end, the same command goes on
+
+
+class Stopped(BaseException):
+    """The work was told to stop, and has.
+
+    Not an `Exception`: what deals with errors on the way (a reader's, Hydra's) must not take it for one.
+
+    Attributes:
+        code: What the process is to exit with: 143 after SIGTERM, 130 after Ctrl-C.
+    """
+
+    def __init__(self, code: int, said: str = "stopped") -> None:
+        super().__init__(said)
+        self.code = code
+
+
+def code_of(number: int) -> int:
+    """The exit code by which a shell knows that a signal ended a process."""
+    return 128 + number
+
+
+@contextmanager
+def listening(handler: Handler, signals: Sequence[int] = STOPPING) -> Iterator[None]:
+    """Have signals handled for the length of a block. Outside the main thread, which alone hears them, nothing changes.
+
+    Ctrl-C stays ignored where it is: a shell's background job is not meant.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {one: signal.getsignal(one) for one in signals}
+    heard = [one for one in signals if not (one == signal.SIGINT and before[one] is signal.SIG_IGN)]
+    for one in heard:
+        signal.signal(one, handler)
+    try:
+        yield
+    finally:
+        for one in heard:
+            signal.signal(one, before[one])
+
+
+def stop_at_once(number: int, frame: FrameType | None = None) -> None:
+    """A handler: nothing is under way that would have to be saved."""
+    raise Stopped(code_of(number))
+
+
+def outlive_the_signal(worker: int = 0) -> None:
+    """In a loader's worker: a signal is for the run, which may need the worker for the step that it is in.
+
+    A worker that its run has forgotten goes by itself.
+    """
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(30)
+
+    if os.name == "posix":
+        for number in STOPPING:
+            signal.signal(number, hear)

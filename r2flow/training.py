@@ -1,0 +1,268 @@
+"""The front door: what a config describes is built, and fitted.
+
+from r2flow.training import build, compose, fit
+
+result = fit(build(compose(["data=kitti_raw", "data.root=FOLDER", "trainer.max_steps=1000"])))
+result.metrics["val/loss"], result.checkpoint
+"""
+
+import logging
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+
+from r2flow.callbacks import build_callbacks, build_loggers
+from r2flow.callbacks.stopping import Stopping
+from r2flow.checkpoints import checkpoints_of, step_of
+from r2flow.composing import compose
+from r2flow.data.datamodule import ScanDataModule
+from r2flow.data.opening import resolve_reflectance
+from r2flow.data.options import DataOptions
+from r2flow.data.sources import AUTO
+from r2flow.errors import InputError
+from r2flow.generators import Generator, build_generator
+from r2flow.lineage import Parent, find_parent, inherit
+from r2flow.noise import seed_torch
+from r2flow.plugins import made_with
+from r2flow.registry import check_options
+from r2flow.reports.training import check_samples, finish, read_curves
+from r2flow.runs import check_run, open_run, run_lock
+from r2flow.stages import STAGES, build_stage, check_roll
+from r2flow.stages.base import Stage
+from r2flow.stages.checkpointing import AtomicCheckpointIO
+
+__all__ = ["Result", "Run", "build", "check", "compose", "fit"]
+
+log = logging.getLogger("r2flow")
+
+# Of Lightning, and about what is meant here.
+EXPECTED_WARNINGS = (
+    ".*does not have many workers.*",
+    "Total length of .list. across ranks is zero.*",
+    ".*smaller than the logging interval.*",
+    "Checkpoint directory .* exists and is not empty.*",
+    ".*isinstance.treespec, LeafSpec.*",
+    "You passed in a .val_dataloader. but have no .validation_step.*",
+    "Using ModelCheckpoint with manual optimization and every_n_train_steps.*",
+    "The dirpath has changed from.*",
+    "Using ModelCheckpoint with manual optimization.*",
+)
+
+
+@dataclass
+class Run:
+    """What a config describes, ready to be fitted.
+
+    Attributes:
+        config: The whole of it, completed by what the parent and the data say.
+        stage: The LightningModule, with its first weights.
+        data: The DataModule; nothing has been read yet.
+        trainer: Lightning's, with callbacks and loggers.
+    """
+
+    config: dict[str, Any]
+    stage: Stage
+    data: ScanDataModule
+    trainer: L.Trainer
+
+    @property
+    def folder(self) -> Path:
+        """Where config, checkpoints, logs and samples go."""
+        return Path(self.config["run_dir"])
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run has come to.
+
+    Attributes:
+        metrics: The last logged value of each metric, as `train/loss`.
+        checkpoint: The last one, or None where none is kept.
+        folder: The run's.
+        step: Optimiser steps taken in all.
+        finished: Whether these are all that were asked for; `trainer.max_time` can end a run before.
+    """
+
+    metrics: dict[str, float]
+    checkpoint: Path | None
+    folder: Path
+    step: int
+    finished: bool
+
+
+def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
+    """Build what a config describes. What can be refused without reading scans is refused here.
+
+    Args:
+        config: As of `compose`.
+        asked: What the command line gave: a run that starts from another refuses what contradicts its parent only where
+            it was asked for, and else takes the parent's.
+
+    Raises:
+        InputError: a value that cannot be used, an unknown name or option, a parent that is not there or not finished.
+    """
+    parent, checkpoint = find_parent(config) or (None, None)
+    config = _checked(config, asked, parent)
+    config["encoding"]["reflectance"] = resolve_reflectance(config["encoding"].get("reflectance", AUTO), config["data"])
+    seed_torch(config["seed"], "weights")
+    generator = build_generator(config)
+    if checkpoint is not None:
+        generator.start_from(checkpoint.generator)
+    return _assembled(config, generator)
+
+
+def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None) -> dict[str, Any]:
+    """Build a run of which nothing is kept: weights on the meta device, no scan read, nothing written.
+
+    Args:
+        parent: The run that it is to start from, where that has not been trained yet.
+
+    Returns:
+        The config, completed by what its parent says.
+
+    Raises:
+        InputError: what `build` refuses, or another run in its folder.
+    """
+    if parent is None:
+        found = find_parent(config)
+        parent = found and found[0]
+    config = _checked(config, asked, parent)
+    if config["encoding"].get("reflectance", AUTO) == AUTO:
+        config["encoding"]["reflectance"] = True  # the scans will tell
+    with torch.device("meta"):
+        generator = build_generator(config)
+    run = _assembled(config, generator)
+    if run.data.pairs is not None:
+        run.data.pairs.recipe(run.data.encoding.shape, run.data.noise_shape)
+    check_run(run.folder, config)
+    return config
+
+
+def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
+    """The config, completed by what its parent says, after what can be told of it alone."""
+    check_trainer(config["trainer"])
+    check_options("samples", check_samples, config["samples"])
+    check_samples(**config["samples"])
+    seed = config["seed"]
+    if not (isinstance(seed, int) and 0 <= seed < 2**63):
+        raise InputError(f"seed must be a whole number of at least 0, found {seed!r}.")
+    with made_with(parent.config if parent else {}, "the run that it starts from"):
+        config = inherit(config, asked, parent)
+    config["generator"] = config["generator"] or {"name": STAGES[config["stage"]["name"]].generator_name}
+    check_options("data", DataOptions, config["data"])
+    return config
+
+
+def _assembled(config: dict[str, Any], generator: Generator) -> Run:
+    space = generator.space
+    data = ScanDataModule(space.sensor, space.encoding, config["seed"], generator.noise_shape, **config["data"])
+    check_roll(data.augment, generator)
+    stage = build_stage(config, generator)
+    trainer = _build_trainer(config, stage)
+    data.check_run(trainer.world_size, trainer.accumulate_grad_batches, trainer.max_steps)
+    return Run(config, stage, data, trainer)
+
+
+def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
+    options = dict(config["trainer"])
+    check_options("trainer", L.Trainer, options)
+    if not stage.automatic_optimization:  # Lightning leaves these two to the stage
+        if options["accumulate_grad_batches"] != 1:
+            name = config["stage"]["name"]
+            raise InputError(f"stage={name} takes its own optimiser steps: trainer.accumulate_grad_batches must be 1.")
+        stage.gradient_clip_val, options["gradient_clip_val"] = options["gradient_clip_val"], None
+    callbacks = build_callbacks(config)
+    loggers = build_loggers(config["loggers"], Path(config["run_dir"]))
+    try:
+        with _quiet():
+            return L.Trainer(**options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])
+    except (TypeError, ValueError, MisconfigurationException) as error:
+        raise InputError(f"trainer: {' '.join(str(error).split())}") from None
+
+
+def check_trainer(options: Mapping[str, Any]) -> None:
+    """Refuse what Lightning would change in silence or end in a traceback.
+
+    Raises:
+        InputError: an accelerator that is not there, a precision that a CPU does not have.
+    """
+    gpu = torch.cuda.is_available()
+    if options["accelerator"] in ("gpu", "cuda") and not gpu:
+        raise InputError("trainer.accelerator=gpu, but torch sees no GPU here; use trainer=cpu.")
+    on_cpu = options["accelerator"] == "cpu" or (options["accelerator"] == "auto" and not gpu)
+    if on_cpu and str(options["precision"]) in ("16-mixed", "16", "16-true"):
+        raise InputError(
+            f"trainer.precision={options['precision']} does not exist on a CPU (Lightning would turn it into "
+            "bfloat16 in silence); use bf16-mixed or 32-true."
+        )
+
+
+def fit(run: Run) -> Result:
+    """Train a run in its folder, from where it stopped, and draw its samples.
+
+    SIGTERM and Ctrl-C end it after the step that it is in, with a checkpoint; before the first step, at once.
+
+    Raises:
+        InputError: scans that cannot be read, another run in its folder, weights no longer finite, a full disk.
+        r2flow.signals.Stopped: it was told to stop.
+    """
+    callbacks: list[L.Callback] = run.trainer.callbacks  # type: ignore[attr-defined]
+    stopping = next((one for one in callbacks if isinstance(one, Stopping)), Stopping(run.folder))
+    with stopping.listening(), _quiet():
+        run.data.setup()
+        run.config["scans"] = run.data.fingerprint()
+        run.stage.config = dict(run.config)
+        if run.config["trainer"]["fast_dev_run"]:
+            run.trainer.fit(run.stage, run.data)
+            return _result(run, run.trainer.global_step, finished=True)
+        with run_lock(run.folder) if run.trainer.is_global_zero else nullcontext():
+            step = _fit_in_folder(run)
+            if run.trainer.is_global_zero:
+                gpu = torch.cuda.is_available() and run.config["trainer"]["accelerator"] != "cpu"
+                finish(
+                    run.folder,
+                    run.config["samples"],
+                    run.config["seed"],
+                    "cuda" if gpu else "cpu",
+                    run.trainer.max_steps,
+                )
+    return _result(run, step, finished=step >= run.trainer.max_steps)
+
+
+def _fit_in_folder(run: Run) -> int:
+    """The step that the run has reached."""
+    last = open_run(run.folder, run.config)
+    if last is not None and step_of(last) >= run.trainer.max_steps:
+        return step_of(last)  # nothing is left to do, nor pairs to make
+    if last is not None:
+        log.info("going on from %s", last)
+    run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)
+    return run.trainer.global_step
+
+
+def _result(run: Run, step: int, finished: bool) -> Result:
+    logged = {name: float(values[-1]) for name, (_, values) in read_curves(run.folder).items()}
+    metrics = {**logged, **{name: float(value) for name, value in run.trainer.callback_metrics.items()}}
+    return Result(metrics, next(iter(checkpoints_of(run.folder)), None), run.folder, step, finished)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Leave out what Lightning says of choices that are meant."""
+    talk = logging.getLogger("lightning.pytorch.utilities.rank_zero")
+    level = talk.level
+    talk.setLevel(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            for message in EXPECTED_WARNINGS:
+                warnings.filterwarnings("ignore", message=message)
+            yield
+    finally:
+        talk.setLevel(level)

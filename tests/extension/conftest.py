@@ -1,0 +1,117 @@
+"""Families that come from outside, as a user gives them: a file, `--plugin`, and what the config says of it."""
+
+import contextlib
+import io
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+
+from r2flow import cli, plugins
+from r2flow.backbones import BACKBONES
+from r2flow.generators import GENERATORS
+from r2flow.stages import STAGES
+from tests.training.conftest import Done
+
+FAMILIES = Path(__file__).parent / "families"
+
+TINY = [
+    "data.scenes=8", "data.batch_size=2", "sensor.rows=16", "sensor.columns=64", "trainer.accelerator=cpu",
+    "trainer.max_steps=6", "trainer.val_check_interval=3", "trainer.log_every_n_steps=1",
+    "trainer.enable_progress_bar=false", "stage.warmup_images=4", "callbacks.ema.every=2",
+    "callbacks.checkpoint.every=2", "callbacks.pictures.every=3", "callbacks.pictures.num=1", "samples.num=1",
+    "loggers=[csv]",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Family:
+    """What a user types to train what a file of theirs adds."""
+
+    name: str
+    file: str
+    choices: tuple[str, ...]
+
+    @property
+    def plugin(self) -> str:
+        return f"--plugin={FAMILIES / self.file}.py"
+
+    def __str__(self) -> str:
+        return self.name
+
+
+GAN = Family("gan", "toy_gan", ("stage=toy_gan",))
+DDPM = Family("ddpm", "toy_ddpm", ("stage=toy_ddpm", "sampler.steps=4"))
+COMPLETION = Family("completion", "toy_completion", ("stage=toy_completion", "sampler.steps=2"))
+BACKBONE = Family("backbone", "toy_backbone", ("backbone=toy_backbone", "sampler.steps=2"))
+ALL = (GAN, DDPM, COMPLETION, BACKBONE)
+
+
+@contextlib.contextmanager
+def loaded(*families: Family) -> Iterator[None]:
+    """Families' files imported for the length of a block: what comes after is as if in a process of its own."""
+    tables = (GENERATORS, STAGES, BACKBONES)
+    before, known = [dict(table.items()) for table in tables], set(plugins._loaded)
+    try:
+        plugins.load_plugins([str(FAMILIES / f"{family.file}.py") for family in families])
+        yield
+    finally:
+        plugins._loaded.clear()
+        plugins._loaded.update(known)
+        for table, entries in zip(tables, before, strict=True):
+            table._entries.clear()
+            table._entries.update(entries)
+
+
+def r2flow(*arguments: object) -> Done:
+    """`r2flow ARGUMENTS` in this process; no plug-in that it loads is there afterwards."""
+    threads, code = torch.get_num_threads(), 0
+    said, complained = io.StringIO(), io.StringIO()
+    torch.set_num_threads(1)
+    try:
+        with (
+            loaded(), pytest.MonkeyPatch.context() as patch,
+            contextlib.redirect_stdout(said), contextlib.redirect_stderr(complained),
+        ):  # fmt: skip
+            patch.setattr(sys, "argv", ["r2flow", *map(str, arguments)])
+            cli.main()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    finally:
+        torch.set_num_threads(threads)
+    return Done(code, said.getvalue(), complained.getvalue())
+
+
+def train(run: Path, family: Family, *more: str) -> Done:
+    done = r2flow("train", family.plugin, *TINY, *family.choices, f"run_dir={run}", *more)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done
+
+
+@pytest.fixture(scope="session", params=ALL, ids=str)
+def trained(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Family, Path]:
+    """Each family with its run, which nobody disturbed."""
+    return request.param, run_of(request.param, tmp_path_factory)
+
+
+RUNS: dict[Family, Path] = {}
+
+
+def run_of(family: Family, folders: pytest.TempPathFactory) -> Path:
+    if family not in RUNS:
+        RUNS[family] = folders.mktemp(family.name) / "run"
+        train(RUNS[family], family)
+    return RUNS[family]
+
+
+@pytest.fixture(scope="session")
+def gan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run_of(GAN, tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def completion(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run_of(COMPLETION, tmp_path_factory)

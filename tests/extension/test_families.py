@@ -1,0 +1,155 @@
+"""A GAN, a DDPM, a conditional flow and a backbone from files outside the package, through every verb."""
+
+import json
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint
+from tests.extension.conftest import BACKBONE, COMPLETION, DDPM, FAMILIES, GAN, TINY, Family, loaded, r2flow, train
+from tests.training.conftest import hold_at, let_go, start, wait_for
+from tests.training.test_train import assert_bit_equal
+
+EVALUATE = ["--metrics", "jsd", "--num", 2, "--real-num", 2, "--workers", 0, "--no-cache"]
+
+
+def test_training_leaves_pictures_checkpoints_and_samples(trained: tuple[Family, Path]):
+    _, run = trained
+    assert [path.name for path in sorted((run / "pictures").iterdir())] == ["step-00000003.png", "step-00000006.png"]
+    assert [path.name for path in checkpoints_of(run)] == ["step-00000006.ckpt", "step-00000004.ckpt"]
+    image = np.load(run / "samples" / "000000.npy")
+    assert image.shape == (2, 16, 64)
+    assert np.isfinite(image).all()
+
+
+def test_a_run_goes_on_from_its_checkpoint_bit_by_bit(trained: tuple[Family, Path], tmp_path: Path):
+    family, run = trained
+    stopped = Path(shutil.copytree(run, tmp_path / "stopped"))
+    checkpoints_of(stopped)[0].unlink()  # as if killed between steps 4 and 6
+    assert "going on from" in train(stopped, family).stdout
+    assert_bit_equal(run, stopped)
+
+
+def test_a_killed_gan_ends_as_the_one_left_alone(gan: Path, tmp_path: Path):
+    run, held = tmp_path / "run", tmp_path / "held"
+    options = hold_at(3, held)
+    process = start(tmp_path, [GAN.plugin, *TINY, *GAN.choices, f"run_dir={run}", *options])
+    wait_for(held, process, 60)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate(timeout=60)
+    let_go(held)
+    assert [path.name for path in checkpoints_of(run)] == ["step-00000002.ckpt"]
+    train(run, GAN, *options)
+    assert_bit_equal(gan, run)
+
+
+def test_info_names_the_family(trained: tuple[Family, Path]):
+    family, run = trained
+    done = r2flow("info", run, "--json", family.plugin)
+    about = json.loads(done.stdout)
+    expected = {
+        GAN: ("toy_gan", None), DDPM: ("toy_ddpm", "hdit"), COMPLETION: ("toy_completion", "hdit"),
+        BACKBONE: ("rectified_flow", "toy_backbone"),
+    }  # fmt: skip
+    assert (about["generator"], about["backbone"]) == expected[family]
+
+
+def test_scan_i_of_a_seed_is_the_same_in_any_batch(trained: tuple[Family, Path], tmp_path: Path):
+    family, run = trained
+    for out, num, batch_size in (("three", 3, 3), ("two", 2, 1)):
+        done = r2flow(
+            "sample", family.plugin, "-c", run, "-o", tmp_path / out, "--num", num, "--batch-size", batch_size,
+            "--format", "npy", "--pictures", 0,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+    three, two = ([np.load(path) for path in sorted((tmp_path / out).iterdir())] for out in ("three", "two"))
+    for a, b in zip(three[:2], two, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+    assert not np.allclose(three[0], three[1])
+
+
+def test_samples_are_measured(trained: tuple[Family, Path], tmp_path: Path):
+    family, run = trained
+    done = r2flow("evaluate", family.plugin, "simulated:7", run, *EVALUATE, "--json", tmp_path / "e.json")
+    assert done.returncode == 0, done.stderr
+    assert "JSD" in done.stdout
+    done = r2flow("evaluate", family.plugin, "simulated:7", "-c", run, *EVALUATE, "--steps", "1,2", "-o", tmp_path)
+    assert done.returncode == 0, done.stderr
+    steps = [row["steps"] for row in json.loads((tmp_path / "speed_quality.json").read_text())["rows"]]
+    assert steps == ([1] if family is GAN else [1, 2])
+
+
+def test_weights_travel_as_safetensors(trained: tuple[Family, Path], tmp_path: Path):
+    family, run = trained
+    assert r2flow("convert", family.plugin, run, tmp_path / "it.safetensors").returncode == 0
+    with loaded(family):
+        there, here = load_checkpoint(run).generator, load_checkpoint(tmp_path / "it.safetensors").generator
+    assert here.sampler == there.sampler
+    assert all(torch.equal(a, b) for a, b in zip(there.state_dict().values(), here.state_dict().values(), strict=True))
+
+
+@pytest.mark.parametrize("family", [COMPLETION, BACKBONE], ids=str)
+def test_a_flow_is_straightened(family: Family, tmp_path: Path, request: pytest.FixtureRequest):
+    from tests.extension.conftest import run_of
+
+    run = Path(shutil.copytree(run_of(family, request.getfixturevalue("tmp_path_factory")), tmp_path / "run"))
+    pairs = ["data.pairs.num=6", "data.pairs.method=euler", "data.pairs.steps=2", "data.pairs.batch_size=3"]
+    options = [family.plugin, *TINY, "sampler.steps=2", *pairs, f"stage.init={run}", f"run_dir={tmp_path / 'two'}"]
+    done = r2flow("train", "experiment=reflow", *options)
+    assert done.returncode == 0, done.stderr
+    with loaded(family):
+        first, second = load_checkpoint(run), load_checkpoint(tmp_path / "two")
+    assert second.config["stage"]["name"] == "reflow"
+    assert type(second.generator).__name__ == type(first.generator).__name__
+    assert second.generator.state_dict().keys() == first.generator.state_dict().keys()
+
+
+CANNOT = {
+    "invert": (["SCAN", "-c", "RUN", "-o", "OUT"], "inversion needs the velocity of a flow, which a ToyGenerator"),
+    "interpolate": (
+        ["SCAN", "SCAN", "-c", "RUN", "-o", "OUT"], "interpolation needs the velocity of a flow, which a ToyGenerator"
+    ),
+    "report": (["curvature", "RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
+    "calibrate": (["RUN", "-o", "OUT.json"], "a time grid needs the velocity of a flow, which a ToyGenerator"),
+    "convert": (["RUN", "OUT.pth"], "the published format cannot hold a ToyGenerator; convert to .safetensors"),
+    "pairs": (["RUN"], "pairs need noise of the scans' shape (2, 16, 64), found (8,)"),
+    "sample": (["-c", "RUN", "--steps", "4", "-o", "OUT"], "a ToyGenerator can be run in one way only"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("verb", CANNOT)
+def test_what_a_gan_cannot_do_is_one_line(gan: Path, tmp_path: Path, verb: str):
+    arguments, said = CANNOT[verb]
+    for name, value in (("RUN", gan), ("SCAN", gan / "samples" / "000000.ply"), ("OUT", tmp_path / "out")):
+        arguments = [one.replace(name, str(value)) for one in arguments]
+    done = r2flow(verb, GAN.plugin, *arguments)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_gan_s_optimizers_and_schedules_keep_step(gan: Path):
+    content = read_checkpoint(checkpoints_of(gan)[0])
+    assert content["global_step"] == 6
+    assert [schedule["last_epoch"] for schedule in content["lr_schedulers"]] == [6, 6]
+    # Warmed up over 4 images, two steps; after the last of 6 the cosine is at 0.
+    assert [state["param_groups"][0]["lr"] for state in content["optimizer_states"]] == pytest.approx([0, 0], abs=1e-9)
+    steps = {int(s["step"]) for state in content["optimizer_states"] for s in state["state"].values()}
+    assert steps == {6}
+
+
+def test_a_run_without_its_plugin_says_which_and_how(trained: tuple[Family, Path], tmp_path: Path):
+    family, run = trained
+    name, kind = ("toy_backbone", "backbone") if family is BACKBONE else (f"toy_{family.name}", "generator")
+    for arguments in (["info", run], ["sample", "-c", run, "-o", tmp_path / "out"]):
+        done = r2flow(*arguments)
+        assert done.returncode == 2
+        assert len(done.stderr.splitlines()) == 1
+        assert f"no {kind} named '{name}'" in done.stderr
+        assert f"give --plugin {FAMILIES / f'{family.file}.py'}." in done.stderr

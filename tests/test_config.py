@@ -1,0 +1,92 @@
+"""The rules of config keys, and whether conf/ and the constructors say the same keys."""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any
+
+import lightning as L
+import pytest
+
+from r2flow.backbones import BACKBONES
+from r2flow.callbacks import CALLBACKS
+from r2flow.composing import CONF, choices, compose
+from r2flow.config import RULES, Key, flatten, key_of, rule
+from r2flow.data.augment import Augmentation
+from r2flow.data.options import DataOptions, PairOptions
+from r2flow.registry import options_of
+from r2flow.stages import STAGES
+
+CONFIG = compose()
+
+
+def test_a_key_follows_the_group_that_it_is_in():
+    assert rule("data.augment.flip") == rule("data.a_key_of_tomorrow") == RULES["data"]
+    assert rule("data.validation.share") == Key()
+    assert rule("data.validation.data.split").links == "scans"
+    assert rule("data.parts.3.root").resume == "free"
+    assert rule("data.parts.3.weight") == rule("data.parts") == RULES["data"]
+    assert rule("data.pairs.num").links == "pairs"
+    assert rule("trainer.max_steps") == rule("seed") == Key()
+    assert rule("backbone.dropout").inherited == "unless_given"
+    assert rule("backbone.depths").inherited == "always"
+    assert rule("sampler.steps").resume == "free"
+
+
+@pytest.mark.parametrize(
+    ("override", "key"),
+    [
+        ("data.root=x", "data.root"),
+        ("+data.augment.flip=true", "data.augment.flip"),
+        ("~callbacks.ema", "callbacks.ema"),
+        ("sensor@_global_.sensor=vlp16", "sensor"),
+        ("hydra/launcher=slurm", "hydra.launcher"),
+    ],
+)
+def test_the_key_of_an_override(override: str, key: str):
+    assert key_of(override) == key
+
+
+def test_every_rule_is_of_a_key_that_exists():
+    keys = {key for key, _ in flatten(CONFIG)} | {"experiment", "hydra", "parent.path", "data.parts.*.root"}
+    keys |= {"data.validation.data.root", *(f"callbacks.{name}" for name in CALLBACKS)}
+    for key in RULES:
+        assert any(known == key or known.startswith(f"{key}.") for known in keys), key
+
+
+def entries() -> list[tuple[str, Callable[..., Any], dict[str, Any], set[str]]]:
+    """(group, constructor, what the composed config says, what the run adds)."""
+    found: list[tuple[str, Callable[..., Any], dict[str, Any], set[str]]] = []
+    for name in choices("stage"):
+        stage = dict(compose([f"stage={name}"])["stage"])
+        found.append((f"stage={name}", STAGES[stage.pop("name")], stage, {"generator", "batch_size", "seed", "init"}))
+    for name in choices("backbone"):
+        backbone = dict(compose([f"backbone={name}"])["backbone"])
+        added = {"rays", "in_channels", "out_channels", "second_time"}
+        found.append((f"backbone={name}", BACKBONES[backbone.pop("name")], backbone, added))
+    for name, options in CONFIG["callbacks"].items():
+        entry = CALLBACKS[name]
+        given = len(entry.given(CONFIG))
+        added = set(list(inspect.signature(entry.constructor).parameters)[:given])
+        found.append((f"callbacks.{name}", entry.constructor, options, added))
+    data = CONFIG["data"]
+    found.append(("data", DataOptions, data, set()))
+    found.append(("data.augment", Augmentation, data["augment"], set()))
+    found.append(("data.pairs", PairOptions, data["pairs"], {"parent"}))
+    found.append(("trainer", L.Trainer, CONFIG["trainer"], {"callbacks", "logger", "plugins"}))
+    return found
+
+
+@pytest.mark.parametrize(("group", "constructor", "options", "added"), entries(), ids=[one[0] for one in entries()])
+def test_conf_says_every_option_of_a_constructor(group: str, constructor, options: dict[str, Any], added: set[str]):
+    known = set(options_of(constructor)) - added
+    if group.startswith("stage=distill"):
+        known -= {"time"} - set(options)
+    assert set(options) - added == known
+
+
+def test_the_groups_of_the_default_config_are_files_of_conf():
+    for group in ("stage", "backbone", "data", "sensor", "encoding", "trainer", "callbacks"):
+        assert choices(group)
+        assert (CONF / group).is_dir()
+    assert {f.name for f in fields(Key)} == {"resume", "inherited", "links"}

@@ -1,0 +1,173 @@
+"""Modules from outside: by name, by path, by entry point; never because a file names them."""
+
+import copy
+import importlib
+import importlib.metadata
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra.core.config_store import ConfigStore
+
+from r2flow import plugins
+from r2flow.checkpoints import checkpoints_of
+from r2flow.composing import REGISTRIES, choices, compose
+from r2flow.errors import InputError
+from r2flow.plugins import load_plugins, made_with, take_plugins
+from r2flow.registry import Registry
+from r2flow.runs import read_config
+from r2flow.stages import STAGES
+from r2flow.training import build
+from tests.training.conftest import Run, in_process, tiny
+
+STAGE = '''
+from r2flow.stages import STAGES
+from r2flow.stages.rectify import Rectify
+
+
+class Eager(Rectify):
+    """Takes its own steps, and clips for itself.
+
+    Args:
+        pace: Nothing.
+    """
+
+    def __init__(self, generator, pace: int = 3, **options):
+        super().__init__(generator, **options)
+        self.automatic_optimization = False
+        self.clipped = []
+
+    def training_step(self, batch, batch_idx):
+        (optimizer,) = self.own_optimizers()
+        loss = super().training_step(batch, batch_idx)
+        optimizer.zero_grad()
+        self.manual_backward(loss)
+        self.clip_gradients(optimizer, self.gradient_clip_val, "norm")
+        optimizer.step()
+
+
+STAGES.add("eager", Eager)
+'''
+
+
+@pytest.fixture
+def eager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file with a stage of its own, forgotten again after the test."""
+    path = tmp_path / "eager.py"
+    path.write_text(STAGE)
+    monkeypatch.setattr(plugins, "_loaded", set(plugins._loaded))
+    monkeypatch.setattr(STAGES, "_entries", dict(STAGES._entries))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("line", "rest", "names"),
+    [
+        (["sample", "--num", "1"], ["sample", "--num", "1"], []),
+        (["--plugin", "a.b", "sample", "-c", "x"], ["sample", "-c", "x"], ["a.b"]),
+        (["sample", "-c", "x", "--plugin=a.b", "--plugin", "./c.py"], ["sample", "-c", "x"], ["a.b", "./c.py"]),
+    ],
+)
+def test_a_plugin_stands_anywhere_on_the_command_line(line: list[str], rest: list[str], names: list[str]):
+    assert take_plugins(line) == (rest, names)
+
+
+def test_a_stage_of_ones_own_needs_no_yaml_trains_and_resumes(eager: Path, train: Run, tmp_path: Path):
+    options = ["stage=eager", "stage.pace=5", "name=own", f"--plugin={eager}"]
+    train(*options, "trainer.max_steps=4")
+    run = tmp_path / "runs" / "own"
+    config = read_config(run)
+    assert config is not None
+    assert config["plugins"] == [str(eager)]
+    assert (config["stage"]["pace"], config["stage"]["loss"], config["stage"]["init"]) == (5, "mse", None)
+    assert [int(path.stem[-8:]) for path in checkpoints_of(run)] == [4, 2]
+
+
+def test_a_stage_that_takes_its_own_steps_clips_for_itself(eager: Path, scans: Path):
+    load_plugins([str(eager)])
+    config = compose(tiny(scans, "stage=eager", "trainer.gradient_clip_val=0.5"))
+    run = build(config)
+    assert run.stage.gradient_clip_val == 0.5
+    assert run.trainer.gradient_clip_val is None
+    config["trainer"]["accumulate_grad_batches"] = 2
+    with pytest.raises(InputError, match="stage=eager takes its own optimiser steps"):
+        build(config)
+
+
+def test_a_plugin_is_not_imported_because_a_file_names_it(eager: Path, tmp_path: Path):
+    with (
+        pytest.raises(
+            InputError,
+            match=f"no stage named 'eager'; known: .*; it was made with the plug-in {eager}: give --plugin {eager}",
+        ),
+        made_with({"plugins": [str(eager)]}, "it"),
+    ):
+        STAGES["eager"]
+    folder = tmp_path / "conf" / "experiment"
+    folder.mkdir(parents=True)
+    (folder / "theirs.yaml").write_text(f"# @package _global_\nplugins: [{eager}]\n")
+    done = in_process(tmp_path, ["--config-dir", str(folder.parent), "experiment=theirs"], check=False)
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        f"error: plug-ins are named on the command line, never in a file: give --plugin {eager}."
+    ]
+    assert "eager" not in STAGES
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1 / 0", "ZeroDivisionError: division by zero"),
+        ("import nothing_of_this_name", "ModuleNotFoundError"),
+        ("def :", "SyntaxError"),
+        ("from r2flow.stages import STAGES\nSTAGES.add('rectify', None)", "exists already"),
+        (None, "is no file"),
+    ],
+)
+def test_a_plugin_that_cannot_be_imported_is_one_line(tmp_path: Path, text: str | None, words: str):
+    path = tmp_path / "broken.py"
+    if text is not None:
+        path.write_text(text)
+    done = in_process(tmp_path, [f"--plugin={path}"], check=False)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"error: the plug-in {path} cannot be imported: ")
+    assert words in line
+
+
+def test_an_installed_plugin_is_looked_for_where_a_name_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "somebodys.py").write_text("from tests.training.test_plugins import TABLE\nTABLE.add('mine', 1)\n")
+    found = importlib.metadata.EntryPoint("somebodys", "somebodys", plugins.GROUP)
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [found])
+    monkeypatch.setattr(plugins, "_loaded", set())
+    monkeypatch.setattr(Registry, "on_missing", [plugins.load_installed])
+    monkeypatch.syspath_prepend(tmp_path)
+    assert TABLE["mine"] == 1
+
+
+TABLE: Registry[int] = Registry("thing")
+
+
+def test_every_verb_takes_plugins(tmp_path: Path):
+    path = tmp_path / "broken.py"
+    path.write_text("raise RuntimeError('here it is')")
+    for line in (["--plugin", str(path), "info", "x"], ["info", "x", "--plugin", str(path)]):
+        done = subprocess.run(
+            [sys.executable, "-m", "r2flow.cli", *line], capture_output=True, text=True, timeout=100, check=False
+        )
+        assert done.returncode == 2
+        assert done.stderr == f"error: the plug-in {path} cannot be imported: RuntimeError: here it is\n"
+
+
+@pytest.mark.parametrize("group", list(REGISTRIES))
+def test_what_is_in_a_registry_without_a_yaml_file_becomes_a_choice(group: str, monkeypatch: pytest.MonkeyPatch):
+    module, table, _ = REGISTRIES[group]
+    registry: Registry[Any] = getattr(importlib.import_module(module), table)
+    original = next(iter(registry.items()))[1]
+    monkeypatch.setattr(registry, "_entries", {**registry._entries, "somebodys": original})
+    monkeypatch.setattr(ConfigStore.instance(), "repo", copy.deepcopy(ConfigStore.instance().repo))
+    config = compose([f"{group}=somebodys"])
+    assert config[group]["name"] == "somebodys"
+    assert set(choices(group)) >= {"somebodys"}
