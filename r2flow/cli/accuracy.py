@@ -48,7 +48,8 @@ def curvature(
             measure_paths(checkpoint, label, draw.num, steps, draw.seed, draw.batch_size, most_curved, advance)
             for label, checkpoint in loaded.items()
         ]
-    finish(curvature_page(flows, draw.seed, command(), where), out)
+    page = curvature_page(flows, draw.seed, command(), where)
+    finish(page, out, page.text)
 
 
 @dataclass(frozen=True)
