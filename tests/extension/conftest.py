@@ -1,6 +1,7 @@
 """Families that come from outside, as a user gives them: a file, `--plugin`, and what the config says of it."""
 
 import contextlib
+import copy
 import io
 import sys
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra.core.config_store import ConfigStore
 
 from r2flow import cli, plugins
 from r2flow.backbones import BACKBONES
@@ -53,12 +55,14 @@ ALL = (GAN, DDPM, COMPLETION, BACKBONE)
 @contextlib.contextmanager
 def loaded(*families: Family) -> Iterator[None]:
     """Families' files imported for the length of a block: what comes after is as if in a process of its own."""
-    tables = (GENERATORS, STAGES, BACKBONES)
+    tables, store = (GENERATORS, STAGES, BACKBONES), ConfigStore.instance()
+    choices = copy.deepcopy(store.repo)
     before, known = [dict(table.items()) for table in tables], set(plugins._loaded)
     try:
         plugins.load_plugins([str(FAMILIES / f"{family.file}.py") for family in families])
         yield
     finally:
+        store.repo = choices
         plugins._loaded.clear()
         plugins._loaded.update(known)
         for table, entries in zip(tables, before, strict=True):

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint
+from r2flow.training import compose
 from tests.extension.conftest import (
     BACKBONE,
     COMPLETION,
@@ -176,3 +177,10 @@ def test_a_family_is_made_of_public_names(file: Path):
             names = [*(node.module or "").split("."), *(alias.name for alias in node.names)]
         private = [name for name in names if name.startswith("_") and name != "__init__"]
         assert not private
+
+
+def test_a_notebook_composes_what_plugins_add():
+    with loaded(GAN, BACKBONE):
+        config = compose(["stage=toy_gan", "backbone=toy_backbone", "stage.width=8", "backbone.base_channels=4"])
+    assert (config["stage"]["name"], config["stage"]["width"]) == ("toy_gan", 8)
+    assert config["backbone"] == {"name": "toy_backbone", "base_channels": 4}
