@@ -1,5 +1,6 @@
 """From a command line to a config: `conf/` composed by Hydra, choices for what plug-ins add, mistakes in one line."""
 
+import json
 import re
 import sys
 from collections.abc import Iterator, Sequence
@@ -133,6 +134,18 @@ def explain(error: Exception) -> str:
         known = choices(group)
         return f"no {group} config named '{name}'; known: {', '.join(known)}.{did_you_mean(name, known)}"
     return " ".join(lines[:2])
+
+
+def override(key: str, value: Any) -> str:
+    """One key in Hydra's grammar."""
+    if isinstance(value, list | tuple):
+        return f"{key}=[{','.join(override('', one)[1:] for one in value)}]"
+    if value is None or isinstance(value, bool):
+        return f"{key}={json.dumps(value)}"
+    if isinstance(value, str) and not value.replace("_", "").replace("-", "").isalnum():
+        escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+        return f"{key}='{escaped}'"
+    return f"{key}={value}"
 
 
 def known_keys() -> list[str]:
