@@ -60,7 +60,7 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except Stopped as stop:
-        if os.environ.get("LOCAL_RANK", "0") == "0":
+        if str(stop):  # of several devices one speaks
             print(stop, flush=True)
         return stop.code
     except KeyboardInterrupt:  # Ctrl-C where nobody listens: in a library's thread
