@@ -80,9 +80,11 @@ def pairs(
     rank, ranks, where = share.place()
     flow = load_checkpoint(checkpoint)
     check_finished(checkpoint, flow)
-    options = {"num": num, "batch_size": batch_size, "shard_mib": shard_mib, "seed": seed, "first": first}
     asked = {"method": solver.solver, "steps": solver.steps, "tolerance": solver.tolerance}
-    options |= {key: value for key, value in asked.items() if value is not None}
+    options = {
+        **{key: value for key, value in asked.items() if value is not None},
+        "num": num, "batch_size": batch_size, "shard_mib": shard_mib, "seed": seed, "first": first,
+    }  # fmt: skip
     recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(
         flow.encoding.shape, flow.generator.noise_shape
     )

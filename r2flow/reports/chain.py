@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from r2flow.checkpoints import Checkpoint, load_checkpoint
@@ -22,7 +21,7 @@ from r2flow.noise import Draws
 from r2flow.progress import track
 from r2flow.reports.outputs import draw_pages, write_scan
 from r2flow.reports.pages import Page, write_page
-from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
+from r2flow.reports.pictures import BACKGROUND, FOREGROUND, dark_figure, draw_range
 from r2flow.reports.tables import print_table, table
 from r2flow.runs import read_config
 from r2flow.sampling import sample
@@ -135,8 +134,7 @@ def explanation(num: int, real: int) -> str:
 def figure(drawn: Mapping[tuple[str, int], np.ndarray], names: list[str]) -> Figure:
     """One scan by every generator (rows) at every number of steps (columns)."""
     columns = sorted({steps for _, steps in drawn})
-    sheet = Figure(figsize=(5.2 * len(columns), 1.35 * len(names) + 0.4), facecolor=BACKGROUND)
-    FigureCanvasAgg(sheet)
+    sheet = dark_figure(5.2 * len(columns), 1.35 * len(names) + 0.4)
     axes = sheet.subplots(len(names), len(columns), squeeze=False)
     for row, name in enumerate(names):
         for column, steps in enumerate(columns):

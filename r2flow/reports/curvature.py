@@ -101,7 +101,9 @@ def _paths(found: Straightness, encoding: Encoding, label: str) -> Paths:
 
 def _together(batches: Sequence[Paths], most_curved: int) -> Paths:
     """The batches of one checkpoint as one."""
-    every = {name: np.concatenate([getattr(b, name) for b in batches]) for name in ("s", "squared_length", *OF_PATHS)}
+    every: dict[str, Any] = {
+        name: np.concatenate([getattr(b, name) for b in batches]) for name in ("s", "squared_length", *OF_PATHS)
+    }
     most = np.argsort(-every["bends"], kind="stable")[:most_curved]
     totals = np.array([b.s.mean(1).sum() for b in batches])
     elements = np.array([b.elements for b in batches])
@@ -156,6 +158,20 @@ COLUMNS = {
     "paths_dropped": "most curved: ending at ray-drop", "dropped_share": "rays dropped",
     "dropped_bend": "share of curvature on dropped rays",
 }  # fmt: skip
+
+
+def curvature_text(flows: Sequence[Paths]) -> list[str]:
+    """What s(t) is, and the flows in a table."""
+    summaries = [summary(flow) for flow in flows]
+    row = summaries[0]
+    about = (
+        "s(t) = |(x_1 - x_0) - v(t, x_t)|^2 along the flow's own path (the paper's eq. 5), the mean over "
+        f"{row['scenes']} scans from the same noise and {len(flows[0].t)} Euler steps. It is 0 on a straight path, "
+        "which one step follows exactly. A flow that goes nowhere is straight too: compare int s dt over the squared "
+        f"length |x_1 - x_0|^2. The most curved paths are {row['paths']} ({row['paths_share']:.2%} of all pixels of "
+        "range and reflectance)."
+    )
+    return [about, table(summaries, COLUMNS)]
 
 
 def curvature_figure(flows: Sequence[Paths]) -> Figure:
@@ -229,23 +245,14 @@ def curvature_page(flows: Sequence[Paths], seed: int, command: str, device: str 
         for flow in flows
         for number in range(len(flow.bends))
     ]  # fmt: skip
-    summaries = [summary(flow) for flow in flows]
-    row = summaries[0]
-    about = (
-        "s(t) = |(x_1 - x_0) - v(t, x_t)|^2 along the flow's own path (the paper's eq. 5), the mean over "
-        f"{row['scenes']} scans from the same noise and {len(flows[0].t)} Euler steps. It is 0 on a straight path, "
-        "which one step follows exactly. A flow that goes nowhere is straight too: compare int s dt over the squared "
-        f"length |x_1 - x_0|^2. The most curved paths are {row['paths']} ({row['paths_share']:.2%} of all pixels of "
-        "range and reflectance)."
-    )
     return Page(
         "curvature",
         "How straight the flows are",
-        [about, table(summaries, COLUMNS)],
+        curvature_text(flows),
         curvature_rows(flows),
         {"curvature": curvature_figure(flows), "trajectories": trajectories_figure(flows)},
         command,
         seeds={"scenes": seed},
         device=device,
-        more={"summary": summaries, "trajectories": paths},
+        more={"summary": [summary(flow) for flow in flows], "trajectories": paths},
     )

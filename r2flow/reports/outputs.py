@@ -27,7 +27,7 @@ FORMATS = ("ply", "bin", "npy")
 
 
 def formats_of(checkpoint: Checkpoint, channels: str = "both") -> list[str]:
-    """The output formats that can hold what there will be: a .bin needs reflectance, a point needs its range."""
+    """The output formats that can hold the scans: a .bin needs reflectance, a point needs its range."""
     if channels == "reflectance":
         return ["npy"]
     return [name for name in FORMATS if name != "bin" or (channels == "both" and checkpoint.encoding.reflectance)]
@@ -80,7 +80,7 @@ def write_samples(
         ):  # fmt: skip
             lost = [drawn.first + offset for offset, solved in enumerate(drawn.converged.tolist()) if not solved]
             if lost:
-                log.warning("not solved, and no scans of this flow: %s; try another solver.", ", ".join(map(str, lost)))
+                log.warning("not solved, so no scans of this flow: %s; try another solver.", ", ".join(map(str, lost)))
             for offset, image in enumerate(drawn.images.numpy()):
                 name = f"{drawn.first + offset:06d}"
                 if channels == "reflectance":
@@ -113,7 +113,7 @@ def keep_note(checkpoint: Checkpoint, out: Path, seed: int, **sampler: Any) -> N
 
 
 def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str) -> None:
-    """Know the formats before there is anything to write.
+    """Check the formats before anything is generated.
 
     Raises:
         InputError: an unknown one, or one that cannot hold what is asked for.
@@ -180,13 +180,10 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path) -> Path:
 
 def draw_reflectances(images: Sequence[np.ndarray], out: Path) -> Path:
     """`samples.png` of scans without a range, (1, h, w) each: their reflectance, one under the other."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from r2flow.reports.pictures import dark_figure, draw_reflectance, save_figure
 
-    from r2flow.reports.pictures import BACKGROUND, draw_reflectance, save_figure
-
-    figure = Figure(figsize=(13, 1.2 * len(images) + 0.3), facecolor=BACKGROUND, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = dark_figure(13, 1.2 * len(images) + 0.3)
+    figure.set_layout_engine("constrained")
     axes: Any = figure.subplots(len(images), 1, squeeze=False)[:, 0]
     for row, (image, place) in enumerate(zip(images, axes, strict=True)):
         draw_reflectance(place, np.concatenate([image, image]), label=row == 0)  # a ray without any was dropped
