@@ -14,6 +14,7 @@ from hydra.core.config_store import ConfigStore
 
 from r2flow import cli, plugins
 from r2flow.backbones import BACKBONES
+from r2flow.callbacks import CALLBACKS
 from r2flow.generators import GENERATORS
 from r2flow.stages import STAGES
 from tests.training.conftest import Done
@@ -55,7 +56,7 @@ ALL = (GAN, DDPM, COMPLETION, BACKBONE)
 @contextlib.contextmanager
 def loaded(*families: Family) -> Iterator[None]:
     """Families' files imported for the length of a block: what comes after is as if in a process of its own."""
-    tables, store = (GENERATORS, STAGES, BACKBONES), ConfigStore.instance()
+    tables, store = (GENERATORS, STAGES, BACKBONES, CALLBACKS), ConfigStore.instance()
     choices = copy.deepcopy(store.repo)
     before, known = [dict(table.items()) for table in tables], set(plugins._loaded)
     try:
