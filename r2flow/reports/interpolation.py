@@ -1,6 +1,5 @@
 """From one real scan to another through the noise: the paper's figure 3, and a point cloud for every frame."""
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from r2flow.generators import Sampler, as_flow
 from r2flow.inversion import TIGHT, interpolate_scans
 from r2flow.lidar.projection import image_to_points
 from r2flow.reports.inversion import COLUMNS, Real, errors_of
-from r2flow.reports.outputs import ScanBar, formats_of, write_scan
+from r2flow.reports.outputs import ScanBar, formats_of, warn_unsolved, write_scan
 from r2flow.reports.pages import Page, prepare_folder
 from r2flow.reports.pictures import (
     FOREGROUND,
@@ -26,8 +25,6 @@ from r2flow.reports.pictures import (
     draw_reflectance,
 )
 from r2flow.reports.tables import table
-
-log = logging.getLogger(__name__)
 
 MOST = 8  # frames in the figure, evenly chosen
 
@@ -59,9 +56,7 @@ def interpolation(
     # both ends go there and back
     with ScanBar("interpolating", frames, (frames + 2) * checkpoint.generator.evaluations_of(sampler)) as bar:
         found = interpolate_scans(checkpoint, pair, frames, sampler, batch_size, bar.evaluated, bar.finished)
-    lost = [number for number, solved in enumerate(found.converged.tolist()) if not solved]
-    if lost:
-        log.warning("not solved, so no scans of this flow: %s; try another solver.", ", ".join(map(str, lost)))
+    warn_unsolved(found.converged)
     images = found.images.nan_to_num(0.0).numpy()
     rows = []
     for number, (weight, image) in enumerate(zip(found.weights.tolist(), images, strict=True)):

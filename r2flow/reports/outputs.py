@@ -78,9 +78,7 @@ def write_samples(
             generator, num, seed, sampler=sampler, batch_size=batch_size, region=region, channels=channels,
             progress=bar.evaluated,
         ):  # fmt: skip
-            lost = [drawn.first + offset for offset, solved in enumerate(drawn.converged.tolist()) if not solved]
-            if lost:
-                log.warning("not solved, so no scans of this flow: %s; try another solver.", ", ".join(map(str, lost)))
+            warn_unsolved(drawn.converged, drawn.first)
             for offset, image in enumerate(drawn.images.numpy()):
                 name = f"{drawn.first + offset:06d}"
                 if channels == "reflectance":
@@ -93,16 +91,28 @@ def write_samples(
     if channels != "reflectance":
         keep_note(checkpoint, out, seed, **sampler.asdict())
     if shown:
-        parts = shown if region is None else [region.crop(torch.from_numpy(image)).numpy() for image in shown]
-        if channels == "reflectance":
-            draw_reflectances(parts[:8], out)
-        else:
-            draw_pages(parts, rays if region is None else region.crop(rays), out)
+        draw_pictures(shown, rays, out, region, channels)
     return shown
 
 
+def draw_pictures(images: Sequence[np.ndarray], rays: Tensor, out: Path, region: Region | None, channels: str) -> None:
+    """The pictures of samples, of the region alone where there is one."""
+    parts = images if region is None else [region.crop(torch.from_numpy(image)).numpy() for image in images]
+    if channels == "reflectance":
+        draw_reflectances(parts[:8], out)
+    else:
+        draw_pages(parts, rays if region is None else region.crop(rays), out)
+
+
+def warn_unsolved(converged: Tensor, first: int = 0) -> None:
+    """Warn of the scans that are none of the flow, by number."""
+    lost = [str(first + offset) for offset, solved in enumerate(converged.tolist()) if not solved]
+    if lost:
+        log.warning("not solved, so no scans of this flow: %s; try another solver.", ", ".join(lost))
+
+
 def keep_note(checkpoint: Checkpoint, out: Path, seed: int, **sampler: Any) -> None:
-    """Leave beside samples what they are, so that nobody has to say their size or sensor."""
+    """Write beside samples what they are, so that readers know their size and sensor."""
     sensor = checkpoint.sensor
     encoding = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
     limits = {"min_range": sensor.min_range, "max_range": sensor.max_range}
