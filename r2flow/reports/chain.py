@@ -169,6 +169,6 @@ flows         {", ".join(str(run) for run in runs.values())}
 next
   r2flow sample --checkpoint {folder} --num 16 --seed 1 --out {out.parent / "more"}
   r2flow show {out / "000000.ply"} --out {out.parent / "views"}
-  python train.py data=kitti_raw data.root=FOLDER backbone=hdit_small""",
+  r2flow train data=kitti_raw data.root=FOLDER backbone=hdit_small""",
         flush=True,
     )

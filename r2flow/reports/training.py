@@ -80,6 +80,6 @@ loss curve    {run / "loss.png"}; tensorboard --logdir {run / "tensorboard"}
 next
   r2flow sample --checkpoint {run} --num 16{advice} --seed 1 --out {run / "more"}
   r2flow show {out / "000000.ply"} --out {run / "views"}
-  python train.py data=kitti_raw data.root=FOLDER backbone=hdit_small""",
+  r2flow train data=kitti_raw data.root=FOLDER backbone=hdit_small""",
         flush=True,
     )
