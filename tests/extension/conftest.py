@@ -15,6 +15,7 @@ from hydra.core.config_store import ConfigStore
 from r2flow import cli, plugins
 from r2flow.backbones import BACKBONES
 from r2flow.callbacks import CALLBACKS
+from r2flow.composing import REGISTRIES
 from r2flow.generators import GENERATORS
 from r2flow.stages import STAGES
 from tests.training.conftest import Done
@@ -57,13 +58,13 @@ ALL = (GAN, DDPM, COMPLETION, BACKBONE)
 def loaded(*families: Family) -> Iterator[None]:
     """Families' files imported for the length of a block: what comes after is as if in a process of its own."""
     tables, store = (GENERATORS, STAGES, BACKBONES, CALLBACKS), ConfigStore.instance()
-    choices = copy.deepcopy(store.repo)
+    choices = {group: copy.deepcopy(store.repo.get(group, {})) for group in REGISTRIES}  # Hydra's own stay
     before, known = [dict(table.items()) for table in tables], set(plugins._loaded)
     try:
         plugins.load_plugins([str(FAMILIES / f"{family.file}.py") for family in families])
         yield
     finally:
-        store.repo = choices
+        store.repo.update(choices)
         plugins._loaded.clear()
         plugins._loaded.update(known)
         for table, entries in zip(tables, before, strict=True):
