@@ -88,7 +88,7 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
         print(f"error: {len(failed) or 'some'} of the sweep's jobs failed: {'; '.join(names)}", file=sys.stderr)
         return 2
     except (HydraException, OmegaConfBaseException) as error:
-        print(f"error: {explain(error)}", file=sys.stderr)
+        print(f"error: {explain(error)}{_forgotten_plugins(arguments)}", file=sys.stderr)
         return 2
     except (InputError, OSError) as error:
         print(f"error: {explain_mistake(error)}", file=sys.stderr)
@@ -105,6 +105,18 @@ def _plugins_of(arguments: list[str]) -> tuple[list[str], list[str]]:
     names = list(dict.fromkeys(name for name in names if name))
     rest = [one for one in others if one not in given]
     return [*rest, *([override("plugins", names)] if names else [])], names
+
+
+def _forgotten_plugins(arguments: Sequence[str]) -> str:
+    """The plug-ins of the run that a command names, where it gives none: its config may name what they hold."""
+    given = dict(one.partition("=")[::2] for one in arguments)
+    run = given.get("run_dir") or f"runs/{given.get('name')}"
+    if "plugins" in given or not Path(run, "config.yaml").is_file():
+        return ""
+    from r2flow.runs import read_config
+
+    names = " ".join(f"--plugin {name}" for name in (read_config(run) or {}).get("plugins") or ())
+    return f" {run} was made with {names}: give it again." if names else ""
 
 
 def _checked_arguments(arguments: list[str]) -> list[str]:

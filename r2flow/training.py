@@ -33,7 +33,7 @@ from r2flow.noise import seed_torch
 from r2flow.plugins import made_with
 from r2flow.registry import Bound, Count, NonNegative, Positive, check_options
 from r2flow.reports.training import check_samples, finish, read_curves
-from r2flow.runs import check_run, open_run, run_lock
+from r2flow.runs import check_run, open_run, read_config, run_lock
 from r2flow.stages import build_stage, check_roll
 from r2flow.stages.base import Stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
@@ -123,6 +123,11 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
         InputError: a value that cannot be used, an unknown name or option, a parent that is not there or not finished.
     """
     check_keys(config)
+    with made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
+        return _build(config, asked)
+
+
+def _build(config: Mapping[str, Any], asked: Sequence[str]) -> Run:
     parent, checkpoint = find_parent(config) or (None, None)
     config = _checked(config, asked, parent)
     config["encoding"]["reflectance"] = resolve_reflectance(config["encoding"].get("reflectance", AUTO), config["data"])
