@@ -82,10 +82,15 @@ class RoundTrip:
 
 def round_trip(checkpoint: Checkpoint, inversion: Inversion) -> RoundTrip:
     """The errors of an inversion; NaN for a scan that is not finite, or in metres where no ray returns twice."""
-    rms = (inversion.again - inversion.x_1).double().square().flatten(1).mean(1).sqrt()
+    apart = rms(inversion.again - inversion.x_1)
     median_m, rms_m, dropped = metres_apart(*(checkpoint.encoding.decode(x) for x in (inversion.x_1, inversion.again)))
     std = inversion.x_0.double().flatten(1).std(1)
-    return RoundTrip(rms, median_m, rms_m, dropped.masked_fill(rms.isnan(), math.nan), std)
+    return RoundTrip(apart, median_m, rms_m, dropped.masked_fill(apart.isnan(), math.nan), std)
+
+
+def rms(x: Tensor) -> Tensor:
+    """Root mean square over each scan's elements, (B, ...) -> (B,), float64."""
+    return x.double().square().flatten(1).mean(1).sqrt()
 
 
 def metres_apart(image: Tensor, other: Tensor) -> tuple[Tensor, Tensor, Tensor]:
