@@ -21,7 +21,7 @@ from r2flow.generators.base import Progress
 from r2flow.inversion import metres_apart, rms
 from r2flow.lidar.region import Region, region
 from r2flow.noise import Draws
-from r2flow.reports.outputs import formats_of, write_scan
+from r2flow.reports.outputs import write_scan
 from r2flow.reports.pages import Page, blank_figure
 from r2flow.reports.tables import shown, table
 from r2flow.reports.timing import timed
@@ -30,9 +30,14 @@ from r2flow.sampling import evaluated_region
 Row = dict[str, Any]
 
 NAME = "a savings report"
-# Scans of the mixed batch by kind: their number and their problem.
+# Scans of the exact batches by kind.
 MIXED = {"straight": 8, "gaussian": 4, "two_modes": 3, "ray_drop": 1}
 LONE = {"straight": 255, "ray_drop": 1}
+# Name, colour and hatch of a kind: told apart without colour.
+KINDS = {
+    "straight": ("straight", "#d9d9d9", ""), "gaussian": ("smooth", "#9ecae1", "//"),
+    "two_modes": ("two modes", "#4a90c2", ".."), "ray_drop": ("ray-drop", "#1b3a57", ""),
+}  # fmt: skip
 ELEMENTS = 256  # of an exact scan
 FIXED = 32  # steps of the fixed-step rows
 REPEATS = 3  # of every timing
@@ -74,7 +79,11 @@ def one_state(flow: Flow, x: Tensor, tolerance: float, progress: Progress = None
     return end, torch.full((len(x),), calls)
 
 
-def _own_steps(flow: Flow, x: Tensor, sampler: Sampler, tolerance: float, progress: Progress) -> tuple[Tensor, Tensor]:
+def _solve(
+    flow: Flow, x: Tensor, sampler: Sampler | None, tolerance: float, progress: Progress
+) -> tuple[Tensor, Tensor]:
+    if sampler is None:
+        return one_state(flow, x, tolerance, progress)
     end = flow.solve(x, sampler=sampler.changed(tolerance=tolerance), progress=progress)
     return end.x, end.evaluations
 
@@ -87,9 +96,7 @@ def solve_in_all_ways(
     seconds: dict[str, list[float]] = defaultdict(list)
     for _ in range(repeats):
         for way, sampler in WAYS.items():
-            solve = one_state if sampler is None else partial(_own_steps, sampler=sampler)
-            call = partial(solve, flow, x_0, tolerance=tolerance, progress=progress)
-            ends[way], taken = timed(call, x_0.device)
+            ends[way], taken = timed(partial(_solve, flow, x_0, sampler, tolerance, progress), x_0.device)
             seconds[way].append(taken)
     for way, (x_1, evaluations) in ends.items():
         errors = rms(x_1 - truth)
@@ -204,23 +211,20 @@ def channel_rows(checkpoint: Checkpoint, budget: float = 1.0) -> list[Row]:
     ranges, t = checkpoint.encoding.format.channels, torch.tensor(0.5)
     space, device = checkpoint.generator.space, checkpoint.generator.device
     x = Draws(0, range(1)).start((ranges + 1, *checkpoint.sensor.shape))
-    networks = {}
-    for name, channels in (("both", ranges + 1), ("range", ranges)):
-        backbone = build_backbone(checkpoint.config["backbone"], space.rays, channels).eval().to(device)
-        networks[name] = partial(backbone, t, x[:, :channels].to(device))
-    network = _in_turns(networks, budget, device)
-    decoding = _in_turns({name: partial(space.decode, x, name) for name in network}, budget)
+    networks, decoders, writers = {}, {}, {}
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
-        writers = {}
-        for name in network:
-            image = space.decode(x, name)[0].numpy()
-            formats = [ending for ending in formats_of(checkpoint, name) if ending != "bin"]
-            writers[name] = partial(write_scan, image, checkpoint.sensor.rays(), Path(folder, name), "scan", formats)
-        writing = _in_turns(writers, budget)
-        for name in network:
-            size = sum(path.stat().st_size for path in Path(folder, name).iterdir())
+        for name, channels in (("both", ranges + 1), ("range", ranges)):
+            backbone = build_backbone(checkpoint.config["backbone"], space.rays, channels).eval().to(device)
+            networks[name] = partial(backbone, t, x[:, :channels].to(device))
+            decoders[name] = partial(space.decode, x, name)
+            image, out = space.decode(x, name)[0].numpy(), Path(folder, name)
+            writers[name] = partial(write_scan, image, checkpoint.sensor.rays(), out, "scan", ("ply", "npy"))
+        network = _in_turns(networks, budget, device)
+        decoding, writing = _in_turns(decoders, budget), _in_turns(writers, budget)
+        for name in networks:
             row: Row = {"part": "channels", "way": name, "network": network[name], "decoding": decoding[name]}
+            size = sum(path.stat().st_size for path in Path(folder, name).iterdir())
             rows.append({**row, "writing": writing[name], "bytes": size})
     return rows
 
@@ -243,10 +247,9 @@ def _in_turns(
 
 # The page: a part is its conditions in a sentence and its rows as a table.
 
-KIND_NAMES = {"straight": "straight", "gaussian": "smooth", "two_modes": "two modes", "ray_drop": "ray-drop"}
 OF_KINDS = {"evaluations": "evaluations, all", "share": "of one state's", "worst_error": "worst error"}
-OF_KINDS |= {f"evaluations_{kind}": f"a {name} scan" for kind, name in KIND_NAMES.items()}
-OF_KINDS |= {f"error_{kind}": f"error, {name}" for kind, name in KIND_NAMES.items()}
+OF_KINDS |= {f"evaluations_{kind}": f"a {name} scan" for kind, (name, _, _) in KINDS.items()}
+OF_KINDS |= {f"error_{kind}": f"error, {name}" for kind, (name, _, _) in KINDS.items()}
 OF_SCANS = {"evaluations": "evaluations", "share": "of one state's", "seconds": "seconds"}
 OF_SCANS |= {"median_error": "median error", "worst_error": "worst error", "straight": "straight scans"}
 OF_REGIONS = {"share": "of the pixels", "seconds": "seconds a scan", "time": "of the time", "error": "RMS, model space"}
@@ -274,7 +277,7 @@ def savings_page(
     """
     mixed = exact_rows(MIXED, "mixed", TOLERANCES, seed)
     lone = [row for row in exact_rows(LONE, "one among 255", (1e-3,), seed) if row["tolerance"]]
-    kinds = ", ".join(f"{count} {KIND_NAMES[kind]}" for kind, count in MIXED.items())
+    kinds = ", ".join(f"{count} {KINDS[kind][0]}" for kind, count in MIXED.items())
     text = [
         f"## Easy and hard scans in one batch\n\nExact problems, {ELEMENTS} elements a scan, float64: {kinds}. Seconds "
         "are the solver's own work, without a network.",
@@ -321,13 +324,6 @@ def _with_share(rows: Sequence[Row]) -> list[Row]:
     return [{**row, "share": row["evaluations"] / base[row["tolerance"]] if row["tolerance"] else None} for row in rows]
 
 
-# Told apart without colour.
-HATCHES = {
-    "straight": ("#d9d9d9", ""), "gaussian": ("#9ecae1", "//"), "two_modes": ("#4a90c2", ".."),
-    "ray_drop": ("#1b3a57", ""),
-}  # fmt: skip
-
-
 def scans_figure(rows: Sequence[Row]) -> Figure:
     """Evaluations of the mixed batch by way and kind of scan, the worst error beside them."""
     figure = blank_figure(11, 4.4, "Easy and hard scans in one batch")
@@ -337,9 +333,9 @@ def scans_figure(rows: Sequence[Row]) -> Figure:
         ways, begin = [row["way"] for row in chosen], [0.0] * len(chosen)
         for kind, count in MIXED.items():
             length = [count * row[f"evaluations_{kind}"] for row in chosen]
-            colour, hatch = HATCHES[kind]
-            label = f"{count} {KIND_NAMES[kind]}"
-            axes.barh(ways, length, left=begin, color=colour, hatch=hatch, edgecolor="black", lw=0.5, label=label)
+            name, colour, hatch = KINDS[kind]
+            style = {"color": colour, "hatch": hatch, "edgecolor": "black", "lw": 0.5}
+            axes.barh(ways, length, left=begin, **style, label=f"{count} {name}")
             begin = [a + b for a, b in zip(begin, length, strict=True)]
         notes = [f" {row['evaluations']}; worst error {shown(row['worst_error'])}" for row in chosen]
         _annotate(axes, begin, notes)
