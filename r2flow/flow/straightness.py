@@ -26,8 +26,7 @@ class Curvature:
     """The integral of s over the paths of a batch.
 
     Attributes:
-        x_0: Start of each path, (B, ...).
-        x_1: End of each path, (B, ...).
+        x_0, x_1: Start and end of each path, (B, ...).
         per_pixel: int_0^1 (d - v_t)^2 dt of every element, (B, ...), float64.
     """
 
@@ -83,8 +82,7 @@ def curvature(velocity: Velocity, x_0: Tensor, steps: int = 256, progress: Progr
         InputError: fewer than one step.
     """
     first: Tensor | None = None
-    mean = torch.zeros_like(x_0, dtype=torch.float64)
-    mean_square = torch.zeros_like(mean)
+    mean, mean_square = torch.zeros(2, *x_0.shape, dtype=torch.float64, device=x_0.device)
 
     def accumulate(t: Tensor, x: Tensor, v: Tensor) -> None:
         nonlocal first

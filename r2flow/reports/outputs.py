@@ -54,8 +54,7 @@ def write_samples(
         formats: All that fit if left out. `ply` and `bin` are points in metres with reflectance, `npy` the range image,
             float32 (2 or 1, H, W) in metres and reflectance; reflectance alone is `NNNNNN.reflectance.npy`.
         pictures: How many scans get a page of their own; the contact sheet shows at most 8 of them.
-        region, channels: See `r2flow.sampling.sample`. Pictures show the region alone, files are of the sensor's
-            shape, 0 outside.
+        region, channels: See `r2flow.sampling.sample`. Files are of the sensor's shape, 0 outside the region.
 
     Returns:
         The images drawn as pictures.

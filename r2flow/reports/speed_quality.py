@@ -178,7 +178,7 @@ def speed_quality_page(
         "Seconds are those of the network and its solver, the median over batches."
     )
     text = [sampled, table(printed, columns), *_remarks(rows)]
-    more = {
+    more: dict[str, Sequence[Mapping[str, Any]]] = {
         "protocols": [
             {**metric.protocol.asdict(), "real_chosen": curve.gathered.rules[name]}
             for name, metric in curve.metrics.items()

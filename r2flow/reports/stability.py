@@ -7,8 +7,7 @@ converged, no estimate) or its global estimate is within a factor of five of the
 import itertools
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -37,8 +36,7 @@ JET = "narrow_jet"  # the known exception: nothing evaluated on either side of i
 FINISHED = ("point_mass", "narrow_gaussian", "ray_drop")
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """A solver on a problem; `tolerance` is None for one of fixed steps, `finish` is left to a last Euler step."""
 
     problem: str
@@ -95,18 +93,17 @@ def stability(
 def _row(cell: Cell, steps: int, x_0: Tensor, max_evaluations: int) -> Row:
     problem, tolerance = PROBLEMS[cell.problem](), cell.tolerance
     state, network = PRECISIONS[cell.precision]
-    x_0 = x_0.to(state)
-    solution = Field(HalfPrecision(problem, network) if network else problem, x_0.shape[1:]).solve(
-        x_0, sampler=Sampler(cell.solver, steps).changed(tolerance=tolerance), finish=cell.finish,
-        max_evaluations=max_evaluations, global_error=tolerance is not None,
-    )  # fmt: skip
+    flow = Field(HalfPrecision(problem, network) if network else problem, x_0.shape[1:])
+    x_0, sampler = x_0.to(state), Sampler(cell.solver, steps).changed(tolerance=tolerance)
+    limits: dict[str, Any] = {"finish": cell.finish, "max_evaluations": max_evaluations}
+    solution = flow.solve(x_0, sampler=sampler, global_error=tolerance is not None, **limits)
     extra = 0.0 if solution.estimate_evaluations is None else _mean(solution.estimate_evaluations)
     errors = _rms(solution.x.double() - problem.solution(x_0, 1.0))
     worst, estimates = int(errors.argmax()), solution.global_error
     estimate = math.nan if estimates is None else estimates[worst].item()
     verdict, unestimated = _verdict(solution, errors, tolerance)
     return {
-        **asdict(cell),
+        **cell._asdict(),
         "steps": None if tolerance is not None else steps,
         "error": errors[worst].item(),
         "estimate": estimate if math.isfinite(estimate) else None,
@@ -179,14 +176,14 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     adaptive = [row for row in rows if row["tolerance"] is not None and row["problem"] != JET]
     failed = [row for row in adaptive if row["verdict"] != "accurate"]
     silent = [row for row in failed if row["verdict"] == "silent"]
-    covered = len(failed) - len(silent)
+    covered = [row for row in failed if row["verdict"] != "silent"]
     return {
         "cells": len(rows),
         "failed": len(failed),
-        "covered": covered,
-        "by_missing_estimate": sum(row["by_missing_estimate"] and row["verdict"] != "silent" for row in failed),
-        "share": covered / len(failed) if failed else 1.0,
-        "silent": [" / ".join(map(str, _line(row)[:4])) for row in silent],
+        "covered": len(covered),
+        "by_missing_estimate": sum(row["by_missing_estimate"] for row in covered),
+        "share": len(covered) / len(failed) if failed else 1.0,
+        "silent": [" / ".join(_line(row)[:4]) for row in silent],
         "silent_jets": sum(row["problem"] == JET and row["verdict"] == "silent" for row in rows),
     }
 

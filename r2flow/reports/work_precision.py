@@ -238,14 +238,14 @@ def best_within(
     return min(within, key=lambda row: (reached(row), row[work]), default=None)
 
 
-def problem_subjects(names: Sequence[str] | None = None, scenes: int = 16, elements: int = 64) -> list[Subject]:
-    """The exact problems of `r2flow.flow.problems`, all if none are named, on Gaussian starts.
+def problem_subjects(names: Sequence[str], scenes: int = 16, elements: int = 64) -> list[Subject]:
+    """Exact problems of `r2flow.flow.problems` on Gaussian starts.
 
     Raises:
         InputError: an unknown name.
     """
     subjects = []
-    for name in PROBLEMS if names is None else names:
+    for name in names:
         problem = PROBLEMS[name]()
         # float64: the solver's error, not rounding, is measured
         x_0 = Draws(PROBLEM_SEED, range(scenes)).start((elements,)).double()
