@@ -91,11 +91,11 @@ def measure_paths(
         most.append((bends.flatten()[pixels], found.trajectories, dropped.flatten()[pixels]))
         sums += bends.numel(), dropped.sum().item(), bends.sum().item(), bends[dropped].sum().item()
     s, squared_length = (torch.cat(batches).cpu().numpy() for batches in zip(*scans, strict=True))
-    bends, trajectories, ends = (torch.cat(batches).cpu().numpy() for batches in zip(*most, strict=True))
-    order = np.argsort(-bends, kind="stable")[:most_curved]
+    worst, trajectories, ends = (torch.cat(batches).cpu().numpy() for batches in zip(*most, strict=True))
+    order = np.argsort(-worst, kind="stable")[:most_curved]
     elements, ends_dropped, bend, bend_of_dropped = map(float, sums)
     return Paths(
-        label, found.t.numpy(), s, squared_length, int(elements), bends[order], trajectories[order], ends[order],
+        label, found.t.numpy(), s, squared_length, int(elements), worst[order], trajectories[order], ends[order],
         dropped_share=ends_dropped / elements, dropped_bend=bend_of_dropped / bend if bend else math.nan,
     )  # fmt: skip
 

@@ -27,6 +27,14 @@ from r2flow.reports.pictures import (
 from r2flow.reports.tables import table
 
 MOST = 8  # frames in the figure, evenly chosen
+# In rows: the first two draw points, the others the image.
+PANELS = {
+    "perspective": draw_perspective, "bird's-eye view": draw_birds_eye, "range": draw_range,
+    "reflectance": draw_reflectance,
+}  # fmt: skip
+REAL = "#ffd479"
+BETWEEN = {"frame": "frame", "weight": "w"} | {key: key for key in ("returns", "evaluations", "converged")}
+ENDS = {key: COLUMNS[key] for key in ("scan", "rms", "median_m", "dropped", "noise_std", "converged")}
 
 
 def interpolation(
@@ -85,7 +93,6 @@ def interpolation_figure(
         real: The two scans, (2, 2 or 1, H, W), in metres.
         frames: Scans on the way, (N, 2 or 1, H, W); the first and the last are the real ones' round trips.
         weights: Of the frames, (N,).
-        names: Of the real scans.
     """
     last = len(frames) - 1
     chosen = sorted({round(i * last / (MOST - 1)) for i in range(MOST)}) if last >= MOST else range(last + 1)
@@ -111,13 +118,3 @@ def interpolation_figure(
             if colour == REAL:
                 axes.spines[:].set(visible=True, color=REAL, linewidth=1.2)
     return figure
-
-
-# In rows: the first two draw points, the others the image.
-PANELS = {
-    "perspective": draw_perspective, "bird's-eye view": draw_birds_eye, "range": draw_range,
-    "reflectance": draw_reflectance,
-}  # fmt: skip
-REAL = "#ffd479"
-BETWEEN = {"frame": "frame", "weight": "w"} | {key: key for key in ("returns", "evaluations", "converged")}
-ENDS = {key: COLUMNS[key] for key in ("scan", "rms", "median_m", "dropped", "noise_std", "converged")}

@@ -93,7 +93,7 @@ def stability(
 def _row(cell: Cell, steps: int, x_0: Tensor, max_evaluations: int) -> Row:
     problem, tolerance = PROBLEMS[cell.problem](), cell.tolerance
     state, network = PRECISIONS[cell.precision]
-    flow = Field(HalfPrecision(problem, network) if network else problem, x_0.shape[1:])
+    flow = Field(_in_precision(problem, network), x_0.shape[1:])
     x_0, sampler = x_0.to(state), Sampler(cell.solver, steps).changed(tolerance=tolerance)
     limits: dict[str, Any] = {"finish": cell.finish, "max_evaluations": max_evaluations}
     solution = flow.solve(x_0, sampler=sampler, global_error=tolerance is not None, **limits)
@@ -150,14 +150,11 @@ def jet_probe(
     return rows
 
 
-class HalfPrecision:
+def _in_precision(velocity: Velocity, dtype: torch.dtype | None) -> Velocity:
     """A velocity as a network in half precision gives it: x rounded before it, v after it; t stays in float32."""
-
-    def __init__(self, velocity: Velocity, dtype: torch.dtype) -> None:
-        self.velocity, self.dtype = velocity, dtype
-
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        return self.velocity(t, x.to(self.dtype).to(x.dtype)).to(self.dtype)
+    if dtype is None:
+        return velocity
+    return lambda t, x: velocity(t, x.to(dtype).to(x.dtype)).to(dtype)
 
 
 def _rms(difference: Tensor) -> Tensor:
