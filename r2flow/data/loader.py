@@ -26,10 +26,6 @@ class FlowDataset(Dataset[Item]):
     - u, (B,): uniform in [0, 1); the stage makes t of it;
     - k, (B,): number of the image in the run. A stage that needs more draws or conditions for an image derives them
       from (seed, purpose, k).
-
-    Args:
-        augment: What is done to scan k before it is encoded.
-        noise_shape: Shape of x_0 for one scan; the encoding's (C, H, W) if left out.
     """
 
     def __init__(
@@ -41,7 +37,6 @@ class FlowDataset(Dataset[Item]):
         augment: Augmentation | None = None,
         noise_shape: Sequence[int] | None = None,
     ) -> None:
-        self.noise_shape = tuple(noise_shape or encoding.shape)
         self.source, self.encoding, self.seed, self.purpose = source, encoding, seed, purpose
         self.augment, self.noise_shape = augment, tuple(noise_shape or encoding.shape)
 
@@ -70,10 +65,8 @@ class Order(Protocol):
 class Permutations:
     """Scan permutation_{k // n}[k mod n] of n: every scan once, in an order of its own, then every scan again.
 
-    The permutations are counter-based, so that the order is known at every k without having drawn what came before.
-
-    Args:
-        part: Which part of a mixture these are the scans of: each has permutations of its own.
+    The permutations are counter-based, so that the order is known at every k without having drawn what came before;
+    each part of a mixture has its own.
     """
 
     def __init__(self, scans: int, seed: int, part: int = 0) -> None:

@@ -19,11 +19,9 @@ import torch
 from r2flow.data import preparing
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive
-from r2flow.data.manifest import read_manifest
 from r2flow.data.opening import find_drives, open_prepared
-from r2flow.data.plans import Plan, plan_files, plan_simulated
-from r2flow.data.prepared import PreparedScans, check_prepared
-from r2flow.data.preparing import Preparation
+from r2flow.data.prepared import PreparedScans, check_prepared, read_manifest
+from r2flow.data.preparing import Plan, Preparation, plan_files, plan_simulated
 from r2flow.data.quantise import RangeCodes, ReflectanceCodes, find_levels
 from r2flow.data.sources import Reading, ScanFiles, SimulatedScans
 from r2flow.data.store import MANIFEST
@@ -302,7 +300,7 @@ def test_splits_and_drives_are_those_of_the_data_set(kitti_360: Path, tmp_path: 
         assert prepared.names == raw.names
         for index in (0, len(raw) - 1):
             assert np.abs(prepared[index][0] - raw[index][0]).max() <= MILLIMETRE
-    with pytest.raises(InputError, match=r"no split named 'best' in prepared kitti_360 scans; known: train, test"):
+    with pytest.raises(InputError, match=r"no split named 'best'; known: train, test"):
         open_prepared(tmp_path / "out", SMALL, split="best")
     with pytest.raises(InputError, match="no drive named '7'"):
         open_prepared(tmp_path / "out", SMALL, drives=[7])
@@ -420,6 +418,19 @@ class Slow:
     def __getitem__(self, index: int) -> np.ndarray:
         time.sleep(self.seconds)
         return self.source[index]
+
+
+class Stopped(Slow):
+    """The same scans, stopped by the user before one of them."""
+
+    def __init__(self, source, last: int) -> None:
+        super().__init__(source, 0)
+        self.last = last
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        if index == self.last:
+            raise KeyboardInterrupt
+        return super().__getitem__(index)
 
 
 def in_process(folder: Path, plan: Plan, seconds: float = 0.0, **options) -> int:
@@ -727,11 +738,8 @@ def test_a_damaged_shard_whose_files_have_changed_is_not_mended(tmp_path: Path):
 def test_a_damaged_note_of_an_unfinished_preparation_is_no_harm(clouds: Path, tmp_path: Path):
     plan = plan_of(clouds)
     one = files(make(tmp_path / "one", plan))
-    work = Preparation(tmp_path / "two", plan)
-    work.begin()
-    claims = preparing._Claims(work, [0, 1, 2])
-    work._make_claimed(claims, "error", 0, lambda scans: None)
-    claims.release()
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "two", replace(plan, source=Stopped(plan.source, 9)))
     (tmp_path / "two" / "making" / "000000.json").write_text('{"recipe": 1')
     _cut(tmp_path / "two" / "scans-000001.safetensors")
     assert Preparation(tmp_path / "two", plan).begin() == [0, 1, 3]
@@ -740,10 +748,8 @@ def test_a_damaged_note_of_an_unfinished_preparation_is_no_harm(clouds: Path, tm
 
 def test_shards_of_another_recipe_are_not_taken_for_these(clouds: Path, tmp_path: Path):
     one = files(make(tmp_path / "one", plan_of(clouds)))
-    other = Preparation(tmp_path / "two", plan_of(clouds, convention="reference"))
-    other.begin()
-    claims = preparing._Claims(other, [0, 1])
-    other._make_claimed(claims, "error", 0, lambda scans: None)
-    claims.release()
+    other = plan_of(clouds, convention="reference")
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "two", replace(other, source=Stopped(other.source, 6)))
     (tmp_path / "two" / MANIFEST).unlink()
     assert files(make(tmp_path / "two", plan_of(clouds))) == one
