@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from r2flow import simulator
 from r2flow.data.augment import Augmentation
-from r2flow.data.loader import FixedSampler, FlowDataset, Item, Order, Permutations, RunLoader, RunSampler
+from r2flow.data.loader import FlowDataset, Item, Order, Permutations, RunLoader, RunSampler, fixed_batches
 from r2flow.data.mixture import MixedOrder, Mixture, refuse_shared_scans
 from r2flow.data.opening import held_out_options, open_source, split_parts
 from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
@@ -215,9 +215,9 @@ class ScanDataModule(L.LightningDataModule):
         # than ranks all take all of them, else the few that are left over are left out.
         if scans < ranks:
             rank, ranks = 0, 1
-        sampler = FixedSampler(scans - scans % ranks, batch_size, rank, ranks)
+        batches = fixed_batches(scans - scans % ranks, batch_size, rank, ranks)
         dataset = self._dataset(self.validation_source, "validation")
-        return DataLoader(dataset, batch_sampler=sampler, **self._loader_options())
+        return DataLoader(dataset, batch_sampler=batches, **self._loader_options())
 
     def _loader_options(self) -> dict[str, Any]:
         return {

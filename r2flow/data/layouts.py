@@ -64,8 +64,8 @@ class SourceKind:
         """
         if split is not None:
             if split not in self.splits:
-                known = ", ".join(self.splits) or "none, these scans have no standard split; name data.drives=[...]"
-                raise InputError(f"no split named {split!r}; known: {known}.")
+                known = f"known: {', '.join(self.splits)}" if self.splits else "the data set has no standard split"
+                raise InputError(f"no split named {split!r}; {known}.")
             drives = [drive for drive in drives if self.split_of(drive.name) == split]
         return drives if names is None else [named_drive(drives, str(name)) for name in names]
 

@@ -125,15 +125,7 @@ class RunLoader(DataLoader[Item]):
         pass
 
 
-class FixedSampler(Sampler[list[tuple[int, int]]]):
+def fixed_batches(scans: int, batch_size: int, rank: int = 0, ranks: int = 1) -> list[list[tuple[int, int]]]:
     """Every `ranks`-th scan in order, the key of each its own number: the same items at every validation."""
-
-    def __init__(self, scans: int, batch_size: int, rank: int = 0, ranks: int = 1) -> None:
-        mine: Sequence[int] = range(rank, scans, ranks)
-        self.chunks = [list(mine[i : i + batch_size]) for i in range(0, len(mine), batch_size)]
-
-    def __len__(self) -> int:
-        return len(self.chunks)
-
-    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        return ([(i, i) for i in chunk] for chunk in self.chunks)
+    keys = [(scan, scan) for scan in range(rank, scans, ranks)]
+    return [keys[i : i + batch_size] for i in range(0, len(keys), batch_size)]

@@ -30,13 +30,13 @@ def pair_noise(recipe: Recipe, index: int) -> Tensor:
 
 @dataclass
 class Made:
-    """What one process has done: pairs, those left out, their evaluations, the seconds and those spent on writing."""
+    """What one process has done."""
 
     pairs: int = 0
     evaluations: int = 0
-    unusable: int = 0
+    unusable: int = 0  # pairs that are left out
     seconds: float = 0.0
-    writing: float = 0.0
+    writing: float = 0.0  # seconds of these
 
 
 def make_pairs(
@@ -51,10 +51,8 @@ def make_pairs(
 
     x_1 is where the generator carries x_0 = `pair_noise`, neither clamped nor snapped, in half precision. Rank r owns
     the batches r, r + R, ... and talks to no other; a batch is computed alike whoever owns it, so the shards are the
-    same, byte for byte, for every R. What is there already, from any earlier process, is kept.
-
-    Args:
-        progress: Called after each batch that is on the disk.
+    same, byte for byte, for every R. What is there already, from any earlier process, is kept. `progress` is called
+    after each batch that is on the disk.
 
     Raises:
         InputError: no pair is usable: the flow is broken, or the tolerance out of its reach; or the folder cannot be

@@ -364,7 +364,7 @@ class Preparation:
 
     def _serialised(self, shard: int, scans: Sequence[Sequence[np.ndarray]]) -> bytes:
         shape = (len(scans), *self.recipe.image_shape)
-        tensors = {
+        tensors: dict[str, np.ndarray] = {
             "crc32": np.array([scan_crc(codes) for codes in scans], np.uint32),
             "range": np.empty(shape, np.uint16),
         }
