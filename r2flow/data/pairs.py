@@ -36,7 +36,6 @@ class Made:
     evaluations: int = 0
     unusable: int = 0  # pairs that are left out
     seconds: float = 0.0
-    writing: float = 0.0  # seconds of these
 
 
 def make_pairs(
@@ -79,12 +78,10 @@ def make_pairs(
         _check_usable(made, store.recipe)
         if made.unusable == made.pairs:
             continue  # not to be kept before it is known that the flow can do better
-        written = time.monotonic()
         for number, solved in kept:
             store.commit(number, solved)
             store.seal(number // store.recipe.shard_batches, num)
         kept = []
-        made.writing += time.monotonic() - written
         made.seconds = time.monotonic() - start
         progress(made)
     if kept:

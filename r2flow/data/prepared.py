@@ -10,18 +10,19 @@ A shard is a safetensors file of `range` uint16 (n, H, W), `reflectance` uint8 (
 
 import hashlib
 import json
-import mmap
 import os
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from io import BufferedReader
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 import torch
+from safetensors import safe_open
 from torch import Tensor
 
 import r2flow
@@ -227,7 +228,7 @@ def check_prepared(folder: Path, advance: Callable[[], None] = lambda: None) -> 
 
 def check_shard(path: Path, entry: ShardEntry) -> None:
     """Read every byte of a shard; raises `Damaged` where it is not what was written."""
-    with _opened(path, entry) as (file, _):
+    with _opened(path, entry) as file:
         file.seek(0)
         if hashlib.file_digest(file, "sha256").hexdigest() != entry.sha256:
             raise Damaged("its checksum differs")
@@ -248,8 +249,8 @@ def scan_crc(codes: Sequence[np.ndarray]) -> int:
 
 
 @contextmanager
-def _opened(path: Path, entry: ShardEntry) -> Iterator[tuple[Any, bytes]]:
-    """A shard of the right length with an unharmed head, open, and this head."""
+def _opened(path: Path, entry: ShardEntry) -> Iterator[BufferedReader]:
+    """A shard of the right length with an unharmed head, open behind this head."""
     if not path.is_file():
         raise Damaged("it is missing, or no file")
     try:
@@ -260,10 +261,9 @@ def _opened(path: Path, entry: ShardEntry) -> Iterator[tuple[Any, bytes]]:
         size = os.fstat(file.fileno()).st_size
         if size != entry.bytes:
             raise Damaged(f"it has {size} bytes, not {entry.bytes}")
-        head = read_head(file)
-        if zlib.crc32(head) != entry.head:
+        if zlib.crc32(read_head(file)) != entry.head:
             raise Damaged("its head is not what was written")
-        yield file, head
+        yield file
 
 
 def _to_be_made_again(path: Path, error: Damaged) -> InputError:
@@ -360,7 +360,7 @@ class PreparedScans(ScanSource):
         path, entry = self.folder / shard_name(shard), self.manifest.shards[shard]
         try:
             if shard not in self._shards:
-                self._shards[shard] = _Shard(path, entry, shape)
+                self._shards[shard] = _Shard(path, entry)
             codes = self._shards[shard].codes(row - int(self._ends[shard]) + entry.scans)
         except Damaged as error:
             raise _to_be_made_again(path, error) from None
@@ -374,25 +374,20 @@ class PreparedScans(ScanSource):
 class _Shard:
     """A memory-mapped shard; raises `Damaged` where it is not what was written."""
 
-    def __init__(self, path: Path, entry: ShardEntry, shape: tuple[int, int]) -> None:
-        with _opened(path, entry) as (file, head):
-            self.map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        self.bytes, tensors = entry.bytes, json.loads(head[8:])
-
-        def tensor(name: str, dtype: str, *size: int) -> np.ndarray:
-            offset = len(head) + tensors[name]["data_offsets"][0]
-            return np.frombuffer(self.map, dtype, int(np.prod(size)), offset).reshape(size)
-
-        self.crc32 = tensor("crc32", "<u4", entry.scans)
-        kinds = {"range": "<u2", "reflectance": "u1"}
-        self.images = [tensor(name, kind, entry.scans, *shape) for name, kind in kinds.items() if name in tensors]
+    def __init__(self, path: Path, entry: ShardEntry) -> None:
+        with _opened(path, entry):
+            self.file = open(path, "rb")  # noqa: SIM115  its length is looked at before each scan
+        self.bytes, tensors = entry.bytes, safe_open(path, framework="numpy")
+        self.crc32, there = tensors.get_tensor("crc32"), set(tensors.keys())
+        self.images = [tensors.get_slice(name) for name in ("range", "reflectance") if name in there]
 
     def codes(self, row: int) -> list[np.ndarray]:
         """Codes of range and, where there is any, of reflectance, (H, W) each."""
         # Reading behind the end of a file that was cut meanwhile kills the process.
-        if self.map.size() != self.bytes:
-            raise Damaged(f"it has {self.map.size()} bytes, not {self.bytes}")
-        codes = [image[row] for image in self.images]
+        size = os.fstat(self.file.fileno()).st_size
+        if size != self.bytes:
+            raise Damaged(f"it has {size} bytes, not {self.bytes}")
+        codes: list[np.ndarray] = [image[row : row + 1][0] for image in self.images]
         if scan_crc(codes) != self.crc32[row]:
             raise Damaged(f"the checksum of scan {row} in it differs")
         return codes
