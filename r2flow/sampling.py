@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
@@ -88,6 +89,7 @@ def sample(
         yield draw(generator, numbers, seed, how, known, region, channels, progress)
 
 
+@torch.no_grad()
 def draw(
     generator: Generator,
     numbers: Sequence[int],

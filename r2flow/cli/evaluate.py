@@ -238,7 +238,8 @@ def _curve(
 
     rows = measure_curve(curve, flows, steps, work, done, keep)
     if work.rank == 0:
-        finish(speed_quality_page(curve, rows, command(), done), out)
+        page = speed_quality_page(curve, rows, command(), done)
+        finish(page, out, page.text)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow import simulator
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.labels import labels_beside, read_labels
@@ -352,6 +351,8 @@ class SimulatedScans(ScanSource):
         return {"kind": "simulated", "seed": self.seed, "scenes": len(self), "reflectance": self.reflectance}
 
     def identity(self) -> dict[str, Any]:
+        from r2flow import simulator
+
         numbers = hashlib.sha256(np.asarray(self.scenes, dtype=np.int64).tobytes()).hexdigest()[:16]
         return {**self.about(), "numbers": numbers, "simulator": simulator.REVISION, "sensor": asdict(self.sensor)}
 
@@ -359,7 +360,9 @@ class SimulatedScans(ScanSource):
         return len(self.scenes)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return simulator.simulate(self.sensor, self.seed, self.scenes[index]).image[: 1 + self.reflectance]
+        from r2flow.simulator import simulate
+
+        return simulate(self.sensor, self.seed, self.scenes[index]).image[: 1 + self.reflectance]
 
 
 class InMemory(ScanSource):

@@ -175,8 +175,21 @@ class Generator(nn.Module):
         raise NotImplementedError
 
     def start_from(self, parent: "Generator") -> None:
-        """Take over a trained generator's weights: every name and shape must be this one's."""
-        self.load_state_dict(parent.state_dict())
+        """Take over a trained generator's weights: every name and shape must be this one's.
+
+        Raises:
+            InputError: one is not.
+        """
+        self._take(parent, parent.state_dict())
+
+    def _take(self, parent: "Generator", weights: Mapping[str, Tensor]) -> None:
+        try:
+            self.load_state_dict(weights)
+        except RuntimeError:
+            raise InputError(
+                f"the weights of a {type(parent).__name__} do not fit into this {type(self).__name__}: give the "
+                "generator and the options that it was trained with, or leave stage.init out."
+            ) from None
 
     @property
     def learns_directions(self) -> bool:
