@@ -33,13 +33,10 @@ log = logging.getLogger(__name__)
 class ScanDataModule(L.LightningDataModule):
     """Projected scans with their noise, or pairs that a flow has drawn, for training and validation.
 
-    What a batch holds is said by `r2flow.data.loader.FlowDataset`.
+    What a batch holds is said by `r2flow.data.loader.FlowDataset`. Noise, times and order derive from the run's seed
+    (`r2flow.noise`); the noise of one scan has the encoding's shape, (C, H, W), if none is given.
 
     Args:
-        sensor: What the scans are projected through.
-        encoding: Metres to model space.
-        seed: Run seed; noise, times and order derive from it (`r2flow.noise`).
-        noise_shape: Shape of the noise x_0 that one scan is made of; the encoding's (C, H, W) if left out.
         keys: The keys of `r2flow.data.options.DataOptions`.
 
     Raises:

@@ -35,11 +35,9 @@ class SourceKind:
     reflectance_scale = 1.0  # the usual value that means full reflectance
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
-        """The scans in their order, none of them read yet.
+        """The scans in their order, none of them read yet; `seed` and `first_scene` are for simulated ones.
 
-        Args:
-            reading: How they become images; `reflectance` is True or False.
-            seed, first_scene: Of simulated scans, the seed and the number of the first.
+        `reading.reflectance` is True or False.
         """
         raise NotImplementedError
 

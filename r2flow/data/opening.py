@@ -154,11 +154,7 @@ def find_drives(
 
 
 def write_samples_note(folder: Path, reading: Reading, **about: Any) -> None:
-    """Say in a folder of samples whose images they are: `open_scans` then needs no sensor and no size.
-
-    Args:
-        about: What else a reader may want to know, as plain values: encoding, seed, sampler.
-    """
+    """Say in a folder of samples whose images they are: `open_scans` then needs no sensor and no size."""
     images = {"sensor": asdict(reading.sensor), "projection": reading.projection, "convention": reading.convention}
     with atomic_write(folder / SAMPLES, "w") as file:
         json.dump({"format": "r2flow samples 1", **images, **about}, file, indent=1)

@@ -68,10 +68,10 @@ class Recipe:
         return len(self.sensor["elevations"]), self.sensor["columns"]
 
     @property
-    def codes(self) -> tuple[RangeCodes, ReflectanceCodes | None]:
+    def codes(self) -> list[RangeCodes | ReflectanceCodes]:
         """The codes of range and, where the scans have it, of reflectance."""
         ranges = RangeCodes(self.sensor["min_range"], self.sensor["max_range"])
-        return ranges, None if self.levels is None else ReflectanceCodes(self.levels)
+        return [ranges] if self.levels is None else [ranges, ReflectanceCodes(self.levels)]
 
     @property
     def shards(self) -> int:
@@ -274,25 +274,19 @@ def _to_be_made_again(path: Path, error: Damaged) -> InputError:
 
 
 class PreparedScans(ScanSource):
-    """Scans of shards as a source. Every scan that is read is compared with its checksum.
+    """Scans of shards as a source, `rows` being their numbers among all that the shards hold.
 
-    Args:
-        folder, manifest: Where the shards lie, and what they are.
-        rows: Number of each scan among all that the shards hold.
-
-    Raises:
-        InputError: reflectance is wanted, and the shards have none.
+    Every scan that is read is compared with its checksum.
     """
 
     def __init__(self, folder: Path, manifest: Manifest, rows: np.ndarray, reflectance: bool = True) -> None:
         self.folder, self.manifest, self.rows, self.reflectance = folder, manifest, rows, reflectance
         self._ends = np.cumsum([entry.scans for entry in manifest.shards])
-        ranges, levels = manifest.recipe.codes
-        if reflectance and levels is None:
+        if reflectance and manifest.recipe.levels is None:
             raise InputError(
                 f"{folder} holds scans without reflectance. Set encoding.reflectance=false for range alone."
             )
-        self._metres = [ranges.metres, levels.values] if reflectance and levels else [ranges.metres]
+        self._values = [codes.values for codes in manifest.recipe.codes[: 1 + reflectance]]
         self._encoding: Encoding | None = None
         self._model: list[np.ndarray] = []
         self._shards: dict[int, _Shard] = {}
@@ -336,7 +330,7 @@ class PreparedScans(ScanSource):
         return {os.path.join(real, name) for name in self.names}
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return self._looked_up(index, self._metres)
+        return self._looked_up(index, self._values)
 
     def encoded(self, index: int, encoding: Encoding) -> Tensor:
         """`encoding.encode` of a scan, bit for bit, (C, H, W), where `encoding` is of this source's sensor.
@@ -348,7 +342,7 @@ class PreparedScans(ScanSource):
             return super().encoded(index, encoding)
         if self._encoding is not encoding:
             # The tables of codes, encoded as an image that shows every code.
-            ranges, *values = self._metres
+            ranges, *values = self._values
             image = np.stack([ranges.reshape(256, 256), *(np.tile(table, (256, 1)) for table in values)])
             first, *others = encoding.encode(torch.from_numpy(image)).numpy()
             self._encoding, self._model = encoding, [first.ravel().copy(), *(one[0].copy() for one in others)]

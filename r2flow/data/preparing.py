@@ -136,7 +136,7 @@ def _reflectance_levels(paths: Sequence[str], scale: float, levels: int | None) 
 
 
 class Coded(NamedTuple):
-    """One scan in codes, (H, W) each, and the most that its ranges and reflectances are off by them."""
+    """One scan in codes of range and reflectance, (H, W) each, and the most that these are off."""
 
     codes: list[np.ndarray]
     errors: list[float]
@@ -146,20 +146,16 @@ class CodedScans(Dataset[tuple[int, Coded | str]]):
     """Scan by scan its number and its codes, or why it cannot be used."""
 
     def __init__(self, source: ScanSource, recipe: Recipe) -> None:
-        self.source = source
-        self.range, self.reflectance = recipe.codes
+        self.source, self.coders = source, recipe.codes
 
     def __getitem__(self, number: int) -> tuple[int, Coded | str]:
         try:
             image = self.source[number]
         except InputError as error:
             return number, str(error)
-        codes = [self.range.encode(image[0])]
-        decoded = [self.range.metres[codes[0]]]
-        if self.reflectance is not None:
-            codes.append(self.reflectance.encode(image[1]))
-            decoded.append(self.reflectance.values[codes[1]])
-        errors = [float(np.abs(one.astype(np.float64) - image[i]).max()) for i, one in enumerate(decoded)]
+        codes = [coder.encode(channel) for coder, channel in zip(self.coders, image, strict=False)]
+        decoded = [coder.values[code].astype(np.float64) for coder, code in zip(self.coders, codes, strict=True)]
+        errors = [float(np.abs(one - channel).max()) for one, channel in zip(decoded, image, strict=False)]
         return number, Coded(codes, errors)
 
 

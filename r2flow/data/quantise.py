@@ -24,7 +24,7 @@ class RangeCodes:
     r(c) = knee + (c - knee_code) coarse     for knee_code <= c <= 65535.
 
     One step, fine = (max_range - min_range) / 65534, where that is at most `STEP` (limits up to 124 m apart); else at
-    most `STEP` as far as 65 m, and what codes are left share the rest. A range is off by at most half a step. `metres`
+    most `STEP` as far as 65 m, and what codes are left share the rest. A range is off by at most half a step. `values`
     is what each code means, (65536,), float32.
     """
 
@@ -41,8 +41,8 @@ class RangeCodes:
         code = np.arange(CODES)
         beyond = self.knee + (code - self.knee_code) * self.coarse
         r = np.where(code <= self.knee_code, min_range + (code - 1) * self.fine, beyond)
-        self.metres = np.clip(r.astype(np.float32), self.near, self.far)
-        self.metres[0] = 0
+        self.values = np.clip(r.astype(np.float32), self.near, self.far)
+        self.values[0] = 0
 
     def encode(self, r: np.ndarray) -> np.ndarray:
         """Ranges in metres, 0 where no return, to the codes nearest to them, uint16.

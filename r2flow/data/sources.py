@@ -140,10 +140,9 @@ def read_scan(
 
 
 def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """The image of `read_scan`, and the semantic id of each pixel's return where labels lie beside the scan.
+    """The image of `read_scan`, and the semantic id of each pixel's return, (H, W) uint16, 0 where none was kept.
 
-    Returns:
-        The image, and ids, (H, W) uint16, 0 where no return was kept; None where there are no labels.
+    The ids are None where no labels lie beside the scan.
 
     Raises:
         InputError: what `read_scan` refuses, or labels that are damaged or of another scan.
@@ -269,10 +268,7 @@ class ScanFiles(ScanSource):
     With `on_bad_scan="skip"` a file that cannot be used is left out with a warning: the next usable file of this source
     takes its place, the same one in every process.
 
-    Args:
-        root: The folder of the data set; a scan is named by its path below it.
-        drives: Numbers of the scans of each drive.
-        about: What a reader must know of the data set.
+    A scan is named by its path below the data set's `root`.
     """
 
     slow = True

@@ -82,7 +82,7 @@ def test_ranges_are_within_a_millimetre_below_65_m(sensor: Sensor, far: float | 
     codes = RangeCodes(near, far)
     r = np.concatenate([np.random.default_rng(0).uniform(near, far, 50_000), [near, 65.0, far]]).astype(np.float32)
     r = r.clip(codes.near, codes.far)
-    decoded = codes.metres[codes.encode(r)]
+    decoded = codes.values[codes.encode(r)]
     error = np.abs(decoded.astype(np.float64) - r)
     assert error[r < 65].max() <= MILLIMETRE
     # Beyond, at worst half of what is left of the codes: (500 - 65) m over some 31,000 of them.
@@ -93,10 +93,10 @@ def test_ranges_are_within_a_millimetre_below_65_m(sensor: Sensor, far: float | 
 
 def test_code_0_is_no_return_and_nothing_else_is(sensor: Sensor):
     codes = RangeCodes(sensor.min_range, sensor.max_range)
-    assert codes.metres[0] == 0
-    assert codes.metres[1:].min() == np.float32(sensor.min_range)
+    assert codes.values[0] == 0
+    assert codes.values[1:].min() == np.float32(sensor.min_range)
     assert codes.encode(np.array([0, sensor.min_range, sensor.max_range], np.float32)).tolist() == [0, 1, 65535]
-    assert (np.diff(codes.metres[1:]) > 0).all()
+    assert (np.diff(codes.values[1:]) > 0).all()
 
 
 @pytest.mark.parametrize("wrong", [1.0, 81.0, -2.0, np.nan, np.inf])
@@ -222,7 +222,7 @@ def test_encoded_is_the_encoding_of_the_decoded_bit_for_bit_in_every_code(
 ):
     sensor = SENSORS["hdl64e"]
     plan = plan_simulated(1, 0, sensor.resized(2, 4), levels=100)
-    metres = RangeCodes(sensor.min_range, sensor.max_range).metres.reshape(64, 1024)
+    metres = RangeCodes(sensor.min_range, sensor.max_range).values.reshape(64, 1024)
     values = np.random.default_rng(0).permutation(np.arange(65536) % 101).reshape(64, 1024) / np.float32(100)
     image = np.stack([metres, np.where(metres > 0, values, 0).astype(np.float32)])
     recipe = replace(plan.recipe, sensor={**plan.recipe.sensor, "elevations": list(sensor.elevations), "columns": 1024})
