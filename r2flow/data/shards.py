@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -135,20 +135,17 @@ class PairStore:
 
     def held(self, shard: int) -> int:
         """How many batches a shard's file holds, by its head; a whole shard of other pairs is refused."""
-        path = self.shard_path(shard)
         try:
-            with _opened(path) as (_, notes):
-                pass
+            with self._opened(self.shard_path(shard)) as (_, notes):
+                return len(notes["usable"]) // self.recipe.batch_size
         except (Damaged, FileNotFoundError):
             return 0
-        self._check_recipe(path, notes)
-        return len(notes["usable"]) // self.recipe.batch_size
 
     def usable(self, num: int) -> np.ndarray:
         """Whether each of the first `num` pairs came to an end, (num,) bool; their shards must be there."""
         flags = []
         for shard in self.shards(num):
-            with _opened(self.shard_path(shard)) as (_, notes):
+            with self._opened(self.shard_path(shard)) as (_, notes):
                 flags += notes["usable"]
         return np.array(flags[:num], dtype=bool)
 
@@ -175,12 +172,9 @@ class PairStore:
     def check(self, shard: int, num: int) -> list[int]:
         """Read every byte of one shard and its loose batches; the batches that were damaged, now removed."""
         batches = self.batches_of(shard, num)
-        files = {
-            self.shard_path(shard): batches,
-            **{self.batch_path(batch): range(batch, batch + 1) for batch in batches},
-        }
+        loose = [(self.batch_path(batch), range(batch, batch + 1)) for batch in batches]
         lost: set[int] = set()
-        for path, held in files.items():
+        for path, held in [(self.shard_path(shard), batches), *loose]:
             try:
                 self._read(path, held[0])
             except FileNotFoundError:
@@ -242,41 +236,38 @@ class PairStore:
             if unless():
                 raise _Unwanted
 
-    def _check_recipe(self, path: Path, notes: Mapping[str, Any]) -> None:
-        if notes["recipe"] != self.recipe.digest:
-            raise InputError(
-                f"{path} holds pairs of another recipe. Give the settings that they were made with, or another folder "
-                f"by {ELSEWHERE}."
-            )
+    @contextmanager
+    def _opened(self, path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
+        """A file of pairs, and what it says of itself: its head is read, and the file's length held to it.
+
+        Raises:
+            FileNotFoundError: no such file.
+            Damaged: whatever else goes wrong in reading it.
+            InputError: it is a whole file of other pairs.
+        """
+        if not path.is_file():
+            raise FileNotFoundError(path)
+        try:
+            with safe_open(path, framework="numpy") as file:
+                notes: dict[str, Any] = json.loads((file.metadata() or {})["pairs"])
+                recipe, *_ = (notes[key] for key in ("recipe", "first", "usable", "sha256"))
+                if recipe != self.recipe.digest:
+                    raise InputError(
+                        f"{path} holds pairs of another recipe. Give the settings that they were made with, or another "
+                        f"folder by {ELSEWHERE}."
+                    )
+                yield file, notes
+        except (FileNotFoundError, InputError):
+            raise
+        except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+            raise Damaged(str(error)) from None
 
     def _read(self, path: Path, batch: int) -> Block:
         """A file that begins with a batch, every byte of it checked."""
-        with _opened(path) as (file, notes):
+        with self._opened(path) as (file, notes):
             block = Block(file.get_tensor("x_1"), file.get_tensor("evaluations"), np.array(notes["usable"], dtype=bool))
-        self._check_recipe(path, notes)
         if notes["first"] != self.recipe.first + batch * self.recipe.batch_size:
             raise Damaged(f"it begins with pair {notes['first']}")
         if notes["sha256"] != block.checksum or len(block.usable) != len(block.x_1):
             raise Damaged("its checksum differs")
         return block
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """A file of pairs, and what it says of itself: its head is read, and the file's length held to it.
-
-    Raises:
-        FileNotFoundError: no such file.
-        Damaged: whatever else goes wrong in reading it.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(path)
-    try:
-        with safe_open(path, framework="numpy") as file:
-            notes: dict[str, Any] = json.loads((file.metadata() or {})["pairs"])
-            notes["recipe"], notes["first"], notes["usable"], notes["sha256"]
-            yield file, notes
-    except FileNotFoundError:
-        raise
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-        raise Damaged(str(error)) from None
