@@ -218,20 +218,22 @@ def check_prepared(folder: Path, advance: Callable[[], None] = lambda: None) -> 
     """Read every byte of every shard: the damaged ones and what is wrong with them."""
     damaged = {}
     for shard, entry in enumerate(read_manifest(folder, finished=True).shards):
-        try:
-            check_shard(folder / shard_name(shard), entry)
-        except Damaged as error:
-            damaged[folder / shard_name(shard)] = str(error)
+        path = folder / shard_name(shard)
+        if damage := damage_of(path, entry):
+            damaged[path] = damage
         advance()
     return damaged
 
 
-def check_shard(path: Path, entry: ShardEntry) -> None:
-    """Read every byte of a shard; raises `Damaged` where it is not what was written."""
-    with _opened(path, entry) as file:
-        file.seek(0)
-        if hashlib.file_digest(file, "sha256").hexdigest() != entry.sha256:
-            raise Damaged("its checksum differs")
+def damage_of(path: Path, entry: ShardEntry) -> str | None:
+    """What is wrong with a shard, of which every byte is read; None where it is what was written."""
+    try:
+        with _opened(path, entry) as file:
+            file.seek(0)
+            same = hashlib.file_digest(file, "sha256").hexdigest() == entry.sha256
+    except Damaged as error:
+        return str(error)
+    return None if same else "its checksum differs"
 
 
 def read_head(file: IO[bytes]) -> bytes:

@@ -25,8 +25,8 @@ from r2flow.data.prepared import (
     Manifest,
     Recipe,
     ShardEntry,
-    check_shard,
     checksum,
+    damage_of,
     describe_sensor,
     read_head,
     read_manifest,
@@ -36,7 +36,7 @@ from r2flow.data.prepared import (
 )
 from r2flow.data.quantise import OTHER_LEVELS, RangeCodes, ReflectanceCodes, find_levels
 from r2flow.data.sources import Reading, ScanFiles, ScanSource, SimulatedScans, spread, stored_reflectance
-from r2flow.data.store import MANIFEST, Damaged, clear_leftovers, refuse_other, shard_bytes, warn_damaged
+from r2flow.data.store import MANIFEST, clear_leftovers, refuse_other, shard_bytes, warn_damaged
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.lidar.sensors import Sensor
@@ -322,13 +322,10 @@ class Preparation:
 
     def _is_whole(self, shard: int, level: int = logging.DEBUG) -> bool:
         entry, path = self._entry(shard), self.folder / shard_name(shard)
-        try:
-            if entry is not None:
-                check_shard(path, entry)
-        except Damaged as error:
-            warn_damaged(path, error, level)
-            return False
-        return entry is not None
+        damage = damage_of(path, entry) if entry is not None else None
+        if damage is not None:
+            warn_damaged(path, damage, level)
+        return entry is not None and damage is None
 
     def _write(self, shard: int, scans: Sequence[Coded], left_out: Sequence[int]) -> None:
         data = self._serialised(shard, [scan.codes for scan in scans])

@@ -41,8 +41,8 @@ def shard_bytes(tensors: dict[str, np.ndarray], key: str, notes: Mapping[str, An
     return save(tensors, metadata={key: json.dumps(notes)})
 
 
-def warn_damaged(path: Path, error: Damaged, level: int = logging.WARNING) -> None:
-    log.log(level, "%s is damaged (%s): it is made again.", path, error)
+def warn_damaged(path: Path, damage: str | Damaged, level: int = logging.WARNING) -> None:
+    log.log(level, "%s is damaged (%s): it is made again.", path, damage)
 
 
 def clear_leftovers(files: Iterable[Path], older: float = 0.0) -> None:
