@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
-from r2flow.data.shards import Recipe
+from r2flow.data.shards import PairRecipe
 from r2flow.errors import InputError
 from r2flow.flow.solvers import check_method, check_tolerance
 from r2flow.registry import check_options
@@ -88,7 +88,7 @@ class PairOptions:
     first: int | None = None  # index of the first pair; None: behind the pairs that the flow itself was trained on
     parent: str | None = None  # hash of the flow; the run fills it in
 
-    def recipe(self, shape: tuple[int, int, int], noise_shape: tuple[int, ...] | None = None) -> Recipe:
+    def recipe(self, shape: tuple[int, int, int], noise_shape: tuple[int, ...] | None = None) -> PairRecipe:
         """All that pairs depend on, where scans and their noise have these shapes in model space.
 
         Raises:
@@ -106,7 +106,7 @@ class PairOptions:
         check_method(self.method)
         shard_batches = max(round(self.shard_mib * 2**20 / (self.batch_size * 2 * math.prod(shape))), 1)
         tolerance = float(self.tolerance)  # 1 and 1.0 are one recipe
-        return Recipe(
+        return PairRecipe(
             self.parent or "", shape, self.seed, first, self.method, self.steps, tolerance, self.batch_size,
             shard_batches, None if noise_shape == shape else noise_shape,
         )  # fmt: skip

@@ -18,12 +18,12 @@ from torch.utils.data import Dataset
 
 from r2flow import noise
 from r2flow.data.loader import Item
-from r2flow.data.shards import Block, PairStore, Recipe
+from r2flow.data.shards import Block, PairRecipe, PairStore
 from r2flow.errors import InputError
 from r2flow.generators import Generator
 
 
-def pair_noise(recipe: Recipe, index: int) -> Tensor:
+def pair_noise(recipe: PairRecipe, index: int) -> Tensor:
     """x_0 of a pair, of the recipe's noise shape or (C, H, W), drawn again from its index."""
     return noise.standard_normal(recipe.noise_shape or recipe.shape, recipe.seed, "pairs", index)
 
@@ -103,7 +103,7 @@ def _in_own_order(batches: set[int], shard_batches: int) -> list[int]:
     return sorted(sorted(batches), key=lambda batch: (turn[batch // shard_batches], draw.random()))
 
 
-def _check_usable(made: Made, recipe: Recipe, patience: int = 64) -> None:
+def _check_usable(made: Made, recipe: PairRecipe, patience: int = 64) -> None:
     if made.unusable == made.pairs > patience:
         raise InputError(
             f"none of {made.pairs} pairs came to an end with {recipe.method} at tolerance {recipe.tolerance:g}: "
@@ -111,7 +111,7 @@ def _check_usable(made: Made, recipe: Recipe, patience: int = 64) -> None:
         )
 
 
-def solve_batch(recipe: Recipe, generator: Generator, batch: int) -> Block:
+def solve_batch(recipe: PairRecipe, generator: Generator, batch: int) -> Block:
     """The pairs first + [b B, (b + 1) B) of batch b."""
     first = recipe.first + batch * recipe.batch_size
     x_0 = torch.stack([pair_noise(recipe, index) for index in range(first, first + recipe.batch_size)])

@@ -42,7 +42,7 @@ FORMAT = "r2flow scans 1"
 
 
 @dataclass(frozen=True)
-class Recipe:
+class ScanRecipe:
     """What prepared scans are a function of, beside the files themselves; nothing in it tells where these lie."""
 
     revision: int  # `preparing.PROJECTION` or the simulator's: a newer r2flow mends damaged shards of an older one
@@ -103,7 +103,7 @@ class ShardEntry:
 class Manifest:
     """Prepared scans: their recipe, the names of the data set's scans by drive, and the shards once all are there."""
 
-    recipe: Recipe
+    recipe: ScanRecipe
     drives: tuple[Drive, ...]
     shards: tuple[ShardEntry, ...] = ()
 
@@ -175,7 +175,7 @@ def read_manifest(folder: Path, finished: bool = False) -> Manifest:
     if finished and not content["shards"]:
         raise InputError(f"{folder} is not finished: the same r2flow prepare command goes on.")
     return Manifest(
-        Recipe(**content["recipe"]),
+        ScanRecipe(**content["recipe"]),
         tuple(Drive(d["name"], tuple(d["prefix"] + rest for rest in d["scans"])) for d in content["drives"]),
         tuple(ShardEntry.of(shard) for shard in content["shards"] or ()),
     )

@@ -23,7 +23,7 @@ from r2flow.data.opening import find_drives
 from r2flow.data.options import SIMULATED
 from r2flow.data.prepared import (
     Manifest,
-    Recipe,
+    ScanRecipe,
     ShardEntry,
     checksum,
     damage_of,
@@ -54,7 +54,7 @@ Advance = Callable[[int], None]  # told a number of scans whenever they are done
 class Plan:
     """The scans to prepare, and how."""
 
-    recipe: Recipe
+    recipe: ScanRecipe
     drives: tuple[Drive, ...]
     source: ScanSource
 
@@ -102,7 +102,7 @@ def _plan(
     names = [name for drive in drives for name in drive.scans]
     if levels is not None:
         ReflectanceCodes(levels)  # refuses what is no number of levels
-    recipe = Recipe(
+    recipe = ScanRecipe(
         revision, layout, len(names), checksum(names), describe_sensor(reading.sensor), reading.projection,
         reading.convention, reading.reflectance_scale or 1.0, levels,
         RangeCodes(reading.sensor.min_range, reading.sensor.max_range).describe(), shard_scans, seed,
@@ -145,7 +145,7 @@ class Coded(NamedTuple):
 class CodedScans(Dataset[tuple[int, Coded | str]]):
     """Scan by scan its number and its codes, or why it cannot be used."""
 
-    def __init__(self, source: ScanSource, recipe: Recipe) -> None:
+    def __init__(self, source: ScanSource, recipe: ScanRecipe) -> None:
         self.source, self.coders = source, recipe.codes
 
     def __getitem__(self, number: int) -> tuple[int, Coded | str]:

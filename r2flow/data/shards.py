@@ -31,7 +31,7 @@ STALE = 3600  # seconds after which a temporary file has no writer any more
 
 
 @dataclass(frozen=True)
-class Recipe:
+class PairRecipe:
     """What a pair is a function of, beside its index: two folders of one recipe hold the same bytes."""
 
     parent: str  # hash of the flow's weights and of what they mean
@@ -89,7 +89,7 @@ class PairStore:
         InputError: the folder holds other pairs, or a damaged manifest.
     """
 
-    def __init__(self, folder: str | Path, recipe: Recipe) -> None:
+    def __init__(self, folder: str | Path, recipe: PairRecipe) -> None:
         self.folder, self.recipe = Path(folder).expanduser(), recipe
         self.staging = self.folder / "batches"
         self._check_manifest()
