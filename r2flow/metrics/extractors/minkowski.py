@@ -121,8 +121,6 @@ class MinkowskiNet(Extractor):
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:
-        from r2flow.metrics.extractors.weights import fill
-
         try:
             stem = tensors["stem.0.kernel"]
             down = [tensors[f"stage{level}.1.net.0.kernel"].shape[2] for level in range(1, 5)]
@@ -132,5 +130,4 @@ class MinkowskiNet(Extractor):
             raise InputError(f"these are no weights of {cls.name}: it has other parameters.") from None
         # Files saved in training may also hold parameters of the loss.
         known = {name for name, _ in extractor.named_children()}
-        fill(extractor, {name: tensor for name, tensor in tensors.items() if name.split(".")[0] in known})
-        return extractor
+        return extractor.filled({name: tensor for name, tensor in tensors.items() if name.split(".")[0] in known})

@@ -144,14 +144,10 @@ class RangeNet(Extractor):
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:
-        from r2flow.metrics.extractors.weights import fill
-
         tensors = {translate(name): tensor for name, tensor in tensors.items()}
         head = tensors.get("head.1.bias")
         mean, std = _normalisation(config, cls.channels) if config else (MEAN, STD)
-        extractor = cls(num_classes=None if head is None else len(head), mean=mean, std=std)
-        fill(extractor, tensors)
-        return extractor
+        return cls(num_classes=None if head is None else len(head), mean=mean, std=std).filled(tensors)
 
 
 class RangeNet53(RangeNet):
