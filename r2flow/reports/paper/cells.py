@@ -42,18 +42,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class CellSettings:
-    """What is the same for all cells.
-
-    Attributes:
-        real: The scans that all are compared with.
-        metrics: By name, `jsd` among them.
-        gathered: Their statistics of the real scans.
-        num: Scans of each flow.
-        bootstrap: Resamples for the intervals of the figures; 0 for none.
-        work: How the work is done.
-        folder: Where finished cells are kept.
-        device: What the networks run on.
-    """
+    """What is the same for all cells: `num` scans of each flow against the real ones, finished cells in the folder."""
 
     real: ScanSet
     metrics: Mapping[str, ScanMetric]
@@ -73,14 +62,12 @@ class CellSettings:
         return self.folder / f"{key}.safetensors"
 
 
-def steps_of(subject: PaperRun, steps: Sequence[int]) -> list[int]:
-    """A distilled flow is measured at its own number of steps only; it was trained for no other."""
-    return list(steps) if subject.steps is None else [subject.steps]
-
-
 def measure_cells(settings: CellSettings, flow: Checkpoint, subject: PaperRun, steps: Sequence[int]) -> Iterator[Cell]:
-    """The cells of one flow, each kept when it is done."""
-    for count in steps_of(subject, steps):
+    """The cells of one flow, each kept when it is done.
+
+    A distilled flow is measured at its own number of steps only; it was trained for no other.
+    """
+    for count in steps if subject.steps is None else [subject.steps]:
         path = settings.path(subject, count)
         cell = _read(path)
         if cell is None:

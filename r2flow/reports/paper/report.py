@@ -10,18 +10,18 @@ import numpy as np
 import torch
 
 from r2flow import simulator
-from r2flow.checkpoints import Checkpoint, load_checkpoint
+from r2flow.checkpoints import load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
 from r2flow.evaluation.sets import ScanSet
 from r2flow.evaluation.statistics import Cache
 from r2flow.generators import Sampler
-from r2flow.inversion import Interpolation, interpolate_scans
+from r2flow.inversion import interpolate_scans
 from r2flow.metrics.base import ScanMetric
 from r2flow.reports.compare import cost
-from r2flow.reports.curvature import Paths, measure_paths
+from r2flow.reports.curvature import measure_paths
 from r2flow.reports.pages import Page
-from r2flow.reports.paper.cells import SEED, Cell, CellSettings, counts_of, measure_cells
+from r2flow.reports.paper.cells import SEED, CellSettings, counts_of, measure_cells
 from r2flow.reports.paper.figures import marginals_apart
 from r2flow.reports.paper.page import PaperResults, paper_page
 from r2flow.reports.paper.subjects import PaperRun
@@ -89,30 +89,38 @@ def report(
     check_reflectance(metrics, [real])
     gathered = gather_real(metrics, real, work, Cache())
     settings = CellSettings(real, metrics, gathered, budget.num, budget.bootstrap, work, out / "cells", device)
-    cells: list[Cell] = []
-    paths: dict[str, Paths] = {}
-    architectures: list[dict[str, Any]] = []
-    costs: dict[str, dict[str, Any]] = {}
-    between: Interpolation | None = None
     metrics["jsd"].load_real_state(gathered.statistics["jsd"].states)
-    birds_eye = counts_of(metrics["jsd"], "real")
     ends = np.stack([real.source[index] for index in (len(real) // 4, 3 * len(real) // 4)])  # far apart in the set
+    measured = PaperResults(subjects, real, counts_of(metrics["jsd"], "real"), ends)
+    costs: dict[str, dict[str, Any]] = {}
     for subject in subjects:
         flow = load_checkpoint(subject.run, device)
-        own = list(measure_cells(settings, flow, subject, budget.steps))
-        cells += own
+        measured.cells += measure_cells(settings, flow, subject, budget.steps)
         if budget.curved and subject.steps is None:
-            paths[subject.label] = _paths(flow, subject, budget, work)
+            most, label = max(budget.steps), subject.label
+            with work.bar(f"following paths of {label}", 2 * most, "evaluations") as advance:
+                measured.paths[label] = measure_paths(
+                    flow, label, budget.curved, most, SEED, budget.curved, progress=advance
+                )
         if subject.role == "1-RF":
             network = json.dumps(subject.config["backbone"], sort_keys=True)
             if network not in costs:
                 costs[network] = cost(subject.config, budget.repeats, device)
-            architectures.append({**_architecture(subject, own[-1], birds_eye, metrics), **costs[network]})
+            cell = measured.cells[-1]
+            measured.architectures.append({
+                "label": subject.label, "family": subject.family, "seed": subject.seed, "steps": cell.row["steps"],
+                "backbone": subject.backbone, "position": subject.position, "kind": subject.kind,
+                **{name: cell.row.get(name) for name in metrics},
+                "marginals": marginals_apart(cell.birds_eye, measured.birds_eye), **costs[network],
+            })  # fmt: skip
         if subject is first and budget.tolerance is not None and len(real) > 1:
-            between = _interpolation(flow, ends, budget.tolerance, work)
+            how = Sampler("dopri5", tolerance=budget.tolerance)
+            with work.bar("interpolating figure 3", FRAMES) as advance:
+                measured.between = interpolate_scans(
+                    flow, torch.from_numpy(ends), FRAMES, how, arrived=lambda _, step=advance: step()
+                )
         del flow
-    measured = PaperResults(subjects, real, cells, birds_eye, paths, architectures, ends, between)
-    return paper_page(measured, list(metrics), chosen.missing, budget.num, command, device, {"sampled scans": SEED})
+    return paper_page(measured, list(metrics), chosen.missing, budget.num, command, device)
 
 
 def held_out(subject: PaperRun) -> ScanSet:
@@ -120,8 +128,7 @@ def held_out(subject: PaperRun) -> ScanSet:
     config = read_config(subject.run) or subject.config  # the folder's own knows where the scans have moved
     flow = load_checkpoint(subject.run)
     data = {**config["data"], "validation": {**(config["data"].get("validation") or {}), "scans": 10**9}}
-    module = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **data)
-    _, held = module.sources()
+    _, held = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **data).sources()
     where = config["data"]["name"]
     # The run's seed is that of its simulated scenes, whose names are the same for every seed.
     identity = {
@@ -137,26 +144,3 @@ def _placeless(data: Mapping[str, Any]) -> dict[str, Any]:
     return {
         key: _placeless(value) if isinstance(value, Mapping) else value for key, value in data.items() if key != "root"
     }
-
-
-def _paths(flow: Checkpoint, subject: PaperRun, budget: Budget, work: Work) -> Paths:
-    with work.bar(f"following paths of {subject.label}", 2 * max(budget.steps), "evaluations") as advance:
-        return measure_paths(
-            flow, subject.label, budget.curved, max(budget.steps), SEED, budget.curved, progress=advance
-        )
-
-
-def _architecture(subject: PaperRun, cell: Cell, real: np.ndarray, metrics: Mapping[str, ScanMetric]) -> dict[str, Any]:
-    """A row of table II, but for what its network costs."""
-    return {
-        "label": subject.label, "family": subject.family, "seed": subject.seed, "steps": cell.row["steps"],
-        "backbone": subject.backbone, "position": subject.position, "kind": subject.kind,
-        **{name: cell.row.get(name) for name in metrics}, "marginals": marginals_apart(cell.birds_eye, real),
-    }  # fmt: skip
-
-
-def _interpolation(flow: Checkpoint, ends: np.ndarray, tolerance: float, work: Work) -> Interpolation:
-    """Figure 3, between two scans, (2, 2 or 1, H, W)."""
-    with work.bar("interpolating figure 3", FRAMES) as advance:
-        sampler = Sampler("dopri5", tolerance=tolerance)
-        return interpolate_scans(flow, torch.from_numpy(ends), FRAMES, sampler, arrived=lambda _: advance())

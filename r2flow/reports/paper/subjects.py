@@ -83,12 +83,10 @@ def find_subjects(folders: Sequence[Path]) -> list[PaperRun]:
 def _read(run: Path, label: str) -> PaperRun:
     """A run by its own config; its family is still its parent's weights, "" without a parent."""
     checkpoint = load_checkpoint(run)
-    config = checkpoint.config
+    config, own = checkpoint.config, checkpoint.generator.sampler
     parent = (config.get("parent") or {}).get("weights", "")
-    stage = config["stage"]["name"]
-    own = checkpoint.generator.sampler
     steps = own.steps if own.fixed else None
-    return PaperRun(run, label, stage, parent, weights_hash(checkpoint), config, steps)
+    return PaperRun(run, label, config["stage"]["name"], parent, weights_hash(checkpoint), config, steps)
 
 
 def _role(one: PaperRun, parent: PaperRun | None) -> str:
