@@ -340,15 +340,16 @@ def compare_figure(groups: Sequence[Group]) -> Figure:
     panels = [column for column in DRAWN if any(group.values(column) for group in groups)]
     below_height = 0.9 + 0.26 * len(groups)
     figure = blank_figure(11, 3.6 + below_height)
-    above, below = figure.add_gridspec(2, 1, height_ratios=(3.6, below_height))
+    grid = figure.add_gridspec(2, 1, height_ratios=(3.6, below_height))
+    above, below = grid[0].subgridspec(1, 2), grid[1].subgridspec(1, max(len(panels), 1))
     styled = [(STYLES[index % len(STYLES)], group) for index, group in enumerate(groups)]
-    for part, name, title in zip(above.subgridspec(1, 2), LOSSES, ("training loss", "validation loss"), strict=True):
-        axes = figure.add_subplot(part)
+    for place, (name, title) in enumerate(zip(LOSSES, ("training loss", "validation loss"), strict=True)):
+        axes = figure.add_subplot(above[place])
         _draw_curves(axes, styled, name)
         axes.set(title=title, xlabel="optimiser step")
     first = None
-    for part, column in zip(below.subgridspec(1, max(len(panels), 1)), panels, strict=False):
-        axes = figure.add_subplot(part, sharey=first)
+    for place, column in enumerate(panels):
+        axes = figure.add_subplot(below[place], sharey=first)
         _draw_points(axes, styled, column)
         axes.set_title({**MEASURED, **FIXED}[column], fontsize=9)
         axes.set_yticks(range(len(groups)), [group.label for group in groups], fontsize=8)

@@ -145,7 +145,7 @@ def find_neighbours(
         Nearest(s, queries, _exact(x, nearest, training, representation, work), nearest.numpy())
         for s, (queries, x), (_, nearest) in zip((generated, real), described, best, strict=True)
     ]
-    return Neighbours(*both, training, representation.words, held is not None)
+    return Neighbours(both[0], both[1], training, representation.words, held is not None)
 
 
 def _describe(scans: ScanSet, representation: Representation, work: Work) -> tuple[np.ndarray, Tensor]:

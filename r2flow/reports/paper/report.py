@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from r2flow import simulator
-from r2flow.checkpoints import load_checkpoint
+from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
 from r2flow.evaluation.sets import ScanSet
 from r2flow.evaluation.statistics import Cache
 from r2flow.generators import Sampler
-from r2flow.inversion import interpolate_scans
+from r2flow.inversion import Interpolation, interpolate_scans
 from r2flow.metrics.base import ScanMetric
 from r2flow.reports.compare import cost
 from r2flow.reports.curvature import measure_paths
@@ -114,13 +114,15 @@ def report(
                 "marginals": marginals_apart(cell.birds_eye, measured.birds_eye), **costs[network],
             })  # fmt: skip
         if subject is first and budget.tolerance is not None and len(real) > 1:
-            how = Sampler("dopri5", tolerance=budget.tolerance)
-            with work.bar("interpolating figure 3", FRAMES) as advance:
-                measured.between = interpolate_scans(
-                    flow, torch.from_numpy(ends), FRAMES, how, arrived=lambda _, step=advance: step()
-                )
+            measured.between = _interpolate(flow, ends, Sampler("dopri5", tolerance=budget.tolerance), work)
         del flow
     return paper_page(measured, list(metrics), chosen.missing, budget.num, command, device)
+
+
+def _interpolate(flow: Checkpoint, ends: np.ndarray, sampler: Sampler, work: Work) -> Interpolation:
+    """Figure 3, between two scans, (2, 2 or 1, H, W)."""
+    with work.bar("interpolating figure 3", FRAMES) as advance:
+        return interpolate_scans(flow, torch.from_numpy(ends), FRAMES, sampler, arrived=lambda _: advance())
 
 
 def held_out(subject: PaperRun) -> ScanSet:
