@@ -8,6 +8,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
+from r2flow.metrics import extractors
 from r2flow.metrics.base import Protocol, ScanMetric
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.scans import Scans
@@ -33,7 +34,7 @@ class FeatureMetric(ScanMetric):
     def __init__(
         self, extractor: Extractor | str, keep: bool = False, folder: str | Path | None = None, suffix: str = ""
     ) -> None:
-        network = loaded(extractor)
+        network = extractor.eval() if isinstance(extractor, Extractor) else extractors.load_extractor(extractor)
         random = "_random" if network.weights == "random" else ""
         name = "" if random or suffix else self.names.get(network.name, "")
         super().__init__(keep, folder, name=name or f"{self.kind}_{network.name}{random}{suffix}")
@@ -48,19 +49,6 @@ class FeatureMetric(ScanMetric):
 
     def rows(self, scans: Scans) -> Tensor:
         return extract(self.extractor, scans)
-
-
-def loaded(extractor: Extractor | str) -> Extractor:
-    """The network itself, or the one of a name with its weights.
-
-    Raises:
-        InputError: no such name, or weights that are not on this machine.
-    """
-    if isinstance(extractor, Extractor):
-        return extractor.eval()
-    from r2flow.metrics.extractors import load_extractor
-
-    return load_extractor(extractor)
 
 
 _COMPUTED: "WeakKeyDictionary[Scans, dict[Any, Tensor]]" = WeakKeyDictionary()

@@ -32,13 +32,10 @@ class Manifold(FeatureMetric):
     The figures are named `precision_<network>` and so on, with `_k<k>` for another k than 5.
 
     Args:
-        extractor: The network, or its name in `EXTRACTORS`.
         neighbours: k.
-        keep: Features are always kept.
-        folder: Where they are kept.
 
     Raises:
-        InputError: k below 1; no network of that name, or no weights for it on this machine.
+        InputError: k below 1; as `FeatureMetric`.
     """
 
     kind = "manifold"
