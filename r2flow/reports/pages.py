@@ -26,9 +26,12 @@ from r2flow.reports.tables import Row
 
 # Told apart without colour: every line of a figure has a marker and a dash of its own.
 _DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (7, 2)), (0, (1, 1)), "-", "--", "-.", ":", "-")
-_COLOURS = "000000 1f6fb4 b5301c 3d7d3a 8c4fb0 c77c11 c2185b 0e6f6f 8f8f8f d06a9e 7a5a2a b9b936".split()
+_COLOURS = (
+    "#000000", "#1f6fb4", "#b5301c", "#3d7d3a", "#8c4fb0", "#c77c11",
+    "#c2185b", "#0e6f6f", "#8f8f8f", "#d06a9e", "#7a5a2a", "#b9b936",
+)  # fmt: skip
 STYLES: tuple[dict[str, Any], ...] = tuple(
-    {"marker": marker, "linestyle": dash, "color": f"#{colour}"}
+    {"marker": marker, "linestyle": dash, "color": colour}
     for marker, dash, colour in zip("os^DvPX*<>hp", _DASHES, _COLOURS, strict=True)
 )
 

@@ -48,20 +48,11 @@ def inputs(scans: Scans, reflectance: bool) -> Tensor:
     rise, run = (F.pad(q[:, :, :-1] - q[:, :, 1:], (0, 0, 0, 1)) for q in (height, away))
     both = F.pad(returned[:, :, :-1] & returned[:, :, 1:], (0, 0, 0, 1))
     length = torch.where(both, torch.hypot(rise, run).clamp(min=1e-6), torch.inf)
-    return torch.cat(
-        [
-            torch.log2(r + 1) / 6,
-            returned.to(r),
-            scans.reflectance if reflectance else torch.zeros_like(r),
-            known,
-            height / 4,
-            (e * 4).expand_as(r),
-            torch.asinh(bend * 20) / 4,
-            rise / length,
-            run / length,
-        ],
-        dim=1,
-    )
+    shown = scans.reflectance if reflectance else torch.zeros_like(r)
+    distance, bent = torch.log2(r + 1) / 6, torch.asinh(bend * 20) / 4
+    elevation = (e * 4).expand_as(r)
+    channels = [distance, returned.to(r), shown, known, height / 4, elevation, bent, rise / length, run / length]
+    return torch.cat(channels, dim=1)
 
 
 class Convolution(nn.Module):
