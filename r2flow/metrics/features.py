@@ -21,7 +21,6 @@ class FeatureMetric(ScanMetric):
         extractor: The network, or its name in `EXTRACTORS`: then it is loaded with its weights.
         keep: Keep the features, for bootstrap intervals.
         folder: Where they are kept.
-        suffix: What the name has behind the network's.
 
     Raises:
         InputError: no network of that name, or no weights for it on this machine.
@@ -31,13 +30,11 @@ class FeatureMetric(ScanMetric):
     kind: ClassVar[str]
     names: ClassVar[Mapping[str, str]] = {}
 
-    def __init__(
-        self, extractor: Extractor | str, keep: bool = False, folder: str | Path | None = None, suffix: str = ""
-    ) -> None:
+    def __init__(self, extractor: Extractor | str, keep: bool = False, folder: str | Path | None = None) -> None:
         network = extractor.eval() if isinstance(extractor, Extractor) else extractors.load_extractor(extractor)
         random = "_random" if network.weights == "random" else ""
-        name = "" if random or suffix else self.names.get(network.name, "")
-        super().__init__(keep, folder, name=name or f"{self.kind}_{network.name}{random}{suffix}")
+        name = "" if random else self.names.get(network.name, "")
+        super().__init__(keep, folder, name=name or f"{self.kind}_{network.name}{random}")
         self.extractor = network
         self.needs_reflectance = network.needs_reflectance
 

@@ -51,23 +51,11 @@ class Budget:
     tolerance: float | None
 
 
-@dataclass(frozen=True)
-class PaperMetrics:
-    """Which distances are measured.
-
-    Attributes:
-        built: By name; `jsd` is among them.
-        missing: The paper's metrics that are not, and why.
-    """
-
-    built: Mapping[str, ScanMetric]
-    missing: Mapping[str, str]
-
-
 def report(
     subjects: Sequence[PaperRun],
     out: Path,
-    chosen: PaperMetrics,
+    metrics: Mapping[str, ScanMetric],
+    missing: Mapping[str, str],
     budget: Budget,
     work: Work,
     real: ScanSet | None = None,
@@ -78,12 +66,13 @@ def report(
 
     Args:
         subjects: From `find_subjects`.
+        metrics: The distances by name, `jsd` among them.
+        missing: The paper's metrics that are not measured, and why.
         real: The scans to compare with; those that the first 1-RF held out if left out.
 
     Raises:
         InputError: scans that cannot be read, or without the reflectance that a metric needs.
     """
-    metrics = chosen.built
     first = next(one for one in subjects if one.role == "1-RF")
     real = real or held_out(first)
     check_reflectance(metrics, [real])
@@ -116,7 +105,7 @@ def report(
         if subject is first and budget.tolerance is not None and len(real) > 1:
             measured.between = _interpolate(flow, ends, Sampler("dopri5", tolerance=budget.tolerance), work)
         del flow
-    return paper_page(measured, list(metrics), chosen.missing, budget.num, command, device)
+    return paper_page(measured, list(metrics), missing, budget.num, command, device)
 
 
 def _interpolate(flow: Checkpoint, ends: np.ndarray, sampler: Sampler, work: Work) -> Interpolation:
