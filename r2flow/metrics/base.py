@@ -186,9 +186,7 @@ class ScanMetric(Metric):
         return state
 
     def load_real_state(self, state: Mapping[str, Tensor]) -> None:
-        """Take the real set's statistics from `real_state`, after `reset`.
-
-        With several processes the first one holds them until figures are computed.
+        """Take the real set's statistics from `real_state`, after `reset`; of several processes the first holds them.
 
         Raises:
             InputError: a state of another metric, or without the rows that this one keeps.
@@ -216,15 +214,8 @@ class ScanMetric(Metric):
         self._remarks = []
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        """Figures of resampled sets, computed from the kept rows, (R) for each name.
-
-        Args:
-            weights: How often each kept scan of a side was drawn, (R, N), float64.
-
-        Raises:
-            InputError: a metric without intervals.
-        """
-        raise InputError(f"{self.name} has no bootstrap interval; leave it out.")
+        """Figures of resampled sets, (R) for each name; `weights` says how often each kept scan was drawn, (R, N)."""
+        raise NotImplementedError
 
     def _left_out(self) -> list[str]:
         remarks = []
@@ -235,7 +226,6 @@ class ScanMetric(Metric):
             elif compared == 0:
                 remarks.append(f"none of the {scans} {side} scans has anything to compare; are all of them empty?")
             elif compared < scans:
-                remarks.append(
-                    f"{scans - compared} of {scans} {side} scans are left out: empty, or nothing to compare."
-                )
+                left = f"{scans - compared} of {scans} {side} scans"
+                remarks.append(f"{left} are left out: empty, or nothing to compare.")
         return remarks

@@ -19,8 +19,7 @@ class FeatureMetric(ScanMetric):
 
     Args:
         extractor: The network, or its name in `EXTRACTORS`: then it is loaded with its weights.
-        keep: Keep the features, for bootstrap intervals.
-        folder: Where they are kept.
+        keep, folder: As `ScanMetric`.
 
     Raises:
         InputError: no network of that name, or no weights for it on this machine.

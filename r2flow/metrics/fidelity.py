@@ -36,9 +36,8 @@ class Member:
     Attributes:
         statistic: Of range images, (N, 2 or 1, H, W), and their sensor.
         distance: Between the statistics of two sets; 0 is equal.
-        label: What its bins are, in words.
+        label, log: What its bins are, and whether they are drawn on a logarithmic axis.
         edges: Of its bins, or how a sensor gives them; None where they are rows, or of two dimensions.
-        log: Whether the bins are drawn on a logarithmic axis.
         needs_reflectance: Whether it is left out for scans of range alone.
     """
 

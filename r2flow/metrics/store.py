@@ -21,10 +21,8 @@ class FeatureStore:
     Several processes may write, each its own rows, into one folder of a shared file system; what is read does not
     depend on which process wrote a row, nor when. Rows that are not finite are left out.
 
-    Args:
-        name: Of the file.
-        folder: Where the file lies and stays; copies of the store share it. Without one it lies in a temporary folder
-            that goes with the store, and a copy of the store copies it.
+    In a folder the files stay, and copies of the store share them. Without one they lie in a temporary folder that goes
+    with the store, and a copy of the store copies them.
     """
 
     def __init__(self, name: str, folder: str | Path | None = None) -> None:

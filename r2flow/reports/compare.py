@@ -57,8 +57,6 @@ class Run:
     """A run, read from its folder.
 
     Attributes:
-        label: Its name in tables and figures.
-        config: The config that it was started with.
         values: By the columns of `FIXED` and `MEASURED`; None where the folder does not hold one.
         curves: (steps, values) by logged name.
         fidelity: Distance to the real scans by member of the panel, if `r2flow report fidelity` wrote it there.

@@ -27,13 +27,7 @@ COPY = 0.1  # of the usual distance
 
 @dataclass(frozen=True)
 class Representation:
-    """What of two scans is compared, by Euclidean distance.
-
-    Attributes:
-        words: For a reader.
-        describe: Gives it, (B, D); a row of NaN for a scan without a return.
-        device: Where `describe` takes scans.
-    """
+    """What of two scans is compared by Euclidean distance, (B, D); a row of NaN for a scan without a return."""
 
     words: str
     describe: Callable[[Scans], Tensor]
@@ -51,10 +45,8 @@ class Nearest:
     """The nearest training scan of each scan of a set; scans without a return have none and are not among them.
 
     Attributes:
-        scans: The set.
-        numbers: Its scans that have a return, (N,).
-        distances: From each to the nearest training scan, (N,) float64.
-        neighbours: Number of the nearest training scan, (N,).
+        numbers: The scans that have a return, (N,).
+        distances, neighbours: From each to the nearest training scan, (N,) float64, and its number, (N,).
     """
 
     scans: ScanSet
@@ -71,12 +63,7 @@ class Nearest:
 class Neighbours:
     """Generated scans and real ones, each with its nearest training scan.
 
-    Attributes:
-        generated: The scans that are judged.
-        real: Held-out scans; without these, training scans, each compared with the others.
-        training: The scans that all of them are compared with.
-        words: What is compared.
-        held_out: Whether `real` was held out.
+    The real ones were held out, or they are training scans, each compared with the others.
     """
 
     generated: Nearest

@@ -60,7 +60,7 @@ class Extractor(nn.Module):
 
     @classmethod
     def random(cls, seed: int = 0) -> Self:
-        """The network with random weights of a seed."""
+        """The network with random weights of a seed, for tests and dry runs: its `weights` are "random"."""
         with torch.random.fork_rng(devices=[]):
             seed_torch(seed, "weights")
             return cls().requires_grad_(False).eval()

@@ -36,13 +36,7 @@ E = TypeVar("E", bound=Extractor)
 
 @dataclass(frozen=True)
 class Source:
-    """A published file of weights.
-
-    Attributes:
-        metric: The distance between its features.
-        page: Where its authors offer it.
-        git_blob: Its id in the git repository that it lies in; None where no hash of it is known.
-    """
+    """A published file of weights: the distance between its features, where its authors offer it, and its id in git."""
 
     metric: str
     page: str

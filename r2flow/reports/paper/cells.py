@@ -28,11 +28,8 @@ SEED = 0  # of their noise, the same for every flow
 class Cell:
     """One flow at one number of Euler steps.
 
-    Attributes:
-        row: label, role, family, kind, seed, steps, seconds a scan, and each metric's first figure under the metric's
-            name with its interval's `_low` and `_high`.
-        birds_eye: Points from above, of all scans together, (100, 100).
-        images: The first scans, (SHOWN, 2 or 1, H, W).
+    The row has label, role, family, kind, seed, steps, seconds a scan, and each metric's first figure under its name
+    with its interval's `_low` and `_high`. Beside it: points of all scans from above, (100, 100), and the first scans.
     """
 
     row: dict[str, Any]

@@ -34,14 +34,11 @@ class PaperResults:
     """What was measured.
 
     Attributes:
-        subjects: The runs.
-        real: The scans compared with.
         birds_eye: Points of the real scans from above, (100, 100).
-        ends: Two real scans, (2, 2 or 1, H, W).
+        ends: Two real scans, (2, 2 or 1, H, W), and between them figure 3's frames.
         cells: Every flow at every number of steps.
         paths: Of the flows that are not distilled, by label.
         architectures: A row for each 1-RF.
-        between: Figure 3's frames, None where it was left out.
     """
 
     subjects: Sequence[PaperRun]
