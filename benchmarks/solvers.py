@@ -19,6 +19,7 @@ from torch import Tensor
 from r2flow.backbones import build_backbone
 from r2flow.flow.problems import Gaussian, Mixed, Problem, RayDrop, Straight, TwoModes
 from r2flow.flow.solvers import Velocity, solve
+from r2flow.generators import Field
 from r2flow.lidar.sensors import build_sensor
 from r2flow.noise import standard_normal
 from r2flow.reports.savings import one_state
@@ -46,7 +47,7 @@ def mixed_batch(seeds: int, elements: int) -> None:
                 x_0 = noise(16, elements, seed)
                 exact = batch.solution(x_0, 1.0)
                 solution = solve(batch, x_0, method=method, tolerance=tolerance)
-                end, evaluations = one_state(batch, x_0, tolerance)
+                end, evaluations = one_state(Field(batch, (elements,)), x_0, tolerance)
                 shares.append(int(solution.evaluations.sum()) / int(evaluations.sum()))
                 ours.append(errors(solution.x, exact).max().item())
                 theirs.append(errors(end, exact).max().item())
@@ -70,7 +71,7 @@ def hard_among_easy(elements: int) -> None:
             x_0 = noise(size, elements, 0)
             exact = batch.solution(x_0, 1.0)
             ours = errors(solve(batch, x_0, method="dopri5", tolerance=1e-3).x, exact)[0]
-            theirs = errors(one_state(batch, x_0, 1e-3)[0], exact)[0]
+            theirs = errors(one_state(Field(batch, (elements,)), x_0, 1e-3)[0], exact)[0]
             found.append(f"{ours:.1e} / {theirs:.1e}")
         print(f"  {name:10s}" + "   ".join(found))
 

@@ -1,4 +1,4 @@
-"""Progress that says how fast and how long."""
+"""Progress of a training, with its rate and the time left."""
 
 import sys
 import time
@@ -7,11 +7,11 @@ from typing import Any
 import lightning as L
 from lightning.pytorch.callbacks import RichProgressBar
 
-from r2flow.reports.clock import duration
+from r2flow.progress import duration
 
 
 class Progress(RichProgressBar):
-    """Lightning's rich bar with scans per second; where no one watches, a line every `seconds` instead."""
+    """Lightning's rich bar with scans a second; a line every `seconds` where standard output is no terminal."""
 
     def __init__(self, seconds: float = 15.0) -> None:
         super().__init__(leave=True)

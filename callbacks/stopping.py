@@ -97,6 +97,9 @@ class Stopping(L.Callback):
             if trainer.global_step % self.every:
                 return
             told = trainer.strategy.reduce_boolean_decision(told, all=False)
+            for number in self.signals if told else ():  # all leave for the same reason
+                if trainer.strategy.reduce_boolean_decision(self.told == number, all=False):
+                    self.told = number
         if told and trainer.global_step < trainer.max_steps:
             if trainer.checkpoint_callbacks:
                 trainer.save_checkpoint(
@@ -122,16 +125,15 @@ class Stopping(L.Callback):
                 old.unlink(missing_ok=True)
 
     def _leave(self, where: str) -> None:
-        number = self.told or signal.SIGTERM  # where another device has heard it
-        code = code_of(number)
-        if self.job is not None and number == signal.SIGUSR1:
+        assert self.told is not None
+        code, first = code_of(self.told), getattr(rank_zero_only, "rank", 0) == 0
+        if self.told == signal.SIGUSR1:
             code = LATER
-            if getattr(rank_zero_only, "rank", 0) == 0:
+            if first:
                 self._requeue(where)
-        kept = (
-            "goes on from the last checkpoint" if checkpoints_of(self.run_dir) else "starts it again: no checkpoint yet"
-        )
-        raise Stopped(code, f"{where}; the same command {kept}") from None
+        begun = bool(checkpoints_of(self.run_dir))
+        kept = "goes on from the last checkpoint" if begun else "starts it again: no checkpoint yet"
+        raise Stopped(code, f"{where}; the same command {kept}" if first else "") from None
 
     def _requeue(self, where: str) -> None:
         assert self.job is not None

@@ -12,6 +12,7 @@ from types import FrameType
 from typing import Any
 
 from r2flow.checkpoints import checkpoints_of, step_of
+from r2flow.composing import override
 from r2flow.config import flatten, key_of, rule
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
@@ -70,18 +71,6 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
         run_dir = Path(folder, name)
         links.append(Link(name, run_dir, (*overrides, override("run_dir", str(run_dir))), parent))
     return links
-
-
-def override(key: str, value: Any) -> str:
-    """One key in Hydra's grammar."""
-    if isinstance(value, list | tuple):
-        return f"{key}=[{','.join(override('', one)[1:] for one in value)}]"
-    if value is None or isinstance(value, bool):
-        return f"{key}={json.dumps(value)}"
-    if isinstance(value, str) and not value.replace("_", "").replace("-", "").isalnum():
-        escaped = value.replace("\\", "\\\\").replace("'", "\\'")
-        return f"{key}='{escaped}'"
-    return f"{key}={value}"
 
 
 def run_chain(links: Sequence[Link], command: Sequence[str]) -> tuple[int, bool]:

@@ -1,6 +1,8 @@
 """From a command line to a config: `conf/` composed by Hydra, choices for what plug-ins add, mistakes in one line."""
 
+import json
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
@@ -91,17 +93,21 @@ def add_choices(group: str) -> None:
 
 
 def add_choice(error: MissingConfigException) -> bool:
-    """Whether a choice that Hydra did not find is one of a registry, as an installed plug-in may have entered it.
+    """Whether a choice that Hydra did not find is one of a registry, as a plug-in may have entered it.
 
-    A name that looks like a misspelt file's is not looked for there: that would take the time to load torch.
+    A name that looks like a misspelt file's is not looked for there where that would take the time to load torch.
+    All groups get their choices: the same command may name several.
     """
     group, _, name = str(error.missing_cfg_file or "").rpartition("/")
-    if group not in REGISTRIES or did_you_mean(name, choices(group)):
+    if group not in REGISTRIES:
         return False
     module, table, _ = REGISTRIES[group]
+    if module not in sys.modules and did_you_mean(name, choices(group)):
+        return False
     if name not in getattr(import_module(module), table):
         return False
-    add_choices(group)
+    for one in REGISTRIES:
+        add_choices(one)
     return True
 
 
@@ -128,6 +134,18 @@ def explain(error: Exception) -> str:
         known = choices(group)
         return f"no {group} config named '{name}'; known: {', '.join(known)}.{did_you_mean(name, known)}"
     return " ".join(lines[:2])
+
+
+def override(key: str, value: Any) -> str:
+    """One key in Hydra's grammar."""
+    if isinstance(value, list | tuple):
+        return f"{key}=[{','.join(override('', one)[1:] for one in value)}]"
+    if value is None or isinstance(value, bool):
+        return f"{key}={json.dumps(value)}"
+    if isinstance(value, str) and not value.replace("_", "").replace("-", "").isalnum():
+        escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+        return f"{key}='{escaped}'"
+    return f"{key}={value}"
 
 
 def known_keys() -> list[str]:

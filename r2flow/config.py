@@ -45,6 +45,7 @@ RULES: dict[str, Key] = {
     "parent.path": FREE,
     "sensor": OF_THE_MODEL,
     "encoding": OF_THE_MODEL,
+    "generator": Key(inherited="unless_given", links="scans"),  # see `lineage.generator_of`
     "backbone": OF_THE_MODEL,
     "backbone.attention": replace(OF_THE_MODEL, inherited="unless_given"),  # the weights fit all the same
     "backbone.dropout": replace(OF_THE_MODEL, inherited="unless_given"),

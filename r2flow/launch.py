@@ -22,7 +22,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from r2flow.composing import CONF, REGISTRIES, add_choice, add_choices, compose, explain, plain
+from r2flow.composing import CONF, REGISTRIES, add_choice, add_choices, compose, explain, override, plain
 from r2flow.errors import InputError, explain_mistake
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.signals import LATER, Stopped, listening, stop_at_once
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except Stopped as stop:
-        if os.environ.get("LOCAL_RANK", "0") == "0":
+        if str(stop):  # of several devices one speaks
             print(stop, flush=True)
         return stop.code
     except KeyboardInterrupt:  # Ctrl-C where nobody listens: in a library's thread
@@ -81,8 +81,6 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
 
 def _plugins_of(arguments: list[str]) -> tuple[list[str], list[str]]:
     """The command line with its plug-ins as one `plugins=[...]`, and these, however they were given."""
-    from r2flow.chain import override
-
     others, names = take_plugins(arguments)
     given = [one for one in others if one.lstrip("+").startswith("plugins=")]
     for one in given:
@@ -156,7 +154,7 @@ def _restart(command: Sequence[str]) -> list[str]:
 
 def _sweep_job(command: Sequence[str], given: Sequence[str], failed: list[str]) -> None:
     """One job of a sweep, as its own process: its failure or its DDP relaunch touches no other job."""
-    from r2flow.chain import override, run_process
+    from r2flow.chain import run_process
 
     run_dir = HydraConfig.get().runtime.output_dir
     log.info("job %s: %s", HydraConfig.get().job.num, " ".join(given))

@@ -66,6 +66,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     if parent is None:
         if STAGES[config["stage"]["name"]].needs_pairs:
             raise InputError(f"stage={config['stage']['name']} starts from a trained flow: give stage.init=RUN.")
+        config["generator"] = generator_of(config, parent)
         return config
     keys = [key_of(one) for one in asked]
     for key in keys:
@@ -78,6 +79,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         given = [key for key in keys if rule(key).inherited == "unless_given" and key.startswith(f"{group}.")]
         own = {key.partition(".")[2]: dict(flatten({group: config[group]}))[key] for key in given}
         config[group] = {**there, **own}
+    config["generator"] = generator_of(config, parent)
     stage = (parent.config.get("stage") or {}).get("name", "rectify")
     config["parent"] = {"path": str(parent.path), "weights": parent.weights, "step": parent.step, "stage": stage}
     data = config["data"]
@@ -85,6 +87,15 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         data["root"] = data["root"] or str(default_folder(parent.path))
         data["pairs"] = pairs_of(parent, data["pairs"] or {}, parent.weights)
     return config
+
+
+def generator_of(config: Mapping[str, Any], parent: Parent | None) -> dict[str, Any]:
+    """What a run trains: the config's `generator`, else its stage's, else its parent's with the options of that."""
+    if config.get("generator"):
+        return dict(config["generator"])
+    theirs = (parent and parent.config.get("generator")) or {"name": "rectified_flow"}
+    own = STAGES[config["stage"]["name"]].generator_name
+    return dict(theirs) if own in (None, theirs["name"]) else {"name": own}
 
 
 def pairs_of(parent: Checkpoint | Parent, options: Mapping[str, Any], weights: str | None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Where a flow's fixed steps should fall: found once, kept in a file, taken by `r2flow sample --grid`."""
+"""Times for a flow's fixed steps: found once, kept in a file, used by `r2flow sample --grid`."""
 
 import json
 import logging
@@ -23,19 +23,19 @@ def calibrate(
 ) -> Tensor:
     """Times that suit a flow better than equal steps (`r2flow.flow.solvers.calibrated_grid`), (steps + 1,) float64.
 
-    The scenes it is found on are none that `r2flow.sampling.sample` draws.
+    It is found on other scans than those of `r2flow.sampling.sample`.
 
     Args:
-        method: One of ours of fixed steps; its order says how steps weigh.
-        num: Scenes.
+        method: One of ours of fixed steps; its order decides the weight of a step.
+        num: Scans.
         progress: Called after every evaluation (`evaluations_of_calibration`).
 
     Raises:
-        InputError: another method, or fewer than one step or scene.
+        InputError: another method, or fewer than one step or scan.
     """
     solver = check_grid_solver(method)
     if num < 1:
-        raise InputError(f"a time grid is found on at least one scene, found {num}.")
+        raise InputError(f"a time grid is found on at least one scan, found {num}.")
     flow = as_flow(checkpoint.generator, "a time grid")
     x_0 = Draws(0, range(num), "validation").start(flow.noise_shape).to(flow.device)
 
@@ -68,7 +68,7 @@ def evaluations_of_calibration(steps: int) -> int:
 
 
 def write_grid(path: str | Path, times: Tensor, checkpoint: Checkpoint, method: str) -> None:
-    """Times as JSON, with what they were found on and for."""
+    """Times as JSON, with the flow and the solver that they are for."""
     content = {"steps": len(times) - 1, "times": times.tolist()}
     content |= {"method": method, "checkpoint": weights_hash(checkpoint)}
     with atomic_write(Path(path), "w") as file:

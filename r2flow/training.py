@@ -34,7 +34,7 @@ from r2flow.plugins import made_with
 from r2flow.registry import check_options
 from r2flow.reports.training import check_samples, finish, read_curves
 from r2flow.runs import check_run, open_run, run_lock
-from r2flow.stages import STAGES, build_stage, check_roll
+from r2flow.stages import build_stage, check_roll
 from r2flow.stages.base import Stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 
@@ -155,7 +155,6 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
         raise InputError(f"seed must be a whole number of at least 0, found {seed!r}.")
     with made_with(parent.config if parent else {}, "the run that it starts from"):
         config = inherit(config, asked, parent)
-    config["generator"] = config["generator"] or {"name": STAGES[config["stage"]["name"]].generator_name}
     check_options("data", DataOptions, config["data"])
     return config
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from r2flow import cli
+from r2flow.checkpoints import load_checkpoint
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS
 from tests.data.conftest import write_scan
@@ -106,6 +107,18 @@ def test_info_says_what_is_in_a_checkpoint(r2flow, saved):  # noqa: F811
     import json
 
     assert json.loads(said)["step"] == 7
+
+
+def test_convert_writes_the_averaged_weights_in_both_formats(r2flow, saved, tmp_path):  # noqa: F811
+    path, averaged = saved
+    ours, published, again = tmp_path / "a.safetensors", tmp_path / "b.pth", tmp_path / "c.safetensors"
+    for source, out in ((path.parent.parent, ours), (ours, published), (published, again)):
+        assert r2flow("convert", source, out) == (0, f"{out}\n", "")
+        for name, value in load_checkpoint(out).generator.state_dict().items():
+            assert torch.equal(value, averaged[f"generator.{name}"])
+    code, _, err = r2flow("convert", path, tmp_path / "d.onnx")
+    assert code == 2
+    assert "give .safetensors for our format or .pth for the published one" in err
 
 
 def verbs() -> list[str]:

@@ -35,7 +35,7 @@ def refuse(constant: str) -> None:
     raise AssertionError(constant)
 
 
-def test_the_json_says_all_of_a_figure(r2flow, real, generated, tmp_path):  # noqa: F811
+def test_the_json_holds_everything_about_a_figure(r2flow, real, generated, tmp_path):  # noqa: F811
     code, said, _ = r2flow("evaluate", real, generated, *QUICK, "--floor", "--json", tmp_path / "e.json")
     assert code == 0
     content = json.loads((tmp_path / "e.json").read_text(), parse_constant=refuse)
@@ -239,7 +239,7 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
         (("{real}", "{bare}", "--metrics", "frechet_embedded", *QUICK[2:]), "has no reflectance"),
     ],
 )
-def test_what_cannot_be_is_one_line(r2flow, real, generated, tmp_path, arguments, message):  # noqa: F811
+def test_a_mistake_is_one_line(r2flow, real, generated, tmp_path, arguments, message):  # noqa: F811
     places = {"real": real, "generated": generated, "bare": tmp_path / "bare"}
     folder(places["bare"], images(3, 4)[:, :1])
     code, _, said = r2flow("evaluate", *(str(one).format(**places) for one in arguments))

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -127,8 +128,9 @@ def test_the_defaults_are_those_of_the_config():
     from r2flow.cli.pairs import pairs
 
     written = yaml.safe_load((Path(__file__).parents[1] / "conf/data/base.yaml").read_text())["pairs"]
-    defaults = {name: one.default for name, one in inspect.signature(pairs).parameters.items()}
-    defaults["method"] = defaults.pop("solver")
+    asked = {name: one.default for name, one in inspect.signature(pairs).parameters.items() if one.default is not None}
+    assert "solver" not in asked
+    defaults = asdict(PairOptions()) | asked
     assert {key: float(value) if key == "tolerance" else value for key, value in written.items()} == {
         key: defaults[key] for key in written
     }

@@ -97,7 +97,7 @@ def test_the_figures_are_the_formulas(real, generated):
     assert found["mmd"] == pytest.approx(mean_kernel(p, p) + mean_kernel(q, q) - 2 * mean_kernel(p, q), rel=1e-6)
 
 
-def test_neither_order_nor_batches_nor_reading_processes_are_seen(real, generated, tmp_path):
+def test_figures_do_not_depend_on_order_batches_or_reading_processes(real, generated, tmp_path):
     there = open_scans(str(real), READING)
     expected = figures(there, open_scans(str(generated), READING))
     backwards = folder(tmp_path / "backwards", images(10, 2)[::-1])

@@ -230,7 +230,7 @@ def test_a_scan_that_is_not_solved_is_flagged_and_said(tmp_path, caplog):
     (others,) = sample(flow(), 3, steps=4, batch_size=3)
     assert torch.equal(drawn.images[::2], others.images[::2])
     write_samples(flow(Lost()), tmp_path, 3, 0, Sampler("euler", 4), pictures=0, batch_size=3)
-    assert "not solved, and no scans of this flow: 1" in caplog.text
+    assert "not solved, so no scans of this flow: 1" in caplog.text
 
 
 def test_the_region_that_is_all_changes_nothing():

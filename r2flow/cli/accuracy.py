@@ -32,6 +32,7 @@ def curvature(
 ) -> None:
     """How straight trained flows are: s(t), and the paths of the most curved pixels (the paper's figure 8)."""
     from r2flow.checkpoints import load_checkpoint
+    from r2flow.generators import as_flow
     from r2flow.progress import Bar
     from r2flow.reports.curvature import curvature_page, measure_paths
     from r2flow.reports.pages import prepare_folder
@@ -39,13 +40,16 @@ def curvature(
 
     where = choose_device(draw.device)
     loaded = {str(path): load_checkpoint(path, where) for path in dict.fromkeys(checkpoints)}
+    for checkpoint in loaded.values():
+        as_flow(checkpoint.generator, "curvature")
     prepare_folder(out)
     with Bar("measuring", len(loaded) * batches(draw.num, draw.batch_size) * 2 * steps, "evaluations") as advance:
         flows = [
             measure_paths(checkpoint, label, draw.num, steps, draw.seed, draw.batch_size, most_curved, advance)
             for label, checkpoint in loaded.items()
         ]
-    finish(curvature_page(flows, draw.seed, command(), where), out)
+    page = curvature_page(flows, draw.seed, command(), where)
+    finish(page, out, page.text)
 
 
 @dataclass(frozen=True)
@@ -97,11 +101,12 @@ def work_precision(
     if loaded is None and not subjects:
         raise InputError("nothing to measure: give a checkpoint, or leave --problems none out.")
     check_tolerance(tight.reference_tolerance)
+    flow = None if loaded is None else as_flow(loaded.generator, "a work-precision report")
     prepare_folder(out)
     found = name = None
     with only_errors():
-        if loaded is not None:
-            flow, x_0 = as_flow(loaded.generator, "this report"), measuring.starts(loaded, draw.num, draw.seed)
+        if loaded is not None and flow is not None:
+            x_0 = measuring.starts(loaded, draw.num, draw.seed)
             with Bar("measuring", draw.num * 4 * tight.reference_steps, "reference evaluations") as advance:
                 found = measuring.reference(flow, x_0, tight.reference_steps, tight.reference_tolerance, advance)
             name = str(checkpoint)
@@ -160,12 +165,15 @@ def savings(
     """What a scan need not cost: own steps, leaving early, one step for the straight, regions, single channels."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.flow.solvers import check_tolerance
+    from r2flow.generators import as_flow
     from r2flow.progress import Bar
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.savings import evaluations_of_page, savings_page
 
     check_tolerance(tolerance)
     loaded = None if checkpoint is None else load_checkpoint(checkpoint, choose_device(device))
+    if loaded is not None:
+        as_flow(loaded.generator, "a savings report")
     prepare_folder(out)
     with Bar("measuring", evaluations_of_page(num, steps) if loaded else 0, "evaluations") as advance:
         page = savings_page(loaded, num, steps, tolerance, seed, command(), advance)

@@ -1,7 +1,5 @@
 """`r2flow compare`: runs side by side."""
 
-import shlex
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +7,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.options import choose_device
+from r2flow.cli.output import command
 
 
 @app.command(epilog="Example: r2flow compare runs/sweep --group --out reports")
@@ -34,6 +33,6 @@ def compare(
     groups = group_runs(found) if group else [Group(run.label, (run,)) for run in found]
     print_comparison(groups)
     if out is not None:
-        page = compare_page(groups, shlex.join(["r2flow", *sys.argv[1:]]), where)
+        page = compare_page(groups, command(), where)
         for path in write_page(page, out):
             print(path)

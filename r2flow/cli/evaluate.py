@@ -228,7 +228,8 @@ def _measure_curve(job: Job, flows: "dict[str, Checkpoint]", num: int, out: Path
 
     rows = measure_curve(curve, flows, steps, job.work, done, keep)
     if job.work.rank == 0:
-        finish(speed_quality_page(curve, rows, command(), done), out)
+        page = speed_quality_page(curve, rows, command(), done)
+        finish(page, out, page.text)
 
 
 @dataclass(frozen=True)

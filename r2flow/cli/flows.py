@@ -1,11 +1,13 @@
-"""Verbs for trained flows and their backbones."""
+"""Verbs for trained generators and their backbones."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from r2flow.cli.app import app
+from r2flow.cli.groups import DrawOptions, SolverOptions, grouped
 from r2flow.cli.options import CheckpointOption, OutOption, SensorOption, SizeOption, build_sized, choose_device
 from r2flow.errors import InputError
 
@@ -14,54 +16,73 @@ if TYPE_CHECKING:
     from r2flow.lidar.region import Region
 
 
+@dataclass(frozen=True)
+class PartOptions:
+    """The part of a scan that is asked for."""
+
+    sector: Annotated[
+        str | None, typer.Option(help="Azimuths in degrees, as -45,45 for the quarter ahead: generate no more.")
+    ] = None
+    rows: Annotated[str | None, typer.Option(help="Rows of the image, as 0-31 for the upper half of 64.")] = None
+    channels: Annotated[str, typer.Option(help="both, range, or reflectance: what is decoded and written.")] = "both"
+
+    def region(self, checkpoint: "Checkpoint") -> "Region | None":
+        """The region of --sector and --rows; prints what is generated for it."""
+        from r2flow.lidar.region import region
+        from r2flow.sampling import evaluated_region
+
+        if self.sector is None and self.rows is None:
+            return None
+        angles = self.sector and _pair("--sector", self.sector, ",", float, "two azimuths in degrees, as -45,45")
+        limits = self.rows and _pair("--rows", self.rows, "-", int, "the first and the last row, as 0-31")
+        wanted = region(checkpoint.sensor.shape, angles or None, limits or None)
+        seen = evaluated_region(checkpoint.generator, wanted)
+        rounded = "" if seen == wanted else f", rounded outward from {wanted}"
+        print(f"generating {seen}{rounded}: {seen.share:.0%} of the image")
+        return wanted
+
+
+def _pair(option: str, text: str, between: str, kind: type, meaning: str) -> tuple[Any, Any]:
+    try:
+        first, second = (kind(part) for part in text.split(between))
+    except ValueError:
+        raise InputError(f"{option} must be {meaning}; found {text!r}.") from None
+    return first, second
+
+
 @app.command(epilog="Example: r2flow sample --checkpoint runs/simulated-hdit_tiny --num 16 --steps 64 --out scans")
+@grouped
 def sample(
     checkpoint: CheckpointOption,
     out: OutOption,
-    num: Annotated[int, typer.Option(min=1, help="Number of scans.")] = 4,
-    steps: Annotated[
-        int | None, typer.Option(min=1, help="Steps from noise to data; the model's own if left out.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0,
-    solver: Annotated[
-        str | None,
-        typer.Option(
-            help="euler, midpoint, heun2, heun3, rk4, ab2; adaptive: dopri5, bosh3, torchdiffeq:NAME; the model's own "
-            "if left out."
-        ),
-    ] = None,
-    tolerance: Annotated[float | None, typer.Option(help="Of an adaptive solver.")] = None,
+    draw: DrawOptions,
+    solver: SolverOptions,
+    part: PartOptions,
     grid: Annotated[
         str | None, typer.Option(help="Where fixed steps fall: uniform, quadratic, or a file of 'r2flow calibrate'.")
     ] = None,
     format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture.")] = 8,
-    sector: Annotated[
-        str | None, typer.Option(help="Azimuths in degrees, as -45,45 for the quarter ahead: generate no more.")
-    ] = None,
-    rows: Annotated[str | None, typer.Option(help="Rows of the image, as 0-31 for the upper half of 64.")] = None,
-    channels: Annotated[str, typer.Option(help="both, range, or reflectance: what is decoded and written.")] = "both",
     straight_first: Annotated[
-        bool, typer.Option("--straight-first", help="One step for the scenes that are straight, --solver for others.")
+        bool, typer.Option("--straight-first", help="One step for the scans that are straight, --solver for others.")
     ] = False,
-    batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto",
 ) -> None:
-    """Draw scans from a trained flow: point clouds, range images and pictures."""
+    """Draw scans from a trained generator: point clouds, range images and pictures.
+
+    Solver, steps and tolerance are the model's own if left out.
+    """
     from r2flow.checkpoints import load_checkpoint
     from r2flow.reports.outputs import formats_of, write_samples
     from r2flow.time_grids import grid_of
 
-    loaded = load_checkpoint(checkpoint, device=choose_device(device))
-    sampler = loaded.generator.sampler.changed(
-        steps=steps, method=solver, tolerance=tolerance, straight_first=straight_first or None,
-        grid=None if grid is None else grid_of(grid, loaded),
-    )  # fmt: skip
-    formats = format.split(",") if format else formats_of(loaded, channels)
-    part = choose_region(loaded, sector, rows) if sector or rows else None
-    write_samples(loaded, out, num, seed, sampler, formats, pictures, batch_size, part, channels)
+    loaded = load_checkpoint(checkpoint, device=choose_device(draw.device))
+    times = None if grid is None else grid_of(grid, loaded)
+    sampler = solver.change(loaded.generator.sampler, straight_first=straight_first or None, grid=times)
+    formats = format.split(",") if format else formats_of(loaded, part.channels)
+    region = part.region(loaded)
+    write_samples(loaded, out, draw.num, draw.seed, sampler, formats, pictures, draw.batch_size, region, part.channels)
     seen = f", pictures in {out / 'samples.png'}" if pictures else ""
-    print(f"{num} scans ({', '.join(formats)}) in {out}{seen}")
+    print(f"{draw.num} scans ({', '.join(formats)}) in {out}{seen}")
 
 
 @app.command(epilog="Example: r2flow calibrate runs/NAME --steps 8 --out grid.json")
@@ -69,11 +90,11 @@ def calibrate(
     checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file or a run folder.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The file to write, .json.", show_default=False)],
     steps: Annotated[int, typer.Option(min=1, help="Steps of the grid.")] = 8,
-    solver: Annotated[str, typer.Option(help="That will use it: euler, ab2, midpoint, heun2, heun3, rk4.")] = "euler",
-    num: Annotated[int, typer.Option(min=1, help="Scenes to find it on.")] = 4,
+    solver: Annotated[str, typer.Option(help="The solver that will use it: euler, ab2, midpoint, ...")] = "euler",
+    num: Annotated[int, typer.Option(min=1, help="Scans to find it on.")] = 4,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto",
 ) -> None:
-    """Find where a flow's steps should fall so that their errors are equal: a grid for `r2flow sample --grid`."""
+    """Find the times at which a flow's steps have equal errors: a grid for `r2flow sample --grid`."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.progress import Bar
     from r2flow.reports.pages import prepare_folder
@@ -96,7 +117,7 @@ def info(
     checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file or a run folder.")],
     json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
-    """Say what is in a checkpoint."""
+    """Print what is in a checkpoint."""
     from r2flow.reports.contents import describe, print_contents
 
     contents = describe(checkpoint)
@@ -145,25 +166,3 @@ def backbones(
         print(encoder.dumps(measured, indent=2))
     else:
         print_costs(measured, chosen, where)
-
-
-def choose_region(checkpoint: "Checkpoint", sector: str | None, rows: str | None) -> "Region":
-    """The region of --sector and --rows; says what is generated where that is more than was asked for."""
-    from r2flow.lidar.region import region
-    from r2flow.sampling import evaluated_region
-
-    angles = None if sector is None else _pair("--sector", sector, ",", float, "two azimuths in degrees, as -45,45")
-    limits = None if rows is None else _pair("--rows", rows, "-", int, "the first and the last row, as 0-31")
-    wanted = region(checkpoint.sensor.shape, angles, limits)
-    seen = evaluated_region(checkpoint.generator, wanted)
-    rounded = "" if seen == wanted else f", rounded outward from {wanted}"
-    print(f"generating {seen}{rounded}: {seen.share:.0%} of the image")
-    return wanted
-
-
-def _pair(option: str, text: str, between: str, kind: type, meaning: str) -> tuple[Any, Any]:
-    try:
-        first, second = (kind(part) for part in text.split(between))
-    except ValueError:
-        raise InputError(f"{option} must be {meaning}; found {text!r}.") from None
-    return first, second

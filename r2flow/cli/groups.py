@@ -79,9 +79,9 @@ class SolverOptions:
     )
     tolerance: Annotated[float | None, typer.Option(help="Of an adaptive solver.")] = None
 
-    def change(self, sampler: "Sampler") -> "Sampler":
-        """A sampler with what was asked for."""
-        return sampler.changed(method=self.solver, steps=self.steps, tolerance=self.tolerance)
+    def change(self, sampler: "Sampler", **more: Any) -> "Sampler":
+        """A sampler with what was asked for, and `more` of its settings."""
+        return sampler.changed(method=self.solver, steps=self.steps, tolerance=self.tolerance, **more)
 
 
 @dataclass(frozen=True)

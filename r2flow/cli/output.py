@@ -1,4 +1,4 @@
-"""What verbs show while they work, and how they end."""
+"""What verbs print at their end."""
 
 import math
 import shlex
@@ -34,7 +34,7 @@ def command() -> str:
 
 
 def finish(page: "Page", out: Path, said: Sequence[str] | None = None) -> None:
-    """Write a page, and say in the terminal what its sentences say, or `said`, and where it lies."""
+    """Write a page; print its sentences, or `said`, and the files."""
     from r2flow.reports.pages import write_page
 
     written = write_page(page, out)

@@ -111,12 +111,12 @@ def curvature(velocity: Velocity, x_0: Tensor, steps: int = 256, progress: Progr
 def straightness(
     velocity: Velocity, x_0: Tensor, steps: int = 256, most_curved: int = 0, progress: Progress = None
 ) -> Straightness:
-    """s(t) of every scene at the times of `steps` Euler steps, in two passes: 2 x steps evaluations.
+    """s(t) of every scan at the times of `steps` Euler steps, in two passes: 2 x steps evaluations.
 
     Args:
         velocity: v(t, x) with t of shape ().
         x_0: Noise, (B, ...).
-        most_curved: How many elements, of all scenes together, have their path kept.
+        most_curved: How many elements, of all scans together, have their path kept.
         progress: Called after every evaluation.
 
     Raises:

@@ -104,7 +104,7 @@ class RectifiedFlow(Flow):
         """Take over a flow's weights; what a second time adds keeps its own, which change nothing at first."""
         own = self.backbone.state_dict()
         new = {f"backbone.{name}": own[name] for name in self.backbone.second_time_names()}
-        self.load_state_dict({**new, **parent.state_dict()})
+        self._take(parent, {**new, **parent.state_dict()})
 
     @property
     def unit(self) -> tuple[int, int]:

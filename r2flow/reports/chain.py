@@ -1,4 +1,4 @@
-"""What straightening and distilling did: every flow of a chain at few and at many steps, from the same noise."""
+"""What reflow and distillation change: every generator of a chain at few and at many steps, from the same noise."""
 
 import json
 import math
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from r2flow.checkpoints import Checkpoint, load_checkpoint
@@ -22,22 +21,22 @@ from r2flow.noise import Draws
 from r2flow.progress import track
 from r2flow.reports.outputs import draw_pages, write_scan
 from r2flow.reports.pages import Page, write_page
-from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
+from r2flow.reports.pictures import BACKGROUND, FOREGROUND, dark_figure, draw_range
 from r2flow.reports.tables import print_table, table
 from r2flow.runs import read_config
 from r2flow.sampling import sample
 
-MANY = 32  # steps that stand for "as many as one likes"
+MANY = 32  # steps that are taken for the limit of many
 
 
 def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu", command: str = "") -> Path:
-    """Sample every flow, set the samples beside held-out scans, and write figure, table and scans.
+    """Sample every generator, compare the samples with held-out scans, and write figure, table and scans.
 
     Each run's folder gets its `fidelity.json`, which `r2flow compare` reads.
 
     Args:
         runs: Run folders by name, the first one trained on scans.
-        num: Scans a flow and number of steps.
+        num: Scans of each, for each number of steps.
         command: What makes the page again.
 
     Returns:
@@ -51,7 +50,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     cells = [(name, steps) for name, flow in flows.items() for steps in steps_of(flow, flows.values())]
     rows, drawn = [], {}
     bends = {name: bend(flow, num) for name, flow in flows.items()}
-    for name, steps in track(cells, "sampling every flow"):
+    for name, steps in track(cells, "sampling"):
         start = time.perf_counter()
         images = np.concatenate([one.images.numpy() for one in sample(flows[name], num, steps=steps)])
         seconds = (time.perf_counter() - start) / num
@@ -61,7 +60,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
             "mean": float(np.mean(list(found.values()))), **found,
         })  # fmt: skip
         drawn[name, steps] = images
-        # A flow's last number of steps is the one that it is meant for.
+        # the last number of steps is the one that it is meant for
         with atomic_write(runs[name] / "fidelity.json", "w") as file:
             json.dump({"sets": {"other": found}, "samples": num, "steps": steps}, file, indent=2)
     last = cells[-1]
@@ -75,7 +74,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
         text=[
             explanation(num, len(real)),
             table(rows, COLUMNS),
-            "Line by line:",
+            "The lines of the fidelity panel:",
             table(rows, {"flow": "flow", "steps": "steps", **{n: n for n in truth}}),
         ],
         rows=rows,
@@ -90,13 +89,13 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
 
 
 COLUMNS = {
-    "flow": "flow", "steps": "Euler steps", "seconds": "seconds a scan", "bend": "bend",
+    "flow": "flow", "steps": "steps", "seconds": "seconds a scan", "bend": "bend",
     "mean": "distance to held-out scans",
 }  # fmt: skip
 
 
 def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
-    """A distilled flow has its own number of steps; the others are shown at all of these and at many."""
+    """A generator for fixed steps at these; the others at all of these and at many."""
     own = flow.generator.sampler
     if own.fixed:
         return [own.steps]
@@ -104,7 +103,7 @@ def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
 
 
 def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
-    """The scans that a run's flow was validated on, (N, 2 or 1, H, W) in metres and reflectance."""
+    """The scans that a run was validated on, (N, 2 or 1, H, W) in metres and reflectance."""
     config = read_config(run) or flow.config  # the folder's own knows where the scans have moved
     data = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **config["data"])
     _, held = data.sources()
@@ -113,7 +112,7 @@ def held_out(flow: Checkpoint, run: Path) -> np.ndarray:
 
 
 def bend(flow: Checkpoint, num: int) -> float:
-    """int s(t) dt over |x_1 - x_0|^2, median over scenes: 0 is straight; NaN where there is no path."""
+    """int s(t) dt over |x_1 - x_0|^2, median over scans: 0 is straight; NaN for a generator without paths."""
     followed = flow.generator
     if not isinstance(followed, Flow):
         return math.nan
@@ -123,8 +122,9 @@ def bend(flow: Checkpoint, num: int) -> float:
 
 
 def explanation(num: int, real: int) -> str:
+    """What the table's columns are."""
     return (
-        f"{num} scans of each flow and number of Euler steps, all from the same noise, against {real} held-out scans. "
+        f"{num} scans of each generator and number of steps, all from the same noise, against {real} held-out scans. "
         "*Bend* is the integral of the paper's s(t) over the squared length of the path (median over scans, 0 is "
         "straight); an untrained flow is straight too, so read it beside the *distance*: the mean of the fidelity "
         "panel's lines, 0 is equal."
@@ -132,10 +132,9 @@ def explanation(num: int, real: int) -> str:
 
 
 def figure(drawn: Mapping[tuple[str, int], np.ndarray], names: list[str]) -> Figure:
-    """One scene through every flow (rows) at every number of steps (columns)."""
+    """One scan by every generator (rows) at every number of steps (columns)."""
     columns = sorted({steps for _, steps in drawn})
-    sheet = Figure(figsize=(5.2 * len(columns), 1.35 * len(names) + 0.4), facecolor=BACKGROUND)
-    FigureCanvasAgg(sheet)
+    sheet = dark_figure(5.2 * len(columns), 1.35 * len(names) + 0.4)
     axes = sheet.subplots(len(names), len(columns), squeeze=False)
     for row, name in enumerate(names):
         for column, steps in enumerate(columns):
@@ -150,21 +149,19 @@ def figure(drawn: Mapping[tuple[str, int], np.ndarray], names: list[str]) -> Fig
             if column == 0:
                 cell.axis("on")
                 cell.set_ylabel(name, color=FOREGROUND, fontsize=11)
-                cell.set_xticks([])
-                cell.set_yticks([])
-                for side in cell.spines.values():
-                    side.set_visible(False)
+                cell.set(xticks=[], yticks=[])
+                cell.spines[:].set_visible(False)
     sheet.subplots_adjust(left=0.05, right=0.99, top=0.88, bottom=0.02, wspace=0.03, hspace=0.08)
     return sheet
 
 
 def tell(rows: list[dict[str, Any]], runs: Mapping[str, Path], out: Path, page: Path) -> None:
-    """The table on the terminal, and where everything lies."""
+    """Print the table, the files, and the commands that come next."""
     print_table(rows, COLUMNS)
     last, folder = list(runs.items())[-1]
     print(
         f"""
-pictures      {out / "chain.png"} (every flow, few and many steps), {out / "samples.png"} ({last})
+pictures      {out / "chain.png"} (every generator, few and many steps), {out / "samples.png"} ({last})
 point clouds  {out / "000000.ply"} ...
 table         {page}
 flows         {", ".join(str(run) for run in runs.values())}
@@ -172,6 +169,6 @@ flows         {", ".join(str(run) for run in runs.values())}
 next
   r2flow sample --checkpoint {folder} --num 16 --seed 1 --out {out.parent / "more"}
   r2flow show {out / "000000.ply"} --out {out.parent / "views"}
-  python train.py data=kitti_raw data.root=FOLDER backbone=hdit_small""",
+  r2flow train data=kitti_raw data.root=FOLDER backbone=hdit_small""",
         flush=True,
     )

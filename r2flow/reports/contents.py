@@ -26,15 +26,17 @@ def describe(path: str | Path) -> dict[str, Any]:
         "sensor": loaded.sensor.name,
         "range_m": [loaded.sensor.min_range, loaded.sensor.max_range],
         "encoding": loaded.config["encoding"],
+        "sampler": loaded.generator.sampler.asdict(),
         "config": loaded.config,
     }
 
 
 def print_contents(contents: dict[str, Any]) -> None:
-    """The same as two short tables."""
+    """Print them as two short tables."""
     summary = {key: value for key, value in contents.items() if key != "config"}
     summary["image"] = " x ".join(map(str, contents["image"]))
-    summary["encoding"] = ", ".join(f"{key} {value}" for key, value in contents["encoding"].items())
+    for name in ("encoding", "sampler"):
+        summary[name] = ", ".join(f"{key} {value}" for key, value in contents[name].items())
     summary |= {key: f"{value:,}" for key, value in summary.items() if isinstance(value, int)}
     print_table([(key, str(value)) for key, value in summary.items()], ("", ""))
     print()

@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.flow.straightness import Straightness, straightness
@@ -20,23 +19,24 @@ from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.tables import table
 
 MOST_CURVED = 200  # paths drawn, as in the paper's figure 8 (b)
+OF_PATHS = ("bends", "trajectories", "dropped")  # fields of `Paths` with an entry for each path that is kept
 
 
 @dataclass(frozen=True)
 class Paths:
-    """What was found along the paths of one checkpoint, elements being pixels of range and of reflectance.
+    """The paths of one checkpoint; an element is a pixel of range or of reflectance.
 
     Attributes:
         label: Its name on the page.
         t: Times of the Euler steps, (n,).
-        s: s(t) of every scene, (N, n).
-        squared_length: |x_1 - x_0|^2 of every scene, (N,).
-        elements: Of all scenes together.
-        bends: int (d - v_t)^2 dt of the elements that bend most, the most bent first, (k,).
+        s: s(t) of every scan, (N, n).
+        squared_length: |x_1 - x_0|^2 of every scan, (N,).
+        elements: Of all scans together.
+        bends: int (d - v_t)^2 dt of the most curved elements, the most curved first, (k,).
         trajectories: Their values in model space at 0, 1/n, ..., 1, (k, n + 1).
         dropped: Whether their rays end as dropped, (k,).
         dropped_share: Share of all elements whose rays end as dropped.
-        dropped_bend: Their share of int s(t) dt; NaN where every path is straight.
+        dropped_bend: Share of int s(t) dt on them; NaN where every path is straight.
     """
 
     label: str
@@ -67,9 +67,9 @@ def measure_paths(
     most_curved: int = MOST_CURVED,
     progress: Callable[[], None] | None = None,
 ) -> Paths:
-    """s(t) over `steps` Euler steps of scans 0 to num - 1 of a seed, and the paths that bend most among them.
+    """s(t) over `steps` Euler steps of scans 0 to num - 1 of a seed, and the most curved paths.
 
-    Takes 2 x steps evaluations a batch; what is kept does not grow with the images.
+    Takes 2 x steps evaluations a batch; the memory does not grow with `num`.
 
     Args:
         progress: Called after every evaluation of a batch.
@@ -88,42 +88,36 @@ def measure_paths(
 
 
 def _paths(found: Straightness, encoding: Encoding, label: str) -> Paths:
-    bends = found.curvature.per_pixel
-    dropped = (encoding.decode(found.curvature.x_1)[:, :1] == 0).expand_as(bends)
-
-    def array(x: Tensor) -> np.ndarray:
-        return x.cpu().numpy()
-
-    total = bends.sum().item()
-    return Paths(
-        label, array(found.t), array(found.s), array(found.curvature.squared_length), bends.numel(),
-        array(bends.flatten()[found.pixels]), array(found.trajectories), array(dropped.flatten()[found.pixels]),
-        dropped.double().mean().item(), bends[dropped].sum().item() / total if total else math.nan,
-    )  # fmt: skip
+    curvature = found.curvature
+    bends = curvature.per_pixel
+    dropped = (encoding.decode(curvature.x_1)[:, :1] == 0).expand_as(bends)
+    tensors = (found.t, found.s, curvature.squared_length, bends.flatten()[found.pixels], found.trajectories,
+               dropped.flatten()[found.pixels])  # fmt: skip
+    t, s, length, most, trajectories, ends = (x.cpu().numpy() for x in tensors)
+    share, total = dropped.double().mean().item(), bends.sum().item()
+    on_dropped = bends[dropped].sum().item() / total if total else math.nan
+    return Paths(label, t, s, length, bends.numel(), most, trajectories, ends, share, on_dropped)
 
 
 def _together(batches: Sequence[Paths], most_curved: int) -> Paths:
     """The batches of one checkpoint as one."""
-    bends = np.concatenate([b.bends for b in batches])
-    most = np.argsort(-bends, kind="stable")[:most_curved]
+    every: dict[str, Any] = {
+        name: np.concatenate([getattr(b, name) for b in batches]) for name in ("s", "squared_length", *OF_PATHS)
+    }
+    most = np.argsort(-every["bends"], kind="stable")[:most_curved]
     totals = np.array([b.s.mean(1).sum() for b in batches])
     elements = np.array([b.elements for b in batches])
-    return Paths(
-        batches[0].label,
-        batches[0].t,
-        np.concatenate([b.s for b in batches]),
-        np.concatenate([b.squared_length for b in batches]),
-        int(elements.sum()),
-        bends[most],
-        np.concatenate([b.trajectories for b in batches])[most],
-        np.concatenate([b.dropped for b in batches])[most],
-        float(np.average([b.dropped_share for b in batches], weights=elements)),
-        float(np.average([b.dropped_bend for b in batches], weights=totals)) if totals.sum() else math.nan,
+    return replace(
+        batches[0],
+        **every | {name: every[name][most] for name in OF_PATHS},
+        elements=int(elements.sum()),
+        dropped_share=float(np.average([b.dropped_share for b in batches], weights=elements)),
+        dropped_bend=float(np.average([b.dropped_bend for b in batches], weights=totals)) if totals.sum() else math.nan,
     )
 
 
 def curvature_rows(flows: Sequence[Paths]) -> list[dict[str, Any]]:
-    """s(t) of every checkpoint and time: mean, least and most over the scenes, as it is and over |d|^2."""
+    """s(t) of every checkpoint and time: mean, least and most over the scans, as it is and over |d|^2."""
     rows = []
     for flow in flows:
         for index, t in enumerate(flow.t):
@@ -158,42 +152,30 @@ def _share(part: np.ndarray, whole: np.ndarray) -> float:
     return float(part.sum() / whole.sum()) if whole.sum() else math.nan
 
 
+COLUMNS = {
+    "checkpoint": "checkpoint", "integral": "int s dt", "integral_normalised": "int s dt / length^2",
+    "t_of_most": "t of the most", "first_tenth": "share in t < 0.1", "last_tenth": "share in t >= 0.9",
+    "paths_dropped": "most curved: ending at ray-drop", "dropped_share": "rays dropped",
+    "dropped_bend": "share of curvature on dropped rays",
+}  # fmt: skip
+
+
 def curvature_text(flows: Sequence[Paths]) -> list[str]:
-    """What the curves say, in sentences and a table."""
-    rows = [summary(flow) for flow in flows]
-    known = [row for row in rows if math.isfinite(row["integral_normalised"])]
-    said = [
+    """What s(t) is, and the flows in a table."""
+    summaries = [summary(flow) for flow in flows]
+    row = summaries[0]
+    about = (
         "s(t) = |(x_1 - x_0) - v(t, x_t)|^2 along the flow's own path (the paper's eq. 5), the mean over "
-        f"{rows[0]['scenes']} scenes from the same noise and {len(flows[0].t)} Euler steps. It is 0 on a straight "
-        "path, which one step follows exactly; a flow that goes nowhere is straight too, so read s over |x_1 - x_0|^2."
-    ]
-    said += [
-        f"**{row['checkpoint']}** bends most at t = {row['t_of_most']:.3g}; {row['first_tenth']:.0%} of its "
-        f"curvature lies in the first tenth of the path and {row['last_tenth']:.0%} in the last. Of its "
-        f"{row['paths']} most curved paths ({row['paths_share']:.2%} of all pixels of range and reflectance) "
-        f"{row['paths_dropped']:.0%} end at ray-drop; dropped rays are {row['dropped_share']:.0%} of all and "
-        f"hold {row['dropped_bend']:.0%} of the curvature."
-        for row in known
-    ]
-    if len(known) > 1:
-        straightest = min(known, key=lambda row: row["integral_normalised"])
-        bent = max(known, key=lambda row: row["integral_normalised"])
-        ratio = bent["integral_normalised"] / straightest["integral_normalised"]
-        said.append(
-            f"For its length **{straightest['checkpoint']}** is the straightest, {ratio:.2g} times as straight as "
-            f"{bent['checkpoint']}."
-        )
-    columns = {
-        "checkpoint": "checkpoint", "integral": "int s dt", "integral_normalised": "int s dt / length^2",
-        "t_of_most": "t of the most", "first_tenth": "share in t < 0.1", "last_tenth": "share in t >= 0.9",
-        "paths_dropped": "most curved: ending at ray-drop", "dropped_share": "rays dropped",
-        "dropped_bend": "share of curvature on dropped rays",
-    }  # fmt: skip
-    return [*said, table(rows, columns)]
+        f"{row['scenes']} scans from the same noise and {len(flows[0].t)} Euler steps. It is 0 on a straight path, "
+        "which one step follows exactly. A flow that goes nowhere is straight too: compare int s dt over the squared "
+        f"length |x_1 - x_0|^2. The most curved paths are {row['paths']} ({row['paths_share']:.2%} of all pixels of "
+        "range and reflectance)."
+    )
+    return [about, table(summaries, COLUMNS)]
 
 
 def curvature_figure(flows: Sequence[Paths]) -> Figure:
-    """s(t), as it is and over |d|^2, every checkpoint a line with the range over its scenes."""
+    """s(t), as it is and over |d|^2, every checkpoint a line with the range over its scans."""
     figure = blank_figure(10, 4.2)
     for place, (values, label) in enumerate(
         (
@@ -220,7 +202,7 @@ def curvature_figure(flows: Sequence[Paths]) -> Figure:
 
 
 def trajectories_figure(flows: Sequence[Paths]) -> Figure:
-    """The paths of the pixels that bend most, a panel for each checkpoint: the paper's figure 8 (b)."""
+    """The most curved paths, a panel for each checkpoint: the paper's figure 8 (b)."""
     columns = min(len(flows), 3)
     rows = math.ceil(len(flows) / columns)
     figure, titles = blank_figure(1 + 4.2 * columns, 4.2 * rows), short_labels([flow.label for flow in flows])
@@ -241,7 +223,7 @@ def trajectories_figure(flows: Sequence[Paths]) -> Figure:
         if index % columns == 0:
             axes.set_ylabel("value in model space (dotted: -1, ray-drop)")
         axes.axhline(-1, color="black", lw=0.9, ls=":", zorder=4)
-        # Below the panel: paths are everywhere in it.
+        # below the panel: paths are everywhere in it
         axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False)
     return figure
 

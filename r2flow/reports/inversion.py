@@ -1,4 +1,4 @@
-"""Real scans turned into their noise and back: files, a table, a page."""
+"""Real scans carried to their noise and back: files, a table, a page."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -124,10 +124,10 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
 
 
 def print_rows(rows: Sequence[dict[str, Any]]) -> None:
-    """The errors as a table, and a line for what has not been solved."""
+    """Print the errors as a table, and the scans that were not solved."""
     headings = ("scan", "returns", "evals", "RMS", "med. m", "RMS m", "rays ±", "std x_0", "solved")
     print_table(rows, dict(zip(COLUMNS, headings, strict=True)))
-    print("RMS in model space; rays ±: share of all rays lost or gained; std x_0: near 1 for scans that the flow knows")
+    print("RMS in model space; rays ±: share of all rays lost or gained; std x_0: near 1 for scans like the training's")
     lost = [row["scan"] for row in rows if not row["converged"]]
     if lost:
         print(f"not solved, and their noise is NaN: {', '.join(lost)}. A larger --tolerance may do.")
@@ -155,7 +155,7 @@ def _page(
     text = (
         f"{len(rows)} scans carried from t = 1 to their noise at t = 0 and back by {solver}, through the flow of "
         f"{checkpoint.path.name}, step {checkpoint.step}. Metres are of the rays that return both times; rays lost or "
-        "gained are a share of all. x_0 of a scan that the flow knows has a standard deviation near 1.",
+        "gained are a share of all. x_0 of a scan like those of the training has a standard deviation near 1.",
         table(rows, COLUMNS),
     )
     device = str(checkpoint.generator.device)

@@ -27,7 +27,7 @@ FORMATS = ("ply", "bin", "npy")
 
 
 def formats_of(checkpoint: Checkpoint, channels: str = "both") -> list[str]:
-    """The output formats that can hold what there will be: a .bin needs reflectance, a point needs its range."""
+    """The output formats that can hold the scans: a .bin needs reflectance, a point needs its range."""
     if channels == "reflectance":
         return ["npy"]
     return [name for name in FORMATS if name != "bin" or (channels == "both" and checkpoint.encoding.reflectance)]
@@ -78,9 +78,7 @@ def write_samples(
             generator, num, seed, sampler=sampler, batch_size=batch_size, region=region, channels=channels,
             progress=bar.evaluated,
         ):  # fmt: skip
-            lost = [drawn.first + offset for offset, solved in enumerate(drawn.converged.tolist()) if not solved]
-            if lost:
-                log.warning("not solved, and no scans of this flow: %s; try another solver.", ", ".join(map(str, lost)))
+            warn_unsolved(drawn.converged, drawn.first)
             for offset, image in enumerate(drawn.images.numpy()):
                 name = f"{drawn.first + offset:06d}"
                 if channels == "reflectance":
@@ -93,16 +91,28 @@ def write_samples(
     if channels != "reflectance":
         keep_note(checkpoint, out, seed, **sampler.asdict())
     if shown:
-        parts = shown if region is None else [region.crop(torch.from_numpy(image)).numpy() for image in shown]
-        if channels == "reflectance":
-            draw_reflectances(parts[:8], out)
-        else:
-            draw_pages(parts, rays if region is None else region.crop(rays), out)
+        draw_pictures(shown, rays, out, region, channels)
     return shown
 
 
+def draw_pictures(images: Sequence[np.ndarray], rays: Tensor, out: Path, region: Region | None, channels: str) -> None:
+    """The pictures of samples, of the region alone where there is one."""
+    parts = images if region is None else [region.crop(torch.from_numpy(image)).numpy() for image in images]
+    if channels == "reflectance":
+        draw_reflectances(parts[:8], out)
+    else:
+        draw_pages(parts, rays if region is None else region.crop(rays), out)
+
+
+def warn_unsolved(converged: Tensor, first: int = 0) -> None:
+    """Warn of the scans that are none of the flow, by number."""
+    lost = [str(first + offset) for offset, solved in enumerate(converged.tolist()) if not solved]
+    if lost:
+        log.warning("not solved, so no scans of this flow: %s; try another solver.", ", ".join(lost))
+
+
 def keep_note(checkpoint: Checkpoint, out: Path, seed: int, **sampler: Any) -> None:
-    """Leave beside samples what they are, so that nobody has to say their size or sensor."""
+    """Write beside samples what they are, so that readers know their size and sensor."""
     sensor = checkpoint.sensor
     encoding = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
     limits = {"min_range": sensor.min_range, "max_range": sensor.max_range}
@@ -113,7 +123,7 @@ def keep_note(checkpoint: Checkpoint, out: Path, seed: int, **sampler: Any) -> N
 
 
 def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str) -> None:
-    """Know the formats before there is anything to write.
+    """Check the formats before anything is generated.
 
     Raises:
         InputError: an unknown one, or one that cannot hold what is asked for.
@@ -180,13 +190,10 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path) -> Path:
 
 def draw_reflectances(images: Sequence[np.ndarray], out: Path) -> Path:
     """`samples.png` of scans without a range, (1, h, w) each: their reflectance, one under the other."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from r2flow.reports.pictures import dark_figure, draw_reflectance, save_figure
 
-    from r2flow.reports.pictures import BACKGROUND, draw_reflectance, save_figure
-
-    figure = Figure(figsize=(13, 1.2 * len(images) + 0.3), facecolor=BACKGROUND, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = dark_figure(13, 1.2 * len(images) + 0.3)
+    figure.set_layout_engine("constrained")
     axes: Any = figure.subplots(len(images), 1, squeeze=False)[:, 0]
     for row, (image, place) in enumerate(zip(images, axes, strict=True)):
         draw_reflectance(place, np.concatenate([image, image]), label=row == 0)  # a ray without any was dropped

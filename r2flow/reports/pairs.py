@@ -1,4 +1,4 @@
-"""Pairs made under the eyes of the user: how many, how fast, how long still."""
+"""Reflow pairs made with progress: how many, how fast, how long still."""
 
 import os
 import sys
@@ -10,8 +10,7 @@ import torch
 from r2flow.checkpoints import Checkpoint
 from r2flow.data.pairs import Made, make_pairs
 from r2flow.data.shards import PairStore
-from r2flow.progress import Bar
-from r2flow.reports.clock import duration
+from r2flow.progress import Bar, duration
 
 
 def make_and_tell(
@@ -23,19 +22,28 @@ def make_and_tell(
     device: torch.device | str = "cpu",
     seconds: float = 15.0,
 ) -> Made:
-    """`make_pairs` with a bar, or a line every `seconds` where no one watches or several work."""
+    """`make_pairs` with a bar; with a line every `seconds` outside a terminal and where several processes work."""
     generator = checkpoint.generator.to(device)
     there = sum(store.shard_path(shard).is_file() for shard in store.shards(num))
     if there > 4 and rank == 0:
         print(f"checking {there} shards of pairs", flush=True)
-    own = [batch for batch in store.missing(num) if batch % ranks == rank]
     who = f"process {rank + 1} of {ranks}: " if ranks > 1 else ""
-    teller = _Teller(who, len(own) * store.recipe.batch_size, seconds, watched=sys.stdout.isatty() and ranks == 1)
-    with teller.bar:
-        made = make_pairs(store, generator, num, rank, ranks, teller)
+    watched, last = sys.stdout.isatty() and ranks == 1, time.monotonic()
+    total = sum(batch % ranks == rank for batch in store.missing(num)) * store.recipe.batch_size
+    with Bar("drawing", total, "pairs", shown=watched) as bar:
+
+        def progress(made: Made) -> None:
+            nonlocal last
+            bar.set(made.pairs, rate(made))
+            if not watched and time.monotonic() - last >= seconds:
+                last = time.monotonic()
+                left = max(total - made.pairs, 0) * made.seconds / made.pairs
+                print(f"{who}pair {made.pairs}/{total}  {rate(made)}  {duration(left)} left", flush=True)
+
+        made = make_pairs(store, generator, num, rank, ranks, progress)
     if made.pairs:
         share = made.writing / max(made.seconds, 1e-9)
-        unusable = f", {made.unusable} did not come to an end and are left out" if made.unusable else ""
+        unusable = f", {made.unusable} did not converge and are left out" if made.unusable else ""
         print(f"{who}{made.pairs} pairs, {rate(made)}, {share:.1%} of the time for writing{unusable}", flush=True)
     return made
 
@@ -45,34 +53,16 @@ def rate(made: Made) -> str:
     return f"{made.pairs / made.seconds:.2f} pairs/s, {made.evaluations / made.pairs:.1f} evaluations a pair"
 
 
-class _Teller:
-    """Moves a bar on a terminal and prints lines elsewhere."""
-
-    def __init__(self, who: str, total: int, seconds: float, watched: bool) -> None:
-        self.who, self.total, self.seconds, self.watched = who, total, seconds, watched
-        self.bar = Bar("drawing", total, "pairs", shown=watched)
-        self.last = time.monotonic()
-
-    def __call__(self, made: Made) -> None:
-        self.bar.set(made.pairs, rate(made))
-        now = time.monotonic()
-        if self.watched or now - self.last < self.seconds:
-            return
-        self.last = now
-        left = max(self.total - made.pairs, 0) * made.seconds / made.pairs
-        print(f"{self.who}pair {made.pairs}/{self.total}  {rate(made)}  {duration(left)} left", flush=True)
-
-
 def wait_for_others(
     store: PairStore, num: int, launched: bool = False, pause: float = 2.0, patience: float = 120.0
 ) -> bool:
-    """Until the other processes' pairs are there too: no collective call, which would time out after a while.
+    """Wait for the other processes' pairs, without a collective call, which would time out.
 
     Args:
-        launched: This process was started by one of the others, and is of no use when that is gone.
+        launched: Whether one of the others started this process, which ends when that one is gone.
 
     Returns:
-        Whether all are there; False when none has come for `patience` seconds: what is missing is anyone's to make.
+        Whether all are there; False when none has come for `patience` seconds: then any process may make the rest.
     """
     parent, lacking, since = os.getppid(), len(store.missing(num)), time.monotonic()
     while not store.is_whole(num):

@@ -27,7 +27,7 @@ def scan_figure(image: np.ndarray, rays: Tensor, title: str = "", labels: np.nda
         rays: Elevation and azimuth in radians, (2, H, W).
         labels: Semantic id of every pixel, (H, W), drawn as a row of its own.
     """
-    figure = _figure(13, 8.6 if labels is None else 9.6)
+    figure = dark_figure(13, 8.6 if labels is None else 9.6)
     strips = len(image) + (labels is not None)
     grid = figure.add_gridspec(
         strips + 1, 2, height_ratios=[1] * strips + [5.2], hspace=0.16, wspace=0.06,
@@ -49,9 +49,9 @@ def scan_figure(image: np.ndarray, rays: Tensor, title: str = "", labels: np.nda
 
 
 def contact_sheet(images: Sequence[np.ndarray], rays: Tensor, titles: Sequence[str] = ()) -> Figure:
-    """Several scans under each other: their strips on the left, bird's-eye view and perspective on the right."""
+    """Several scans, one a row: images on the left, bird's-eye view and perspective on the right."""
     rows = len(images)
-    figure = _figure(15, 2.5 * rows)
+    figure = dark_figure(15, 2.5 * rows)
     grid = figure.add_gridspec(
         rows, 3, width_ratios=[2.6, 0.9, 1.3], hspace=0.12, wspace=0.03,
         left=0.01, right=0.99, top=1 - 0.3 / (2.5 * rows), bottom=0.01,
@@ -76,8 +76,7 @@ def contact_sheet(images: Sequence[np.ndarray], rays: Tensor, titles: Sequence[s
 def loss_figure(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
     """Loss against optimiser step; each curve is (steps, values), a long noisy one also smoothed."""
     figure = Figure(figsize=(8, 4.5), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
+    axes = FigureCanvasAgg(figure).figure.add_subplot()
     for colour, (name, (steps, values)) in zip(("C0", "C1", "C2"), curves.items(), strict=False):
         long = len(values) > 100
         axes.plot(steps, values, color=colour, alpha=0.25 if long else 1, lw=1, marker="" if long else "o", ms=3,
@@ -181,7 +180,8 @@ def figure_pixels(figure: Figure, dpi: int = 80) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _figure(width: float, height: float) -> Figure:
+def dark_figure(width: float, height: float) -> Figure:
+    """An empty figure of inches for scans."""
     figure = Figure(figsize=(width, height), facecolor=BACKGROUND)
     FigureCanvasAgg(figure)
     return figure
@@ -195,7 +195,7 @@ def _colours(name: str) -> Any:
 
 @cache
 def _ranges() -> Any:
-    """turbo from warm and near to cold and far, without its dark ends, which would pass for dropped rays."""
+    """turbo from warm (near) to cold (far), without its dark ends, which would look like dropped rays."""
     from matplotlib.colors import ListedColormap
 
     return ListedColormap(_colours("turbo_r")(np.linspace(0.1, 0.93, 256))).with_extremes(bad="black")
@@ -203,7 +203,6 @@ def _ranges() -> Any:
 
 def _strip(axes: Any, title: str) -> None:
     axes.set(xticks=[], yticks=[], facecolor="black")
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    axes.spines[:].set_visible(False)
     if title:
         axes.set_title(title, color=FOREGROUND, fontsize=8, loc="left", pad=3)

@@ -224,9 +224,11 @@ def channel_rows(checkpoint: Checkpoint, budget: float = 1.0) -> list[Row]:
     ranges, t = checkpoint.encoding.format.channels, torch.tensor(0.5)
     space, device = checkpoint.generator.space, checkpoint.generator.device
     x = Draws(0, range(1)).start((ranges + 1, *checkpoint.sensor.shape))
-    alone = build_backbone(checkpoint.config["backbone"], space.rays, ranges).eval().to(device)
-    on = x.to(device)
-    network = _in_turns({"both": partial(checkpoint.model, t, on), "range": partial(alone, t, on[:, :ranges])}, budget)
+    networks = {}
+    for name, channels in (("both", ranges + 1), ("range", ranges)):
+        backbone = build_backbone(checkpoint.config["backbone"], space.rays, channels).eval().to(device)
+        networks[name] = partial(backbone, t, x[:, :channels].to(device))
+    network = _in_turns(networks, budget)
     decoding = _in_turns({name: partial(space.decode, x, name) for name in network}, budget)
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""How good a flow's scans are within a number of evaluations, and within seconds: the paper's figure 6."""
+"""Distance to real scans against evaluations and seconds: the paper's figure 6."""
 
 import json
 import math
@@ -18,7 +18,7 @@ from r2flow.generators import Sampler
 from r2flow.metrics.base import ScanMetric
 from r2flow.reports.evaluation import heading
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
-from r2flow.reports.tables import shown, table
+from r2flow.reports.tables import table
 
 NAME = "speed_quality"
 BETWEEN = " | "  # remarks of a row
@@ -63,7 +63,7 @@ class Curve:
     device: str
 
     def key(self, flow: Checkpoint, steps: int) -> str:
-        """Of a point: it is measured again when anything in it differs."""
+        """Of a point; when it changes, the point is measured again."""
         how = self.drawing.sampler(flow, steps)
         return point_key(
             self.real, self.metrics, weights=weights_hash(flow), steps=steps, num=self.drawing.num,
@@ -72,7 +72,7 @@ class Curve:
 
 
 def steps_of(flow: Checkpoint, label: str, steps: Sequence[int], drawing: Drawing) -> list[int]:
-    """Those of some numbers of steps that a generator can be run with, as a GAN with 1 alone.
+    """The numbers of steps, out of some, that a generator can be run with; a GAN with 1 alone.
 
     Raises:
         InputError: it can be run with none of them.
@@ -97,7 +97,7 @@ def measure_curve(
     done: Sequence[Mapping[str, Any]] = (),
     arrived: Callable[[list[dict[str, Any]]], None] = lambda rows: None,
 ) -> list[dict[str, Any]]:
-    """A row for each flow and number of steps; those that are done already are taken as they are.
+    """A row for each generator and number of steps; rows that are done already are kept as they are.
 
     Seconds are of the network and its solver alone, the median over batches, so that neither the first batch's warm-up
     nor the metrics count.
@@ -134,7 +134,7 @@ def measure_curve(
 
 
 def _or_nan(average: Callable[[Sequence[float]], float], values: Sequence[float]) -> float:
-    """NaN for a process that had no batch; the first one, which writes the page, always has."""
+    """NaN for a process without a batch; the first one, which writes the page, always has some."""
     return average(values) if values else math.nan
 
 
@@ -181,7 +181,7 @@ def speed_quality_page(
         f"{curve.drawing.method or 'its own solver'}; measured against {len(curve.real)} scans of {curve.real.label}. "
         "Seconds are those of the network and its solver, the median over batches."
     )
-    text = [*_best(rows, names), sampled, table(printed, columns), *_remarks(rows)]
+    text = [sampled, table(printed, columns), *_remarks(rows)]
     protocols = [
         {**curve.metrics[metric].protocol.asdict(), "real_chosen": curve.gathered.rules[metric]}
         for metric in curve.metrics
@@ -198,7 +198,7 @@ def figure_names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _remarks(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Each remark once, with the points that it is made of."""
+    """Each remark once, with the points it is about."""
     found: dict[str, list[str]] = {}
     for row in rows:
         for remark in filter(None, row["remarks"].split(BETWEEN)):
@@ -210,28 +210,11 @@ def _remarks(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return ["\n".join(lines)] if lines else []
 
 
-def _best(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[str]:
-    """Where each flow is best by each metric's first figure."""
-    first = list({name.split("/", 1)[0]: name for name in reversed(names)}.values())[::-1]
-    said = []
-    for name in first:
-        heads, factor = heading(*name.split("/", 1))
-        parts = []
-        for flow in dict.fromkeys(row["flow"] for row in rows):
-            own = [row for row in rows if row["flow"] == flow and math.isfinite(row.get(name, math.nan))]
-            if own:
-                best = min(own, key=lambda row: row[name])
-                parts.append(f"{flow} at {best['steps']} steps ({shown(best[name] * factor)})")
-        if parts:
-            said.append(f"{heads} is least for {', for '.join(parts)}.")
-    return [" ".join(said)] if said else []
-
-
 def _figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Figure:
     """Each metric's first figure against evaluations (above) and seconds (below), a line for each flow."""
     first = list({name.split("/", 1)[0]: name for name in reversed(names)}.values())[::-1]
     flows = list(dict.fromkeys(row["flow"] for row in rows))
-    figure = blank_figure(3.4 * len(first) + 0.6, 6.2, "quality against speed: down and to the left is better")
+    figure = blank_figure(3.4 * len(first) + 0.6, 6.2, "quality against speed: lower left is better")
     for line, (x, label) in enumerate(AXES):
         for place, name in enumerate(first):
             axes = figure.add_subplot(2, len(first), line * len(first) + place + 1)

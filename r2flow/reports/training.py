@@ -1,4 +1,4 @@
-"""The end of a run: its curve, its samples, and where everything is."""
+"""The end of a training: its loss curve, its samples, and its files."""
 
 import csv
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ Curve = tuple[np.ndarray, np.ndarray]
 def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/loss")) -> dict[str, Curve]:
     """Logged values against optimiser steps, (steps, values) by name.
 
-    Every resumption logs into a folder of its own; where two of them logged one step, the later counts.
+    Every resumption logs into a folder of its own; of two values of one step, the later counts.
     """
     values: dict[str, dict[int, float]] = {name: {} for name in names}
     folders = Path(run, "metrics").glob("version_*/metrics.csv")
@@ -37,17 +37,17 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
 
 
 def check_samples(num: int = 4) -> None:
-    """Refuse before the training what could not be drawn after it.
+    """Check the number of samples before the training.
 
     Raises:
-        InputError: fewer than no scans.
+        InputError: a negative number.
     """
     if num < 0:
         raise InputError(f"samples.num must be at least 0, found {num}.")
 
 
 def finish(run: str | Path, samples: Mapping[str, Any], seed: int, device: str, max_steps: int) -> None:
-    """Draw the loss curve and a few scans of a run, and say where everything lies and what comes next."""
+    """Draw the loss curve and a few scans of a run; print its files and the commands that come next."""
     from r2flow.reports.pictures import loss_figure, save_figure
 
     run = Path(run)
@@ -80,6 +80,6 @@ loss curve    {run / "loss.png"}; tensorboard --logdir {run / "tensorboard"}
 next
   r2flow sample --checkpoint {run} --num 16{advice} --seed 1 --out {run / "more"}
   r2flow show {out / "000000.ply"} --out {run / "views"}
-  python train.py data=kitti_raw data.root=FOLDER backbone=hdit_small""",
+  r2flow train data=kitti_raw data.root=FOLDER backbone=hdit_small""",
         flush=True,
     )

@@ -39,7 +39,7 @@ class Stage(L.LightningModule):
         gradient_clip_val: The run's, for a stage with manual optimisation, which clips for itself.
     """
 
-    generator_name: ClassVar[str] = "rectified_flow"  # what it trains unless the config's `generator` says otherwise
+    generator_name: ClassVar[str | None] = None  # what it trains; None: the parent's, or a rectified flow
     needs_pairs: ClassVar[bool] = False  # whether a batch's x_0 and x_1 belong together
 
     def __init__(

@@ -1,6 +1,7 @@
 """Families that come from outside, as a user gives them: a file, `--plugin`, and what the config says of it."""
 
 import contextlib
+import copy
 import io
 import sys
 from collections.abc import Iterator
@@ -9,9 +10,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra.core.config_store import ConfigStore
 
 from r2flow import cli, plugins
 from r2flow.backbones import BACKBONES
+from r2flow.callbacks import CALLBACKS
+from r2flow.composing import REGISTRIES
 from r2flow.generators import GENERATORS
 from r2flow.stages import STAGES
 from tests.training.conftest import Done
@@ -53,12 +57,14 @@ ALL = (GAN, DDPM, COMPLETION, BACKBONE)
 @contextlib.contextmanager
 def loaded(*families: Family) -> Iterator[None]:
     """Families' files imported for the length of a block: what comes after is as if in a process of its own."""
-    tables = (GENERATORS, STAGES, BACKBONES)
+    tables, store = (GENERATORS, STAGES, BACKBONES, CALLBACKS), ConfigStore.instance()
+    choices = {group: copy.deepcopy(store.repo.get(group, {})) for group in REGISTRIES}  # Hydra's own stay
     before, known = [dict(table.items()) for table in tables], set(plugins._loaded)
     try:
         plugins.load_plugins([str(FAMILIES / f"{family.file}.py") for family in families])
         yield
     finally:
+        store.repo.update(choices)
         plugins._loaded.clear()
         plugins._loaded.update(known)
         for table, entries in zip(tables, before, strict=True):

@@ -13,17 +13,21 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.sampling import sample
-from tests.extension.conftest import BACKBONE, COMPLETION, DDPM, loaded
+from tests.extension.conftest import BACKBONE, COMPLETION, DDPM, GAN, loaded
 
 M, S = 0.1, 0.2  # x_1 ~ N(M, S^2) in every pixel
+
+
+def space() -> ModelSpace:
+    sensor = SENSORS["hdl64e"].resized(16, 64)
+    return ModelSpace(sensor, Encoding(sensor), sensor.rays())
 
 
 @pytest.fixture
 def gaussian_ddpm():
     """A DDPM whose network is exact: E[x_0 | x_t] for independent x_0 ~ N(0, 1) and x_1 ~ N(M, S^2)."""
-    sensor = SENSORS["hdl64e"].resized(16, 64)
     with loaded(DDPM, BACKBONE):
-        ddpm = GENERATORS["toy_ddpm"](ModelSpace(sensor, Encoding(sensor), sensor.rays()), {"name": "toy_backbone"})
+        ddpm = GENERATORS["toy_ddpm"](space(), {"name": "toy_backbone"})
 
     def expected_noise(t, x):
         a = torch.sin(torch.as_tensor(t) * torch.pi / 2).square().clamp(min=1e-4)
@@ -48,6 +52,16 @@ def test_ddpm_draws_from_the_data(gaussian_ddpm):
     assert x.mean().item() == pytest.approx(M, abs=0.01)  # of 16,384 draws: 6 standard errors
     assert x.std().item() == pytest.approx(S, rel=0.05)
     assert torch.corrcoef(torch.stack([x.flatten(), x_0.flatten()]))[0, 1].abs() < 0.1  # the start is forgotten
+
+
+def test_scan_i_is_a_function_of_noise_of_the_generator_s_own_shape():
+    with loaded(GAN):
+        gan = GENERATORS["toy_gan"](space(), {}, latent=5)
+    drawn = next(sample(gan, 2, seed=3, batch_size=2))
+    expected = gan.space.decode(gan.network(Draws(3, [0, 1]).start((5,))))
+    torch.testing.assert_close(drawn.images, expected.detach())
+    assert not drawn.images.requires_grad
+    assert drawn.evaluations.tolist() == [1, 1]
 
 
 def test_known_rays_are_given_back_and_the_others_depend_on_them(completion: Path):

@@ -1,5 +1,6 @@
 """A GAN, a DDPM, a conditional flow and a backbone from files outside the package, through every verb."""
 
+import ast
 import json
 import os
 import shutil
@@ -11,7 +12,20 @@ import pytest
 import torch
 
 from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint
-from tests.extension.conftest import BACKBONE, COMPLETION, DDPM, FAMILIES, GAN, TINY, Family, loaded, r2flow, train
+from r2flow.training import compose
+from tests.extension.conftest import (
+    BACKBONE,
+    COMPLETION,
+    DDPM,
+    FAMILIES,
+    GAN,
+    TINY,
+    Family,
+    loaded,
+    r2flow,
+    run_of,
+    train,
+)  # fmt: skip
 from tests.training.conftest import hold_at, let_go, start, wait_for
 from tests.training.test_train import assert_bit_equal
 
@@ -67,7 +81,7 @@ def test_scan_i_of_a_seed_is_the_same_in_any_batch(trained: tuple[Family, Path],
             "--format", "npy", "--pictures", 0,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
-    three, two = ([np.load(path) for path in sorted((tmp_path / out).iterdir())] for out in ("three", "two"))
+    three, two = ([np.load(path) for path in sorted((tmp_path / out).glob("*.npy"))] for out in ("three", "two"))
     for a, b in zip(three[:2], two, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
     assert not np.allclose(three[0], three[1])
@@ -94,10 +108,8 @@ def test_weights_travel_as_safetensors(trained: tuple[Family, Path], tmp_path: P
 
 
 @pytest.mark.parametrize("family", [COMPLETION, BACKBONE], ids=str)
-def test_a_flow_is_straightened(family: Family, tmp_path: Path, request: pytest.FixtureRequest):
-    from tests.extension.conftest import run_of
-
-    run = Path(shutil.copytree(run_of(family, request.getfixturevalue("tmp_path_factory")), tmp_path / "run"))
+def test_a_flow_is_straightened(family: Family, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory):
+    run = Path(shutil.copytree(run_of(family, tmp_path_factory), tmp_path / "run"))
     pairs = ["data.pairs.num=6", "data.pairs.method=euler", "data.pairs.steps=2", "data.pairs.batch_size=3"]
     options = [family.plugin, *TINY, "sampler.steps=2", *pairs, f"stage.init={run}", f"run_dir={tmp_path / 'two'}"]
     done = r2flow("train", "experiment=reflow", *options)
@@ -114,10 +126,12 @@ CANNOT = {
     "interpolate": (
         ["SCAN", "SCAN", "-c", "RUN", "-o", "OUT"], "interpolation needs the velocity of a flow, which a ToyGenerator"
     ),
-    "report": (["curvature", "RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
+    "report curvature": (["RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
+    "report savings": (["RUN", "-o", "OUT"], "a savings report needs the velocity of a flow, which a ToyGenerator"),
+    "report work-precision": (["RUN", "-o", "OUT"], "a work-precision report needs the velocity of a flow"),
     "calibrate": (["RUN", "-o", "OUT.json"], "a time grid needs the velocity of a flow, which a ToyGenerator"),
     "convert": (["RUN", "OUT.pth"], "the published format cannot hold a ToyGenerator; convert to .safetensors"),
-    "pairs": (["RUN"], "pairs need noise of the scans' shape (2, 16, 64), found (8,)"),
+    "pairs": (["RUN"], "a ToyGenerator can be run in one way only, direct with 1 step; found dopri5"),
     "sample": (["-c", "RUN", "--steps", "4", "-o", "OUT"], "a ToyGenerator can be run in one way only"),
 }  # fmt: skip
 
@@ -127,7 +141,7 @@ def test_what_a_gan_cannot_do_is_one_line(gan: Path, tmp_path: Path, verb: str):
     arguments, said = CANNOT[verb]
     for name, value in (("RUN", gan), ("SCAN", gan / "samples" / "000000.ply"), ("OUT", tmp_path / "out")):
         arguments = [one.replace(name, str(value)) for one in arguments]
-    done = r2flow(verb, GAN.plugin, *arguments)
+    done = r2flow(*verb.split(), GAN.plugin, *arguments)
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.splitlines()) == 1
@@ -153,3 +167,20 @@ def test_a_run_without_its_plugin_says_which_and_how(trained: tuple[Family, Path
         assert len(done.stderr.splitlines()) == 1
         assert f"no {kind} named '{name}'" in done.stderr
         assert f"give --plugin {FAMILIES / f'{family.file}.py'}." in done.stderr
+
+
+@pytest.mark.parametrize("file", sorted(FAMILIES.glob("*.py")), ids=lambda file: file.stem)
+def test_a_family_is_made_of_public_names(file: Path):
+    for node in ast.walk(ast.parse(file.read_text())):
+        names = [node.attr] if isinstance(node, ast.Attribute) else []
+        if isinstance(node, ast.ImportFrom):
+            names = [*(node.module or "").split("."), *(alias.name for alias in node.names)]
+        private = [name for name in names if name.startswith("_") and name != "__init__"]
+        assert not private
+
+
+def test_a_notebook_composes_what_plugins_add():
+    with loaded(GAN, BACKBONE):
+        config = compose(["stage=toy_gan", "backbone=toy_backbone", "stage.width=8", "backbone.base_channels=4"])
+    assert (config["stage"]["name"], config["stage"]["width"]) == ("toy_gan", 8)
+    assert config["backbone"] == {"name": "toy_backbone", "base_channels": 4}

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from r2flow.lidar.sensors import SENSORS
+from r2flow.metrics import METRICS
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.scans import Scans
 
@@ -27,6 +28,13 @@ class Summary(Extractor):
         both = torch.stack([r.amax((1, 2)), scans.returned.float().mean((1, 2, 3))], 1)
         features = torch.cat([quarters, both], 1)
         return torch.where(scans.returned.flatten(1).any(1)[:, None], features, torch.nan)
+
+
+def one_of_each_class() -> list[str]:
+    """A name of every class in the table: its other names differ by their network alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("r2flow.metrics.extractors.load_extractor", lambda name: Summary())
+        return list({type(build()): name for name, build in METRICS.items()}.values())
 
 
 @pytest.fixture

@@ -52,7 +52,7 @@ def test_mmd_is_the_mean_over_all_pairs_in_blocks_of_any_size(monkeypatch):
         assert figure(MMD(), Seen(counts[:10]), Seen(counts[10:]))["mmd"] == pytest.approx(expected, rel=1e-9)
 
 
-def test_disjoint_sets_lie_as_far_as_can_be(scans_of):
+def test_disjoint_sets_have_the_largest_distance(scans_of):
     near, far = scans_of(3, scale=0.0), scans_of(3)
     far.images[:, 0] = torch.where(far.returned[:, 0], 45.0, 0.0)
     near.images[:, 0] = torch.where(near.returned[:, 0], 4.0, 0.0)

@@ -64,7 +64,7 @@ def test_the_shipped_weights_are_small_packaged_and_named_by_their_hash(embedded
     assert SHIPPED.relative_to(ROOT / "r2flow").as_posix() in packaged
 
 
-def test_range_alone_has_a_name_of_its_own_and_needs_no_reflectance(embedded, images):
+def test_the_network_of_range_alone_has_its_own_name_and_needs_no_reflectance(embedded, images):
     assert {embedded.name, EmbeddedRange.name} <= set(EXTRACTORS)
     assert embedded.name != EmbeddedRange.name
     assert not any("frd" in name.lower() for name in (embedded.name, EmbeddedRange.name))
@@ -196,12 +196,12 @@ def test_a_training_changes_the_weights_and_its_file_is_the_same_again(tmp_path,
 
 
 @pytest.mark.slow
-def test_processes_that_simulate_change_no_weight(small):
+def test_the_number_of_simulating_processes_does_not_change_the_weights(small):
     assert len({state_hash(train(TINY, workers).state_dict()) for workers in (0, 2)}) == 1
 
 
 @pytest.mark.parametrize("content", [b"", b"no weights at all", json.dumps({}).encode()])
-def test_a_file_that_is_no_extractor_says_so(tmp_path, content):
+def test_a_file_without_extractor_weights_is_refused(tmp_path, content):
     (tmp_path / "x.safetensors").write_bytes(content)
     with pytest.raises(InputError, match="is not a safetensors file"):
         Embedded.trained(tmp_path / "x.safetensors")

@@ -95,7 +95,7 @@ def test_the_name_is_that_of_its_network():
 
 
 @pytest.mark.parametrize("dead", [0, 4, 5, 8])
-def test_the_order_of_scans_is_nothing_to_the_kernel_distance_whichever_channels_are_dead(dead, monkeypatch):
+def test_the_kernel_distance_does_not_depend_on_the_order_of_scans_whichever_channels_are_0(dead, monkeypatch):
     monkeypatch.setattr(kid, "SUBSETS", 3)
     monkeypatch.setattr(kid, "SUBSET_SIZE", 7)
     real, generated = torch.randn(2, 20, 8)

@@ -14,17 +14,10 @@ from r2flow.metrics import METRICS
 from r2flow.metrics.base import SIDES
 from r2flow.metrics.features import extract
 from r2flow.metrics.scans import Scans
-from tests.metrics.conftest import Summary
+from tests.metrics.conftest import one_of_each_class
 
 REAL, GENERATED = 12, 9
 pytestmark = pytest.mark.usefixtures("coarse")
-
-
-def one_of_each_class() -> list[str]:
-    """A name of every class in the table: its other names differ by their network alone."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("r2flow.metrics.extractors.load_extractor", lambda name: Summary())
-        return list({type(build()): name for name, build in METRICS.items()}.values())
 
 
 @pytest.fixture(params=one_of_each_class())
@@ -57,7 +50,7 @@ def shared_by(metrics):
     return metrics[0]
 
 
-def test_every_name_is_its_protocols_and_no_two_figures_share_one(summary, sets):
+def test_every_name_is_that_of_its_protocol_and_of_one_figure_only(summary, sets):
     figures = []
     for name, build in METRICS.items():
         metric = give(build(), sets)
@@ -71,7 +64,7 @@ def test_every_name_is_its_protocols_and_no_two_figures_share_one(summary, sets)
 
 
 @pytest.mark.parametrize("processes", [2, 3])
-def test_figures_know_nothing_of_processes_nor_of_the_order_of_scans(build, sets, processes, tmp_path):
+def test_figures_do_not_depend_on_processes_or_the_order_of_scans(build, sets, processes, tmp_path):
     expected = give(build(), sets).compute()
     backwards = give(build(), sets, size=5, order=-1).compute()
     ranks = [build(folder=tmp_path) for _ in range(processes)]
@@ -83,7 +76,7 @@ def test_figures_know_nothing_of_processes_nor_of_the_order_of_scans(build, sets
         assert values == pytest.approx(expected, rel=1e-10, abs=1e-13)
 
 
-def test_an_empty_scan_leaves_the_figures_of_the_others_and_a_word(build, sets):
+def test_an_empty_scan_is_left_out_with_a_remark(build, sets):
     expected = give(build(), sets).compute()
     with_empty = dict(sets)
     more = torch.cat([sets["generated"].images, torch.zeros(2, 2, 8, 32)])
@@ -98,7 +91,7 @@ def test_an_empty_scan_leaves_the_figures_of_the_others_and_a_word(build, sets):
 
 
 @pytest.mark.parametrize("case", ["all empty", "one alone", "none"])
-def test_a_figure_that_does_not_exist_comes_with_a_word(build, sets, case):
+def test_a_figure_that_does_not_exist_comes_with_a_remark(build, sets, case):
     few = {"all empty": 0 * sets["generated"].images, "one alone": sets["generated"].images[:1]}
     chosen = {"real": sets["real"]}
     if case != "none":
@@ -123,7 +116,7 @@ def test_equal_sets_have_the_figures_that_the_class_states(build, sets):
 
 
 @pytest.mark.parametrize("keep", [False, True])
-def test_the_real_set_is_taken_from_its_statistics(build, sets, keep):
+def test_statistics_of_the_real_set_replace_its_scans(build, sets, keep):
     whole = give(build(keep=keep), sets)
     kept = build(keep=keep)
     give(kept, {"real": sets["real"]})
@@ -151,7 +144,7 @@ def test_reset_copies_and_pickles(build, sets):
     assert give(metric, sets).compute() == expected
 
 
-def test_rows_given_under_one_number_are_not_passed_over(build, sets):
+def test_rows_given_twice_under_one_number_are_refused(build, sets):
     metric = build(keep=True)
     for side, scans in sets.items():
         for _ in range(2):
@@ -163,7 +156,7 @@ def test_rows_given_under_one_number_are_not_passed_over(build, sets):
         metric.compute()
 
 
-def test_in_a_collection_every_metric_has_its_own_say(summary, sets):
+def test_in_a_collection_every_metric_has_its_own_figures(summary, sets):
     names = [*one_of_each_class(), "frd", "manifold_rangenet53"]
     collection = MetricCollection({name: METRICS[name]() for name in names})
     assert collection(sets["real"], real=True) == {}  # a batch has no distance of its own
@@ -188,7 +181,7 @@ def test_a_network_runs_once_for_all_metrics_of_it(summary, sets, monkeypatch):
     assert [network.name for network in ran] == ["embedded", "rangenet21"]
 
 
-def test_features_of_a_network_that_is_gone_are_not_those_of_the_next(summary, sets):
+def test_features_of_a_deleted_network_are_not_taken_for_those_of_another(summary, sets):
     class Numbered(type(summary)):
         weights = "random"
 

@@ -62,14 +62,14 @@ class LostBetween(GaussianFlow):
         return v if len(x) == 1 else torch.full_like(v, math.nan)
 
 
-def test_a_frame_that_is_not_solved_is_said_to_be(tmp_path, caplog):
+def test_a_frame_that_is_not_solved_is_reported(tmp_path, caplog):
     paths = [tmp_path / "one.npy", tmp_path / "two.npy"]
     for path, image in zip(paths, scans(2).numpy(), strict=True):
         np.save(path, image)
     checkpoint = flow(LostBetween())
     page = interpolation(checkpoint, real_scans(checkpoint, paths), 4, tmp_path / "o", Sampler("rk4", 4), batch_size=2)
     assert [row["converged"] for row in page.rows] == [True, False, False, True]
-    assert "not solved, and no scans of this flow: 1, 2;" in caplog.text
+    assert "not solved, so no scans of this flow: 1, 2;" in caplog.text
     assert "| no |" in page.text[2]
 
 
@@ -82,7 +82,7 @@ def test_an_end_without_its_noise_is_refused(tmp_path):
         interpolate_scans(flow(), bad.flip(0), 3)
 
 
-def test_a_scan_that_is_not_solved_is_said_to_be(tmp_path, capsys):
+def test_a_scan_that_is_not_solved_is_reported(tmp_path, capsys):
     images = scans(2)
     images[0, 0, 0, 0] = torch.nan
     rows = errors_of(flow(), invert(flow(), images), ["bad", "good"], images)
@@ -100,7 +100,7 @@ def test_inversion_refuses_before_it_writes(tmp_path):
     assert not (tmp_path / "o").exists()
 
 
-def test_a_range_image_is_held_to_the_sensor_s_limits(tmp_path):
+def test_a_range_image_is_limited_to_the_range_of_the_sensor(tmp_path):
     image = np.array([[1.0, 1.45, 40, 80, 81, np.inf, np.nan, -3], [2, 0.5, -1, 1, 1, 1, 1, 1]], np.float32)
     sensor = SENSORS["hdl64e"].resized(2, 4)
     np.save(tmp_path / "image.npy", image.reshape(2, 2, 4))

@@ -136,9 +136,9 @@ def start(cwd: Path, arguments: Sequence[str], **variables: str) -> subprocess.P
     )  # fmt: skip
 
 
-def hold_at(step: int, file: Path) -> list[str]:
-    """Options by which a run waits at a step until `let_go(file)`, when it has written the file."""
-    return [f"--plugin={HOLDING}", f"+callbacks.hold={{file: {file}, step: {step}}}"]
+def hold_at(step: int, file: Path, seconds: float = 60.0) -> list[str]:
+    """Options by which a run writes a file at a step and waits to be told to stop, if not `let_go(file)` before."""
+    return [f"--plugin={HOLDING}", f"+callbacks.hold={{file: {file}, step: {step}, seconds: {seconds}}}"]
 
 
 def let_go(file: Path) -> None:

@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from r2flow.chain import Link, is_finished, links_of, override
+from r2flow.chain import Link, is_finished, links_of
 from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
+from r2flow.composing import override
 from r2flow.errors import InputError
 from tests.training.conftest import (
     TINY,

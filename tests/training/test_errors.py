@@ -1,5 +1,7 @@
 """What a user gets wrong: one line that names it, exit code 2, nothing written."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -78,3 +80,12 @@ def test_one_bad_scan_stops_the_run_or_is_left_out(train: Run, scans: Path, tmp_
     done = train(f"data.root={folder}", "name=lenient", "data.on_bad_scan=skip", "trainer.max_steps=2")
     assert "left out" in done.stdout + done.stderr
     assert (tmp_path / "runs" / "lenient" / "checkpoints").exists()
+
+
+@pytest.mark.parametrize("mistake", ["bakcbone.base_channels=8", "backbone=hditt", "chain=[", "+experiment=reflo"])
+def test_a_misspelt_config_is_answered_without_loading_torch(tmp_path: Path, mistake: str):
+    script = f"import sys; from r2flow.launch import main; print(main([{mistake!r}], []), 'torch' in sys.modules)"
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+    assert done.stdout == "2 False\n", done.stderr
+    assert len(done.stderr.splitlines()) == 1

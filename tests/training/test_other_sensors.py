@@ -41,14 +41,16 @@ def test_other_sensors_train_one_step_of_a_whole_network(shared, tmp_path, folde
     one_step(tmp_path, *network, f"data.root={root}", *CASES[folder], "trainer.fast_dev_run=true")
 
 
-MINE = Sensor("mine", (3.0, 1.0, 0.0, -1.0, -2.5, -6.0, -12.0, -24.0), columns=64, min_range=2.0, firing=(7, *range(7)))
+MINE = Sensor(
+    "sparse", (3.0, 1.0, 0.0, -1.0, -2.5, -6.0, -12.0, -24.0), columns=64, min_range=2.0, firing=(7, *range(7))
+)
 
 
 def test_a_sensor_of_one_s_own_trains_and_travels_in_the_checkpoint(scans: Path, tmp_path: Path):
-    write_sensor(MINE, tmp_path / "conf" / "sensor" / "mine.yaml", "a sensor of a test")
+    write_sensor(MINE, tmp_path / "conf" / "sensor" / "sparse.yaml", "a sensor of a test")
     one_step(
         tmp_path, "--config-dir", str(tmp_path / "conf"), *SMALL, f"data.root={scans}",
-        "sensor=mine", "name=own", "trainer.max_steps=1", "sampler.steps=1",
+        "sensor=sparse", "name=own", "trainer.max_steps=1", "sampler.steps=1",
     )  # fmt: skip
     shutil.rmtree(tmp_path / "conf")
     assert load_checkpoint(tmp_path / "runs" / "own").sensor == MINE

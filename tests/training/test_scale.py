@@ -20,7 +20,7 @@ import torch
 from r2flow.callbacks.stopping import slurm_job
 from r2flow.checkpoints import checkpoints_of, read_checkpoint
 from r2flow.signals import LATER
-from tests.training.conftest import ROOT, TINY, Run, in_process
+from tests.training.conftest import ROOT, TINY, Run, hold_at, in_process, start, tiny, wait_for
 from tests.training.test_train import assert_bit_equal, weights
 
 STEPS = 20
@@ -202,6 +202,20 @@ def test_two_tasks_leave_together_when_one_is_told_to(one: Path, scans: Path, tm
     for a, b in zip(weights(one / "runs" / "one"), weights(run), strict=True):
         for name in a:
             torch.testing.assert_close(a[name], b[name], rtol=0, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_two_processes_of_which_one_is_told_to_stop_leave_together(scans: Path, tmp_path: Path):
+    held = tmp_path / "held"
+    options = ["name=stopped", *EXACT, *TWO, "callbacks.requeue.every=2", *hold_at(5, held, seconds=5.0)]
+    process = start(tmp_path, tiny(scans, *options))
+    wait_for(held, process)
+    process.send_signal(signal.SIGTERM)  # to the launching process alone
+    said, _ = process.communicate(timeout=100)
+    assert process.returncode == 143, said
+    assert said.count("stopped at step 6; the same command goes on from the last checkpoint") == 1
+    assert "Traceback" not in said
+    assert read_checkpoint(checkpoints_of(tmp_path / "runs" / "stopped")[0])["global_step"] == 6
 
 
 @pytest.mark.parametrize(

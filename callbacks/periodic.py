@@ -1,0 +1,41 @@
+"""What is looked at from time to time while a generator is trained."""
+
+import lightning as L
+import torch
+
+from r2flow.errors import InputError
+
+from .ema import averaged_weights
+
+
+class Periodic(L.Callback):
+    """Calls `act` every `every` steps and at the end, on the first process, with averaged weights in eval mode.
+
+    Args:
+        every: Steps between two calls; 0 for none.
+
+    Raises:
+        InputError: `every` is below 0.
+    """
+
+    def __init__(self, every: int) -> None:
+        if every < 0:
+            raise InputError(f"callbacks.{type(self).__name__} needs every of at least 0, found {every}.")
+        self.every, self._last = every, 0
+
+    def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """What a subclass does."""
+        raise NotImplementedError
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: object, batch: object, batch_idx: int
+    ) -> None:
+        step = trainer.global_step
+        due = self.every > 0 and step > 0 and (step % self.every == 0 or step == trainer.max_steps)
+        # Under accumulation a step lasts several batches: the first one that ends it acts.
+        if due and trainer.is_global_zero and step != self._last:
+            self._last, training = step, pl_module.training
+            with averaged_weights(trainer, pl_module), torch.no_grad():
+                pl_module.eval()
+                self.act(trainer, pl_module)
+                pl_module.train(training)
