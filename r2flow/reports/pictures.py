@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap, hsv_to_rgb, to_hex, to_rgb
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -108,8 +110,6 @@ def draw_reflectance(axes: Any, image: np.ndarray, label: bool = True) -> None:
 
 def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
     """Semantic ids, (H, W), named where SemanticKITTI knows all of them, else by number; dropped rays black."""
-    from matplotlib.colors import to_rgb
-
     returned = image[0] > 0
     found, counts = np.unique(labels[returned], return_counts=True)
     named = all(int(one) in CLASSES for one in found)
@@ -129,8 +129,6 @@ def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
 
 def _numbered_colour(number: int) -> str:
     """A colour for a number that has no name; by the golden ratio, neighbours lie far apart in hue."""
-    from matplotlib.colors import hsv_to_rgb, to_hex
-
     red, green, blue = hsv_to_rgb((number * 0.618034 % 1, 0.45 + 0.4 * (number % 3 > 0), 1 - 0.25 * (number % 2)))
     return to_hex((red, green, blue))
 
@@ -188,16 +186,12 @@ def dark_figure(width: float, height: float) -> Figure:
 
 
 def _colours(name: str) -> Any:
-    from matplotlib import colormaps
-
     return colormaps[name].with_extremes(bad="black")
 
 
 @cache
 def _ranges() -> Any:
     """turbo from warm (near) to cold (far), without its dark ends, which would look like dropped rays."""
-    from matplotlib.colors import ListedColormap
-
     return ListedColormap(_colours("turbo_r")(np.linspace(0.1, 0.93, 256))).with_extremes(bad="black")
 
 
