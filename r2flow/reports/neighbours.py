@@ -40,19 +40,45 @@ class Representation:
                 yield self.describe(Scans(images.to(self.device), scans.sensor)).float().cpu()
 
 
-@dataclass(frozen=True)
 class Nearest:
-    """The nearest training scan of each scan of a set; scans without a return have none and are not among them.
+    """The nearest training scan of each scan of a set, of those that were compared so far.
 
     Attributes:
-        numbers: The scans that have a return, (N,).
-        distances, neighbours: From each to the nearest training scan, (N,) float64, and its number, (N,).
+        scans: The set.
+        numbers: Its scans that have a return, (N,); the others have no neighbour.
+        distances, neighbours: From each of these to its nearest training scan, (N,) float64, and its number, (N,).
     """
 
-    scans: ScanSet
-    numbers: np.ndarray
-    distances: np.ndarray
-    neighbours: np.ndarray
+    def __init__(self, scans: ScanSet, representation: Representation, work: Work) -> None:
+        rows = []
+        with work.bar("describing", len(scans)) as advance:
+            for batch in representation.batches(scans, range(len(scans)), work):
+                rows.append(batch)
+                advance(len(batch))
+        x = torch.cat(rows)
+        kept = x.isfinite().all(1)
+        if not kept.any():
+            raise InputError(
+                f"none of the {len(scans)} scans of {scans.label} has a return: there is nothing to compare."
+            )
+        self.scans, self.numbers, self.x = scans, np.flatnonzero(kept.numpy()), x[kept]
+        self.squared = torch.full((len(self.x),), torch.inf)
+        self.distances = np.full(len(self.x), np.inf)
+        self.neighbours = np.zeros(len(self.x), dtype=np.int64)
+
+    def approach(self, y: Tensor, first: int, leave_out_itself: bool) -> None:
+        """Compare with training scans `first`, `first + 1`, ..., described by y (M, D); NaN is never nearest."""
+        d = self.x.square().sum(1)[:, None] + y.square().sum(1) - 2 * self.x @ y.T
+        d = d.nan_to_num(torch.inf)
+        if leave_out_itself:
+            d[torch.from_numpy(self.numbers)[:, None] == torch.arange(first, first + len(y))] = torch.inf
+        squared, place = d.min(1)
+        nearer = squared < self.squared
+        self.squared[nearer] = squared[nearer]
+        self.neighbours[nearer] = place[nearer] + first
+        # One product is exact enough to find the nearest, but its rounding would hide a copy.
+        difference = self.x[nearer].double() - y[place[nearer]].double()
+        self.distances[nearer] = torch.linalg.vector_norm(difference, dim=1)
 
     def order(self) -> np.ndarray:
         """Places in the arrays, the nearest first."""
@@ -114,57 +140,15 @@ def find_neighbours(
     real = held if held is not None else training.part(chosen, "training scans, each without itself")
     if len(training) < (2 if held is None else 1):
         raise InputError(f"{training.label} holds {len(training)} training scans; needs at least two, or --real HELD.")
-    described = [_describe(s, representation, work) for s in (generated, real)]
-    best = [(torch.full((len(n),), torch.inf), torch.zeros(len(n), dtype=torch.int64)) for n, _ in described]
+    judged, usual = (Nearest(s, representation, work) for s in (generated, real))
     first = 0
     with work.bar("reading training scans", len(training)) as advance:
         for there in representation.batches(training, range(len(training)), work):
-            for (queries, x), (least, where), s in zip(described, best, (generated, real), strict=True):
-                d = _square_distances(x, there)
-                if s is real and held is None:  # not with itself
-                    d[torch.from_numpy(queries)[:, None] == torch.arange(first, first + len(there))] = torch.inf
-                found, place = d.min(1)
-                nearer = found < least
-                least[nearer], where[nearer] = found[nearer], place[nearer] + first
+            judged.approach(there, first, leave_out_itself=False)
+            usual.approach(there, first, leave_out_itself=held is None)
             first += len(there)
             advance(len(there))
-    both = [
-        Nearest(s, queries, _exact(x, nearest, training, representation, work), nearest.numpy())
-        for s, (queries, x), (_, nearest) in zip((generated, real), described, best, strict=True)
-    ]
-    return Neighbours(both[0], both[1], training, representation.words, held is not None)
-
-
-def _describe(scans: ScanSet, representation: Representation, work: Work) -> tuple[np.ndarray, Tensor]:
-    """Numbers of the scans that have a return, and their descriptions."""
-    rows = []
-    with work.bar("describing", len(scans)) as advance:
-        for batch in representation.batches(scans, range(len(scans)), work):
-            rows.append(batch)
-            advance(len(batch))
-    x = torch.cat(rows)
-    kept = x.isfinite().all(1)
-    if not kept.any():
-        raise InputError(f"none of the {len(scans)} scans of {scans.label} has a return: there is nothing to compare.")
-    return torch.nonzero(kept)[:, 0].numpy(), x[kept]
-
-
-def _square_distances(x: Tensor, y: Tensor) -> Tensor:
-    """|x - y|^2 by one product, (N, M): exact enough to find the nearest; infinite where y is NaN."""
-    d = x.square().sum(1)[:, None] + y.square().sum(1) - 2 * x @ y.T
-    return d.nan_to_num(torch.inf)
-
-
-def _exact(x: Tensor, nearest: Tensor, training: ScanSet, representation: Representation, work: Work) -> np.ndarray:
-    """|x - y| of each scan and its nearest training scan: the rounding of the product would hide a copy."""
-    wanted, own = nearest.unique(return_inverse=True)
-    d = torch.zeros(len(x), dtype=torch.float64)
-    first = 0
-    for there in representation.batches(training, wanted.tolist(), work):
-        mine = torch.nonzero((own >= first) & (own < first + len(there)))[:, 0]
-        d[mine] = torch.linalg.vector_norm(x[mine].double() - there[own[mine] - first].double(), dim=1)
-        first += len(there)
-    return d.numpy()
+    return Neighbours(judged, usual, training, representation.words, held is not None)
 
 
 def neighbours_page(found: Neighbours, pairs: int, command: str, device: str) -> Page:
