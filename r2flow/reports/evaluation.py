@@ -40,17 +40,16 @@ def heading(metric: str, figure: str) -> tuple[str, float]:
 def rows_of(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
     """A row for each figure."""
     rows = []
-    for one in comparisons:
-        for measured in one.measured:
-            for name, value in measured.figures.items():
-                said, factor = heading(measured.metric, name)
-                low, high = measured.intervals.get(name, (None, None))
-                rows.append({
-                    "comparison": one.name, "metric": measured.metric, "figure": name, "value": value, "low": low,
-                    "high": high, "printed_as": said, "printed": value * factor,
-                    "real": measured.protocol["sizes"]["real"], "generated": measured.protocol["sizes"]["generated"],
-                    "remarks": "; ".join(measured.remarks),
-                })  # fmt: skip
+    for comparison, measured in ((one, metric) for one in comparisons for metric in one.measured):
+        for name, value in measured.figures.items():
+            said, factor = heading(measured.metric, name)
+            low, high = measured.intervals.get(name, (None, None))
+            sizes = measured.protocol["sizes"]
+            rows.append({
+                "comparison": comparison.name, "metric": measured.metric, "figure": name, "value": value, "low": low,
+                "high": high, "printed_as": said, "printed": value * factor, "real": sizes["real"],
+                "generated": sizes["generated"], "remarks": "; ".join(measured.remarks),
+            })  # fmt: skip
     return rows
 
 
@@ -108,19 +107,13 @@ def _table(comparisons: Sequence[Comparison], between: str = " ") -> tuple[list[
     """
     columns = ["", *(f"{one.name}{between}({len(one.generated)} : {len(one.real)})" for one in comparisons)]
     cells: dict[str, dict[str, str]] = {}
-    for one in comparisons:
-        for measured in one.measured:
-            for name, value in measured.figures.items():
-                said, factor = heading(measured.metric, name)
-                cells.setdefault(said, {})[one.name] = _cell(value, measured.intervals.get(name), factor, between)
+    for row in rows_of(comparisons):
+        factor = heading(row["metric"], row["figure"])[1]
+        text = "none" if math.isnan(row["value"]) else f"{row['printed']:#.4g}"
+        if row["low"] is not None and text != "none":
+            text += f"{between}[{row['low'] * factor:#.3g}, {row['high'] * factor:#.3g}]"
+        cells.setdefault(row["printed_as"], {})[row["comparison"]] = text
     return columns, [[said, *(cells[said].get(one.name, "") for one in comparisons)] for said in cells]
-
-
-def _cell(value: float, interval: tuple[float, float] | None, factor: float, between: str) -> str:
-    if math.isnan(value):
-        return "none"
-    low_high = "" if interval is None else f"{between}[{interval[0] * factor:#.3g}, {interval[1] * factor:#.3g}]"
-    return f"{value * factor:#.4g}{low_high}"
 
 
 def _remarks(comparisons: Sequence[Comparison]) -> list[str]:

@@ -32,14 +32,12 @@ FRAMES = 6  # of figure 3, as in the paper: both ends' round trips and four betw
 
 @dataclass(frozen=True)
 class Budget:
-    """How much is measured.
+    """How much is measured: `num` scans of each flow and number of steps, intervals from `bootstrap` resamplings.
 
     Attributes:
-        num: Scans of each flow and number of steps.
         steps: Euler steps of the flows that are not distilled.
         curved: Scenes whose paths are followed for figure 8; 0 leaves it out.
         repeats: Timed evaluations of each network for table II; 0 leaves latency out.
-        bootstrap: Resamplings for intervals.
         tolerance: Of dopri5 in the inversion of figure 3; None leaves it out.
     """
 
