@@ -22,10 +22,9 @@ import torch
 
 from r2flow.data.layouts import Drive
 from r2flow.data.loader import FlowDataset
-from r2flow.data.manifest import Manifest, Recipe, ShardEntry, checksum, describe_sensor, shard_name, write_manifest
 from r2flow.data.opening import find_drives, open_prepared
-from r2flow.data.plans import plan_files
-from r2flow.data.preparing import Preparation
+from r2flow.data.prepared import Manifest, Recipe, ShardEntry, checksum, describe_sensor, shard_name, write_manifest
+from r2flow.data.preparing import Preparation, plan_files
 from r2flow.data.quantise import RangeCodes
 from r2flow.data.sources import read_scan, spread
 from r2flow.lidar.encoding import Encoding
