@@ -12,7 +12,7 @@ from r2flow.cli.options import ConventionOption, ProjectionOption, SizeOption, b
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
-    from r2flow.data.manifest import Manifest
+    from r2flow.data.prepared import Manifest
     from r2flow.data.preparing import Preparation
 
 
@@ -74,8 +74,7 @@ def prepare(
     elif num is not None:
         raise InputError("--num is for simulated scans; choose files by --split and --drives.")
     from r2flow.data.opening import SOURCES
-    from r2flow.data.plans import plan_files, plan_simulated
-    from r2flow.data.preparing import Preparation
+    from r2flow.data.preparing import Preparation, plan_files, plan_simulated
 
     usual = SOURCES[layout]
     chosen = build_sized(sensor or usual.sensor, size)
@@ -112,7 +111,7 @@ def _cores() -> int:
 
 
 def _summary(folder: Path, manifest: "Manifest") -> str:
-    shards = manifest.shards or ()
+    shards = manifest.shards
     scans, size = sum(shard.scans for shard in shards), sum(shard.bytes for shard in shards)
     said = f"range within {max(shard.range_error for shard in shards) * 1e3:.2f} mm"
     levels, error = manifest.recipe.levels, max(shard.reflectance_error for shard in shards)
@@ -127,11 +126,10 @@ def _summary(folder: Path, manifest: "Manifest") -> str:
 
 
 def _check(folder: Path) -> None:
-    from r2flow.data.manifest import read_manifest
-    from r2flow.data.prepared import check_prepared
+    from r2flow.data.prepared import check_prepared, read_manifest
     from r2flow.progress import Bar
 
-    shards = len(read_manifest(folder).shards or ())
+    shards = len(read_manifest(folder).shards)
     with Bar("checking", shards, "shards") as advance:
         damaged = check_prepared(folder, advance)
     for path, reason in damaged.items():

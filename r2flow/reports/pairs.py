@@ -42,9 +42,8 @@ def make_and_tell(
 
         made = make_pairs(store, generator, num, rank, ranks, progress)
     if made.pairs:
-        share = made.writing / max(made.seconds, 1e-9)
         unusable = f", {made.unusable} did not converge and are left out" if made.unusable else ""
-        print(f"{who}{made.pairs} pairs, {rate(made)}, {share:.1%} of the time for writing{unusable}", flush=True)
+        print(f"{who}{made.pairs} pairs, {rate(made)}{unusable}", flush=True)
     return made
 
 

@@ -19,11 +19,9 @@ import torch
 from r2flow.data import preparing
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive
-from r2flow.data.manifest import read_manifest
 from r2flow.data.opening import find_drives, open_prepared
-from r2flow.data.plans import Plan, plan_files, plan_simulated
-from r2flow.data.prepared import PreparedScans, check_prepared
-from r2flow.data.preparing import Preparation
+from r2flow.data.prepared import PreparedScans, check_prepared, read_manifest
+from r2flow.data.preparing import Plan, Preparation, plan_files, plan_simulated
 from r2flow.data.quantise import RangeCodes, ReflectanceCodes, find_levels
 from r2flow.data.sources import Reading, ScanFiles, SimulatedScans
 from r2flow.data.store import MANIFEST
@@ -84,7 +82,7 @@ def test_ranges_are_within_a_millimetre_below_65_m(sensor: Sensor, far: float | 
     codes = RangeCodes(near, far)
     r = np.concatenate([np.random.default_rng(0).uniform(near, far, 50_000), [near, 65.0, far]]).astype(np.float32)
     r = r.clip(codes.near, codes.far)
-    decoded = codes.metres[codes.encode(r)]
+    decoded = codes.values[codes.encode(r)]
     error = np.abs(decoded.astype(np.float64) - r)
     assert error[r < 65].max() <= MILLIMETRE
     # Beyond, at worst half of what is left of the codes: (500 - 65) m over some 31,000 of them.
@@ -95,10 +93,10 @@ def test_ranges_are_within_a_millimetre_below_65_m(sensor: Sensor, far: float | 
 
 def test_code_0_is_no_return_and_nothing_else_is(sensor: Sensor):
     codes = RangeCodes(sensor.min_range, sensor.max_range)
-    assert codes.metres[0] == 0
-    assert codes.metres[1:].min() == np.float32(sensor.min_range)
+    assert codes.values[0] == 0
+    assert codes.values[1:].min() == np.float32(sensor.min_range)
     assert codes.encode(np.array([0, sensor.min_range, sensor.max_range], np.float32)).tolist() == [0, 1, 65535]
-    assert (np.diff(codes.metres[1:]) > 0).all()
+    assert (np.diff(codes.values[1:]) > 0).all()
 
 
 @pytest.mark.parametrize("wrong", [1.0, 81.0, -2.0, np.nan, np.inf])
@@ -224,7 +222,7 @@ def test_encoded_is_the_encoding_of_the_decoded_bit_for_bit_in_every_code(
 ):
     sensor = SENSORS["hdl64e"]
     plan = plan_simulated(1, 0, sensor.resized(2, 4), levels=100)
-    metres = RangeCodes(sensor.min_range, sensor.max_range).metres.reshape(64, 1024)
+    metres = RangeCodes(sensor.min_range, sensor.max_range).values.reshape(64, 1024)
     values = np.random.default_rng(0).permutation(np.arange(65536) % 101).reshape(64, 1024) / np.float32(100)
     image = np.stack([metres, np.where(metres > 0, values, 0).astype(np.float32)])
     recipe = replace(plan.recipe, sensor={**plan.recipe.sensor, "elevations": list(sensor.elevations), "columns": 1024})
@@ -302,7 +300,7 @@ def test_splits_and_drives_are_those_of_the_data_set(kitti_360: Path, tmp_path: 
         assert prepared.names == raw.names
         for index in (0, len(raw) - 1):
             assert np.abs(prepared[index][0] - raw[index][0]).max() <= MILLIMETRE
-    with pytest.raises(InputError, match=r"no split named 'best' in prepared kitti_360 scans; known: train, test"):
+    with pytest.raises(InputError, match=r"no split named 'best'; known: train, test"):
         open_prepared(tmp_path / "out", SMALL, split="best")
     with pytest.raises(InputError, match="no drive named '7'"):
         open_prepared(tmp_path / "out", SMALL, drives=[7])
@@ -420,6 +418,19 @@ class Slow:
     def __getitem__(self, index: int) -> np.ndarray:
         time.sleep(self.seconds)
         return self.source[index]
+
+
+class Stopped(Slow):
+    """The same scans, stopped by the user before one of them."""
+
+    def __init__(self, source, last: int) -> None:
+        super().__init__(source, 0)
+        self.last = last
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        if index == self.last:
+            raise KeyboardInterrupt
+        return super().__getitem__(index)
 
 
 def in_process(folder: Path, plan: Plan, seconds: float = 0.0, **options) -> int:
@@ -727,11 +738,8 @@ def test_a_damaged_shard_whose_files_have_changed_is_not_mended(tmp_path: Path):
 def test_a_damaged_note_of_an_unfinished_preparation_is_no_harm(clouds: Path, tmp_path: Path):
     plan = plan_of(clouds)
     one = files(make(tmp_path / "one", plan))
-    work = Preparation(tmp_path / "two", plan)
-    work.begin()
-    claims = preparing._Claims(work, [0, 1, 2])
-    work._make_claimed(claims, "error", 0, lambda scans: None)
-    claims.release()
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "two", replace(plan, source=Stopped(plan.source, 9)))
     (tmp_path / "two" / "making" / "000000.json").write_text('{"recipe": 1')
     _cut(tmp_path / "two" / "scans-000001.safetensors")
     assert Preparation(tmp_path / "two", plan).begin() == [0, 1, 3]
@@ -740,10 +748,8 @@ def test_a_damaged_note_of_an_unfinished_preparation_is_no_harm(clouds: Path, tm
 
 def test_shards_of_another_recipe_are_not_taken_for_these(clouds: Path, tmp_path: Path):
     one = files(make(tmp_path / "one", plan_of(clouds)))
-    other = Preparation(tmp_path / "two", plan_of(clouds, convention="reference"))
-    other.begin()
-    claims = preparing._Claims(other, [0, 1])
-    other._make_claimed(claims, "error", 0, lambda scans: None)
-    claims.release()
+    other = plan_of(clouds, convention="reference")
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "two", replace(other, source=Stopped(other.source, 6)))
     (tmp_path / "two" / MANIFEST).unlink()
     assert files(make(tmp_path / "two", plan_of(clouds))) == one
