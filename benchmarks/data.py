@@ -22,10 +22,9 @@ import torch
 
 from r2flow.data.layouts import Drive
 from r2flow.data.loader import FlowDataset
-from r2flow.data.manifest import Manifest, Recipe, ShardEntry, checksum, describe_sensor, shard_name, write_manifest
 from r2flow.data.opening import find_drives, open_prepared
-from r2flow.data.plans import plan_files
-from r2flow.data.preparing import Preparation
+from r2flow.data.prepared import Manifest, ScanRecipe, ShardEntry, checksum, describe_sensor, shard_name, write_manifest
+from r2flow.data.preparing import Preparation, plan_files
 from r2flow.data.quantise import RangeCodes
 from r2flow.data.sources import read_scan, spread
 from r2flow.lidar.encoding import Encoding
@@ -147,7 +146,7 @@ def write_index(folder: Path) -> int:
         for name in [f"2013_05_28_drive_{drive:04d}_sync"]
     )
     names = [name for drive in drives for name in drive.scans]
-    recipe = Recipe(
+    recipe = ScanRecipe(
         "0", "kitti_360", len(names), checksum(names), describe_sensor(HDL64E), "spherical", "centre", 1.0, 256,
         RangeCodes(HDL64E.min_range, HDL64E.max_range).describe(), 512,
     )  # fmt: skip

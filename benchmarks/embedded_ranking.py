@@ -28,6 +28,7 @@ import torch
 from matplotlib.figure import Figure
 from rich.progress import track
 from torch import Tensor
+from train_extractor import CLASS_OF_LABEL, Settings, judge
 
 from r2flow.checkpoints import checkpoints_of, load_checkpoint, step_of
 from r2flow.data.sources import Reading, SimulatedScans
@@ -36,7 +37,6 @@ from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.metrics.extractors import load_extractor
 from r2flow.metrics.extractors.embedded import Embedded
-from r2flow.metrics.extractors.training import CLASS_OF_LABEL, Settings, judge
 from r2flow.metrics.fidelity import controls
 from r2flow.metrics.frechet import frechet_distance
 from r2flow.metrics.scans import Scans

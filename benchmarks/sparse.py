@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from r2flow.errors import InputError
-from r2flow.metrics.extractors import random_extractor
+from r2flow.metrics.extractors import extractor_class
 from r2flow.metrics.extractors.voxels import voxelise
 
 NETWORKS = ("minkowskinet", "spvcnn")
@@ -66,7 +66,7 @@ def peak() -> float:
 def measure(name: str, scans: Path | None, num: int, repeats: int, threads: int) -> None:
     """Run one network and print its line of the table."""
     torch.set_num_threads(threads)
-    network = random_extractor(name)
+    network = extractor_class(name).random()
     coords, features = voxels(scans, num)
     coords = torch.nn.functional.pad(coords, (1, 0))
     before, walls, works = peak(), [], []

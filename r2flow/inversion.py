@@ -9,7 +9,6 @@ from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
-from r2flow.flow.solvers import Solution
 from r2flow.generators import Sampler, as_flow
 from r2flow.generators.base import Progress
 
@@ -18,10 +17,10 @@ TIGHT = Sampler("dopri5", tolerance=1e-5)
 
 @dataclass(frozen=True)
 class Inversion:
-    """Scans, their noise, and what becomes of it on the way forward again.
+    """Scans, their noise, and what becomes of it on the way forward again; all on the CPU.
 
     Attributes:
-        x_1: The scans in model space, (B, C, H, W), on the CPU as all of it.
+        x_1: The scans in model space, (B, C, H, W).
         x_0: Their noise.
         again: x_1 once more, from x_0.
         evaluations: Network evaluations of both ways, (B,).
@@ -46,8 +45,7 @@ def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, pro
         progress: Called after every network evaluation.
 
     Raises:
-        InputError: a generator without an ODE, images of another shape or without the model's reflectance; a solver's
-            own complaints.
+        InputError: a generator without an ODE, images of another shape, or a solver that cannot be used.
     """
     encoding, flow = checkpoint.encoding, as_flow(checkpoint.generator, "inversion")
     if images.ndim != 4 or images.shape[2:] != checkpoint.sensor.shape:
@@ -61,31 +59,25 @@ def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, pro
     return Inversion(x_1, x_0, again.x.cpu(), evaluations, converged)
 
 
-@dataclass(frozen=True)
-class RoundTrip:
+def round_trip(checkpoint: Checkpoint, inversion: Inversion) -> dict[str, Tensor]:
     """How far scans are from themselves after inversion and generation, each (B,).
 
-    Attributes:
-        rms: Root mean square in model space, whose values span [-1, 1].
-        median_m: Median |r' - r| in metres over the rays that return before and after.
-        rms_m: Its root mean square.
-        dropped: Share of all rays that return before and not after, or the other way round.
-        noise_std: Standard deviation of x_0; far from 1, the scan is unlike what the flow was trained on.
+    Returns:
+        `rms` in model space, whose values span [-1, 1]; `median_m`, `rms_m` and `dropped` of `metres_apart`;
+        `noise_std`, the standard deviation of x_0: far from 1, the scan is unlike what the flow was trained on. NaN for
+        a scan that is not finite.
     """
-
-    rms: Tensor
-    median_m: Tensor
-    rms_m: Tensor
-    dropped: Tensor
-    noise_std: Tensor
-
-
-def round_trip(checkpoint: Checkpoint, inversion: Inversion) -> RoundTrip:
-    """The errors of an inversion; NaN for a scan that is not finite, or in metres where no ray returns twice."""
-    rms = (inversion.again - inversion.x_1).double().square().flatten(1).mean(1).sqrt()
+    apart = rms(inversion.again - inversion.x_1)
     median_m, rms_m, dropped = metres_apart(*(checkpoint.encoding.decode(x) for x in (inversion.x_1, inversion.again)))
-    std = inversion.x_0.double().flatten(1).std(1)
-    return RoundTrip(rms, median_m, rms_m, dropped.masked_fill(rms.isnan(), math.nan), std)
+    return {
+        "rms": apart, "median_m": median_m, "rms_m": rms_m, "dropped": dropped.masked_fill(apart.isnan(), math.nan),
+        "noise_std": inversion.x_0.double().flatten(1).std(1),
+    }  # fmt: skip
+
+
+def rms(x: Tensor) -> Tensor:
+    """Root mean square over each scan's elements, (B, ...) -> (B,), float64."""
+    return x.double().square().flatten(1).mean(1).sqrt()
 
 
 def metres_apart(image: Tensor, other: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -105,12 +97,11 @@ def metres_apart(image: Tensor, other: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def slerp(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
     """Spherical linear interpolation, (sin((1 - w) a) x + sin(w a) y) / sin a, a the angle of x and y.
 
-    Shoemake 1985, "Animating rotation with quaternion curves". Unlike the straight mean, which is shorter, it keeps
-    the length of noise: two independent draws are nearly orthogonal. Where the angle vanishes it is the straight mean.
+    Shoemake 1985, "Animating rotation with quaternion curves". Unlike the straight mean it keeps the length of noise:
+    two independent draws are nearly orthogonal. Where the angle vanishes it is the straight mean.
 
     Args:
-        x: One end, (...).
-        y: The other end, (...).
+        x, y: The ends, (...).
         weights: w of each point, (N,); 0 gives x and 1 gives y.
 
     Returns:
@@ -144,8 +135,8 @@ class Interpolation:
         ends: The two inverted.
         weights: Where each frame lies, (N,), from 0 to 1.
         images: Range in metres and reflectance, (N, 2 or 1, H, W); the first and the last are the ends' round trips.
-        evaluations: Network evaluations of each frame, (N,); the ends' are those of their inversion.
-        converged: Whether each is solved, (N,) bool; what is not is no scan of the flow. The ends always are.
+        evaluations: Network evaluations of each frame, (N,); the ends' are those of both ways.
+        converged: Whether each is solved, (N,) bool; what is not is no scan of the flow.
     """
 
     ends: Inversion
@@ -178,6 +169,7 @@ def interpolate_scans(
     """
     if frames < 2 or batch_size < 1:
         raise InputError(f"needs at least two frames and a batch of at least one; found {frames} and {batch_size}.")
+    flow = as_flow(checkpoint.generator, "interpolation")
     arrived = arrived or (lambda done: None)
     inverted = []
     for scan, which in zip(pair, ("first", "last"), strict=True):
@@ -190,12 +182,14 @@ def interpolate_scans(
         arrived(len(inverted))
     ends = Inversion(*(torch.cat([getattr(end, name) for end in inverted]) for name in Inversion.__annotations__))
     weights = torch.linspace(0, 1, frames, dtype=torch.float64)
-    found: list[Solution] = []
-    for x_0 in slerp(ends.x_0[0], ends.x_0[1], weights[1:-1]).split(batch_size):
-        if len(x_0):
-            found.append(as_flow(checkpoint.generator, "interpolation").solve(x_0, sampler=sampler, progress=progress))
-            arrived(2 + sum(len(end.x) for end in found))
-    x_1 = torch.cat([ends.again[:1], *(end.x.cpu() for end in found), ends.again[1:]])
-    evaluations = torch.cat([ends.evaluations[:1], *(end.evaluations for end in found), ends.evaluations[1:]])
-    converged = torch.cat([ends.converged[:1], *(end.converged for end in found), ends.converged[1:]])
-    return Interpolation(ends, weights, checkpoint.encoding.decode(x_1), evaluations, converged)
+    noise = slerp(ends.x_0[0], ends.x_0[1], weights[1:-1])
+    x_1, evaluations, converged = [ends.again[:1]], [ends.evaluations[:1]], [ends.converged[:1]]
+    for first in range(0, len(noise), batch_size):
+        found = flow.solve(noise[first : first + batch_size], sampler=sampler, progress=progress)
+        x_1.append(found.x.cpu())
+        evaluations.append(found.evaluations)
+        converged.append(found.converged)
+        arrived(2 + first + len(found.x))
+    images = checkpoint.encoding.decode(torch.cat([*x_1, ends.again[1:]]))
+    counted = torch.cat([*evaluations, ends.evaluations[1:]])
+    return Interpolation(ends, weights, images, counted, torch.cat([*converged, ends.converged[1:]]))

@@ -81,11 +81,7 @@ def sample(
     generator.space.check_channels(channels)
     for first in range(0, num, batch_size):
         numbers = range(first, min(first + batch_size, num))
-        known = (
-            None
-            if condition is None
-            else {name: value[numbers.start : numbers.stop] for name, value in condition.items()}
-        )
+        known = condition and {name: value[first : numbers.stop] for name, value in condition.items()}
         yield draw(generator, numbers, seed, how, known, region, channels, progress)
 
 

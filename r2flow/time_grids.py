@@ -2,7 +2,6 @@
 
 import json
 import logging
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -13,17 +12,18 @@ from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.flow.solvers import GRIDS, SOLVERS, TORCHDIFFEQ, FixedStep, calibrated_grid, check_method
 from r2flow.generators import as_flow
+from r2flow.generators.base import Progress
 from r2flow.noise import Draws
 
 log = logging.getLogger(__name__)
 
 
 def calibrate(
-    checkpoint: Checkpoint, steps: int, method: str = "euler", num: int = 4, progress: Callable[[], None] | None = None
+    checkpoint: Checkpoint, steps: int, method: str = "euler", num: int = 4, progress: Progress = None
 ) -> Tensor:
     """Times that suit a flow better than equal steps (`r2flow.flow.solvers.calibrated_grid`), (steps + 1,) float64.
 
-    It is found on other scans than those of `r2flow.sampling.sample`.
+    They are found on other scans than those of `r2flow.sampling.sample`.
 
     Args:
         method: One of ours of fixed steps; its order decides the weight of a step.
@@ -31,11 +31,9 @@ def calibrate(
         progress: Called after every evaluation (`evaluations_of_calibration`).
 
     Raises:
-        InputError: another method, or fewer than one step or scan.
+        InputError: another method, or fewer than one step.
     """
     solver = check_grid_solver(method)
-    if num < 1:
-        raise InputError(f"a time grid is found on at least one scan, found {num}.")
     flow = as_flow(checkpoint.generator, "a time grid")
     x_0 = Draws(0, range(num), "validation").start(flow.noise_shape).to(flow.device)
 
@@ -69,8 +67,8 @@ def evaluations_of_calibration(steps: int) -> int:
 
 def write_grid(path: str | Path, times: Tensor, checkpoint: Checkpoint, method: str) -> None:
     """Times as JSON, with the flow and the solver that they are for."""
-    content = {"steps": len(times) - 1, "times": times.tolist()}
-    content |= {"method": method, "checkpoint": weights_hash(checkpoint)}
+    content = {"steps": len(times) - 1, "times": times.tolist(), "method": method}
+    content["checkpoint"] = weights_hash(checkpoint)
     with atomic_write(Path(path), "w") as file:
         file.write(json.dumps(content, indent=2) + "\n")
 
@@ -101,7 +99,7 @@ def grid_of(text: str, checkpoint: Checkpoint) -> str | list[float]:
     Raises:
         InputError: neither.
     """
-    if text in GRIDS or not (text.endswith(".json") or Path(text).exists()):
-        GRIDS[text]
-        return text
-    return read_grid(text, checkpoint).tolist()
+    if text.endswith(".json") or (text not in GRIDS and Path(text).exists()):
+        return read_grid(text, checkpoint).tolist()
+    GRIDS[text]
+    return text

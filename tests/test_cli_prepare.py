@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import yaml
 
-from r2flow.data.manifest import read_manifest
 from r2flow.data.opening import open_prepared
+from r2flow.data.prepared import read_manifest
 from r2flow.data.sources import read_scan
 from r2flow.lidar.sensors import SENSORS
 from tests.data.conftest import kitti_360, write_scan  # noqa: F401  a fixture

@@ -12,7 +12,6 @@ from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     accuracy,
     compare,
     evaluate,
-    extractor,
     flows,
     inversion,
     measure,

@@ -85,6 +85,7 @@ def work_precision(
     from r2flow.checkpoints import load_checkpoint
     from r2flow.flow.solvers import check_tolerance
     from r2flow.generators import as_flow
+    from r2flow.noise import Draws
     from r2flow.progress import Bar
     from r2flow.reports import work_precision as measuring
     from r2flow.reports.pages import prepare_folder
@@ -106,7 +107,7 @@ def work_precision(
     found = name = None
     with only_errors():
         if loaded is not None and flow is not None:
-            x_0 = measuring.starts(loaded, draw.num, draw.seed)
+            x_0 = Draws(draw.seed, range(draw.num)).start(flow.noise_shape).to(flow.device)
             with Bar("measuring", draw.num * 4 * tight.reference_steps, "reference evaluations") as advance:
                 found = measuring.reference(flow, x_0, tight.reference_steps, tight.reference_tolerance, advance)
             name = str(checkpoint)

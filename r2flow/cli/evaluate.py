@@ -21,13 +21,14 @@ if TYPE_CHECKING:
     from r2flow.data.sources import Reading
     from r2flow.evaluation.measuring import Work
     from r2flow.evaluation.processes import Process
+    from r2flow.evaluation.statistics import Cache
     from r2flow.metrics.base import ScanMetric
-    from r2flow.reports.speed_quality import Drawing
 
 log = logging.getLogger(__name__)
 
 EMBEDDED = "frechet_embedded"
 DEFAULT = ("jsd", "mmd", EMBEDDED)
+SAMPLED = 1000  # scans of a flow
 
 
 @dataclass(frozen=True)
@@ -106,24 +107,22 @@ def evaluate(
     """
     from r2flow.evaluation.measuring import check_reflectance
     from r2flow.evaluation.processes import joined
-    from r2flow.reports.speed_quality import Drawing, steps_of
+    from r2flow.evaluation.statistics import Cache
+    from r2flow.reports.pages import prepare_folder
 
     _check_evaluation(generated, checkpoint, measured, output)
-    num = scans.num or 1000
+    sampled = generated if _is_flow(generated) else None
     with joined(choose_device(work.device)) as place:
         built = _build(measured.metrics.split(","), measured.bootstrap, place) if measured.metrics else None
-        flows = _load_flows(
-            [*(checkpoint or []), *([Path(generated)] if generated and _is_flow(generated) else [])], place.device
-        )
-        judged_scans = None if _is_flow(generated) else generated
-        reading = reading_of([real, judged_scans], list(flows.values()), how)
+        flows = _load_flows([*(checkpoint or []), *([Path(sampled)] if sampled else [])], place.device)
+        reading = reading_of([real, None if sampled else generated], list(flows.values()), how)
         if built is not None:  # where no metric reads reflectance, its scale does not matter
             looks = any(m.needs_reflectance or m.uses_reflectance for m in built.values())
             reading = replace(reading, reflectance=reading.reflectance if looks else False)
         truth = _open(real, reading, scans.split, scans.real_num)
         judged: ScanSet | None = None
-        if _is_flow(generated):
-            judged = _sampled(flows, num, sampling)
+        if sampled:
+            judged = _sampled(sampled, flows[sampled], scans.num or SAMPLED, sampling)
         elif generated is not None:
             own = _rescaled(generated, reading, scans.generated_scale)
             judged = _open(generated, own, scans.generated_split, scans.num)
@@ -133,14 +132,29 @@ def evaluate(
             reflectance = reflectance and all(flow.encoding.reflectance for flow in flows.values())
             built = _build_default(reflectance, measured.bootstrap, place)
         check_reflectance(built, sets)
-        shared = work_of(work.batch_size, work.workers, place.rank, place.ranks)
-        if checkpoint:
-            drawing = Drawing(num, sampling.seed, sampling.solver, sampling.tolerance)
-            for label, flow in flows.items():
-                steps_of(flow, label, _many(sampling.steps), drawing)  # what it refuses is refused before reading
-            _curve(truth, flows, built, _many(sampling.steps), drawing, shared, measured, output, place.device)
+        job = Job(
+            truth, built, work_of(work.batch_size, work.workers, place.rank, place.ranks),
+            None if measured.no_cache else Cache(), place.device, sampling,
+        )  # fmt: skip
+        for folder in (output.out, output.json.parent if output.json else None):
+            if folder is not None:
+                prepare_folder(folder)
+        if checkpoint and output.out:
+            _measure_curve(job, flows, scans.num or SAMPLED, output.out)
         else:
-            _compare(truth, judged, built, measured, shared, output, place.device, sampling.seed)
+            _compare(job, judged, measured, output)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a comparison and a curve both need: real scans, metrics, and how the work is done."""
+
+    truth: "ScanSet"
+    metrics: "dict[str, ScanMetric]"
+    work: "Work"
+    cache: "Cache | None"
+    device: str
+    sampling: SamplingOptions
 
 
 def _check_evaluation(
@@ -159,85 +173,61 @@ def _check_evaluation(
         raise InputError(f"--json {output.json} is a folder; name a file to write to.")
 
 
-def _compare(
-    truth: "ScanSet",
-    judged: "ScanSet | None",
-    metrics: "dict[str, ScanMetric]",
-    measured: MeasureOptions,
-    work: "Work",
-    output: OutputOptions,
-    device: str,
-    seed: int,
-) -> None:
+def _compare(job: Job, judged: "ScanSet | None", measured: MeasureOptions, output: OutputOptions) -> None:
     from r2flow.cli.output import command
     from r2flow.evaluation.floor import floor_sets
     from r2flow.evaluation.measuring import Gathered, gather_real, measure
-    from r2flow.evaluation.statistics import Cache
     from r2flow.reports.evaluation import Comparison, evaluation_page, print_comparisons, write_json
-    from r2flow.reports.pages import prepare_folder, write_page
+    from r2flow.reports.pages import write_page
 
-    pairs = {} if judged is None else {"generated": (truth, judged)}
+    pairs = {} if judged is None else {"generated": (job.truth, judged)}
     if measured.floor:
-        pairs |= floor_sets(truth, judged)
-    json, out = output.json, output.out
-    for folder in (out, json.parent if json else None):
-        if folder is not None:
-            prepare_folder(folder)
-    cache = None if measured.no_cache else Cache()
+        pairs |= floor_sets(job.truth, judged)
     found: list[Comparison] = []
     known: dict[int, Gathered] = {}
     for name, (real, other) in pairs.items():
         start = time.monotonic()
         if id(real) not in known:
-            known[id(real)] = gather_real(metrics, real, work, cache)
-        results = measure(metrics, known[id(real)], other, work, measured.bootstrap)
+            known[id(real)] = gather_real(job.metrics, real, job.work, job.cache)
+        results = measure(job.metrics, known[id(real)], other, job.work, measured.bootstrap)
         found.append(Comparison(name, real, other, results, time.monotonic() - start))
-    if work.rank > 0:
+    if job.work.rank > 0:
         return
     seeds = {"subsets": 0}
     if judged is not None and judged.about["kind"] == "sampled":
-        seeds["sampled scans"] = seed
+        seeds["sampled scans"] = job.sampling.seed
     if measured.bootstrap:
         seeds["bootstrap"] = 0
-    page = evaluation_page(found, command(), device, seeds)
+    page = evaluation_page(found, command(), job.device, seeds)
     print_comparisons(found)
-    if json is not None:
-        write_json(page, found, json)
-        print(json)
-    if out is not None:
-        for path in write_page(page, out):
+    if output.json is not None:
+        write_json(page, output.json)
+        print(output.json)
+    if output.out is not None:
+        for path in write_page(page, output.out):
             print(path)
 
 
-def _curve(
-    truth: "ScanSet",
-    flows: "dict[str, Checkpoint]",
-    metrics: "dict[str, ScanMetric]",
-    steps: Sequence[int],
-    drawing: "Drawing",
-    work: "Work",
-    measured: MeasureOptions,
-    output: OutputOptions,
-    device: str,
-) -> None:
+def _measure_curve(job: Job, flows: "dict[str, Checkpoint]", num: int, out: Path) -> None:
     from r2flow.cli.output import command, finish
     from r2flow.evaluation.measuring import gather_real
-    from r2flow.evaluation.statistics import Cache
-    from r2flow.reports.pages import prepare_folder, write_page
-    from r2flow.reports.speed_quality import Curve, measure_curve, read_rows, speed_quality_page
+    from r2flow.reports.pages import write_page
+    from r2flow.reports.speed_quality import Curve, Drawing, measure_curve, read_rows, speed_quality_page, steps_of
 
-    assert output.out is not None
-    out = prepare_folder(output.out)
+    drawing = Drawing(num, job.sampling.seed, job.sampling.solver, job.sampling.tolerance)
+    steps = _many(job.sampling.steps)
+    for label, flow in flows.items():
+        steps_of(flow, label, steps, drawing)  # what it refuses is refused before reading
     done = read_rows(out)
-    gathered = gather_real(metrics, truth, work, None if measured.no_cache else Cache())
-    curve = Curve(truth, metrics, gathered, drawing, device)
+    gathered = gather_real(job.metrics, job.truth, job.work, job.cache)
+    curve = Curve(job.truth, job.metrics, gathered, drawing, job.device)
 
     def keep(rows: list[dict[str, Any]]) -> None:
-        if work.rank == 0:
+        if job.work.rank == 0:
             write_page(speed_quality_page(curve, rows, command(), done, figures=False), out)
 
-    rows = measure_curve(curve, flows, steps, work, done, keep)
-    if work.rank == 0:
+    rows = measure_curve(curve, flows, steps, job.work, done, keep)
+    if job.work.rank == 0:
         page = speed_quality_page(curve, rows, command(), done)
         finish(page, out, page.text)
 
@@ -309,9 +299,7 @@ def _load_flows(paths: list[Path], device: str) -> "dict[str, Checkpoint]":
 
 
 def reading_of(
-    specs: "Sequence[str | None]",
-    flows: "Sequence[Checkpoint]" = (),
-    how: ReadingOptions | None = None,
+    specs: "Sequence[str | None]", flows: "Sequence[Checkpoint]" = (), how: ReadingOptions | None = None
 ) -> "Reading":
     """How scans become images: as asked for, else as the flow's or one of the named sets' were, else the usual way."""
     from r2flow.evaluation.sets import reading_of_flow
@@ -339,13 +327,17 @@ def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> 
     return scans
 
 
-def _sampled(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOptions) -> "ScanSet":
+def _sampled(label: str, flow: "Checkpoint", num: int, sampling: SamplingOptions) -> "ScanSet":
     """Scans of the one flow that is judged."""
     from r2flow.evaluation.sets import sampled_set
 
-    (label, flow), *_ = flows.items()
-    changes = {"steps": _one(sampling.steps), "method": sampling.solver, "tolerance": sampling.tolerance}
-    return sampled_set(flow, label, num, flow.generator.sampler.changed(**changes), sampling.seed)
+    steps = _many(sampling.steps) if sampling.steps else [None]
+    if len(steps) != 1:
+        raise InputError(
+            f"one comparison takes one number of --steps, found {sampling.steps}; --checkpoint makes a curve."
+        )
+    how = flow.generator.sampler.changed(steps=steps[0], method=sampling.solver, tolerance=sampling.tolerance)
+    return sampled_set(flow, label, num, how, sampling.seed)
 
 
 def _build(names: Sequence[str], bootstrap: int, place: "Process") -> "dict[str, ScanMetric]":
@@ -364,13 +356,6 @@ def _build_default(reflectance: bool, bootstrap: int, place: "Process") -> "dict
         except InputError as error:
             log.warning("%s is left out: %s", name, error)
     return built
-
-
-def _one(steps: str | None) -> int | None:
-    found = [None] if steps is None else _many(steps)
-    if len(found) != 1:
-        raise InputError(f"one comparison takes one number of --steps, found {steps}; --checkpoint makes a curve.")
-    return found[0]
 
 
 def _many(steps: str | None) -> list[int]:

@@ -1,5 +1,6 @@
 """Options that several verbs share, and what becomes of them."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -101,6 +102,11 @@ def _rows_and_columns(size: str | None) -> tuple[int | None, int | None]:
     if len(parts) != 2 or not all(part.isascii() and part.isdigit() and int(part) > 0 for part in parts):
         raise InputError(f"--size must be ROWSxCOLUMNS, as 64x1024; found {size!r}.")
     return int(parts[0]), int(parts[1])
+
+
+def cores() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def choose_device(name: str) -> str:

@@ -13,7 +13,7 @@ from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.evaluation.sets import ScanSet
-    from r2flow.reports.paper.report import PaperMetrics
+    from r2flow.metrics.base import ScanMetric
 
 EMBEDDED = "frechet_embedded"
 
@@ -64,10 +64,11 @@ def paper(
     subjects = find_subjects(runs)
     truth = None if real is None else real_set(real, split, subjects[0].run)
     reflectance = bool(subjects[0].config["encoding"]["reflectance"])
-    chosen = build_metrics(metrics.split(",") if metrics else None, amount.bootstrap > 0, reflectance, where)
+    chosen, missing = build_metrics(metrics.split(",") if metrics else None, amount.bootstrap > 0, reflectance, where)
     prepare_folder(out)
     print(f"{len(subjects)} runs: {', '.join(f'{one.label} ({one.role})' for one in subjects)}")
-    page = report(subjects, out, chosen, amount, work_of(work.batch_size, work.workers), truth, where, command())
+    doing = work_of(work.batch_size, work.workers)
+    page = report(subjects, out, chosen, missing, amount, doing, truth, where, command())
     finish(page, out, page.text[2:4])
 
 
@@ -80,18 +81,20 @@ def real_set(text: str, split: str | None, run: Path) -> "ScanSet":
     return open_scans(text, reading_of([text], [load_checkpoint(run)]), split)
 
 
-def build_metrics(names: list[str] | None, keep: bool, reflectance: bool, device: str) -> "PaperMetrics":
+def build_metrics(
+    names: list[str] | None, keep: bool, reflectance: bool, device: str
+) -> "tuple[dict[str, ScanMetric], dict[str, str]]":
     """The metrics, `jsd` always among them; of the paper's those that are missing, and why.
 
     Without names: whatever of the paper's can be computed here, and the embedded network's distance.
     """
     from r2flow.metrics import METRICS
     from r2flow.reports.paper.printed import COLUMNS
-    from r2flow.reports.paper.report import PaperMetrics
 
     embedded = EMBEDDED if reflectance else f"{EMBEDDED}_range"
     asked = list(dict.fromkeys(["jsd", *(names or ["mmd", embedded, *COLUMNS])]))
-    built, missing = {}, {}
+    built: dict[str, ScanMetric] = {}
+    missing: dict[str, str] = {name: "not asked for" for name in COLUMNS if name not in asked}
     for name in asked:
         try:
             built[name] = METRICS[name](keep=keep).to(device)
@@ -99,5 +102,4 @@ def build_metrics(names: list[str] | None, keep: bool, reflectance: bool, device
             if names is not None:
                 raise
             missing[name] = str(error)
-    left_out = {name: "not asked for" for name in COLUMNS if name not in asked}
-    return PaperMetrics(built, {name: why for name, why in {**missing, **left_out}.items() if name in COLUMNS})
+    return built, {name: missing[name] for name in COLUMNS if name in missing}

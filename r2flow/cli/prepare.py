@@ -1,7 +1,5 @@
 """The verb that turns a data set into prepared scans."""
 
-import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,13 +8,12 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import ReadingOptions, grouped
-from r2flow.cli.options import build_sized
+from r2flow.cli.options import build_sized, cores
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
-    from r2flow.data.manifest import Manifest
-    from r2flow.data.plans import Plan
-    from r2flow.data.preparing import Preparation
+    from r2flow.data.prepared import Manifest
+    from r2flow.data.preparing import Plan, Preparation
 
 
 @dataclass(frozen=True)
@@ -87,7 +84,7 @@ def _plan(
     shards: ShardOptions,
 ) -> "Plan":
     from r2flow.data.opening import SOURCES
-    from r2flow.data.plans import plan_files, plan_simulated
+    from r2flow.data.preparing import plan_files, plan_simulated
 
     usual = SOURCES[layout]
     sensor = build_sized(reading.sensor or usual.sensor, reading.size)
@@ -115,26 +112,17 @@ def _plan(
 def _run(work: "Preparation", on_bad_scan: str, workers: int | None) -> None:
     from r2flow.progress import Bar
 
-    recipe, workers = work.recipe, workers or _cores()
+    recipe, workers = work.recipe, workers or cores()
     with Bar("checking what is there", recipe.scans, "scans") as advance:
-        missing = work.begin(lambda scans: _repeat(advance, scans))
+        missing = work.begin(advance)
     scans = sum(len(recipe.numbers_of(shard)) for shard in missing)
     with Bar("preparing", scans, "scans") as advance:
-        manifest = work.make(missing, on_bad_scan, workers if workers > 1 else 0, lambda scans: _repeat(advance, scans))
+        manifest = work.make(missing, on_bad_scan, workers if workers > 1 else 0, advance)
     print(_summary(work.folder, manifest))
 
 
-def _repeat(advance: Callable[[], None], times: int) -> None:
-    for _ in range(times):
-        advance()
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _summary(folder: Path, manifest: "Manifest") -> str:
-    shards = manifest.shards or ()
+    shards = manifest.shards
     scans, size = sum(shard.scans for shard in shards), sum(shard.bytes for shard in shards)
     said = f"range within {max(shard.range_error for shard in shards) * 1e3:.2f} mm"
     levels, error = manifest.recipe.levels, max(shard.reflectance_error for shard in shards)
@@ -149,11 +137,10 @@ def _summary(folder: Path, manifest: "Manifest") -> str:
 
 
 def _check(folder: Path) -> None:
-    from r2flow.data.manifest import read_manifest
-    from r2flow.data.prepared import check_prepared
+    from r2flow.data.prepared import check_prepared, read_manifest
     from r2flow.progress import Bar
 
-    shards = len(read_manifest(folder).shards or ())
+    shards = len(read_manifest(folder).shards)
     with Bar("checking", shards, "shards") as advance:
         damaged = check_prepared(folder, advance)
     for path, reason in damaged.items():

@@ -1,7 +1,7 @@
 """Changes to training scans, drawn for each image of a run: mirrored, turned, with returns taken away."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -17,21 +17,14 @@ class Augmentation:
     Image k's draws depend on (seed, k) alone, each kind's not on which others are on, and none is shared with its noise
     and time.
 
-    Attributes:
-        flip: Mirror every other scan, left for right: azimuth -> -azimuth, columns reversed, exact because bins lie
-            symmetrically about straight ahead.
-        roll: Turn each scan about the sensor by a whole number of columns, drawn uniformly: exact on the ring.
-        beam_dropout: Share of the rows that lose all their returns.
-        ray_dropout: Share of the returns that are lost one by one.
-
     Raises:
         InputError: a share outside [0, 1).
     """
 
-    flip: bool = False
-    roll: bool = False
-    beam_dropout: float = 0.0
-    ray_dropout: float = 0.0
+    flip: bool = False  # mirror every other scan: azimuth -> -azimuth, exact as bins lie symmetrically about ahead
+    roll: bool = False  # turn each about the sensor by a whole number of columns, drawn uniformly: exact on the ring
+    beam_dropout: float = 0.0  # share of the rows that lose all their returns
+    ray_dropout: float = 0.0  # share of the returns that are lost one by one
 
     def __post_init__(self) -> None:
         for name in ("beam_dropout", "ray_dropout"):
@@ -63,5 +56,4 @@ def upgraded(data: Mapping[str, Any]) -> dict[str, Any]:
     if "flip" not in data:
         return dict(data)
     kept = {key: value for key, value in data.items() if key != "flip"}
-    off = {"flip": bool(data["flip"]), "roll": False, "beam_dropout": 0.0, "ray_dropout": 0.0}
-    return {**kept, "augment": off}
+    return {**kept, "augment": asdict(Augmentation(flip=bool(data["flip"])))}

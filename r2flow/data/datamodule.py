@@ -2,22 +2,24 @@
 
 import hashlib
 import logging
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import lightning as L
+import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
 from r2flow import simulator
 from r2flow.data.augment import Augmentation
-from r2flow.data.loader import FixedSampler, FlowDataset, Item, Order, Permutations, RunLoader, RunSampler
+from r2flow.data.loader import FlowDataset, Item, Order, Permutations, RunLoader, RunSampler, fixed_batches
 from r2flow.data.mixture import MixedOrder, Mixture, refuse_shared_scans
-from r2flow.data.opening import held_out_options, open_scans, split_parts
+from r2flow.data.opening import held_out_options, open_source, split_parts
 from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
 from r2flow.data.pairs import PairDataset, PairSource
 from r2flow.data.shards import PairStore
-from r2flow.data.sources import Reading, ScanSource, holdout_block, spread
+from r2flow.data.sources import InMemory, Reading, ScanSource, holdout_block, spread
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
@@ -31,13 +33,10 @@ log = logging.getLogger(__name__)
 class ScanDataModule(L.LightningDataModule):
     """Projected scans with their noise, or pairs that a flow has drawn, for training and validation.
 
-    What a batch holds is said by `r2flow.data.loader.FlowDataset`.
+    What a batch holds is said by `r2flow.data.loader.FlowDataset`. Noise, times and order derive from the run's seed
+    (`r2flow.noise`); the noise of one scan has the encoding's shape, (C, H, W), if none is given.
 
     Args:
-        sensor: What the scans are projected through.
-        encoding: Metres to model space.
-        seed: Run seed; noise, times and order derive from it (`r2flow.noise`).
-        noise_shape: Shape of the noise x_0 that one scan is made of; the encoding's (C, H, W) if left out.
         keys: The keys of `r2flow.data.options.DataOptions`.
 
     Raises:
@@ -53,7 +52,7 @@ class ScanDataModule(L.LightningDataModule):
         self.noise_shape = tuple(noise_shape or encoding.shape)
         self.options = DataOptions(**keys)
         self.batch_size = self.options.batch_size
-        self.parts = [] if self.options.name == PAIRS else split_parts(self.options)
+        self.parts = split_parts(self.options)
         augment = self.options.augment or {}
         check_options("data.augment", Augmentation, augment)
         self.augment = Augmentation(**augment)
@@ -99,14 +98,17 @@ class ScanDataModule(L.LightningDataModule):
         whole = [self._open(options) for options in self.parts]
         if len(whole) > 1:
             refuse_shared_scans(whole)
-        self.names = [
-            f"{label}{name}" for label, source in zip(self._labels(), whole, strict=True) for name in source.names
-        ]
+        # What goes before the names of each part's scans tells them apart.
+        labels = [f"{number}: " if len(whole) > 1 else "" for number in range(len(whole))]
+        self.names = [f"{label}{name}" for label, source in zip(labels, whole, strict=True) for name in source.names]
         other = held_out_options(self.options)
         if not other:
-            blocks = [self._blocks(source) for source in whole]
-            training = [source.subset(first) for source, (first, _) in zip(whole, blocks, strict=True)]
-            held = [source.subset(last) for source, (_, last) in zip(whole, blocks, strict=True)]
+            training, held = [], []
+            for source in whole:
+                starts = sorted(numbers[0] for numbers in source.drives.values() if len(numbers))
+                first, last = holdout_block(len(source), self.validation.share, starts)
+                training.append(source.subset(first))
+                held.append(source.subset(last))
         else:
             # Scenes that are held out beside simulated training ones come after them.
             first_scene = max((part.scenes for part in self.parts if part.name == SIMULATED), default=0)
@@ -117,33 +119,22 @@ class ScanDataModule(L.LightningDataModule):
                     "data.validation.data holds %d scans that are trained on, as %s: give it its own split or drives",
                     len(shared), min(shared),
                 )  # fmt: skip
-        validation = self._joined(held)
-        return self._joined(training), validation.subset(spread(len(validation), self.validation.scans))
-
-    def _blocks(self, source: ScanSource) -> tuple[range, range]:
-        starts = sorted(numbers[0] for numbers in source.drives.values() if len(numbers))
-        return holdout_block(len(source), self.validation.share, starts)
+        validation = _joined(held)
+        return _joined(training), validation.subset(spread(len(validation), self.validation.scans))
 
     def _open(self, options: SourceOptions, first_scene: int = 0) -> ScanSource:
         reading = Reading(
             self.sensor, options.projection, options.convention, options.reflectance_scale,  # type: ignore[arg-type]
             self.encoding.reflectance, options.on_bad_scan, within_limits=True,
         )  # fmt: skip
-        return open_scans(options, reading, seed=self.seed, first_scene=first_scene).source
-
-    def _labels(self) -> list[str]:
-        """What goes before the names of each part's scans: they are told apart by it."""
-        return [f"{number}: " if len(self.parts) > 1 else "" for number in range(len(self.parts))]
-
-    def _joined(self, sources: list[ScanSource]) -> ScanSource:
-        return sources[0] if len(sources) == 1 else Mixture(sources)
+        return open_source(options, reading, self.seed, first_scene)
 
     def _order(self, source: ScanSource | PairSource) -> Order:
         """Which scan is image k of the run."""
         weights = [part.weight for part in self.parts if part.weight is not None]
         if len(weights) > 1:
             assert isinstance(source, Mixture)
-            return MixedOrder(source.sizes, weights, self.seed)
+            return MixedOrder([len(part) for part in source.parts], weights, self.seed)
         return Permutations(len(source), self.seed)
 
     def fingerprint(self) -> str:
@@ -158,21 +149,22 @@ class ScanDataModule(L.LightningDataModule):
 
     def _kept(self, source: ScanSource, what: str) -> ScanSource:
         """The source in memory where all that is slow to get of it fits there, read with a progress bar."""
-        height, width = self.sensor.shape
-        size = source.slow_scans() * (1 + self.encoding.reflectance) * height * width * 4
+        parts = list(source.parts) if isinstance(source, Mixture) else [source]
+        slow = sum(len(part) for part in parts if part.slow)
+        size = slow * (1 + self.encoding.reflectance) * math.prod(self.sensor.shape) * 4
         if size > self.options.memory_gib * 2**30:
             return source
-        return source.kept(lambda numbers: track(numbers, f"reading {what}", least=16))
+        for i, part in enumerate(parts):
+            if part.slow and len(part):
+                numbers = track(range(len(part)), f"reading {what}", least=16)
+                parts[i] = InMemory(np.stack([part[number] for number in numbers]), part.names)
+        return _joined(parts)
 
     def _ranks(self) -> tuple[int, int]:
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
     def check_run(self, ranks: int, accumulated: int, max_steps: int) -> None:
-        """Refuse a run whose global batch cannot be shared, or that has no length.
-
-        Raises:
-            InputError: either of these.
-        """
+        """Refuse a run whose global batch cannot be shared, or that has no length."""
         if self.batch_size % (ranks * accumulated):
             raise InputError(
                 f"data.batch_size={self.batch_size} cannot be shared by {ranks} devices times "
@@ -189,22 +181,13 @@ class ScanDataModule(L.LightningDataModule):
         rank, ranks = self._ranks()
         accumulated = self.trainer.accumulate_grad_batches
         self.check_run(ranks, accumulated, self.trainer.max_steps)
-        sampler = RunSampler(
-            self._order(self.training_source),
-            self.batch_size // accumulated,
-            self.trainer.max_steps * accumulated,
-            rank,
-            ranks,
-        )
+        order, batches = self._order(self.training_source), self.trainer.max_steps * accumulated
+        sampler = RunSampler(order, self.batch_size // accumulated, batches, rank, ranks)
         sampler.first_batch = self.trainer.global_step * accumulated
         return RunLoader(self._dataset(self.training_source, "training"), sampler, **self._loader_options())
 
     def _ready(self) -> None:
-        """Open what is there by now: pairs are made after `setup`.
-
-        Raises:
-            InputError: some pairs are missing still.
-        """
+        """Open what is there by now: pairs are made after `setup`."""
         self.setup()
         if self.pairs is not None and self.training_source is None:
             pairs = PairSource(self.pair_store, self.pairs.num)
@@ -229,9 +212,9 @@ class ScanDataModule(L.LightningDataModule):
         # than ranks all take all of them, else the few that are left over are left out.
         if scans < ranks:
             rank, ranks = 0, 1
-        sampler = FixedSampler(scans - scans % ranks, batch_size, rank, ranks)
+        batches = fixed_batches(scans - scans % ranks, batch_size, rank, ranks)
         dataset = self._dataset(self.validation_source, "validation")
-        return DataLoader(dataset, batch_sampler=sampler, **self._loader_options())
+        return DataLoader(dataset, batch_sampler=batches, **self._loader_options())
 
     def _loader_options(self) -> dict[str, Any]:
         return {
@@ -240,3 +223,7 @@ class ScanDataModule(L.LightningDataModule):
             "worker_init_fn": outlive_the_signal,
             "pin_memory": torch.cuda.is_available(),
         }
+
+
+def _joined(sources: list[ScanSource]) -> ScanSource:
+    return sources[0] if len(sources) == 1 else Mixture(sources)

@@ -21,56 +21,32 @@ OBJECT_SPLIT = {"train": ("training",), "test": ("testing",)}
 
 @dataclass(frozen=True)
 class Drive:
-    """One recording: scans that follow each other.
+    """One recording: scans that follow each other."""
 
-    Attributes:
-        name: What `data.drives` may call it.
-        scans: Paths, as strings: of a hundred thousand, Path objects take seconds and ten times the memory.
-    """
-
-    name: str
-    scans: tuple[str, ...]
+    name: str  # what `data.drives` may call it
+    scans: tuple[str, ...]  # paths: of a hundred thousand, Path objects take seconds and ten times the memory
 
 
 class SourceKind:
-    """A kind of scans that a name opens, `data=NAME` in a run and `NAME:ROOT` in a verb; an entry of `SOURCES`.
+    """A kind of scans that a name opens, `data=NAME` in a run and `NAME:ROOT` in a verb; an entry of `SOURCES`."""
 
-    Attributes:
-        splits: The data set's standard split: names or numbers of the drives of each part; empty where it has none.
-        sensor: Name of the usual sensor.
-        reflectance_scale: The usual value that means full reflectance.
-    """
-
-    splits: Mapping[str, Sequence[int | str]] = {}
-    sensor = "hdl64e"
-    reflectance_scale = 1.0
+    splits: Mapping[str, Sequence[int | str]] = {}  # names or numbers of the drives of each part of a standard split
+    sensor = "hdl64e"  # name of the usual sensor
+    reflectance_scale = 1.0  # the usual value that means full reflectance
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
-        """The scans in their order, none of them read yet.
+        """The scans in their order, none of them read yet; `seed` and `first_scene` are for simulated ones.
 
-        Args:
-            reading: How they become images; `reflectance` is True or False.
-            seed, first_scene: Of simulated scans, the seed and the number of the first.
-
-        Raises:
-            InputError: there are no such scans, or they cannot become such images.
+        `reading.reflectance` is True or False.
         """
         raise NotImplementedError
 
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
-        """Why the scans count as scans without reflectance; None where they have it.
-
-        Raises:
-            InputError: there are no such scans, or they cannot be read.
-        """
+        """Why the scans count as scans without reflectance; None where they have it."""
         return None
 
     def find_drives(self, options: SourceOptions) -> list[Drive]:
-        """The drives, in order.
-
-        Raises:
-            InputError: there are none, or the scans are no files.
-        """
+        """The drives of scan files, in order."""
         raise InputError(f"{options.name} scans are no files in drives.")
 
     def split_of(self, drive: str) -> str | None:
@@ -78,13 +54,25 @@ class SourceKind:
         names = {drive, *_numbers(drive)}
         return next((part for part, members in self.splits.items() if names & set(members)), None)
 
+    def chosen(self, drives: list[Drive], split: str | None, names: Sequence[str | int] | None) -> list[Drive]:
+        """Those of a part of the standard split; of these, those of some names or numbers; None takes all.
+
+        Raises:
+            InputError: an unknown split, or a drive that is not there or not alone.
+        """
+        if split is not None:
+            if split not in self.splits:
+                known = f"known: {', '.join(self.splits)}" if self.splits else "the data set has no standard split"
+                raise InputError(f"no split named {split!r}; {known}.")
+            drives = [drive for drive in drives if self.split_of(drive.name) == split]
+        return drives if names is None else [named_drive(drives, str(name)) for name in names]
+
 
 @dataclass(frozen=True)
 class Layout(SourceKind):
-    """A data set of scan files.
+    """A data set of scan files, whose drives `find` finds below its folder, in order.
 
-    Attributes:
-        find: All drives below the data set's folder, in order. Its docstring's first line says what it looks for.
+    The first line of its docstring says what it looks for.
     """
 
     find: Callable[[Path], list[Drive]]
@@ -99,18 +87,15 @@ class Layout(SourceKind):
             InputError: a root that is missing or holds no such scan, an unknown split, or a drive that is not there.
         """
         name, split, root = options.name, options.split, Path(options.folder).expanduser()
-        if split is not None and not self.splits:
-            raise InputError(f"{name} has no standard split, found split={split!r}; name data.drives=[...] instead.")
-        if split is not None and split not in self.splits:
-            raise InputError(f"no split named {split!r}; known: {', '.join(self.splits)}.")
+        self.chosen([], split, None)  # a split that is not known is refused before anything is looked for
         if not root.is_dir():
             raise InputError(f"{root} is not a folder. Give the folder of your {name} scans (data.root=FOLDER).")
-        found = [d for d in self.find(root) if d.scans and (split is None or self.split_of(d.name) == split)]
+        found = self.chosen([drive for drive in self.find(root) if drive.scans], split, None)
         if not found:
             part = f" of its {split} split" if split else ""
             where = (self.find.__doc__ or "").splitlines()[0]
             raise InputError(f"{root} holds no scan{part}. Looked for ({name}): {where}")
-        return found if options.drives is None else [named_drive(found, str(one)) for one in options.drives]
+        return self.chosen(found, None, options.drives)
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanFiles:
         if reading.projection == "unfolding" and reading.sensor.name == "hdl64e":
@@ -119,8 +104,7 @@ class Layout(SourceKind):
                 "elevations, sensor=hdl64e is up to 6 degrees off"
             )
         found = self.find_drives(options)
-        ends = list(accumulate(len(drive.scans) for drive in found))
-        drives = {d.name: range(end - len(d.scans), end) for d, end in zip(found, ends, strict=True)}
+        drives = {drive.name: span for drive, span in zip(found, spans_of(found), strict=True)}
         about = {"kind": options.name, **({"split": options.split or "all"} if self.splits else {})}
         root = Path(options.folder).expanduser()  # as the paths begin that are found in it, however it was written
         return ScanFiles([path for drive in found for path in drive.scans], reading, root, drives, about)
@@ -185,12 +169,14 @@ def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:
     return paths if len(chosen) == len(paths) else tuple(sorted(chosen.values()))
 
 
-def named_drive(drives: list[Drive], name: str) -> Drive:
-    """The drive of a name, or of a number in its name.
+def spans_of(drives: Sequence[Drive]) -> list[range]:
+    """The numbers of each drive's scans, where the drives lie end to end."""
+    ends = accumulate(len(drive.scans) for drive in drives)
+    return [range(end - len(drive.scans), end) for drive, end in zip(drives, ends, strict=True)]
 
-    Raises:
-        InputError: none, or several.
-    """
+
+def named_drive(drives: list[Drive], name: str) -> Drive:
+    """The drive of a name, or of a number in its name; none and several are refused."""
     matches = [d for d in drives if name == d.name or (name.isdigit() and int(name) in _numbers(d.name))]
     if len(matches) != 1:
         known = ", ".join(d.name for d in drives)

@@ -26,10 +26,6 @@ class FlowDataset(Dataset[Item]):
     - u, (B,): uniform in [0, 1); the stage makes t of it;
     - k, (B,): number of the image in the run. A stage that needs more draws or conditions for an image derives them
       from (seed, purpose, k).
-
-    Args:
-        augment: What is done to scan k before it is encoded.
-        noise_shape: Shape of x_0 for one scan; the encoding's (C, H, W) if left out.
     """
 
     def __init__(
@@ -41,7 +37,6 @@ class FlowDataset(Dataset[Item]):
         augment: Augmentation | None = None,
         noise_shape: Sequence[int] | None = None,
     ) -> None:
-        self.noise_shape = tuple(noise_shape or encoding.shape)
         self.source, self.encoding, self.seed, self.purpose = source, encoding, seed, purpose
         self.augment, self.noise_shape = augment, tuple(noise_shape or encoding.shape)
 
@@ -70,10 +65,8 @@ class Order(Protocol):
 class Permutations:
     """Scan permutation_{k // n}[k mod n] of n: every scan once, in an order of its own, then every scan again.
 
-    The permutations are counter-based, so that the order is known at every k without having drawn what came before.
-
-    Args:
-        part: Which part of a mixture these are the scans of: each has permutations of its own.
+    The permutations are counter-based, so that the order is known at every k without having drawn what came before;
+    each part of a mixture has its own.
     """
 
     def __init__(self, scans: int, seed: int, part: int = 0) -> None:
@@ -132,15 +125,7 @@ class RunLoader(DataLoader[Item]):
         pass
 
 
-class FixedSampler(Sampler[list[tuple[int, int]]]):
+def fixed_batches(scans: int, batch_size: int, rank: int = 0, ranks: int = 1) -> list[list[tuple[int, int]]]:
     """Every `ranks`-th scan in order, the key of each its own number: the same items at every validation."""
-
-    def __init__(self, scans: int, batch_size: int, rank: int = 0, ranks: int = 1) -> None:
-        mine: Sequence[int] = range(rank, scans, ranks)
-        self.chunks = [list(mine[i : i + batch_size]) for i in range(0, len(mine), batch_size)]
-
-    def __len__(self) -> int:
-        return len(self.chunks)
-
-    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        return ([(i, i) for i in chunk] for chunk in self.chunks)
+    keys = [(scan, scan) for scan in range(rank, scans, ranks)]
+    return [keys[i : i + batch_size] for i in range(0, len(keys), batch_size)]

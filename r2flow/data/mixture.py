@@ -1,6 +1,6 @@
 """Several data sets in one run: their scans end to end, and whose turn it is at each image."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from torch import Tensor
@@ -20,10 +20,6 @@ class Mixture(ScanSource):
     def __init__(self, parts: Sequence[ScanSource]) -> None:
         self.parts = list(parts)
         self.starts = np.cumsum([0, *(len(part) for part in parts)])
-
-    @property
-    def sizes(self) -> list[int]:
-        return [len(part) for part in self.parts]
 
     @property
     def names(self) -> list[str]:
@@ -55,19 +51,9 @@ class Mixture(ScanSource):
             chosen[part].append(number)
         return Mixture([part.subset(own) for part, own in zip(self.parts, chosen, strict=True)])
 
-    def slow_scans(self) -> int:
-        return sum(part.slow_scans() for part in self.parts)
-
-    def kept(self, track: Callable[[range], Iterable[int]]) -> "Mixture":
-        return Mixture([part.kept(track) for part in self.parts])
-
 
 def refuse_shared_scans(parts: Sequence[ScanSource]) -> None:
-    """Refuse parts that share scans: each holds out a block of its own, which the other would train on.
-
-    Raises:
-        InputError: they do.
-    """
+    """Refuse parts that share scans: each holds out a block of its own, which the other would train on."""
     before: set[str] = set()
     for number, part in enumerate(parts):
         own = part.places()
@@ -85,10 +71,6 @@ class MixedOrder:
     Parts are drawn independently with probabilities w_p / sum w; the j-th image of a part is its scan
     permutation_{j // n}[j mod n] of n (`Permutations`). All of it is a function of (seed, k): draws come in blocks by
     their number, and how often a part was drawn before a block is counted from the blocks before it.
-
-    Args:
-        sizes: Scans of each part.
-        weights: Weight of each part, positive.
 
     Raises:
         InputError: a weight that is not positive, or a part without scans.
@@ -113,17 +95,13 @@ class MixedOrder:
             drawn = self._draw_parts(len(self._counts) - 1)
             self._counts.append(self._counts[-1] + np.bincount(drawn, minlength=len(self.orders)))
         if block != self._block:
-            self._enter(block)
+            self._block, self._parts = block, self._draw_parts(block)
+            self._turns = np.zeros(BLOCK, dtype=np.int64)  # how often each image's part came before in the block
+            for part in range(len(self.orders)):
+                own = np.flatnonzero(self._parts == part)
+                self._turns[own] = np.arange(len(own))
         part = int(self._parts[offset])
         return int(self.starts[part]) + self.orders[part][int(self._counts[block][part] + self._turns[offset])]
-
-    def _enter(self, block: int) -> None:
-        """Draw the part of each image of a block, and count how often it came before in the block."""
-        self._block, self._parts = block, self._draw_parts(block)
-        self._turns = np.zeros(BLOCK, dtype=np.int64)
-        for part in range(len(self.orders)):
-            own = np.flatnonzero(self._parts == part)
-            self._turns[own] = np.arange(len(own))
 
     def _draw_parts(self, block: int) -> np.ndarray:
         u = noise.generator(self.seed, "mixture", block).random(BLOCK)

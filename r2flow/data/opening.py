@@ -10,15 +10,14 @@
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from r2flow.data import layouts
-from r2flow.data.layouts import Drive, Layout, SourceKind, named_drive
-from r2flow.data.manifest import Manifest, read_manifest
+from r2flow.data.layouts import Drive, Layout, SourceKind, spans_of
 from r2flow.data.options import (
     FOLDER,
     MIXED,
@@ -29,7 +28,7 @@ from r2flow.data.options import (
     PartOptions,
     SourceOptions,
 )
-from r2flow.data.prepared import PreparedScans, find_prepared
+from r2flow.data.prepared import PreparedScans, find_prepared, read_manifest
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import AUTO, Reading, ScanFiles, ScanSource, SimulatedScans, lacks_reflectance, range_image
 from r2flow.data.store import MANIFEST
@@ -56,10 +55,8 @@ class Prepared(SourceKind):
     """Shards of `r2flow prepare`."""
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
-        return open_prepared(
-            options.folder, reading.sensor, options.split, options.drives, bool(reading.reflectance),
-            reading.projection, reading.convention,
-        )  # fmt: skip
+        how = (bool(reading.reflectance), reading.projection, reading.convention)
+        return open_prepared(options.folder, reading.sensor, options.split, options.drives, *how)
 
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
         lacks = read_manifest(Path(options.folder).expanduser()).recipe.levels is None
@@ -80,60 +77,53 @@ SOURCES: Registry[SourceKind] = Registry(
 
 
 def open_scans(
-    spec: str | Path | SourceOptions,
+    spec: str | Path,
     reading: Reading | None = None,
     split: str | None = None,
     num: int | None = None,
-    seed: int = 0,
-    first_scene: int = 0,
     own_size: bool = False,
 ) -> ScanSet:
     """The scans that a name stands for, none of them read yet but for what decides whether they have reflectance.
 
     Args:
         spec: A scan file, a range image (.npy) or a folder of them, a folder of `r2flow prepare`, `NAME:ROOT` with a
-            name of `SOURCES`, `simulated:SEED`, a folder of samples, a run folder, which stands for its samples; or the
-            options of a run's data set.
+            name of `SOURCES`, `simulated:SEED`, a folder of samples, or a run folder, which stands for its samples.
         reading: How scans become images; what the scans say of themselves, or `usual_reading`, if left out.
         split: A part of the data set's standard split.
         num: At most so many, by a fixed shuffle; the number of simulated scenes.
-        seed, first_scene: Of the options of simulated scans, the seed and the number of the first.
         own_size: Whether a range image's own size is taken in place of the sensor's, as a picture may do.
 
     Raises:
         InputError: nothing is there, or what is there cannot become such images.
     """
-    label = spec.name if isinstance(spec, SourceOptions) else str(spec)
-    options, file = (spec, None) if isinstance(spec, SourceOptions) else parse(label)
-    if isinstance(spec, str | Path):
-        options = replace(options, split=split, scenes=num or SCENES) if split or num else options
-        reading = reading or own_reading(label) or usual_reading(label)
-        if options.name == SIMULATED and options.root is not None:
-            seed = int(options.root)
-    assert reading is not None
+    label = str(spec)
+    options, file = parse(label)
+    reading = reading or own_reading(label) or usual_reading(label)
+    if file is None:
+        options = replace(options, split=split, scenes=num or SCENES)
+        if options.name == SIMULATED:
+            return ScanSet(label, open_source(options, reading, int(options.folder)), reading.sensor)
+        return ScanSet(label, open_source(options, reading), reading.sensor).limited(num)
+    refuse_other_samples(file.parent, reading.sensor)
+    if own_size and (image := range_image(file)) is not None:
+        reading = replace(reading, sensor=reading.sensor.resized(*image.shape[1:]))
+    if reading.reflectance == AUTO:
+        reading = replace(reading, reflectance=lacks_reflectance([file], reading.on_bad_scan) is None)
+    return ScanSet(label, ScanFiles([file], reading, file.parent, about={"kind": "file"}), reading.sensor)
+
+
+def open_source(options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
+    """The scans of some options: `SourceKind.open`, with its arguments and `reading.reflectance` decided."""
     kind = SOURCES[options.name]
-    if file is not None:
-        refuse_other_samples(file.parent, reading.sensor)
-        if own_size and (image := range_image(file)) is not None:
-            reading = replace(reading, sensor=reading.sensor.resized(*image.shape[1:]))
-        if reading.reflectance == AUTO:
-            reading = replace(reading, reflectance=lacks_reflectance([file], reading.on_bad_scan) is None)
-        return ScanSet(label, ScanFiles([file], reading, file.parent, about={"kind": "file"}), reading.sensor)
     if options.name == FOLDER:
         refuse_other_samples(Path(options.folder), reading.sensor)
     if reading.reflectance == AUTO:
         reading = replace(reading, reflectance=kind.lacks_reflectance(options, reading.on_bad_scan) is None)
-    source = kind.open(options, reading, seed, first_scene)
-    found = ScanSet(label, source, reading.sensor)
-    return found if isinstance(spec, SourceOptions) or options.name == SIMULATED else found.limited(num)
+    return kind.open(options, reading, seed, first_scene)
 
 
 def parse(text: str) -> tuple[SourceOptions, Path | None]:
-    """The options that a user's name stands for, and the file where it is one.
-
-    Raises:
-        InputError: nothing is there.
-    """
+    """The options that a user's name stands for, and the file where it is one."""
     path = Path(text).expanduser()
     kind, colon, rest = text.partition(":")
     if colon and kind in SOURCES:
@@ -156,11 +146,7 @@ def parse(text: str) -> tuple[SourceOptions, Path | None]:
 def find_drives(
     name: str, root: str | Path, split: str | None = None, drives: Sequence[str | int] | None = None
 ) -> list[Drive]:
-    """The drives of a data set of scan files, in order; see `SourceOptions`.
-
-    Raises:
-        InputError: what `Layout.find_drives` refuses.
-    """
+    """The drives of a data set of scan files, in order: `Layout.find_drives`."""
     return SOURCES[name].find_drives(SourceOptions(name, str(root), split, None if drives is None else list(drives)))
 
 
@@ -168,28 +154,14 @@ def find_drives(
 
 
 def write_samples_note(folder: Path, reading: Reading, **about: Any) -> None:
-    """Say in a folder of samples whose images they are: `open_scans` then needs no sensor and no size.
-
-    Args:
-        about: What else a reader may want to know, as plain values: encoding, seed, sampler.
-    """
-    content = {
-        "format": "r2flow samples 1",
-        "sensor": asdict(reading.sensor),
-        "projection": reading.projection,
-        "convention": reading.convention,
-        **about,
-    }
+    """Say in a folder of samples whose images they are: `open_scans` then needs no sensor and no size."""
+    images = {"sensor": asdict(reading.sensor), "projection": reading.projection, "convention": reading.convention}
     with atomic_write(folder / SAMPLES, "w") as file:
-        json.dump(content, file, indent=1)
+        json.dump({"format": "r2flow samples 1", **images, **about}, file, indent=1)
 
 
 def samples_of(run: Path) -> Path | None:
-    """The samples of a run folder: its `samples`, else its only folder of samples; None where it is no run folder.
-
-    Raises:
-        InputError: it has several other folders of samples, or none.
-    """
+    """The samples of a run folder: its `samples`, else its only folder of samples; None where it is no run folder."""
     if not (run / "config.yaml").is_file() and not (run / "checkpoints").is_dir():
         return None
     noted = {note.parent for note in run.glob(f"*/{SAMPLES}")}
@@ -206,11 +178,7 @@ def samples_of(run: Path) -> Path | None:
 
 
 def own_reading(spec: str | Path) -> Reading | None:
-    """How the images of scans were made, where they say so: prepared scans and samples. Other images they are not.
-
-    Raises:
-        InputError: nothing is there, or what it says of itself cannot be read.
-    """
+    """How the images of scans were made, where they say so: prepared scans and samples. Other images they are not."""
     options, _ = parse(str(spec))
     if options.name == PREPARED:
         recipe = read_manifest(Path(options.folder).expanduser()).recipe
@@ -241,11 +209,7 @@ def _sensor(described: Mapping[str, Any]) -> Sensor:
 
 
 def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
-    """Refuse a folder whose note says that its images are of another sensor or size.
-
-    Raises:
-        InputError: it does.
-    """
+    """Refuse a folder whose note says that its images are of another sensor or size."""
     own = _noted(folder)
     if own is None or (own.sensor.shape == sensor.shape and np.allclose(own.sensor.elevations, sensor.elevations)):
         return
@@ -271,7 +235,7 @@ def open_prepared(
     """The scans of a folder that `r2flow prepare` has written, by the split and the drives of their data set.
 
     Raises:
-        InputError: what `find_prepared` refuses, no reflectance where it is needed, or no such split or drive.
+        InputError: what `find_prepared` refuses, no reflectance where it is needed, or no such split, drive or scan.
     """
     folder = Path(root).expanduser()
     manifest = find_prepared(folder, sensor, projection, convention)
@@ -280,55 +244,34 @@ def open_prepared(
         held = sorted({part for drive in manifest.drives if (part := kind.split_of(drive.name))})
         if len(held) > 1:
             log.warning("%s holds %s drives, and data.split=null takes all of them", folder, " and ".join(held))
-    return PreparedScans(folder, manifest, _chosen(manifest, kind, split, drives), reflectance)
-
-
-def _chosen(manifest: Manifest, kind: SourceKind, split: str | None, drives: Sequence[str | int] | None) -> np.ndarray:
-    """The scans of a split and of some drives, numbered as they lie in the shards, (n,) int64."""
-    ends = np.cumsum([len(drive.scans) for drive in manifest.drives])
-    found = [(d, np.arange(end - len(d.scans), end)) for d, end in zip(manifest.drives, ends, strict=True)]
-    if split is not None:
-        if split not in kind.splits:
-            known = ", ".join(kind.splits) or "none"
-            raise InputError(f"no split named {split!r} in prepared {manifest.recipe.layout} scans; known: {known}.")
-        found = [pair for pair in found if kind.split_of(pair[0].name) == split]
-    if drives is not None:
-        named = [named_drive([drive for drive, _ in found], str(name)) for name in drives]
-        found = [pair for drive in named for pair in found if pair[0] is drive]
     usable = np.ones(manifest.recipe.scans, dtype=bool)
     usable[list(manifest.left_out)] = False
-    numbers = np.concatenate([np.empty(0, dtype=np.int64), *(span for _, span in found)])
-    chosen: np.ndarray = (np.cumsum(usable) - 1)[numbers[usable[numbers]]]
-    if len(chosen) == 0:
+    spans = dict(zip(map(id, manifest.drives), spans_of(manifest.drives), strict=True))
+    chosen = kind.chosen(list(manifest.drives), split, drives)
+    numbers = np.array([number for drive in chosen for number in spans[id(drive)]], dtype=np.int64)
+    rows = (np.cumsum(usable) - 1)[numbers[usable[numbers]]]  # as they lie in the shards
+    if len(rows) == 0:
         raise InputError(f"none of the {int(usable.sum())} prepared scans is of split={split!r}, drives={drives}.")
-    return chosen
+    return PreparedScans(folder, manifest, rows, reflectance)
 
 
 # The sets of scans that a run's `data` names
 
 
-def described_sources(data: Mapping[str, Any]) -> list[SourceOptions]:
-    """The sets of scans that a config's `data` names, to train on and to hold out; none where it names pairs."""
-    options = DataOptions.of(data)
-    if options.name == PAIRS:
-        return []
-    return [*split_parts(options), *held_out_options(options)]
-
-
 def split_parts(options: DataOptions) -> list[PartOptions]:
-    """The sets of scans to train on. What a part does not say is the run's, but for root, split and drives.
+    """The sets of scans to train on; none of pairs. What a part does not say is the run's, but for root, split, drives.
 
     Raises:
         InputError: a mixture without parts, an option that a part does not know, weights on some alone, or a part of
             which nobody said whether its test drives are meant too.
     """
-    common = {f.name: getattr(options, f.name) for f in fields(SourceOptions)}
+    if options.name == PAIRS:
+        return []
     if options.name != MIXED:
-        return [PartOptions(**common)]
+        return [PartOptions(**options.common)]
     if not options.parts:
         example = "[{name: kitti_360, root: FOLDER, split: train, weight: 3}, {name: folder, root: FOLDER, weight: 1}]"
         raise InputError(f"data=mixed needs its parts: data.parts='{example}'.")
-    common |= {"root": None, "split": None, "drives": None}
     made = []
     for number, part in enumerate(options.parts):
         what = f"data.parts[{number}]"
@@ -337,13 +280,12 @@ def split_parts(options: DataOptions) -> list[PartOptions]:
         check_options(what, PartOptions, part)
         if "name" not in part or part["name"] in (MIXED, PAIRS):
             raise InputError(f"{what} needs the name of a data set, found {part.get('name')!r}.")
-        splits = SOURCES[part["name"]].splits
-        if splits and "split" not in part:
-            known = ", ".join(splits)
+        known = ", ".join(SOURCES[part["name"]].splits)
+        if known and "split" not in part:
             raise InputError(
                 f"{what}: {part['name']} has a standard split: give split, one of {known}, or null for all."
             )
-        made.append(PartOptions(**{**common, **part}))
+        made.append(PartOptions(**{**options.common, "root": None, "split": None, "drives": None, **part}))
     if len({part.weight is None for part in made}) > 1:
         raise InputError("data.parts: give every part a weight, or none, for shares by size.")
     if sum(part.name == SIMULATED for part in made) > 1:
@@ -352,33 +294,25 @@ def split_parts(options: DataOptions) -> list[PartOptions]:
 
 
 def held_out_options(options: DataOptions) -> list[SourceOptions]:
-    """`data.validation.data`: what it does not say is the run's, but for split and drives; empty where there is none.
-
-    Raises:
-        InputError: an option that it does not know, or several data sets.
-    """
+    """`data.validation.data`, where there is one: what it does not say is the run's, but for split and drives."""
     other = options.held.data
-    if other is None:
+    if other is None or options.name == PAIRS:
         return []
     check_options("data.validation.data", SourceOptions, other)
-    common = {f.name: getattr(options, f.name) for f in fields(SourceOptions)}
-    held = SourceOptions(**{**common, "split": None, "drives": None, **other})
+    held = SourceOptions(**{**options.common, "split": None, "drives": None, **other})
     if held.name in (MIXED, PAIRS):
         raise InputError(f"data.validation.data must name one data set, found {held.name}; hold out a part of it.")
     return [held]
 
 
 def resolve_reflectance(wanted: Any, data: Mapping[str, Any]) -> bool:
-    """`encoding.reflectance` for a config's `data`: `auto` is true where each of its sets of scans has reflectance.
-
-    Raises:
-        InputError: another value than true, false and auto; or, under auto, a data set that cannot be opened.
-    """
+    """`encoding.reflectance` for a config's `data`: `auto` is true where each of its sets of scans has reflectance."""
     if isinstance(wanted, bool):
         return wanted
     if wanted != AUTO:
         raise InputError(f"encoding.reflectance must be true, false or auto, found {wanted!r}.")
-    for options in described_sources(data):
+    named = DataOptions.of(data)
+    for options in [*split_parts(named), *held_out_options(named)]:
         lacking = SOURCES[options.name].lacks_reflectance(options, options.on_bad_scan)
         if lacking:
             log.info("encoding.reflectance=auto is false here, a flow of range alone: %s", lacking)

@@ -5,9 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
-import numpy as np
-
-from r2flow.data.shards import Recipe
+from r2flow.data.shards import PairRecipe
 from r2flow.errors import InputError
 from r2flow.flow.solvers import check_method, check_tolerance
 from r2flow.registry import check_options
@@ -15,37 +13,20 @@ from r2flow.registry import check_options
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # in the table `r2flow.data.opening.SOURCES`
 MIXED, PAIRS = "mixed", "pairs"  # what `data.name` may be besides: several sets of scans, and pairs drawn by a flow
 
-MIB = 2**20
-
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """One set of scans.
+    """One set of scans. A value that cannot be is refused (`InputError`), here and in the options below."""
 
-    Attributes:
-        name: Its kind: a name in `r2flow.data.opening.SOURCES`.
-        root: Folder of the data set.
-        split: Part of the data set's standard split; None takes all.
-        drives: Names or numbers of the drives to take; None takes all.
-        scenes: Number of simulated scenes.
-        projection: `spherical` or `unfolding`.
-        convention: `centre` or `reference`.
-        reflectance_scale: The value in the files that means full reflectance.
-        on_bad_scan: What is done with a scan that cannot be used: `error`, or `skip` to take the next one.
-
-    Raises:
-        InputError: no scene, a reflectance scale that is not positive, or another value of `on_bad_scan`.
-    """
-
-    name: str = SIMULATED
-    root: str | int | None = None
-    split: str | None = None
-    drives: list[str | int] | None = None
-    scenes: int = 512
-    projection: str = "spherical"
-    convention: str = "centre"
-    reflectance_scale: float = 1.0
-    on_bad_scan: str = "error"
+    name: str = SIMULATED  # its kind: a name in `r2flow.data.opening.SOURCES`
+    root: str | int | None = None  # folder of the data set
+    split: str | None = None  # part of the data set's standard split; None takes all
+    drives: list[str | int] | None = None  # names or numbers of the drives to take; None takes all
+    scenes: int = 512  # number of simulated scenes
+    projection: str = "spherical"  # or unfolding
+    convention: str = "centre"  # or reference
+    reflectance_scale: float = 1.0  # the value in the files that means full reflectance
+    on_bad_scan: str = "error"  # or skip: the next usable scan takes the place of one that cannot be used
 
     def __post_init__(self) -> None:
         if not 0 < self.reflectance_scale < math.inf:
@@ -61,12 +42,13 @@ class SourceOptions:
         return cls(**{f.name: data[f.name] for f in fields(cls) if f.name in data})
 
     @property
-    def folder(self) -> str:
-        """`root`, which is a folder's name even where it looks like a number.
+    def common(self) -> dict[str, Any]:
+        """The options of a set of scans among these."""
+        return {f.name: getattr(self, f.name) for f in fields(SourceOptions)}
 
-        Raises:
-            InputError: there is none.
-        """
+    @property
+    def folder(self) -> str:
+        """`root`, which is a folder's name even where it looks like a number."""
         if self.root is None:
             raise InputError(f"data={self.name} needs the folder of its scans: data.root=FOLDER.")
         return str(self.root)
@@ -74,31 +56,18 @@ class SourceOptions:
 
 @dataclass(frozen=True)
 class PartOptions(SourceOptions):
-    """One of several sets of scans.
+    """One of several sets of scans."""
 
-    Attributes:
-        weight: Its share of the images of a run, beside the other parts' weights.
-    """
-
-    weight: float | None = None
+    weight: float | None = None  # its share of the images of a run, beside the other parts' weights
 
 
 @dataclass(frozen=True)
 class ValidationOptions:
-    """What is held out of the training (`data.validation`).
+    """What is held out of the training (`data.validation`)."""
 
-    Attributes:
-        share: About this share of the scans, in one contiguous block.
-        scans: The most scans to validate on.
-        data: Another set of scans to hold out instead: {name, root, split, drives, ...}.
-
-    Raises:
-        InputError: `scans` is not a whole number of at least 0, or the share not finite.
-    """
-
-    share: float = 0.1
-    scans: int = 64
-    data: Mapping[str, Any] | None = None
+    share: float = 0.1  # about this share of the scans, in one contiguous block
+    scans: int = 64  # the most scans to validate on
+    data: Mapping[str, Any] | None = None  # another set of scans to hold out instead: {name, root, split, drives, ...}
 
     def __post_init__(self) -> None:
         if not (isinstance(self.scans, int) and self.scans >= 0 and math.isfinite(self.share)):
@@ -107,33 +76,20 @@ class ValidationOptions:
 
 @dataclass(frozen=True)
 class PairOptions:
-    """The choices behind a set of pairs (`data.pairs`).
-
-    Attributes:
-        num: Number of pairs.
-        method, steps, tolerance: The solver's (`r2flow.flow.solvers.solve`); the paper takes dopri5 at 1e-5.
-        batch_size: Pairs solved together. The last bits of a pair depend on it.
-        shard_mib: Size of a shard.
-        seed: Of the noise. It is not the run's seed: runs of several seeds can share one set of pairs.
-        first: Index of the first pair; None takes the one behind the pairs that the flow itself was trained on.
-        parent: Hash of the flow; the run fills it in.
-    """
+    """The choices behind a set of pairs (`data.pairs`)."""
 
     num: int = 1000
-    method: str = "dopri5"
+    method: str = "dopri5"  # the solver's, like steps and tolerance: `r2flow.flow.solvers.solve`; here the paper's
     steps: int = 32
     tolerance: float = 1e-5
-    batch_size: int = 16
+    batch_size: int = 16  # pairs solved together; the last bits of a pair depend on it
     shard_mib: float = 256.0
-    seed: int = 0
-    first: int | None = None
-    parent: str | None = None
+    seed: int = 0  # of the noise; not the run's: runs of several seeds can share one set of pairs
+    first: int | None = None  # index of the first pair; None: behind the pairs that the flow itself was trained on
+    parent: str | None = None  # hash of the flow; the run fills it in
 
-    def recipe(self, shape: tuple[int, int, int], noise_shape: tuple[int, ...] | None = None) -> Recipe:
-        """All that pairs depend on, where scans have this shape in model space.
-
-        Args:
-            noise_shape: Shape of x_0, where it is not the scan's.
+    def recipe(self, shape: tuple[int, int, int], noise_shape: tuple[int, ...] | None = None) -> PairRecipe:
+        """All that pairs depend on, where scans and their noise have these shapes in model space.
 
         Raises:
             InputError: a number out of its range or an unknown solver.
@@ -148,46 +104,28 @@ class PairOptions:
             raise InputError(f"data.pairs: seed and first must be at least 0, found {self.seed} and {first}.")
         check_tolerance(self.tolerance)
         check_method(self.method)
-        batch_bytes = self.batch_size * 2 * int(np.prod(shape))
-        return Recipe(
-            parent=self.parent or "",
-            shape=shape,
-            seed=self.seed,
-            first=first,
-            method=self.method,
-            steps=self.steps,
-            tolerance=float(self.tolerance),  # 1 and 1.0 are one recipe
-            batch_size=self.batch_size,
-            shard_batches=max(round(self.shard_mib * MIB / batch_bytes), 1),
-            noise_shape=None if noise_shape == shape else noise_shape,
-        )
+        shard_batches = max(round(self.shard_mib * 2**20 / (self.batch_size * 2 * math.prod(shape))), 1)
+        tolerance = float(self.tolerance)  # 1 and 1.0 are one recipe
+        return PairRecipe(
+            self.parent or "", shape, self.seed, first, self.method, self.steps, tolerance, self.batch_size,
+            shard_batches, None if noise_shape == shape else noise_shape,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class DataOptions(SourceOptions):
     """All of a run's `data`. `name` may also be `mixed` or `pairs`; `root` is then that of the pairs.
 
-    Attributes:
-        parts: Of `mixed`: its sets of scans, each `{name, root, split, drives, ..., weight}`. The weights are the
-            shares of the run's images; without any, all scans are one set.
-        augment: Options of `r2flow.data.augment.Augmentation`, done to training scans alone.
-        batch_size: Images in one optimiser step, over all devices and accumulated batches.
-        workers: Loader processes of each device.
-        memory_gib: Training scans are kept in memory where they fit into this, else read when needed.
-        validation: `ValidationOptions`.
-        pairs: `PairOptions`, where the data are pairs.
-
-    Raises:
-        InputError: as for `SourceOptions`; an empty batch, fewer than no workers, parts without data=mixed.
+    Weights of parts are the shares of the run's images; without any, all scans are one set.
     """
 
-    parts: Sequence[Mapping[str, Any]] | None = None
-    augment: Mapping[str, Any] | None = None
-    batch_size: int = 8
-    workers: int = 0
-    memory_gib: float = 2.0
-    validation: Mapping[str, Any] | None = None
-    pairs: Mapping[str, Any] | None = None
+    parts: Sequence[Mapping[str, Any]] | None = None  # of `mixed`: {name, root, split, drives, ..., weight} each
+    augment: Mapping[str, Any] | None = None  # `r2flow.data.augment.Augmentation`, of training scans alone
+    batch_size: int = 8  # images in one optimiser step, over all devices and accumulated batches
+    workers: int = 0  # loader processes of each device
+    memory_gib: float = 2.0  # training scans are kept in memory where they fit into this, else read when needed
+    validation: Mapping[str, Any] | None = None  # `ValidationOptions`
+    pairs: Mapping[str, Any] | None = None  # `PairOptions`, where the data are pairs
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -201,10 +139,6 @@ class DataOptions(SourceOptions):
 
     @property
     def held(self) -> ValidationOptions:
-        """`validation`, checked.
-
-        Raises:
-            InputError: an option that it does not know, or a value that it cannot take.
-        """
+        """`validation`, checked."""
         check_options("data.validation", ValidationOptions, self.validation or {})
         return ValidationOptions(**(self.validation or {}))

@@ -18,30 +18,24 @@ from torch.utils.data import Dataset
 
 from r2flow import noise
 from r2flow.data.loader import Item
-from r2flow.data.shards import Block, PairStore, Recipe, read_notes
+from r2flow.data.shards import Block, PairRecipe, PairStore
 from r2flow.errors import InputError
-from r2flow.generators import Generator, Sampler
+from r2flow.generators import Generator
 
 
-def pair_noise(recipe: Recipe, index: int) -> Tensor:
+def pair_noise(recipe: PairRecipe, index: int) -> Tensor:
     """x_0 of a pair, of the recipe's noise shape or (C, H, W), drawn again from its index."""
     return noise.standard_normal(recipe.noise_shape or recipe.shape, recipe.seed, "pairs", index)
 
 
 @dataclass
 class Made:
-    """What one process has done: pairs, those left out, their evaluations, the seconds and those spent on writing."""
+    """What one process has done."""
 
     pairs: int = 0
     evaluations: int = 0
-    unusable: int = 0
+    unusable: int = 0  # pairs that are left out
     seconds: float = 0.0
-    writing: float = 0.0
-
-    def add(self, block: Block) -> None:
-        self.pairs += len(block.usable)
-        self.evaluations += int(block.evaluations.sum())
-        self.unusable += int((~block.usable).sum())
 
 
 def make_pairs(
@@ -56,10 +50,8 @@ def make_pairs(
 
     x_1 is where the generator carries x_0 = `pair_noise`, neither clamped nor snapped, in half precision. Rank r owns
     the batches r, r + R, ... and talks to no other; a batch is computed alike whoever owns it, so the shards are the
-    same, byte for byte, for every R. What is there already, from any earlier process, is kept.
-
-    Args:
-        progress: Called after each batch that is on the disk.
+    same, byte for byte, for every R. What is there already, from any earlier process, is kept. `progress` is called
+    after each batch that is on the disk.
 
     Raises:
         InputError: no pair is usable: the flow is broken, or the tolerance out of its reach; or the folder cannot be
@@ -67,7 +59,7 @@ def make_pairs(
     """
     if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
         raise InputError(f"these pairs are of another noise than the generator's {generator.noise_shape}.")
-    generator.check_sampler(sampler_of(store.recipe))
+    generator.check_sampler(store.recipe.sampler)
     store.begin()
     # Shards are checked by turns; who finds one damaged makes its batches, which the others hold to be there.
     shards = store.shards(num)
@@ -79,17 +71,17 @@ def make_pairs(
         if store.has(batch):
             continue
         block = solve_batch(store.recipe, generator, batch)
-        made.add(block)
+        made.pairs += len(block.usable)
+        made.evaluations += int(block.evaluations.sum())
+        made.unusable += int((~block.usable).sum())
         kept.append((batch, block))
         _check_usable(made, store.recipe)
         if made.unusable == made.pairs:
             continue  # not to be kept before it is known that the flow can do better
-        written = time.monotonic()
         for number, solved in kept:
             store.commit(number, solved)
             store.seal(number // store.recipe.shard_batches, num)
         kept = []
-        made.writing += time.monotonic() - written
         made.seconds = time.monotonic() - start
         progress(made)
     if kept:
@@ -111,7 +103,7 @@ def _in_own_order(batches: set[int], shard_batches: int) -> list[int]:
     return sorted(sorted(batches), key=lambda batch: (turn[batch // shard_batches], draw.random()))
 
 
-def _check_usable(made: Made, recipe: Recipe, patience: int = 64) -> None:
+def _check_usable(made: Made, recipe: PairRecipe, patience: int = 64) -> None:
     if made.unusable == made.pairs > patience:
         raise InputError(
             f"none of {made.pairs} pairs came to an end with {recipe.method} at tolerance {recipe.tolerance:g}: "
@@ -119,16 +111,11 @@ def _check_usable(made: Made, recipe: Recipe, patience: int = 64) -> None:
         )
 
 
-def sampler_of(recipe: Recipe) -> Sampler:
-    """How the generator is run."""
-    return Sampler(recipe.method, recipe.steps, recipe.tolerance)
-
-
-def solve_batch(recipe: Recipe, generator: Generator, batch: int) -> Block:
+def solve_batch(recipe: PairRecipe, generator: Generator, batch: int) -> Block:
     """The pairs first + [b B, (b + 1) B) of batch b."""
     first = recipe.first + batch * recipe.batch_size
     x_0 = torch.stack([pair_noise(recipe, index) for index in range(first, first + recipe.batch_size)])
-    end = generator.generate(x_0.to(generator.device), sampler=sampler_of(recipe))
+    end = generator.generate(x_0.to(generator.device), sampler=recipe.sampler)
     x_1 = end.x.to(torch.float16).cpu()
     usable = end.converged.cpu() & x_1.isfinite().flatten(1).all(1)
     return Block(x_1.numpy(), end.evaluations.cpu().numpy().astype(np.int32), usable.numpy())
@@ -146,8 +133,7 @@ class PairSource:
         if not store.is_whole(num):
             lacking = len(store.missing(num)) * store.recipe.batch_size
             raise InputError(f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
-        flags = [read_notes(store.shard_path(shard))["usable"] for shard in store.shards(num)]
-        self.indices = np.flatnonzero(np.concatenate([np.array(one, dtype=bool) for one in flags])[:num])
+        self.indices = np.flatnonzero(store.usable(num))
         self._opened: dict[int, Any] = {}
 
     def __getstate__(self) -> dict[str, Any]:

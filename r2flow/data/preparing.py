@@ -1,44 +1,142 @@
-"""Making prepared scans: shard by shard, by any number of processes, at any number of attempts."""
+"""Making prepared scans: which and how is planned, then shard by shard, by any number of processes and attempts."""
 
 import hashlib
 import json
 import logging
+import os
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from filelock import BaseFileLock
-from torch.utils.data import DataLoader, Dataset, Sampler
+from filelock import FileLock, Timeout
+from torch.utils.data import DataLoader, Dataset
 
-from r2flow.data.manifest import (
+from r2flow import simulator
+from r2flow.data.layouts import Drive
+from r2flow.data.opening import find_drives
+from r2flow.data.options import SIMULATED
+from r2flow.data.prepared import (
     Manifest,
-    Recipe,
+    ScanRecipe,
     ShardEntry,
     checksum,
-    read_entry,
+    damage_of,
+    describe_sensor,
+    read_head,
     read_manifest,
+    scan_crc,
     shard_name,
     write_manifest,
 )
-from r2flow.data.plans import Plan
-from r2flow.data.prepared import check_shard, read_head, scan_crc
-from r2flow.data.quantise import RangeCodes, ReflectanceCodes
-from r2flow.data.sources import ScanSource
-from r2flow.data.store import MANIFEST, Damaged, clear_leftovers, lock_file, refuse_other, shard_bytes, warn_damaged
+from r2flow.data.quantise import OTHER_LEVELS, RangeCodes, ReflectanceCodes, find_levels
+from r2flow.data.sources import Reading, ScanFiles, ScanSource, SimulatedScans, spread, stored_reflectance
+from r2flow.data.store import MANIFEST, clear_leftovers, refuse_other, shard_bytes, warn_damaged
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
+from r2flow.lidar.sensors import Sensor
 
 log = logging.getLogger(__name__)
 
+SHARD_SCANS = 512  # 100 MB at 64 x 1024, held in memory while they are made
+PROBED = 8  # scans that tell whether a data set has reflectance, and in which steps
+PROJECTION = 1  # to be raised when the same files give other images, or images other codes
+
+Advance = Callable[[int], None]  # told a number of scans whenever they are done
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The scans to prepare, and how."""
+
+    recipe: ScanRecipe
+    drives: tuple[Drive, ...]
+    source: ScanSource
+
+
+def plan_files(
+    layout: str,
+    root: str | Path,
+    sensor: Sensor,
+    projection: str = "spherical",
+    convention: str = "centre",
+    split: str | None = None,
+    drives: Sequence[str | int] | None = None,
+    reflectance_scale: float = 1.0,
+    levels: int | None = None,
+    shard_scans: int = SHARD_SCANS,
+) -> Plan:
+    """The scans of a data set (`find_drives`). Without `levels`, some of the scans tell those of reflectance.
+
+    Raises:
+        InputError: no such scans, or levels out of their range.
+    """
+    root = Path(root).expanduser()
+    found = find_drives(layout, root, split, drives)
+    paths = [path for drive in found for path in drive.scans]
+    named = tuple(Drive(d.name, tuple(Path(os.path.relpath(p, root)).as_posix() for p in d.scans)) for d in found)
+    known = _reflectance_levels(paths, reflectance_scale, levels)
+    reading = Reading(sensor, projection, convention, reflectance_scale, known is not None, "error", within_limits=True)  # type: ignore[arg-type]
+    return _plan(layout, named, ScanFiles(paths, reading), reading, known, shard_scans, PROJECTION)
+
+
+def plan_simulated(
+    num: int, seed: int, sensor: Sensor, levels: int | None = None, shard_scans: int = SHARD_SCANS
+) -> Plan:
+    """The first `num` scenes of the simulator under a seed."""
+    drives = (Drive(SIMULATED, tuple(f"scene {scene}" for scene in range(num))),)
+    source = SimulatedScans(sensor, seed, range(num))
+    known = levels or find_levels(source[0][1])
+    return _plan(SIMULATED, drives, source, Reading(sensor), known, shard_scans, simulator.REVISION, seed)
+
+
+def _plan(
+    layout: str, drives: tuple[Drive, ...], source: ScanSource, reading: Reading, levels: int | None,
+    shard_scans: int, revision: int, seed: int | None = None,
+) -> Plan:  # fmt: skip
+    names = [name for drive in drives for name in drive.scans]
+    if levels is not None:
+        ReflectanceCodes(levels)  # refuses what is no number of levels
+    recipe = ScanRecipe(
+        revision, layout, len(names), checksum(names), describe_sensor(reading.sensor), reading.projection,
+        reading.convention, reading.reflectance_scale or 1.0, levels,
+        RangeCodes(reading.sensor.min_range, reading.sensor.max_range).describe(), shard_scans, seed,
+    )  # fmt: skip
+    return Plan(recipe, drives, source)
+
+
+def _reflectance_levels(paths: Sequence[str], scale: float, levels: int | None) -> int | None:
+    """Levels of reflectance, `levels` where given; None where one of some scans has none, or all have 0 throughout."""
+    found = []
+    for index in spread(len(paths), PROBED):
+        with suppress(InputError):  # it is met again, and dealt with, when its turn comes
+            reflectance = stored_reflectance(paths[index])
+            if reflectance is None:
+                return None
+            found.append(reflectance / np.float32(scale))
+    if not found:
+        return OTHER_LEVELS if levels is None else levels
+    values = np.concatenate(found)
+    if not values.any():
+        return None
+    if levels is not None:
+        return levels
+    levels, highest = find_levels(values), float(values.max())
+    if highest < 0.25 and not ReflectanceCodes(levels).fits(values):
+        log.warning(
+            "reflectance goes up to %.3g of 1 alone and is kept in steps of 1/%d: --reflectance-scale %.3g spreads it",
+            highest, levels, highest * scale,
+        )  # fmt: skip
+    return levels
+
 
 class Coded(NamedTuple):
-    """One scan in codes, (H, W) each, and the most that its ranges and reflectances are off by them."""
+    """One scan in codes of range and reflectance, (H, W) each, and the most that these are off."""
 
     codes: list[np.ndarray]
     errors: list[float]
@@ -47,22 +145,17 @@ class Coded(NamedTuple):
 class CodedScans(Dataset[tuple[int, Coded | str]]):
     """Scan by scan its number and its codes, or why it cannot be used."""
 
-    def __init__(self, source: ScanSource, recipe: Recipe) -> None:
-        self.source = source
-        self.range = RangeCodes(recipe.sensor["min_range"], recipe.sensor["max_range"])
-        self.reflectance = None if recipe.levels is None else ReflectanceCodes(recipe.levels)
+    def __init__(self, source: ScanSource, recipe: ScanRecipe) -> None:
+        self.source, self.coders = source, recipe.codes
 
     def __getitem__(self, number: int) -> tuple[int, Coded | str]:
         try:
             image = self.source[number]
         except InputError as error:
             return number, str(error)
-        codes = [self.range.encode(image[0])]
-        decoded = [self.range.metres[codes[0]]]
-        if self.reflectance is not None:
-            codes.append(self.reflectance.encode(image[1]))
-            decoded.append(self.reflectance.values[codes[1]])
-        errors = [float(np.abs(one.astype(np.float64) - image[i]).max()) for i, one in enumerate(decoded)]
+        codes = [coder.encode(channel) for coder, channel in zip(self.coders, image, strict=False)]
+        decoded = [coder.values[code].astype(np.float64) for coder, code in zip(self.coders, codes, strict=True)]
+        errors = [float(np.abs(one - channel).max()) for one, channel in zip(decoded, image, strict=False)]
         return number, Coded(codes, errors)
 
 
@@ -76,25 +169,21 @@ class Preparation:
 
     def __init__(self, folder: str | Path, plan: Plan) -> None:
         self.folder, self.plan, self.recipe = Path(folder).expanduser(), plan, plan.recipe
-        self.finished: tuple[ShardEntry, ...] | None = None
+        self.making = self.folder / "making"
+        self.finished: tuple[ShardEntry, ...] = ()
 
-    @property
-    def _making(self) -> Path:
-        return self.folder / "making"
-
-    def begin(self, advance: Callable[[int], None] = lambda scans: None) -> list[int]:
+    def begin(self, advance: Advance = lambda scans: None) -> list[int]:
         """Take the folder, and check all that is in it; the shards that are missing or damaged.
 
         What is finished is only read: it may lie where nothing can be written.
-
-        Args:
-            advance: Called with the number of scans of each shard that was looked at.
 
         Raises:
             InputError: other scans are in the folder.
         """
         if not self._is_taken():
-            self._take()
+            with self._lock("manifest", wait=True):
+                if not self._is_taken():
+                    write_manifest(self.folder, Manifest(self.recipe, self.plan.drives))
         self._look()
         missing = []
         for shard in range(self.recipe.shards):
@@ -103,36 +192,12 @@ class Preparation:
             advance(len(self.recipe.numbers_of(shard)))
         return missing
 
-    def _take(self) -> None:
-        self._making.mkdir(parents=True, exist_ok=True)
-        with self._manifest_lock():
-            if not self._is_taken():
-                write_manifest(self.folder, Manifest(self.recipe, self.plan.drives))
-
-    @contextmanager
-    def _manifest_lock(self) -> Iterator[None]:
-        lock = lock_file(self._making / "manifest.lock", wait=True)
-        assert lock is not None
-        try:
-            yield
-        finally:
-            lock.release()
-
-    def _is_taken(self) -> bool:
-        """Whether a manifest is here that has to stay: not one of other settings by which no shard was ever made."""
-        if not (self.folder / MANIFEST).exists():
-            return False
-        there = read_manifest(self.folder)
-        if there.shards is not None or there.recipe.digest == self.recipe.digest or any(self.folder.glob("scans-*")):
-            return True
-        return not all(self._is_free(int(lock.stem)) for lock in self._making.glob("[0-9]*.lock"))
-
     def make(
         self,
         missing: Sequence[int],
         on_bad_scan: str = "error",
         workers: int = 0,
-        advance: Callable[[int], None] = lambda scans: None,
+        advance: Advance = lambda scans: None,
         patience: float = 0.5,
     ) -> Manifest:
         """Make the missing shards, wait for those that another process makes, and finish the manifest.
@@ -140,7 +205,6 @@ class Preparation:
         Args:
             on_bad_scan: `error`, or `skip` to leave out what cannot be used.
             workers: Processes that read and project; 0 does it in this one.
-            advance: Called with a number of scans whenever these are done, here or elsewhere.
             patience: Seconds between looks at what others do.
 
         Raises:
@@ -150,44 +214,92 @@ class Preparation:
         """
         if on_bad_scan not in ("error", "skip"):
             raise InputError(f"--on-bad-scan must be 'error' or 'skip', found {on_bad_scan!r}.")
-        left = list(missing)
+        left = set(missing)
         while left:
-            claims = _Claims(self, left)
+            claims: dict[int, ExitStack] = {}
             try:
-                made = self._make_claimed(claims, on_bad_scan, workers, advance)
+                self._make_unclaimed(left, claims, on_bad_scan, workers, advance)
             finally:
-                claims.release()
-            for shard in claims.elsewhere:
-                advance(len(self.recipe.numbers_of(shard)))
-            left = [shard for shard in left if shard not in made and shard not in claims.elsewhere]
+                for claim in claims.values():
+                    claim.close()
             while left and not any(self._is_free(shard) for shard in left):
                 time.sleep(patience)
         return self._finish()
 
-    def _make_claimed(
-        self, claims: "_Claims", on_bad_scan: str, workers: int, advance: Callable[[int], None]
-    ) -> set[int]:
+    def _make_unclaimed(
+        self, left: set[int], claims: dict[int, ExitStack], on_bad_scan: str, workers: int, advance: Advance
+    ) -> None:
+        """Make what no other process is making; what is there then is `left` no more."""
         loader = DataLoader(
-            CodedScans(self.plan.source, self.recipe), sampler=claims, batch_size=None, num_workers=workers,
-            collate_fn=_as_it_is,
+            CodedScans(self.plan.source, self.recipe), sampler=self._claimed(left, claims, advance), batch_size=None,
+            num_workers=workers, collate_fn=_as_it_is,
         )  # fmt: skip
-        made, scans, left_out = set(), [], []
+        scans: list[Coded] = []
+        left_out: list[int] = []
         for number, coded in loader:  # in order, whoever read them
-            if isinstance(coded, str):
-                if on_bad_scan == "error":
-                    raise InputError(coded)
+            if not isinstance(coded, str):
+                scans.append(coded)
+            elif on_bad_scan == "error":
+                raise InputError(coded)
+            else:
                 log.warning("left out: %s", coded)
                 left_out.append(number)
-            else:
-                scans.append(coded)
             advance(1)
             shard = number // self.recipe.shard_scans
             if number + 1 == self.recipe.numbers_of(shard).stop:
                 self._write(shard, scans, left_out)
-                claims.done(shard)
-                made.add(shard)
+                claims.pop(shard).close()
+                left.remove(shard)
                 scans, left_out = [], []
-        return made
+
+    def _claimed(self, left: set[int], claims: dict[int, ExitStack], advance: Advance) -> Iterator[int]:
+        """The scans of shards that no other process is making, claimed as they are asked for.
+
+        It never waits for another process: that one may wait for a shard that is claimed here and not made yet.
+        """
+        for shard in sorted(left):
+            with ExitStack() as claim:
+                if not claim.enter_context(self._lock(f"{shard:06d}")):
+                    continue
+                if not self.finished and not self._note(shard).exists():
+                    self._look()
+                if self._is_whole(shard):  # another process has made it meanwhile
+                    left.remove(shard)
+                    advance(len(self.recipe.numbers_of(shard)))
+                    continue
+                claims[shard] = claim.pop_all()
+            clear_leftovers(self.folder.glob(f".{shard_name(shard)}.*.part"))
+            yield from self.recipe.numbers_of(shard)
+
+    @contextmanager
+    def _lock(self, name: str, wait: bool = False) -> Iterator[bool]:
+        """Hold a lock, which the system releases when this process ends, however it ends; whether it is held here."""
+        lock = FileLock(self.making / f"{name}.lock", timeout=-1 if wait else 0)
+        while not lock.is_locked:
+            self.making.mkdir(parents=True, exist_ok=True)
+            try:
+                lock.acquire()
+            except Timeout:
+                break
+            except FileNotFoundError:  # another process has finished, and removed the folder
+                continue
+        try:
+            yield lock.is_locked
+        finally:
+            lock.release()
+
+    def _is_free(self, shard: int) -> bool:
+        with self._lock(f"{shard:06d}") as held:
+            return held
+
+    def _is_taken(self) -> bool:
+        """Whether a manifest is here that has to stay: not one of other settings by which no shard was ever made."""
+        if not (self.folder / MANIFEST).exists():
+            return False
+        there = read_manifest(self.folder)
+        if there.shards or there.recipe.digest == self.recipe.digest or any(self.folder.glob("scans-*")):
+            return True
+        return not all(self._is_free(int(lock.stem)) for lock in self.making.glob("[0-9]*.lock"))
 
     def _look(self) -> None:
         """Read the manifest again: another process may have finished it."""
@@ -195,53 +307,29 @@ class Preparation:
         refuse_other(self.folder, "scans", asdict(manifest.recipe), asdict(self.recipe), "--out FOLDER")
         self.finished = manifest.shards
 
+    def _note(self, shard: int) -> Path:
+        return self.making / f"{shard:06d}.json"
+
     def _entry(self, shard: int) -> ShardEntry | None:
         """What is known of a shard."""
-        if self.finished is not None:
+        if self.finished:
             return self.finished[shard]
         with suppress(OSError, ValueError, TypeError, KeyError):
             note = json.loads(self._note(shard).read_text(encoding="utf-8"))
             if note["recipe"] == self.recipe.digest and note["checksum"] == checksum(note["shard"]):
-                return read_entry(note["shard"])
+                return ShardEntry.of(note["shard"])
         return None
 
-    def _note(self, shard: int) -> Path:
-        return self._making / f"{shard:06d}.json"
-
     def _is_whole(self, shard: int, level: int = logging.DEBUG) -> bool:
-        entry = self._entry(shard)
-        if entry is None:
-            return False
-        try:
-            check_shard(self.folder / shard_name(shard), entry)
-        except Damaged as error:
-            warn_damaged(self.folder / shard_name(shard), error, level)
-            return False
-        return True
-
-    def claim(self, shard: int) -> BaseFileLock | None:
-        """The lock of a shard, None where another process holds it."""
-        return lock_file(self._making / f"{shard:06d}.lock")
-
-    def _is_free(self, shard: int) -> bool:
-        lock = self.claim(shard)
-        if lock is not None:
-            lock.release()
-        return lock is not None
-
-    def is_made(self, shard: int) -> bool:
-        """Whether another process has made a shard meanwhile; to be asked with its lock held."""
-        if self.finished is None and not self._note(shard).exists():
-            self._look()
-        return self._is_whole(shard)
-
-    def clear(self, shard: int) -> None:
-        """Remove what a killed process was writing; to be done with the shard's lock held."""
-        clear_leftovers(self.folder.glob(f".{shard_name(shard)}.*.part"))
+        entry, path = self._entry(shard), self.folder / shard_name(shard)
+        damage = damage_of(path, entry) if entry is not None else None
+        if damage is not None:
+            warn_damaged(path, damage, level)
+        return entry is not None and damage is None
 
     def _write(self, shard: int, scans: Sequence[Coded], left_out: Sequence[int]) -> None:
         data = self._serialised(shard, [scan.codes for scan in scans])
-        errors = [max((scan.errors[i] for scan in scans), default=0.0) for i in range(self._channels)]
+        errors = [*np.max([scan.errors for scan in scans], axis=0).tolist(), 0.0] if scans else [0.0, 0.0]
         entry = ShardEntry(
             scans=len(scans),
             left_out=tuple(left_out),
@@ -249,10 +337,10 @@ class Preparation:
             head=zlib.crc32(read_head(BytesIO(data))),
             sha256=hashlib.sha256(data).hexdigest(),
             range_error=errors[0],
-            reflectance_error=errors[1] if len(errors) > 1 else 0.0,
+            reflectance_error=errors[1],
         )
         path = self.folder / shard_name(shard)
-        if self.finished is not None and entry != self.finished[shard]:
+        if self.finished and entry != self.finished[shard]:
             raise InputError(
                 f"{path} was damaged, and what it was made of has changed since: prepare all scans into another folder."
             )
@@ -262,22 +350,22 @@ class Preparation:
             path.unlink()
         with atomic_write(path) as file:
             file.write(data)
-        if self.finished is None:
-            note = json.loads(json.dumps({"shard": asdict(entry)}))
+        if not self.finished:
+            note = asdict(entry)
             with atomic_write(self._note(shard), "w") as file:
-                json.dump({"recipe": self.recipe.digest, **note, "checksum": checksum(note["shard"])}, file)
-
-    @property
-    def _channels(self) -> int:
-        return 1 if self.recipe.levels is None else 2
+                json.dump({"recipe": self.recipe.digest, "shard": note, "checksum": checksum(note)}, file)
 
     def _serialised(self, shard: int, scans: Sequence[Sequence[np.ndarray]]) -> bytes:
-        crc = np.array([scan_crc(codes) for codes in scans], dtype=np.uint32)
-        tensors = {"crc32": crc}
-        for channel, (name, kind) in enumerate((("range", np.uint16), ("reflectance", np.uint8))[: self._channels]):
-            tensors[name] = np.empty((len(scans), *self.recipe.image_shape), dtype=kind)
-            for row, codes in enumerate(scans):
-                tensors[name][row] = codes[channel]
+        shape = (len(scans), *self.recipe.image_shape)
+        tensors: dict[str, np.ndarray] = {
+            "crc32": np.array([scan_crc(codes) for codes in scans], np.uint32),
+            "range": np.empty(shape, np.uint16),
+        }
+        if self.recipe.levels is not None:
+            tensors["reflectance"] = np.empty(shape, np.uint8)
+        for row, codes in enumerate(scans):
+            for name, code in zip(("range", "reflectance"), codes, strict=False):
+                tensors[name][row] = code
         notes = {
             "recipe": self.recipe.digest,
             "shard": shard,
@@ -288,62 +376,25 @@ class Preparation:
 
     def _finish(self) -> Manifest:
         """Turn the notes into the manifest, unless another process has, and clear away what was needed for it."""
-        if self.finished is not None and not self._making.exists():
+        if self.finished and not self.making.exists():
             return read_manifest(self.folder)
-        with self._manifest_lock():
+        with self._lock("manifest", wait=True):
             self._look()
-            if self.finished is None:
-                entries = [self._entry(shard) for shard in range(self.recipe.shards)]
-                shards = tuple(entry for entry in entries if entry is not None)
-                if len(shards) < len(entries):
-                    raise InputError(f"{self._making} was changed meanwhile; the same command goes on.")
+            if not self.finished:
+                shards = tuple(entry for shard in range(self.recipe.shards) if (entry := self._entry(shard)))
+                if len(shards) < self.recipe.shards:
+                    raise InputError(f"{self.making} was changed meanwhile; the same command goes on.")
                 if not any(entry.scans for entry in shards):
                     raise InputError(
                         f"all {self.recipe.scans} scans were left out as unusable; see the warnings above."
                     )
                 write_manifest(self.folder, Manifest(self.recipe, self.plan.drives, shards))
             with suppress(OSError):  # another process may have removed the folder, or opened a lock in it
-                for path in (*self.folder.glob(f".{MANIFEST}.*.part"), *self._making.iterdir()):
+                for path in (*self.folder.glob(f".{MANIFEST}.*.part"), *self.making.iterdir()):
                     path.unlink(missing_ok=True)
-                self._making.rmdir()
+                self.making.rmdir()
         return read_manifest(self.folder)
 
 
 def _as_it_is(item: Any) -> Any:
     return item
-
-
-class _Claims(Sampler[int]):
-    """The scans of shards that no other process is making, claimed as they are asked for.
-
-    It never waits for another process: that one may wait for a shard that is claimed here and not made yet.
-
-    Attributes:
-        elsewhere: Shards that turned out to have been made by another process.
-    """
-
-    def __init__(self, work: Preparation, shards: Sequence[int]) -> None:
-        self.work, self.shards = work, shards
-        self.elsewhere: set[int] = set()
-        self._locks: dict[int, BaseFileLock] = {}
-
-    def __iter__(self) -> Iterator[int]:
-        for shard in self.shards:
-            lock = self.work.claim(shard)
-            if lock is None:
-                continue
-            if self.work.is_made(shard):
-                self.elsewhere.add(shard)
-                lock.release()
-                continue
-            self._locks[shard] = lock
-            self.work.clear(shard)
-            yield from self.work.recipe.numbers_of(shard)
-
-    def done(self, shard: int) -> None:
-        self._locks.pop(shard).release()
-
-    def release(self) -> None:
-        for lock in self._locks.values():
-            lock.release()
-        self._locks.clear()

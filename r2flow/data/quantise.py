@@ -24,10 +24,8 @@ class RangeCodes:
     r(c) = knee + (c - knee_code) coarse     for knee_code <= c <= 65535.
 
     One step, fine = (max_range - min_range) / 65534, where that is at most `STEP` (limits up to 124 m apart); else at
-    most `STEP` as far as 65 m, and what codes are left share the rest. A range is off by at most half a step.
-
-    Attributes:
-        metres: What each code means, (65536,), float32.
+    most `STEP` as far as 65 m, and what codes are left share the rest. A range is off by at most half a step. `values`
+    is what each code means, (65536,), float32.
     """
 
     def __init__(self, min_range: float, max_range: float) -> None:
@@ -41,12 +39,10 @@ class RangeCodes:
         self.fine = (self.knee - min_range) / max(self.knee_code - 1, 1)
         self.coarse = (max_range - self.knee) / max(CODES - 1 - self.knee_code, 1)
         code = np.arange(CODES)
-        r = np.where(code <= self.knee_code, min_range + (code - 1) * self.fine, self._beyond(code))
-        self.metres = np.clip(r.astype(np.float32), self.near, self.far)
-        self.metres[0] = 0
-
-    def _beyond(self, code: np.ndarray) -> np.ndarray:
-        return self.knee + (code - self.knee_code) * self.coarse
+        beyond = self.knee + (code - self.knee_code) * self.coarse
+        r = np.where(code <= self.knee_code, min_range + (code - 1) * self.fine, beyond)
+        self.values = np.clip(r.astype(np.float32), self.near, self.far)
+        self.values[0] = 0
 
     def encode(self, r: np.ndarray) -> np.ndarray:
         """Ranges in metres, 0 where no return, to the codes nearest to them, uint16.
@@ -71,11 +67,7 @@ class RangeCodes:
 class ReflectanceCodes:
     """uint8 codes of reflectance, n / levels; a value between two levels becomes the nearer one.
 
-    Attributes:
-        values: What each code means, (256,), float32 in [0, 1].
-
-    Raises:
-        InputError: levels outside [1, 256].
+    `values` is what each code means, (256,), float32 in [0, 1]. Levels outside [1, 256] are refused (`InputError`).
     """
 
     def __init__(self, levels: int) -> None:

@@ -15,16 +15,9 @@ from r2flow.noise import generator
 
 
 class ScanSet:
-    """Scans with a name.
+    """Scans of a sensor; the label is as the user named them.
 
-    Attributes:
-        label: As the user named it.
-        source: The scans by number.
-        sensor: Whose images they are.
-        about: What a reader of a figure must know of them; the source's own if left out.
-        identity: All that decides what the images are; None where they are drawn anew and nothing is worth keeping. The
-            source's own if left out.
-        drives: Numbers of the scans of each recording, where recordings are known; the source's own if left out.
+    `about`, `identity` and `drives` are those of `ScanSource`, and the source's own if left out.
     """
 
     def __init__(
@@ -81,13 +74,8 @@ class ScanSet:
         chunks = [list(numbers[i : i + batch_size]) for i in range(0, len(numbers), batch_size)]
         # Processes cost seconds to start; and what is drawn is drawn where the network is.
         alone = self.source.drawn or len(chunks) < 8
-        loader: DataLoader[Tensor] = DataLoader(
-            _Batches(self.source),
-            batch_size=None,
-            sampler=chunks,  # each key is a batch's numbers
-            num_workers=0 if alone else workers,
-        )
-        return iter(loader)
+        workers = 0 if alone else workers
+        return iter(DataLoader(_Batches(self.source), batch_size=None, sampler=chunks, num_workers=workers))
 
 
 class _Batches(Dataset[Tensor]):

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -24,40 +24,35 @@ from r2flow.data.store import (
 )
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
+from r2flow.generators import Sampler
 
 ELSEWHERE = "data.root=FOLDER (r2flow pairs --out FOLDER)"  # how another folder is given
 STALE = 3600  # seconds after which a temporary file has no writer any more
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """What a pair is a function of, beside its index: two folders of one recipe hold the same bytes.
+class PairRecipe:
+    """What a pair is a function of, beside its index: two folders of one recipe hold the same bytes."""
 
-    Attributes:
-        parent: Hash of the flow's weights and of what they mean.
-        shape: (C, H, W) of a scan in model space.
-        seed: x_0 of index i is the noise of (seed, "pairs", i); it is never stored.
-        first: Index of the first pair.
-        method, steps, tolerance: The solver's.
-        batch_size: Consecutive indices that are solved together.
-        shard_batches: Batches in a shard.
-        noise_shape: Of x_0, where it is not the scan's.
-    """
-
-    parent: str
-    shape: tuple[int, int, int]
-    seed: int
-    first: int
-    method: str
+    parent: str  # hash of the flow's weights and of what they mean
+    shape: tuple[int, int, int]  # (C, H, W) of a scan in model space
+    seed: int  # x_0 of index i is the noise of (seed, "pairs", i); it is never stored
+    first: int  # index of the first pair
+    method: str  # the solver's, like steps and tolerance
     steps: int
     tolerance: float
-    batch_size: int
-    shard_batches: int
-    noise_shape: tuple[int, ...] | None = None
+    batch_size: int  # consecutive indices that are solved together
+    shard_batches: int  # batches in a shard
+    noise_shape: tuple[int, ...] | None = None  # of x_0, where it is not the scan's
 
     def describe(self) -> dict[str, Any]:
-        """All of it as plain values; `noise_shape` only where it is not that of the scan."""
+        """All of it as plain values; `noise_shape` only where it has one."""
         return {key: value for key, value in asdict(self).items() if key != "noise_shape" or value is not None}
+
+    @property
+    def sampler(self) -> Sampler:
+        """How the generator is run."""
+        return Sampler(self.method, self.steps, self.tolerance)
 
     @cached_property
     def digest(self) -> str:
@@ -71,6 +66,13 @@ class Block(NamedTuple):
     evaluations: np.ndarray
     usable: np.ndarray
 
+    @property
+    def checksum(self) -> str:
+        digest = hashlib.sha256(self.usable.astype(bool).tobytes())
+        for values in (self.evaluations, self.x_1):
+            digest.update(np.ascontiguousarray(values).data)
+        return digest.hexdigest()
+
 
 class _Unwanted(Exception):
     """What was about to be written is there already."""
@@ -82,10 +84,14 @@ class PairStore:
     Batch b holds indices first + [b B, (b + 1) B), shard s holds batches [s S, (s + 1) S). Every file is written under
     a temporary name, flushed and renamed, and carries the checksum of its tensors and the digest of its recipe. Any
     number of processes may write into one folder: what two of them write under one name are the same bytes.
+
+    Raises:
+        InputError: the folder holds other pairs, or a damaged manifest.
     """
 
-    def __init__(self, folder: str | Path, recipe: Recipe) -> None:
+    def __init__(self, folder: str | Path, recipe: PairRecipe) -> None:
         self.folder, self.recipe = Path(folder).expanduser(), recipe
+        self.staging = self.folder / "batches"
         self._check_manifest()
 
     def _check_manifest(self) -> None:
@@ -99,11 +105,7 @@ class PairStore:
         refuse_other(self.folder, "pairs", found, self.recipe.describe(), ELSEWHERE)
 
     def begin(self) -> None:
-        """Write the manifest where there is none, and clear away what killed writers left.
-
-        Raises:
-            InputError: the folder cannot be written, or another process has begun other pairs in it.
-        """
+        """Write the manifest where there is none, and clear away what killed writers left."""
         content = {"format": "r2flow pairs 1", "recipe": self.recipe.describe(), "digest": self.recipe.digest}
         try:
             if not (self.folder / MANIFEST).is_file():
@@ -113,17 +115,13 @@ class PairStore:
             raise InputError(f"{self.folder} cannot be written to; give another folder by {ELSEWHERE}.") from None
         self._check_manifest()
         # Another process may be writing the younger ones.
-        clear_leftovers((*self.folder.glob(".*.part"), *self._staging.glob(".*.part")), STALE)
-
-    @property
-    def _staging(self) -> Path:
-        return self.folder / "batches"
+        clear_leftovers((*self.folder.glob(".*.part"), *self.staging.glob(".*.part")), STALE)
 
     def shard_path(self, shard: int) -> Path:
         return self.folder / f"pairs-{shard:06d}.safetensors"
 
     def batch_path(self, batch: int) -> Path:
-        return self._staging / f"{batch:09d}.safetensors"
+        return self.staging / f"{batch:09d}.safetensors"
 
     def batches(self, num: int) -> range:
         """The batches that hold the first `num` pairs; the last one is made whole."""
@@ -133,21 +131,23 @@ class PairStore:
         return range(shard_count(len(self.batches(num)), self.recipe.shard_batches))
 
     def batches_of(self, shard: int, num: int) -> range:
-        """The batches of one shard."""
         return shard_items(shard, len(self.batches(num)), self.recipe.shard_batches)
 
     def held(self, shard: int) -> int:
-        """How many batches a shard's file holds; only its head is read.
-
-        Raises:
-            InputError: it is a whole shard of other pairs.
-        """
+        """How many batches a shard's file holds, by its head; a whole shard of other pairs is refused."""
         try:
-            notes = read_notes(self.shard_path(shard))
+            with self._opened(self.shard_path(shard)) as (_, notes):
+                return len(notes["usable"]) // self.recipe.batch_size
         except (Damaged, FileNotFoundError):
             return 0
-        self._check_recipe(self.shard_path(shard), notes)
-        return len(notes["usable"]) // self.recipe.batch_size
+
+    def usable(self, num: int) -> np.ndarray:
+        """Whether each of the first `num` pairs came to an end, (num,) bool; their shards must be there."""
+        flags = []
+        for shard in self.shards(num):
+            with self._opened(self.shard_path(shard)) as (_, notes):
+                flags += notes["usable"]
+        return np.array(flags[:num], dtype=bool)
 
     def has(self, batch: int) -> bool:
         """Whether a batch is there, by itself or in its shard; its bytes are not read."""
@@ -171,26 +171,19 @@ class PairStore:
 
     def check(self, shard: int, num: int) -> list[int]:
         """Read every byte of one shard and its loose batches; the batches that were damaged, now removed."""
-        lost = []
-        path = self.shard_path(shard)
-        try:
-            self._read(path, shard * self.recipe.shard_batches)
-        except FileNotFoundError:
-            pass
-        except Damaged as error:
-            warn_damaged(path, error)
-            path.unlink(missing_ok=True)
-            lost += list(self.batches_of(shard, num))
-        for batch in self.batches_of(shard, num):
+        batches = self.batches_of(shard, num)
+        loose = [(self.batch_path(batch), range(batch, batch + 1)) for batch in batches]
+        lost: set[int] = set()
+        for path, held in [(self.shard_path(shard), batches), *loose]:
             try:
-                self._read(self.batch_path(batch), batch)
+                self._read(path, held[0])
             except FileNotFoundError:
                 continue
             except Damaged as error:
-                warn_damaged(self.batch_path(batch), error)
-                self.batch_path(batch).unlink(missing_ok=True)
-                lost.append(batch)
-        return sorted({batch for batch in lost if not self.has(batch)})
+                warn_damaged(path, error)
+                path.unlink(missing_ok=True)
+                lost |= set(held)
+        return sorted(batch for batch in lost if not self.has(batch))
 
     def commit(self, batch: int, block: Block) -> None:
         """Keep a batch: from here on it is not made again."""
@@ -218,82 +211,63 @@ class PairStore:
         return True
 
     def _gather(self, shard: int, batches: range) -> list[Block]:
-        held: list[Block] = []
+        held, count = [], 0
         if self.shard_path(shard).is_file():  # shorter: fewer pairs were asked for then
-            block, size = self._read(self.shard_path(shard), batches[0]), self.recipe.batch_size
-            held = [Block(*(part[i : i + size] for part in block)) for i in range(0, len(block.usable), size)]
-        return held + [self._read(self.batch_path(batch), batch) for batch in batches[len(held) :]]
+            held = [self._read(self.shard_path(shard), batches[0])]
+            count = len(held[0].usable) // self.recipe.batch_size
+        return held + [self._read(self.batch_path(batch), batch) for batch in batches[count:]]
 
     def _clear(self, shard: int, num: int) -> None:
         for batch in self.batches_of(shard, num):
             self.batch_path(batch).unlink(missing_ok=True)
         with suppress(OSError):
-            self._staging.rmdir()
+            self.staging.rmdir()
 
     def _write(self, path: Path, batch: int, block: Block, unless: Callable[[], bool] = lambda: False) -> None:
-        tensors = {"evaluations": block.evaluations, "x_1": block.x_1}
         notes = {
             "recipe": self.recipe.digest,
             "first": self.recipe.first + batch * self.recipe.batch_size,
             "usable": [int(one) for one in block.usable],
-            "sha256": _checksum(tensors, block.usable),
+            "sha256": block.checksum,
         }
-        data = shard_bytes(tensors, "pairs", notes)
+        data = shard_bytes({"evaluations": block.evaluations, "x_1": block.x_1}, "pairs", notes)
         with suppress(_Unwanted), atomic_write(path) as file:
             file.write(data)
             if unless():
                 raise _Unwanted
 
-    def _check_recipe(self, path: Path, notes: Mapping[str, Any]) -> None:
-        if notes["recipe"] != self.recipe.digest:
-            raise InputError(
-                f"{path} holds pairs of another recipe. Give the settings that they were made with, or another folder "
-                f"by {ELSEWHERE}."
-            )
+    @contextmanager
+    def _opened(self, path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
+        """A file of pairs, and what it says of itself: its head is read, and the file's length held to it.
+
+        Raises:
+            FileNotFoundError: no such file.
+            Damaged: whatever else goes wrong in reading it.
+            InputError: it is a whole file of other pairs.
+        """
+        if not path.is_file():
+            raise FileNotFoundError(path)
+        try:
+            with safe_open(path, framework="numpy") as file:
+                notes: dict[str, Any] = json.loads((file.metadata() or {})["pairs"])
+                recipe, *_ = (notes[key] for key in ("recipe", "first", "usable", "sha256"))
+                if recipe != self.recipe.digest:
+                    raise InputError(
+                        f"{path} holds pairs of another recipe. Give the settings that they were made with, or another "
+                        f"folder by {ELSEWHERE}."
+                    )
+                yield file, notes
+        except (FileNotFoundError, InputError):
+            raise
+        except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+            raise Damaged(str(error)) from None
 
     def _read(self, path: Path, batch: int) -> Block:
-        """A file, every byte of it checked."""
-        notes = read_notes(path)
-        with _opened(path) as file:
-            tensors = {name: file.get_tensor(name) for name in ("evaluations", "x_1")}
-        self._check_recipe(path, notes)
+        """A file that begins with a batch, every byte of it checked."""
+        with self._opened(path) as (file, notes):
+            block = Block(file.get_tensor("x_1"), file.get_tensor("evaluations"), np.array(notes["usable"], dtype=bool))
         if notes["first"] != self.recipe.first + batch * self.recipe.batch_size:
             raise Damaged(f"it begins with pair {notes['first']}")
-        usable = np.array(notes["usable"], dtype=bool)
-        if notes["sha256"] != _checksum(tensors, usable) or len(usable) != len(tensors["x_1"]):
+        if notes["sha256"] != block.checksum or len(block.usable) != len(block.x_1):
             raise Damaged("its checksum differs")
-        return Block(tensors["x_1"], tensors["evaluations"], usable)
-
-
-def read_notes(path: Path) -> dict[str, Any]:
-    """What a file says of itself: recipe, first, usable, sha256. Only its head is read, and its length held to it.
-
-    Raises:
-        FileNotFoundError: no such file.
-        Damaged: not a file of pairs, or not whole.
-    """
-    with _opened(path) as file:
-        notes: dict[str, Any] = json.loads((file.metadata() or {})["pairs"])
-        notes["recipe"], notes["first"], notes["usable"], notes["sha256"]
-        return notes
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """A safetensors file; whatever goes wrong in reading it is damage."""
-    if not path.is_file():
-        raise FileNotFoundError(path)
-    try:
-        with safe_open(path, framework="numpy") as file:
-            yield file
-    except FileNotFoundError:
-        raise
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-        raise Damaged(str(error)) from None
-
-
-def _checksum(tensors: dict[str, np.ndarray], usable: np.ndarray) -> str:
-    digest = hashlib.sha256(usable.astype(bool).tobytes())
-    for name in sorted(tensors):
-        digest.update(np.ascontiguousarray(tensors[name]).data)
-    return digest.hexdigest()
+        return block

@@ -6,7 +6,7 @@ import logging
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -34,7 +34,6 @@ class Reading:
     """How scans of any kind become images of one sensor.
 
     Attributes:
-        sensor: Its rays and its size.
         projection, convention: As in `r2flow.lidar.projection.project`.
         reflectance_scale: The value in the files that means full reflectance; None guesses it from each file, which is
             good enough for a picture and for nothing else.
@@ -54,10 +53,6 @@ class Reading:
     reflectance: bool | str = AUTO
     on_bad_scan: str = "empty"
     within_limits: bool = False
-
-    def identity(self) -> dict[str, Any]:
-        """All of it, as plain values."""
-        return asdict(self)
 
 
 class ScanSource(ABC):
@@ -111,18 +106,6 @@ class ScanSource(ABC):
         """Where the scans lie, by which two sources are known to share some; empty where they lie nowhere."""
         return set()
 
-    def slow_scans(self) -> int:
-        """How many of the scans are worth keeping in memory."""
-        return len(self) if self.slow else 0
-
-    def kept(self, track: Callable[[range], Iterable[int]]) -> "ScanSource":
-        """The source with all that is slow to get of it in memory.
-
-        Args:
-            track: Wraps the numbers while they are read, for a progress bar.
-        """
-        return InMemory(self, track) if self.slow_scans() else self
-
 
 def read_scan(
     path: str | Path,
@@ -132,11 +115,7 @@ def read_scan(
     reflectance: bool = True,
     reflectance_scale: float | None = 1.0,
 ) -> np.ndarray:
-    """One scan file as a range image.
-
-    Args:
-        reflectance: Whether the image needs reflectance; without it, (1, H, W) is returned.
-        reflectance_scale: The value in the file that means full reflectance (1 in KITTI, often 255); None guesses it.
+    """One scan file as a range image, (2, H, W); without `reflectance`, (1, H, W). The options are those of `Reading`.
 
     Raises:
         InputError: the file cannot be read, no point of it lies in the sensor's view and range (`NoPointsError`), or it
@@ -161,13 +140,9 @@ def read_scan(
 
 
 def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """One scan file as a range image, and the semantic id of each pixel's return, where labels lie beside the scan.
+    """The image of `read_scan`, and the semantic id of each pixel's return, (H, W) uint16, 0 where none was kept.
 
-    Args:
-        options: Keyword options of `read_scan`.
-
-    Returns:
-        The image of `read_scan`, and ids, (H, W) uint16, 0 where no return was kept; None where there are no labels.
+    The ids are None where no labels lie beside the scan.
 
     Raises:
         InputError: what `read_scan` refuses, or labels that are damaged or of another scan.
@@ -211,11 +186,8 @@ def _scaled_reflectance(path: str | Path, points: Points, scale: float | None) -
 def range_image(path: Path, shape: tuple[int, int] | None = None) -> np.ndarray | None:
     """The range image in a .npy of shape (2 or 1, H, W), what is not finite as 0; None where the file is another.
 
-    Args:
-        shape: (H, W) that it must have.
-
     Raises:
-        InputError: it has another size.
+        InputError: its size is not the (H, W) of `shape`.
     """
     if path.suffix.lower() != ".npy":
         return None
@@ -264,12 +236,9 @@ def lacks_reflectance(paths: Iterable[str | Path], on_bad_scan: str = "error") -
     The one rule, for training, measuring and pictures: the first scan that has a return decides, and reflectance that
     is 0 throughout is none, because a KITTI .bin has a column for it whatever the sensor reports.
 
-    Args:
-        on_bad_scan: As in `Reading`: whether a scan that cannot be read is passed over (`skip`), or one alone that has
-            no point (`empty`).
-
     Raises:
-        InputError: a scan that cannot be read.
+        InputError: a scan that cannot be read. With `on_bad_scan="skip"` it is passed over; with `empty`, one alone
+            that has no point.
     """
     for path in paths:
         try:
@@ -286,11 +255,7 @@ def lacks_reflectance(paths: Iterable[str | Path], on_bad_scan: str = "error") -
 
 
 def stored_reflectance(path: str | Path) -> np.ndarray | None:
-    """The reflectance of all returns of a scan file or a range image, as it is stored; None where there is none.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
+    """The reflectance of all returns of a scan file or a range image, as it is stored; None where there is none."""
     image = range_image(Path(path))
     if image is None:
         return read_points(path).reflectance
@@ -303,12 +268,7 @@ class ScanFiles(ScanSource):
     With `on_bad_scan="skip"` a file that cannot be used is left out with a warning: the next usable file of this source
     takes its place, the same one in every process.
 
-    Args:
-        paths: The files.
-        reading: How they become images.
-        root: The folder of the data set; a scan is named by its path below it.
-        drives: Numbers of the scans of each drive.
-        about: What a reader must know of the data set.
+    A scan is named by its path below the data set's `root`.
     """
 
     slow = True
@@ -337,13 +297,12 @@ class ScanFiles(ScanSource):
         return {**self.described, "files": self._digest[:12], "reflectance": bool(self.reading.reflectance)}
 
     def identity(self) -> dict[str, Any]:
-        return {"files": self._digest, **self.reading.identity()}
+        return {"files": self._digest, **asdict(self.reading)}
 
     @cached_property
     def _digest(self) -> str:
-        stats = [
-            (n, s.st_size, s.st_mtime_ns) for n, p in zip(self.names, self.paths, strict=True) if (s := os.stat(p))
-        ]
+        found = [(name, os.stat(path)) for name, path in zip(self.names, self.paths, strict=True)]
+        stats = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in found]
         # Some contents, too: unpacked archives have equal names, sizes and times.
         some = [hashlib.sha256(Path(self.paths[i]).read_bytes()).hexdigest() for i in spread(len(self.paths), 8)]
         return hashlib.sha256(json.dumps([stats, some]).encode()).hexdigest()
@@ -358,8 +317,7 @@ class ScanFiles(ScanSource):
     def __getitem__(self, index: int) -> np.ndarray:
         if self.reading.on_bad_scan != "skip":
             return read_image(Path(self.paths[index]), self.reading)
-        for offset in range(len(self.paths)):
-            candidate = (index + offset) % len(self.paths)
+        for candidate in (*range(index, len(self)), *range(index)):
             if candidate in self.bad:
                 continue
             try:
@@ -404,24 +362,17 @@ class SimulatedScans(ScanSource):
 
 
 class InMemory(ScanSource):
-    """A source read once and kept; what it gives in memory is what it gives from its files.
+    """Images in memory, (N, 2 or 1, H, W), and their names."""
 
-    Args:
-        track: Wraps the numbers while they are read, for a progress bar.
-    """
-
-    def __init__(self, source: ScanSource, track: Callable[[range], Iterable[int]] = lambda numbers: numbers) -> None:
-        self.images = np.stack([source[index] for index in track(range(len(source)))])
-        self._names = source.names
+    def __init__(self, images: np.ndarray, names: Sequence[str]) -> None:
+        self.images, self._names = images, names
 
     @property
     def names(self) -> Sequence[str]:
         return self._names
 
     def subset(self, indices: Sequence[int]) -> "InMemory":
-        chosen = InMemory.__new__(InMemory)
-        chosen.images, chosen._names = self.images[list(indices)], [self.names[i] for i in indices]
-        return chosen
+        return InMemory(self.images[list(indices)], [self.names[i] for i in indices])
 
     def __len__(self) -> int:
         return len(self.images)
@@ -440,12 +391,9 @@ def spread(count: int, most: int) -> list[int]:
 def holdout_block(count: int, share: float, starts: Sequence[int] = ()) -> tuple[range, range]:
     """(training, validation) numbers: about the last `share` of the scans, in one contiguous block.
 
-    Never a random choice of frames: neighbours in a drive are near-duplicates of each other. Where whole drives at the
-    end come within half of the share, they are held out, so that no scan has a neighbour on the other side; else
-    exactly the share is.
-
-    Args:
-        starts: Number of the first scan of each drive.
+    Never a random choice of frames: neighbours in a drive are near-duplicates of each other. Where whole drives, which
+    begin at the numbers `starts`, come within half of the share at the end, they are held out, so that no scan has a
+    neighbour on the other side; else exactly the share is.
     """
     if not 0 <= share < 1:
         raise InputError(f"data.validation.share must lie in [0, 1), found {share}.")

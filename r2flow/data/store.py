@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import BaseFileLock, FileLock, Timeout
 from safetensors.numpy import save
 
 from r2flow.errors import InputError
@@ -42,29 +41,8 @@ def shard_bytes(tensors: dict[str, np.ndarray], key: str, notes: Mapping[str, An
     return save(tensors, metadata={key: json.dumps(notes)})
 
 
-def lock_file(path: Path, wait: bool = False) -> BaseFileLock | None:
-    """Hold a lock until its `release`, or until this process ends, however it ends.
-
-    Args:
-        wait: Whether to wait for another holder.
-
-    Returns:
-        The lock; None where another process holds it and `wait` is false.
-    """
-    lock = FileLock(path, timeout=-1 if wait else 0)
-    while True:
-        path.parent.mkdir(exist_ok=True)
-        try:
-            lock.acquire()
-            return lock
-        except Timeout:
-            return None
-        except FileNotFoundError:  # another process has finished, and removed the folder
-            continue
-
-
-def warn_damaged(path: Path, error: Damaged, level: int = logging.WARNING) -> None:
-    log.log(level, "%s is damaged (%s): it is made again.", path, error)
+def warn_damaged(path: Path, damage: str | Damaged, level: int = logging.WARNING) -> None:
+    log.log(level, "%s is damaged (%s): it is made again.", path, damage)
 
 
 def clear_leftovers(files: Iterable[Path], older: float = 0.0) -> None:
@@ -76,11 +54,7 @@ def clear_leftovers(files: Iterable[Path], older: float = 0.0) -> None:
 
 
 def refuse_other(folder: Path, what: str, there: Mapping[str, Any], here: Mapping[str, Any], option: str) -> None:
-    """Refuse a folder that was begun with other settings.
-
-    Args:
-        what: What the folder holds, as `pairs`.
-        option: How another folder is given.
+    """Refuse a folder that holds `what` of other settings; `option` is how another folder is given.
 
     Raises:
         InputError: the settings differ.
@@ -93,25 +67,17 @@ def refuse_other(folder: Path, what: str, there: Mapping[str, Any], here: Mappin
 
 
 def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str | None:
-    """The first setting that differs, in words; None where all are equal."""
+    """The first setting that differs, in words; None where all are equal, as JSON writes them."""
+    there, here = json.loads(json.dumps([there, here]))
     for key in {**there, **here}:
-        old, new = _plain(there.get(key)), _plain(here.get(key))
+        old, new = there.get(key), here.get(key)
         if old == new:
             continue
         if isinstance(old, dict) and isinstance(new, dict):
             return f"{key}: {difference(old, new)}"
         if key == "names":
             return "the names of the scans are others"
-        if isinstance(old, list) or isinstance(new, list):
-            return f"{key} are others ({_count(old)} there, {_count(new)} here)"
+        if isinstance(old, list) and isinstance(new, list):
+            return f"{key} are others ({len(old)} values there, {len(new)} values here)"
         return f"{key} is {old} there, {new} here"
     return None
-
-
-def _plain(value: Any) -> Any:
-    """A tuple as the list that JSON makes of it."""
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _count(value: Any) -> str:
-    return f"{len(value)} values" if isinstance(value, list) else str(value)

@@ -25,20 +25,13 @@ LEVEL = 0.95  # of intervals
 
 @dataclass(frozen=True)
 class Work:
-    """How the work is done; figures do not depend on it beyond rounding.
+    """How the work is done; figures do not depend on it beyond rounding."""
 
-    Attributes:
-        batch_size: Scans at once.
-        workers: Further processes that read.
-        rank, ranks: Number of this process among those that take batches by turns, and how many there are.
-        watched: Whether progress bars are shown.
-    """
-
-    batch_size: int = 8
-    workers: int = 0
-    rank: int = 0
-    ranks: int = 1
-    watched: bool = False
+    batch_size: int = 8  # scans at once
+    workers: int = 0  # further processes that read
+    rank: int = 0  # number of this process among those that take batches by turns
+    ranks: int = 1  # how many these are
+    watched: bool = False  # whether progress bars are shown
 
     def bar(self, doing: str, total: int, unit: str = "scans") -> Bar:
         """A progress bar of `total` units; shows nothing unless the work is watched."""
@@ -47,30 +40,22 @@ class Work:
 
 @dataclass(frozen=True)
 class MetricResult:
-    """One metric's figures of one comparison.
-
-    Attributes:
-        metric: Its name.
-        figures: By name; NaN where one does not exist, and a remark says why.
-        protocol: The metric's, with the numbers of scans and the rule by which the real ones were chosen.
-        remarks: What a reader must know.
-        intervals: (low, high) of a figure, where intervals were asked for.
-    """
+    """One metric's figures of one comparison."""
 
     metric: str
-    figures: Mapping[str, float]
-    protocol: Mapping[str, Any]
+    figures: Mapping[str, float]  # by name; NaN where one does not exist, and a remark says why
+    protocol: Mapping[str, Any]  # the metric's, with the numbers of scans and how the real ones were chosen
     remarks: Sequence[str] = ()
-    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # (low, high), where asked for
 
 
 @dataclass(frozen=True)
 class Gathered:
-    """The statistics of a real set by metric, the rule of each one's subset, and which of them the cache held."""
+    """The statistics of a real set, by metric."""
 
     statistics: Mapping[str, Statistics]
-    rules: Mapping[str, str]
-    kept: frozenset[str]
+    rules: Mapping[str, str]  # how the scans that each metric saw were chosen
+    kept: frozenset[str]  # the metrics whose statistics the cache held
 
 
 def real_rule(metric: ScanMetric, count: int) -> tuple[list[int] | None, str]:
@@ -81,11 +66,7 @@ def real_rule(metric: ScanMetric, count: int) -> tuple[list[int] | None, str]:
 
 
 def check_reflectance(metrics: Mapping[str, ScanMetric], sets: Iterable[ScanSet]) -> None:
-    """Refuse, before anything is read, a set without the reflectance that a metric needs.
-
-    Raises:
-        InputError: there is one.
-    """
+    """Refuse, before anything is read, a set without the reflectance that a metric needs."""
     needing = [name for name, metric in metrics.items() if metric.needs_reflectance]
     for scans in sets:
         if needing and not scans.about.get("reflectance", True):
@@ -103,24 +84,21 @@ def gather_real(metrics: Mapping[str, ScanMetric], real: ScanSet, work: Work, ca
     chosen = {name: real_rule(metric, len(real)) for name, metric in metrics.items()}
     rules = {name: rule for name, (_, rule) in chosen.items()}
     keys = {name: key_of(metric, real, rules[name]) for name, metric in metrics.items()}
-    found: dict[str, Statistics] = {}
-    if cache is not None:
-        found = {name: s for name in metrics if (s := cache.read(keys[name])) is not None}
-    common = _common(set(found), work)
-    found = {name: s for name, s in found.items() if name in common}
+    held = {name: cache.read(key) for name, key in keys.items()} if cache is not None else {}
+    common = _common({name for name, one in held.items() if one is not None}, work)
+    found = {name: one for name, one in held.items() if one is not None and name in common}
     missing = {name: metric for name, metric in metrics.items() if name not in found}
     for metric in missing.values():
         metric.reset()
     # The subset first, for every metric, then the rest, for those that take all scans: every scan is read once.
-    some = next((numbers for name, (numbers, _) in chosen.items() if name in missing and numbers is not None), [])
+    some = next((chosen[name][0] for name in missing if chosen[name][0] is not None), None) or []
     whole_set = {name: metric for name, metric in missing.items() if chosen[name][0] is None}
     rest = sorted(set(range(len(real))) - set(some)) if whole_set else []
     first = _update(missing, real, some, 0, True, work)
     second = _update(whole_set, real, rest, len(some), True, work)
-    counts = {name: (len(some), first) for name in missing}
-    counts |= {name: (len(real), first + second) for name in whole_set}
     for name, metric in missing.items():
-        found[name] = Statistics(metric.real_state(), *counts[name])
+        counts = (len(real), first + second) if name in whole_set else (len(some), first)
+        found[name] = Statistics(metric.real_state(), *counts)
         if cache is not None and work.rank == 0:
             cache.write(keys[name], found[name])
     return Gathered(found, rules, frozenset(metrics.keys() - missing.keys()))
@@ -144,14 +122,14 @@ def measure(
         metric.reset()
         metric.load_real_state(gathered.statistics[name].states)
     empty = _update(metrics, generated, range(len(generated)), 0, False, work)
-    source, results = generated.source, []
-    unsolved = []
-    if isinstance(source, SampledScans) and source.unsolved:
-        unsolved = [f"{source.unsolved} of {len(generated)} scans are not solved to the tolerance."]
+    results = []
+    unsolved = generated.source.unsolved if isinstance(generated.source, SampledScans) else 0
     for name, metric in metrics.items():
         real = gathered.statistics[name]
         figures = {key: float(value) for key, value in metric.compute().items()}
-        remarks = [*metric.remarks(), *_remarks(real, len(generated), figures), *unsolved]
+        remarks = [*metric.remarks(), *_remarks(real, len(generated), figures)]
+        if unsolved:
+            remarks.append(f"{unsolved} of {len(generated)} scans are not solved to the tolerance.")
         sizes = {
             "real": real.scans, "real_chosen": gathered.rules[name], "real_empty": real.empty,
             "generated": len(generated), "generated_empty": empty,
@@ -170,11 +148,7 @@ def measure(
 
 
 def point_key(real: ScanSet, metrics: Mapping[str, ScanMetric], **sampling: Any) -> str:
-    """16 hex digits of everything that the figures of a sampled flow depend on.
-
-    Args:
-        sampling: How the flow is sampled: weights, steps, number of scans, seed, device, ...
-    """
+    """16 hex digits of everything that the figures of a sampled flow depend on; `sampling` is how it is sampled."""
     protocols = {name: metric.protocol.asdict() for name, metric in metrics.items()}
     parts = {"real": real.identity or real.label, "metrics": protocols, **sampling}
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]

@@ -14,18 +14,12 @@ import torch.distributed as dist
 
 @dataclass(frozen=True)
 class Process:
-    """This process among those that share an evaluation.
+    """This process among those that share an evaluation."""
 
-    Attributes:
-        rank, ranks: Its number, and how many there are.
-        device: The device that it computes on.
-        folder: Where all processes keep the rows of single scans; None for a process alone.
-    """
-
-    rank: int
-    ranks: int
-    device: str
-    folder: Path | None = None
+    rank: int  # its number
+    ranks: int  # how many there are
+    device: str  # that it computes on
+    folder: Path | None = None  # where all processes keep the rows of single scans; None for a process alone
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Sets of scans that a flow draws when they are asked for."""
 
+import copy
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -38,9 +39,6 @@ def sampled_set(flow: Checkpoint, label: str, num: int, sampler: Sampler | None 
 
     Their noise is that of (seed, "evaluation", i), which no training step and no reflow pair has seen.
 
-    Args:
-        sampler: How it is run; its own if left out.
-
     Raises:
         InputError: fewer than one, or a sampler that the generator does not have.
     """
@@ -56,41 +54,32 @@ def sampled_set(flow: Checkpoint, label: str, num: int, sampler: Sampler | None 
 
 
 class SampledScans(ScanSource):
-    """Scans of a generator by their numbers; what one is depends on (seed, number) alone.
-
-    Attributes:
-        unsolved: How many of those drawn so far are no solution to the tolerance.
-        evaluations: Network evaluations of each.
-        seconds: Of the generation of a scan, for each batch.
-    """
+    """Scans of a generator by their numbers; what one is depends on (seed, number) alone."""
 
     drawn = True
 
     def __init__(self, flow: Checkpoint, numbers: Sequence[int], sampler: Sampler, seed: int) -> None:
         self.flow, self.numbers, self.sampler, self.seed = flow, numbers, sampler, seed
-        self.unsolved = 0
-        self.evaluations: list[int] = []
-        self.seconds: list[float] = []
+        self.unsolved = 0  # of those drawn so far, how many are no solution to the tolerance
+        self.evaluations: list[int] = []  # of the network, of each
+        self.seconds: list[float] = []  # a scan, of each batch
 
     def __len__(self) -> int:
         return len(self.numbers)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return self.draw([index])[0].numpy()
+        return self.batch([index])[0].numpy()
 
     @property
     def names(self) -> list[str]:
         return [f"sample {number}" for number in self.numbers]
 
     def subset(self, indices: Sequence[int]) -> "SampledScans":
-        part = SampledScans.__new__(SampledScans)
-        part.__dict__.update(self.__dict__, numbers=[self.numbers[i] for i in indices])
+        part = copy.copy(self)
+        part.numbers = [self.numbers[i] for i in indices]
         return part
 
     def batch(self, indices: Sequence[int]) -> Tensor:
-        return self.draw(indices)
-
-    def draw(self, indices: Sequence[int]) -> Tensor:
         """The scans of a batch together, (B, 2 or 1, H, W). One that is not solved is taken as it is, and counted."""
         made = draw(self.flow.generator, [self.numbers[i] for i in indices], self.seed, self.sampler)
         self.seconds.append(made.seconds / len(indices))

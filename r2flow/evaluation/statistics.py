@@ -7,9 +7,10 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor
 
 from r2flow.errors import InputError
@@ -24,25 +25,15 @@ FORMAT = 1  # to be raised when statistics of the same scans change under the sa
 
 @dataclass(frozen=True)
 class Statistics:
-    """A metric's states after one set of scans, and how many it has seen.
+    """A metric's states after one set of scans, and how many it has seen."""
 
-    Attributes:
-        states: From `ScanMetric.real_state`.
-        scans: Number of scans.
-        empty: How many of them have no return within the mask.
-    """
-
-    states: Mapping[str, Tensor] = field(repr=False)
+    states: Mapping[str, Tensor] = field(repr=False)  # from `ScanMetric.real_state`
     scans: int
-    empty: int
+    empty: int  # how many of them have no return within the mask
 
 
 class Cache:
-    """Statistics of real scans in a folder, each file named by a hash of everything that it depends on.
-
-    Args:
-        folder: Where; `default_folder()` if left out.
-    """
+    """Statistics of real scans in a folder, each file named by a hash of everything that it depends on."""
 
     def __init__(self, folder: str | Path | None = None) -> None:
         self.folder = default_folder() if folder is None else Path(folder)
@@ -56,8 +47,6 @@ class Cache:
         """The statistics of a key; None where there are none that can be read."""
         if key is None or not (path := self.path(key)).is_file():
             return None
-        from safetensors import SafetensorError, safe_open
-
         try:
             with safe_open(path, framework="pt") as file:
                 notes = file.metadata() or {}
@@ -73,8 +62,6 @@ class Cache:
         """Keep statistics; a disk that cannot be written to costs a warning, but no figure."""
         if key is None:
             return
-        from safetensors.torch import save
-
         notes = {"key": key, "scans": str(statistics.scans), "empty": str(statistics.empty)}
         data = save({name: value.contiguous() for name, value in statistics.states.items()}, metadata=notes)
         try:
@@ -99,14 +86,10 @@ def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str | None:
     """
     if scans.identity is None:
         return None
-    parts: dict[str, Any] = {
-        "format": FORMAT,
-        "scans": scans.identity,
-        "subset": rule,
-        "protocol": metric.protocol.asdict(),
-        "keeps": metric.keeps,
-        "device": torch.device(metric.device).type,
-    }
+    parts = {
+        "format": FORMAT, "scans": scans.identity, "subset": rule, "protocol": metric.protocol.asdict(),
+        "keeps": metric.keeps, "device": torch.device(metric.device).type,
+    }  # fmt: skip
     try:
         return json.dumps(parts, sort_keys=True)
     except TypeError as error:

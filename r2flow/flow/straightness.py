@@ -26,8 +26,7 @@ class Curvature:
     """The integral of s over the paths of a batch.
 
     Attributes:
-        x_0: Start of each path, (B, ...).
-        x_1: End of each path, (B, ...).
+        x_0, x_1: Start and end of each path, (B, ...).
         per_pixel: int_0^1 (d - v_t)^2 dt of every element, (B, ...), float64.
     """
 
@@ -75,26 +74,15 @@ class Straightness:
         """s(t) / |d|^2, (B, n); NaN where a path has no length."""
         return self.s / self.curvature.squared_length[:, None]
 
-    @property
-    def total(self) -> Tensor:
-        """int_0^1 s(t) dt, (B,)."""
-        return self.s.mean(1)
-
 
 def curvature(velocity: Velocity, x_0: Tensor, steps: int = 256, progress: Progress = None) -> Curvature:
-    """The integral of s over the path, pixel by pixel, in one pass of Euler steps.
-
-    Args:
-        velocity: v(t, x) with t of shape ().
-        x_0: Noise, (B, ...).
-        progress: Called after every evaluation.
+    """The integral of s over the path, pixel by pixel, in one pass of Euler steps from x_0, (B, ...).
 
     Raises:
         InputError: fewer than one step.
     """
     first: Tensor | None = None
-    mean = torch.zeros_like(x_0, dtype=torch.float64)
-    mean_square = torch.zeros_like(mean)
+    mean, mean_square = torch.zeros(2, *x_0.shape, dtype=torch.float64, device=x_0.device)
 
     def accumulate(t: Tensor, x: Tensor, v: Tensor) -> None:
         nonlocal first
@@ -114,10 +102,8 @@ def straightness(
     """s(t) of every scan at the times of `steps` Euler steps, in two passes: 2 x steps evaluations.
 
     Args:
-        velocity: v(t, x) with t of shape ().
         x_0: Noise, (B, ...).
         most_curved: How many elements, of all scans together, have their path kept.
-        progress: Called after every evaluation.
 
     Raises:
         InputError: fewer than one step.

@@ -18,6 +18,8 @@ Condition = Mapping[str, Tensor]
 
 Progress = Callable[[], None] | None
 
+WHOLE_ONLY = "a {} makes whole images and no part of one; leave the region out."
+
 
 @dataclass(frozen=True)
 class Sampler:
@@ -160,7 +162,7 @@ class Generator(nn.Module):
         Raises:
             InputError: this generator makes whole images only.
         """
-        raise InputError(f"a {type(self).__name__} makes whole images and no part of one; leave the region out.")
+        raise InputError(WHOLE_ONLY.format(type(self).__name__))
 
     def part(self, region: Region) -> "Generator":
         """The same generator for a region of whole units, its weights shared.
@@ -168,11 +170,9 @@ class Generator(nn.Module):
         Raises:
             InputError: this generator makes whole images only.
         """
-        return self if region.share == 1 else self._no_part()
-
-    def _no_part(self) -> "Generator":
-        _ = self.unit
-        raise NotImplementedError
+        if region.share < 1:
+            raise InputError(WHOLE_ONLY.format(type(self).__name__))
+        return self
 
     def start_from(self, parent: "Generator") -> None:
         """Take over a trained generator's weights: every name and shape must be this one's.

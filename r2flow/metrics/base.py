@@ -26,9 +26,8 @@ class Protocol:
         metric: Name in `r2flow.metrics.METRICS`.
         representation: What of a scan is compared: "range image", "points", "bird's-eye histogram".
         mask: Metres between which returns are kept.
-        extractor: Name of the network, or None without one.
-        weights: First 12 digits of the SHA-256 of its weights, or None.
-        layer: Which features of the network, and how many.
+        extractor, weights, layer: Name of the network, first 12 digits of the SHA-256 of its weights, and which
+            features are taken; None without a network.
         settings: Everything else: bins, bandwidth, neighbours.
     """
 
@@ -55,10 +54,9 @@ class ScanMetric(Metric):
     out, counted and remarked on.
 
     Attributes:
-        name: Name in `r2flow.metrics.METRICS`.
-        representation, mask, settings: As in `Protocol`.
-        needs_reflectance: Whether scans without reflectance are refused.
-        uses_reflectance: Whether it reads reflectance where there is some.
+        name, representation, mask, settings: As in `Protocol`.
+        needs_reflectance, uses_reflectance: Whether scans without reflectance are refused; whether it is read where
+            there is some.
         keeping: Whether the rows are kept: "on request" (`keep=True`), "always" or "never".
         resamples: Whether it has bootstrap intervals, which are made of kept rows.
         counts_empty: Whether a scan without a return is compared as well.
@@ -113,20 +111,13 @@ class ScanMetric(Metric):
         raise NotImplementedError
 
     def update(self, scans: Scans, real: bool, first: int = 0) -> None:
-        """Take in a batch.
-
-        Args:
-            scans: The batch.
-            real: Whether the scans are real or generated ones.
-            first: Number of the batch's first scan in its set, under which its rows are kept.
+        """Take in a batch of real or generated scans, the rows of which are kept from number `first` on.
 
         Raises:
             InputError: something else than `Scans`, or scans without the reflectance that is needed.
         """
         if not isinstance(scans, Scans):
-            raise InputError(
-                f"'{self.name}' takes r2flow.metrics.scans.Scans(images, sensor), found {type(scans).__name__}."
-            )
+            raise InputError(f"'{self.name}' takes metrics.scans.Scans(images, sensor), found {type(scans).__name__}.")
         if self.needs_reflectance and not scans.has_reflectance:
             raise InputError(f"'{self.name}' needs reflectance, which these scans have not; leave it out.")
         self.take_in(scans, "real" if real else "generated", first)
@@ -195,22 +186,17 @@ class ScanMetric(Metric):
         return state
 
     def load_real_state(self, state: Mapping[str, Tensor]) -> None:
-        """Take the real set's statistics from `real_state`, after `reset`.
-
-        With several processes the first one holds them until figures are computed.
+        """Take the real set's statistics from `real_state`, after `reset`; of several processes the first holds them.
 
         Raises:
             InputError: a state of another metric, or without the rows that this one keeps.
         """
         own = {name: getattr(self, name) for name in self._defaults if name.startswith("real_")}
-        wanted = {name: tuple(value.shape) for name, value in own.items()}
-        found = {name: tuple(value.shape) for name, value in state.items()}
-        fits = all(found.get(name) == shape for name, shape in wanted.items())
-        if not fits or (self.keeps and "real_rows" not in found):
-            rows = " and the rows of its scans" if self.keeps else ""
+        fits = all(name in state and state[name].shape == value.shape for name, value in own.items())
+        if not fits or (self.keeps and "real_rows" not in state):
+            found = {name: tuple(value.shape) for name, value in state.items()}
             raise InputError(
-                f"the kept statistics of the real set do not fit {self.name}: it takes {wanted}{rows}, "
-                f"found {found}; measure the real set again."
+                f"the real set's kept statistics do not fit {self.name}, found {found}; measure the real set again."
             )
         if dist.is_available() and dist.is_initialized() and dist.get_rank() > 0:
             return
@@ -228,15 +214,8 @@ class ScanMetric(Metric):
         self._remarks = []
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        """Figures of resampled sets, computed from the kept rows, (R) for each name.
-
-        Args:
-            weights: How often each kept scan of a side was drawn, (R, N), float64.
-
-        Raises:
-            InputError: a metric without intervals.
-        """
-        raise InputError(f"{self.name} has no bootstrap interval; leave it out.")
+        """Figures of resampled sets, (R) for each name; `weights` says how often each kept scan was drawn, (R, N)."""
+        raise NotImplementedError
 
     def _left_out(self) -> list[str]:
         remarks = []
@@ -247,7 +226,6 @@ class ScanMetric(Metric):
             elif compared == 0:
                 remarks.append(f"none of the {scans} {side} scans has anything to compare; are all of them empty?")
             elif compared < scans:
-                remarks.append(
-                    f"{scans - compared} of {scans} {side} scans are left out: empty, or nothing to compare."
-                )
+                left = f"{scans - compared} of {scans} {side} scans"
+                remarks.append(f"{left} are left out: empty, or nothing to compare.")
         return remarks

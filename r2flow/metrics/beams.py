@@ -29,8 +29,7 @@ class BeamHistograms(SumMetric):
     name = "beams"
     representation = "range image"
     settings: ClassVar[Mapping[str, Any]] = {
-        "range bins": len(RANGES) - 1, "reflectance bins": len(REFLECTANCES) - 1,
-        "distance": "mean over beams of the Jensen-Shannon distance",
+        "range bins": 32, "reflectance bins": 25, "distance": "mean over beams of the Jensen-Shannon distance"
     }  # fmt: skip
     width = MOST_BEAMS * _BINS
     uses_reflectance = True
@@ -38,10 +37,9 @@ class BeamHistograms(SumMetric):
     def rows(self, scans: Scans) -> Tensor:
         _check_beams(self.name, scans)
         ranges = _per_beam(scans.images[:, 0], scans.returned[:, 0], RANGES)
+        reflectances = ranges.new_zeros(*ranges.shape[:2], len(REFLECTANCES) - 1)
         if scans.has_reflectance:
             reflectances = _per_beam(scans.images[:, 1], scans.returned[:, 0], REFLECTANCES)
-        else:
-            reflectances = ranges.new_zeros(*ranges.shape[:2], len(REFLECTANCES) - 1)
         counts = torch.cat([ranges, reflectances], -1).flatten(1)
         return torch.where(counts.sum(1, keepdim=True) > 0, counts, torch.nan)
 
@@ -78,9 +76,8 @@ def _per_beam(values: Tensor, returned: Tensor, edges: np.ndarray) -> Tensor:
 
 
 def _mean_distance(real: np.ndarray, generated: np.ndarray) -> float:
-    if not len(real):
-        return float("nan")
-    return float(np.mean([js_distance(p, q) for p, q in zip(real, generated, strict=True)]))
+    found = [js_distance(p, q) for p, q in zip(real, generated, strict=True)]
+    return float(np.mean(found)) if found else float("nan")
 
 
 class DropRate(SumMetric):

@@ -33,9 +33,8 @@ def bootstrap(
 
     Args:
         metric: Built with `keep=True`, after both sets.
-        draws: Resampled pairs of sets.
+        draws: Resampled pairs of sets; draw r depends on the seed and on r alone.
         level: Share of them within the interval.
-        seed: Draw r depends on the seed and on r alone.
         advance: Called after every draw.
 
     Returns:

@@ -8,6 +8,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
+from r2flow.metrics import extractors
 from r2flow.metrics.base import Protocol, ScanMetric
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.scans import Scans
@@ -18,9 +19,7 @@ class FeatureMetric(ScanMetric):
 
     Args:
         extractor: The network, or its name in `EXTRACTORS`: then it is loaded with its weights.
-        keep: Keep the features, for bootstrap intervals.
-        folder: Where they are kept.
-        suffix: What the name has behind the network's.
+        keep, folder: As `ScanMetric`.
 
     Raises:
         InputError: no network of that name, or no weights for it on this machine.
@@ -30,13 +29,11 @@ class FeatureMetric(ScanMetric):
     kind: ClassVar[str]
     names: ClassVar[Mapping[str, str]] = {}
 
-    def __init__(
-        self, extractor: Extractor | str, keep: bool = False, folder: str | Path | None = None, suffix: str = ""
-    ) -> None:
-        network = loaded(extractor)
+    def __init__(self, extractor: Extractor | str, keep: bool = False, folder: str | Path | None = None) -> None:
+        network = extractor.eval() if isinstance(extractor, Extractor) else extractors.load_extractor(extractor)
         random = "_random" if network.weights == "random" else ""
-        name = "" if random or suffix else self.names.get(network.name, "")
-        super().__init__(keep, folder, name=name or f"{self.kind}_{network.name}{random}{suffix}")
+        name = "" if random else self.names.get(network.name, "")
+        super().__init__(keep, folder, name=name or f"{self.kind}_{network.name}{random}")
         self.extractor = network
         self.needs_reflectance = network.needs_reflectance
 
@@ -48,19 +45,6 @@ class FeatureMetric(ScanMetric):
 
     def rows(self, scans: Scans) -> Tensor:
         return extract(self.extractor, scans)
-
-
-def loaded(extractor: Extractor | str) -> Extractor:
-    """The network itself, or the one of a name with its weights.
-
-    Raises:
-        InputError: no such name, or weights that are not on this machine.
-    """
-    if isinstance(extractor, Extractor):
-        return extractor.eval()
-    from r2flow.metrics.extractors import load_extractor
-
-    return load_extractor(extractor)
 
 
 _COMPUTED: "WeakKeyDictionary[Scans, dict[Any, Tensor]]" = WeakKeyDictionary()

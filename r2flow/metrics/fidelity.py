@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
@@ -35,9 +36,8 @@ class Member:
     Attributes:
         statistic: Of range images, (N, 2 or 1, H, W), and their sensor.
         distance: Between the statistics of two sets; 0 is equal.
-        label: What its bins are, in words.
+        label, log: What its bins are, and whether they are drawn on a logarithmic axis.
         edges: Of its bins, or how a sensor gives them; None where they are rows, or of two dimensions.
-        log: Whether the bins are drawn on a logarithmic axis.
         needs_reflectance: Whether it is left out for scans of range alone.
     """
 
@@ -114,14 +114,12 @@ def _share(counts: np.ndarray) -> np.ndarray:
 
 def surface_normals(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Upward parts n_z of the surfaces' normals, -1 to 1, in 20 bins."""
-    found = [np.histogram(normals(r, sensor)[0], NORMALS)[0] for r in _chunks(images)]
-    return np.sum(found, axis=0)
+    return np.sum([np.histogram(normals(r, sensor)[0], NORMALS)[0] for r in _chunks(images)], axis=0)
 
 
 def incidence(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Cosines of the angle at which rays meet surfaces, in 20 bins."""
-    found = [np.histogram(normals(r, sensor)[1], COSINES)[0] for r in _chunks(images)]
-    return np.sum(found, axis=0)
+    return np.sum([np.histogram(normals(r, sensor)[1], COSINES)[0] for r in _chunks(images)], axis=0)
 
 
 def _chunks(images: np.ndarray) -> Iterator[np.ndarray]:
@@ -148,13 +146,12 @@ def _pairs(x: np.ndarray, known: np.ndarray, edges: np.ndarray, parts: int) -> n
 
 def birds_eye_density(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     """How many others of its scan share a point's 1.6 m cell of the bird's-eye view, in 10 bins."""
-    counts = [_from_above(image, sensor) for image in images]
+    counts = _from_above(images, sensor)
     return np.sum([np.histogram(count, DENSITIES, weights=count)[0] for count in counts], axis=0)
 
 
-def fill_row(images: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Share of each row's rays that returned, (H,)."""
-    return (images[:, 0] > 0).mean((0, 2))
+def _from_above(images: np.ndarray, sensor: Sensor) -> list[np.ndarray]:
+    return [birds_eye_histogram(image_to_points(image, sensor.rays())[0]) for image in images]
 
 
 def range_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
@@ -166,24 +163,10 @@ def _log_ranges(sensor: Sensor) -> np.ndarray:
     return np.linspace(np.log(sensor.min_range), np.log(sensor.max_range), 33)
 
 
-def reflectance_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Reflectance in 25 bins."""
-    return np.histogram(images[:, 1][images[:, 0] > 0], REFLECTANCES)[0]
-
-
 def height_histogram(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Heights z of the points from 3.5 m below the sensor to 4 m above, in 25 cm bins."""
     z = images[:, 0] * np.sin(sensor.rays()[0].numpy())
     return np.histogram(z[images[:, 0] > 0], HEIGHTS)[0]
-
-
-def birds_eye(images: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """The bird's-eye histograms of all scans, added: what the field's JSD compares."""
-    return np.sum([_from_above(image, sensor) for image in images], axis=0)
-
-
-def _from_above(image: np.ndarray, sensor: Sensor) -> np.ndarray:
-    return birds_eye_histogram(image_to_points(image, sensor.rays())[0])
 
 
 def mean_difference(a: np.ndarray, b: np.ndarray) -> float:
@@ -207,16 +190,17 @@ PANEL: dict[str, Member] = {
 
 # Dropped from the panel: sums over single pixels, which are the same for pixels shuffled across real scans.
 PER_PIXEL: dict[str, Member] = {
-    "fill per row": Member(fill_row, mean_difference, "row"),
+    "fill per row": Member(lambda images, sensor: (images[:, 0] > 0).mean((0, 2)), mean_difference, "row"),
     "range histogram": Member(
         range_histogram, js_distance, "metres", lambda sensor: np.exp(_log_ranges(sensor)), log=True
     ),
     "reflectance histogram": Member(
-        reflectance_histogram, js_distance, "reflectance", REFLECTANCES, needs_reflectance=True
+        lambda images, sensor: np.histogram(images[:, 1][images[:, 0] > 0], REFLECTANCES)[0],
+        js_distance, "reflectance", REFLECTANCES, needs_reflectance=True,
     ),
     "height histogram": Member(height_histogram, js_distance, "metres above the sensor", HEIGHTS),
-    "bird's-eye JSD": Member(birds_eye, js_distance),
-}
+    "bird's-eye JSD": Member(lambda images, sensor: np.sum(_from_above(images, sensor), axis=0), js_distance),
+}  # fmt: skip
 
 
 def panel(images: np.ndarray, sensor: Sensor, members: Mapping[str, Member] = PANEL) -> dict[str, np.ndarray]:
@@ -270,8 +254,6 @@ def nearest(images: np.ndarray, training: np.ndarray, sensor: Sensor, leave_self
     Args:
         leave_self: The images are the training scans themselves: each is compared to the others.
     """
-    import torch
-
     encoding = Encoding(sensor, reflectance=False)
     a, b = (encoding.encode(torch.from_numpy(np.ascontiguousarray(x[:, :1]))).flatten(1) for x in (images, training))
     d = torch.cdist(a, b) / a.shape[1] ** 0.5

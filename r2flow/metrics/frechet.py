@@ -11,7 +11,7 @@ from r2flow.metrics import FIELD_NAMES
 from r2flow.metrics.base import SIDES, Side
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.features import FeatureMetric
-from r2flow.metrics.moments import Moments, add_moments, merge_moments, moments, no_moments
+from r2flow.metrics.moments import add_moments, merge_moments, moments, no_moments
 from r2flow.metrics.store import FeatureStore
 
 BLOCK = 4000  # kept features read at once
@@ -52,8 +52,8 @@ def root(covariance: Tensor) -> Tensor:
 class FrechetDistance(FeatureMetric):
     """Frechet distance between features of real and generated scans, of Heusel et al. (2017).
 
-    The Gaussians have the mean and the unbiased covariance of the features. Both are added up in float64; nothing else
-    is kept. The distance takes a minute on a core for 4096 features, and next to nothing for 256.
+    The Gaussians have the mean and the unbiased covariance of the features, both added up in float64. The distance
+    takes a minute on a core for 4096 features, and next to nothing for 256.
 
     The network gives it its name: `frd` (RangeNet-53, Zyrianov et al. 2022), `frid` (RangeNet-21), `fpvd` (SPVCNN) and
     `fsvd` (MinkowskiNet, all three Ran et al. 2024), `fpd` (PointNet, Shu et al. 2019), `frechet_<network>` for any
@@ -73,21 +73,26 @@ class FrechetDistance(FeatureMetric):
         add_moments(getattr(self, f"{side}_moments"), rows)
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
-        name = self.name
+        name, dim = self.name, self.extractor.dim
         both = {side: moments(getattr(self, f"{side}_moments")) for side in SIDES}
-        if min(one.n for one in both.values()) < 2:
-            few = [f"{one.n} {side}" for side, one in both.items() if one.n < 2]
+        few = [f"{one.n} {side}" for side, one in both.items() if one.n < 2]
+        if few:
             return {name: float("nan")}, [f"{name}: {' and '.join(few)} scans have no covariance; it takes two."]
-        real, generated = both["real"], both["generated"]
-        value = frechet_distance(real.mean, real.covariance, generated.mean, generated.covariance)
-        return {name: value}, [r for side, one in both.items() for r in _remarks(name, side, one)]
+        value = frechet_distance(*(part for one in both.values() for part in (one.mean, one.covariance)))
+        return {name: value}, [
+            f"{name}: {one.n} {side} scans are fewer than needed for {dim} features: the covariance has a rank of at "
+            f"most {one.n - 1}, and the distance is too large; compare it only with distances of as many scans."
+            for side, one in both.items()
+            if one.n <= dim
+        ]
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        drawn = []
-        for real, generated in zip(weights["real"], weights["generated"], strict=True):
-            pair = (weighted_root(self.store(s), w) for s, w in zip(SIDES, (real, generated), strict=True))
-            (mean_1, a_1), (mean_2, a_2) = pair
-            drawn.append(distance_from_roots(mean_1, a_1, mean_2, a_2))
+        drawn = [
+            distance_from_roots(
+                *weighted_root(self.store("real"), real), *weighted_root(self.store("generated"), other)
+            )
+            for real, other in zip(weights["real"], weights["generated"], strict=True)
+        ]
         return {self.name: torch.tensor(drawn, dtype=torch.float64)}
 
 
@@ -106,13 +111,3 @@ def weighted_root(store: FeatureStore, weights: Tensor) -> tuple[Tensor, Tensor]
     for x in parts:
         scatter.addmm_(x.T, x)
     return mean, root(scatter / (n - 1))
-
-
-def _remarks(name: str, side: Side, one: Moments) -> list[str]:
-    dim = len(one.mean)
-    if one.n > dim:
-        return []
-    return [
-        f"{name}: {one.n} {side} scans are fewer than needed for {dim} features: the covariance has a rank of at most "
-        f"{one.n - 1}, and the distance is too large; compare it only with distances of as many scans."
-    ]

@@ -25,11 +25,8 @@ class KernelDistance(FeatureMetric):
 
     kind = "kid"
     settings: ClassVar[Mapping[str, Any]] = {
-        "kernel": "(a b / D + 1)^3",
-        "subsets": SUBSETS,
-        "subset size": SUBSET_SIZE,
-        "seed": 0,
-    }
+        "kernel": "(a b / D + 1)^3", "subsets": SUBSETS, "subset size": SUBSET_SIZE, "seed": 0
+    }  # fmt: skip
     keeping = "always"
     resamples = False  # it is a mean over subsets already
     of_equal_sets = None

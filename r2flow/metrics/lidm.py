@@ -41,11 +41,8 @@ class JSDLiDM(ScanMetric):
     representation = "occupied cells from above"
     mask = (NEAR, FAR)
     settings: ClassVar[Mapping[str, Any]] = {
-        "cell": FINE,
-        "metres": [-EXTENT, EXTENT],
-        "logarithm": "natural",
-        "root": True,
-    }
+        "cell": FINE, "metres": [-EXTENT, EXTENT], "logarithm": "natural", "root": True
+    }  # fmt: skip
     keeping = "never"
     resamples = False
 
@@ -81,20 +78,17 @@ class MMDLiDM(ScanMetric):
     representation = "occupied cells from above"
     mask = (NEAR, FAR)
     settings: ClassVar[Mapping[str, Any]] = {
-        "cell": COARSE,
-        "metres": [-EXTENT, EXTENT],
-        "distance": "Chamfer, squared, halved",
-    }
+        "cell": COARSE, "metres": [-EXTENT, EXTENT], "distance": "Chamfer, squared, halved"
+    }  # fmt: skip
     keeping = "always"
 
     def rows(self, scans: Scans) -> Tensor:
         side = round(2 * EXTENT / COARSE)
-        maps = torch.empty(len(scans.points), side * side)
-        for i, points in enumerate(scans.points):
-            held = torch.zeros(side * side, dtype=torch.bool)
-            held[occupied(points, COARSE).cpu()] = True
-            maps[i] = squared_distance_map(held.view(side, side)).flatten()
-        return maps
+        held = torch.zeros(len(scans), side * side, dtype=torch.bool)
+        for own, points in zip(held, scans.points, strict=True):
+            own[occupied(points, COARSE).cpu()] = True
+        maps = [squared_distance_map(own.view(side, side)).flatten() for own in held]
+        return torch.stack(maps) if maps else torch.empty(0, side * side)
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         if not all(self.count(side) for side in SIDES):

@@ -1,17 +1,16 @@
 """Whether generated scans lie where real ones do, and real ones where generated ones do."""
 
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
-from r2flow.metrics.base import SIDES, Protocol
-from r2flow.metrics.extractors.base import Extractor
+from r2flow.metrics.base import SIDES
 from r2flow.metrics.features import FeatureMetric
 from r2flow.metrics.store import FeatureStore
 
+NEIGHBOURS = 5  # k
 BLOCK = 2000  # scans: their distances take 32 MB
 TIE = 1e-9  # relative: a neighbour at exactly the radius lies inside, however its distance is rounded
 NAMES = ("precision", "recall", "density", "coverage")
@@ -29,40 +28,20 @@ class Manifold(FeatureMetric):
     There is no bootstrap interval: balls around scans that are drawn twice have no radius, and with the balls held
     fixed, intervals of 95 % held the mean figure in 76 to 81 of 100 cases.
 
-    The figures are named `precision_<network>` and so on, with `_k<k>` for another k than 5.
-
-    Args:
-        extractor: The network, or its name in `EXTRACTORS`.
-        neighbours: k.
-        keep: Features are always kept.
-        folder: Where they are kept.
-
-    Raises:
-        InputError: k below 1; no network of that name, or no weights for it on this machine.
+    The figures are named `precision_<network>` and so on.
     """
 
     kind = "manifold"
+    settings: ClassVar[Mapping[str, Any]] = {"neighbours": NEIGHBOURS, "distance": "Euclidean"}
     keeping = "always"
     resamples = False
     of_equal_sets = None
 
-    def __init__(
-        self, extractor: Extractor | str, neighbours: int = 5, keep: bool = True, folder: str | Path | None = None
-    ) -> None:
-        if neighbours < 1:
-            raise InputError(f"manifold: neighbours must be at least 1, found {neighbours}.")
-        super().__init__(extractor, keep, folder, suffix=f"_k{neighbours}" if neighbours != 5 else "")
-        self.neighbours = neighbours
-
-    @property
-    def protocol(self) -> Protocol:
-        return replace(super().protocol, settings={"neighbours": self.neighbours, "distance": "Euclidean"})
-
     def figures(self) -> tuple[dict[str, float], list[str]]:
         names = [f"{name}_{self.name.removeprefix('manifold_')}" for name in NAMES]
-        few = [side for side in SIDES if self.count(side) <= self.neighbours]
+        few = [side for side in SIDES if self.count(side) <= NEIGHBOURS]
         if few:
-            remark = f"{self.name}: too few {' and '.join(few)} scans to have {self.neighbours} neighbours each."
+            remark = f"{self.name}: too few {' and '.join(few)} scans to have {NEIGHBOURS} neighbours each."
             return dict.fromkeys(names, float("nan")), [remark]
         per_scan = self._per_scan()
         return {name: float(per_scan[one].mean()) for name, one in zip(names, NAMES, strict=True)}, []
@@ -71,7 +50,7 @@ class Manifold(FeatureMetric):
         """What each scan of the side in question adds to the figures, (N)."""
         real, generated = self.store("real"), self.store("generated")
         middle = next(block for _, block in real.blocks(BLOCK)).mean(0)
-        in_real, in_generated = (radii(store, self.neighbours, middle) * (1 + TIE) for store in (real, generated))
+        in_real, in_generated = (radii(store, NEIGHBOURS, middle) * (1 + TIE) for store in (real, generated))
         balls = torch.zeros(len(generated), dtype=torch.float64)
         recalled, covered = (torch.zeros(len(real), dtype=torch.bool) for _ in range(2))
         for i, x in real.blocks(BLOCK):
@@ -84,7 +63,7 @@ class Manifold(FeatureMetric):
         return {
             "precision": (balls > 0).double(),
             "recall": recalled.double(),
-            "density": balls / self.neighbours,
+            "density": balls / NEIGHBOURS,
             "coverage": covered.double(),
         }
 

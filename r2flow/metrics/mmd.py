@@ -50,12 +50,8 @@ class MMD(ScanMetric):
 def mean_kernel(a: tuple[FeatureStore, Tensor], b: tuple[FeatureStore, Tensor]) -> Tensor:
     """Weighted mean of k(p, q) - 1 over all scans p of one set and q of another, for every draw of weights, (R).
 
-    The 1 drops out of MMD^2, and k differs so little from it that it would cost four digits. The kernel is computed
-    once for all draws.
-
-    Args:
-        a: Kept histograms and how often each counts, (R, N).
-        b: Another set, or the same object.
+    A set is its kept histograms and how often each counts, (R, N). The 1 drops out of MMD^2, and k differs so little
+    from it that it would cost four digits. The kernel is computed once for all draws.
     """
     (x_store, x_weights), (y_store, y_weights) = a, b
     total = torch.zeros(len(x_weights), dtype=torch.float64)

@@ -21,10 +21,8 @@ class FeatureStore:
     Several processes may write, each its own rows, into one folder of a shared file system; what is read does not
     depend on which process wrote a row, nor when. Rows that are not finite are left out.
 
-    Args:
-        name: Of the file.
-        folder: Where the file lies and stays; copies of the store share it. Without one it lies in a temporary folder
-            that goes with the store, and a copy of the store copies it.
+    In a folder the files stay, and copies of the store share them. Without one they lie in a temporary folder that goes
+    with the store, and a copy of the store copies them.
     """
 
     def __init__(self, name: str, folder: str | Path | None = None) -> None:
@@ -42,18 +40,18 @@ class FeatureStore:
 
     def __len__(self) -> int:
         """Rows that are kept."""
-        return len(self._index())
+        return len(self._table()[0])
 
     def blocks(self, size: int) -> Iterator[tuple[slice, Tensor]]:
         """The kept rows in the order of their scans, at most `size` at a time: their places, and they in float64."""
-        index, table = self._index(), self._table()
+        index, table = self._table()
         for start in range(0, len(index), size):
             chosen = index[start : start + size]
             yield slice(start, start + len(chosen)), torch.from_numpy(table[chosen].astype(np.float64))
 
     def tensor(self) -> Tensor:
         """All kept rows, (N, D) float32; mapped from the file where none is missing between them."""
-        index, table = self._index(), self._table()
+        index, table = self._table()
         whole = len(index) == len(table)
         return torch.from_numpy(np.asarray(table if whole else table[index]))
 
@@ -76,20 +74,15 @@ class FeatureStore:
         folder.mkdir(parents=True, exist_ok=True)
         return folder / f"{self.name}-{self._round if number is None else number}.{kind}"
 
-    def _flags(self) -> np.ndarray:
-        path = self._path("flags")
-        return np.fromfile(path, dtype=np.uint8) if path.exists() else np.zeros(0, np.uint8)
-
-    def _index(self) -> np.ndarray:
-        return np.flatnonzero(self._flags() == KEPT)
-
-    def _table(self) -> np.ndarray:
-        flags, path = self._flags(), self._path("rows")
-        if not len(flags):
-            return np.zeros((0, 0), np.float32)
-        dim = path.stat().st_size // (4 * len(flags))
+    def _table(self) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers of the kept rows, and all rows."""
+        flags, rows = self._path("flags"), self._path("rows")
+        if not flags.exists() or not flags.stat().st_size:
+            return np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
+        kept = np.fromfile(flags, dtype=np.uint8) == KEPT
         # Copy on write: the tensors that torch makes of it may be written to, the file may not.
-        return np.memmap(path, np.float32, "c", shape=(len(flags), dim))
+        table = np.memmap(rows, np.float32, "c", shape=(len(kept), rows.stat().st_size // (4 * len(kept))))
+        return np.flatnonzero(kept), table
 
     def __getstate__(self) -> dict[str, Any]:
         paths = {kind: self._path(kind) for kind in ("rows", "flags")} if self._temporary else {}

@@ -64,7 +64,4 @@ class SumMetric(ScanMetric):
         return {name: torch.tensor([one[name] for one in drawn], dtype=torch.float64) for name in drawn[0]}
 
     def _other_size(self, a: int, b: int) -> InputError:
-        return InputError(
-            f"{self.name}: some scans give {a} numbers and others {b}; are they of two sensors? "
-            "Compare scans of one sensor only."
-        )
+        return InputError(f"{self.name}: scans give {a} and {b} numbers, as of two sensors; compare scans of one.")

@@ -1,7 +1,7 @@
 """What each backbone costs: the paper's table II, measured here."""
 
-import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -13,6 +13,7 @@ from r2flow.backbones.cost import RULE, count_macs, count_parameters
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Sensor
 from r2flow.reports.tables import print_table
+from r2flow.reports.timing import timed
 
 
 def backbone_costs(
@@ -50,14 +51,8 @@ def backbone_costs(
 def latency(model: nn.Module, shape: tuple[int, ...], repeats: int, device: str) -> float:
     """Median milliseconds of one evaluation in float32, without gradients."""
     x, t = torch.randn(shape, device=device), torch.full((shape[0],), 0.5, device=device)
-    seconds = []
     with torch.inference_mode():
-        for _ in range(repeats + 1):
-            begin = time.perf_counter()
-            model(t, x)
-            if device.startswith("cuda"):
-                torch.cuda.synchronize()
-            seconds.append(time.perf_counter() - begin)
+        seconds = [timed(partial(model, t, x), device)[1] for _ in range(repeats + 1)]
     return 1e3 * median(seconds[1:])
 
 
@@ -66,7 +61,7 @@ def print_costs(rows: Sequence[dict[str, Any]], sensor: Sensor, device: str) -> 
     height, width = sensor.shape
     formats = {"parameters": "{:,}", "gmac": "{:.2f}", "latency_ms": "{:,.0f}"}
     cells = [
-        {**row, **{key: form.format(row[key]) for key, form in formats.items() if row[key] is not None}} for row in rows
+        row | {key: form.format(row[key]) for key, form in formats.items() if row[key] is not None} for row in rows
     ]
     columns = {"name": "backbone", "parameters": "parameters", "gmac": "GMAC", "latency_ms": "latency, ms"}
     if any("error" in row for row in rows):

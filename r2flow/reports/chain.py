@@ -4,8 +4,8 @@ import json
 import math
 import time
 from collections.abc import Iterable, Mapping
+from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from r2flow.generators import Flow
 from r2flow.metrics.fidelity import distances, panel
 from r2flow.noise import Draws
 from r2flow.progress import track
-from r2flow.reports.outputs import draw_pages, write_scan
+from r2flow.reports.outputs import draw_pages, what_next, write_scan
 from r2flow.reports.pages import Page, write_page
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, dark_figure, draw_range
 from r2flow.reports.tables import print_table, table
@@ -27,6 +27,12 @@ from r2flow.runs import read_config
 from r2flow.sampling import sample
 
 MANY = 32  # steps that are taken for the limit of many
+
+
+COLUMNS = {
+    "flow": "flow", "steps": "steps", "seconds": "seconds a scan", "bend": "bend",
+    "mean": "distance to held-out scans",
+}  # fmt: skip
 
 
 def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu", command: str = "") -> Path:
@@ -47,51 +53,48 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     first = next(iter(flows.values()))
     real = held_out(first, next(iter(runs.values())))
     truth = panel(real, first.sensor)
-    cells = [(name, steps) for name, flow in flows.items() for steps in steps_of(flow, flows.values())]
     rows, drawn = [], {}
     bends = {name: bend(flow, num) for name, flow in flows.items()}
+    cells = [(name, steps) for name, flow in flows.items() for steps in steps_of(flow, flows.values())]
     for name, steps in track(cells, "sampling"):
         start = time.perf_counter()
         images = np.concatenate([one.images.numpy() for one in sample(flows[name], num, steps=steps)])
         seconds = (time.perf_counter() - start) / num
         found = distances(truth, panel(images, first.sensor))
-        rows.append({
-            "flow": name, "steps": steps, "seconds": seconds, "bend": bends[name],
-            "mean": float(np.mean(list(found.values()))), **found,
-        })  # fmt: skip
+        mean = float(np.mean(list(found.values())))
+        rows.append({"flow": name, "steps": steps, "seconds": seconds, "bend": bends[name], "mean": mean, **found})
         drawn[name, steps] = images
         # the last number of steps is the one that it is meant for
         with atomic_write(runs[name] / "fidelity.json", "w") as file:
             json.dump({"sets": {"other": found}, "samples": num, "steps": steps}, file, indent=2)
-    last = cells[-1]
-    rays = first.sensor.rays()
-    for index, image in enumerate(drawn[last][:4]):
+    shown, rays = list(drawn[cells[-1]][:4]), first.sensor.rays()
+    for index, image in enumerate(shown):
         write_scan(image, rays, out, f"{index:06d}", ("ply", "npy"))
-    draw_pages(list(drawn[last][:4]), rays, out)
-    page = Page(
-        name="chain",
-        title="From many steps to few",
-        text=[
-            explanation(num, len(real)),
-            table(rows, COLUMNS),
-            "The lines of the fidelity panel:",
-            table(rows, {"flow": "flow", "steps": "steps", **{n: n for n in truth}}),
-        ],
-        rows=rows,
-        figures={"chain": figure(drawn, list(flows))},
-        command=command,
-        seeds={"evaluation": 0},
-        device=device,
-    )
+    draw_pages(shown, rays, out)
+    text = [
+        f"{num} scans of each generator and number of steps, all from the same noise, against {len(real)} held-out "
+        "scans. *Bend* is the integral of the paper's s(t) over the squared length of the path (median over scans, 0 "
+        "is straight); an untrained flow is straight too, so read it beside the *distance*: the mean of the fidelity "
+        "panel's lines, 0 is equal.",
+        table(rows, COLUMNS),
+        "The lines of the fidelity panel:",
+        table(rows, {"flow": "flow", "steps": "steps", **{line: line for line in truth}}),
+    ]
+    figures = {"chain": figure(drawn, list(flows))}
+    page = Page("chain", "From many steps to few", text, rows, figures, command, {"evaluation": 0}, device)
     written = write_page(page, out)[-1]
-    tell(rows, runs, out, written)
+    print_table(rows, COLUMNS)
+    last, folder = list(runs.items())[-1]
+    print(
+        f"""
+pictures      {out / "chain.png"} (every generator, few and many steps), {out / "samples.png"} ({last})
+point clouds  {out / "000000.ply"} ...
+table         {written}
+flows         {", ".join(str(run) for run in runs.values())}
+{what_next(folder, out)}""",
+        flush=True,
+    )
     return written
-
-
-COLUMNS = {
-    "flow": "flow", "steps": "steps", "seconds": "seconds a scan", "bend": "bend",
-    "mean": "distance to held-out scans",
-}  # fmt: skip
 
 
 def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
@@ -121,54 +124,21 @@ def bend(flow: Checkpoint, num: int) -> float:
         return float(curvature(followed.velocity, x_0, MANY).normalised.median())
 
 
-def explanation(num: int, real: int) -> str:
-    """What the table's columns are."""
-    return (
-        f"{num} scans of each generator and number of steps, all from the same noise, against {real} held-out scans. "
-        "*Bend* is the integral of the paper's s(t) over the squared length of the path (median over scans, 0 is "
-        "straight); an untrained flow is straight too, so read it beside the *distance*: the mean of the fidelity "
-        "panel's lines, 0 is equal."
-    )
-
-
 def figure(drawn: Mapping[tuple[str, int], np.ndarray], names: list[str]) -> Figure:
     """One scan by every generator (rows) at every number of steps (columns)."""
     columns = sorted({steps for _, steps in drawn})
     sheet = dark_figure(5.2 * len(columns), 1.35 * len(names) + 0.4)
     axes = sheet.subplots(len(names), len(columns), squeeze=False)
-    for row, name in enumerate(names):
-        for column, steps in enumerate(columns):
-            cell = axes[row][column]
-            cell.set_facecolor(BACKGROUND)
-            if (name, steps) in drawn:
-                draw_range(cell, drawn[name, steps][0], label=False)
-            else:
-                cell.axis("off")
-            if row == 0:
-                cell.set_title(f"{steps} step{'s' * (steps > 1)}", color=FOREGROUND, fontsize=11)
-            if column == 0:
-                cell.axis("on")
-                cell.set_ylabel(name, color=FOREGROUND, fontsize=11)
-                cell.set(xticks=[], yticks=[])
-                cell.spines[:].set_visible(False)
+    for (row, name), (column, steps) in product(enumerate(names), enumerate(columns)):
+        cell = axes[row][column]
+        if (name, steps) in drawn:
+            draw_range(cell, drawn[name, steps][0], label=False)
+        else:
+            cell.set(facecolor=BACKGROUND, xticks=[], yticks=[])
+            cell.spines[:].set_visible(False)
+        if row == 0:
+            cell.set_title(f"{steps} step{'s' * (steps > 1)}", color=FOREGROUND, fontsize=11)
+        if column == 0:
+            cell.set_ylabel(name, color=FOREGROUND, fontsize=11)
     sheet.subplots_adjust(left=0.05, right=0.99, top=0.88, bottom=0.02, wspace=0.03, hspace=0.08)
     return sheet
-
-
-def tell(rows: list[dict[str, Any]], runs: Mapping[str, Path], out: Path, page: Path) -> None:
-    """Print the table, the files, and the commands that come next."""
-    print_table(rows, COLUMNS)
-    last, folder = list(runs.items())[-1]
-    print(
-        f"""
-pictures      {out / "chain.png"} (every generator, few and many steps), {out / "samples.png"} ({last})
-point clouds  {out / "000000.ply"} ...
-table         {page}
-flows         {", ".join(str(run) for run in runs.values())}
-
-next
-  r2flow sample --checkpoint {folder} --num 16 --seed 1 --out {out.parent / "more"}
-  r2flow show {out / "000000.ply"} --out {out.parent / "views"}
-  r2flow train data=kitti_raw data.root=FOLDER backbone=hdit_small""",
-        flush=True,
-    )

@@ -30,7 +30,7 @@ from r2flow.runs import CONFIG, contradictions, read_config
 log = logging.getLogger(__name__)
 
 LOSSES = ("train/loss", "val/loss")
-CURVATURE = ("curvature/s_normalised", "curvature/s")
+STRAIGHTNESS = "curvature/s_normalised"
 
 # Column -> heading: what is averaged over seeds, and what must be the same for all of them.
 MEASURED = {
@@ -49,6 +49,7 @@ FIXED = {
     "steps": "steps",
     "images": "images",
 }
+DRAWN = ("train_loss", "val_best", "straightness", "gmac", "seconds")  # the figure's lower panels
 
 
 @dataclass(frozen=True)
@@ -56,20 +57,29 @@ class Run:
     """A run, read from its folder.
 
     Attributes:
-        label: Its name in tables and figures.
-        path: Its folder.
-        config: The config that it was started with.
         values: By the columns of `FIXED` and `MEASURED`; None where the folder does not hold one.
         curves: (steps, values) by logged name.
         fidelity: Distance to the real scans by member of the panel, if `r2flow report fidelity` wrote it there.
     """
 
     label: str
-    path: Path
     config: dict[str, Any]
     values: dict[str, Any]
     curves: dict[str, Curve]
     fidelity: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs that differ in nothing but their seed; a run alone where they were not to be grouped."""
+
+    label: str
+    runs: tuple[Run, ...]
+
+    def values(self, column: str) -> list[float]:
+        """A column or a line of the fidelity panel, of the runs that have it."""
+        found = [{**run.values, **run.fidelity}.get(column) for run in self.runs]
+        return [value for value in found if value is not None]
 
 
 def find_runs(paths: Sequence[Path]) -> list[Path]:
@@ -106,19 +116,6 @@ def _runs_in(path: Path, levels: int) -> list[Path]:
     return [run for folder in folders for run in _runs_in(folder, levels - 1)]
 
 
-def read_runs(paths: Sequence[Path], repeats: int = 0, device: str = "cpu") -> list[Run]:
-    """Every run, each backbone built once.
-
-    Args:
-        repeats: Timed evaluations of each backbone; 0 leaves the latency out.
-    """
-    folders = find_runs(paths)
-    costs: dict[str, dict[str, Any]] = {}
-    return [
-        _read_run(path, label, costs, repeats, device) for path, label in zip(folders, labels(folders), strict=True)
-    ]
-
-
 def labels(folders: Sequence[Path]) -> list[str]:
     """Each folder's name, with as many parents as it takes to tell them apart."""
     parts = [folder.resolve().parts for folder in folders]
@@ -128,45 +125,58 @@ def labels(folders: Sequence[Path]) -> list[str]:
     return ["/".join(p[-depth:]) for p in parts]
 
 
-def _read_run(path: Path, label: str, costs: dict[str, dict[str, Any]], repeats: int, device: str) -> Run:
+def read_runs(paths: Sequence[Path], repeats: int = 0, device: str = "cpu") -> list[Run]:
+    """Every run, each backbone built once.
+
+    Args:
+        repeats: Timed evaluations of each backbone; 0 leaves the latency out.
+    """
+    folders = find_runs(paths)
+    costs: dict[str, dict[str, Any]] = {}
+    runs = []
+    for path, label in zip(folders, labels(folders), strict=True):
+        config = _config_of(path)
+        architecture = json.dumps([config.get(key) for key in ("sensor", "encoding", "backbone")], sort_keys=True)
+        if architecture not in costs:
+            costs[architecture] = cost(config, repeats, device)
+        curves = read_curves(path, (*LOSSES, STRAIGHTNESS))
+        values = {**costs[architecture], **_read_values(path, config, curves)}
+        runs.append(Run(label, config, values, curves, read_fidelity(path)))
+    return runs
+
+
+def _config_of(path: Path) -> dict[str, Any]:
     try:
         config = read_config(path)
     except yaml.YAMLError:
         raise InputError(f"{path / CONFIG} cannot be read as YAML; is it whole?") from None
     if not isinstance(config, dict) or not {"stage", "backbone", "data"} <= config.keys():
         raise InputError(f"{path / CONFIG} is no config of a run.")
-    architecture = json.dumps([config.get(key) for key in ("sensor", "encoding", "backbone")], sort_keys=True)
-    if architecture not in costs:
-        costs[architecture] = cost(config, repeats, device)
-    curves = read_curves(path, (*LOSSES, *CURVATURE))
-    train, validation = (curves[name][1] if name in curves else np.empty(0) for name in LOSSES)
-    straightness = curves[CURVATURE[0]][1] if CURVATURE[0] in curves else np.empty(0)
+    return config
+
+
+def _read_values(path: Path, config: Mapping[str, Any], curves: Mapping[str, Curve]) -> dict[str, Any]:
+    """The columns of a run that its network does not decide."""
+    nothing = (np.empty(0), np.empty(0))
+    train, validation, straightness = (curves.get(name, nothing)[1] for name in (*LOSSES, STRAIGHTNESS))
     checkpoints = checkpoints_of(path)
-    logged = [int(steps[-1]) for name, (steps, _) in curves.items() if name in LOSSES]
+    logged = [int(curves[name][0][-1]) for name in LOSSES if name in curves]
     step = step_of(checkpoints[0]) if checkpoints else max(logged, default=None)
     values = {
-        "stage": stage_name(config),
+        "train_loss": train[-max(len(train) // 10, 1) :].mean() if len(train) else math.nan,
+        "val_best": validation.min(initial=math.inf),
+        "val_last": validation[-1] if len(validation) else math.nan,
+        "straightness": straightness[-1] if len(straightness) else math.nan,
+    }
+    stage = config["stage"]
+    return {
+        "stage": f"{stage['name']} {stage['steps']}" if "steps" in stage else str(stage["name"]),
         "backbone": config["backbone"]["name"],
-        **costs[architecture],
         "steps": step,
         "images": None if step is None else step * int(config["data"]["batch_size"]),
-        "train_loss": _number(train[-max(len(train) // 10, 1) :].mean()) if len(train) else None,
-        "val_best": _number(validation.min()) if len(validation) else None,
-        "val_last": _number(validation[-1]) if len(validation) else None,
-        "straightness": _number(straightness[-1]) if len(straightness) else None,
+        **{name: float(value) if math.isfinite(value) else None for name, value in values.items()},
         "seconds": training_seconds(path),
     }
-    return Run(label, path, config, values, curves, read_fidelity(path))
-
-
-def _number(value: Any) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def stage_name(config: Mapping[str, Any]) -> str:
-    """'rectify', 'reflow', or 'distill 2' for two steps."""
-    stage = config["stage"]
-    return f"{stage['name']} {stage['steps']}" if "steps" in stage else str(stage["name"])
 
 
 def cost(config: Mapping[str, Any], repeats: int, device: str) -> dict[str, Any]:
@@ -198,7 +208,7 @@ def read_fidelity(path: Path) -> dict[str, float]:
     Raises:
         InputError: the file holds something else.
     """
-    files = sorted([*path.glob("fidelity.json"), *path.glob("*/fidelity.json")])
+    files = [*path.glob("fidelity.json"), *path.glob("*/fidelity.json")]
     if not files:
         return {}
     newest = max(files, key=lambda file: file.stat().st_mtime)
@@ -206,28 +216,6 @@ def read_fidelity(path: Path) -> dict[str, float]:
         return {line: float(value) for line, value in json.loads(newest.read_text("utf-8"))["sets"]["other"].items()}
     except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(f"{newest} is no result of 'r2flow report fidelity'; remove it or make it again.") from None
-
-
-@dataclass(frozen=True)
-class Group:
-    """Runs that differ in nothing but their seed; a run alone where they were not to be grouped."""
-
-    label: str
-    runs: tuple[Run, ...]
-
-    def spread(self, column: str) -> tuple[float, float | None] | None:
-        """Mean and standard deviation over the runs that have the value; None where none has it."""
-        found = [run.values[column] for run in self.runs if run.values.get(column) is not None]
-        return _spread(found)
-
-    def fidelity(self, line: str) -> tuple[float, float | None] | None:
-        return _spread([run.fidelity[line] for run in self.runs if line in run.fidelity])
-
-
-def _spread(values: Sequence[float]) -> tuple[float, float | None] | None:
-    if not values:
-        return None
-    return fmean(values), stdev(values) if len(values) > 1 else None
 
 
 def group_runs(runs: Sequence[Run]) -> list[Group]:
@@ -239,7 +227,7 @@ def group_runs(runs: Sequence[Run]) -> list[Group]:
             groups.append([run])
         else:
             same.append(run)
-    return [Group(group_label(group), tuple(group)) for group in groups]
+    return [Group(_common_label(group), tuple(group)) for group in groups]
 
 
 def same_but_seed(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
@@ -251,19 +239,17 @@ def same_but_seed(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
         {key: value for key, value in flatten(config) if key not in ignored and not key.startswith("parent.")}
         for config in (first, second)
     ]
-    return not contradictions(*trimmed) and _same_parents(first, second)
-
-
-def _same_parents(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
+    if contradictions(*trimmed):
+        return False
     one, other = first.get("parent"), second.get("parent")
     if not one or not other or one["weights"] == other["weights"]:
         return bool(one) == bool(other)
-    configs = [read_config(Path(parent["path"]).parent.parent) for parent in (one, other)]
+    parents = [read_config(Path(parent["path"]).parent.parent) for parent in (one, other)]
     # Without a parent's folder its config is not known, and the runs stay apart.
-    return bool(configs[0] and configs[1] and same_but_seed(configs[0], configs[1]))
+    return bool(parents[0] and parents[1] and same_but_seed(parents[0], parents[1]))
 
 
-def group_label(runs: Sequence[Run]) -> str:
+def _common_label(runs: Sequence[Run]) -> str:
     """The common part of several runs' names, without the word seed."""
     if len(runs) == 1:
         return runs[0].label
@@ -281,17 +267,12 @@ def rows_of(groups: Sequence[Group]) -> list[dict[str, Any]]:
         for column in FIXED:
             found = {run.values.get(column) for run in group.runs}
             row[column] = found.pop() if len(found) == 1 else None
-        for column in MEASURED:
-            row |= _columns(column, group.spread(column))
-        for line in panel_lines(groups):
-            row |= _columns(line, group.fidelity(line))
+        for column in (*MEASURED, *panel_lines(groups)):
+            values = group.values(column)
+            row[column] = fmean(values) if values else None
+            row[f"{column}_spread"] = stdev(values) if len(values) > 1 else None
         rows.append(row)
     return rows
-
-
-def _columns(name: str, spread: tuple[float, float | None] | None) -> dict[str, float | None]:
-    mean, deviation = spread or (None, None)
-    return {name: mean, f"{name}_spread": deviation}
 
 
 def panel_lines(groups: Sequence[Group]) -> list[str]:
@@ -312,19 +293,15 @@ def tables(groups: Sequence[Group]) -> list[tuple[str, list[list[str]], list[str
     """(title, cells, headings): what the runs are and cost, their results, and the fidelity panel where it was run."""
     rows = rows_of(groups)
     several = {"n": "n"} if any(row["n"] > 1 for row in rows) else {}
-    results = {key: heading for key, heading in MEASURED.items() if key != "latency_ms"}
+    results = dict(MEASURED)
+    latencies = {"latency_ms": results.pop("latency_ms")}
     timed = any(row["latency_ms"] is not None for row in rows)
-    latencies = {"latency_ms": MEASURED["latency_ms"]} if timed else {}
-    lines = panel_lines(groups)
-    columns: dict[str, dict[str, str]] = {
-        "Runs": {**FIXED, **latencies},
-        "Results": results,
-        **({"Distance to real scans": {line: line for line in lines}} if lines else {}),
-    }
+    lines = {line: line for line in panel_lines(groups)}
+    titled = {"Runs": {**FIXED, **(latencies if timed else {})}, "Results": results, "Distance to real scans": lines}
     return [
         (title, [[row["name"], *(cell(row, key) for key in [*several, *own])] for row in rows],
          ["run", *several.values(), *own.values()])
-        for title, own in columns.items()
+        for title, own in titled.items() if own
     ]  # fmt: skip
 
 
@@ -345,56 +322,45 @@ NOTES = (
 
 def compare_page(groups: Sequence[Group], command: str, device: str = "cpu") -> Page:
     """`compare.md .csv .json .png`."""
-    spread = ["Several seeds: mean ± standard deviation over n runs."] if any(len(g.runs) > 1 for g in groups) else []
-    seeds = {run.label: int(run.config["seed"]) for group in groups for run in group.runs if "seed" in run.config}
+    runs = [(group.label, run) for group in groups for run in group.runs]
+    spread = ["Several seeds: mean ± standard deviation over n runs."] if len(runs) > len(groups) else []
+    seeds = {run.label: int(run.config["seed"]) for _, run in runs if "seed" in run.config}
     written = [part for title, cells, headings in tables(groups) for part in (f"## {title}", table(cells, headings))]
-    members = [{"group": g.label, "run": run.label, **run.values, **run.fidelity} for g in groups for run in g.runs]
+    members = [{"group": label, "run": run.label, **run.values, **run.fidelity} for label, run in runs]
     return Page(
-        name="compare",
-        title="Runs compared",
-        text=[*written, "## How to read it", NOTES, *spread],
-        rows=rows_of(groups),
-        figures={"compare": compare_figure(groups)},
-        command=command,
-        seeds=seeds,
-        device=device,
-        more={"runs": members},
-    )
+        "compare", "Runs compared", [*written, "## How to read it", NOTES, *spread], rows_of(groups),
+        {"compare": compare_figure(groups)}, command, seeds, device, {"runs": members},
+    )  # fmt: skip
 
 
 def compare_figure(groups: Sequence[Group]) -> Figure:
     """Learning curves above, a panel of points for each figure below."""
-    panels = [c for c in ("train_loss", "val_best", "straightness", "gmac", "seconds") if _has(groups, c)]
-    height = 3.6 + 0.9 + 0.26 * len(groups)
-    figure = blank_figure(11, height)
-    grid = figure.add_gridspec(2, 1, height_ratios=(3.6, 0.9 + 0.26 * len(groups)))
-    above = grid[0].subgridspec(1, 2)
-    for index, (name, title) in enumerate(zip(LOSSES, ("training loss", "validation loss"), strict=True)):
-        axes = figure.add_subplot(above[0, index])
-        _draw_curves(axes, groups, name)
+    panels = [column for column in DRAWN if any(group.values(column) for group in groups)]
+    below_height = 0.9 + 0.26 * len(groups)
+    figure = blank_figure(11, 3.6 + below_height)
+    grid = figure.add_gridspec(2, 1, height_ratios=(3.6, below_height))
+    above, below = grid[0].subgridspec(1, 2), grid[1].subgridspec(1, max(len(panels), 1))
+    styled = [(STYLES[index % len(STYLES)], group) for index, group in enumerate(groups)]
+    for place, (name, title) in enumerate(zip(LOSSES, ("training loss", "validation loss"), strict=True)):
+        axes = figure.add_subplot(above[place])
+        _draw_curves(axes, styled, name)
         axes.set(title=title, xlabel="optimiser step")
-    below = grid[1].subgridspec(1, max(len(panels), 1))
     first = None
-    for index, column in enumerate(panels):
-        axes = figure.add_subplot(below[0, index], sharey=first)
-        _draw_points(axes, groups, column)
+    for place, column in enumerate(panels):
+        axes = figure.add_subplot(below[place], sharey=first)
+        _draw_points(axes, styled, column)
         axes.set_title({**MEASURED, **FIXED}[column], fontsize=9)
         axes.set_yticks(range(len(groups)), [group.label for group in groups], fontsize=8)
-        axes.tick_params(labelleft=index == 0, labelsize=8)
+        axes.set_ylim(len(groups) - 0.5, -0.5)
+        axes.tick_params(labelleft=first is None, labelsize=8)
         first = first or axes
-    if first is not None:
-        first.set_ylim(len(groups) - 0.5, -0.5)
     return figure
 
 
-def _has(groups: Sequence[Group], column: str) -> bool:
-    return any(run.values.get(column) is not None for group in groups for run in group.runs)
-
-
-def _draw_curves(axes: Any, groups: Sequence[Group], name: str) -> None:
+def _draw_curves(axes: Any, styled: Sequence[tuple[dict[str, Any], Group]], name: str) -> None:
     """Every run's curve in its group's style; many points as their running mean over a twentieth of the run."""
     drawn = []
-    for style, group in zip(_styles(len(groups)), groups, strict=True):
+    for style, group in styled:
         for number, run in enumerate(group.runs):
             if name not in run.curves:
                 continue
@@ -422,22 +388,18 @@ def smooth(steps: np.ndarray, values: np.ndarray) -> Curve:
     return np.convolve(steps, kernel, "valid"), np.convolve(values, kernel, "valid")
 
 
-def _draw_points(axes: Any, groups: Sequence[Group], column: str) -> None:
-    for row, (style, group) in enumerate(zip(_styles(len(groups)), groups, strict=True)):
-        values = [float(run.values[column]) for run in group.runs if run.values.get(column) is not None]
-        found = _spread(values)
-        if found is None:
+def _draw_points(axes: Any, styled: Sequence[tuple[dict[str, Any], Group]], column: str) -> None:
+    """Mean and standard deviation of each group, and the values of its runs."""
+    for row, (style, group) in enumerate(styled):
+        mark = {"color": style["color"], "marker": style["marker"]}
+        values = group.values(column)
+        if not values:
             axes.text(0.02, row, "-", va="center", transform=axes.get_yaxis_transform())
             continue
-        mean, deviation = found
-        mark = {"color": style["color"], "marker": style["marker"]}
-        axes.errorbar(mean, row, xerr=deviation or None, capsize=3, markersize=6, linestyle="none", **mark)
+        deviation = stdev(values) if len(values) > 1 else None
+        axes.errorbar(fmean(values), row, xerr=deviation, capsize=3, markersize=6, linestyle="none", **mark)
         if len(values) > 1:
             axes.plot(values, [row] * len(values), "|", color=style["color"], markersize=9, alpha=0.6)
     axes.grid(axis="x", alpha=0.25)
     axes.margins(x=0.15)
     axes.locator_params(axis="x", nbins=4)
-
-
-def _styles(count: int) -> list[dict[str, Any]]:
-    return [STYLES[index % len(STYLES)] for index in range(count)]

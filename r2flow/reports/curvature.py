@@ -1,25 +1,25 @@
 """How straight the paths of trained flows are: the paper's figure 8."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
-from r2flow.flow.straightness import Straightness, straightness
+from r2flow.flow.straightness import straightness
 from r2flow.generators import as_flow
-from r2flow.lidar.encoding import Encoding
+from r2flow.generators.base import Progress
 from r2flow.noise import Draws
 from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.tables import table
 
 MOST_CURVED = 200  # paths drawn, as in the paper's figure 8 (b)
-OF_PATHS = ("bends", "trajectories", "dropped")  # fields of `Paths` with an entry for each path that is kept
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def measure_paths(
     seed: int = 0,
     batch_size: int = 1,
     most_curved: int = MOST_CURVED,
-    progress: Callable[[], None] | None = None,
+    progress: Progress = None,
 ) -> Paths:
     """s(t) over `steps` Euler steps of scans 0 to num - 1 of a seed, and the most curved paths.
 
@@ -78,42 +78,26 @@ def measure_paths(
         InputError: fewer than one step.
     """
     flow = as_flow(checkpoint.generator, "curvature")
-    batches: list[Paths] = []
+    scans: list[tuple[Tensor, ...]] = []  # s and squared length of each
+    most: list[tuple[Tensor, ...]] = []  # bend, path and end of the most curved of each batch
+    sums = np.zeros(4)  # elements, those that end as dropped, the bend of all, the bend of those
     for first in range(0, num, batch_size):
         x_0 = Draws(seed, range(first, min(first + batch_size, num))).start(flow.noise_shape).to(flow.device)
         with torch.inference_mode():
             found = straightness(flow.velocity, x_0, steps, most_curved, progress)
-        batches.append(_paths(found, checkpoint.encoding, label))
-    return _together(batches, most_curved)
-
-
-def _paths(found: Straightness, encoding: Encoding, label: str) -> Paths:
-    curvature = found.curvature
-    bends = curvature.per_pixel
-    dropped = (encoding.decode(curvature.x_1)[:, :1] == 0).expand_as(bends)
-    tensors = (found.t, found.s, curvature.squared_length, bends.flatten()[found.pixels], found.trajectories,
-               dropped.flatten()[found.pixels])  # fmt: skip
-    t, s, length, most, trajectories, ends = (x.cpu().numpy() for x in tensors)
-    share, total = dropped.double().mean().item(), bends.sum().item()
-    on_dropped = bends[dropped].sum().item() / total if total else math.nan
-    return Paths(label, t, s, length, bends.numel(), most, trajectories, ends, share, on_dropped)
-
-
-def _together(batches: Sequence[Paths], most_curved: int) -> Paths:
-    """The batches of one checkpoint as one."""
-    every: dict[str, Any] = {
-        name: np.concatenate([getattr(b, name) for b in batches]) for name in ("s", "squared_length", *OF_PATHS)
-    }
-    most = np.argsort(-every["bends"], kind="stable")[:most_curved]
-    totals = np.array([b.s.mean(1).sum() for b in batches])
-    elements = np.array([b.elements for b in batches])
-    return replace(
-        batches[0],
-        **every | {name: every[name][most] for name in OF_PATHS},
-        elements=int(elements.sum()),
-        dropped_share=float(np.average([b.dropped_share for b in batches], weights=elements)),
-        dropped_bend=float(np.average([b.dropped_bend for b in batches], weights=totals)) if totals.sum() else math.nan,
-    )
+        bends, pixels = found.curvature.per_pixel, found.pixels
+        dropped = (checkpoint.encoding.decode(found.curvature.x_1)[:, :1] == 0).expand_as(bends)
+        scans.append((found.s, found.curvature.squared_length))
+        most.append((bends.flatten()[pixels], found.trajectories, dropped.flatten()[pixels]))
+        sums += bends.numel(), dropped.sum().item(), bends.sum().item(), bends[dropped].sum().item()
+    s, squared_length = (torch.cat(batches).cpu().numpy() for batches in zip(*scans, strict=True))
+    worst, trajectories, ends = (torch.cat(batches).cpu().numpy() for batches in zip(*most, strict=True))
+    order = np.argsort(-worst, kind="stable")[:most_curved]
+    elements, ends_dropped, bend, bend_of_dropped = map(float, sums)
+    return Paths(
+        label, found.t.numpy(), s, squared_length, int(elements), worst[order], trajectories[order], ends[order],
+        dropped_share=ends_dropped / elements, dropped_bend=bend_of_dropped / bend if bend else math.nan,
+    )  # fmt: skip
 
 
 def curvature_rows(flows: Sequence[Paths]) -> list[dict[str, Any]]:
@@ -122,7 +106,8 @@ def curvature_rows(flows: Sequence[Paths]) -> list[dict[str, Any]]:
     for flow in flows:
         for index, t in enumerate(flow.t):
             row: dict[str, Any] = {"checkpoint": flow.label, "t": float(t)}
-            for name, values in (("s", flow.s[:, index]), ("s_normalised", flow.s_normalised[:, index])):
+            for name in ("s", "s_normalised"):
+                values = getattr(flow, name)[:, index]
                 row |= {name: float(values.mean()), f"{name}_least": float(values.min())}
                 row |= {f"{name}_most": float(values.max())}
             rows.append(row)
@@ -177,27 +162,21 @@ def curvature_text(flows: Sequence[Paths]) -> list[str]:
 def curvature_figure(flows: Sequence[Paths]) -> Figure:
     """s(t), as it is and over |d|^2, every checkpoint a line with the range over its scans."""
     figure = blank_figure(10, 4.2)
-    for place, (values, label) in enumerate(
-        (
-            (lambda flow: flow.s, r"$s(t) = \|(x_1 - x_0) - v_t\|^2$"),
-            (lambda flow: flow.s_normalised, r"$s(t)\ /\ \|x_1 - x_0\|^2$"),
-        )
-    ):
-        axes = figure.add_subplot(1, 2, place + 1)
+    panels = {"s": r"$s(t) = \|(x_1 - x_0) - v_t\|^2$", "s_normalised": r"$s(t)\ /\ \|x_1 - x_0\|^2$"}
+    for axes, (name, label) in zip(figure.subplots(1, 2), panels.items(), strict=True):
         for index, flow in enumerate(flows):
-            style, found = STYLES[index % len(STYLES)], values(flow)
+            style, found = STYLES[index % len(STYLES)], getattr(flow, name)
             every = max(len(flow.t) // 8, 1)
             # Markers begin at another step for each line, so that lines on top of each other stay apart.
-            marks = (index * every // max(len(flows), 1), every)
+            marks = (index * every // len(flows), every)
             axes.plot(flow.t, found.mean(0), **style, ms=5, lw=1.4, markevery=marks, label=flow.label)
             if len(found) > 1:
                 axes.fill_between(flow.t, found.min(0), found.max(0), color=style["color"], alpha=0.12, lw=0)
         axes.set(xlabel="t  (0 noise, 1 data)", ylabel=label, xlim=(0, 1))
-        if any((values(flow) > 0).any() for flow in flows):
+        if any((getattr(flow, name) > 0).any() for flow in flows):
             axes.set_yscale("log")
         axes.grid(True, which="both", color="0.9", lw=0.6)
-        if place == 0:
-            axes.legend(fontsize=8, framealpha=0.9)
+    figure.axes[0].legend(fontsize=8, framealpha=0.9)
     return figure
 
 
@@ -212,11 +191,11 @@ def trajectories_figure(flows: Sequence[Paths]) -> Figure:
         times = np.append(flow.t, 1.0)
         for dropped, style in ((False, {"color": "0.55", "ls": "-"}), (True, {"color": "#b5301c", "ls": (0, (4, 2))})):
             chosen = flow.trajectories[flow.dropped == dropped]
-            name = "ray ends dropped" if dropped else "ray ends as a return"
-            for number, path in enumerate(chosen):
-                label = f"{name}: {len(chosen)}" if number == 0 else None
-                axes.plot(times, path, lw=0.7, alpha=0.8, label=label, **style)
-            axes.scatter(np.ones(len(chosen)), [p[-1] for p in chosen], s=9, marker="x" if dropped else "o",
+            label = f"ray ends {'dropped' if dropped else 'as a return'}: {len(chosen)}"
+            lines = axes.plot(times, chosen.T, lw=0.7, alpha=0.8, **style)
+            if lines:
+                lines[0].set_label(label)
+            axes.scatter(np.ones(len(chosen)), chosen[:, -1], s=9, marker="x" if dropped else "o",
                          lw=0.7, color=style["color"], clip_on=False, zorder=3)  # fmt: skip
         axes.set(xlabel="t  (0 noise, 1 data)", xlim=(0, 1))
         axes.set_title(titles[index], fontsize=9)
@@ -245,14 +224,8 @@ def curvature_page(flows: Sequence[Paths], seed: int, command: str, device: str 
         for flow in flows
         for number in range(len(flow.bends))
     ]  # fmt: skip
+    figures = {"curvature": curvature_figure(flows), "trajectories": trajectories_figure(flows)}
     return Page(
-        "curvature",
-        "How straight the flows are",
-        curvature_text(flows),
-        curvature_rows(flows),
-        {"curvature": curvature_figure(flows), "trajectories": trajectories_figure(flows)},
-        command,
-        seeds={"scenes": seed},
-        device=device,
-        more={"summary": [summary(flow) for flow in flows], "trajectories": paths},
-    )
+        "curvature", "How straight the flows are", curvature_text(flows), curvature_rows(flows), figures, command,
+        {"scenes": seed}, device, {"summary": [summary(flow) for flow in flows], "trajectories": paths},
+    )  # fmt: skip

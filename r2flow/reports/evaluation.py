@@ -23,14 +23,7 @@ PRINTED = {"jsd": ("JSD x 10^2", 1e2), "mmd": ("MMD x 10^4", 1e4)}
 
 @dataclass(frozen=True)
 class Comparison:
-    """One set against another.
-
-    Attributes:
-        name: "generated", "real halves", ...
-        real, generated: The two sets.
-        measured: Each metric's figures.
-        seconds: That it took, with the statistics of the real set if they were gathered for it.
-    """
+    """One set against another, as "generated" or "real halves"; the seconds include gathering the real statistics."""
 
     name: str
     real: ScanSet
@@ -47,17 +40,16 @@ def heading(metric: str, figure: str) -> tuple[str, float]:
 def rows_of(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
     """A row for each figure."""
     rows = []
-    for one in comparisons:
-        for measured in one.measured:
-            for name, value in measured.figures.items():
-                said, factor = heading(measured.metric, name)
-                low, high = measured.intervals.get(name, (None, None))
-                rows.append({
-                    "comparison": one.name, "metric": measured.metric, "figure": name, "value": value, "low": low,
-                    "high": high, "printed_as": said, "printed": value * factor,
-                    "real": measured.protocol["sizes"]["real"], "generated": measured.protocol["sizes"]["generated"],
-                    "remarks": "; ".join(measured.remarks),
-                })  # fmt: skip
+    for comparison, measured in ((one, metric) for one in comparisons for metric in one.measured):
+        for name, value in measured.figures.items():
+            said, factor = heading(measured.metric, name)
+            low, high = measured.intervals.get(name, (None, None))
+            sizes = measured.protocol["sizes"]
+            rows.append({
+                "comparison": comparison.name, "metric": measured.metric, "figure": name, "value": value, "low": low,
+                "high": high, "printed_as": said, "printed": value * factor, "real": sizes["real"],
+                "generated": sizes["generated"], "remarks": "; ".join(measured.remarks),
+            })  # fmt: skip
     return rows
 
 
@@ -69,13 +61,9 @@ def print_comparisons(comparisons: Sequence[Comparison]) -> None:
         print(f"  {remark}")
 
 
-def write_json(page: Page, comparisons: Sequence[Comparison], path: Path) -> None:
+def write_json(page: Page, path: Path) -> None:
     """Write every figure with its protocol, remarks and origin, as strict JSON; one that does not exist is null."""
-    content = {
-        "format": FORMAT,
-        "origin": provenance(page),
-        "comparisons": [_plain_comparison(one) for one in comparisons],
-    }
+    content = {"format": FORMAT, "origin": provenance(page), **page.more}
     with atomic_write(path, "w") as file:
         file.write(json.dumps(plain(content), indent=2, allow_nan=False) + "\n")
 
@@ -84,34 +72,31 @@ def evaluation_page(comparisons: Sequence[Comparison], command: str, device: str
     """The page of an evaluation: table, sets, protocols, and a picture."""
     columns, lines = _table(comparisons)
     remarks = "\n".join(f"- {remark}" for remark in _remarks(comparisons))
+    sets = [
+        (one.name, whose, s.label, len(s), _words(s.about))
+        for one in comparisons
+        for whose, s in (("real", one.real), ("generated", one.generated))
+    ]
+    protocols = [one.protocol for one in comparisons[0].measured]
+    used = [
+        (p["metric"], p["representation"], "{:g} < r < {:g}".format(*p["mask"]), p["extractor"], p["weights"],
+         p["layer"], _words(p["settings"]), p["sizes"]["real_chosen"], p["sizes"]["generated"])
+        for p in protocols
+    ]  # fmt: skip
     text = [
         table(lines, columns),
         *([remarks] if remarks else []),
         "## Sets",
-        table(
-            [
-                {"comparison": one.name, "whose": whose, "set": s.label, "scans": len(s), "about": _words(s.about)}
-                for one in comparisons
-                for whose, s in (("real", one.real), ("generated", one.generated))
-            ],
-            {"comparison": "comparison", "whose": "as", "set": "set", "scans": "scans", "about": "details"},
-        ),
+        table(sets, ("comparison", "as", "set", "scans", "details")),
         "## Protocols",
         "Before every metric, returns beyond the mask are dropped from both sets. Figures of different protocols are "
         "not comparable.",
-        table(
-            [_protocol_row(measured) for measured in comparisons[0].measured],
-            {
-                "metric": "metric", "representation": "compares", "mask": "mask, m", "extractor": "network",
-                "weights": "weights", "layer": "features", "settings": "settings", "real_chosen": "real scans",
-                "generated": "generated scans",
-            },
-        ),
+        table(used, ("metric", "compares", "mask, m", "network", "weights", "features", "settings", "real scans",
+                     "generated scans")),
     ]  # fmt: skip
     more = {"comparisons": [_plain_comparison(one) for one in comparisons]}
-    picture = {"evaluation": _figure(comparisons)} if comparisons else {}
-    return Page("evaluation", "Generated scans against real ones", text, rows_of(comparisons), picture, command,
-                seeds, device, more)  # fmt: skip
+    return Page("evaluation", "Generated scans against real ones", text, rows_of(comparisons),
+                {"evaluation": _figure(comparisons)}, command, seeds, device, more)  # fmt: skip
 
 
 def _table(comparisons: Sequence[Comparison], between: str = " ") -> tuple[list[str], list[list[str]]]:
@@ -122,62 +107,33 @@ def _table(comparisons: Sequence[Comparison], between: str = " ") -> tuple[list[
     """
     columns = ["", *(f"{one.name}{between}({len(one.generated)} : {len(one.real)})" for one in comparisons)]
     cells: dict[str, dict[str, str]] = {}
-    for one in comparisons:
-        for measured in one.measured:
-            for name, value in measured.figures.items():
-                said, factor = heading(measured.metric, name)
-                cells.setdefault(said, {})[one.name] = _cell(value, measured.intervals.get(name), factor, between)
+    for row in rows_of(comparisons):
+        factor = heading(row["metric"], row["figure"])[1]
+        text = "none" if math.isnan(row["value"]) else f"{row['printed']:#.4g}"
+        if row["low"] is not None and text != "none":
+            text += f"{between}[{row['low'] * factor:#.3g}, {row['high'] * factor:#.3g}]"
+        cells.setdefault(row["printed_as"], {})[row["comparison"]] = text
     return columns, [[said, *(cells[said].get(one.name, "") for one in comparisons)] for said in cells]
-
-
-def _cell(value: float, interval: tuple[float, float] | None, factor: float, between: str) -> str:
-    if math.isnan(value):
-        return "none"
-    low_high = "" if interval is None else f"{between}[{interval[0] * factor:#.3g}, {interval[1] * factor:#.3g}]"
-    return f"{value * factor:#.4g}{low_high}"
 
 
 def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
     """Each remark once, with the comparison and the metrics that it holds for."""
-    found: dict[tuple[str, str], list[str]] = {}
+    said = []
+    drawn = [m.protocol["interval"] for one in comparisons for m in one.measured if m.intervals]
+    if drawn:
+        draws = drawn[0]["bootstrap draws"]
+        said.append(f"In brackets: intervals of {drawn[0]['level']:.0%}, from {draws} bootstrap draws.")
+    if len({(len(one.real), len(one.generated)) for one in comparisons}) > 1:
+        said.append("Distances of fewer scans are larger: compare only columns of equal sizes.")
     for one in comparisons:
+        found: dict[str, list[str]] = {}
         for measured in one.measured:
             for remark in measured.remarks:
-                found.setdefault((one.name, remark), []).append(measured.metric)
-    everything = {one.name: len(one.measured) for one in comparisons}
-    sizes = {one.name: (len(one.real), len(one.generated)) for one in comparisons}
-    uneven = (
-        ["Distances of fewer scans are larger: compare only columns of equal sizes."]
-        if len(set(sizes.values())) > 1
-        else []
-    )
-    drawn = [m.protocol["interval"] for one in comparisons for m in one.measured if m.intervals]
-    brackets = (
-        [f"In brackets: intervals of {drawn[0]['level']:.0%}, from {drawn[0]['bootstrap draws']} bootstrap draws."]
-        if drawn
-        else []
-    )
-    return [
-        *brackets,
-        *uneven,
-        *(
-            f"{name}: {remark}"
-            if len(metrics) == everything[name] or remark.startswith(tuple(metrics))
-            else f"{name}, {', '.join(metrics)}: {remark}"
-            for (name, remark), metrics in found.items()
-        ),
-    ]
-
-
-def _protocol_row(measured: MetricResult) -> dict[str, Any]:
-    protocol = measured.protocol
-    return {
-        **{key: protocol[key] for key in ("metric", "representation", "extractor", "weights", "layer")},
-        "mask": "{:g} < r < {:g}".format(*protocol["mask"]),
-        "settings": _words(protocol["settings"]),
-        "real_chosen": protocol["sizes"]["real_chosen"],
-        "generated": protocol["sizes"]["generated"],
-    }
+                found.setdefault(remark, []).append(measured.metric)
+        for remark, metrics in found.items():
+            obvious = len(metrics) == len(one.measured) or remark.startswith(tuple(metrics))
+            said.append(f"{one.name}: {remark}" if obvious else f"{one.name}, {', '.join(metrics)}: {remark}")
+    return said
 
 
 def _words(values: Mapping[str, Any]) -> str:
@@ -213,11 +169,8 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
     first = {m.metric: next(iter(m.figures)) for m in comparisons[0].measured if m.figures}
     columns = max(min(len(first), 4), 1)
     lines = max(math.ceil(len(first) / columns), 1)
-    figure = blank_figure(
-        2.9 * columns + 1.0,
-        0.5 * len(comparisons) * lines + 1.2 * lines,
-        "Each metric's first figure, generated scans and real ones",
-    )
+    title = "Each metric's first figure, generated scans and real ones"
+    figure = blank_figure(2.9 * columns + 1.0, (0.5 * len(comparisons) + 1.2) * lines, title)
     for place, (metric, name) in enumerate(first.items()):
         axes = figure.add_subplot(lines, columns, place + 1)
         said, factor = heading(metric, name)

@@ -21,6 +21,12 @@ MEMBERS = PANEL | PER_PIXEL
 DRIVE = 4  # scans: fewer are no drive that another can be compared to
 CLEARLY = 0.5  # a member tells controls from real scans where the floor is below this share of the nearest control
 WITHIN = 2.0  # floors: as near to the real scans as can be asked of scans of other places
+# What the floor is, the first that there is.
+FLOORS = {
+    "other real scans": "the distance of the real scans given as --floor",
+    "training scans": "the distance of the training scans",
+    "drive against drive": "the mean distance of two of the real drives",
+}
 
 
 def load_scans(spec: str | Path, reading: Reading, most: int = 1000) -> tuple[np.ndarray, list[str]]:
@@ -40,10 +46,9 @@ def load_scans(spec: str | Path, reading: Reading, most: int = 1000) -> tuple[np
 
 
 def joined(sets: Sequence[np.ndarray]) -> np.ndarray:
-    """Images, or sets of them, as one set; with reflectance where all have it."""
-    sets = [s[None] if s.ndim == 3 else s for s in sets]
-    channels = min(s.shape[1] for s in sets)
-    return np.concatenate([s[:, :channels] for s in sets])
+    """Sets of images as one set; with reflectance where all have it."""
+    channels = min(images.shape[1] for images in sets)
+    return np.concatenate([images[:, :channels] for images in sets])
 
 
 def compare_sets(
@@ -76,37 +81,32 @@ def compare_sets(
     sets = {name: images for name, images in given.items() if images is not None}
     channels = min(images.shape[1] for images in sets.values())
     sets = {name: images[:, :channels] for name, images in sets.items()}
-    made = controls(_base(sets), sensor, max(len(other), 8), seed)
-    statistics: dict[str, Statistics] = {
-        name: panel(images, sensor, MEMBERS) for name, images in {**sets, **made}.items()
-    }
+    base = next(sets[name] for name in ("training scans", "other real scans", "real") if name in sets)
+    made = controls(base, sensor, max(len(other), 8), seed)
+    statistics: dict[str, Statistics] = {name: panel(images, sensor, MEMBERS) for name, images in (sets | made).items()}
     apart = {name: distances(found, statistics["real"]) for name, found in statistics.items() if name != "real"}
     if between := _between_drives(sets["real"], drives, sensor):
         apart = {"other": apart.pop("other"), "drive against drive": between, **apart}
+    judged, per_pixel = (
+        {name: {line: value for line, value in d.items() if line in members} for name, d in apart.items()}
+        for members in (PANEL, PER_PIXEL)
+    )
     result: dict[str, Any] = {
         "sizes": {name.removesuffix(" scans"): len(images) for name, images in sets.items()},
-        "sets": _members(apart, PANEL),
-        **_verdicts(_members(apart, PANEL), list(made)),
-        "per_pixel": _members(apart, PER_PIXEL),
+        "sets": judged,
+        **_verdicts(judged, list(made)),
+        "per_pixel": per_pixel,
     }
     if training is not None:
-        compared = {
-            "other": nearest(other, training, sensor),
-            "real": nearest(real, training, sensor),
-            "training scans": nearest(training, training, sensor, leave_self=True),
-            **{name: nearest(images, training, sensor) for name, images in made.items()},
-        }
-        result["nearest"] = {name: (float(np.median(d)), float(d.min())) for name, d in compared.items()}
+        compared = {"other": other, "real": real, "training scans": training, **made}
+        found = {n: nearest(images, training, sensor, n == "training scans") for n, images in compared.items()}
+        result["nearest"] = {name: (float(np.median(d)), float(d.min())) for name, d in found.items()}
     return result, statistics
-
-
-def _members(table: Distances, members: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    return {name: {line: value for line, value in d.items() if line in members} for name, d in table.items()}
 
 
 def _verdicts(table: Distances, made: Sequence[str]) -> dict[str, Any]:
     """The floor, and the lines that are blind, won, lost and beyond it."""
-    floor_is = next((n for n in ("other real scans", "training scans", "drive against drive") if n in table), None)
+    floor_is = next((name for name in FLOORS if name in table), None)
     found, floor = table["other"], dict(table[floor_is]) if floor_is else {}
     least = {line: min(table[name][line] for name in made) for line in found}
     blind = [line for line in floor if floor[line] > CLEARLY * least[line]]
@@ -121,11 +121,6 @@ def _verdicts(table: Distances, made: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _base(sets: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The scans that controls are made of: real ones, if possible not those that they are held against."""
-    return next(sets[name] for name in ("training scans", "other real scans", "real") if name in sets)
-
-
 def _between_drives(real: np.ndarray, drives: Sequence[str], sensor: Sensor) -> dict[str, float]:
     """The mean distance of two drives, over all pairs of them; empty where there are not two."""
     names = [name for name in dict.fromkeys(drives) if drives.count(name) >= DRIVE]
@@ -134,7 +129,7 @@ def _between_drives(real: np.ndarray, drives: Sequence[str], sensor: Sensor) -> 
     return {line: float(np.mean([pair[line] for pair in pairs])) for line in pairs[0]} if pairs else {}
 
 
-def markdown(result: dict[str, Any], name: str = "other") -> str:
+def markdown(result: Mapping[str, Any], name: str = "other") -> str:
     """The result as Markdown tables; `name` stands for the set that was judged."""
     sets, floor = result["sets"], result["floor"]
     rows = []
@@ -143,40 +138,32 @@ def markdown(result: dict[str, Any], name: str = "other") -> str:
         if line in result["won"]:
             cells[0] = f"**{cells[0]}**"
         rows.append([line, *cells, *([f"{own / max(floor[line], 1e-9):.2f}"] if floor else [])])
+    headings = ["distance to the real scans", *_named(sets, name), *([f"{name} / floor"] if floor else [])]
+    lists = {key: ", ".join(result[key]) or "nowhere" for key in ("won", "lost", "beyond", "blind")}
+    about = "No floor: give --floor OTHER_REAL, or real scans of several drives, to see what real scans come to."
+    if floor:
+        about = f"The floor is {FLOORS[result['floor_is']]}. Farther than twice the floor: {lists['beyond']}."
+    if result["blind"]:
+        about += f"\nNot judged, as they hardly tell this floor from the controls: {lists['blind']}."
     parts = [
-        table(rows, ["distance to the real scans", *_named(sets, name), *([f"{name} / floor"] if floor else [])]),
-        f"Nearer to the real scans than every control (bold): {', '.join(result['won']) or 'nowhere'}.\n"
-        f"Not yet: {', '.join(result['lost']) or 'nowhere'}.",
-        _about_the_floor(result),
+        table(rows, headings),
+        f"Nearer to the real scans than every control (bold): {lists['won']}.\nNot yet: {lists['lost']}.",
+        about,
     ]
     if "nearest" in result:
-        found = zip(_named(result["nearest"], name), result["nearest"].values(), strict=True)
-        rows = [[key, f"{median:.3f}", f"{least:.3f}"] for key, (median, least) in found]
+        near = zip(_named(result["nearest"], name), result["nearest"].values(), strict=True)
+        rows = [[key, f"{median:.3f}", f"{least:.3f}"] for key, (median, least) in near]
         parts.append(table(rows, ["distance to the nearest training scan", "median", "least"]))
     sizes = ", ".join(f"{count} {key}" for key, count in result["sizes"].items() if count)
     return "\n\n".join([*parts, f"Scans: {sizes}."])
 
 
-def _named(sets: Mapping[str, Any], name: str) -> list[str]:
-    return [name if key == "other" else key for key in sets]
-
-
-def _about_the_floor(result: dict[str, Any]) -> str:
-    if not result["floor"]:
-        return "No floor: give --floor OTHER_REAL, or real scans of several drives, to see what real scans come to."
-    meant = {
-        "other real scans": "the distance of the real scans given as --floor",
-        "training scans": "the distance of the training scans",
-        "drive against drive": "the mean distance of two of the real drives",
-    }[result["floor_is"]]
-    blind = result["blind"]
-    return f"The floor is {meant}. Farther than twice the floor: {', '.join(result['beyond']) or 'nowhere'}." + (
-        f"\nNot judged, as they hardly tell this floor from the controls: {', '.join(blind)}." if blind else ""
-    )
-
-
-def per_pixel_table(result: dict[str, Any], name: str = "other") -> str:
+def per_pixel_table(result: Mapping[str, Any], name: str = "other") -> str:
     """The statistics of single pixels, which judge nothing, as a Markdown table."""
     sets = result["per_pixel"]
     rows = [[line, *(f"{found[line]:.4f}" for found in sets.values())] for line in sets["other"]]
     return table(rows, ["distance to the real scans", *_named(sets, name)])
+
+
+def _named(sets: Mapping[str, Any], name: str) -> list[str]:
+    return [name if key == "other" else key for key in sets]

@@ -48,13 +48,10 @@ def fidelity_page(
         "fidelity_histograms": histogram_figure(statistics, sensor, name),
         "fidelity_scans": scans_figure(real, other, name),
     }
-    kept = {key: value for key, value in result.items() if key != "per_pixel"}
-    more: dict[str, Any] = {**kept, "per_pixel": result["per_pixel"]}
-    more = {key: [value] if isinstance(value, str | None) else value for key, value in more.items()}
-    return Page(
-        "fidelity", f"Fidelity of {name}", [markdown(dict(result), name), apart, per_pixel_table(dict(result), name)],
-        rows, figures, command, {"controls": seed}, more=more,
-    )  # fmt: skip
+    # The rows of the page's JSON are lists or tables.
+    more: dict[str, Any] = {k: [value] if isinstance(value, str | None) else value for k, value in result.items()}
+    text = [markdown(result, name), apart, per_pixel_table(result, name)]
+    return Page("fidelity", f"Fidelity of {name}", text, rows, figures, command, {"controls": seed}, more=more)
 
 
 def distance_figure(result: Mapping[str, Any], name: str) -> Figure:
@@ -72,14 +69,11 @@ def distance_figure(result: Mapping[str, Any], name: str) -> Figure:
             continue  # the line at 1
         values = np.array([max(found[line], LEAST) for line in lines]) / unit
         big = key == "other"
-        axes.plot(
-            values, y, linestyle="", marker=style["marker"], color=style["color"], ms=9 if big else 6,
-            label=name if big else key, zorder=3 if big else 2, alpha=1 if big else 0.85,
-        )  # fmt: skip
+        look: dict[str, Any] = {"ms": 9, "zorder": 3} if big else {"ms": 6, "zorder": 2, "alpha": 0.85}
+        axes.plot(values, y, style["marker"], color=style["color"], label=name if big else key, **look)
     shown = [f"{line} (not judged)" if line in result["blind"] else line for line in lines]
-    axes.set(xscale="log", yticks=y, ylim=(-0.7, len(lines) - 0.3))
-    axes.set_yticklabels(shown)
-    axes.set_xlabel("distance / floor" if result["floor"] else "distance")
+    axes.set(xscale="log", ylim=(-0.7, len(lines) - 0.3), xlabel="distance / floor" if result["floor"] else "distance")
+    axes.set_yticks(y, shown)
     axes.xaxis.set_major_formatter("{x:g}")
     axes.grid(alpha=0.3, axis="both", which="major")
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
@@ -91,10 +85,11 @@ def histogram_figure(statistics: Mapping[str, Statistics], sensor: Sensor, name:
     drawn = [line for line, value in statistics["real"].items() if value.ndim == 1]
     sets = ["real", "other", *(s for s in ("other real scans", "training scans", "shuffled pixels") if s in statistics)]
     columns = 4
-    figure = blank_figure(14, 2.5 * -(-len(drawn) // columns), "")
+    lines = -(-len(drawn) // columns)
+    figure = blank_figure(14, 2.5 * lines)
     for index, line in enumerate(drawn):
         member = MEMBERS[line]
-        axes = figure.add_subplot(-(-len(drawn) // columns), columns, index + 1)
+        axes = figure.add_subplot(lines, columns, index + 1)
         for style, key in zip(STYLES, sets, strict=False):
             value = np.asarray(statistics[key][line], dtype=float)
             value = value if member.distance is mean_difference else value / max(value.sum(), 1)

@@ -14,7 +14,7 @@ from r2flow.generators import Sampler, as_flow
 from r2flow.inversion import TIGHT, interpolate_scans
 from r2flow.lidar.projection import image_to_points
 from r2flow.reports.inversion import COLUMNS, Real, errors_of
-from r2flow.reports.outputs import ScanBar, formats_of, warn_unsolved, write_scan
+from r2flow.reports.outputs import ScanBar, warn_unsolved, write_scan
 from r2flow.reports.pages import Page, prepare_folder
 from r2flow.reports.pictures import (
     FOREGROUND,
@@ -27,6 +27,14 @@ from r2flow.reports.pictures import (
 from r2flow.reports.tables import table
 
 MOST = 8  # frames in the figure, evenly chosen
+# In rows: the first two draw points, the others the image.
+PANELS = {
+    "perspective": draw_perspective, "bird's-eye view": draw_birds_eye, "range": draw_range,
+    "reflectance": draw_reflectance,
+}  # fmt: skip
+REAL = "#ffd479"
+BETWEEN = {"frame": "frame", "weight": "w"} | {key: key for key in ("returns", "evaluations", "converged")}
+ENDS = {key: COLUMNS[key] for key in ("scan", "rms", "median_m", "dropped", "noise_std", "converged")}
 
 
 def interpolation(
@@ -60,17 +68,15 @@ def interpolation(
     images = found.images.nan_to_num(0.0).numpy()
     rows = []
     for number, (weight, image) in enumerate(zip(found.weights.tolist(), images, strict=True)):
-        write_scan(image, rays, Path(out, "frames"), f"{number:03d}", [f for f in formats_of(checkpoint) if f != "bin"])
-        returns = int((image[0] > 0).sum())
-        evaluations = int(found.evaluations[number])
-        row = {"frame": number, "weight": weight, "returns": returns, "evaluations": evaluations}
-        rows.append({**row, "converged": bool(found.converged[number])})
-    ends = errors_of(checkpoint, found.ends, names, pair)
+        write_scan(image, rays, Path(out, "frames"), f"{number:03d}", ("ply", "npy"))
+        row = {"frame": number, "weight": weight, "returns": int((image[0] > 0).sum())}
+        row |= {"evaluations": int(found.evaluations[number]), "converged": bool(found.converged[number])}
+        rows.append(row)
     text = (
         f"Both scans were carried to their noise by the flow of {checkpoint.path.name}, step {checkpoint.step}; frames "
         "come from the spherical interpolation (slerp) of the two. The first and the last frame are the scans' round "
         "trips; their evaluations are those of both ways.",
-        table(ends, ENDS),
+        table(errors_of(checkpoint, found.ends, names, pair), ENDS),
         table(rows, BETWEEN),
     )
     figures = {"interpolation": interpolation_figure(pair.numpy(), images, found.weights.tolist(), rays, names)}
@@ -87,7 +93,6 @@ def interpolation_figure(
         real: The two scans, (2, 2 or 1, H, W), in metres.
         frames: Scans on the way, (N, 2 or 1, H, W); the first and the last are the real ones' round trips.
         weights: Of the frames, (N,).
-        names: Of the real scans.
     """
     last = len(frames) - 1
     chosen = sorted({round(i * last / (MOST - 1)) for i in range(MOST)}) if last >= MOST else range(last + 1)
@@ -113,13 +118,3 @@ def interpolation_figure(
             if colour == REAL:
                 axes.spines[:].set(visible=True, color=REAL, linewidth=1.2)
     return figure
-
-
-# In rows: the first two draw points, the others the image.
-PANELS = {
-    "perspective": draw_perspective, "bird's-eye view": draw_birds_eye, "range": draw_range,
-    "reflectance": draw_reflectance,
-}  # fmt: skip
-REAL = "#ffd479"
-BETWEEN = {"frame": "frame", "weight": "w"} | {key: key for key in ("returns", "evaluations", "converged")}
-ENDS = {key: COLUMNS[key] for key in ("scan", "rms", "median_m", "dropped", "noise_std", "converged")}

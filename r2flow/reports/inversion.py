@@ -17,19 +17,14 @@ from r2flow.generators import Sampler, as_flow
 from r2flow.inversion import TIGHT, Inversion, invert, round_trip
 from r2flow.reports.outputs import ScanBar
 from r2flow.reports.pages import Page, prepare_folder
+from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.tables import print_table, table
 
 COLUMNS = {
-    "scan": "scan",
-    "returns": "returns",
-    "evaluations": "evaluations",
-    "rms": "RMS, model space",
-    "median_m": "median, m",
-    "rms_m": "RMS, m",
-    "dropped": "rays lost or gained",
-    "noise_std": "std of x_0",
+    "scan": "scan", "returns": "returns", "evaluations": "evaluations", "rms": "RMS, model space",
+    "median_m": "median, m", "rms_m": "RMS, m", "dropped": "rays lost or gained", "noise_std": "std of x_0",
     "converged": "converged",
-}
+}  # fmt: skip
 SHOWN = 4  # scans in the figure
 
 
@@ -53,9 +48,8 @@ def real_scans(
     Raises:
         InputError: a scan that cannot be read, has another size, or no reflectance where the flow needs it.
     """
-    own = reading_of_flow(checkpoint)
+    own, needed = reading_of_flow(checkpoint), checkpoint.encoding.reflectance
     scale = own.reflectance_scale if reflectance_scale is None else reflectance_scale
-    needed = checkpoint.encoding.reflectance
     reading = replace(own, reflectance=needed, reflectance_scale=scale, on_bad_scan="error", within_limits=True)
     sets = [open_scans(spec, reading).spread(most) for spec in specs]
     images = [torch.from_numpy(scans.source[i]) for scans in sets for i in range(len(scans))]
@@ -80,38 +74,51 @@ def invert_scans(
         InputError: a solver that cannot be used, before anything is written.
     """
     as_flow(checkpoint.generator, "inversion").check_sampler(sampler)
-    names = [scan.name for scan in scans]
     prepare_folder(out)
     rows: list[dict[str, Any]] = []
-    pairs: list[tuple[str, np.ndarray]] = []
-    way = 2 * checkpoint.generator.evaluations_of(sampler) * -(-len(scans) // batch_size)
-    with ScanBar("inverting", len(scans), way) as bar:
+    titles: list[str] = []
+    pictures: list[np.ndarray] = []
+    evaluations = 2 * checkpoint.generator.evaluations_of(sampler) * -(-len(scans) // batch_size)
+    with ScanBar("inverting", len(scans), evaluations) as bar:
         for first in range(0, len(scans), batch_size):
-            some = slice(first, first + batch_size)
-            images = torch.stack([scan.image for scan in scans[some]])
+            names, batch = zip(*scans[first : first + batch_size], strict=True)
+            images = torch.stack(batch)
             found = invert(checkpoint, images, sampler, bar.evaluated)
-            for name, x_0 in zip(names[some], found.x_0.numpy(), strict=True):
+            for name, x_0 in zip(names, found.x_0.numpy(), strict=True):
                 with atomic_write(Path(out, f"{name}.x_0.npy")) as file:
                     np.save(file, x_0)
-            rows += errors_of(checkpoint, found, names[some], images)
-            for name, image, x in zip(names[some], images, found.again, strict=True):
-                if len(pairs) < 2 * SHOWN:
-                    pairs += [(f"{name}, real", image.numpy()), ("there and back", _decoded(checkpoint, x))]
+            rows += errors_of(checkpoint, found, names, images)
+            again = checkpoint.encoding.decode(found.again).nan_to_num(0.0)
+            for name, image, back in zip(names, images.numpy(), again.numpy(), strict=True):
+                titles += [f"{name}, real", "there and back"]
+                pictures += [image, back]
             bar.finished(len(rows))
-    return _page(checkpoint, rows, pairs, _solver(sampler, way), command)
+    figure = contact_sheet(pictures[: 2 * SHOWN], checkpoint.sensor.rays(), titles[: 2 * SHOWN])
+    how = f"{sampler.steps} steps" if evaluations else f"tolerance {sampler.tolerance:g}"
+    text = (
+        f"{len(rows)} scans carried from t = 1 to their noise at t = 0 and back by {sampler.method}, {how}, through "
+        f"the flow of {checkpoint.path.name}, step {checkpoint.step}. Metres are of the rays that return both times; "
+        "rays lost or gained are a share of all. x_0 of a scan like those of the training has a standard deviation "
+        "near 1.",
+        table(rows, COLUMNS),
+    )
+    device = str(checkpoint.generator.device)
+    return Page("invert", "Scans there and back", text, rows, {"invert": figure}, command, device=device)
 
 
 def errors_of(checkpoint: Checkpoint, found: Inversion, names: Sequence[str], images: Tensor) -> list[dict[str, Any]]:
     """A row of `COLUMNS` for each scan."""
     errors = round_trip(checkpoint, found)
-    rows: list[dict[str, Any]] = []
-    for i, name in enumerate(names):
-        row: dict[str, Any] = {"scan": name, "returns": int((images[i, 0] > 0).sum())}
-        row["evaluations"] = int(found.evaluations[i])
-        for key in ("rms", "median_m", "rms_m", "dropped", "noise_std"):
-            row[key] = float(getattr(errors, key)[i])
-        rows.append({**row, "converged": bool(found.converged[i])})
-    return rows
+    return [
+        {
+            "scan": name,
+            "returns": int((images[i, 0] > 0).sum()),
+            "evaluations": int(found.evaluations[i]),
+            **{key: float(values[i]) for key, values in errors.items()},
+            "converged": bool(found.converged[i]),
+        }
+        for i, name in enumerate(names)
+    ]
 
 
 def unique_names(paths: Sequence[Path]) -> list[str]:
@@ -131,32 +138,3 @@ def print_rows(rows: Sequence[dict[str, Any]]) -> None:
     lost = [row["scan"] for row in rows if not row["converged"]]
     if lost:
         print(f"not solved, and their noise is NaN: {', '.join(lost)}. A larger --tolerance may do.")
-
-
-def _decoded(checkpoint: Checkpoint, x: Tensor) -> np.ndarray:
-    return checkpoint.encoding.decode(x).nan_to_num(0.0).numpy()
-
-
-def _solver(sampler: Sampler, evaluations: int) -> str:
-    return f"{sampler.method}, " + (f"{sampler.steps} steps" if evaluations else f"tolerance {sampler.tolerance:g}")
-
-
-def _page(
-    checkpoint: Checkpoint,
-    rows: Sequence[dict[str, Any]],
-    pairs: Sequence[tuple[str, np.ndarray]],
-    solver: str,
-    command: str,
-) -> Page:
-    from r2flow.reports.pictures import contact_sheet
-
-    titles, images = zip(*pairs, strict=True)
-    figure = contact_sheet(images, checkpoint.sensor.rays(), titles)
-    text = (
-        f"{len(rows)} scans carried from t = 1 to their noise at t = 0 and back by {solver}, through the flow of "
-        f"{checkpoint.path.name}, step {checkpoint.step}. Metres are of the rays that return both times; rays lost or "
-        "gained are a share of all. x_0 of a scan like those of the training has a standard deviation near 1.",
-        table(rows, COLUMNS),
-    )
-    device = str(checkpoint.generator.device)
-    return Page("invert", "Scans there and back", text, rows, {"invert": figure}, command, device=device)

@@ -1,6 +1,6 @@
 """Generated scans beside the training scans that are nearest to them: is anything memorised?"""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,8 @@ from r2flow.evaluation.measuring import Work
 from r2flow.evaluation.sets import ScanSet
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
-from r2flow.lidar.sensors import Sensor
+from r2flow.metrics.extractors import load_extractor
+from r2flow.metrics.extractors.base import nan_where_empty
 from r2flow.metrics.scans import Scans
 from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_birds_eye, draw_range
@@ -26,36 +27,58 @@ COPY = 0.1  # of the usual distance
 
 @dataclass(frozen=True)
 class Representation:
-    """What of two scans is compared, by Euclidean distance.
+    """What of two scans is compared by Euclidean distance, (B, D); a row of NaN for a scan without a return."""
 
-    Attributes:
-        name: One of `REPRESENTATIONS`.
-        words: The same for a reader.
-        describe: Gives it, (B, D); a row of NaN for a scan without a return.
-        device: Where `describe` takes scans.
-    """
-
-    name: str
     words: str
     describe: Callable[[Scans], Tensor]
     device: str = "cpu"
 
+    def batches(self, scans: ScanSet, numbers: Sequence[int], work: Work) -> Iterator[Tensor]:
+        """Descriptions of scans, batch by batch, on the CPU."""
+        with torch.no_grad():
+            for images in scans.batches(numbers, work.batch_size, work.workers):
+                yield self.describe(Scans(images.to(self.device), scans.sensor)).float().cpu()
 
-@dataclass(frozen=True)
+
 class Nearest:
-    """The nearest training scan of each scan of a set; scans without a return have none and are not among them.
+    """The nearest training scan of each scan of a set, of those that were compared so far.
 
     Attributes:
         scans: The set.
-        numbers: Its scans that have a return, (N,).
-        distances: From each to the nearest training scan, (N,) float64.
-        neighbours: Number of the nearest training scan, (N,).
+        numbers: Its scans that have a return, (N,); the others have no neighbour.
+        distances, neighbours: From each of these to its nearest training scan, (N,) float64, and its number, (N,).
     """
 
-    scans: ScanSet
-    numbers: np.ndarray
-    distances: np.ndarray
-    neighbours: np.ndarray
+    def __init__(self, scans: ScanSet, representation: Representation, work: Work) -> None:
+        rows = []
+        with work.bar("describing", len(scans)) as advance:
+            for batch in representation.batches(scans, range(len(scans)), work):
+                rows.append(batch)
+                advance(len(batch))
+        x = torch.cat(rows)
+        kept = x.isfinite().all(1)
+        if not kept.any():
+            raise InputError(
+                f"none of the {len(scans)} scans of {scans.label} has a return: there is nothing to compare."
+            )
+        self.scans, self.numbers, self.x = scans, np.flatnonzero(kept.numpy()), x[kept]
+        self.squared = torch.full((len(self.x),), torch.inf)
+        self.distances = np.full(len(self.x), np.inf)
+        self.neighbours = np.zeros(len(self.x), dtype=np.int64)
+
+    def approach(self, y: Tensor, first: int, leave_out_itself: bool) -> None:
+        """Compare with training scans `first`, `first + 1`, ..., described by y (M, D); NaN is never nearest."""
+        d = self.x.square().sum(1)[:, None] + y.square().sum(1) - 2 * self.x @ y.T
+        d = d.nan_to_num(torch.inf)
+        if leave_out_itself:
+            d[torch.from_numpy(self.numbers)[:, None] == torch.arange(first, first + len(y))] = torch.inf
+        squared, place = d.min(1)
+        nearer = squared < self.squared
+        self.squared[nearer] = squared[nearer]
+        self.neighbours[nearer] = place[nearer] + first
+        # One product is exact enough to find the nearest, but its rounding would hide a copy.
+        difference = self.x[nearer].double() - y[place[nearer]].double()
+        self.distances[nearer] = torch.linalg.vector_norm(difference, dim=1)
 
     def order(self) -> np.ndarray:
         """Places in the arrays, the nearest first."""
@@ -66,18 +89,19 @@ class Nearest:
 class Neighbours:
     """Generated scans and real ones, each with its nearest training scan.
 
-    Attributes:
-        generated: The scans that are judged.
-        real: Held-out scans; without these, training scans, each compared with the others.
-        training: The scans that all of them are compared with.
-        held_out: Whether `real` was held out.
+    The real ones were held out, or they are training scans, each compared with the others.
     """
 
     generated: Nearest
     real: Nearest
     training: ScanSet
-    representation: Representation
+    words: str
     held_out: bool
+
+    @property
+    def usual(self) -> str:
+        """What the real scans are."""
+        return "held-out real scans" if self.held_out else "training scans (each against the others)"
 
 
 def representation_of(name: str | None, sets: Sequence[ScanSet], device: str) -> Representation:
@@ -86,29 +110,19 @@ def representation_of(name: str | None, sets: Sequence[ScanSet], device: str) ->
     Raises:
         InputError: no such name, or no network.
     """
-    if name is not None and name not in REPRESENTATIONS:
+    if name not in (None, *REPRESENTATIONS):
         raise InputError(f"--by must be {' or '.join(REPRESENTATIONS)}, found {name!r}.")
-    sensor = sets[0].sensor
     if name != "pixels":
-        from r2flow.metrics.extractors import load_extractor
-
         kind = "embedded" if all(s.about["reflectance"] for s in sets) else "embedded_range"
         network = load_extractor(kind).to(device)
-        return Representation("embedded", f"features of '{kind}' ({network.layer})", network.features, device)
-    return Representation(
-        "pixels", "RMS difference of log-range in model space, pixel by pixel", _pixels(sensor), device
-    )
+        return Representation(f"features of '{kind}' ({network.layer})", network.features, device)
+    encoding = Encoding(sets[0].sensor, reflectance=False)
 
-
-def _pixels(sensor: Sensor) -> Callable[[Scans], Tensor]:
-    encoding = Encoding(sensor, reflectance=False)
-
-    def describe(scans: Scans) -> Tensor:
+    def log_range(scans: Scans) -> Tensor:
         x = encoding.encode(scans.images[:, :1].cpu()).flatten(1)
-        x = x / x.shape[1] ** 0.5
-        return torch.where(scans.returned.cpu().flatten(1).any(1)[:, None], x, torch.nan)
+        return nan_where_empty(x / x.shape[1] ** 0.5, scans)
 
-    return describe
+    return Representation("RMS difference of log-range in model space, pixel by pixel", log_range, device)
 
 
 def find_neighbours(
@@ -122,84 +136,35 @@ def find_neighbours(
     Raises:
         InputError: nothing to compare.
     """
-    chosen = list(range(len(training)))[: len(generated)] if held is None else None
-    real = held if held is not None else training.part(chosen or [], "training scans, each without itself")
+    chosen = range(min(len(training), len(generated)))
+    real = held if held is not None else training.part(chosen, "training scans, each without itself")
     if len(training) < (2 if held is None else 1):
         raise InputError(f"{training.label} holds {len(training)} training scans; needs at least two, or --real HELD.")
-    described = [_describe(s, representation, work) for s in (generated, real)]
-    for (numbers, _), s in zip(described, (generated, real), strict=True):
-        if len(numbers) == 0:
-            raise InputError(f"none of the {len(s)} scans of {s.label} has a return: there is nothing to compare.")
-    best = [(torch.full((len(n),), torch.inf), torch.zeros(len(n), dtype=torch.int64)) for n, _ in described]
-    with work.bar("reading training scans", len(training)) as advance, torch.no_grad():
-        first = 0
-        for images in training.batches(range(len(training)), work.batch_size, work.workers):
-            there = representation.describe(Scans(images.to(representation.device), training.sensor)).float().cpu()
-            for own, (queries, x) in enumerate(described):
-                d = _square_distances(x, there)
-                if own == 1 and chosen is not None:
-                    d[torch.from_numpy(queries)[:, None] == torch.arange(first, first + len(there))] = torch.inf
-                least, where = d.min(1)
-                nearer = least < best[own][0]
-                best[own][0][nearer], best[own][1][nearer] = least[nearer], where[nearer] + first
+    judged, usual = (Nearest(s, representation, work) for s in (generated, real))
+    first = 0
+    with work.bar("reading training scans", len(training)) as advance:
+        for there in representation.batches(training, range(len(training)), work):
+            judged.approach(there, first, leave_out_itself=False)
+            usual.approach(there, first, leave_out_itself=held is None)
             first += len(there)
             advance(len(there))
-    found = [
-        Nearest(s, queries, _exact(x, nearest, training, representation, work), nearest.numpy())
-        for s, (queries, x), (_, nearest) in zip((generated, real), described, best, strict=True)
-    ]
-    return Neighbours(found[0], found[1], training, representation, held is not None)
-
-
-def _describe(scans: ScanSet, representation: Representation, work: Work) -> tuple[np.ndarray, Tensor]:
-    """Numbers of the scans that have a return, and their descriptions."""
-    rows = []
-    with work.bar("describing", len(scans)) as advance, torch.no_grad():
-        for images in scans.batches(range(len(scans)), work.batch_size, work.workers):
-            rows.append(representation.describe(Scans(images.to(representation.device), scans.sensor)).float().cpu())
-            advance(len(images))
-    x = torch.cat(rows)
-    kept = x.isfinite().all(1)
-    return torch.nonzero(kept)[:, 0].numpy(), x[kept]
-
-
-def _square_distances(x: Tensor, y: Tensor) -> Tensor:
-    """|x - y|^2 by one product, (N, M): exact enough to find the nearest; infinite where y is NaN."""
-    d = x.square().sum(1)[:, None] + y.square().sum(1) - 2 * x @ y.T
-    return d.nan_to_num(torch.inf)
-
-
-def _exact(x: Tensor, nearest: Tensor, training: ScanSet, representation: Representation, work: Work) -> np.ndarray:
-    """|x - y| of each scan and its nearest training scan: the rounding of the product would hide a copy."""
-    wanted = sorted(set(nearest.tolist()))
-    place = {number: i for i, number in enumerate(wanted)}
-    own = torch.tensor([place[number] for number in nearest.tolist()])
-    d = torch.zeros(len(x), dtype=torch.float64)
-    first = 0
-    with torch.no_grad():
-        for images in training.batches(wanted, work.batch_size, work.workers):
-            there = representation.describe(Scans(images.to(representation.device), training.sensor)).double().cpu()
-            mine = torch.nonzero((own >= first) & (own < first + len(there)))[:, 0]
-            d[mine] = torch.linalg.vector_norm(x[mine].double() - there[own[mine] - first], dim=1)
-            first += len(there)
-    return d.numpy()
+    return Neighbours(judged, usual, training, representation.words, held is not None)
 
 
 def neighbours_page(found: Neighbours, pairs: int, command: str, device: str) -> Page:
     """The pairs, the distributions of the distances, and what these say."""
-    usual = _usual(found)
     sets = [
         {
             "set": name, "scans": len(one.distances), "empty": len(one.scans) - len(one.distances),
             "least": float(one.distances.min()), "5 %": float(np.quantile(one.distances, 0.05)),
             "median": float(np.median(one.distances)), "largest": float(one.distances.max()),
         }
-        for name, one in (("generated", found.generated), (usual, found.real))
+        for name, one in (("generated", found.generated), (found.usual, found.real))
     ]  # fmt: skip
     near = "" if found.held_out else " Neighbouring frames of one drive are near-duplicates of each other: give --real."
-    how = f"Distance: {found.representation.words}; to the nearest of {len(found.training)} training scans.{near}"
+    how = f"Distance: {found.words}; to the nearest of {len(found.training)} training scans.{near}"
     text = [*sentences(found), how, table(sets, {key: key for key in sets[0]})]
-    figures = {"neighbours": _sheet(found, pairs), "neighbours_distances": _distances(found, usual)}
+    figures = {"neighbours": _sheet(found, pairs), "neighbours_distances": _distances(found)}
     title = "Generated scans and their nearest training scans"
     return Page("neighbours", title, text, pair_rows(found), figures, command, {}, device)
 
@@ -207,22 +172,17 @@ def neighbours_page(found: Neighbours, pairs: int, command: str, device: str) ->
 def sentences(found: Neighbours) -> list[str]:
     """What the distances say of copies."""
     generated, real = found.generated.distances, found.real.distances
-    usual = _usual(found)
     nearer, expected = int((generated < real.min()).sum()), len(generated) / (len(real) + 1)
     share = float((generated < np.quantile(real, 0.05)).mean())
     copies = int((generated < COPY * np.median(real)).sum())
     return [
-        f"{nearer} of {len(generated)} generated scans lie nearer to a training scan than any of {len(real)} {usual} "
-        f"does; about {shown(expected)} would if both were drawn alike. {share:.0%} lie nearer than the nearest 5 % of "
-        "these.",
+        f"{nearer} of {len(generated)} generated scans lie nearer to a training scan than any of {len(real)} "
+        f"{found.usual} does; about {shown(expected)} would if both were drawn alike. {share:.0%} lie nearer than the "
+        "nearest 5 % of these.",
         f"{copies} lie nearer than a tenth of the usual (median) distance: look at them, they are copies or nearly so."
         if copies
         else "None lies nearer than a tenth of the usual (median) distance: no copy among them.",
     ]
-
-
-def _usual(found: Neighbours) -> str:
-    return "held-out real scans" if found.held_out else "training scans (each against the others)"
 
 
 def pair_rows(found: Neighbours) -> list[Row]:
@@ -240,10 +200,16 @@ def pair_rows(found: Neighbours) -> list[Row]:
 
 
 def _sheet(found: Neighbours, pairs: int) -> Figure:
-    """The nearest pairs and the farthest, generated on the left and real on the right."""
+    """The nearest pairs and half as many of the farthest, generated on the left and real on the right."""
     sides = (found.generated, found.real)
-    chosen = [_chosen(one, pairs) for one in sides]
-    lines = max(map(len, chosen))
+    orders = [one.order() for one in sides]
+    # Places of what is drawn, from the front of the order and from its end.
+    near = [range(min(pairs, len(order))) for order in orders]
+    far = [
+        range(-1, -1 - min(max(pairs // 2, 1), len(order) - len(front)), -1)
+        for order, front in zip(orders, near, strict=True)
+    ]
+    lines = max(len(a) + len(b) for a, b in zip(near, far, strict=True))
     height = 1.62 * lines + 0.2
     figure = blank_figure(17, height)
     figure.set_layout_engine("none")  # the grid is a layout already, and a computed one takes seconds
@@ -253,48 +219,35 @@ def _sheet(found: Neighbours, pairs: int) -> Figure:
         left=0.005, right=0.995, top=1 - 0.25 / height, bottom=0.05 / height,
     )  # fmt: skip
     heads = ("generated", "held-out real" if found.held_out else "training")
-    for side, (one, head, picks) in enumerate(zip(sides, heads, chosen, strict=True)):
-        for line, (place, word) in enumerate(picks):
+    rays = found.training.sensor.rays()
+    for side, (one, head) in enumerate(zip(sides, heads, strict=True)):
+        words = [f"nearest {k + 1}" for k in near[side]] + [f"farthest {-k}" for k in far[side]]
+        for line, (place, word) in enumerate(zip(orders[side][[*near[side], *far[side]]], words, strict=True)):
             number, neighbour = int(one.numbers[place]), int(one.neighbours[place])
-            titles = (
-                f"{word}: {head} {number}, {shown(float(one.distances[place]))} away from",
-                f"training {neighbour}",
+            away = shown(float(one.distances[place]))
+            drawn = (
+                (f"{word}: {head} {number}, {away} away from", one.scans.source[number]),
+                (f"training {neighbour}", found.training.source[neighbour]),
             )
-            images = one.scans.source[number], found.training.source[neighbour]
-            for half, (image, title) in enumerate(zip(images, titles, strict=True)):
+            for half, (title, image) in enumerate(drawn):
                 column = 5 * side + 2 * half
-                _draw(figure, grid[line, column], grid[line, column + 1], image, found.training.sensor, title)
+                axes = figure.add_subplot(grid[line, column])
+                draw_range(axes, image, label=False)
+                axes.set_title(title, color=FOREGROUND, fontsize=8, loc="left", pad=3)
+                xyz, _ = image_to_points(image, rays)
+                draw_birds_eye(figure.add_subplot(grid[line, column + 1]), xyz, label=False)
     return figure
 
 
-def _chosen(one: Nearest, pairs: int) -> list[tuple[int, str]]:
-    """Places of the nearest pairs and of half as many of the farthest, each with its word."""
-    order = one.order().tolist()
-    near = order[:pairs]
-    far = order[len(near) :][::-1][: max(pairs // 2, 1)]
-    return [
-        *((place, f"nearest {i + 1}") for i, place in enumerate(near)),
-        *((place, f"farthest {i + 1}") for i, place in enumerate(far)),
-    ]
-
-
-def _draw(figure: Figure, strip: Any, square: Any, image: np.ndarray, sensor: Sensor, title: str) -> None:
-    axes = figure.add_subplot(strip)
-    draw_range(axes, image, label=False)
-    axes.set_title(title, color=FOREGROUND, fontsize=8, loc="left", pad=3)
-    xyz, _ = image_to_points(image, sensor.rays())
-    draw_birds_eye(figure.add_subplot(square), xyz, label=False)
-
-
-def _distances(found: Neighbours, usual: str) -> Figure:
+def _distances(found: Neighbours) -> Figure:
     """Share of scans whose nearest training scan lies within a distance."""
     figure = blank_figure(6.4, 4, "Distance to the nearest training scan")
     axes = figure.add_subplot()
-    for style, one, name in zip(STYLES, (found.generated, found.real), ("generated", usual), strict=False):
+    for style, one, name in zip(STYLES, (found.generated, found.real), ("generated", found.usual), strict=False):
         d = np.sort(one.distances)
         look: dict[str, Any] = {key: style[key] for key in ("linestyle", "color")}
         axes.step(d, np.arange(1, len(d) + 1) / len(d), where="post", **look, lw=1.6, label=f"{name} ({len(d)})")
-    axes.set(xlabel=found.representation.words, ylabel="share of the scans", ylim=(0, 1.02))
+    axes.set(xlabel=found.words, ylabel="share of the scans", ylim=(0, 1.02))
     axes.set_xlim(left=0)
     axes.grid(True, color="0.88", lw=0.6)
     axes.legend(fontsize=8, frameon=False)

@@ -54,8 +54,7 @@ def write_samples(
         formats: All that fit if left out. `ply` and `bin` are points in metres with reflectance, `npy` the range image,
             float32 (2 or 1, H, W) in metres and reflectance; reflectance alone is `NNNNNN.reflectance.npy`.
         pictures: How many scans get a page of their own; the contact sheet shows at most 8 of them.
-        region, channels: See `r2flow.sampling.sample`. Pictures show the region alone, files are of the sensor's
-            shape, 0 outside.
+        region, channels: See `r2flow.sampling.sample`. Files are of the sensor's shape, 0 outside the region.
 
     Returns:
         The images drawn as pictures.
@@ -79,29 +78,22 @@ def write_samples(
             progress=bar.evaluated,
         ):  # fmt: skip
             warn_unsolved(drawn.converged, drawn.first)
-            for offset, image in enumerate(drawn.images.numpy()):
-                name = f"{drawn.first + offset:06d}"
+            for number, image in enumerate(drawn.images.numpy(), drawn.first):
                 if channels == "reflectance":
-                    _save(image, out / f"{name}.reflectance.npy")
+                    _save(image, out / f"{number:06d}.reflectance.npy")
                 else:
-                    write_scan(image, rays, out, name, formats)
+                    write_scan(image, rays, out, f"{number:06d}", formats)
                 if len(shown) < pictures:
                     shown.append(image)
             bar.finished(min(drawn.first + batch_size, num))
     if channels != "reflectance":
         keep_note(checkpoint, out, seed, **sampler.asdict())
-    if shown:
-        draw_pictures(shown, rays, out, region, channels)
-    return shown
-
-
-def draw_pictures(images: Sequence[np.ndarray], rays: Tensor, out: Path, region: Region | None, channels: str) -> None:
-    """The pictures of samples, of the region alone where there is one."""
-    parts = images if region is None else [region.crop(torch.from_numpy(image)).numpy() for image in images]
-    if channels == "reflectance":
+    parts = shown if region is None else [region.crop(torch.from_numpy(image)).numpy() for image in shown]
+    if parts and channels == "reflectance":
         draw_reflectances(parts[:8], out)
-    else:
+    elif parts:
         draw_pages(parts, rays if region is None else region.crop(rays), out)
+    return shown
 
 
 def warn_unsolved(converged: Tensor, first: int = 0) -> None:
@@ -113,13 +105,10 @@ def warn_unsolved(converged: Tensor, first: int = 0) -> None:
 
 def keep_note(checkpoint: Checkpoint, out: Path, seed: int, **sampler: Any) -> None:
     """Write beside samples what they are, so that readers know their size and sensor."""
-    sensor = checkpoint.sensor
-    encoding = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
-    limits = {"min_range": sensor.min_range, "max_range": sensor.max_range}
-    write_samples_note(
-        out, reading_of_flow(checkpoint), encoding={**encoding, **limits}, seed=seed, sampler=sampler,
-        step=checkpoint.step,
-    )  # fmt: skip
+    about = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
+    about |= {"min_range": checkpoint.sensor.min_range, "max_range": checkpoint.sensor.max_range}
+    reading, step = reading_of_flow(checkpoint), checkpoint.step
+    write_samples_note(out, reading, encoding=about, seed=seed, sampler=sampler, step=step)
 
 
 def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str) -> None:
@@ -142,8 +131,6 @@ class ScanBar(Bar):
     """A bar of scans that moves with the network evaluations between two scans.
 
     Args:
-        doing: What is done to them.
-        num: Scans in all.
         evaluations: Network evaluations in all, batches counted as one; 0 where nobody knows: then a batch is taken
             to need as many as the one before it.
     """
@@ -154,7 +141,6 @@ class ScanBar(Bar):
         self._spent = self._done = self._spent_before = 0
 
     def evaluated(self) -> None:
-        """One more evaluation of the network."""
         self._spent += 1
         self(self._share)
         self.set(note=f"{self._spent} evaluations")
@@ -198,6 +184,15 @@ def draw_reflectances(images: Sequence[np.ndarray], out: Path) -> Path:
     for row, (image, place) in enumerate(zip(images, axes, strict=True)):
         draw_reflectance(place, np.concatenate([image, image]), label=row == 0)  # a ray without any was dropped
     return save_figure(figure, out / "samples.png")
+
+
+def what_next(checkpoint: Path, out: Path, options: str = "") -> str:
+    """The commands that come after scans were written to `out`."""
+    return f"""
+next
+  r2flow sample --checkpoint {checkpoint} --num 16{options} --seed 1 --out {out.parent / "more"}
+  r2flow show {out / "000000.ply"} --out {out.parent / "views"}
+  r2flow train data=kitti_raw data.root=FOLDER backbone=hdit_small"""
 
 
 def _save(image: np.ndarray, path: Path) -> None:

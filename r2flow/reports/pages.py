@@ -7,6 +7,7 @@ import math
 import os
 import platform
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,22 +25,14 @@ from r2flow.files import atomic_write
 from r2flow.reports.tables import Row
 
 # Told apart without colour: every line of a figure has a marker and a dash of its own.
+_DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (7, 2)), (0, (1, 1)), "-", "--", "-.", ":", "-")
+_COLOURS = (
+    "#000000", "#1f6fb4", "#b5301c", "#3d7d3a", "#8c4fb0", "#c77c11",
+    "#c2185b", "#0e6f6f", "#8f8f8f", "#d06a9e", "#7a5a2a", "#b9b936",
+)  # fmt: skip
 STYLES: tuple[dict[str, Any], ...] = tuple(
     {"marker": marker, "linestyle": dash, "color": colour}
-    for marker, dash, colour in (
-        ("o", "-", "#000000"),
-        ("s", "--", "#1f6fb4"),
-        ("^", "-.", "#b5301c"),
-        ("D", ":", "#3d7d3a"),
-        ("v", (0, (5, 1, 1, 1, 1, 1)), "#8c4fb0"),
-        ("P", (0, (7, 2)), "#c77c11"),
-        ("X", (0, (1, 1)), "#c2185b"),
-        ("*", "-", "#0e6f6f"),
-        ("<", "--", "#8f8f8f"),
-        (">", "-.", "#d06a9e"),
-        ("h", ":", "#7a5a2a"),
-        ("p", "-", "#b9b936"),
-    )
+    for marker, dash, colour in zip("os^DvPX*<>hp", _DASHES, _COLOURS, strict=True)
 )
 
 
@@ -49,12 +42,11 @@ class Page:
 
     Attributes:
         name: Of its files, as `work_precision`.
-        title: Of its page.
-        text: Paragraphs and tables of Markdown.
+        title, text: Of its page: paragraphs and tables of Markdown.
         rows: One for each measurement: the CSV, and the `rows` of the JSON.
         figures: By name; the PNG is `NAME.png`.
-        seeds: Every seed that a number depends on, by what it is for.
         command: What makes the page again.
+        seeds: Every seed that a number depends on, by what it is for.
         device: What the networks ran on.
         more: Further lists for the JSON, by name.
     """
@@ -85,10 +77,9 @@ def write_page(page: Page, out: str | Path) -> list[Path]:
         "md": _markdown(page, origin),
     }
     for ending, content in contents.items():
-        path = out / f"{page.name}.{ending}"
-        with atomic_write(path, "w") as file:
+        written.append(out / f"{page.name}.{ending}")
+        with atomic_write(written[-1], "w") as file:
             file.write(content)
-        written.append(path)
     return written
 
 
@@ -112,7 +103,7 @@ def provenance(page: Page) -> dict[str, Any]:
     """The machine, the versions, the seeds, the date and the command of a page. No paths but the command's."""
     machine: dict[str, Any] = {
         "cpu": _cpu_name(),
-        "cores": _cores(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         "threads": torch.get_num_threads(),
         "load": round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
@@ -192,11 +183,9 @@ def _markdown(page: Page, origin: Mapping[str, Any]) -> str:
     # A figure that the text does not place itself stands above it.
     placed = "\n".join(page.text)
     pictures = [picture(name) for name in page.figures if picture(name) not in placed]
-    notes = "\n".join(
-        f"- {key}: {_one_line(value)}" for key, value in origin.items() if key not in ("report", "command")
-    )
-    again = f"Made with\n\n```\n{page.command}\n```\n\n{notes}"
-    return "\n\n".join([f"# {page.title}", *pictures, *page.text, "## Where this comes from", again]) + "\n"
+    notes = [f"- {key}: {_one_line(value)}" for key, value in origin.items() if key not in ("report", "command")]
+    again = ["## Where this comes from", "Made with", f"```\n{page.command}\n```", "\n".join(notes)]
+    return "\n\n".join([f"# {page.title}", *pictures, *page.text, *again]) + "\n"
 
 
 def _one_line(value: Any) -> str:
@@ -215,14 +204,8 @@ def plain(value: Any) -> Any:
 
 
 def _cpu_name() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or "unknown"
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or "unknown"
-
-
-def _cores() -> int:
-    """Those that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or "unknown"

@@ -42,9 +42,8 @@ def make_and_tell(
 
         made = make_pairs(store, generator, num, rank, ranks, progress)
     if made.pairs:
-        share = made.writing / max(made.seconds, 1e-9)
         unusable = f", {made.unusable} did not converge and are left out" if made.unusable else ""
-        print(f"{who}{made.pairs} pairs, {rate(made)}, {share:.1%} of the time for writing{unusable}", flush=True)
+        print(f"{who}{made.pairs} pairs, {rate(made)}{unusable}", flush=True)
     return made
 
 
@@ -82,17 +81,16 @@ def wait_for_others(
 def place(environment: Mapping[str, str] = os.environ) -> tuple[int, int, int]:
     """(rank, processes, rank on this machine) as torchrun or SLURM tell it, arrays included; (0, 1, 0) elsewhere."""
 
-    def number(name: str, default: int) -> int:
+    def number(name: str, default: int = 0) -> int:
         return int(environment.get(name, default))
 
     # Of a step, not of the job: in the batch script itself, outside srun, there is one process however many were asked.
     tasks = number("SLURM_STEP_NUM_TASKS", 1)
-    task = number("SLURM_PROCID", 0) if tasks > 1 else 0
+    task = number("SLURM_PROCID") if tasks > 1 else 0
     jobs = number("SLURM_ARRAY_TASK_COUNT", 1)
-    job = number("SLURM_ARRAY_TASK_ID", 0) - number("SLURM_ARRAY_TASK_MIN", 0)
-    step = number("SLURM_ARRAY_TASK_STEP", 1)
-    job //= step
+    job = number("SLURM_ARRAY_TASK_ID") - number("SLURM_ARRAY_TASK_MIN")
+    job //= number("SLURM_ARRAY_TASK_STEP", 1)
     if "RANK" in environment and "WORLD_SIZE" in environment:
-        rank, ranks, local = number("RANK", 0), number("WORLD_SIZE", 1), number("LOCAL_RANK", 0)
+        rank, ranks, local = number("RANK"), number("WORLD_SIZE"), number("LOCAL_RANK")
         return job * ranks + rank, jobs * ranks, local
-    return job * tasks + task, jobs * tasks, number("SLURM_LOCALID", 0)
+    return job * tasks + task, jobs * tasks, number("SLURM_LOCALID")

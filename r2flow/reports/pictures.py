@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap, hsv_to_rgb, to_hex, to_rgb
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -41,12 +43,10 @@ def scan_figure(image: np.ndarray, rays: Tensor, title: str = "", labels: np.nda
     xyz, _ = image_to_points(image, rays)
     draw_birds_eye(figure.add_subplot(grid[strips, 0]), xyz)
     draw_perspective(figure.add_subplot(grid[strips, 1]), xyz)
-    returns = int((image[0] > 0).sum())
-    share = returns / image[0].size
-    figure.suptitle(
-        f"{title}   {image.shape[1]} x {image.shape[2]}, {returns:,} returns ({share:.0%})".strip(),
-        color=FOREGROUND, fontsize=11, x=0.03, ha="left",
-    )  # fmt: skip
+    returned = image[0] > 0
+    size = " x ".join(map(str, returned.shape))
+    about = f"{title}   {size}, {returned.sum():,} returns ({returned.mean():.0%})".strip()
+    figure.suptitle(about, color=FOREGROUND, fontsize=11, x=0.03, ha="left")
     return figure
 
 
@@ -110,8 +110,6 @@ def draw_reflectance(axes: Any, image: np.ndarray, label: bool = True) -> None:
 
 def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
     """Semantic ids, (H, W), named where SemanticKITTI knows all of them, else by number; dropped rays black."""
-    from matplotlib.colors import to_rgb
-
     returned = image[0] > 0
     found, counts = np.unique(labels[returned], return_counts=True)
     named = all(int(one) in CLASSES for one in found)
@@ -131,17 +129,15 @@ def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
 
 def _numbered_colour(number: int) -> str:
     """A colour for a number that has no name; by the golden ratio, neighbours lie far apart in hue."""
-    from matplotlib.colors import hsv_to_rgb, to_hex
-
     red, green, blue = hsv_to_rgb((number * 0.618034 % 1, 0.45 + 0.4 * (number % 3 > 0), 1 - 0.25 * (number % 2)))
     return to_hex((red, green, blue))
 
 
 def draw_birds_eye(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
     """Points from above, driving direction upwards, coloured by height."""
-    near = np.abs(xyz[:, :2]).max(axis=1) < VIEW if len(xyz) else np.zeros(0, bool)
-    x, y, z = xyz[near].T if len(xyz) else np.zeros((3, 0))
-    axes.scatter(-y, x, c=z, s=_dot(len(x)), cmap="turbo", vmin=HEIGHTS[0], vmax=HEIGHTS[1], lw=0, rasterized=True)
+    x, y, z = xyz[(np.abs(xyz[:, :2]) < VIEW).all(axis=1)].T
+    dot = float(np.clip(20_000 / max(len(x), 1), 0.25, 3.0))
+    axes.scatter(-y, x, c=z, s=dot, cmap="turbo", vmin=HEIGHTS[0], vmax=HEIGHTS[1], lw=0, rasterized=True)
     axes.set(xlim=(-VIEW, VIEW), ylim=(-VIEW, VIEW), aspect="equal")
     axes.plot(0, 0, marker="^", color="white", ms=4)
     _strip(axes, f"bird's-eye view, {2 * VIEW:.0f} m" if label else "")
@@ -190,21 +186,13 @@ def dark_figure(width: float, height: float) -> Figure:
 
 
 def _colours(name: str) -> Any:
-    from matplotlib import colormaps
-
     return colormaps[name].with_extremes(bad="black")
 
 
 @cache
 def _ranges() -> Any:
     """turbo from warm (near) to cold (far), without its dark ends, which would look like dropped rays."""
-    from matplotlib.colors import ListedColormap
-
     return ListedColormap(_colours("turbo_r")(np.linspace(0.1, 0.93, 256))).with_extremes(bad="black")
-
-
-def _dot(points: int) -> float:
-    return float(np.clip(20_000 / max(points, 1), 0.25, 3.0))
 
 
 def _strip(axes: Any, title: str) -> None:

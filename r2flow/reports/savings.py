@@ -1,9 +1,8 @@
 """What a scan need not cost: evaluations and seconds saved, and the error that this adds."""
 
 import tempfile
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -15,23 +14,30 @@ from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
-from r2flow.flow.problems import PROBLEMS, Mixed, Problem
+from r2flow.flow.problems import PROBLEMS, Mixed
 from r2flow.flow.straight_exit import probes
 from r2flow.generators import Field, Flow, Sampler, as_flow
 from r2flow.generators.base import Progress
+from r2flow.inversion import metres_apart, rms
 from r2flow.lidar.region import Region, region
 from r2flow.noise import Draws
-from r2flow.reports.outputs import formats_of, write_scan
+from r2flow.reports.outputs import write_scan
 from r2flow.reports.pages import Page, blank_figure
 from r2flow.reports.tables import shown, table
+from r2flow.reports.timing import timed
 from r2flow.sampling import evaluated_region
 
 Row = dict[str, Any]
 
 NAME = "a savings report"
-# Scans of the mixed batch by kind: their number and their problem.
+# Scans of the exact batches by kind.
 MIXED = {"straight": 8, "gaussian": 4, "two_modes": 3, "ray_drop": 1}
 LONE = {"straight": 255, "ray_drop": 1}
+# Name, colour and hatch of a kind: told apart without colour.
+KINDS = {
+    "straight": ("straight", "#d9d9d9", ""), "gaussian": ("smooth", "#9ecae1", "//"),
+    "two_modes": ("two modes", "#4a90c2", ".."), "ray_drop": ("ray-drop", "#1b3a57", ""),
+}  # fmt: skip
 ELEMENTS = 256  # of an exact scan
 FIXED = 32  # steps of the fixed-step rows
 REPEATS = 3  # of every timing
@@ -46,16 +52,13 @@ LEAVING = "dopri5, own steps, the finished leave"
 STRAIGHT = "the same, and one step for the straight"
 
 
-@dataclass(frozen=True)
-class Solved:
-    """Ends of all scans, (B, ...), their evaluations, (B,), and the seconds for all of them."""
-
-    x: Tensor
-    evaluations: Tensor
-    seconds: float
-
-
-Way = Callable[[Flow, Tensor, float, Progress], tuple[Tensor, Tensor]]
+WAYS: dict[str, Sampler | None] = {
+    EULER: Sampler("euler", FIXED),
+    AB2: Sampler("ab2", FIXED),
+    ONE_STATE: None,
+    LEAVING: Sampler("dopri5"),
+    STRAIGHT: Sampler("dopri5", straight_first=True),
+}
 
 
 def one_state(flow: Flow, x: Tensor, tolerance: float, progress: Progress = None) -> tuple[Tensor, Tensor]:
@@ -76,70 +79,54 @@ def one_state(flow: Flow, x: Tensor, tolerance: float, progress: Progress = None
     return end, torch.full((len(x),), calls)
 
 
-def _by(sampler: Sampler) -> Way:
-    def way(flow: Flow, x: Tensor, tolerance: float, progress: Progress = None) -> tuple[Tensor, Tensor]:
-        end = flow.solve(x, sampler=sampler.changed(tolerance=tolerance), progress=progress)
-        return end.x, end.evaluations
-
-    return way
-
-
-WAYS: dict[str, Way] = {
-    EULER: _by(Sampler("euler", FIXED)),
-    AB2: _by(Sampler("ab2", FIXED)),
-    ONE_STATE: one_state,
-    LEAVING: _by(Sampler("dopri5")),
-    STRAIGHT: _by(Sampler("dopri5", straight_first=True)),
-}
+def _solve(
+    flow: Flow, x: Tensor, sampler: Sampler | None, tolerance: float, progress: Progress
+) -> tuple[Tensor, Tensor]:
+    if sampler is None:
+        return one_state(flow, x, tolerance, progress)
+    end = flow.solve(x, sampler=sampler.changed(tolerance=tolerance), progress=progress)
+    return end.x, end.evaluations
 
 
 def solve_in_all_ways(
-    flow: Flow, x: Tensor, tolerance: float, repeats: int = REPEATS, progress: Progress = None
-) -> dict[str, Solved]:
-    """The end of x at t = 1 by each of `WAYS`; seconds are medians of `repeats`."""
+    part: str, flow: Flow, x_0: Tensor, truth: Tensor, tolerance: float, repeats: int, progress: Progress = None
+) -> Iterator[tuple[Row, Tensor, Tensor]]:
+    """A row for each of `WAYS`, with every scan's evaluations and error, (B,); seconds are medians of `repeats`."""
     ends: dict[str, tuple[Tensor, Tensor]] = {}
-    seconds: dict[str, list[float]] = {name: [] for name in WAYS}
+    seconds: dict[str, list[float]] = defaultdict(list)
     for _ in range(repeats):
-        for name, way in WAYS.items():
-            begin = time.perf_counter()
-            ends[name] = way(flow, x, tolerance, progress)
-            _wait(x)
-            seconds[name].append(time.perf_counter() - begin)
-    found = {}
-    for name, (end, evaluations) in ends.items():
-        if name == LEAVING:  # what solvers with own steps spend that keep the batch whole (torchode): same ends
-            found[STAYING] = Solved(end, torch.full_like(evaluations, int(evaluations.max())), float("nan"))
-        found[name] = Solved(end, evaluations, median(seconds[name]))
-    return found
+        for way, sampler in WAYS.items():
+            ends[way], taken = timed(partial(_solve, flow, x_0, sampler, tolerance, progress), x_0.device)
+            seconds[way].append(taken)
+    for way, (x_1, evaluations) in ends.items():
+        errors = rms(x_1 - truth)
+        row: Row = {"part": part, "way": way, "tolerance": None if way in (EULER, AB2) else tolerance}
+        row |= {"evaluations": int(evaluations.sum()), "seconds": median(seconds[way])}
+        row["worst_error"] = float(errors.max())
+        if way == LEAVING:  # what solvers with own steps spend that keep the batch whole (torchode): same ends
+            most = torch.full_like(evaluations, int(evaluations.max()))
+            whole = {**row, "way": STAYING, "evaluations": int(most.sum()), "seconds": float("nan")}
+            yield whole, most, errors
+        yield row, evaluations, errors
 
 
 def exact_rows(kinds: Mapping[str, int], batch: str, tolerances: Sequence[float], seed: int) -> list[Row]:
     """Scans whose ends are known: evaluations and errors by kind, a row for each way and tolerance."""
-    problems: list[Problem] = []
-    places: dict[str, slice] = {}
-    for kind, count in kinds.items():
-        places[kind] = slice(len(problems), len(problems) + count)
-        problems += [PROBLEMS[kind]()] * count
+    every = [kind for kind, count in kinds.items() for _ in range(count)]
+    mixed = Mixed([PROBLEMS[kind]() for kind in every])
     # float64: the solver's error, not rounding, is measured
-    x_0 = Draws(seed, range(len(problems))).start((ELEMENTS,)).double()
-    mixed = Mixed(problems)
+    x_0 = Draws(seed, range(len(every))).start((ELEMENTS,)).double()
     truth, flow = mixed.solution(x_0, 1.0), Field(mixed, (ELEMENTS,))
     rows = []
     for tolerance in tolerances:
-        for way, solved in solve_in_all_ways(flow, x_0, tolerance, REPEATS).items():
-            row, errors = _row(batch, way, tolerance, solved, truth)
-            for kind, scans in places.items():
-                row[f"evaluations_{kind}"] = float(solved.evaluations[scans].double().mean())
-                row[f"error_{kind}"] = float(errors[scans].max())
-            rows.append(row)
-    return [row for i, row in enumerate(rows) if row["tolerance"] or i < len(WAYS)]  # fixed steps: once
-
-
-def _row(part: str, way: str, tolerance: float, solved: Solved, truth: Tensor) -> tuple[Row, Tensor]:
-    errors = (solved.x - truth).double().square().flatten(1).mean(1).sqrt()
-    row: Row = {"part": part, "way": way, "tolerance": None if way in (EULER, AB2) else tolerance}
-    row |= {"evaluations": int(solved.evaluations.sum()), "seconds": solved.seconds}
-    return row | {"worst_error": float(errors.max())}, errors
+        for row, evaluations, errors in solve_in_all_ways(batch, flow, x_0, truth, tolerance, REPEATS):
+            for kind in kinds:
+                own = torch.tensor([one == kind for one in every])
+                row[f"evaluations_{kind}"] = float(evaluations[own].double().mean())
+                row[f"error_{kind}"] = float(errors[own].max())
+            if row["tolerance"] or tolerance == tolerances[0]:  # fixed steps: once
+                rows.append(row)
+    return rows
 
 
 def scan_rows(checkpoint: Checkpoint, num: int, tolerance: float, seed: int, progress: Progress = None) -> list[Row]:
@@ -158,13 +145,11 @@ def scan_rows(checkpoint: Checkpoint, num: int, tolerance: float, seed: int, pro
                 f"dopri5 at {TIGHT:g} does not solve scan {lost} of this flow, so there is no solution to compare "
                 "with. Leave the checkpoint out for the exact problems alone."
             )
-        found = solve_in_all_ways(flow, x_0, tolerance, repeats=1, progress=progress)
-    rows = []
-    for way, solved in found.items():
-        row, errors = _row("scenes of the flow", way, tolerance, solved, tight.x)
-        row["straight"] = int((solved.evaluations == 1 + len(probes(tolerance))).sum()) if way == STRAIGHT else None
-        rows.append({**row, "median_error": float(errors.median())})
-    return rows
+        found = list(solve_in_all_ways("scenes of the flow", flow, x_0, tight.x, tolerance, 1, progress))
+    for row, evaluations, errors in found:
+        row["straight"] = int((evaluations == 1 + len(probes(tolerance))).sum()) if row["way"] == STRAIGHT else None
+        row["median_error"] = float(errors.median())
+    return [row for row, _, _ in found]
 
 
 def regions_to_measure(shape: tuple[int, int]) -> dict[str, tuple[Region, Region]]:
@@ -185,34 +170,36 @@ def regions_to_measure(shape: tuple[int, int]) -> dict[str, tuple[Region, Region
 
 def region_rows(checkpoint: Checkpoint, num: int, steps: int, seed: int, progress: Progress = None) -> list[Row]:
     """Parts of the image against the same pixels of the whole one, from the same noise and in the same steps."""
-    flow = as_flow(checkpoint.generator, NAME)
+    flow, shape = as_flow(checkpoint.generator, NAME), checkpoint.sensor.shape
+    wanted = {WHOLE: (region(shape), region(shape)), **regions_to_measure(shape)}
+    seen = {name: evaluated_region(flow, generated) for name, (_, generated) in wanted.items()}
+    parts = {name: as_flow(flow.part(part), NAME) for name, part in seen.items()}
     x_0 = Draws(seed, range(num)).start(flow.noise_shape)
-    wanted = regions_to_measure(checkpoint.sensor.shape)
-    regions = {WHOLE: region(checkpoint.sensor.shape)}
-    regions |= {name: evaluated_region(flow, generated) for name, (_, generated) in wanted.items()}
-    parts = {name: as_flow(flow.part(seen), NAME) for name, seen in regions.items()}
-    ends = {name: _sampled(parts[name], seen.crop(x_0), steps, progress) for name, seen in regions.items()}
-    t, first = torch.tensor(0.5), x_0[:1]
-    calls = {name: partial(parts[name].velocity, t, seen.crop(first).to(flow.device)) for name, seen in regions.items()}
-    seconds = _in_turns(calls, 1.0)
+    calls, ends = {}, {}
+    for name, part in seen.items():
+        own, sampler = part.crop(x_0), Sampler("ab2", steps)
+        one_by_one = [parts[name].solve(x, sampler=sampler, progress=progress).x.cpu() for x in own.split(1)]
+        ends[name] = part.place(torch.cat(one_by_one))
+        calls[name] = partial(parts[name].velocity, torch.tensor(0.5), own[:1].to(flow.device))
+    seconds = _in_turns(calls, 1.0, flow.device)
     rows: list[Row] = []
-    for name, seen in regions.items():
-        row: Row = {"part": "regions", "way": name, "share": seen.share, "seconds": steps * seconds[name]}
+    for name, (asked, _) in wanted.items():
+        row: Row = {"part": "regions", "way": name, "share": seen[name].share, "seconds": steps * seconds[name]}
         row["time"] = seconds[name] / seconds[WHOLE]
-        if name in wanted:
-            asked, _ = wanted[name]
-            truth = asked.crop(ends[WHOLE])
-            row |= _apart(checkpoint, asked.crop(seen.place(ends[name])), truth)
+        if name != WHOLE:
+            mine, truth = asked.crop(ends[name]), asked.crop(ends[WHOLE])
+            # all rays of all scans as one image
+            decoded = (checkpoint.encoding.decode(x)[:, :1].flatten(0, 2)[None, None] for x in (mine, truth))
+            median_m, _, dropped = metres_apart(*decoded)
+            row |= {"error": _rms(mine, truth), "median_m": float(median_m), "dropped": float(dropped)}
             # how far it would be if the noise told nothing of the scan
             row["unrelated"] = _rms(truth, truth.roll(1, 0)) if num > 1 else None
         rows.append(row)
     return rows
 
 
-def _sampled(flow: Flow, x_0: Tensor, steps: int, progress: Progress) -> Tensor:
-    """Scans one by one, (B, ...) on the CPU."""
-    sampler = Sampler("ab2", steps)
-    return torch.cat([flow.solve(scan, sampler=sampler, progress=progress).x.cpu() for scan in x_0.split(1)])
+def _rms(a: Tensor, b: Tensor) -> float:
+    return float((a - b).double().square().mean().sqrt())
 
 
 def channel_rows(checkpoint: Checkpoint, budget: float = 1.0) -> list[Row]:
@@ -224,68 +211,45 @@ def channel_rows(checkpoint: Checkpoint, budget: float = 1.0) -> list[Row]:
     ranges, t = checkpoint.encoding.format.channels, torch.tensor(0.5)
     space, device = checkpoint.generator.space, checkpoint.generator.device
     x = Draws(0, range(1)).start((ranges + 1, *checkpoint.sensor.shape))
-    networks = {}
-    for name, channels in (("both", ranges + 1), ("range", ranges)):
-        backbone = build_backbone(checkpoint.config["backbone"], space.rays, channels).eval().to(device)
-        networks[name] = partial(backbone, t, x[:, :channels].to(device))
-    network = _in_turns(networks, budget)
-    decoding = _in_turns({name: partial(space.decode, x, name) for name in network}, budget)
+    networks, decoders, writers = {}, {}, {}
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
-        writers = {}
-        for name in network:
-            image = space.decode(x, name)[0].numpy()
-            formats = [ending for ending in formats_of(checkpoint, name) if ending != "bin"]
-            writers[name] = partial(write_scan, image, checkpoint.sensor.rays(), Path(folder, name), "scan", formats)
-        writing = _in_turns(writers, budget)
-        for name in network:
-            size = sum(path.stat().st_size for path in Path(folder, name).iterdir())
+        for name, channels in (("both", ranges + 1), ("range", ranges)):
+            backbone = build_backbone(checkpoint.config["backbone"], space.rays, channels).eval().to(device)
+            networks[name] = partial(backbone, t, x[:, :channels].to(device))
+            decoders[name] = partial(space.decode, x, name)
+            image, out = space.decode(x, name)[0].numpy(), Path(folder, name)
+            writers[name] = partial(write_scan, image, checkpoint.sensor.rays(), out, "scan", ("ply", "npy"))
+        network = _in_turns(networks, budget, device)
+        decoding, writing = _in_turns(decoders, budget), _in_turns(writers, budget)
+        for name in networks:
             row: Row = {"part": "channels", "way": name, "network": network[name], "decoding": decoding[name]}
+            size = sum(path.stat().st_size for path in Path(folder, name).iterdir())
             rows.append({**row, "writing": writing[name], "bytes": size})
     return rows
 
 
-def _in_turns(calls: Mapping[str, Callable[[], Any]], budget: float) -> dict[str, float]:
+def _in_turns(
+    calls: Mapping[str, Callable[[], Any]], budget: float, device: torch.device | str = "cpu"
+) -> dict[str, float]:
     """Seconds of each call: the least of 3 to 40, as many as fit into a budget of seconds, after one to warm up.
 
     In turns, and the least: what else the machine does slows all of them alike, and can only add.
     """
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    seconds: list[dict[str, float]] = []
     rounds = 1 + 40
     with torch.inference_mode():
-        while len(next(iter(seconds.values()))) < rounds:
-            for name, call in calls.items():
-                begin = time.perf_counter()
-                _wait(call())
-                seconds[name].append(time.perf_counter() - begin)
-            longest = max(values[-1] for values in seconds.values())
-            rounds = min(rounds, 1 + max(3, int(budget / longest)))
-    return {name: min(values[1:]) for name, values in seconds.items()}
-
-
-def _wait(result: Any) -> None:
-    if isinstance(result, Tensor) and result.is_cuda:
-        torch.cuda.synchronize(result.device)
-
-
-def _rms(a: Tensor, b: Tensor) -> float:
-    return float((a - b).double().square().mean().sqrt())
-
-
-def _apart(checkpoint: Checkpoint, mine: Tensor, truth: Tensor) -> Row:
-    """Root mean square in model space, median metres where both return, share of rays lost or gained."""
-    a, b = (checkpoint.encoding.decode(x)[:, 0].double() for x in (mine, truth))
-    both = (a > 0) & (b > 0)
-    metres = float((a - b).abs()[both].median()) if both.any() else float("nan")
-    return {"error": _rms(mine, truth), "median_m": metres, "dropped": float(((a > 0) != (b > 0)).double().mean())}
+        while len(seconds) < rounds:
+            seconds.append({name: timed(call, device)[1] for name, call in calls.items()})
+            rounds = min(rounds, 1 + max(3, int(budget / max(seconds[-1].values()))))
+    return {name: min(one[name] for one in seconds[1:]) for name in calls}
 
 
 # The page: a part is its conditions in a sentence and its rows as a table.
 
-KIND_NAMES = {"straight": "straight", "gaussian": "smooth", "two_modes": "two modes", "ray_drop": "ray-drop"}
 OF_KINDS = {"evaluations": "evaluations, all", "share": "of one state's", "worst_error": "worst error"}
-OF_KINDS |= {f"evaluations_{kind}": f"a {name} scan" for kind, name in KIND_NAMES.items()}
-OF_KINDS |= {f"error_{kind}": f"error, {name}" for kind, name in KIND_NAMES.items()}
+OF_KINDS |= {f"evaluations_{kind}": f"a {name} scan" for kind, (name, _, _) in KINDS.items()}
+OF_KINDS |= {f"error_{kind}": f"error, {name}" for kind, (name, _, _) in KINDS.items()}
 OF_SCANS = {"evaluations": "evaluations", "share": "of one state's", "seconds": "seconds"}
 OF_SCANS |= {"median_error": "median error", "worst_error": "worst error", "straight": "straight scans"}
 OF_REGIONS = {"share": "of the pixels", "seconds": "seconds a scan", "time": "of the time", "error": "RMS, model space"}
@@ -313,7 +277,7 @@ def savings_page(
     """
     mixed = exact_rows(MIXED, "mixed", TOLERANCES, seed)
     lone = [row for row in exact_rows(LONE, "one among 255", (1e-3,), seed) if row["tolerance"]]
-    kinds = ", ".join(f"{count} {KIND_NAMES[kind]}" for kind, count in MIXED.items())
+    kinds = ", ".join(f"{count} {KINDS[kind][0]}" for kind, count in MIXED.items())
     text = [
         f"## Easy and hard scans in one batch\n\nExact problems, {ELEMENTS} elements a scan, float64: {kinds}. Seconds "
         "are the solver's own work, without a network.",
@@ -360,13 +324,6 @@ def _with_share(rows: Sequence[Row]) -> list[Row]:
     return [{**row, "share": row["evaluations"] / base[row["tolerance"]] if row["tolerance"] else None} for row in rows]
 
 
-# Told apart without colour.
-HATCHES = {
-    "straight": ("#d9d9d9", ""), "gaussian": ("#9ecae1", "//"), "two_modes": ("#4a90c2", ".."),
-    "ray_drop": ("#1b3a57", ""),
-}  # fmt: skip
-
-
 def scans_figure(rows: Sequence[Row]) -> Figure:
     """Evaluations of the mixed batch by way and kind of scan, the worst error beside them."""
     figure = blank_figure(11, 4.4, "Easy and hard scans in one batch")
@@ -376,9 +333,9 @@ def scans_figure(rows: Sequence[Row]) -> Figure:
         ways, begin = [row["way"] for row in chosen], [0.0] * len(chosen)
         for kind, count in MIXED.items():
             length = [count * row[f"evaluations_{kind}"] for row in chosen]
-            colour, hatch = HATCHES[kind]
-            label = f"{count} {KIND_NAMES[kind]}"
-            axes.barh(ways, length, left=begin, color=colour, hatch=hatch, edgecolor="black", lw=0.5, label=label)
+            name, colour, hatch = KINDS[kind]
+            style = {"color": colour, "hatch": hatch, "edgecolor": "black", "lw": 0.5}
+            axes.barh(ways, length, left=begin, **style, label=f"{count} {name}")
             begin = [a + b for a, b in zip(begin, length, strict=True)]
         notes = [f" {row['evaluations']}; worst error {shown(row['worst_error'])}" for row in chosen]
         _annotate(axes, begin, notes)

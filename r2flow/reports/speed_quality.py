@@ -5,6 +5,7 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +28,7 @@ AXES = (("evaluations", "network evaluations a scan"), ("seconds", "seconds a sc
 
 @dataclass(frozen=True)
 class Drawing:
-    """What is drawn at each point of a curve.
-
-    Attributes:
-        num, seed: Of the scans, the same noise at every point.
-        method, tolerance: The solver's; None for each generator's own.
-    """
+    """What is drawn at each point of a curve; None for each generator's own method or tolerance."""
 
     num: int
     seed: int
@@ -50,9 +46,7 @@ class Curve:
 
     Attributes:
         real: The scans that it is measured against.
-        metrics: By name.
-        gathered: Their statistics of the real scans.
-        drawing: What is drawn at each point.
+        gathered: Their statistics, for the metrics.
         device: What the network runs on, in words.
     """
 
@@ -114,23 +108,26 @@ def measure_curve(
             key = curve.key(flow, count)
             if key in known:
                 rows.append({**known[key], "flow": label})
-                continue
-            own, how = flow.generator.sampler, curve.drawing.sampler(flow, count)
-            drawn = sampled_set(flow, label, curve.drawing.num, how, curve.drawing.seed)
-            measured = measure(curve.metrics, curve.gathered, drawn, work)
-            assert isinstance(drawn.source, SampledScans)
-            figures = {f"{m.metric}/{name}": value for m in measured for name, value in m.figures.items()}
-            remarks = dict.fromkeys(remark for m in measured for remark in m.remarks)
-            rows.append({
-                "flow": label, "weights": weights_hash(flow), "steps": count,
-                "distilled_for": own.steps if own.fixed else None,
-                "solver": how.method, "evaluations": _or_nan(statistics.fmean, drawn.source.evaluations),
-                "seconds": _or_nan(statistics.median, drawn.source.seconds), "batch_size": work.batch_size,
-                "scans": curve.drawing.num, "seed": curve.drawing.seed, **figures,
-                "remarks": BETWEEN.join(remarks), "key": key,
-            })  # fmt: skip
-            arrived(rows)
+            else:
+                rows.append({**_point(curve, flow, label, count, work), "key": key})
+                arrived(rows)
     return rows
+
+
+def _point(curve: Curve, flow: Checkpoint, label: str, steps: int, work: Work) -> dict[str, Any]:
+    own, how = flow.generator.sampler, curve.drawing.sampler(flow, steps)
+    drawn = sampled_set(flow, label, curve.drawing.num, how, curve.drawing.seed)
+    measured = measure(curve.metrics, curve.gathered, drawn, work)
+    assert isinstance(drawn.source, SampledScans)
+    figures = {f"{m.metric}/{name}": value for m in measured for name, value in m.figures.items()}
+    remarks = dict.fromkeys(remark for m in measured for remark in m.remarks)
+    return {
+        "flow": label, "weights": weights_hash(flow), "steps": steps,
+        "distilled_for": own.steps if own.fixed else None,
+        "solver": how.method, "evaluations": _or_nan(statistics.fmean, drawn.source.evaluations),
+        "seconds": _or_nan(statistics.median, drawn.source.seconds), "batch_size": work.batch_size,
+        "scans": curve.drawing.num, "seed": curve.drawing.seed, **figures, "remarks": BETWEEN.join(remarks),
+    }  # fmt: skip
 
 
 def _or_nan(average: Callable[[Sequence[float]], float], values: Sequence[float]) -> float:
@@ -170,26 +167,27 @@ def speed_quality_page(
         done: Rows of earlier calls, which the JSON keeps although this call did not ask for them.
         figures: False while it is still being measured.
     """
-    shown_keys = {row["key"] for row in rows}
-    others = [row for row in done if row["key"] not in shown_keys]
-    names = figure_names(rows)
+    drawing, keys, names = curve.drawing, {row["key"] for row in rows}, figure_names(rows)
+    headings = {name: heading(*name.split("/", 1)) for name in names}
     columns = {"flow": "flow", "steps": "steps", "evaluations": "evaluations", "seconds": "s a scan"}
-    columns |= {name: heading(*name.split("/", 1))[0] for name in names}
-    printed = [{**row, **{n: row[n] * heading(*n.split("/", 1))[1] for n in names if n in row}} for row in rows]
+    columns |= {name: said for name, (said, _) in headings.items()}
+    printed = [{**row, **{n: row[n] * factor for n, (_, factor) in headings.items() if n in row}} for row in rows]
     sampled = (
-        f"{curve.drawing.num} scans of seed {curve.drawing.seed} at every point, from the same noise, by "
-        f"{curve.drawing.method or 'its own solver'}; measured against {len(curve.real)} scans of {curve.real.label}. "
+        f"{drawing.num} scans of seed {drawing.seed} at every point, from the same noise, by "
+        f"{drawing.method or 'its own solver'}; measured against {len(curve.real)} scans of {curve.real.label}. "
         "Seconds are those of the network and its solver, the median over batches."
     )
     text = [sampled, table(printed, columns), *_remarks(rows)]
-    protocols = [
-        {**curve.metrics[metric].protocol.asdict(), "real_chosen": curve.gathered.rules[metric]}
-        for metric in curve.metrics
-    ]
+    more: dict[str, Sequence[Mapping[str, Any]]] = {
+        "protocols": [
+            {**metric.protocol.asdict(), "real_chosen": curve.gathered.rules[name]}
+            for name, metric in curve.metrics.items()
+        ],
+        "other_points": [row for row in done if row["key"] not in keys],
+    }
     drawn = {NAME: _figure(rows, names)} if figures and names else {}
-    seeds = {"sampled scans": curve.drawing.seed}
-    return Page(NAME, "Quality against speed", text, rows, drawn, command, seeds, curve.device,
-                {"protocols": protocols, "other_points": others})  # fmt: skip
+    seeds = {"sampled scans": drawing.seed}
+    return Page(NAME, "Quality against speed", text, rows, drawn, command, seeds, curve.device, more)
 
 
 def figure_names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -212,29 +210,31 @@ def _remarks(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Figure:
     """Each metric's first figure against evaluations (above) and seconds (below), a line for each flow."""
-    first = list({name.split("/", 1)[0]: name for name in reversed(names)}.values())[::-1]
+    first: dict[str, str] = {}
+    for name in names:
+        first.setdefault(name.split("/", 1)[0], name)
     flows = list(dict.fromkeys(row["flow"] for row in rows))
     figure = blank_figure(3.4 * len(first) + 0.6, 6.2, "quality against speed: lower left is better")
-    for line, (x, label) in enumerate(AXES):
-        for place, name in enumerate(first):
-            axes = figure.add_subplot(2, len(first), line * len(first) + place + 1)
-            said, factor = heading(*name.split("/", 1))
-            for number, flow in enumerate(flows):
-                own = sorted((row for row in rows if row["flow"] == flow), key=lambda row: row[x])
-                values = [row.get(name, math.nan) * factor for row in own]
-                axes.plot([row[x] for row in own], values, **STYLES[number % len(STYLES)], ms=5, lw=1.2, label=flow)
-            axes.set(xscale="log", xlabel=label, ylabel=said)
-            values = [row[name] for row in rows if row.get(name, 0) > 0]
-            if values and max(values) > 20 * min(values):
-                axes.set_yscale("log")
-            if x == "seconds":
-                few_log_ticks(axes.xaxis)
-            if x == "evaluations":
-                ticks = sorted({row[x] for row in rows})
-                axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-                axes.set_xticks([], minor=True)
-            axes.grid(True, which="major", color="0.88", lw=0.6)
-            axes.tick_params(labelsize=8)
+    panels = figure.subplots(2, len(first), squeeze=False)
+    for (line, (x, label)), (column, name) in product(enumerate(AXES), enumerate(first.values())):
+        axes = panels[line, column]
+        said, factor = heading(*name.split("/", 1))
+        for number, flow in enumerate(flows):
+            own = sorted((row for row in rows if row["flow"] == flow), key=lambda row: row[x])
+            values = [row.get(name, math.nan) * factor for row in own]
+            axes.plot([row[x] for row in own], values, **STYLES[number % len(STYLES)], ms=5, lw=1.2, label=flow)
+        axes.set(xscale="log", xlabel=label, ylabel=said)
+        values = [row[name] for row in rows if row.get(name, 0) > 0]
+        if values and max(values) > 20 * min(values):
+            axes.set_yscale("log")
+        if x == "seconds":
+            few_log_ticks(axes.xaxis)
+        else:
+            ticks = sorted({row[x] for row in rows})
+            axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+            axes.set_xticks([], minor=True)
+        axes.grid(True, which="major", color="0.88", lw=0.6)
+        axes.tick_params(labelsize=8)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(len(flows), 4), fontsize=8, frameon=False)
     return figure

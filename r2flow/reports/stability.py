@@ -6,10 +6,10 @@ converged, no estimate) or its global estimate is within a factor of five of the
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -17,7 +17,8 @@ from torch import Tensor
 from r2flow.flow.problems import PROBLEMS, Mixed, NarrowJet
 from r2flow.flow.solvers import SOLVERS, Solution, Velocity, adapts
 from r2flow.generators import Field, Sampler
-from r2flow.noise import generator, standard_normal
+from r2flow.generators.base import Progress
+from r2flow.noise import Draws, generator
 from r2flow.reports.pages import Page, blank_figure
 from r2flow.reports.tables import table
 
@@ -35,8 +36,7 @@ JET = "narrow_jet"  # the known exception: nothing evaluated on either side of i
 FINISHED = ("point_mass", "narrow_gaussian", "ray_drop")
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """A solver on a problem; `tolerance` is None for one of fixed steps, `finish` is left to a last Euler step."""
 
     problem: str
@@ -50,13 +50,12 @@ def cells(
     problems: Iterable[str] = tuple(PROBLEMS),
     solvers: Iterable[str] = tuple(SOLVERS),
     tolerances: Sequence[float] = (1e-3, 1e-5),
-    precisions: Iterable[str] = tuple(PRECISIONS),
 ) -> list[Cell]:
     """Every problem, precision, solver and, of adaptive solvers, tolerance; those of `FINISHED` also with a last Euler
     step of 1e-3."""
     return [
         Cell(problem, finish, precision, solver, tolerance)
-        for problem, precision, solver in itertools.product(problems, precisions, solvers)
+        for problem, precision, solver in itertools.product(problems, PRECISIONS, solvers)
         for finish in ((0.0, 1e-3) if problem in FINISHED else (0.0,))
         for tolerance in (tolerances if adapts(solver) else (None,))
     ]
@@ -69,21 +68,20 @@ def stability(
     elements: int = 64,
     seed: int = 0,
     max_evaluations: int = 5000,
-    progress: Callable[[], None] | None = None,
+    progress: Progress = None,
 ) -> list[Row]:
-    """One row for each cell.
+    """One row of plain values for each cell.
 
     Args:
         steps: Of the fixed-step solvers.
-        scans: A row is about its worst scan.
         max_evaluations: Of an adaptive solver for a scan.
         progress: Called after every row.
 
     Returns:
-        Rows of plain values: `error` is the root mean square over the elements of the worst scan, `estimate` that
-        scan's global estimate (None: none), `verdict` one of accurate, flagged, owned up, silent and no estimate.
+        `error` is the root mean square over the elements of the worst scan, `estimate` that scan's global estimate
+        (None: none), `verdict` one of accurate, flagged, owned up, silent and no estimate.
     """
-    x_0 = torch.stack([standard_normal((elements,), seed, "evaluation", number) for number in range(scans)])
+    x_0 = Draws(seed, range(scans)).start((elements,))
     rows = []
     for cell in chosen:
         rows.append(_row(cell, steps, x_0, max_evaluations))
@@ -95,26 +93,25 @@ def stability(
 def _row(cell: Cell, steps: int, x_0: Tensor, max_evaluations: int) -> Row:
     problem, tolerance = PROBLEMS[cell.problem](), cell.tolerance
     state, network = PRECISIONS[cell.precision]
-    x_0 = x_0.to(state)
-    solution = Field(HalfPrecision(problem, network) if network else problem, x_0.shape[1:]).solve(
-        x_0, sampler=Sampler(cell.solver, steps).changed(tolerance=tolerance), finish=cell.finish,
-        max_evaluations=max_evaluations, global_error=tolerance is not None,
-    )  # fmt: skip
-    extra = 0.0 if solution.estimate_evaluations is None else solution.estimate_evaluations.double().mean().item()
+    flow = Field(_in_precision(problem, network), x_0.shape[1:])
+    x_0, sampler = x_0.to(state), Sampler(cell.solver, steps).changed(tolerance=tolerance)
+    limits: dict[str, Any] = {"finish": cell.finish, "max_evaluations": max_evaluations}
+    solution = flow.solve(x_0, sampler=sampler, global_error=tolerance is not None, **limits)
+    extra = 0.0 if solution.estimate_evaluations is None else _mean(solution.estimate_evaluations)
     errors = _rms(solution.x.double() - problem.solution(x_0, 1.0))
     worst, estimates = int(errors.argmax()), solution.global_error
     estimate = math.nan if estimates is None else estimates[worst].item()
     verdict, unestimated = _verdict(solution, errors, tolerance)
     return {
-        **asdict(cell),
+        **cell._asdict(),
         "steps": None if tolerance is not None else steps,
         "error": errors[worst].item(),
         "estimate": estimate if math.isfinite(estimate) else None,
-        "evaluations": solution.evaluations.double().mean().item() - extra,
+        "evaluations": _mean(solution.evaluations) - extra,
         "estimate_evaluations": extra,
-        "stiff": solution.stiff.double().mean().item(),
-        "converged": solution.converged.double().mean().item(),
-        "estimated": 0.0 if estimates is None else estimates.isfinite().double().mean().item(),
+        "stiff": _mean(solution.stiff),
+        "converged": _mean(solution.converged),
+        "estimated": 0.0 if estimates is None else _mean(estimates.isfinite()),
         "verdict": verdict,
         "by_missing_estimate": unestimated,
     }
@@ -125,46 +122,39 @@ def _verdict(solution: Solution, errors: Tensor, tolerance: float | None) -> tup
     estimate = solution.global_error
     if tolerance is None or estimate is None:
         return "no estimate", False
-    failed = errors > FAILS_AT * tolerance
+    failed, missing = errors > FAILS_AT * tolerance, ~estimate.isfinite()
     if not failed.any():
         return "accurate", False
     known = solution.stiff | ~solution.converged
-    unestimated = bool((failed & ~known & ~estimate.isfinite()).any())
-    flagged = known | ~estimate.isfinite()
     honest = (estimate >= errors / HONEST_WITHIN) & (estimate <= errors * HONEST_WITHIN)
-    if (failed & ~flagged & ~honest).any():
-        return "silent", unestimated
-    return "flagged" if (failed & flagged).any() else "owned up", unestimated
+    silent, flagged = failed & ~known & ~missing & ~honest, failed & (known | missing)
+    verdict = "silent" if silent.any() else "flagged" if flagged.any() else "owned up"
+    return verdict, bool((failed & ~known & missing).any())
 
 
 def jet_probe(
-    tolerance: float = 1e-3,
-    shares: Sequence[float] = (1.0, 1 / 8, 1 / 16, 1 / 32, 1 / 64, 1 / 128),
-    scans: int = 64,
-    seed: int = 0,
+    shares: Sequence[float] = (1.0, 1 / 8, 1 / 16, 1 / 32, 1 / 64, 1 / 128), scans: int = 64, seed: int = 0
 ) -> list[Row]:
     """How many narrow jets at random times a limit on the longest step finds, and what it costs."""
+    tolerance = 1e-3
     draws = generator(seed, "evaluation", 0)
     jets = Mixed([NarrowJet(at=float(at)) for at in draws.uniform(0.1, 0.9, scans)])
     x_0 = torch.from_numpy(draws.standard_normal((scans, 16)))
     exact = jets.solution(x_0, 1.0)
     rows = []
-    for solver, share in itertools.product([name for name, _ in SOLVERS.items() if adapts(name)], shares):
+    for solver, share in itertools.product(filter(adapts, SOLVERS), shares):
         solution = Field(jets, (16,)).solve(x_0, sampler=Sampler(solver, tolerance=tolerance), max_step=share)
-        found = (_rms(solution.x - exact) <= FAILS_AT * tolerance).double().mean().item()
+        found = _mean(_rms(solution.x - exact) <= FAILS_AT * tolerance)
         row: Row = {"solver": solver, "tolerance": tolerance, "longest_step": share, "found": found}
-        rows.append({**row, "evaluations": solution.evaluations.double().mean().item()})
+        rows.append({**row, "evaluations": _mean(solution.evaluations)})
     return rows
 
 
-class HalfPrecision:
+def _in_precision(velocity: Velocity, dtype: torch.dtype | None) -> Velocity:
     """A velocity as a network in half precision gives it: x rounded before it, v after it; t stays in float32."""
-
-    def __init__(self, velocity: Velocity, dtype: torch.dtype) -> None:
-        self.velocity, self.dtype = velocity, dtype
-
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        return self.velocity(t, x.to(self.dtype).to(x.dtype)).to(self.dtype)
+    if dtype is None:
+        return velocity
+    return lambda t, x: velocity(t, x.to(dtype).to(x.dtype)).to(dtype)
 
 
 def _rms(difference: Tensor) -> Tensor:
@@ -174,21 +164,28 @@ def _rms(difference: Tensor) -> Tensor:
     return largest[:, 0] * (flat / largest).square().mean(1).sqrt()
 
 
+def _mean(values: Tensor) -> float:
+    return values.double().mean().item()
+
+
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """How many cells of adaptive solvers fail, how many of these say so, and which do not, the jet apart."""
     adaptive = [row for row in rows if row["tolerance"] is not None and row["problem"] != JET]
     failed = [row for row in adaptive if row["verdict"] != "accurate"]
     silent = [row for row in failed if row["verdict"] == "silent"]
-    covered = len(failed) - len(silent)
+    covered = [row for row in failed if row["verdict"] != "silent"]
     return {
         "cells": len(rows),
         "failed": len(failed),
-        "covered": covered,
-        "by_missing_estimate": sum(row["by_missing_estimate"] and row["verdict"] != "silent" for row in failed),
-        "share": covered / len(failed) if failed else 1.0,
-        "silent": [" / ".join(map(str, _line(row)[:4])) for row in silent],
+        "covered": len(covered),
+        "by_missing_estimate": sum(row["by_missing_estimate"] for row in covered),
+        "share": len(covered) / len(failed) if failed else 1.0,
+        "silent": [" / ".join(_line(row)[:4]) for row in silent],
         "silent_jets": sum(row["problem"] == JET and row["verdict"] == "silent" for row in rows),
     }
+
+
+COLUMNS = ("problem", "precision", "solver", "tolerance", "error", "estimate", "evaluations", "flags", "verdict")
 
 
 def stability_page(rows: Sequence[Row], probe: Sequence[Row] = (), seed: int = 0, command: str = "") -> Page:
@@ -215,10 +212,7 @@ def stability_page(rows: Sequence[Row], probe: Sequence[Row] = (), seed: int = 0
     text += [
         "Error: root mean square over the worst scan's elements. Evaluations: mean over scans, the estimate's own in "
         "brackets. Flags: s stiff, n not converged, e no estimate.",
-        table(
-            [_line(row) for row in rows],
-            ("problem", "precision", "solver", "tolerance", "error", "estimate", "evaluations", "flags", "verdict"),
-        ),
+        table([_line(row) for row in rows], COLUMNS),
     ]
     return Page(
         "stability", "Where solvers fail, and whether they say so", text, rows, {"stability": stability_figure(rows)},
@@ -259,22 +253,25 @@ def stability_figure(rows: Sequence[Row]) -> Figure:
     """Left: estimated against true error, the band of a factor of five. Right: verdicts by precision."""
     figure = blank_figure(12, 5.2)
     left, right = figure.subplots(1, 2)
-    ends = [1e-9, 1e2]
+    ends = np.array([1e-9, 1e2])
     left.plot(ends, ends, color="black", linewidth=0.8)
-    left.fill_between(ends, [e / HONEST_WITHIN for e in ends], [e * HONEST_WITHIN for e in ends], color="0.9")
+    left.fill_between(ends, ends / HONEST_WITHIN, ends * HONEST_WITHIN, color="0.9")
+    by_verdict: dict[str, list[Row]] = {verdict: [] for verdict in VERDICTS}
+    for row in rows:
+        jet = row["problem"] == JET and row["verdict"] == "silent"
+        by_verdict[SILENT_JET if jet else row["verdict"]].append(row)
     names = list(dict.fromkeys(row["precision"] for row in rows))
-    start = [0] * len(names)
+    start = np.zeros(len(names))
     for verdict, (marker, face, shade, hatch) in VERDICTS.items():
-        own = [row for row in rows if _shown_as(row) == verdict]
-        points = [
-            [max(row[key], ends[0]) for row in own if row["estimate"] is not None] for key in ("error", "estimate")
-        ]
+        own = by_verdict[verdict]
         if marker:
-            label = f"{verdict} ({len(points[0])})"
+            known = [row for row in own if row["estimate"] is not None]
+            points = [[max(row[key], ends[0]) for row in known] for key in ("error", "estimate")]
+            label = f"{verdict} ({len(known)})"
             left.scatter(*points, marker=marker, facecolors=face, edgecolors="black", s=26, label=label)
         counts = [sum(row["precision"] == name for row in own) for name in names]
         right.barh(names, counts, left=start, color=shade, hatch=hatch, edgecolor="black", label=verdict)
-        start = [before + count for before, count in zip(start, counts, strict=True)]
+        start += counts
     left.set(xscale="log", yscale="log", xlabel="true error", ylabel="global estimate")
     left.set_title("Global estimate against true error (grey: within a factor of five)", fontsize=10)
     left.legend(fontsize=8)
@@ -283,7 +280,3 @@ def stability_figure(rows: Sequence[Row]) -> Figure:
     right.set_title("Verdicts", fontsize=10)
     right.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=6, frameon=False)
     return figure
-
-
-def _shown_as(row: Row) -> str:
-    return SILENT_JET if row["problem"] == JET and row["verdict"] == "silent" else row["verdict"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from r2flow.checkpoints import checkpoints_of, find_checkpoint, load_checkpoint
 from r2flow.errors import InputError
-from r2flow.reports.outputs import write_samples
+from r2flow.reports.outputs import what_next, write_samples
 
 Curve = tuple[np.ndarray, np.ndarray]
 
@@ -28,12 +28,11 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
                     if row.get(name):
                         # Lightning logs the number of the step that was being taken.
                         values[name][int(row["step"]) + 1] = float(row[name])
-    curves = {}
-    for name, points in values.items():
-        if points:
-            steps = sorted(points)
-            curves[name] = (np.array(steps), np.array([points[step] for step in steps]))
-    return curves
+    return {
+        name: (np.array(sorted(points)), np.array([points[step] for step in sorted(points)]))
+        for name, points in values.items()
+        if points
+    }
 
 
 def check_samples(num: int = 4) -> None:
@@ -69,17 +68,12 @@ def finish(run: str | Path, samples: Mapping[str, Any], seed: int, device: str, 
     for name, (steps, values) in curves.items():
         tenth = max(len(values) // 10, 1)
         print(f"{name}: {values[:tenth].mean():.4f} at the start, {values[-tenth:].mean():.4f} at step {steps[-1]}")
-    advice = "" if checkpoint.generator.sampler.fixed else " --steps 64"
     print(
         f"""
 checkpoint    {path}
 pictures      {out / "samples.png"} and one page a scan beside it; during training: {run / "pictures"}
 point clouds  {out / "000000.ply"} ...
 loss curve    {run / "loss.png"}; tensorboard --logdir {run / "tensorboard"}
-
-next
-  r2flow sample --checkpoint {run} --num 16{advice} --seed 1 --out {run / "more"}
-  r2flow show {out / "000000.ply"} --out {run / "views"}
-  r2flow train data=kitti_raw data.root=FOLDER backbone=hdit_small""",
+{what_next(run, out, "" if checkpoint.generator.sampler.fixed else " --steps 64")}""",
         flush=True,
     )

@@ -70,9 +70,8 @@ def views_of(
     options, file = parse(str(spec))
     own = own_reading(spec)
     reading = own or replace(usual_reading(spec), projection=projection)  # type: ignore[arg-type]
-    reading = replace(
-        reading, sensor=sensor or reading.sensor, reflectance_scale=reflectance_scale, on_bad_scan="error"
-    )
+    sensor = sensor or reading.sensor
+    reading = replace(reading, sensor=sensor, reflectance_scale=reflectance_scale, on_bad_scan="error")
     if own is None and options.name == FOLDER:
         loose = scans_of(file or Path(options.folder), most)
         return [View(path, open_scans(path, reading, own_size=True), 0) for path in loose]

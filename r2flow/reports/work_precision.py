@@ -1,10 +1,9 @@
 """Error against work: which solver gives what accuracy for how many evaluations and how much time (measurement)."""
 
 import math
-import time
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -12,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.checkpoints import Checkpoint
 from r2flow.flow.problems import PROBLEMS
 from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, Solution, adapts, check_method
 from r2flow.generators import Field, Flow, Sampler
-from r2flow.inversion import metres_apart
+from r2flow.inversion import metres_apart, rms
 from r2flow.lidar.encoding import Encoding
 from r2flow.noise import Draws
+from r2flow.reports import timing
 
 METHODS = (*SOLVERS, f"{TORCHDIFFEQ}dopri5")
 MOST_EVALUATIONS = 1000  # of an adaptive method for a scan; one that needs more is of no use here
@@ -54,13 +53,10 @@ class Subject:
     """A flow with known ends.
 
     Attributes:
-        name: Of the problem, or the checkpoint as it was typed.
-        flow: What is solved.
         x_0: Starts of the scans, (N, ...), on the flow's device.
         x_1: Their ends, (N, ...), float64.
-        batch_size: Scans solved at once.
         floor: The least root mean square error that can be measured against `x_1`; 0 where it is exact.
-        encoding: Between model space and metres; None for a problem that has none.
+        encoding: None for a problem without metres.
     """
 
     name: str
@@ -74,10 +70,10 @@ class Subject:
 
 @dataclass(frozen=True)
 class Reference:
-    """The tight solution that errors on a checkpoint are measured against, and how far two methods agree on it.
+    """The tight solution by rk4 that errors on a checkpoint are measured against.
 
     Attributes:
-        x_1: By rk4, (N, ...), float64.
+        x_1: (N, ...), float64.
         disagreement: Root mean square difference to dopri5 of every scan, (N,); inf where either did not converge.
         evaluations: Of both for a scan, the mean.
     """
@@ -116,11 +112,7 @@ def configurations(
 
 
 def reference(
-    flow: Flow,
-    x_0: Tensor,
-    steps: int,
-    tolerance: float,
-    progress: Callable[[], None] | None = None,
+    flow: Flow, x_0: Tensor, steps: int, tolerance: float, progress: Callable[[], None] | None = None
 ) -> Reference:
     """x_1 by rk4 with many steps and, one scan at a time, its distance from dopri5 at a tight tolerance.
 
@@ -135,17 +127,6 @@ def reference(
         apart.append(rms(rk4.x - dopri5.x).item() if solved else math.inf)
         evaluations.append(int(rk4.evaluations.sum() + dopri5.evaluations.sum()))
     return Reference(torch.cat(ends), np.array(apart), float(np.mean(evaluations)), steps, tolerance)
-
-
-def starts(checkpoint: Checkpoint, num: int, seed: int) -> Tensor:
-    """x_0 of scans 0 to num - 1 of a seed, on the generator's device."""
-    generator = checkpoint.generator
-    return Draws(seed, range(num)).start(generator.noise_shape).to(generator.device)
-
-
-def rms(x: Tensor) -> Tensor:
-    """Root mean square over each scan's elements, (B, ...) -> (B,), float64."""
-    return x.double().square().flatten(1).mean(1).sqrt()
 
 
 def measure(
@@ -165,21 +146,27 @@ def measure(
     """
     rows = []
     for subject in subjects:
-        tallies = [_Tally() for _ in chosen]
+        seconds: list[list[float]] = [[] for _ in chosen]  # for a scan
+        spent = [0.0] * len(chosen)
+        found: list[list[dict[str, Tensor]]] = [[] for _ in chosen]
         batches = list(zip(*(x.split(subject.batch_size) for x in (subject.x_0, subject.x_1)), strict=True))
         with torch.inference_mode():
             subject.flow.velocity(torch.zeros((), device=subject.x_0.device), subject.x_0[:1])  # what happens only once
-            for repeat, (x_0, x_1), (of, tally) in product(
-                range(repeats), batches, list(zip(chosen, tallies, strict=True))
-            ):
-                if repeat == 0 or tally.spent < PATIENCE:
-                    found, seconds = timed(of, subject.flow, x_0)
-                    tally.add(seconds, len(x_0))
+            for repeat, (x_0, x_1), (i, one) in product(range(repeats), batches, list(enumerate(chosen))):
+                if repeat == 0 or spent[i] < PATIENCE:
+                    solution, taken = timed(one, subject.flow, x_0)
+                    spent[i] += taken
+                    seconds[i].append(taken / len(x_0))
                     if repeat == 0:
-                        tally.judge(found, x_1, subject.encoding)
+                        found[i].append(_judged(solution, x_1, subject.encoding))
                 if progress is not None:
                     progress()
-        rows += _mark([tally.row(subject, of) for tally, of in zip(tallies, chosen, strict=True)])
+        own = [_row(subject, *of_one) for of_one in zip(chosen, seconds, found, strict=True)]
+        for work in ("evaluations", "seconds"):
+            front = pareto([row[work] for row in own], [reached(row) for row in own])
+            for row, on_front in zip(own, front, strict=True):
+                row[f"pareto_{work}"] = on_front
+        rows += own
     return rows
 
 
@@ -190,68 +177,41 @@ def runs(subjects: Iterable[Subject], chosen: Sequence[Configuration], repeats: 
 
 def timed(configuration: Configuration, flow: Flow, x_0: Tensor) -> tuple[Solution, float]:
     """The solution and its seconds."""
-    _wait_for(x_0.device)
-    begin = time.perf_counter()
-    found = configuration.solve(flow, x_0)
-    _wait_for(x_0.device)
-    return found, time.perf_counter() - begin
+    return timing.timed(partial(configuration.solve, flow, x_0), x_0.device)
 
 
-def _wait_for(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+def _judged(solution: Solution, x_1: Tensor, encoding: Encoding | None) -> dict[str, Tensor]:
+    """What is known of each scan, (B,) by name."""
+    known = {name: getattr(solution, name) for name in ("evaluations", "converged", "stiff")}
+    known["error"] = rms(solution.x - x_1)
+    if encoding is not None:
+        apart = metres_apart(encoding.decode(solution.x), encoding.decode(x_1.to(solution.x)))
+        known |= dict(zip(METRES, apart, strict=True))
+    return known
 
 
-class _Tally:
-    """What one configuration did on one subject."""
-
-    def __init__(self) -> None:
-        self.spent = 0.0
-        self.seconds: list[float] = []
-        self.found: dict[str, list[float]] = defaultdict(list)
-
-    def add(self, seconds: float, scans: int) -> None:
-        self.spent += seconds
-        self.seconds.append(seconds / scans)
-
-    def judge(self, found: Solution, x_1: Tensor, encoding: Encoding | None) -> None:
-        self.found["error"] += rms(found.x.double() - x_1).tolist()
-        self.found["evaluations"] += found.evaluations.tolist()
-        self.found["converged"] += found.converged.tolist()
-        self.found["stiff"] += found.stiff.tolist()
-        if encoding is not None:
-            apart = metres_apart(encoding.decode(found.x), encoding.decode(x_1.to(found.x)))
-            for name, values in zip(METRES, apart, strict=True):
-                self.found[name] += values.tolist()
-
-    def row(self, subject: Subject, of: Configuration) -> dict[str, Any]:
-        error, evaluations = np.array(self.found["error"]), self.found["evaluations"]
-        row = {
-            "problem": subject.name, "method": of.method, "steps": of.steps, "tolerance": of.tolerance,
-            "label": of.label, "scenes": len(error),
-            "evaluations": float(np.mean(evaluations)), "evaluations_most": int(max(evaluations)),
-            "seconds": float(np.median(self.seconds)), "timings": len(self.seconds),
-            "seconds_quarter": float(np.quantile(self.seconds, 0.25)),
-            "seconds_three_quarters": float(np.quantile(self.seconds, 0.75)),
-            "error": float(np.median(error)), "error_p95": float(np.quantile(error, 0.95, method="higher")),
-            "error_worst": float(error.max()), "floor": subject.floor,
-            "length": float(rms(subject.x_1 - subject.x_0).median()),
-            "judged": bool(np.median(error) > subject.floor),
-            "converged": int(sum(self.found["converged"])), "stiff": int(sum(self.found["stiff"])),
-        }  # fmt: skip
-        for name in METRES:
-            known = [value for value in self.found[name] if math.isfinite(value)]
-            row[name] = float(np.median(known)) if known else None
-        return row
-
-
-def _mark(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Enter which rows of one subject are on the Pareto fronts of error against evaluations and against seconds."""
-    for work in ("evaluations", "seconds"):
-        front = pareto([row[work] for row in rows], [reached(row) for row in rows])
-        for row, on_front in zip(rows, front, strict=True):
-            row[f"pareto_{work}"] = on_front
-    return rows
+def _row(
+    subject: Subject, of: Configuration, seconds: Sequence[float], found: Sequence[Mapping[str, Tensor]]
+) -> dict[str, Any]:
+    scans = {name: torch.cat([batch[name] for batch in found]).cpu().numpy() for name in found[0]}
+    error, evaluations = scans["error"], scans["evaluations"]
+    row = {
+        "problem": subject.name, **asdict(of), "label": of.label, "scenes": len(error),
+        "evaluations": float(np.mean(evaluations)), "evaluations_most": int(max(evaluations)),
+        "seconds": float(np.median(seconds)), "timings": len(seconds),
+        "seconds_quarter": float(np.quantile(seconds, 0.25)),
+        "seconds_three_quarters": float(np.quantile(seconds, 0.75)),
+        "error": float(np.median(error)), "error_p95": float(np.quantile(error, 0.95, method="higher")),
+        "error_worst": float(error.max()), "floor": subject.floor,
+        "length": float(rms(subject.x_1 - subject.x_0).median()),
+        "judged": bool(np.median(error) > subject.floor),
+        "converged": int(scans["converged"].sum()), "stiff": int(scans["stiff"].sum()),
+    }  # fmt: skip
+    for name in METRES:
+        values = scans.get(name, np.empty(0))
+        known = values[np.isfinite(values)]
+        row[name] = float(np.median(known)) if len(known) else None
+    return row
 
 
 def reached(row: Mapping[str, Any]) -> float:
@@ -278,14 +238,14 @@ def best_within(
     return min(within, key=lambda row: (reached(row), row[work]), default=None)
 
 
-def problem_subjects(names: Sequence[str] | None = None, scenes: int = 16, elements: int = 64) -> list[Subject]:
-    """The exact problems of `r2flow.flow.problems`, all if none are named, on Gaussian starts.
+def problem_subjects(names: Sequence[str], scenes: int = 16, elements: int = 64) -> list[Subject]:
+    """Exact problems of `r2flow.flow.problems` on Gaussian starts.
 
     Raises:
         InputError: an unknown name.
     """
     subjects = []
-    for name in PROBLEMS if names is None else names:
+    for name in names:
         problem = PROBLEMS[name]()
         # float64: the solver's error, not rounding, is measured
         x_0 = Draws(PROBLEM_SEED, range(scenes)).start((elements,)).double()

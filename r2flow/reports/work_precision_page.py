@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.tables import shown, table
@@ -18,6 +19,23 @@ Axis = tuple[str, str]  # key of a row, label
 EVALUATIONS: Axis = ("evaluations", "network evaluations a scan")
 SECONDS: Axis = ("seconds", "seconds a scan")
 ERROR: Axis = ("error", "RMS error, model space")
+PANELS: tuple[tuple[Axis, Axis], ...] = (  # of a checkpoint
+    (EVALUATIONS, ERROR),
+    (SECONDS, ERROR),
+    (EVALUATIONS, ("range_rms_m", "RMS range error, m")),
+    (EVALUATIONS, ("drop_differs", "share of rays that differ in ray-drop")),
+)
+COLUMNS = {
+    "label": "configuration", "evaluations": "evaluations", "seconds": "seconds", "seconds_quarter": "quartile",
+    "seconds_three_quarters": "quartile", "error": "error, median", "error_p95": "95th percentile",
+    "error_worst": "worst scan", "range_rms_m": "range, RMS m", "range_median_m": "range, median m",
+    "drop_differs": "ray-drop differs", "front": "Pareto",
+}  # fmt: skip
+NOTE = (
+    "All configurations. Errors are RMS over the elements of a scan in model space; in metres, over the rays that both "
+    "solutions return, the median over scans. Seconds are for a scan, the median and quartiles over all its solutions, "
+    "which took turns with those of the other configurations."
+)
 
 
 def work_precision_page(
@@ -39,13 +57,18 @@ def work_precision_page(
     of_checkpoint = [row for row in rows if row["problem"] == name]
     of_problems = [row for row in rows if row["problem"] != name]
     text, figures = [], {}
+    if name is not None and found is not None:
+        text += checkpoint_text(of_checkpoint, name, found, budgets)
+        figures["work_precision"] = checkpoint_figure(of_checkpoint, name)
     if of_problems:
         text += problems_text(of_problems, budgets)
         figures["exact_problems"] = problems_figure(of_problems, EVALUATIONS)
         figures["exact_problems_time"] = problems_figure(of_problems, SECONDS)
-    if name is not None and found is not None:
-        text = [*checkpoint_text(of_checkpoint, name, found, budgets), *text, NOTE, all_rows(of_checkpoint)]
-        figures = {"work_precision": checkpoint_figure(of_checkpoint, name), **figures}
+    if name is not None:
+        works = ("evaluations", "seconds")
+        fronts = [" and ".join(work for work in works if row[f"pareto_{work}"]) for row in of_checkpoint]
+        lines = [{**row, "front": front} for row, front in zip(of_checkpoint, fronts, strict=True)]
+        text += [NOTE, table(lines, COLUMNS)]
     return Page("work_precision", "Error against work", text, rows, figures, command, seeds, device)
 
 
@@ -79,29 +102,9 @@ def best_table(rows: Sequence[Row], budgets: Mapping[str, float], work: str) -> 
     return table(lines, ("within", "configuration", "error"))
 
 
-NOTE = (
-    "All configurations. Errors are RMS over the elements of a scan in model space; in metres, over the rays that both "
-    "solutions return, the median over scans. Seconds are for a scan, the median and quartiles over all its solutions, "
-    "which took turns with those of the other configurations."
-)
-
-
-def all_rows(rows: Sequence[Row]) -> str:
-    """Every configuration on a checkpoint."""
-    columns = {
-        "label": "configuration", "evaluations": "evaluations", "seconds": "seconds", "seconds_quarter": "quartile",
-        "seconds_three_quarters": "quartile", "error": "error, median", "error_p95": "95th percentile",
-        "error_worst": "worst scan", "range_rms_m": "range, RMS m", "range_median_m": "range, median m",
-        "drop_differs": "ray-drop differs", "front": "Pareto",
-    }  # fmt: skip
-    works = ("evaluations", "seconds")
-    fronts = [" and ".join(work for work in works if row[f"pareto_{work}"]) for row in rows]
-    return table([{**row, "front": front} for row, front in zip(rows, fronts, strict=True)], columns)
-
-
 def problems_text(rows: Sequence[Row], budgets: Sequence[int]) -> list[str]:
     """The most accurate solver of every exact problem within every budget, and the one nearest to these throughout."""
-    problems = {row["problem"]: [r for r in rows if r["problem"] == row["problem"]] for row in rows}
+    problems = _by(rows, "problem")
     budgets, scans = sorted(set(budgets)), rows[0]["scenes"]
     lines = [[name, *(_winner(own, budget) for budget in budgets)] for name, own in problems.items()]
     lines.append(["**nearest to the best**", *(steadiest(rows, budget) or "none" for budget in budgets)])
@@ -133,12 +136,12 @@ def steadiest(rows: Sequence[Row], budget: float) -> str | None:
     By the geometric mean over problems of (its error / the best error), where its error is at most that of x_0. None
     where no method solves any problem within the budget.
     """
-    problems = {row["problem"]: [r for r in rows if r["problem"] == row["problem"]] for row in rows}
+    problems = _by(rows, "problem")
     regret: dict[str, float] = {}
-    for method in dict.fromkeys(row["method"] for row in rows):
+    for method in _by(rows, "method"):
         ratios, arrives = [], False
         for own in problems.values():
-            best, mine = best_within(own, budget), best_within([r for r in own if r["method"] == method], budget)
+            best, mine = best_within(own, budget), best_within(_by(own, "method").get(method, []), budget)
             if best is not None:
                 arrives |= mine is not None
                 ratios.append(math.log((best["length"] if mine is None else reached(mine)) / reached(best)))
@@ -150,35 +153,33 @@ def steadiest(rows: Sequence[Row], budget: float) -> str | None:
 def checkpoint_figure(rows: Sequence[Row], name: str) -> Figure:
     """Error of a checkpoint's solutions against evaluations and time, and what it is in metres and ray-drop."""
     figure = blank_figure(10.5, 8.2)
-    panels: list[tuple[Axis, Axis]] = [
-        (EVALUATIONS, ERROR),
-        (SECONDS, ERROR),
-        (EVALUATIONS, ("range_rms_m", "RMS range error, m")),
-        (EVALUATIONS, ("drop_differs", "share of rays that differ in ray-drop")),
-    ]
-    for place, (work, error) in enumerate(panels):
+    floor = rows[0]["floor"]
+    for place, (work, error) in enumerate(PANELS):
         axes = figure.add_subplot(2, 2, place + 1)
         _draw(axes, rows, work, error)
-        if error is ERROR and math.isfinite(rows[0]["floor"]):
-            _draw_floor(axes, rows[0]["floor"])
+        if error is ERROR and math.isfinite(floor):
+            low = min(axes.get_ylim()[0], floor / 2)
+            axes.axhspan(low, floor, facecolor="0.93", hatch="///", edgecolor="0.75", lw=0)
+            axes.text(0.02, 0.02, "closer than can be measured", fontsize=8, transform=axes.transAxes, color="0.25")
+            axes.set_ylim(bottom=low)
     _legend(figure, rows, f"{name}: error against work, median of {rows[0]['scenes']} scans")
     return figure
 
 
 def problems_figure(rows: Sequence[Row], work: Axis) -> Figure:
     """Error on every exact problem against evaluations or time."""
-    problems = list(dict.fromkeys(row["problem"] for row in rows if math.isfinite(reached(row))))
+    solved = _by([row for row in rows if math.isfinite(reached(row))], "problem")
+    problems, missing = list(solved), [problem for problem in _by(rows, "problem") if problem not in solved]
     columns = max(min(4, len(problems)), 1)
     lines = math.ceil(len(problems) / columns)
     figure = blank_figure(3.2 * columns + 0.4, 2.7 * lines + 0.9)
     for place, problem in enumerate(problems):
         axes = figure.add_subplot(lines, columns, place + 1)
-        _draw(axes, [row for row in rows if row["problem"] == problem], work, ERROR, lowest=1e-10)
+        _draw(axes, solved[problem], work, ERROR, lowest=1e-10)
         axes.set_title(problem.replace("_", " "), fontsize=9)
         axes.set_ylabel("RMS error" if place % columns == 0 else "")
         axes.set_xlabel(work[1].replace("network ", "") if place >= len(problems) - columns else "")
-    missing = [row["problem"] for row in rows if row["problem"] not in problems]
-    unsolved = f"; unsolved: {', '.join(dict.fromkeys(missing))}" if missing else ""
+    unsolved = f"; unsolved: {', '.join(missing)}" if missing else ""
     _legend(figure, rows, f"Exact problems, median of {rows[0]['scenes']} scans{unsolved}")
     return figure
 
@@ -186,9 +187,9 @@ def problems_figure(rows: Sequence[Row], work: Axis) -> Figure:
 def _draw(axes: Any, rows: Sequence[Row], work: Axis, error: Axis, lowest: float = 0.0) -> None:
     """One line a method; ringed where no other configuration is both cheaper and more accurate."""
     (x, x_label), (y, y_label) = work, error
-    for method in dict.fromkeys(row["method"] for row in rows):
-        own = [row for row in rows if row["method"] == method and math.isfinite(reached(row))]
-        own = [row for row in own if row[y] is not None and math.isfinite(row[y])]
+    solved = [row for row in rows if math.isfinite(reached(row)) and row[y] is not None and math.isfinite(row[y])]
+    for method in _by(rows, "method"):
+        own = [row for row in solved if row["method"] == method]
         values = np.array([max(row[y], lowest) or math.nan for row in own])
         works = np.array([row[x] for row in own])
         axes.plot(works, values, **_style(method), ms=4.5, lw=1.1, label=method)
@@ -206,37 +207,19 @@ def _draw(axes: Any, rows: Sequence[Row], work: Axis, error: Axis, lowest: float
     if any((line.get_ydata() > 0).any() for line in axes.lines):
         axes.set(xscale="log", yscale="log")
     if work is EVALUATIONS:
-        _powers_of_two(axes)
+        low, high = axes.get_xlim()
+        ticks = [2.0**n for n in range(16) if low <= 2.0**n <= high]
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.minorticks_off()
     axes.grid(True, which="major", color="0.88", lw=0.6)
     axes.tick_params(labelsize=8)
 
 
-def _powers_of_two(axes: Any) -> None:
-    """Ticks where budgets of evaluations are counted."""
-    low, high = axes.get_xlim()
-    ticks = [2.0**n for n in range(16) if low <= 2.0**n <= high]
-    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-    axes.minorticks_off()
-
-
-def _draw_floor(axes: Any, floor: float) -> None:
-    """The errors that cannot be measured."""
-    low = min(axes.get_ylim()[0], floor / 2)
-    axes.axhspan(low, floor, facecolor="0.93", hatch="///", edgecolor="0.75", lw=0)
-    axes.text(0.02, 0.02, "closer than can be measured", fontsize=8, transform=axes.transAxes, color="0.25")
-    axes.set_ylim(bottom=low)
-
-
 def _legend(figure: Figure, rows: Sequence[Row], title: str) -> None:
-    from matplotlib.lines import Line2D
-
-    methods = dict.fromkeys(row["method"] for row in rows)
-    handles = [Line2D([], [], **_style(method), ms=5, lw=1.1, label=method) for method in methods]
-    ring: dict[str, Any] = {"marker": "o", "ls": "", "mfc": "none", "mec": "black", "ms": 9}
-    handles.append(Line2D([], [], **ring, label="Pareto front"))
-    handles.append(
-        Line2D([], [], color="0.4", lw=0.8, label="in the solver's colour: to the worst scan; quartiles of time")
-    )
+    handles = [Line2D([], [], **_style(method), ms=5, lw=1.1, label=method) for method in _by(rows, "method")]
+    handles.append(Line2D([], [], marker="o", ls="", mfc="none", mec="black", ms=9, label="Pareto front"))
+    spread = "in the solver's colour: to the worst scan; quartiles of time"
+    handles.append(Line2D([], [], color="0.4", lw=0.8, label=spread))
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=11)
 
@@ -244,3 +227,11 @@ def _legend(figure: Figure, rows: Sequence[Row], title: str) -> None:
 def _style(method: str) -> dict[str, Any]:
     place = METHODS.index(method) if method in METHODS else sum(map(ord, method))
     return STYLES[place % len(STYLES)]
+
+
+def _by(rows: Sequence[Row], key: str) -> dict[str, list[Row]]:
+    """The rows of each value of a key."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row[key], []).append(row)
+    return groups

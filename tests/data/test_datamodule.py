@@ -7,9 +7,8 @@ import torch
 
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import resolve_reflectance
-from r2flow.data.plans import plan_files
 from r2flow.data.prepared import PreparedScans
-from r2flow.data.preparing import Preparation
+from r2flow.data.preparing import Preparation, plan_files
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
@@ -119,7 +118,7 @@ def test_a_mixture_can_hold_out_another_data_set(tmp_path: Path):
 def shares(data: ScanDataModule) -> list[float]:
     """The part of 2,000 images that each of two parts has."""
     order = data._order(data.training_source)
-    size = data.training_source.sizes[0]
+    size = len(data.training_source.parts[0])
     first = sum(order[k] < size for k in range(2000)) / 2000
     return [first, 1 - first]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.data.loader import FixedSampler, FlowDataset, Permutations, RunLoader, RunSampler
+from r2flow.data.loader import FlowDataset, Permutations, RunLoader, RunSampler, fixed_batches
 from r2flow.data.sources import ScanSource
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
@@ -70,5 +70,5 @@ def test_workers_change_nothing():
 
 
 def test_validation_covers_every_scan_once_over_the_ranks():
-    seen = [key for rank in range(3) for batch in FixedSampler(10, 4, rank, 3) for key in batch]
+    seen = [key for rank in range(3) for batch in fixed_batches(10, 4, rank, 3) for key in batch]
     assert sorted(seen) == [(i, i) for i in range(10)]

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.data.manifest import read_manifest
 from r2flow.data.opening import open_prepared
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairSource, make_pairs
-from r2flow.data.plans import Plan, plan_files
-from r2flow.data.prepared import check_prepared
-from r2flow.data.preparing import Preparation
+from r2flow.data.prepared import check_prepared, read_manifest
+from r2flow.data.preparing import Plan, Preparation, plan_files
 from r2flow.data.shards import PairStore
 from r2flow.data.sources import read_scan
 from r2flow.generators import Field

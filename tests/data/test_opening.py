@@ -13,6 +13,7 @@ from r2flow.data.opening import (
     SAMPLES,
     SOURCES,
     open_scans,
+    open_source,
     own_reading,
     resolve_reflectance,
     usual_reading,
@@ -20,8 +21,8 @@ from r2flow.data.opening import (
 )
 from r2flow.data.options import PairOptions, SourceOptions
 from r2flow.data.pairs import PairSource, make_pairs, pair_noise
-from r2flow.data.plans import plan_files
-from r2flow.data.preparing import Preparation
+from r2flow.data.preparing import Preparation, plan_files
+from r2flow.data.sets import ScanSet
 from r2flow.data.shards import PairStore
 from r2flow.data.sources import Reading, ScanSource
 from r2flow.errors import InputError
@@ -74,8 +75,8 @@ class TestNames:
         assert numbers(scans) == list(range(12))
 
     def test_options_of_a_run(self, numbered: Path):
-        scans = open_scans(SourceOptions("folder", str(numbered)), READING)
-        assert numbers(scans) == list(range(12))
+        source = open_source(SourceOptions("folder", str(numbered)), READING)
+        assert numbers(ScanSet("", source, SENSOR)) == list(range(12))
 
     def test_one_file_of_each_scan_is_taken(self, tmp_path: Path):
         write_scan(tmp_path / "a.bin", 1)

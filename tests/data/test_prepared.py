@@ -19,11 +19,9 @@ import torch
 from r2flow.data import preparing
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive
-from r2flow.data.manifest import read_manifest
 from r2flow.data.opening import find_drives, open_prepared
-from r2flow.data.plans import Plan, plan_files, plan_simulated
-from r2flow.data.prepared import PreparedScans, check_prepared
-from r2flow.data.preparing import Preparation
+from r2flow.data.prepared import PreparedScans, check_prepared, read_manifest
+from r2flow.data.preparing import Plan, Preparation, plan_files, plan_simulated
 from r2flow.data.quantise import RangeCodes, ReflectanceCodes, find_levels
 from r2flow.data.sources import Reading, ScanFiles, SimulatedScans
 from r2flow.data.store import MANIFEST
@@ -32,6 +30,7 @@ from r2flow.lidar.encoding import FORMATS, Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from tests.data.conftest import write_scan
+from tests.killing import MOMENTS, die_at, wait_until, was_killed
 
 SMALL = SENSORS["hdl64e"].resized(4, 16)
 MILLIMETRE = 1e-3
@@ -84,7 +83,7 @@ def test_ranges_are_within_a_millimetre_below_65_m(sensor: Sensor, far: float | 
     codes = RangeCodes(near, far)
     r = np.concatenate([np.random.default_rng(0).uniform(near, far, 50_000), [near, 65.0, far]]).astype(np.float32)
     r = r.clip(codes.near, codes.far)
-    decoded = codes.metres[codes.encode(r)]
+    decoded = codes.values[codes.encode(r)]
     error = np.abs(decoded.astype(np.float64) - r)
     assert error[r < 65].max() <= MILLIMETRE
     # Beyond, at worst half of what is left of the codes: (500 - 65) m over some 31,000 of them.
@@ -95,10 +94,10 @@ def test_ranges_are_within_a_millimetre_below_65_m(sensor: Sensor, far: float | 
 
 def test_code_0_is_no_return_and_nothing_else_is(sensor: Sensor):
     codes = RangeCodes(sensor.min_range, sensor.max_range)
-    assert codes.metres[0] == 0
-    assert codes.metres[1:].min() == np.float32(sensor.min_range)
+    assert codes.values[0] == 0
+    assert codes.values[1:].min() == np.float32(sensor.min_range)
     assert codes.encode(np.array([0, sensor.min_range, sensor.max_range], np.float32)).tolist() == [0, 1, 65535]
-    assert (np.diff(codes.metres[1:]) > 0).all()
+    assert (np.diff(codes.values[1:]) > 0).all()
 
 
 @pytest.mark.parametrize("wrong", [1.0, 81.0, -2.0, np.nan, np.inf])
@@ -224,7 +223,7 @@ def test_encoded_is_the_encoding_of_the_decoded_bit_for_bit_in_every_code(
 ):
     sensor = SENSORS["hdl64e"]
     plan = plan_simulated(1, 0, sensor.resized(2, 4), levels=100)
-    metres = RangeCodes(sensor.min_range, sensor.max_range).metres.reshape(64, 1024)
+    metres = RangeCodes(sensor.min_range, sensor.max_range).values.reshape(64, 1024)
     values = np.random.default_rng(0).permutation(np.arange(65536) % 101).reshape(64, 1024) / np.float32(100)
     image = np.stack([metres, np.where(metres > 0, values, 0).astype(np.float32)])
     recipe = replace(plan.recipe, sensor={**plan.recipe.sensor, "elevations": list(sensor.elevations), "columns": 1024})
@@ -302,7 +301,7 @@ def test_splits_and_drives_are_those_of_the_data_set(kitti_360: Path, tmp_path: 
         assert prepared.names == raw.names
         for index in (0, len(raw) - 1):
             assert np.abs(prepared[index][0] - raw[index][0]).max() <= MILLIMETRE
-    with pytest.raises(InputError, match=r"no split named 'best' in prepared kitti_360 scans; known: train, test"):
+    with pytest.raises(InputError, match=r"no split named 'best'; known: train, test"):
         open_prepared(tmp_path / "out", SMALL, split="best")
     with pytest.raises(InputError, match="no drive named '7'"):
         open_prepared(tmp_path / "out", SMALL, drives=[7])
@@ -345,8 +344,7 @@ def test_settings_by_which_nothing_was_made_can_be_mended_in_the_same_folder(clo
 
 def test_a_folder_in_which_another_process_makes_its_first_shard_is_not_taken_from_it(clouds: Path, tmp_path: Path):
     slow = in_process(tmp_path, plan_of(clouds), seconds=30)
-    while not (tmp_path / "making" / "000000.lock").exists():
-        time.sleep(0.005)
+    wait_until((tmp_path / "making" / "000000.lock").exists)
     with pytest.raises(InputError, match=r"holds other scans: convention is centre there, reference here"):
         make(tmp_path, plan_of(clouds, convention="reference"))
     os.kill(slow, signal.SIGKILL)
@@ -422,12 +420,27 @@ class Slow:
         return self.source[index]
 
 
-def in_process(folder: Path, plan: Plan, seconds: float = 0.0, **options) -> int:
-    """`make` in a child of its own, with scans that take their time: its process id."""
+class Stopped(Slow):
+    """The same scans, stopped by the user before one of them."""
+
+    def __init__(self, source, last: int) -> None:
+        super().__init__(source, 0)
+        self.last = last
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        if index == self.last:
+            raise KeyboardInterrupt
+        return super().__getitem__(index)
+
+
+def in_process(folder: Path, plan: Plan, seconds: float = 0.0, dies: tuple[int, bool] | None = None, **options) -> int:
+    """`make` in a child of its own, with scans that take their time and perhaps a moment to die: its process id."""
     child = os.fork()
     if child == 0:
         try:
             torch.set_num_threads(1)
+            if dies:
+                die_at(*dies)
             make(folder, replace(plan, source=Slow(plan.source, seconds)), patience=0.01, **options)
         except BaseException as error:
             print(repr(error))
@@ -441,19 +454,13 @@ def test_worker_processes_make_the_same_bytes(clouds: Path, tmp_path: Path):
     assert files(make(tmp_path / "two", plan_of(clouds), workers=2)) == files(one)
 
 
-def test_killed_at_random_moments_the_same_command_ends_alike(clouds: Path, tmp_path: Path):
+def test_killed_again_and_again_the_same_command_ends_alike(clouds: Path, tmp_path: Path):
     plan = plan_of(clouds, shard_scans=1)
     one = files(make(tmp_path / "one", plan))
-    draw, folder = random.Random(0), tmp_path / "killed"
-    killed, kept = 0, []
-    for _ in range(8):
-        child = in_process(folder, plan, seconds=0.03)  # a third of a second for all
-        time.sleep(draw.uniform(0.01, 0.1))
-        os.kill(child, signal.SIGKILL)
-        _, status = os.waitpid(child, 0)
-        killed += os.WIFSIGNALED(status)
+    folder, kept = tmp_path / "killed", []
+    for dies in MOMENTS:
+        assert was_killed(in_process(folder, plan, dies=dies))
         kept.append(len(list(folder.glob("scans-*"))))
-    assert killed >= 3  # the others had come to their end
     assert kept == sorted(kept)  # what was whole stays
     (folder / ".scans-000002.safetensors.abc.part").write_bytes(b"half")  # as one of them may have left it
     make(folder, plan)
@@ -484,8 +491,7 @@ def test_who_waits_takes_over_from_who_is_killed(clouds: Path, tmp_path: Path):
     plan = plan_of(clouds, shard_scans=10)
     one = files(make(tmp_path / "one", plan))
     slow = in_process(tmp_path / "two", plan, seconds=30)
-    while not (tmp_path / "two" / "making" / "000000.lock").exists():
-        time.sleep(0.005)
+    wait_until((tmp_path / "two" / "making" / "000000.lock").exists)
     other = in_process(tmp_path / "two", plan)
     time.sleep(0.05)
     os.kill(slow, signal.SIGKILL)
@@ -727,11 +733,8 @@ def test_a_damaged_shard_whose_files_have_changed_is_not_mended(tmp_path: Path):
 def test_a_damaged_note_of_an_unfinished_preparation_is_no_harm(clouds: Path, tmp_path: Path):
     plan = plan_of(clouds)
     one = files(make(tmp_path / "one", plan))
-    work = Preparation(tmp_path / "two", plan)
-    work.begin()
-    claims = preparing._Claims(work, [0, 1, 2])
-    work._make_claimed(claims, "error", 0, lambda scans: None)
-    claims.release()
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "two", replace(plan, source=Stopped(plan.source, 9)))
     (tmp_path / "two" / "making" / "000000.json").write_text('{"recipe": 1')
     _cut(tmp_path / "two" / "scans-000001.safetensors")
     assert Preparation(tmp_path / "two", plan).begin() == [0, 1, 3]
@@ -740,10 +743,8 @@ def test_a_damaged_note_of_an_unfinished_preparation_is_no_harm(clouds: Path, tm
 
 def test_shards_of_another_recipe_are_not_taken_for_these(clouds: Path, tmp_path: Path):
     one = files(make(tmp_path / "one", plan_of(clouds)))
-    other = Preparation(tmp_path / "two", plan_of(clouds, convention="reference"))
-    other.begin()
-    claims = preparing._Claims(other, [0, 1])
-    other._make_claimed(claims, "error", 0, lambda scans: None)
-    claims.release()
+    other = plan_of(clouds, convention="reference")
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "two", replace(other, source=Stopped(other.source, 6)))
     (tmp_path / "two" / MANIFEST).unlink()
     assert files(make(tmp_path / "two", plan_of(clouds))) == one

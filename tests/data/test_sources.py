@@ -45,7 +45,7 @@ def test_memory_holds_what_the_files_give(numbered: Path):
     # The same length and order either way, or a run could not go on with other memory.
     (numbered / "000003.bin").write_bytes(b"")
     source = files(numbered, on_bad_scan="skip")
-    kept = InMemory(source)
+    kept = InMemory(source.batch(range(12)).numpy(), source.names)
     assert ranges(kept) == ranges(source) == [0, 1, 2, 4, 4, 5, 6, 7, 8, 9, 10, 11]
     assert ranges(kept.subset([2, 3])) == [2, 4]
 

@@ -78,7 +78,7 @@ def test_a_straight_flow_has_no_curvature_however_long_it_is():
 @pytest.mark.parametrize("field", [gaussian, rotation])
 def test_one_pass_finds_the_integral_of_s(field):
     once, twice = curvature(field, X_0, steps=64), straightness(field, X_0, steps=64)
-    torch.testing.assert_close(once.total, twice.total, rtol=1e-10, atol=0)
+    torch.testing.assert_close(once.total, twice.s.mean(1), rtol=1e-10, atol=0)
     torch.testing.assert_close(once.normalised, twice.s_normalised.mean(1), rtol=1e-10, atol=0)
 
 

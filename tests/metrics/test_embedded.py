@@ -3,17 +3,28 @@
 import hashlib
 import json
 import math
+import shlex
 import tomllib
 
 import numpy as np
 import pytest
 import torch
 
+from benchmarks import train_extractor as training
+from benchmarks.train_extractor import (
+    CLASS_OF_LABEL,
+    IGNORED,
+    Settings,
+    judge,
+    judge_held_out,
+    train,
+    write_weights,
+)
 from r2flow.errors import InputError
 from r2flow.hashing import state_hash
 from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.metrics.extractors import EXTRACTORS, load_extractor, training
+from r2flow.metrics.extractors import EXTRACTORS, load_extractor
 from r2flow.metrics.extractors.embedded import (
     BANDS,
     CHANNELS,
@@ -25,15 +36,6 @@ from r2flow.metrics.extractors.embedded import (
     EmbeddedRange,
     inputs,
     pooled,
-)
-from r2flow.metrics.extractors.training import (
-    CLASS_OF_LABEL,
-    IGNORED,
-    Settings,
-    judge,
-    judge_held_out,
-    train,
-    write_weights,
 )
 from r2flow.metrics.scans import Scans
 from r2flow.simulator import simulate
@@ -201,7 +203,7 @@ def test_the_number_of_simulating_processes_does_not_change_the_weights(small):
 @pytest.mark.parametrize("content", [b"", b"no weights at all", json.dumps({}).encode()])
 def test_a_file_without_extractor_weights_is_refused(tmp_path, content):
     (tmp_path / "x.safetensors").write_bytes(content)
-    with pytest.raises(InputError, match="is not a file of 'r2flow train-extractor'"):
+    with pytest.raises(InputError, match="is not a safetensors file"):
         Embedded.trained(tmp_path / "x.safetensors")
 
 
@@ -211,3 +213,17 @@ def test_settings_name_each_sensor_in_its_turn():
     assert turns[0].shape == (64, 1024)
     assert turns[: len(settings.views)] == turns[len(settings.views) :]
     assert math.prod(turns[1].shape) * 8 == math.prod(turns[0].shape)
+
+
+def test_the_script_trains_judges_and_notes_how_it_is_done_again(tmp_path, small, capsys):
+    out = tmp_path / "new" / "mine.safetensors"
+    common = ["--workers", "0", "--out", str(out)]
+    training.main(["--seed", "1", "--steps", "2", "--batch-size", "2", "--view", "hdl64e 16x64", *common])
+    said = capsys.readouterr().out
+    for words in ("hdl64e 16x64, range and reflectance", "hdl64e 16x64, range alone", "classes", f"{out}: "):
+        assert words in said
+    notes = Embedded.trained(out).notes
+    assert notes["settings"]["steps"] == 2
+    assert set(notes["held_out"]) == {"hdl64e 16x64, range and reflectance", "hdl64e 16x64, range alone"}
+    training.main([*shlex.split(notes["command"])[2:], *common])
+    assert Embedded.trained(out).notes["weights_sha256"] == notes["weights_sha256"]

@@ -3,7 +3,7 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
-from r2flow.metrics.extractors import random_extractor
+from r2flow.metrics.extractors import extractor_class
 from r2flow.metrics.extractors.minkowski import MinkowskiNet
 from r2flow.metrics.extractors.spvcnn import SPVCNN
 from r2flow.metrics.extractors.voxels import mean_by_distance, voxelise
@@ -68,11 +68,11 @@ def test_the_sparse_networks_features_are_of_each_scan_alone(cls):
 
 def test_random_weights_are_the_seed_s():
     before = torch.get_rng_state()
-    one, same, other = (random_extractor("minkowskinet", seed).stem[0].kernel for seed in (1, 1, 2))
+    one, same, other = (extractor_class("minkowskinet").random(seed).stem[0].kernel for seed in (1, 1, 2))
     assert torch.equal(one, same)
     assert not torch.equal(one, other)
     assert torch.equal(torch.get_rng_state(), before)
-    assert random_extractor("minkowskinet").weights == "random"
+    assert extractor_class("minkowskinet").random().weights == "random"
 
 
 @pytest.mark.parametrize("cls", [MinkowskiNet, SPVCNN])

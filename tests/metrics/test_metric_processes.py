@@ -9,7 +9,7 @@ import torch.multiprocessing as mp
 
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.bootstrap import bootstrap
-from r2flow.metrics.extractors import random_extractor
+from r2flow.metrics.extractors import extractor_class
 from r2flow.metrics.frechet import FrechetDistance
 from r2flow.metrics.manifold import Manifold
 from r2flow.metrics.scans import Scans
@@ -30,7 +30,7 @@ def measure(rank, ranks, folder):
     """Figures, remarks and intervals of all metrics, of two generated sets one after the other."""
     from r2flow.metrics import METRICS
 
-    network = random_extractor("embedded")
+    network = extractor_class("embedded").random()
     metrics = [METRICS[name](keep=True, folder=folder / name) for name in PLAIN]
     metrics += [FrechetDistance(network, keep=True, folder=folder), Manifold(network, folder=folder)]
     found = []

@@ -23,7 +23,7 @@ HEADER_LIMIT = 1 << 16  # bytes; a header has a few hundred
 
 
 @dataclass(frozen=True)
-class Field:
+class PointField:
     """`count` numbers of one type under one name."""
 
     name: str
@@ -78,7 +78,7 @@ def point_count(path: Path, count: int) -> int:
     return count
 
 
-def find_roles(path: Path, fields: Sequence[Field]) -> dict[str, int]:
+def find_roles(path: Path, fields: Sequence[PointField]) -> dict[str, int]:
     """Which field holds x, y, z and, where present, reflectance and ring.
 
     Names are compared without case and without CloudCompare's prefix `scalar_`.
@@ -104,7 +104,7 @@ def find_roles(path: Path, fields: Sequence[Field]) -> dict[str, int]:
 
 
 def binary_columns(
-    payload: memoryview, count: int, fields: Sequence[Field], roles: Mapping[str, int]
+    payload: memoryview, count: int, fields: Sequence[PointField], roles: Mapping[str, int]
 ) -> dict[str, np.ndarray]:
     """Views of the wanted columns, (count,) each, of `count` rows in `payload`, whose size has been checked."""
     offsets = list(accumulate((field.nbytes for field in fields), initial=0))
@@ -121,7 +121,7 @@ def binary_columns(
 
 
 def text_columns(
-    path: Path, lines: Sequence[str], fields: Sequence[Field], roles: Mapping[str, int]
+    path: Path, lines: Sequence[str], fields: Sequence[PointField], roles: Mapping[str, int]
 ) -> dict[str, np.ndarray]:
     """The wanted columns, float64 (len(lines),) each, of lines with one point each.
 

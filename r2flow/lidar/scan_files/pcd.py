@@ -10,7 +10,7 @@ import numpy as np
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import lzf
 from r2flow.lidar.scan_files.fields import (
-    Field,
+    PointField,
     binary_columns,
     column_points,
     find_roles,
@@ -80,7 +80,7 @@ def _read_header(path: Path, data: bytes) -> tuple[Header, int]:
     return header, end
 
 
-def _read_fields(path: Path, header: Header) -> list[Field]:
+def _read_fields(path: Path, header: Header) -> list[PointField]:
     names = header["FIELDS"]
     counts = header.get("COUNT", ["1"] * len(names))
     lengths = [len(header["SIZE"]), len(header["TYPE"]), len(counts)]
@@ -96,7 +96,7 @@ def _read_fields(path: Path, header: Header) -> list[Field]:
         number = whole_number(path, f"the COUNT of {name!r} as", count)
         if not number:
             raise InputError(f"{path} declares field {name!r} with COUNT 0. Is it damaged?")
-        fields.append(Field(name, np.dtype(f"<{kind.lower()}{size}"), number))
+        fields.append(PointField(name, np.dtype(f"<{kind.lower()}{size}"), number))
     return fields
 
 

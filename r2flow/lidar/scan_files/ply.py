@@ -8,7 +8,7 @@ import numpy as np
 
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files.fields import (
-    Field,
+    PointField,
     binary_columns,
     column_points,
     find_roles,
@@ -37,8 +37,8 @@ class _Element:
     codes: list[tuple[str, str]] = field(default_factory=list)
     lists: list[str] = field(default_factory=list)
 
-    def fields(self, order: str) -> list[Field]:
-        return [Field(name, np.dtype(order + code)) for name, code in self.codes]
+    def fields(self, order: str) -> list[PointField]:
+        return [PointField(name, np.dtype(order + code)) for name, code in self.codes]
 
     @property
     def nbytes(self) -> int:

@@ -58,12 +58,3 @@ def load_extractor(name: str) -> Extractor:
         InputError: no such name, or weights that are not on this machine; `r2flow weights` says how to get them.
     """
     return extractor_class(name).trained()
-
-
-def random_extractor(name: str, seed: int = 0) -> Extractor:
-    """The network with random weights of a seed, for tests and dry runs: its `weights` are "random".
-
-    Raises:
-        InputError: no such name.
-    """
-    return extractor_class(name).random(seed)

@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
+from r2flow.errors import InputError
 from r2flow.metrics.scans import Scans
 from r2flow.noise import seed_torch
 
@@ -44,11 +45,7 @@ class Extractor(nn.Module):
         Raises:
             InputError: weights of another network.
         """
-        from r2flow.metrics.extractors.weights import fill
-
-        extractor = cls()
-        fill(extractor, tensors)
-        return extractor
+        return cls().filled(tensors)
 
     @classmethod
     def trained(cls) -> Self:
@@ -63,10 +60,35 @@ class Extractor(nn.Module):
 
     @classmethod
     def random(cls, seed: int = 0) -> Self:
-        """The network with random weights of a seed."""
+        """The network with random weights of a seed, for tests and dry runs: its `weights` are "random"."""
         with torch.random.fork_rng(devices=[]):
             seed_torch(seed, "weights")
             return cls().requires_grad_(False).eval()
+
+    def filled(self, tensors: Mapping[str, Tensor]) -> Self:
+        """The network with these parameters, none missing and none left over, in evaluation mode.
+
+        Raises:
+            InputError: parameters of another network, or some that are not finite.
+        """
+        wanted = self.state_dict()
+        # A count of training steps that inference does not read; older files lack it.
+        given = {**{name: value for name, value in wanted.items() if name.endswith("num_batches_tracked")}, **tensors}
+        missing, left = ([name for name in a if name not in b] for a, b in ((wanted, given), (given, wanted)))
+        other = [name for name in wanted if name in given and given[name].shape != wanted[name].shape]
+        if missing or left:
+            found = [f"{len(missing)} of its {len(wanted)} parameters are missing ('{missing[0]}')"] if missing else []
+            wrong = " and ".join([*found, *([f"{len(left)} are none of its own ('{left[0]}')"] if left else [])])
+        elif other:
+            sizes = f"the shape {tuple(given[other[0]].shape)}, not {tuple(wanted[other[0]].shape)}"
+            wrong = f"'{other[0]}' has {sizes}"
+        else:
+            bad = next((name for name in wanted if not given[name].isfinite().all()), None)
+            wrong = f"'{bad}' has values that are not finite" if bad else ""
+        if wrong:
+            raise InputError(f"these are no weights of {self.name}: {wrong}.")
+        self.load_state_dict(given)
+        return self.requires_grad_(False).eval()
 
     @property
     def device(self) -> torch.device:

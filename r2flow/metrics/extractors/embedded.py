@@ -1,13 +1,11 @@
 """The feature network that comes with the package: a small segmentation network for range images of any sensor.
 
-It is trained on simulated scans only (`r2flow train-extractor`), so that a Frechet distance needs no download.
+It is trained on simulated scans only (benchmarks/train_extractor.py), so that a Frechet distance needs no download.
 It is not the field's RangeNet-53, and its distance is no FRD. benchmarks/embedded_ranking.py measures what it ranks
 correctly, docs/metrics.md has the results and its limits.
 """
 
 import hashlib
-import json
-from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -16,8 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.errors import InputError
-from r2flow.metrics.extractors.base import Extractor
+from r2flow.metrics.extractors.base import Extractor, nan_where_empty
+from r2flow.metrics.extractors.weights import read_safetensors
 from r2flow.metrics.scans import Scans
 
 SHIPPED = Path(__file__).with_name("embedded.safetensors")
@@ -50,20 +48,11 @@ def inputs(scans: Scans, reflectance: bool) -> Tensor:
     rise, run = (F.pad(q[:, :, :-1] - q[:, :, 1:], (0, 0, 0, 1)) for q in (height, away))
     both = F.pad(returned[:, :, :-1] & returned[:, :, 1:], (0, 0, 0, 1))
     length = torch.where(both, torch.hypot(rise, run).clamp(min=1e-6), torch.inf)
-    return torch.cat(
-        [
-            torch.log2(r + 1) / 6,
-            returned.to(r),
-            scans.reflectance if reflectance else torch.zeros_like(r),
-            known,
-            height / 4,
-            (e * 4).expand_as(r),
-            torch.asinh(bend * 20) / 4,
-            rise / length,
-            run / length,
-        ],
-        dim=1,
-    )
+    shown = scans.reflectance if reflectance else torch.zeros_like(r)
+    distance, bent = torch.log2(r + 1) / 6, torch.asinh(bend * 20) / 4
+    elevation = (e * 4).expand_as(r)
+    channels = [distance, returned.to(r), shown, known, height / 4, elevation, bent, rise / length, run / length]
+    return torch.cat(channels, dim=1)
 
 
 class Convolution(nn.Module):
@@ -154,28 +143,21 @@ class Embedded(Extractor):
 
     @classmethod
     def trained(cls, path: str | Path = SHIPPED) -> Self:
-        """With the shipped weights, or others that `r2flow train-extractor` wrote.
+        """With the shipped weights, or others that benchmarks/train_extractor.py wrote.
 
         Raises:
             InputError: not such a file.
         """
-        extractor, path = cls(), Path(path)
-        state, extractor.notes = read_weights(path)
-        try:
-            extractor.network.load_state_dict(state)
-        except RuntimeError:
-            raise InputError(
-                f"{path} holds weights of another network; train it again: r2flow train-extractor."
-            ) from None
-        extractor.weights = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
-        return extractor.requires_grad_(False).eval()
+        tensors, notes = read_safetensors(Path(path), "r2flow-extractor")
+        extractor = cls().filled({f"network.{name}": tensor for name, tensor in tensors.items()})
+        extractor.weights, extractor.notes = hashlib.sha256(Path(path).read_bytes()).hexdigest()[:12], notes
+        return extractor
 
     @torch.no_grad()
     def features(self, scans: Scans) -> Tensor:
         """(B, 256), float32: bands x sectors x channels; a row of NaN for a scan without a single return."""
         features = pooled(self.network.map(inputs(scans, self.needs_reflectance)), scans.returned)
-        features[~scans.returned.flatten(1).any(1)] = torch.nan
-        return features
+        return nan_where_empty(features, scans)
 
 
 class EmbeddedRange(Embedded):
@@ -194,19 +176,3 @@ def pooled(x: Tensor, returned: Tensor) -> Tensor:
     """
     share = F.adaptive_avg_pool2d(returned.to(x), (x.shape[2], x.shape[3]))
     return F.adaptive_avg_pool2d(x * share, (BANDS, SECTORS)).movedim(1, -1).flatten(1)
-
-
-def read_weights(path: Path) -> tuple[Mapping[str, Tensor], dict[str, Any]]:
-    """Weights, and the notes of their training.
-
-    Raises:
-        InputError: no such file, or not one of `r2flow train-extractor`.
-    """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt") as file:
-            notes = (file.metadata() or {})["r2flow-extractor"]
-            return {name: file.get_tensor(name) for name in file.keys()}, json.loads(notes)  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError, KeyError):
-        raise InputError(f"{path} is not a file of 'r2flow train-extractor', or a damaged one.") from None

@@ -54,10 +54,7 @@ class Residual(nn.Module):
 class MinkowskiNet(Extractor):
     """FSVD's network; its features are the means of the last map over 16 sectors of distance.
 
-    Args:
-        widths: Channels of the stem, of four levels down and of four up.
-        num_classes: Of the classifier; features are taken before it.
-        channels: Of a voxel.
+    The widths are those of the stem, of four levels down and of four up. Features are taken before the classifier.
     """
 
     name = "minkowskinet"
@@ -92,15 +89,7 @@ class MinkowskiNet(Extractor):
         return self.get_submodule(f"up{level}.1")(x.with_features(torch.cat([x.features, kept.features], 1)))
 
     def forward(self, coords: Tensor, features: Tensor) -> Tensor:
-        """The last map.
-
-        Args:
-            coords: Scan, x, y, z of each voxel, (N, 4), int64, none twice.
-            features: x, y, z in metres and -1, (N, 4).
-
-        Returns:
-            (N, 48), in the order of the voxels.
-        """
+        """The last map, (N, 48), of voxels at scan, x, y, z, (N, 4) int64, with x, y, z in metres and -1, (N, 4)."""
         maps = self.down(self.stem(Sparse(features, VoxelGrid(coords))))
         y = maps[4]
         for level in range(1, 5):
@@ -121,8 +110,6 @@ class MinkowskiNet(Extractor):
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:
-        from r2flow.metrics.extractors.weights import fill
-
         try:
             stem = tensors["stem.0.kernel"]
             down = [tensors[f"stage{level}.1.net.0.kernel"].shape[2] for level in range(1, 5)]
@@ -132,5 +119,4 @@ class MinkowskiNet(Extractor):
             raise InputError(f"these are no weights of {cls.name}: it has other parameters.") from None
         # Files saved in training may also hold parameters of the loss.
         known = {name for name, _ in extractor.named_children()}
-        fill(extractor, {name: tensor for name, tensor in tensors.items() if name.split(".")[0] in known})
-        return extractor
+        return extractor.filled({name: tensor for name, tensor in tensors.items() if name.split(".")[0] in known})

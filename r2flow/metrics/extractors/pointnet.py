@@ -66,11 +66,7 @@ class Cloud(Points):
 
 
 class PointNet(Extractor):
-    """FPD's network; its features are the cloud's and those of the classifier's three layers, concatenated.
-
-    Args:
-        k: Classes of the classifier.
-    """
+    """FPD's network; its features are the cloud's and those of the three layers of a classifier of k classes."""
 
     name = "pointnet"
     layer = "global feature and the classifier's three layers, 1024 + 512 + 256 + 16"

@@ -66,31 +66,22 @@ class Level(nn.Module):
 
 
 class RangeNet(Extractor):
-    """RangeNet of 21 or 53 layers.
-
-    Attributes:
-        layers: 21 or 53.
-        channels: 4 for range, x, y, z; 5 with reflectance.
+    """RangeNet of 21 or 53 layers on range, x, y, z and, where it is needed, reflectance.
 
     Args:
         num_classes: Classes of the segmentation head, None without a head: features are taken before it.
-        mean: Of each channel; what exceeds the number of channels is ignored.
-        std: The same.
+        mean, std: Of each channel; what exceeds the number of channels is ignored.
     """
 
     layers: ClassVar[int]
-    channels: ClassVar[int]
     mean: Tensor
     std: Tensor
 
     def __init__(
-        self,
-        num_classes: int | None = 20,
-        mean: tuple[float, ...] = MEAN,
-        std: tuple[float, ...] = STD,
+        self, num_classes: int | None = 20, mean: tuple[float, ...] = MEAN, std: tuple[float, ...] = STD
     ) -> None:
         super().__init__()
-        channels, blocks = self.channels, BLOCKS[self.layers]
+        channels, blocks = 4 + self.needs_reflectance, BLOCKS[self.layers]
         widths = [32 << level for level in range(6)]
         self.stem = _convolution(nn.Conv2d(channels, widths[0], 3, padding=1, bias=False), widths[0])
         for level in range(1, 6):
@@ -115,10 +106,7 @@ class RangeNet(Extractor):
             InputError: a width that cannot be halved five times.
         """
         if x.shape[-1] % 32:
-            raise InputError(
-                f"RangeNet takes images whose width is a multiple of 32, found {x.shape[-1]} columns; "
-                "project to another size (--size)."
-            )
+            raise InputError(f"RangeNet's width must be a multiple of 32, found {x.shape[-1]}; choose another --size.")
         kept = [self.stem(x)]
         for level in range(1, 6):
             kept.append(self.get_submodule(f"enc{level}")(kept[-1]))
@@ -127,16 +115,13 @@ class RangeNet(Extractor):
             x = self.get_submodule(f"dec{level}")(x) + kept.pop()
         return x
 
-    def image(self, scans: Scans) -> Tensor:
-        """Range, x, y, z and, for a network of five channels, reflectance: (B, 4 or 5, H, W), 0 where missing."""
-        reflectance = [scans.reflectance] if self.needs_reflectance else []
-        return torch.cat([scans.images[:, :1], scans.xyz, *reflectance], 1).to(self.device)
-
     @torch.inference_mode()
     def features(self, scans: Scans) -> Tensor:
         if not len(scans):
             return torch.zeros(0, self.dim, device=self.device)
-        return nan_where_empty(self.pool(self(self.normalise(self.image(scans)))), scans)
+        reflectance = [scans.reflectance] if self.needs_reflectance else []
+        image = torch.cat([scans.images[:, :1], scans.xyz, *reflectance], 1).to(self.device)
+        return nan_where_empty(self.pool(self(self.normalise(image))), scans)
 
     def pool(self, maps: Tensor) -> Tensor:
         """Decoder maps (B, C, H, W) to features (B, D)."""
@@ -144,14 +129,10 @@ class RangeNet(Extractor):
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Self:
-        from r2flow.metrics.extractors.weights import fill
-
         tensors = {translate(name): tensor for name, tensor in tensors.items()}
         head = tensors.get("head.1.bias")
-        mean, std = _normalisation(config, cls.channels) if config else (MEAN, STD)
-        extractor = cls(num_classes=None if head is None else len(head), mean=mean, std=std)
-        fill(extractor, tensors)
-        return extractor
+        mean, std = _normalisation(config, 4 + cls.needs_reflectance) if config else (MEAN, STD)
+        return cls(num_classes=None if head is None else len(head), mean=mean, std=std).filled(tensors)
 
 
 class RangeNet53(RangeNet):
@@ -162,7 +143,6 @@ class RangeNet53(RangeNet):
     dim = 4096
     needs_reflectance = True
     layers = 53
-    channels = 5
 
     def pool(self, maps: Tensor) -> Tensor:
         return subsample(maps, self.dim)
@@ -175,7 +155,6 @@ class RangeNet21(RangeNet):
     layer = "decoder map, mean over 16 bands of rows"
     dim = 512
     layers = 21
-    channels = 4
 
     def pool(self, maps: Tensor) -> Tensor:
         return mean_by_depth(maps)
@@ -195,10 +174,8 @@ def subsample(maps: Tensor, num: int = 4096) -> Tensor:
     """
     flat = maps.flatten(1)
     if flat.shape[1] < num:
-        raise InputError(
-            f"the metric draws {num} values of a map of {maps.shape[1]} x {maps.shape[2]} x {maps.shape[3]}, which has "
-            f"{flat.shape[1]}; project to a larger size (--size)."
-        )
+        size = " x ".join(map(str, maps.shape[1:]))
+        raise InputError(f"the metric draws {num} values of a map of {size}; project to a larger size (--size).")
     return flat[:, torch.tensor(_draw(flat.shape[1], num), device=maps.device)]
 
 
@@ -209,10 +186,8 @@ def mean_by_depth(maps: Tensor, bands: int = BANDS) -> Tensor:
         InputError: a number of rows that is no multiple of the bands.
     """
     if maps.shape[2] % bands:
-        raise InputError(
-            f"the metric takes means over {bands} equal parts of the rows, found {maps.shape[2]}; project to a "
-            f"multiple of {bands} (--size)."
-        )
+        parts = f"{bands} equal parts of the rows, found {maps.shape[2]}"
+        raise InputError(f"the metric takes means over {parts}; project to a multiple of {bands} (--size).")
     return maps.unflatten(2, (bands, -1)).mean((3, 4)).flatten(1)
 
 
@@ -223,8 +198,7 @@ def _normalisation(config: Mapping[str, Any], channels: int) -> tuple[tuple[floa
         mean, std = (tuple(float(value) for value in sensor[key])[:channels] for key in ("img_means", "img_stds"))
     except (KeyError, TypeError, ValueError):
         mean = std = ()
-    finite = all(math.isfinite(value) for value in (*mean, *std))
-    if len(mean) < channels or len(std) < channels or not finite or not all(value > 0 for value in std):
+    if len(mean) < channels or len(std) < channels or not all(map(math.isfinite, mean + std)) or min(std) <= 0:
         raise InputError(f"arch_cfg.yaml must have {channels} finite img_means and img_stds under dataset: sensor.")
     return mean, std
 

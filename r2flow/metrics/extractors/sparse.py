@@ -139,8 +139,7 @@ class SparseConv3d(nn.Module):
     the voxels that these were made from, with the same map read the other way. A kernel of 1 is a matrix.
 
     Args:
-        channels: C_in.
-        out: C_out.
+        channels, out: C_in, C_out.
         size: Voxels of the kernel along each axis.
         stride: 1, or 2 with a kernel of 2.
         transposed: Undo a stride.
@@ -169,9 +168,6 @@ class SparseConv3d(nn.Module):
             coarser = x.grid.coarser()
             return Sparse(convolve(x.features, self.kernel, coarser.inside, len(coarser)), coarser)
         return x.with_features(convolve(x.features, self.kernel, x.grid.around(self.size), len(x.grid)))
-
-    def extra_repr(self) -> str:
-        return f"kernel {tuple(self.kernel.shape)}, stride={self.stride}, transposed={self.transposed}"
 
 
 def convolve(features: Tensor, kernel: Tensor, where: KernelMap, num: int) -> Tensor:

@@ -45,13 +45,7 @@ class SPVCNN(MinkowskiNet):
 
 
 class Corners:
-    """Points with integer coordinates among voxels that are `scale` times as large.
-
-    Args:
-        coords: Scan, x, y, z of each point, (N, 4), int64.
-        grid: The larger voxels, with one around each point.
-        scale: How much larger, along each axis.
-    """
+    """Points at scan, x, y, z, (N, 4) int64, among voxels `scale` times as large, with one around each point."""
 
     def __init__(self, coords: Tensor, grid: VoxelGrid, scale: int) -> None:
         self.num = len(grid)

@@ -14,12 +14,14 @@ import re
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, TypeVar
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor
 
 from r2flow.errors import InputError
@@ -34,14 +36,7 @@ E = TypeVar("E", bound=Extractor)
 
 @dataclass(frozen=True)
 class Source:
-    """A published file of weights.
-
-    Attributes:
-        metric: The distance between its features.
-        page: Where its authors offer it.
-        git_blob: Its id in the git repository that it lies in, the SHA-1 of a short header and the file; None where no
-            hash of it is known.
-    """
+    """A published file of weights: the distance between its features, where its authors offer it, and its id in git."""
 
     metric: str
     page: str
@@ -56,9 +51,8 @@ class Source:
         if path.is_dir() or self.git_blob is None:
             return None
         content = path.read_bytes()
-        return (
-            hashlib.sha1(b"blob %d\0%b" % (len(content), content), usedforsecurity=False).hexdigest() == self.git_blob
-        )
+        blob = b"blob %d\0%b" % (len(content), content)
+        return hashlib.sha1(blob, usedforsecurity=False).hexdigest() == self.git_blob
 
 
 BONN = "http://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models/"
@@ -118,7 +112,7 @@ def kept(name: str) -> InstalledWeights | None:
     path = kept_file(name)
     if not path.exists():
         return None
-    notes = _open(path, with_tensors=False)[1]
+    notes = read_safetensors(path, with_tensors=False)[1]
     return InstalledWeights(notes["weights"], notes["source"], notes["sha256"], notes["published"])
 
 
@@ -136,7 +130,10 @@ def add(name: str, path: Path) -> InstalledWeights:
         raise InputError(f"{path}: {error}") from None
     sha256 = None if path.is_dir() else hashlib.sha256(path.read_bytes()).hexdigest()
     found = InstalledWeights(weights_hash(extractor), path.name, sha256, source.matches(path))
-    _keep(kept_file(name), tensors, {**vars(found), "config": config})
+    whole = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}  # some share their memory
+    notes = json.dumps({**asdict(found), "config": config}, default=str)
+    with atomic_write(kept_file(name)) as file:
+        file.write(save(whole, metadata={"r2flow": notes}))
     return found
 
 
@@ -152,7 +149,7 @@ def read_kept(cls: type[E]) -> E:
             f"no weights of {cls.name} in {path.parent}: get {SOURCES[cls.name].file} and give "
             f"r2flow weights --add {cls.name} FILE (r2flow weights says where from)."
         )
-    tensors, notes = _open(path)
+    tensors, notes = read_safetensors(path)
     extractor = cls.from_tensors(tensors, notes["config"])
     extractor.weights = weights_hash(extractor)
     if extractor.weights != notes["weights"]:
@@ -167,36 +164,6 @@ def weights_hash(extractor: Extractor) -> str:
     return state_hash({**dict(extractor.named_parameters()), **dict(extractor.named_buffers())})[:12]
 
 
-def fill(extractor: Extractor, tensors: Mapping[str, Tensor]) -> None:
-    """Load a network's parameters, by name, none missing and none left over, and put it into evaluation mode.
-
-    Raises:
-        InputError: parameters of another network, or some that are not finite.
-    """
-    wanted = extractor.state_dict()
-    # A count of training steps that inference does not read; older files lack it.
-    counts = {name: value for name, value in wanted.items() if name.endswith("num_batches_tracked")}
-    given = {**counts, **tensors}
-    missing = [name for name in wanted if name not in given]
-    left = [name for name in given if name not in wanted]
-    other = [name for name in wanted if name in given and given[name].shape != wanted[name].shape]
-    if missing or left:
-        found = [f"{len(missing)} of its {len(wanted)} parameters are missing ('{missing[0]}')"] if missing else []
-        found += [f"{len(left)} are none of its own ('{left[0]}')"] if left else []
-        raise InputError(f"these are no weights of {extractor.name}: {' and '.join(found)}.")
-    if other:
-        name = other[0]
-        raise InputError(
-            f"these are no weights of {extractor.name}: '{name}' has the shape {tuple(given[name].shape)}, "
-            f"not {tuple(wanted[name].shape)}."
-        )
-    bad = next((name for name in wanted if not given[name].isfinite().all()), None)
-    if bad:
-        raise InputError(f"the weights of {extractor.name} are damaged: '{bad}' has values that are not finite.")
-    extractor.load_state_dict(given)
-    extractor.requires_grad_(False).eval()
-
-
 def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors by name, and the archive's config, of a file or of an archive or folder of several.
 
@@ -208,77 +175,77 @@ def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if not path.exists():
         raise InputError(f"{path} does not exist; give a file, a .tar.gz or a folder of weights.")
     if path.suffix == ".safetensors":
-        tensors, notes = _open(path)
+        tensors, notes = read_safetensors(path)
         return tensors, notes["config"]
     if not (path.is_dir() or tarfile.is_tarfile(path)):
         with path.open("rb") as file:
-            return _tensors(file, str(path)), {}
-    tensors = {}
-    members = _members(path)
-    for part in PARTS:
-        if part in members:
-            tensors.update(_tensors(io.BytesIO(members[part]), f"{path}: {part}"))
+            return _read_torch(file, str(path)), {}
+    members = _read_members(path)
+    parts = [_read_torch(io.BytesIO(members[part]), f"{path}: {part}") for part in PARTS if part in members]
+    if not parts:
+        raise InputError(f"{path} holds none of {', '.join(PARTS)}; give the archive as it was published.")
     try:
-        config = yaml.safe_load(members[CONFIG]) if CONFIG in members else {}
+        config = yaml.safe_load(members.get(CONFIG, b"{}"))
     except yaml.YAMLError:
-        raise InputError(f"{path}: {CONFIG} is not YAML; is the archive whole?") from None
+        config = None
     if not isinstance(config, dict):
         raise InputError(f"{path}: {CONFIG} is no table of settings; is the archive whole?")
-    if not tensors:
-        raise InputError(f"{path} holds none of {', '.join(PARTS)}; give the archive as it was published.")
-    return tensors, config
+    return {name: tensor for part in parts for name, tensor in part.items()}, config
 
 
-def _members(path: Path) -> dict[str, bytes]:
+def _read_members(path: Path) -> dict[str, bytes]:
     """The files of `PARTS` and `CONFIG` in a folder or a tar archive, by their last name."""
     found: dict[str, bytes] = {}
-
-    def take(name: str, size: int, file: IO[bytes] | None) -> None:
-        last = PurePosixPath(name).name
-        if file is None or last not in (*PARTS, CONFIG):
-            return
-        if last in found:
-            raise InputError(f"{path} holds several networks ('{last}' twice); unpack it and give the folder of one.")
-        if size > LARGEST:
-            raise InputError(f"{path}: {name} is {size / 2**30:.1f} GiB, which is too large for such a network.")
-        found[last] = file.read(LARGEST)
-
     try:
-        if path.is_dir():
-            for child in sorted(path.iterdir()):
-                if child.is_file():
-                    with child.open("rb") as part:
-                        take(child.name, child.stat().st_size, part)
-        else:
-            with tarfile.open(path) as tar:
-                for member in tar:
-                    take(member.name, member.size, tar.extractfile(member) if member.isreg() else None)
-                # A compressed archive ends with a check sum, which is compared when the end is read.
-                while tar.fileobj is not None and tar.fileobj.read(2**20):
-                    pass
+        for name, size, file in _opened(path):
+            last = PurePosixPath(name).name
+            if last not in (*PARTS, CONFIG):
+                continue
+            if last in found:
+                raise InputError(
+                    f"{path} holds several networks ('{last}' twice); unpack it and give the folder of one."
+                )
+            if size > LARGEST:
+                raise InputError(f"{path}: {name} is {size / 2**30:.1f} GiB, which is too large for such a network.")
+            found[last] = file.read(LARGEST)
     except (tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError):
         raise InputError(f"{path} is a damaged archive; get it again.") from None
     return found
 
 
-def _tensors(file: IO[bytes], what: str) -> dict[str, Tensor]:
+def _opened(path: Path) -> Iterator[tuple[str, int, IO[bytes]]]:
+    """Name, size and content of each plain file in a folder or a tar archive."""
+    if path.is_dir():
+        for child in sorted(path.iterdir()):
+            if child.is_file():
+                with child.open("rb") as part:
+                    yield child.name, child.stat().st_size, part
+        return
+    with tarfile.open(path) as tar:
+        for member in tar:
+            if member.isreg() and (content := tar.extractfile(member)) is not None:
+                yield member.name, member.size, content
+        # A compressed archive ends with a check sum, which is compared when the end is read.
+        while tar.fileobj is not None and tar.fileobj.read(2**20):
+            pass
+
+
+def _read_torch(file: IO[bytes], what: str) -> dict[str, Tensor]:
     """The tensors of one of torch's files, by name."""
     _check_sums(file, what)
     try:
         content = torch.load(file, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
+    except Exception as error:  # torch raises many kinds of errors on other files
         held = re.search(r"(?:GLOBAL|Unsupported (?:global|class):?(?: GLOBAL)?) (\S+)", str(error))
-        if held is None:
+        if held is None or not isinstance(error, pickle.UnpicklingError):
             raise InputError(f"{what} is not a file of weights.") from None
         raise InputError(
             f"{what} is refused: it holds objects that would run code when loaded ({held[1]}). Save its 'state_dict' "
             "alone, where you trust it: torch.save(torch.load(FILE, weights_only=False)['state_dict'], 'weights.pth')."
         ) from None
-    except Exception:  # torch raises many kinds of errors on other files
-        raise InputError(f"{what} is not a file of weights.") from None
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         content = content["state_dict"]
-    if not isinstance(content, dict) or not content or not all(_plain(*item) for item in content.items()):
+    if not isinstance(content, dict) or not content or not all(_is_plain(*item) for item in content.items()):
         raise InputError(f"{what} holds no table of tensors.")
     return dict(content)
 
@@ -296,33 +263,25 @@ def _check_sums(file: IO[bytes], what: str) -> None:
     file.seek(0)
 
 
-def _plain(name: object, value: object) -> bool:
+def _is_plain(name: object, value: object) -> bool:
     """Whether it is a name and a dense tensor of real numbers."""
-    return (
-        isinstance(name, str)
-        and isinstance(value, Tensor)
-        and value.layout == torch.strided
-        and not (value.is_meta or value.is_quantized or value.is_complex())
-    )
+    if not isinstance(name, str) or not isinstance(value, Tensor) or value.layout != torch.strided:
+        return False
+    return not (value.is_meta or value.is_quantized or value.is_complex())
 
 
-def _keep(path: Path, tensors: Mapping[str, Tensor], notes: Mapping[str, Any]) -> None:
-    from safetensors.torch import save
+def read_safetensors(
+    path: Path, notes: str = "r2flow", with_tensors: bool = True
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors of a safetensors file, and the notes that are kept with them under a name; those of `add` by default.
 
-    whole = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}  # some share their memory
-    data = save(whole, metadata={"r2flow": json.dumps(dict(notes), default=str)})
-    with atomic_write(path) as file:
-        file.write(data)
-
-
-def _open(path: Path, with_tensors: bool = True) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and notes of a file that `_keep` wrote, or of another safetensors file, which has no notes."""
-    from safetensors import SafetensorError, safe_open
-
+    Raises:
+        InputError: not such a file, or a damaged one.
+    """
     try:
         with safe_open(path, framework="pt") as file:
-            notes = json.loads((file.metadata() or {}).get("r2flow", "{}"))
+            noted = json.loads((file.metadata() or {}).get(notes, "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys() if with_tensors}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError):
         raise InputError(f"{path} is not a safetensors file, or a damaged one.") from None
-    return tensors, {"config": {}, "weights": "", "source": path.name, "sha256": None, "published": None, **notes}
+    return tensors, {"config": {}, "weights": "", "source": path.name, "sha256": None, "published": None, **noted}

@@ -28,11 +28,8 @@ SEED = 0  # of their noise, the same for every flow
 class Cell:
     """One flow at one number of Euler steps.
 
-    Attributes:
-        row: label, role, family, kind, seed, steps, seconds a scan, and each metric's first figure under the metric's
-            name with its interval's `_low` and `_high`.
-        birds_eye: Points from above, of all scans together, (100, 100).
-        images: The first scans, (SHOWN, 2 or 1, H, W).
+    The row has label, role, family, kind, seed, steps, seconds a scan, and each metric's first figure under its name
+    with its interval's `_low` and `_high`. Beside it: points of all scans from above, (100, 100), and the first scans.
     """
 
     row: dict[str, Any]
@@ -42,18 +39,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class CellSettings:
-    """What is the same for all cells.
-
-    Attributes:
-        real: The scans that all are compared with.
-        metrics: By name, `jsd` among them.
-        gathered: Their statistics of the real scans.
-        num: Scans of each flow.
-        bootstrap: Resamples for the intervals of the figures; 0 for none.
-        work: How the work is done.
-        folder: Where finished cells are kept.
-        device: What the networks run on.
-    """
+    """What is the same for all cells: `num` scans of each flow against the real ones, finished cells in the folder."""
 
     real: ScanSet
     metrics: Mapping[str, ScanMetric]
@@ -73,14 +59,12 @@ class CellSettings:
         return self.folder / f"{key}.safetensors"
 
 
-def steps_of(subject: PaperRun, steps: Sequence[int]) -> list[int]:
-    """A distilled flow is measured at its own number of steps only; it was trained for no other."""
-    return list(steps) if subject.steps is None else [subject.steps]
-
-
 def measure_cells(settings: CellSettings, flow: Checkpoint, subject: PaperRun, steps: Sequence[int]) -> Iterator[Cell]:
-    """The cells of one flow, each kept when it is done."""
-    for count in steps_of(subject, steps):
+    """The cells of one flow, each kept when it is done.
+
+    A distilled flow is measured at its own number of steps only; it was trained for no other.
+    """
+    for count in steps if subject.steps is None else [subject.steps]:
         path = settings.path(subject, count)
         cell = _read(path)
         if cell is None:

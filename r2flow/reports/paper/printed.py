@@ -19,13 +19,9 @@ COLUMNS = {
 
 
 class Printed(NamedTuple):
-    """A row of table I.
+    """A row of table I: the role is "1-RF", ... for the paper's own flows, None for others' methods.
 
-    Attributes:
-        method: As the paper names it.
-        role: "1-RF", "2-RF", "1-TD", ... for the paper's own flows, None for others' methods.
-        evaluations: NFE.
-        figures: In the order of `COLUMNS`, with its factors; None where the paper has none.
+    The figures stand in the order of `COLUMNS`, with its factors; None where the paper has none.
     """
 
     method: str

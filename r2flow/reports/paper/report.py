@@ -19,9 +19,9 @@ from r2flow.generators import Sampler
 from r2flow.inversion import Interpolation, interpolate_scans
 from r2flow.metrics.base import ScanMetric
 from r2flow.reports.compare import cost
-from r2flow.reports.curvature import Paths, measure_paths
+from r2flow.reports.curvature import measure_paths
 from r2flow.reports.pages import Page
-from r2flow.reports.paper.cells import SEED, Cell, CellSettings, counts_of, measure_cells
+from r2flow.reports.paper.cells import SEED, CellSettings, counts_of, measure_cells
 from r2flow.reports.paper.figures import marginals_apart
 from r2flow.reports.paper.page import PaperResults, paper_page
 from r2flow.reports.paper.subjects import PaperRun
@@ -32,14 +32,12 @@ FRAMES = 6  # of figure 3, as in the paper: both ends' round trips and four betw
 
 @dataclass(frozen=True)
 class Budget:
-    """How much is measured.
+    """How much is measured: `num` scans of each flow and number of steps, intervals from `bootstrap` resamplings.
 
     Attributes:
-        num: Scans of each flow and number of steps.
         steps: Euler steps of the flows that are not distilled.
         curved: Scenes whose paths are followed for figure 8; 0 leaves it out.
         repeats: Timed evaluations of each network for table II; 0 leaves latency out.
-        bootstrap: Resamplings for intervals.
         tolerance: Of dopri5 in the inversion of figure 3; None leaves it out.
     """
 
@@ -51,23 +49,11 @@ class Budget:
     tolerance: float | None
 
 
-@dataclass(frozen=True)
-class PaperMetrics:
-    """Which distances are measured.
-
-    Attributes:
-        built: By name; `jsd` is among them.
-        missing: The paper's metrics that are not, and why.
-    """
-
-    built: Mapping[str, ScanMetric]
-    missing: Mapping[str, str]
-
-
 def report(
     subjects: Sequence[PaperRun],
     out: Path,
-    chosen: PaperMetrics,
+    metrics: Mapping[str, ScanMetric],
+    missing: Mapping[str, str],
     budget: Budget,
     work: Work,
     real: ScanSet | None = None,
@@ -78,41 +64,52 @@ def report(
 
     Args:
         subjects: From `find_subjects`.
+        metrics: The distances by name, `jsd` among them.
+        missing: The paper's metrics that are not measured, and why.
         real: The scans to compare with; those that the first 1-RF held out if left out.
 
     Raises:
         InputError: scans that cannot be read, or without the reflectance that a metric needs.
     """
-    metrics = chosen.built
     first = next(one for one in subjects if one.role == "1-RF")
     real = real or held_out(first)
     check_reflectance(metrics, [real])
     gathered = gather_real(metrics, real, work, Cache())
     settings = CellSettings(real, metrics, gathered, budget.num, budget.bootstrap, work, out / "cells", device)
-    cells: list[Cell] = []
-    paths: dict[str, Paths] = {}
-    architectures: list[dict[str, Any]] = []
-    costs: dict[str, dict[str, Any]] = {}
-    between: Interpolation | None = None
     metrics["jsd"].load_real_state(gathered.statistics["jsd"].states)
-    birds_eye = counts_of(metrics["jsd"], "real")
     ends = np.stack([real.source[index] for index in (len(real) // 4, 3 * len(real) // 4)])  # far apart in the set
+    measured = PaperResults(subjects, real, counts_of(metrics["jsd"], "real"), ends)
+    costs: dict[str, dict[str, Any]] = {}
     for subject in subjects:
         flow = load_checkpoint(subject.run, device)
-        own = list(measure_cells(settings, flow, subject, budget.steps))
-        cells += own
+        measured.cells += measure_cells(settings, flow, subject, budget.steps)
         if budget.curved and subject.steps is None:
-            paths[subject.label] = _paths(flow, subject, budget, work)
+            most, label = max(budget.steps), subject.label
+            with work.bar(f"following paths of {label}", 2 * most, "evaluations") as advance:
+                measured.paths[label] = measure_paths(
+                    flow, label, budget.curved, most, SEED, budget.curved, progress=advance
+                )
         if subject.role == "1-RF":
             network = json.dumps(subject.config["backbone"], sort_keys=True)
             if network not in costs:
                 costs[network] = cost(subject.config, budget.repeats, device)
-            architectures.append({**_architecture(subject, own[-1], birds_eye, metrics), **costs[network]})
+            cell = measured.cells[-1]
+            measured.architectures.append({
+                "label": subject.label, "family": subject.family, "seed": subject.seed, "steps": cell.row["steps"],
+                "backbone": subject.backbone, "position": subject.position, "kind": subject.kind,
+                **{name: cell.row.get(name) for name in metrics},
+                "marginals": marginals_apart(cell.birds_eye, measured.birds_eye), **costs[network],
+            })  # fmt: skip
         if subject is first and budget.tolerance is not None and len(real) > 1:
-            between = _interpolation(flow, ends, budget.tolerance, work)
+            measured.between = _interpolate(flow, ends, Sampler("dopri5", tolerance=budget.tolerance), work)
         del flow
-    measured = PaperResults(subjects, real, cells, birds_eye, paths, architectures, ends, between)
-    return paper_page(measured, list(metrics), chosen.missing, budget.num, command, device, {"sampled scans": SEED})
+    return paper_page(measured, list(metrics), missing, budget.num, command, device)
+
+
+def _interpolate(flow: Checkpoint, ends: np.ndarray, sampler: Sampler, work: Work) -> Interpolation:
+    """Figure 3, between two scans, (2, 2 or 1, H, W)."""
+    with work.bar("interpolating figure 3", FRAMES) as advance:
+        return interpolate_scans(flow, torch.from_numpy(ends), FRAMES, sampler, arrived=lambda _: advance())
 
 
 def held_out(subject: PaperRun) -> ScanSet:
@@ -120,8 +117,7 @@ def held_out(subject: PaperRun) -> ScanSet:
     config = read_config(subject.run) or subject.config  # the folder's own knows where the scans have moved
     flow = load_checkpoint(subject.run)
     data = {**config["data"], "validation": {**(config["data"].get("validation") or {}), "scans": 10**9}}
-    module = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **data)
-    _, held = module.sources()
+    _, held = ScanDataModule(flow.sensor, flow.encoding, config["seed"], **data).sources()
     where = config["data"]["name"]
     # The run's seed is that of its simulated scenes, whose names are the same for every seed.
     identity = {
@@ -137,26 +133,3 @@ def _placeless(data: Mapping[str, Any]) -> dict[str, Any]:
     return {
         key: _placeless(value) if isinstance(value, Mapping) else value for key, value in data.items() if key != "root"
     }
-
-
-def _paths(flow: Checkpoint, subject: PaperRun, budget: Budget, work: Work) -> Paths:
-    with work.bar(f"following paths of {subject.label}", 2 * max(budget.steps), "evaluations") as advance:
-        return measure_paths(
-            flow, subject.label, budget.curved, max(budget.steps), SEED, budget.curved, progress=advance
-        )
-
-
-def _architecture(subject: PaperRun, cell: Cell, real: np.ndarray, metrics: Mapping[str, ScanMetric]) -> dict[str, Any]:
-    """A row of table II, but for what its network costs."""
-    return {
-        "label": subject.label, "family": subject.family, "seed": subject.seed, "steps": cell.row["steps"],
-        "backbone": subject.backbone, "position": subject.position, "kind": subject.kind,
-        **{name: cell.row.get(name) for name in metrics}, "marginals": marginals_apart(cell.birds_eye, real),
-    }  # fmt: skip
-
-
-def _interpolation(flow: Checkpoint, ends: np.ndarray, tolerance: float, work: Work) -> Interpolation:
-    """Figure 3, between two scans, (2, 2 or 1, H, W)."""
-    with work.bar("interpolating figure 3", FRAMES) as advance:
-        sampler = Sampler("dopri5", tolerance=tolerance)
-        return interpolate_scans(flow, torch.from_numpy(ends), FRAMES, sampler, arrived=lambda _: advance())

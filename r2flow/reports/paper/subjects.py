@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,10 @@ class PaperRun:
     """One run.
 
     Attributes:
-        run: Its folder.
-        label: Its name on the page.
+        run, label: Its folder, and its name on the page.
         role: "1-RF", "2-RF", "2-TD" for one that was distilled from a 2-RF, "2-TD of 1-RF" from another.
         family: The `weights_hash` of the 1-RF that it descends from: flows of one family are one chain.
         weights: Its own `weights_hash`.
-        config: The config that it was trained with.
         steps: k of a k-TD; None for the others.
     """
 
@@ -83,12 +82,10 @@ def find_subjects(folders: Sequence[Path]) -> list[PaperRun]:
 def _read(run: Path, label: str) -> PaperRun:
     """A run by its own config; its family is still its parent's weights, "" without a parent."""
     checkpoint = load_checkpoint(run)
-    config = checkpoint.config
+    config, own = checkpoint.config, checkpoint.generator.sampler
     parent = (config.get("parent") or {}).get("weights", "")
-    stage = config["stage"]["name"]
-    own = checkpoint.generator.sampler
     steps = own.steps if own.fixed else None
-    return PaperRun(run, label, stage, parent, weights_hash(checkpoint), config, steps)
+    return PaperRun(run, label, config["stage"]["name"], parent, weights_hash(checkpoint), config, steps)
 
 
 def _role(one: PaperRun, parent: PaperRun | None) -> str:
@@ -108,10 +105,9 @@ def _check_comparable(subjects: Sequence[PaperRun]) -> None:
     if not any(one.role == "1-RF" for one in subjects):
         raise InputError(f"no 1-RF among the runs: {', '.join(f'{one.label} is {one.role}' for one in subjects)}.")
     first = subjects[0]
-    for one in subjects:
-        for group in ("sensor", "encoding"):
-            if one.config[group] != first.config[group]:
-                raise InputError(
-                    f"{one.label} and {first.label} have another {group}, and distances between such scans mean "
-                    "nothing. Report on them one by one."
-                )
+    for one, group in product(subjects, ("sensor", "encoding")):
+        if one.config[group] != first.config[group]:
+            raise InputError(
+                f"{one.label} and {first.label} have another {group}, and distances between such scans mean nothing. "
+                "Report on them one by one."
+            )

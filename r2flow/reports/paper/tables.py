@@ -15,7 +15,7 @@ PAPER_KIND = "hdit with APE"  # the network of its chains
 
 
 def over_seeds(rows: Sequence[Row], metrics: Sequence[str]) -> list[dict[str, Any]]:
-    """One row for each flow, kind of network and number of evaluations: means over seeds, `_spread` of several."""
+    """One row for each flow, kind of network and number of evaluations: means over seeds, and `METRIC text`."""
     grouped: dict[tuple[str, str, int], list[Row]] = {}
     for row in rows:
         grouped.setdefault((row["role"], row.get("kind", ""), row["steps"]), []).append(row)
@@ -24,37 +24,34 @@ def over_seeds(rows: Sequence[Row], metrics: Sequence[str]) -> list[dict[str, An
         one: dict[str, Any] = {"role": role, "kind": kind, "steps": steps, "n": len(same)}
         one["seconds"] = fmean(row["seconds"] for row in same)
         for metric in metrics:
-            values = [row[metric] for row in same if row.get(metric) is not None]
+            values = _values(same, metric)
             one[metric] = fmean(values) if values else None
-            if len(values) > 1:
-                one[f"{metric}_spread"] = stdev(values)
-            elif f"{metric}_low" in same[0]:
-                one[f"{metric}_interval"] = (same[0][f"{metric}_low"], same[0][f"{metric}_high"])
+            one[f"{metric} text"] = _text(same, metric)
         merged.append(one)
     return merged
 
 
+def _values(rows: Sequence[Row], metric: str) -> list[float]:
+    return [row[metric] for row in rows if row.get(metric) is not None]
+
+
+def _text(rows: Sequence[Row], metric: str) -> str:
+    """Mean ± spread over seeds, or one seed's figure with the bootstrap's interval where it has one."""
+    values = _values(rows, metric)
+    if len(values) > 1:
+        return f"{shown(fmean(values))} ± {shown(stdev(values))}"
+    if values and f"{metric}_low" in rows[0]:
+        return f"{shown(values[0])} ({shown(rows[0][f'{metric}_low'])} to {shown(rows[0][f'{metric}_high'])})"
+    return shown(values[0]) if values else "-"
+
+
 def ours(rows: Sequence[Row], metrics: Mapping[str, str]) -> str:
-    """Every flow at every number of evaluations; mean ± spread over seeds, or the bootstrap's interval of one."""
-    lines = []
-    for row in over_seeds(rows, list(metrics)):
-        cells = {metric: _cell(row, metric) for metric in metrics}
-        lines.append({**{key: row[key] for key in ("role", "kind", "steps", "n", "seconds")}, **cells})
+    """Every flow at every number of evaluations."""
     headings = {
         "role": "flow", "kind": "backbone", "steps": "evaluations", "n": "seeds", "seconds": "seconds a scan",
     }  # fmt: skip
-    return table(lines, {**headings, **metrics})
-
-
-def _cell(row: Row, metric: str) -> str:
-    if row[metric] is None:
-        return "-"
-    if f"{metric}_spread" in row:
-        return f"{shown(row[metric])} ± {shown(row[f'{metric}_spread'])}"
-    if f"{metric}_interval" in row:
-        low, high = row[f"{metric}_interval"]
-        return f"{shown(row[metric])} ({shown(low)} to {shown(high)})"
-    return shown(row[metric])
+    figures = {f"{metric} text": heading for metric, heading in metrics.items()}
+    return table(over_seeds(rows, list(metrics)), headings | figures)
 
 
 def beside(rows: Sequence[Row], metrics: Sequence[str]) -> str:
@@ -69,15 +66,13 @@ def beside(rows: Sequence[Row], metrics: Sequence[str]) -> str:
     lines = []
     for printed in TABLE_I:
         # Our many evaluations may be fewer than the paper's 256.
-        steps = most if printed.evaluations == 256 else printed.evaluations
-        own = mine.get((printed.role, steps)) if printed.role else None
+        own = mine.get((printed.role or "", most if printed.evaluations == 256 else printed.evaluations))
         if own is None:
             continue
         line: dict[str, Any] = {"role": printed.role, "printed": printed.evaluations, "own": own["steps"]}
         for metric, figure in zip(COLUMNS, printed.figures, strict=True):
-            if metric in shared:
-                value = own[metric]
-                line |= {f"{metric} printed": figure, metric: None if value is None else value * COLUMNS[metric][1]}
+            value = own.get(metric)
+            line |= {f"{metric} printed": figure, metric: None if value is None else value * COLUMNS[metric][1]}
         lines.append(line)
     if not lines or not shared:
         return ""
@@ -89,12 +84,10 @@ def beside(rows: Sequence[Row], metrics: Sequence[str]) -> str:
 
 def printed_table() -> str:
     """Table I as the paper has it."""
-    lines = []
-    for one in TABLE_I:
-        cells = zip(COLUMNS, one.figures, strict=True)
-        line: Row = {name: "-" if figure is None else f"{figure:.2f}" for name, figure in cells}
-        lines.append({"method": one.method, "flow": one.role or "", "nfe": one.evaluations, **line})
-    return table(lines, {"method": "method", "flow": "flow", "nfe": "NFE", **{k: v[0] for k, v in COLUMNS.items()}})
+    headings = ("method", "flow", "NFE", *(heading for heading, _ in COLUMNS.values()))
+    cells = [["-" if figure is None else f"{figure:.2f}" for figure in one.figures] for one in TABLE_I]
+    lines = [[one.method, one.role, one.evaluations, *own] for one, own in zip(TABLE_I, cells, strict=True)]
+    return table(lines, headings)
 
 
 def architectures_table(rows: Sequence[Row], metrics: Mapping[str, str]) -> str:
@@ -105,17 +98,12 @@ def architectures_table(rows: Sequence[Row], metrics: Mapping[str, str]) -> str:
     lines = []
     for (kind, parameters), same in grouped.items():
         printed = same_architecture(parameters)
-        line: dict[str, Any] = {
+        lines.append({
             "kind": kind, "n": len(same), "parameters": f"{parameters:,}", "gmac": f"{same[0]['gmac']:.2f}",
             "latency_ms": same[0]["latency_ms"], "gmac_printed": printed and printed.gmac,
             "latency_printed": printed and printed.latency_ms, "frd_printed": printed and printed.frd,
-        }  # fmt: skip
-        for metric in metrics:
-            values = [row[metric] for row in same if row.get(metric) is not None]
-            line[metric] = (
-                f"{shown(fmean(values))} ± {shown(stdev(values))}" if len(values) > 1 else (values or [None])[0]
-            )
-        lines.append(line)
+            **{metric: _text(same, metric) for metric in metrics},
+        })  # fmt: skip
     columns = {
         "kind": "backbone", "n": "seeds", "parameters": "parameters", "gmac": "GMAC", "gmac_printed": "paper",
         "latency_ms": "ms an evaluation", "latency_printed": "paper", **metrics, "frd_printed": "FRD, paper",
@@ -146,32 +134,23 @@ def differences(
 
     Args:
         data: What the flows were trained on, in words.
-        real: Scans that were compared to.
-        generated: Scans of each flow.
-        shape: (H, W).
+        real, generated: Scans that were compared to, and of each flow.
         parameters: Of the 1-RFs' networks.
         images: That each 1-RF was trained on, repeats counted.
         missing: Metrics of the paper that were not computed, and why.
-    """  # fmt: skip
-    said = [f"**Data:** {data}; the paper: KITTI-360, drives 3 4 5 6 7 9 10."]
-    if real != REAL or generated != SCANS:
-        said.append(
-            f"**Scans compared:** {generated:,} generated against {real:,} real ones; the paper: {SCANS:,} against "
-            f"{REAL:,}. Distances between small sets come out larger."
-        )
-    if shape != SIZE:
-        said.append(f"**Image:** {shape[0]} x {shape[1]}; the paper: {SIZE[0]} x {SIZE[1]}.")
+    """
     others = sorted({count for count in parameters if same_architecture(count) is None})
-    if others:
-        said.append(
-            f"**Network:** {', '.join(f'{count:,}' for count in others)} parameters; the paper's HDiT: 80,908,420."
-        )
-    if images and min(images) < IMAGES:
-        low, high = f"{min(images):,}", f"{max(images):,}"
-        said.append(
-            f"**Budget:** {low if low == high else f'{low} to {high}'} training images a 1-RF; the paper: {IMAGES:,}."
-        )
+    least, most = min(images, default=IMAGES), max(images, default=IMAGES)
+    seen = f"{least:,}" if least == most else f"{least:,} to {most:,}"
+    said = {
+        f"**Data:** {data}; the paper: KITTI-360, drives 3 4 5 6 7 9 10.": True,
+        f"**Scans compared:** {generated:,} generated against {real:,} real ones; the paper: {SCANS:,} against "
+        f"{REAL:,}. Distances between small sets come out larger.": (real, generated) != (REAL, SCANS),
+        f"**Image:** {shape[0]} x {shape[1]}; the paper: {SIZE[0]} x {SIZE[1]}.": shape != SIZE,
+        f"**Network:** {', '.join(f'{count:,}' for count in others)} parameters; the paper's HDiT: 80,908,420.": others,
+        f"**Budget:** {seen} training images a 1-RF; the paper: {IMAGES:,}.": least < IMAGES,
+    }
     for why in dict.fromkeys(missing.values()):
         names = ", ".join(COLUMNS[name][0].split()[0] for name in missing if missing[name] == why)
-        said.append(f"**{names}:** not computed: {why}")
-    return said
+        said[f"**{names}:** not computed: {why}"] = True
+    return [sentence for sentence, differs in said.items() if differs]

@@ -1,7 +1,14 @@
-"""Training of the embedded extractor on simulated scans with their labels."""
+"""Train the embedded extractor on simulated scans with their labels: the same seed gives the same weights, bit for bit.
 
+    python benchmarks/train_extractor.py --seed 7001 --out embedded.safetensors
+
+Without --view, sensors and sizes take turns, as for the shipped weights. --out and --workers change no weight.
+"""
+
+import argparse
 import hashlib
 import json
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,6 +28,9 @@ from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.metrics.extractors.embedded import CLASSES, REFLECTANCE, SegmentationNetwork, inputs
 from r2flow.metrics.scans import Scans
 from r2flow.noise import generator, seed_torch
+from r2flow.progress import Bar
+from r2flow.reports.pages import prepare_folder
+from r2flow.reports.tables import print_table
 from r2flow.simulator import simulate
 from r2flow.stages.base import learning_rate_factor
 
@@ -63,12 +73,12 @@ class Settings:
         return build_sensor(name, rows, columns)
 
     def command(self) -> str:
-        """The command that trains them; --out and --workers do not change the weights."""
-        words = f"r2flow train-extractor --seed {self.seed} --steps {self.steps} --batch-size {self.batch_size}"
-        if self.views == VIEWS:
-            return words
-        name, _, size = self.views[0].partition(" ")
-        return f"{words} --sensor {name} --size {size}"
+        """The command that trains them."""
+        words = ["python", "benchmarks/train_extractor.py", "--seed", self.seed, "--steps", self.steps]
+        words += ["--batch-size", self.batch_size]
+        if self.views != VIEWS:
+            words += [word for view in self.views for word in ("--view", view)]
+        return shlex.join(map(str, words))
 
     def simulator(self) -> str:
         """The simulator's version: 12 digits of the SHA-256 of one scan."""
@@ -225,3 +235,27 @@ def judge(network: SegmentationNetwork, scans: Scans, classes: Tensor, reflectan
         "mean_iou": float((hit / union)[there].mean()),
         "classes": int(there.sum()),
     }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="The .safetensors to write.")
+    parser.add_argument("--seed", type=int, default=0, help="Of scenes, initial weights and augmentation.")
+    parser.add_argument("--steps", type=int, default=1500, help="Optimiser steps.")
+    parser.add_argument("--batch-size", type=int, default=4, help="Scans of a step, each seen once.")
+    parser.add_argument("--view", action="append", help="Sensor and size, as 'hdl64e 16x64'; may be repeated.")
+    parser.add_argument("--workers", type=int, default=1, help="Processes that simulate.")
+    given = parser.parse_args(arguments)
+    prepare_folder(given.out.parent)
+    settings = Settings(given.seed, given.steps, given.batch_size, tuple(given.view or VIEWS))
+    with Bar("training", settings.steps, "steps") as advance:
+        network = train(settings, given.workers, advance)
+    judged = judge_held_out(network, settings)
+    write_weights(given.out, network, settings, judged)
+    rows = [(view, figures["accuracy"], figures["mean_iou"], figures["classes"]) for view, figures in judged.items()]
+    print_table(rows, ("held-out simulated scans", "accuracy", "mean IoU", "classes"))
+    print(f"{given.out}: {given.out.stat().st_size / 2**20:.2f} MiB")
+
+
+if __name__ == "__main__":
+    main()
