@@ -53,7 +53,7 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
     return built
 
 
-def keep_checkpoints(folder: Path, every: Count = 1000) -> list[Callback]:
+def keep_checkpoints(folder: Path, every: Count = 100) -> list[Callback]:
     """A checkpoint every `every` steps and one at the last step; the newest two are kept."""
     common: dict[str, Any] = {
         "dirpath": folder,

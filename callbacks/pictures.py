@@ -23,7 +23,7 @@ class SamplePictures(Periodic):
     """
 
     def __init__(
-        self, folder: str | Path, seed: int, every: Natural = 1000, num: Count = 4, steps: Count | None = None
+        self, folder: str | Path, seed: int, every: Natural = 500, num: Count = 4, steps: Count | None = None
     ) -> None:
         super().__init__(every)
         self.folder, self.seed, self.num, self.steps = Path(folder), seed, num, steps

@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from r2flow.backbones import BACKBONES
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Sensor, build_sensor
-from r2flow.registry import did_you_mean
+from r2flow.registry import did_you_mean, options_of
 
 ARCHITECTURES = {
     "nat_hdit": "hdit",
@@ -19,7 +20,7 @@ ARCHITECTURES = {
     "efficient_unet": "efficient_unet",
 }
 THEIR_POSITIONS = {"learnable": "learnable_embedding", "polar": "polar_coordinates", "none": None}
-DEFAULTS = {"patch": [1, 4], "window": [3, 9], "ring": True}
+UNSAID = {"patch": [1, 4], "window": [3, 9], "ring": True}
 
 
 def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
@@ -91,13 +92,15 @@ def published_cfg(config: Mapping[str, Any]) -> dict[str, Any]:
         return dict(config["published"])
     sensor, encoding, backbone = (dict(config[key]) for key in ("sensor", "encoding", "backbone"))
     name = backbone["name"]
-    unsaid = [key for key in ("patch", "window", "ring") if backbone.get(key, DEFAULTS[key]) != DEFAULTS[key]]
+    unsaid = [key for key, theirs in UNSAID.items() if backbone.get(key, theirs) != theirs]
     if sensor["name"] != "hdl64e" or name not in ARCHITECTURES.values() or unsaid:
         what = ", ".join(unsaid) or f"sensor {sensor['name']!r} with backbone {name!r}"
         raise InputError(f"the published format cannot say {what}; convert to .safetensors instead.")
     built = build_sensor(sensor["name"], sensor.get("rows"), sensor.get("columns"))
     rows, columns = built.shape
-    position = backbone.get("position", "learnable" if name == "hdit" else "fourier_features")
+    defaults = {key: list(v) if isinstance(v, tuple) else v for key, v in options_of(BACKBONES[name], given=1).items()}
+    backbone = {**defaults, **backbone}
+    position = backbone["position"]
     architecture = next(theirs for theirs, ours in ARCHITECTURES.items() if ours == name)
     return {
         "data": {
@@ -111,13 +114,13 @@ def published_cfg(config: Mapping[str, Any]) -> dict[str, Any]:
         },
         "model": {
             "architecture": architecture,
-            "base_channels": backbone.get("base_channels", 128 if name == "hdit" else 64),
-            "temb_channels": backbone.get("time_channels", 256),
+            "base_channels": backbone["base_channels"],
+            "temb_channels": backbone["time_channels"] or 4 * backbone["base_channels"],
             "channel_multiplier": backbone.get("channel_multiplier", [1, 2, 4, 8]),
-            "num_residual_blocks": backbone.get("depths") or backbone.get("num_residual_blocks", [3, 3, 3, 3]),
-            "attn_num_heads": backbone.get("num_heads", [2, 4, 8, 16] if name == "hdit" else 8),
+            "num_residual_blocks": backbone.get("depths") or backbone["num_residual_blocks"],
+            "attn_num_heads": backbone["num_heads"],
             "coords_encoding": THEIR_POSITIONS.get(position, position),
-            "dropout": backbone.get("dropout", 0.0),
+            "dropout": backbone["dropout"],
             "gn_num_groups": 8,
             "gn_eps": 1e-6,
         },

@@ -23,7 +23,7 @@ from r2flow.callbacks.stopping import Stopping
 from r2flow.checkpoints import checkpoints_of, step_of
 from r2flow.composing import check_keys, compose
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.opening import resolve_reflectance
+from r2flow.data.opening import SOURCES, Layout, Prepared, resolve_reflectance
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, SourceOptions
 from r2flow.data.sources import AUTO
 from r2flow.errors import InputError
@@ -31,8 +31,8 @@ from r2flow.generators import Generator, build_generator
 from r2flow.lineage import Parent, find_parent, inherit
 from r2flow.noise import seed_torch
 from r2flow.plugins import made_with
-from r2flow.registry import Bound, Count, NonNegative, Positive, check_options
-from r2flow.reports.training import check_samples, finish, read_curves
+from r2flow.registry import Bound, Count, Natural, NonNegative, Positive, check_options
+from r2flow.reports.training import finish, read_curves
 from r2flow.runs import check_run, open_run, read_config, run_lock
 from r2flow.stages import build_stage, check_roll
 from r2flow.stages.base import Stage
@@ -54,6 +54,13 @@ EXPECTED_WARNINGS = (
     "The dirpath has changed from.*",
     "Using ModelCheckpoint with manual optimization.*",
 )
+
+
+@dataclass(frozen=True)
+class SampleOptions:
+    """What is drawn when a run is done."""
+
+    num: Natural = 4
 
 
 @dataclass(frozen=True)
@@ -169,8 +176,7 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
 def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
     """The config, completed by what its parent says, after what can be told of it alone."""
     check_trainer(config["trainer"])
-    check_options("samples", check_samples, config["samples"])
-    check_samples(**config["samples"])
+    check_options("samples", SampleOptions, config["samples"])
     with made_with(parent.config if parent else {}, "the run that it starts from"):
         config = inherit(config, asked, parent)
     check_options("data", DataOptions, config["data"])
@@ -184,9 +190,9 @@ def _refuse_unread(data: Mapping[str, Any]) -> None:
     Raises:
         InputError: the options of files with simulated scans, or the other way round.
     """
-    if data["name"] in (PAIRS, MIXED):
-        return
     simulated = data["name"] == SIMULATED
+    if not simulated and (data["name"] in (PAIRS, MIXED) or not isinstance(SOURCES[data["name"]], Layout | Prepared)):
+        return
     usual = SourceOptions()
     unread = {f.name for f in fields(usual)} - {"name", "scenes"} if simulated else {"scenes"}
     wrong = sorted(f"data.{key}" for key in unread if data.get(key, getattr(usual, key)) != getattr(usual, key))

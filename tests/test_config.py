@@ -85,6 +85,20 @@ def test_conf_says_every_option_of_a_constructor(group: str, constructor, option
     assert set(options) - added == known
 
 
+@pytest.mark.parametrize("group", ["callbacks", "data", "data.augment", "data.pairs", *BACKBONES])
+def test_where_conf_and_a_constructor_say_a_default_it_is_the_same(group: str):
+    own = {
+        "callbacks.ema": {"every"},
+        "data": {"batch_size", "name", "validation", "augment", "pairs"},
+    }  # of the budget
+    for name, constructor, options, added in entries():
+        if name == group or name == f"backbone={group}" or (name.startswith(f"{group}.") and group == "callbacks"):
+            defaults = options_of(constructor)
+            for key in set(options) - added - own.get(name, set()):
+                default = list(defaults[key]) if isinstance(defaults[key], tuple) else defaults[key]
+                assert default == options[key] or (key, default) == ("time_channels", None), f"{name}.{key}"
+
+
 def test_the_groups_of_the_default_config_are_files_of_conf():
     for group in ("stage", "backbone", "data", "sensor", "encoding", "trainer", "callbacks"):
         assert choices(group)

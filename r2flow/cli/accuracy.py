@@ -11,7 +11,7 @@ import typer
 
 from r2flow.cli.app import report
 from r2flow.cli.groups import DrawOptions, grouped
-from r2flow.cli.options import OutOption, choose_device
+from r2flow.cli.options import DeviceOption, OutOption, choose_device
 from r2flow.cli.output import command, finish, numbers
 from r2flow.errors import InputError
 
@@ -161,7 +161,7 @@ def savings(
     steps: Annotated[int, typer.Option(min=1, help="AB2 steps of the regions.")] = 16,
     tolerance: Annotated[float, typer.Option(help="Of the checkpoint's adaptive solutions.")] = 1e-3,
     seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto",
+    device: DeviceOption = "auto",
 ) -> None:
     """What a scan need not cost: own steps, leaving early, one step for the straight, regions, single channels."""
     from r2flow.checkpoints import load_checkpoint

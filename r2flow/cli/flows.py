@@ -1,6 +1,7 @@
 """Verbs for trained generators and their backbones."""
 
 from dataclasses import dataclass
+from json import dumps as to_json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -8,7 +9,15 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import DrawOptions, SolverOptions, grouped
-from r2flow.cli.options import CheckpointOption, OutOption, SensorOption, SizeOption, build_sized, choose_device
+from r2flow.cli.options import (
+    CheckpointOption,
+    DeviceOption,
+    OutOption,
+    SensorOption,
+    SizeOption,
+    build_sized,
+    choose_device,
+)
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -92,7 +101,7 @@ def calibrate(
     steps: Annotated[int, typer.Option(min=1, help="Steps of the grid.")] = 8,
     solver: Annotated[str, typer.Option(help="The solver that will use it: euler, ab2, midpoint, ...")] = "euler",
     num: Annotated[int, typer.Option(min=1, help="Scans to find it on.")] = 4,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto",
+    device: DeviceOption = "auto",
 ) -> None:
     """Find the times at which a flow's steps have equal errors: a grid for `r2flow sample --grid`."""
     from r2flow.checkpoints import load_checkpoint
@@ -121,12 +130,7 @@ def info(
     from r2flow.reports.contents import describe, print_contents
 
     contents = describe(checkpoint)
-    if json:
-        import json as encoder
-
-        print(encoder.dumps(contents, indent=2))
-    else:
-        print_contents(contents)
+    print(to_json(contents, indent=2)) if json else print_contents(contents)
 
 
 @app.command(epilog="Example: r2flow convert r2flow-kitti360-1rf.pth 1rf.safetensors")
@@ -148,7 +152,7 @@ def backbones(
     size: SizeOption = None,
     channels: Annotated[int, typer.Option(min=1, help="Channels of the image.")] = 2,
     repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each; 0 leaves the latency out.")] = 3,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, ...")] = "auto",
+    device: DeviceOption = "auto",
     json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
     """Parameters, multiply-accumulates and measured latency of every configuration: the paper's table II."""
@@ -160,9 +164,4 @@ def backbones(
     names = only.split(",") if only else list(configurations())
     rows = backbone_costs(chosen, names, channels, repeats, where)
     measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
-    if json:
-        import json as encoder
-
-        print(encoder.dumps(measured, indent=2))
-    else:
-        print_costs(measured, chosen, where)
+    print(to_json(measured, indent=2)) if json else print_costs(measured, chosen, where)

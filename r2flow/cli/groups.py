@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from r2flow.cli.options import ConventionChoice, ProjectionChoice, ScaleChoice, SensorChoice, SizeOption
+from r2flow.cli.options import ConventionChoice, DeviceOption, ProjectionChoice, ScaleChoice, SensorChoice, SizeOption
 
 if TYPE_CHECKING:
     from r2flow.generators import Sampler
@@ -63,7 +63,7 @@ class WorkOptions:
 
     batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 8
     workers: Annotated[int, typer.Option(min=0, help="Further processes that read scans.")] = 2
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto"
+    device: DeviceOption = "auto"
 
 
 @dataclass(frozen=True)
@@ -91,4 +91,4 @@ class DrawOptions:
     num: Annotated[int, typer.Option(min=1, help="Scans.")] = 4
     seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0
     batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto"
+    device: DeviceOption = "auto"

@@ -7,7 +7,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import SolverOptions, grouped
-from r2flow.cli.options import SETS, CheckpointOption, OutOption, choose_device
+from r2flow.cli.options import SETS, CheckpointOption, DeviceOption, OutOption, choose_device
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class ScanOptions:
         typer.Option(min=1e-6, help="Value in the files that means full reflectance; the training's if left out."),
     ] = None
     batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto"
+    device: DeviceOption = "auto"
 
 
 @app.command(epilog="Example: r2flow invert velodyne/0000000100.bin --checkpoint runs/NAME --out noise")

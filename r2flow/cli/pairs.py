@@ -8,7 +8,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import SolverOptions, grouped
-from r2flow.cli.options import choose_device
+from r2flow.cli.options import DeviceOption, choose_device
 from r2flow.errors import InputError
 
 
@@ -20,7 +20,7 @@ class ShareOptions:
         None
     )
     ranks: Annotated[int | None, typer.Option(min=1, help="Processes that share the work.")] = None
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")] = "auto"
+    device: DeviceOption = "auto"
 
     def place(self) -> tuple[int, int, str]:
         """Rank, processes and device.

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from r2flow.checkpoints import checkpoints_of, find_checkpoint, load_checkpoint
-from r2flow.errors import InputError
 from r2flow.reports.outputs import what_next, write_samples
 
 Curve = tuple[np.ndarray, np.ndarray]
@@ -33,16 +32,6 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
         for name, points in values.items()
         if points
     }
-
-
-def check_samples(num: int = 4) -> None:
-    """Check the number of samples before the training.
-
-    Raises:
-        InputError: a negative number.
-    """
-    if num < 0:
-        raise InputError(f"samples.num must be at least 0, found {num}.")
 
 
 def finish(run: str | Path, samples: Mapping[str, Any], seed: int, device: str, max_steps: int) -> None:
