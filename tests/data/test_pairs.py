@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import random
 import resource
 import signal
 import time
@@ -27,6 +26,7 @@ from r2flow.errors import InputError
 from r2flow.generators import Field
 from r2flow.noise import standard_normal
 from r2flow.reports.pairs import wait_for_others
+from tests.killing import MOMENTS, die_at, was_killed
 
 SHAPE = (2, 4, 8)
 OPTIONS = {"num": 50, "tolerance": 1e-6, "batch_size": 4, "shard_mib": 3 * 4 * 2 * 64 / 2**20, "parent": "abc"}
@@ -86,13 +86,15 @@ def test_any_number_of_processes_writes_the_same_bytes(tmp_path: Path, ranks: in
     assert files(tmp_path / "one") == files(tmp_path / "many")
 
 
-def in_process(folder: Path, rank: int = 0, ranks: int = 1, delay: float = 0.0, num: int = 50) -> int:
-    """make_pairs in a child of its own, with a flow that takes its time: its process id."""
+def in_process(folder: Path, rank: int = 0, ranks: int = 1, dies: tuple[int, bool] | None = None) -> int:
+    """make_pairs in a child of its own, which may die at a moment of `die_at`: its process id."""
     child = os.fork()
     if child == 0:
         try:
             torch.set_num_threads(1)  # a forked OpenMP pool hangs
-            make_pairs(store_in(folder), Field(lambda t, x: time.sleep(delay) or x, SHAPE), num, rank, ranks)
+            if dies:
+                die_at(*dies)
+            make_pairs(store_in(folder), grow, 50, rank, ranks)
         finally:
             os._exit(0)
     return child
@@ -108,18 +110,11 @@ def test_processes_at_once_write_the_same_bytes(tmp_path: Path):
     assert files(tmp_path / "one") == files(tmp_path / "many")
 
 
-def test_killed_at_ten_random_moments_the_same_command_ends_alike(tmp_path: Path):
+def test_killed_again_and_again_the_same_command_ends_alike(tmp_path: Path):
     torch.set_num_threads(1)
     make_pairs(store_in(tmp_path / "one"), grow, 50)
-    draw = random.Random(0)
-    killed = 0
-    for _ in range(10):
-        child = in_process(tmp_path / "killed", delay=2e-3)
-        time.sleep(draw.uniform(0.02, 0.25))
-        os.kill(child, signal.SIGKILL)
-        _, status = os.waitpid(child, 0)
-        killed += os.WIFSIGNALED(status)
-    assert killed >= 3  # the others had come to their end
+    for dies in MOMENTS:
+        assert was_killed(in_process(tmp_path / "killed", dies=dies))
     make_pairs(store_in(tmp_path / "killed"), grow, 50)
     kept = {name: data for name, data in files(tmp_path / "killed").items() if not name.endswith(".part")}
     assert kept == files(tmp_path / "one")

@@ -30,6 +30,7 @@ from r2flow.lidar.encoding import FORMATS, Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from tests.data.conftest import write_scan
+from tests.killing import MOMENTS, die_at, wait_until, was_killed
 
 SMALL = SENSORS["hdl64e"].resized(4, 16)
 MILLIMETRE = 1e-3
@@ -343,8 +344,7 @@ def test_settings_by_which_nothing_was_made_can_be_mended_in_the_same_folder(clo
 
 def test_a_folder_in_which_another_process_makes_its_first_shard_is_not_taken_from_it(clouds: Path, tmp_path: Path):
     slow = in_process(tmp_path, plan_of(clouds), seconds=30)
-    while not (tmp_path / "making" / "000000.lock").exists():
-        time.sleep(0.005)
+    wait_until((tmp_path / "making" / "000000.lock").exists)
     with pytest.raises(InputError, match=r"holds other scans: convention is centre there, reference here"):
         make(tmp_path, plan_of(clouds, convention="reference"))
     os.kill(slow, signal.SIGKILL)
@@ -433,12 +433,14 @@ class Stopped(Slow):
         return super().__getitem__(index)
 
 
-def in_process(folder: Path, plan: Plan, seconds: float = 0.0, **options) -> int:
-    """`make` in a child of its own, with scans that take their time: its process id."""
+def in_process(folder: Path, plan: Plan, seconds: float = 0.0, dies: tuple[int, bool] | None = None, **options) -> int:
+    """`make` in a child of its own, with scans that take their time and perhaps a moment to die: its process id."""
     child = os.fork()
     if child == 0:
         try:
             torch.set_num_threads(1)
+            if dies:
+                die_at(*dies)
             make(folder, replace(plan, source=Slow(plan.source, seconds)), patience=0.01, **options)
         except BaseException as error:
             print(repr(error))
@@ -452,19 +454,13 @@ def test_worker_processes_make_the_same_bytes(clouds: Path, tmp_path: Path):
     assert files(make(tmp_path / "two", plan_of(clouds), workers=2)) == files(one)
 
 
-def test_killed_at_random_moments_the_same_command_ends_alike(clouds: Path, tmp_path: Path):
+def test_killed_again_and_again_the_same_command_ends_alike(clouds: Path, tmp_path: Path):
     plan = plan_of(clouds, shard_scans=1)
     one = files(make(tmp_path / "one", plan))
-    draw, folder = random.Random(0), tmp_path / "killed"
-    killed, kept = 0, []
-    for _ in range(8):
-        child = in_process(folder, plan, seconds=0.03)  # a third of a second for all
-        time.sleep(draw.uniform(0.01, 0.1))
-        os.kill(child, signal.SIGKILL)
-        _, status = os.waitpid(child, 0)
-        killed += os.WIFSIGNALED(status)
+    folder, kept = tmp_path / "killed", []
+    for dies in MOMENTS:
+        assert was_killed(in_process(folder, plan, dies=dies))
         kept.append(len(list(folder.glob("scans-*"))))
-    assert killed >= 3  # the others had come to their end
     assert kept == sorted(kept)  # what was whole stays
     (folder / ".scans-000002.safetensors.abc.part").write_bytes(b"half")  # as one of them may have left it
     make(folder, plan)
@@ -495,8 +491,7 @@ def test_who_waits_takes_over_from_who_is_killed(clouds: Path, tmp_path: Path):
     plan = plan_of(clouds, shard_scans=10)
     one = files(make(tmp_path / "one", plan))
     slow = in_process(tmp_path / "two", plan, seconds=30)
-    while not (tmp_path / "two" / "making" / "000000.lock").exists():
-        time.sleep(0.005)
+    wait_until((tmp_path / "two" / "making" / "000000.lock").exists)
     other = in_process(tmp_path / "two", plan)
     time.sleep(0.05)
     os.kill(slow, signal.SIGKILL)

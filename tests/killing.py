@@ -1,0 +1,39 @@
+"""Processes that kill themselves at a moment that the test chooses, and waiting for others, not for ever."""
+
+import os
+import signal
+import time
+from collections.abc import Callable
+
+# The n-th rename, and whether the process dies before it or after it.
+MOMENTS = [(1, True), (1, False), (2, True), (1, False), (1, True), (2, True), (1, False), (2, False)]
+
+
+def die_at(rename: int, before: bool) -> None:
+    """From now on this process dies, by SIGKILL, at its `rename`-th file: before it has its name, or after."""
+    replace, seen = os.replace, 0
+
+    def dying(source: str, target: str) -> None:
+        nonlocal seen
+        seen += 1
+        if seen == rename and before:
+            os.kill(os.getpid(), signal.SIGKILL)
+        replace(source, target)
+        if seen == rename:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    os.replace = dying
+
+
+def was_killed(child: int) -> bool:
+    """Whether a child process has died by SIGKILL; waits for its end."""
+    _, status = os.waitpid(child, 0)
+    return os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
+
+
+def wait_until(there: Callable[[], bool], seconds: float = 60.0) -> None:
+    """Wait for another process; the test fails when it takes longer."""
+    begin = time.monotonic()
+    while not there():
+        assert time.monotonic() - begin < seconds, f"not there after {seconds} s"
+        time.sleep(0.005)
