@@ -9,7 +9,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 from r2flow.checkpoints import FOLDER
 from r2flow.errors import InputError
-from r2flow.registry import Registry, check_options
+from r2flow.registry import Count, Registry, check_options
 
 from .curvature import Curvature
 from .ema import EMA
@@ -28,13 +28,19 @@ class Entry(NamedTuple):
 
 
 def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
-    """The callbacks that a config's `callbacks` names; null leaves one out."""
+    """The callbacks that a config's `callbacks` names; null leaves one out.
+
+    Raises:
+        InputError: an unknown name or option, or a value that one cannot take.
+    """
     if config["trainer"]["fast_dev_run"]:
         return [Progress()] if config["trainer"]["enable_progress_bar"] else []
     wanted = {name: options for name, options in (config["callbacks"] or {}).items() if options is not None}
     for name, key in (("checkpoint", "enable_checkpointing"), ("progress", "enable_progress_bar")):
         if not config["trainer"][key]:
             wanted.pop(name, None)
+    for name in wanted:
+        CALLBACKS[name]
     built: list[Callback] = []
     for name, entry in CALLBACKS.items():
         if name in wanted:
@@ -47,14 +53,8 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
     return built
 
 
-def keep_checkpoints(folder: Path, every: int = 1000) -> list[Callback]:
-    """A checkpoint every `every` steps and one at the last step; the newest two are kept.
-
-    Raises:
-        InputError: `every` is below 1.
-    """
-    if every < 1:
-        raise InputError(f"callbacks.checkpoint.every must be at least 1, found {every}.")
+def keep_checkpoints(folder: Path, every: Count = 1000) -> list[Callback]:
+    """A checkpoint every `every` steps and one at the last step; the newest two are kept."""
     common: dict[str, Any] = {
         "dirpath": folder,
         "filename": "step-{step:08d}",

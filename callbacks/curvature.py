@@ -2,10 +2,10 @@
 
 import lightning as L
 
-from r2flow.errors import InputError
 from r2flow.flow.straightness import curvature
 from r2flow.generators import Flow
 from r2flow.noise import Draws
+from r2flow.registry import Count, Natural
 
 from .periodic import Periodic
 
@@ -21,15 +21,10 @@ class Curvature(Periodic):
         every: Steps between two measurements; 0 for none.
         num: Scans a measurement.
         steps: Euler steps a scan.
-
-    Raises:
-        InputError: `every` is below 0, `num` or `steps` below 1.
     """
 
-    def __init__(self, seed: int, every: int = 500, num: int = 2, steps: int = 16) -> None:
+    def __init__(self, seed: int, every: Natural = 500, num: Count = 2, steps: Count = 16) -> None:
         super().__init__(every)
-        if num < 1 or steps < 1:
-            raise InputError(f"callbacks.curvature needs num and steps of at least 1, found {num} and {steps}.")
         self.seed, self.num, self.steps = seed, num, steps
 
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:

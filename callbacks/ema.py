@@ -9,7 +9,7 @@ import torch
 from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.registry import Count, Natural, Portion
 
 
 def ema_decay(step: int, warmup: int, highest: float = 0.995, power: float = 2 / 3) -> float:
@@ -31,14 +31,9 @@ class EMA(WeightAveraging):
         every: Steps between two updates.
         warmup_steps: Steps during which the average copies the weights; None takes the stage's
             learning-rate warm-up.
-
-    Raises:
-        InputError: `every` is below 1.
     """
 
-    def __init__(self, decay: float = 0.995, every: int = 10, warmup_steps: int | None = None) -> None:
-        if every < 1:
-            raise InputError(f"callbacks.ema.every must be at least 1, found {every}.")
+    def __init__(self, decay: Portion = 0.995, every: Count = 10, warmup_steps: Natural | None = None) -> None:
         # Buffers are constants here (ray angles, frequencies): averaging them would only cost time.
         super().__init__(use_buffers=False, avg_fn=self._average)
         self.decay, self.every, self.warmup_steps = decay, every, warmup_steps

@@ -15,6 +15,7 @@ from torch.nn.utils import get_total_norm
 
 from r2flow.checkpoints import checkpoints_of
 from r2flow.errors import InputError
+from r2flow.registry import Count, NonNegative
 
 log = logging.getLogger(__name__)
 
@@ -39,14 +40,9 @@ class Guard(L.Callback):
     Attributes:
         in_a_row: Steps skipped since the last that was taken.
         total: Steps skipped in the run, those left out that only moved the loss scale.
-
-    Raises:
-        InputError: `skips` is below 1.
     """
 
-    def __init__(self, run_dir: str | Path, skips: int = 10, lowest_scale: float = 1.0) -> None:
-        if skips < 1:
-            raise InputError(f"callbacks.guard.skips must be at least 1, found {skips}.")
+    def __init__(self, run_dir: str | Path, skips: Count = 10, lowest_scale: NonNegative = 1.0) -> None:
         self.run_dir, self.skips, self.lowest_scale = Path(run_dir), skips, lowest_scale
         self.in_a_row = self.total = 0
         self._losses: list[Tensor] = []

@@ -3,8 +3,6 @@
 import lightning as L
 import torch
 
-from r2flow.errors import InputError
-
 from .ema import averaged_weights
 
 
@@ -13,14 +11,9 @@ class Periodic(L.Callback):
 
     Args:
         every: Steps between two calls; 0 for none.
-
-    Raises:
-        InputError: `every` is below 0.
     """
 
     def __init__(self, every: int) -> None:
-        if every < 0:
-            raise InputError(f"callbacks.{type(self).__name__} needs every of at least 0, found {every}.")
         self.every, self._last = every, 0
 
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:

@@ -6,6 +6,7 @@ import lightning as L
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from r2flow.generators import Generator
+from r2flow.registry import Count, Natural
 from r2flow.sampling import draw
 
 from .periodic import Periodic
@@ -19,13 +20,10 @@ class SamplePictures(Periodic):
         every: Steps between two pictures; 0 for none.
         num: Scans a picture.
         steps: Steps a scan; None for the generator's own sampler.
-
-    Raises:
-        InputError: `every` is below 0.
     """
 
     def __init__(
-        self, folder: str | Path, seed: int, every: int = 1000, num: int = 4, steps: int | None = None
+        self, folder: str | Path, seed: int, every: Natural = 1000, num: Count = 4, steps: Count | None = None
     ) -> None:
         super().__init__(every)
         self.folder, self.seed, self.num, self.steps = Path(folder), seed, num, steps

@@ -8,12 +8,13 @@ import lightning as L
 from lightning.pytorch.callbacks import RichProgressBar
 
 from r2flow.progress import duration
+from r2flow.registry import NonNegative
 
 
 class Progress(RichProgressBar):
     """Lightning's rich bar with scans a second; a line every `seconds` where standard output is no terminal."""
 
-    def __init__(self, seconds: float = 15.0) -> None:
+    def __init__(self, seconds: NonNegative = 15.0) -> None:
         super().__init__(leave=True)
         self.seconds = seconds
         self._begin: tuple[float, int] | None = None

@@ -17,6 +17,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from r2flow.checkpoints import FOLDER, checkpoints_of
 from r2flow.errors import InputError
+from r2flow.registry import Count
 from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening
 
 log = logging.getLogger(__name__)
@@ -35,14 +36,9 @@ class Stopping(L.Callback):
         run_dir: The run's folder.
         every: Steps between two questions to all devices whether one of them was told to stop; a single device
             asks itself at every step.
-
-    Raises:
-        InputError: `every` is below 1.
     """
 
-    def __init__(self, run_dir: str | Path, every: int = 10) -> None:
-        if every < 1:
-            raise InputError(f"callbacks.requeue.every must be at least 1, found {every}.")
+    def __init__(self, run_dir: str | Path, every: Count = 10) -> None:
         self.run_dir, self.every = Path(run_dir), every
         self.job = slurm_job()
         self.told: int | None = None

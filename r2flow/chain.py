@@ -54,8 +54,10 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
         raise InputError("stage.init is each link's own: give +chain.LINK.stage.init=RUN to one of them.")
     links: list[Link] = []
     for name, difference in chain.items():
-        own, parent = dict(difference), difference.get("init")
-        own.pop("init", None)
+        if not isinstance(difference, Mapping):
+            raise InputError(f"chain.{name} must be a group of keys, in which it differs; found {difference!r}.")
+        own = dict(difference)
+        parent = own.pop("init", None)
         overrides = [override(key, value) for key, value in flatten(own) if (key, value) != ("experiment", None)]
         if parent is not None:
             if parent not in [link.name for link in links]:

@@ -91,7 +91,9 @@ def find_checkpoint(path: str | Path) -> Path:
     if path.is_dir():
         found = checkpoints_of(path) or sorted(path.glob("step-*.ckpt"), key=step_of, reverse=True)
         if not found:
-            raise InputError(f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt). Has a run been started there?")
+            runs = sorted(str(one.parent) for one in path.glob(f"*/{FOLDER}") if checkpoints_of(one.parent))
+            hint = f"It holds runs: give {' or '.join(runs[:8])}." if runs else "Has a run been started there?"
+            raise InputError(f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt). {hint}")
         return found[0]
     if not path.is_file():
         raise InputError(f"no checkpoint at {path}. Give a checkpoint file or a run folder.")

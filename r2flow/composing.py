@@ -3,21 +3,25 @@
 import json
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import hydra
 from hydra import initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import OverrideType, Sweep
 from hydra.errors import MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 
-from r2flow.registry import did_you_mean, options_of
+from r2flow.errors import InputError
+from r2flow.registry import Bound, check_options, did_you_mean, options_of
 
 CONF = Path(__file__).resolve().parent / "conf"
 
@@ -38,6 +42,7 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
     Raises:
         HydraException: an unknown key or choice; `explain` has it in a line.
     """
+    overrides = as_hydra_takes(overrides)
     search = (
         [f"hydra.searchpath=[{','.join(f'file://{Path(folder).resolve()}' for folder in folders)}]"] if folders else []
     )
@@ -50,6 +55,40 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
             config = hydra.compose("train", [*overrides, *search], return_hydra_config=True)
         HydraConfig.instance().set_config(config)
         return plain(config)
+
+
+@dataclass(frozen=True)
+class Keys:
+    """The keys at the top of a run's config."""
+
+    stage: Mapping[str, Any]
+    backbone: Mapping[str, Any]
+    sensor: Mapping[str, Any]
+    encoding: Mapping[str, Any]
+    data: Mapping[str, Any]
+    trainer: Mapping[str, Any]
+    callbacks: Mapping[str, Any]
+    samples: Mapping[str, Any]
+    run_dir: Annotated[str, Bound("that names a folder", lambda text: text.strip("/ "))]
+    seed: Annotated[int, Bound("of at least 0 and below 2^63", lambda n: 0 <= n < 2**63)]
+    name: Annotated[str, Bound("of at least one letter", bool)] | int | float = "run"
+    experiment: str | Sequence[str] | None = None
+    generator: Mapping[str, Any] | str | None = None
+    sampler: Mapping[str, Any] | None = None
+    chain: Mapping[str, Any] | None = None
+    loggers: Sequence[str] | str | None = None  # a word is answered by `build_loggers`
+    plugins: Sequence[str] = ()
+    parent: Mapping[str, Any] | None = None
+    scans: Any = None
+
+
+def check_keys(config: Mapping[str, Any]) -> None:
+    """Check what stands at the top of a config.
+
+    Raises:
+        InputError: a key that nothing reads, one that is missing, or a value of another type.
+    """
+    check_options("the config", Keys, config)
 
 
 @contextmanager
@@ -118,14 +157,40 @@ def choices(group: str) -> list[str]:
     return sorted(known | {name.removesuffix(".yaml") for name in stored})
 
 
+def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
+    """Overrides, of which `KEY={name: NAME, ...}` takes the whole place of what was there: it has options of its own.
+
+    Raises:
+        InputError: a group of configs without a choice from it.
+        HydraException: what is not Hydra's grammar.
+    """
+    groups = {path.name for path in CONF.iterdir() if path.is_dir()} - {"hydra"}
+    found: list[str] = []
+    for text, parsed in zip(overrides, OverridesParser.create().parse_overrides(list(overrides)), strict=True):
+        key, value = parsed.key_or_group, parsed.value()
+        if not key:
+            raise InputError(f"{text} names no key: give KEY=VALUE.")
+        if key in groups and (parsed.is_delete() or not isinstance(value, str | list | dict | Sweep) or value == ""):
+            if key == "experiment":  # as it is by itself
+                continue
+            raise InputError(f"{text} leaves the run without its {key}: give one of {', '.join(choices(key))}.")
+        named = isinstance(value, dict) and "name" in value and "." in key and not key.startswith("chain.")
+        found += [f"{key}=null", f"++{text}"] if named and parsed.type == OverrideType.CHANGE else [text]
+    return found
+
+
 def explain(error: Exception) -> str:
     """Hydra's complaint in one line, with the nearest key that exists."""
     text = str(error)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    unknown = re.search(r"Could not override '([^']+)'", text)
+    unknown = re.search(r"Could not (?:override|delete from config\.) '([^']+)'", text)
     if unknown:
-        key = unknown.group(1)
+        within = re.search(r"full_key: (\S+)", str(error.__cause__))  # of a group's value, the key in it
+        key = max(unknown[1], within[1] if within else "", key=len)
         return f"the config has no key '{key}'.{did_you_mean(key, known_keys())} See --cfg job for all of them."
+    missing = re.search(r"Missing mandatory value.*full_key: (\S+)", text, re.DOTALL)
+    if missing:
+        return f"{missing[1]} has no default: give {missing[1]}=VALUE."
     if "Could not find 'hydra/launcher/submitit" in text:
         return "this launcher needs an extra of the project: python -m pip install -e '.[slurm]'"
     choice = re.search(r"Could not find '([^/']+)/([^']+)'", text)

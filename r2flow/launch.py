@@ -13,16 +13,29 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from r2flow.composing import CONF, REGISTRIES, add_choice, add_choices, compose, explain, override, plain
+from r2flow import __version__
+from r2flow.composing import (
+    CONF,
+    REGISTRIES,
+    add_choice,
+    add_choices,
+    as_hydra_takes,
+    check_keys,
+    compose,
+    explain,
+    override,
+    plain,
+)
 from r2flow.errors import InputError, explain_mistake
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.signals import LATER, Stopped, listening, stop_at_once
@@ -52,10 +65,14 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
         # SLURM signals every process of a job: a run answers, a chain waits for it.
         ignored = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
         with listening(stop_at_once), listening(signal.SIG_IGN, ignored):
+            if "--version" in arguments:
+                print(f"r2flow {__version__}")
+                return 0
             arguments, plugins = _plugins_of(list(arguments) or ["experiment=demo"])
             load_plugins(plugins)
             for group in REGISTRIES if plugins else ():
                 add_choices(group)
+            arguments = _checked_arguments(arguments)
             _run_hydra(arguments, functools.partial(_job, arguments, command, failed))
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
@@ -71,7 +88,7 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
         print(f"error: {len(failed) or 'some'} of the sweep's jobs failed: {'; '.join(names)}", file=sys.stderr)
         return 2
     except (HydraException, OmegaConfBaseException) as error:
-        print(f"error: {explain(error)}", file=sys.stderr)
+        print(f"error: {explain(error)}{_forgotten_plugins(arguments)}", file=sys.stderr)
         return 2
     except (InputError, OSError) as error:
         print(f"error: {explain_mistake(error)}", file=sys.stderr)
@@ -88,6 +105,34 @@ def _plugins_of(arguments: list[str]) -> tuple[list[str], list[str]]:
     names = list(dict.fromkeys(name for name in names if name))
     rest = [one for one in others if one not in given]
     return [*rest, *([override("plugins", names)] if names else [])], names
+
+
+def _forgotten_plugins(arguments: Sequence[str]) -> str:
+    """The plug-ins of the run that a command names, where it gives none: its config may name what they hold."""
+    given = dict(one.partition("=")[::2] for one in arguments)
+    run = given.get("run_dir") or f"runs/{given.get('name')}"
+    if "plugins" in given or not Path(run, "config.yaml").is_file():
+        return ""
+    from r2flow.runs import read_config
+
+    names = " ".join(f"--plugin {name}" for name in (read_config(run) or {}).get("plugins") or ())
+    return f" {run} was made with {names}: give it again." if names else ""
+
+
+def _checked_arguments(arguments: list[str]) -> list[str]:
+    """Hydra's flags, then its overrides.
+
+    Raises:
+        InputError: a flag that it does not have.
+    """
+    parser = get_args_parser()
+
+    def refuse(message: str) -> NoReturn:
+        raise InputError(f"{message}; see --help.")
+
+    parser.error = refuse  # type: ignore[method-assign]  # its own prints all of the flags
+    overrides = parser.parse_args(arguments).overrides
+    return [*(one for one in arguments if one not in overrides), *as_hydra_takes(overrides)]
 
 
 def _run_hydra(arguments: Sequence[str], job: Task) -> None:
@@ -125,8 +170,8 @@ def job_folder(arguments: Sequence[str], overrides: str) -> str:
 
 def _job(arguments: Sequence[str], command: Sequence[str], failed: list[str], config: DictConfig) -> None:
     """What Hydra runs. Of the exceptions only `Exception` is caught by it: SystemExit says the code."""
-    given = list(HydraConfig.get().overrides.task)
     try:
+        given = list(HydraConfig.get().overrides.task)
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             _sweep_job(command, given, failed)
             return
@@ -134,9 +179,11 @@ def _job(arguments: Sequence[str], command: Sequence[str], failed: list[str], co
         if settings["plugins"] and not any(one.startswith("plugins=") for one in given):
             named = " ".join(f"--plugin {name}" for name in settings["plugins"])
             raise InputError(f"plug-ins are named on the command line, never in a file: give {named}.")
+        check_keys(settings)
         code = _chain(settings, given, command) if settings["chain"] else _fit(settings, given)
-    except (InputError, OSError) as error:  # Hydra would print its own lines around it
-        print(f"error: {explain_mistake(error)}", file=sys.stderr)
+    except (InputError, OSError, OmegaConfBaseException) as error:  # Hydra would print its own lines around it
+        said = explain(error) if isinstance(error, OmegaConfBaseException) else explain_mistake(error)
+        print(f"error: {said}", file=sys.stderr)
         raise SystemExit(2) from None
     if code:
         raise SystemExit(code)

@@ -41,8 +41,8 @@ def find_parent(config: Mapping[str, Any]) -> tuple[Parent, Checkpoint] | None:
     init = config["stage"].get("init")
     if init is None:
         return None
-    found = load_checkpoint(init)
-    check_finished(Path(init), found)
+    found = load_checkpoint(str(init))
+    check_finished(Path(str(init)), found)
     if "published" in found.config and found.config["data"]["projection"] == "unfolding":
         raise InputError(
             f"{init} was trained on unfolded scans, whose rings a new run's sensor does not carry; "
@@ -91,8 +91,9 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
 
 def generator_of(config: Mapping[str, Any], parent: Parent | None) -> dict[str, Any]:
     """What a run trains: the config's `generator`, else its stage's, else its parent's with the options of that."""
-    if config.get("generator"):
-        return dict(config["generator"])
+    own = config.get("generator")
+    if own:
+        return {"name": own} if isinstance(own, str) else dict(own)
     theirs = (parent and parent.config.get("generator")) or {"name": "rectified_flow"}
     own = STAGES[config["stage"]["name"]].generator_name
     return dict(theirs) if own in (None, theirs["name"]) else {"name": own}

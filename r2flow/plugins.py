@@ -19,6 +19,7 @@ from typing import Any
 
 from r2flow.errors import InputError
 from r2flow.registry import Registry, UnknownName
+from r2flow.signals import Stopped
 
 GROUP = "r2flow.plugins"
 
@@ -53,14 +54,21 @@ def load_plugins(names: Sequence[str]) -> None:
         InputError: a module that is not there, or whose import ends in an error.
     """
     for name in names:
-        if name in _loaded:
+        if _known(name) in _loaded:
             continue
         try:
             _import(name)
-        except Exception as error:  # whatever somebody's module raises
+        except (KeyboardInterrupt, Stopped):
+            raise
+        except BaseException as error:  # whatever somebody's module raises, SystemExit too
             said = " ".join(str(error).split()) or "no more is known"
             raise InputError(f"the plug-in {name} cannot be imported: {type(error).__name__}: {said}") from None
-        _loaded.add(name)
+        _loaded.add(_known(name))
+
+
+def _known(name: str) -> str:
+    """One name for one file, however its path is written."""
+    return str(Path(name).expanduser().resolve()) if name.endswith(".py") else name
 
 
 def _import(name: str) -> None:
@@ -68,7 +76,8 @@ def _import(name: str) -> None:
         here = str(Path.cwd())
         if here not in sys.path and "" not in sys.path:
             sys.path.append(here)  # as `python -m` does, but last
-        importlib.import_module(name)
+        if importlib.import_module(name).__file__ is None:
+            raise ImportError("it is a folder without an __init__.py; to name a file, end it in .py")
         return
     path = Path(name).expanduser().resolve()
     if not path.is_file():
@@ -107,7 +116,7 @@ def made_with(config: Mapping[str, Any], what: str) -> Iterator[None]:
     try:
         yield
     except UnknownName as error:
-        missing = [name for name in config.get("plugins") or () if name not in _loaded]
+        missing = [name for name in config.get("plugins") or () if _known(name) not in _loaded]
         if not missing:
             raise
         give = " ".join(f"--plugin {name}" for name in missing)

@@ -3,15 +3,30 @@
 import dataclasses
 import difflib
 import inspect
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import NoneType, UnionType
-from typing import Annotated, Any, ClassVar, Generic, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
 from r2flow.errors import InputError
 
 T = TypeVar("T")
 
 MISSING = "???"  # what OmegaConf writes where a value must be given
+
+
+class Bound(NamedTuple):
+    """The range of an option's value, in its annotation: `width: Annotated[int, Bound("below 9", lambda n: n < 9)]`."""
+
+    words: str
+    holds: Callable[[Any], bool]
+
+
+Count = Annotated[int, Bound("of at least 1", lambda n: n >= 1)]
+Natural = Annotated[int, Bound("of at least 0", lambda n: n >= 0)]
+Positive = Annotated[float, Bound("above 0", lambda x: x > 0)]
+NonNegative = Annotated[float, Bound("of at least 0", lambda x: x >= 0)]
+Portion = Annotated[float, Bound("in [0, 1)", lambda x: 0 <= x < 1)]
 
 
 def did_you_mean(name: str, known: Mapping[str, Any] | list[str]) -> str:
@@ -80,9 +95,10 @@ class Registry(Generic[T]):
         Raises:
             InputError: no such name, or an option that the constructor does not know.
         """
+        if not isinstance(options, Mapping) or "name" not in options:
+            known = ", ".join(sorted(self._entries))
+            raise InputError(f"a {self.kind} config needs a 'name', found {options!r}; known: {known}.")
         chosen = dict(options)
-        if "name" not in chosen:
-            raise InputError(f"a {self.kind} config needs a 'name'; known: {', '.join(sorted(self._entries))}.")
         name = chosen.pop("name")
         constructor = self[name]
         if not callable(constructor):
@@ -101,6 +117,8 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
         InputError: an option that `constructor` does not take by keyword, one that it cannot do without, or a value
             that its annotation does not allow.
     """
+    if not isinstance(options, Mapping):
+        raise InputError(f"{what} must be a group of keys, found {options!r}.")
     parameters = _parameters(constructor)
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return
@@ -108,7 +126,7 @@ def check_options(what: str, constructor: Callable[..., Any], options: Mapping[s
     for key, value in options.items():
         if key not in known:
             hint = did_you_mean(key, known)
-            raise InputError(f"{what} has no option {key!r}; it knows: {', '.join(known)}.{hint}")
+            raise InputError(f"{what} has no option {key!r}; it knows: {', '.join(known) or 'none'}.{hint}")
         wanted = _wanted(known[key].annotation)
         if wanted and not any(fits(value) for _, fits in wanted):
             raise InputError(f"{what}: {key} must be {' or '.join(word for word, _ in wanted)}, found {value!r}.")
@@ -151,15 +169,16 @@ def _parameters(constructor: Callable[..., Any]) -> list[inspect.Parameter]:
 
 Check = tuple[str, Callable[[Any], bool]]
 
+LIST: Check = ("a list", lambda v: isinstance(v, list | tuple))
 PLAIN: dict[Any, Check] = {
     bool: ("true or false", lambda v: isinstance(v, bool)),
     int: ("a whole number", lambda v: isinstance(v, int) and not isinstance(v, bool)),
-    float: ("a number", lambda v: isinstance(v, int | float) and not isinstance(v, bool)),
+    float: ("a finite number", lambda v: isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < math.inf),
     str: ("a word", lambda v: isinstance(v, str)),
     NoneType: ("null", lambda v: v is None),
-    list: ("a list", lambda v: isinstance(v, list | tuple)),
-    tuple: ("a list", lambda v: isinstance(v, list | tuple)),
-    Sequence: ("a list", lambda v: isinstance(v, list | tuple)),
+    list: LIST,
+    tuple: LIST,
+    Sequence: LIST,
     Mapping: ("a group of keys", lambda v: isinstance(v, Mapping)),
 }
 
@@ -168,9 +187,36 @@ def _wanted(annotation: Any) -> list[Check]:
     """The checks of an annotation, any of which may hold; none where it cannot be checked."""
     origin = get_origin(annotation)
     if origin is Annotated:
-        return _wanted(get_args(annotation)[0])
+        checks = _wanted(get_args(annotation)[0])
+        for bound in annotation.__metadata__:
+            checks = [_bounded(check, bound) for check in checks] if isinstance(bound, Bound) else checks
+        return checks
+    if origin is Literal:
+        known = get_args(annotation)
+        return [(" or ".join(map(repr, known)), lambda v: any(type(v) is type(one) and v == one for one in known))]
     if origin in (Union, UnionType):
         alternatives = [_wanted(one) for one in get_args(annotation)]
         return [check for checks in alternatives for check in checks] if all(alternatives) else []
     check = PLAIN.get(origin or annotation)
+    if check is LIST and get_args(annotation):
+        return [_list_of(*get_args(annotation), counted=origin is tuple)]
     return [check] if check else []
+
+
+def _bounded(check: Check, bound: Bound) -> Check:
+    return f"{check[0]} {bound.words}", lambda v: check[1](v) and bound.holds(v)
+
+
+def _list_of(element: Any, *others: Any, counted: bool) -> Check:
+    """A list of one kind of element; a tuple has as many as its annotation, if that does not end in `...`."""
+    checks = _wanted(element)
+    size = 1 + len(others) if counted and Ellipsis not in others else None
+    words = "a list" if size is None else f"a list of {size}"
+    if checks:
+        words += f", each {' or '.join(word for word, _ in checks)}"
+
+    def fits(value: Any) -> bool:
+        whole = LIST[1](value) and size in (None, len(value))
+        return whole and all(not checks or any(fit(one) for _, fit in checks) for one in value)
+
+    return words, fits

@@ -56,12 +56,41 @@ def run_lock(run: str | Path, patience: float = 20.0) -> Iterator[None]:
 
 
 def read_config(run: str | Path) -> dict[str, Any] | None:
-    """The config that a run folder was begun with, or None."""
+    """The config that a run folder was begun with, or None. Where its file is lost, that in its newest checkpoint.
+
+    Raises:
+        InputError: the file is damaged.
+    """
     path = Path(run, CONFIG)
-    if not path.is_file():
+    config: dict[str, Any] | None
+    if path.is_file():
+        config = _read_yaml(path)
+    else:
+        newest = _newest_whole(run)
+        config = read_checkpoint(newest).get("config") if newest is not None else None
+    if not config:
         return None
-    config = yaml.safe_load(path.read_text(encoding="utf-8"))
     return {**config, "data": upgraded(config["data"])} if "data" in config else config
+
+
+MOST_ALIASES = 20  # a few lines of aliases of aliases stand for billions of values
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+        if sum(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)) > MOST_ALIASES:
+            raise ValueError("it repeats itself by aliases")
+        config = yaml.safe_load(text)
+        groups = [key for key in ("stage", "data", "trainer") if not isinstance(config.get(key, {}), Mapping)]
+        if groups:
+            raise ValueError(f"its {groups[0]} is no group of keys")
+    except (yaml.YAMLError, ValueError, RecursionError, AttributeError) as error:
+        said = str(error).splitlines()[0] if isinstance(error, ValueError) else "it is no config"
+        raise InputError(
+            f"{path} is damaged ({said}); remove it, and the config in the run's newest checkpoint takes its place."
+        ) from None
+    return dict(config)
 
 
 def write_config(run: str | Path, config: Mapping[str, Any]) -> None:
@@ -84,7 +113,8 @@ def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
     differing = contradictions(old, config)
     newest = _newest_whole(run)
     if not differing:
-        if newest is not None and old != dict(config):  # free keys moved: the folder says what runs now
+        # Free keys moved: the folder says what runs now.
+        if newest is not None and (old != dict(config) or not Path(run, CONFIG).is_file()):
             write_config(run, config)
         return newest
     if newest is None:  # nothing has been learned there yet

@@ -10,9 +10,9 @@ import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import lightning as L
 import torch
@@ -21,19 +21,19 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from r2flow.callbacks import build_callbacks, build_loggers
 from r2flow.callbacks.stopping import Stopping
 from r2flow.checkpoints import checkpoints_of, step_of
-from r2flow.composing import compose
+from r2flow.composing import check_keys, compose
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import resolve_reflectance
-from r2flow.data.options import DataOptions
+from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, SourceOptions
 from r2flow.data.sources import AUTO
 from r2flow.errors import InputError
 from r2flow.generators import Generator, build_generator
 from r2flow.lineage import Parent, find_parent, inherit
 from r2flow.noise import seed_torch
 from r2flow.plugins import made_with
-from r2flow.registry import check_options
+from r2flow.registry import Bound, Count, NonNegative, Positive, check_options
 from r2flow.reports.training import check_samples, finish, read_curves
-from r2flow.runs import check_run, open_run, run_lock
+from r2flow.runs import check_run, open_run, read_config, run_lock
 from r2flow.stages import build_stage, check_roll
 from r2flow.stages.base import Stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
@@ -54,6 +54,20 @@ EXPECTED_WARNINGS = (
     "The dirpath has changed from.*",
     "Using ModelCheckpoint with manual optimization.*",
 )
+
+
+@dataclass(frozen=True)
+class TrainerRanges:
+    """Values of Lightning's Trainer with which a run can come to its end, where Lightning itself takes others."""
+
+    max_steps: Count
+    max_epochs: Annotated[int, Bound("other than 0", lambda n: n != 0)] | None
+    limit_train_batches: Annotated[None, Bound("(trainer.max_steps is the length of a run)", lambda n: True)]
+    val_check_interval: Positive | str | Mapping[str, Any] | None
+    check_val_every_n_epoch: Count | None
+    log_every_n_steps: Count
+    accumulate_grad_batches: Count
+    gradient_clip_val: NonNegative | None
 
 
 @dataclass
@@ -108,6 +122,12 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
     Raises:
         InputError: a value that cannot be used, an unknown name or option, a parent that is not there or not finished.
     """
+    check_keys(config)
+    with made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
+        return _build(config, asked)
+
+
+def _build(config: Mapping[str, Any], asked: Sequence[str]) -> Run:
     parent, checkpoint = find_parent(config) or (None, None)
     config = _checked(config, asked, parent)
     config["encoding"]["reflectance"] = resolve_reflectance(config["encoding"].get("reflectance", AUTO), config["data"])
@@ -130,6 +150,7 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
     Raises:
         InputError: what `build` refuses, or another run in its folder.
     """
+    check_keys(config)
     if parent is None:
         found = find_parent(config)
         parent = found and found[0]
@@ -150,13 +171,28 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
     check_trainer(config["trainer"])
     check_options("samples", check_samples, config["samples"])
     check_samples(**config["samples"])
-    seed = config["seed"]
-    if not (isinstance(seed, int) and 0 <= seed < 2**63):
-        raise InputError(f"seed must be a whole number of at least 0, found {seed!r}.")
     with made_with(parent.config if parent else {}, "the run that it starts from"):
         config = inherit(config, asked, parent)
     check_options("data", DataOptions, config["data"])
+    _refuse_unread(config["data"])
     return config
+
+
+def _refuse_unread(data: Mapping[str, Any]) -> None:
+    """Refuse what the set of scans would pass over in silence.
+
+    Raises:
+        InputError: the options of files with simulated scans, or the other way round.
+    """
+    if data["name"] in (PAIRS, MIXED):
+        return
+    simulated = data["name"] == SIMULATED
+    usual = SourceOptions()
+    unread = {f.name for f in fields(usual)} - {"name", "scenes"} if simulated else {"scenes"}
+    wrong = sorted(f"data.{key}" for key in unread if data.get(key, getattr(usual, key)) != getattr(usual, key))
+    if wrong:
+        what = "simulated scans are no files" if simulated else "scans in files are no simulated scenes"
+        raise InputError(f"{what}: leave {', '.join(wrong)} out.")
 
 
 def _assembled(config: dict[str, Any], generator: Generator) -> Run:
@@ -182,7 +218,7 @@ def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
     try:
         with _quiet():
             return L.Trainer(**options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()])
-    except (TypeError, ValueError, MisconfigurationException) as error:
+    except (TypeError, ValueError, ImportError, MisconfigurationException) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from None
 
 
@@ -190,8 +226,9 @@ def check_trainer(options: Mapping[str, Any]) -> None:
     """Refuse what Lightning would change in silence or end in a traceback.
 
     Raises:
-        InputError: an accelerator that is not there, a precision that a CPU does not have.
+        InputError: a value out of its range, an accelerator that is not there, a precision that a CPU does not have.
     """
+    check_options("trainer", TrainerRanges, {f.name: options.get(f.name) for f in fields(TrainerRanges)})
     gpu = torch.cuda.is_available()
     if options["accelerator"] in ("gpu", "cuda") and not gpu:
         raise InputError("trainer.accelerator=gpu, but torch sees no GPU here; use trainer=cpu.")

@@ -15,7 +15,7 @@ Backends, all of the same values and gradients:
 
 import functools
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -46,12 +46,21 @@ def neighbourhood_attention(
     Raises:
         InputError: an even or empty window, no such backend, or one that cannot be had here.
     """
-    if any(size < 1 or size % 2 == 0 for size in window):
-        raise InputError(f"the attention window must have odd sizes of at least 1, found {tuple(window)}.")
+    check_window(window)
     rows = _Axis(q.shape[1], window[0], wrap=False)
     columns = _Axis(q.shape[2], window[1], wrap=wrap)
     name = _fastest(q, rows, columns) if backend == "auto" else backend
     return BACKENDS[name](q, k, v, rows, columns)
+
+
+def check_window(window: Sequence[int]) -> None:
+    """Refuse a window without a middle.
+
+    Raises:
+        InputError: a size that is even, or below 1.
+    """
+    if any(size < 1 or size % 2 == 0 for size in window):
+        raise InputError(f"the attention window must have odd sizes of at least 1, found {tuple(window)}.")
 
 
 class _Axis(NamedTuple):

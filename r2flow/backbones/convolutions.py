@@ -13,6 +13,7 @@ from r2flow.backbones.base import Backbone, CommonOptions, integers
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, position_name
 from r2flow.backbones.layers import ExactBuffers, ExactLinear, at_least_float32, zero_initialised
 from r2flow.errors import InputError
+from r2flow.registry import Count, Portion
 
 GROUPS = 8
 EPS = 1e-6
@@ -211,14 +212,14 @@ class UNet(Backbone):
     def __init__(
         self,
         rays: Tensor,
-        base_channels: int = 64,
+        base_channels: Count = 64,
         channel_multiplier: Sequence[int] = (1, 2, 4, 8),
         num_residual_blocks: int | Sequence[int] = (3, 3, 3, 3),
         num_heads: int = 8,
-        time_channels: int | None = None,
+        time_channels: Count | None = None,
         position: str | None = "fourier_features",
         ring: bool = True,
-        dropout: float = 0.0,
+        dropout: Portion = 0.0,
         **common: Unpack[CommonOptions],
     ) -> None:
         levels = max(len(channel_multiplier), 1)

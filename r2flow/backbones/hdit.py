@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.attention import backend_name, neighbourhood_attention
+from r2flow.backbones.attention import backend_name, check_window, neighbourhood_attention
 from r2flow.backbones.base import Backbone, CommonOptions, integers
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, Rotary, mean_rays, position_name, rotate
 from r2flow.backbones.layers import (
@@ -25,6 +25,7 @@ from r2flow.backbones.layers import (
     zero_initialised,
 )
 from r2flow.errors import InputError
+from r2flow.registry import Count, Portion
 
 
 class HDiT(Backbone):
@@ -60,15 +61,15 @@ class HDiT(Backbone):
     def __init__(
         self,
         rays: Tensor,
-        base_channels: int = 128,
+        base_channels: Count = 128,
         depths: Sequence[int] = (3, 3, 3, 3),
         num_heads: Sequence[int] = (2, 4, 8, 16),
-        time_channels: int = 256,
+        time_channels: Count = 256,
         position: str | None = "learnable",
         window: Sequence[int] = (3, 9),
         patch: Sequence[int] = (1, 4),
         ring: bool = True,
-        dropout: float = 0.0,
+        dropout: Portion = 0.0,
         attention: str = "auto",
         **common: Unpack[CommonOptions],
     ) -> None:
@@ -82,6 +83,7 @@ class HDiT(Backbone):
         self.patch, self.levels = (patch_h, patch_w), levels
         rows, columns = rays.shape[1] // patch_h, rays.shape[2] // patch_w
         span_h, span_w = integers("window", window, 2)
+        check_window((span_h, span_w))
         local = Neighbourhood((span_h, span_w), ring, backend_name(attention))
         widths = [base_channels * 2**level for level in range(levels)]
 

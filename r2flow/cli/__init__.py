@@ -7,6 +7,7 @@ from typing import Any
 
 import typer
 
+from r2flow import __version__
 from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     accuracy,
     compare,
@@ -39,6 +40,9 @@ def main() -> None:
         load_plugins(plugins)
         if arguments[:1] == ["train"]:  # which passes them on to its own processes
             arguments += [f"--plugin={name}" for name in plugins]
+        if arguments[:1] == ["--version"]:
+            print(f"r2flow {__version__}")
+            sys.exit(0)
         code = app(arguments, prog_name="r2flow", standalone_mode=False)
     except BrokenPipeError:  # r2flow ... | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,5 +1,6 @@
 """Options that several verbs share, and what becomes of them."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -98,9 +99,14 @@ def _rows_and_columns(size: str | None) -> tuple[int | None, int | None]:
     if size is None:
         return None, None
     parts = size.lower().split("x")
-    if len(parts) != 2 or not all(part.isdigit() and int(part) > 0 for part in parts):
+    if len(parts) != 2 or not all(part.isascii() and part.isdigit() and int(part) > 0 for part in parts):
         raise InputError(f"--size must be ROWSxCOLUMNS, as 64x1024; found {size!r}.")
     return int(parts[0]), int(parts[1])
+
+
+def cores() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def choose_device(name: str) -> str:
@@ -110,9 +116,13 @@ def choose_device(name: str) -> str:
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     try:
-        torch.device(name)
+        device = torch.device(name)
     except RuntimeError:
-        raise InputError(f"--device must be auto, cpu, cuda, cuda:1, ...; found {name!r}.") from None
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError(f"--device {name}, but torch sees no GPU here; use --device cpu.")
+        device = torch.device("meta")
+    if device.type not in ("cpu", "cuda", "mps", "xpu"):
+        raise InputError(f"--device must be auto, cpu, cuda, cuda:1, ...; found {name!r}.")
+    there = {"cuda": torch.cuda, "mps": torch.mps, "xpu": torch.xpu}.get(device.type)
+    if there is not None and (device.index or 0) >= there.device_count():
+        seen = f"{there.device_count()} of them" if there.device_count() else "no GPU"
+        raise InputError(f"--device {name}, but torch sees {seen} here; use --device cpu.")
     return name

@@ -1,23 +1,56 @@
 """The verb that turns a data set into prepared scans."""
 
-import os
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.options import ConventionOption, ProjectionOption, SizeOption, build_sized
+from r2flow.cli.groups import ReadingOptions, grouped
+from r2flow.cli.options import build_sized, cores
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.data.prepared import Manifest
-    from r2flow.data.preparing import Preparation
+    from r2flow.data.preparing import Plan, Preparation
+
+
+@dataclass(frozen=True)
+class FileOptions:
+    """Which files are taken, and what is done with a bad one."""
+
+    split: Annotated[str | None, typer.Option(help="A part of the layout's split; all of it if left out.")] = None
+    drives: Annotated[str | None, typer.Option(help="Names or numbers, separated by commas; all if left out.")] = None
+    on_bad_scan: Annotated[str, typer.Option(help="error, or skip: leave out by name what cannot be used.")] = "error"
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Which simulated scans are made."""
+
+    num: Annotated[int | None, typer.Option(min=1, help="Scenes, of simulated scans.", show_default=False)] = None
+    seed: Annotated[int, typer.Option(min=0, help="Of simulated scans.")] = 0
+
+
+@dataclass(frozen=True)
+class ShardOptions:
+    """How the shards are written."""
+
+    reflectance_levels: Annotated[
+        int | None, typer.Option(help="Reflectance is kept as n / LEVELS; found from the scans if left out.")
+    ] = None
+    shard_scans: Annotated[int, typer.Option(min=1, help="Scans a file.")] = 512
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; one a core if left out.")] = None
 
 
 @app.command(epilog="Example: r2flow prepare kitti_360 /data/KITTI-360 --out prepared/kitti_360")
+@grouped
 def prepare(
+    reading: ReadingOptions,
+    files: FileOptions,
+    scenes: SceneOptions,
+    shards: ShardOptions,
     layout: Annotated[
         str | None, typer.Argument(help="Layout of the data set (kitti_360, odometry, folder, ...), or simulated.")
     ] = None,
@@ -26,36 +59,6 @@ def prepare(
     check: Annotated[
         Path | None, typer.Option(help="Only read a prepared folder and name what is damaged.", show_default=False)
     ] = None,
-    sensor: Annotated[
-        str | None,
-        typer.Option(
-            help="Name of the sensor, or the YAML file of your own; if left out hdl64e, of nuscenes hdl32e.",
-            show_default=False,
-        ),
-    ] = None,
-    size: SizeOption = None,
-    projection: ProjectionOption = "spherical",
-    convention: ConventionOption = "centre",
-    split: Annotated[str | None, typer.Option(help="A part of the layout's split; all of it if left out.")] = None,
-    drives: Annotated[str | None, typer.Option(help="Names or numbers, separated by commas; all if left out.")] = None,
-    reflectance_scale: Annotated[
-        float | None,
-        typer.Option(
-            min=1e-6,
-            help="Value in the files that means full reflectance; if left out 1, of nuscenes 255.",
-            show_default=False,
-        ),
-    ] = None,
-    reflectance_levels: Annotated[
-        int | None, typer.Option(help="Reflectance is kept as n / LEVELS; found from the scans if left out.")
-    ] = None,
-    on_bad_scan: Annotated[str, typer.Option(help="error, or skip: leave out by name what cannot be used.")] = "error",
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes; one a core if left out.", show_default=False)
-    ] = None,
-    shard_scans: Annotated[int, typer.Option(min=1, help="Scans a file.")] = 512,
-    num: Annotated[int | None, typer.Option(min=1, help="Scenes, of simulated scans.", show_default=False)] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of simulated scans.")] = 0,
 ) -> None:
     """Project a data set once, into shards that training reads: range in 2 bytes, reflectance in 1.
 
@@ -67,47 +70,55 @@ def prepare(
         return
     if layout is None or out is None:
         raise InputError("r2flow prepare needs LAYOUT ROOT --out FOLDER, or --check FOLDER.")
-    if layout == "simulated":
-        _refuse_file_options(root, projection, convention, split, drives, reflectance_scale)
-    elif root is None:
-        raise InputError(f"r2flow prepare {layout} needs the folder of its scans: r2flow prepare {layout} ROOT --out.")
-    elif num is not None:
-        raise InputError("--num is for simulated scans; choose files by --split and --drives.")
+    from r2flow.data.preparing import Preparation
+
+    _run(Preparation(out, _plan(layout, root, reading, files, scenes, shards)), files.on_bad_scan, shards.workers)
+
+
+def _plan(
+    layout: str,
+    root: Path | None,
+    reading: ReadingOptions,
+    files: FileOptions,
+    scenes: SceneOptions,
+    shards: ShardOptions,
+) -> "Plan":
     from r2flow.data.opening import SOURCES
-    from r2flow.data.preparing import Preparation, plan_files, plan_simulated
+    from r2flow.data.preparing import plan_files, plan_simulated
 
     usual = SOURCES[layout]
-    chosen = build_sized(sensor or usual.sensor, size)
+    sensor = build_sized(reading.sensor or usual.sensor, reading.size)
+    levels, shard_scans = shards.reflectance_levels, shards.shard_scans
+    if layout == "simulated":
+        of_files = {
+            "ROOT": root, "--projection": reading.projection, "--convention": reading.convention,
+            "--split": files.split, "--drives": files.drives, "--reflectance-scale": reading.reflectance_scale,
+        }  # fmt: skip
+        wrong = [option for option, value in of_files.items() if value is not None]
+        if wrong:
+            raise InputError(f"simulated scans are no files: leave out {', '.join(wrong)}.")
+        return plan_simulated(scenes.num or 512, scenes.seed, sensor, levels, shard_scans)
     if root is None:
-        plan = plan_simulated(num or 512, seed, chosen, reflectance_levels, shard_scans)
-    else:
-        wanted = drives.split(",") if drives else None
-        plan = plan_files(
-            layout, root, chosen, projection, convention, split, wanted, reflectance_scale or usual.reflectance_scale,
-            reflectance_levels, shard_scans,
-        )  # fmt: skip
-    _run(Preparation(out, plan), on_bad_scan, workers)
+        raise InputError(f"r2flow prepare {layout} needs the folder of its scans: r2flow prepare {layout} ROOT --out.")
+    if scenes.num is not None:
+        raise InputError("--num is for simulated scans; choose files by --split and --drives.")
+    return plan_files(
+        layout, root, sensor, reading.projection or "spherical", reading.convention or "centre", files.split,
+        files.drives.split(",") if files.drives else None, reading.reflectance_scale or usual.reflectance_scale,
+        levels, shard_scans,
+    )  # fmt: skip
 
 
 def _run(work: "Preparation", on_bad_scan: str, workers: int | None) -> None:
     from r2flow.progress import Bar
 
-    recipe, workers = work.recipe, workers or _cores()
+    recipe, workers = work.recipe, workers or cores()
     with Bar("checking what is there", recipe.scans, "scans") as advance:
-        missing = work.begin(lambda scans: _repeat(advance, scans))
+        missing = work.begin(advance)
     scans = sum(len(recipe.numbers_of(shard)) for shard in missing)
     with Bar("preparing", scans, "scans") as advance:
-        manifest = work.make(missing, on_bad_scan, workers if workers > 1 else 0, lambda scans: _repeat(advance, scans))
+        manifest = work.make(missing, on_bad_scan, workers if workers > 1 else 0, advance)
     print(_summary(work.folder, manifest))
-
-
-def _repeat(advance: Callable[[], None], times: int) -> None:
-    for _ in range(times):
-        advance()
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _summary(folder: Path, manifest: "Manifest") -> str:
@@ -139,15 +150,3 @@ def _check(folder: Path) -> None:
             f"{len(damaged)} of {shards} shards are damaged; the same r2flow prepare command makes these again."
         )
     print(f"{folder}: all {shards} shards are what was written")
-
-
-def _refuse_file_options(
-    root: Path | None, projection: str, convention: str, split: str | None, drives: str | None, scale: float | None
-) -> None:
-    given = {
-        "ROOT": root is not None, "--projection": projection != "spherical", "--convention": convention != "centre",
-        "--split": split is not None, "--drives": drives is not None, "--reflectance-scale": scale is not None,
-    }  # fmt: skip
-    wrong = [option for option, is_given in given.items() if is_given]
-    if wrong:
-        raise InputError(f"simulated scans are no files: leave out {', '.join(wrong)}.")

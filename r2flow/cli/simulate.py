@@ -1,12 +1,11 @@
 """`r2flow simulate`: scans of simulated street scenes."""
 
-import os
 from typing import Annotated
 
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.options import OutOption, SensorOption, SizeOption, build_sized
+from r2flow.cli.options import OutOption, SensorOption, SizeOption, build_sized, cores
 
 
 @app.command(epilog="Example: r2flow simulate --num 1000 --sensor os1_64 --seed 1 --out scans --labels")
@@ -31,8 +30,7 @@ def simulate(
 
     formats = tuple(dict.fromkeys(format.split(",")))
     folder = SimulatedFolder(out, build_sized(sensor, size), seed, formats, labels)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with Bar("simulating", num, "scans") as advance:
-        made = write_folder(folder, range(first, first + num), workers or cores, advance)
+        made = write_folder(folder, range(first, first + num), workers or cores(), advance)
     kept = f", {num - made} were there already" if made < num else ""
     print(f"{made} scans ({', '.join(formats)}{', labels' if labels else ''}) in {out}{kept}")

@@ -10,8 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
-from r2flow.registry import Registry
+from r2flow.registry import Count, Positive, Registry
 
 TimeDensity = Callable[[Tensor], Tensor]
 
@@ -30,9 +29,7 @@ class UShaped:
     taken half of the time; one has the inverse CDF t = ln(u (e^a - 1) + 1) / a, the other is its mirror.
     """
 
-    def __init__(self, a: float = 4.0) -> None:
-        if not a > 0:
-            raise InputError(f"the U-shaped time density needs a > 0, found {a}.")
+    def __init__(self, a: Positive = 4.0) -> None:
         self.a = a
 
     def __call__(self, u: Tensor) -> Tensor:
@@ -46,7 +43,7 @@ class UShaped:
 class LogitNormal:
     """logit(t) ~ N(mean, std^2) (Esser et al. 2024): most weight in the middle of the path."""
 
-    def __init__(self, mean: float = 0.0, std: float = 1.0) -> None:
+    def __init__(self, mean: float = 0.0, std: Positive = 1.0) -> None:
         self.mean, self.std = mean, std
 
     def __call__(self, u: Tensor) -> Tensor:
@@ -57,9 +54,7 @@ class LogitNormal:
 class Discrete:
     """t uniform on {0, 1/k, ..., (k-1)/k}, the times at which k Euler steps begin (timestep distillation)."""
 
-    def __init__(self, k: int) -> None:
-        if k < 1:
-            raise InputError(f"the discrete time density needs at least one time, found k={k}.")
+    def __init__(self, k: Count) -> None:
         self.k = k
 
     def __call__(self, u: Tensor) -> Tensor:

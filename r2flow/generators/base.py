@@ -11,7 +11,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
-from r2flow.registry import check_options
+from r2flow.registry import Count, Positive, check_options
 
 Condition = Mapping[str, Tensor]
 """What is known of each scan, by name: tensors of shape (B, ...). Which names there are, the generator says."""
@@ -35,8 +35,8 @@ class Sampler:
     """
 
     method: str = "euler"
-    steps: int = 32
-    tolerance: float = 1e-5
+    steps: Count = 32
+    tolerance: Positive = 1e-5
     grid: str | tuple[float, ...] = "uniform"
     straight_first: bool = False
     fixed: bool = False

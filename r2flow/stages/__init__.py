@@ -41,8 +41,8 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
         raise InputError(f"stage={options['name']} learns from pairs: give data=pairs, found {config['data']['name']}.")
     if on_pairs and not stage.needs_pairs:
         raise InputError(f"stage={options['name']} learns from scans, and data=pairs has none; give stage=reflow.")
-    wanted = config.get("sampler") or {}
-    check_options("sampler", Sampler, {key: value for key, value in wanted.items() if value is not None})
+    wanted = {key: value for key, value in (config.get("sampler") or {}).items() if value is not None}
+    check_options("sampler", Sampler, wanted)
     sampler = generator.sampler.changed(**wanted)
     generator.check_sampler(sampler)
     generator.sampler = sampler

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from r2flow.generators import Generator
 from r2flow.noise import seed_torch
+from r2flow.registry import Count, Natural, NonNegative, Portion
 
 Batch = dict[str, Tensor]
 
@@ -45,11 +46,11 @@ class Stage(L.LightningModule):
     def __init__(
         self,
         generator: Generator,
-        learning_rate: float = 1e-4,
-        betas: tuple[float, float] = (0.9, 0.99),
-        weight_decay: float = 0.0,
-        warmup_images: int = 80_000,
-        batch_size: int = 8,
+        learning_rate: NonNegative = 1e-4,
+        betas: tuple[Portion, Portion] = (0.9, 0.99),
+        weight_decay: NonNegative = 0.0,
+        warmup_images: Natural = 80_000,
+        batch_size: Count = 8,
         seed: int = 0,
     ) -> None:
         super().__init__()

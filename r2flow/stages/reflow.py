@@ -5,6 +5,7 @@ from typing import Any
 
 from r2flow.errors import InputError
 from r2flow.generators import Generator, Sampler
+from r2flow.registry import Count
 from r2flow.stages.rectify import Rectify
 
 
@@ -30,9 +31,7 @@ class Distill(Reflow):
         steps: k, the steps that the flow is to be sampled with.
     """
 
-    def __init__(self, generator: Generator, steps: int = 1, loss: str = "pseudo_huber", **options: Any) -> None:
-        if steps < 1:
-            raise InputError(f"stage.steps must be at least 1, found {steps}: a distilled flow takes k steps.")
+    def __init__(self, generator: Generator, steps: Count = 1, loss: str = "pseudo_huber", **options: Any) -> None:
         if options.pop("time", None) is not None:
             raise InputError(
                 f"a distilled flow trains at the {steps} times that its steps visit; leave stage.time out."

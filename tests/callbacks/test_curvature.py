@@ -9,7 +9,6 @@ from torch import nn
 
 from r2flow.callbacks.curvature import Curvature
 from r2flow.callbacks.ema import EMA
-from r2flow.errors import InputError
 from r2flow.generators import Field
 from r2flow.noise import standard_normal
 from r2flow.reports.training import read_curves
@@ -112,8 +111,3 @@ def test_a_step_of_several_batches_is_measured_once(tmp_path):
 def test_it_can_be_left_out(tmp_path):
     fit(tmp_path, [Curvature(seed=0, every=0)], steps=2)
     assert read_curves(tmp_path, ("curvature/s",)) == {}
-
-
-def test_bad_options_are_refused():
-    with pytest.raises(InputError, match=r"found 0 and 16"):
-        Curvature(0, every=5, num=0)

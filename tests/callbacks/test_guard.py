@@ -206,11 +206,6 @@ def test_broken_weights_are_never_written(tmp_path, averaged: bool):
     assert [p.name for p in checkpoints_of(tmp_path)] == ["step-00000002.ckpt", "step-00000001.ckpt"]
 
 
-def test_a_limit_below_one_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"callbacks.guard.skips must be at least 1, found 0"):
-        Guard(tmp_path, skips=0)
-
-
 class TwoLosses(Line):
     """Each layer has an optimiser of its own; the gradient of the outer one is broken at the step of a negative x."""
 

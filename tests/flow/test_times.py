@@ -60,10 +60,10 @@ def test_the_reference_densities(shared):
 
 
 def test_bad_options_are_refused():
-    with pytest.raises(InputError, match="a > 0"):
-        UShaped(0)
-    with pytest.raises(InputError, match="at least one time"):
-        Discrete(0)
+    with pytest.raises(InputError, match="a must be a finite number above 0"):
+        TIMES.build({"name": "u_shaped", "a": 0})
+    with pytest.raises(InputError, match="k must be a whole number of at least 1"):
+        TIMES.build({"name": "discrete", "k": 0})
 
 
 def test_a_config_of_version_0_1_0_has_the_discrete_density_by_its_old_name():

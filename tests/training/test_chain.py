@@ -170,7 +170,10 @@ def test_a_chain_killed_at_ten_random_moments_ends_as_the_one_left_alone(
         (["experiment=reflow", "stage.init=RF1", "data.pairs.num=0"], "num, batch_size, steps must be at least 1"),
         (["experiment=reflow", "stage.init=RF1", "data.pairs.method=dopri"], "Did you mean 'dopri5'"),
         (["experiment=reflow", "stage.init=RF1"], "holds other pairs: method is midpoint there, dopri5 here"),
-        (["experiment=distill", "stage.init=RF1", "stage.steps=0", "data.root=x"], "stage.steps must be at least 1"),
+        (
+            ["experiment=distill", "stage.init=RF1", "stage.steps=0", "data.root=x"],
+            "steps must be a whole number of at least 1",
+        ),
     ],
 )
 def test_a_child_that_cannot_be_is_refused_in_one_line(
@@ -276,11 +279,11 @@ def test_the_command_line_cannot_bypass_a_link():
         (["stage.init=x"], "stage.init is each link's own"),
         # What only building finds out, in links that would run last.
         (["+chain.td2.stage.loss=l3"], "chain.td2: no loss named 'l3'"),
-        (["chain.td2.stage.steps=0"], "chain.td2: stage.steps must be at least 1"),
+        (["chain.td2.stage.steps=0"], "chain.td2: stage 'distill': steps must be a whole number of at least 1"),
         (["chain.rf2.data.pairs.method=dopri"], "chain.rf2: no solver named 'dopri'"),
         (["+chain.td2.data.augment.flip=true"], "chain.td2: data.augment changes scans"),
         (["+chain.rf2.backbone.depths=[1,2]"], "chain.rf2: backbone.depths is [1, 2] here"),
-        (["+chain.td2.callbacks.ema.every=0"], "chain.td2: callbacks.ema.every must be at least 1"),
+        (["+chain.td2.callbacks.ema.every=0"], "chain.td2: callbacks.ema: every must be a whole number of at least 1"),
         (["+chain.td2.data.batch_size=3", "trainer.accumulate_grad_batches=2"], "chain.td2: data.batch_size=3"),
     ],
 )

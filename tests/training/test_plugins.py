@@ -17,7 +17,7 @@ from r2flow.composing import REGISTRIES, choices, compose
 from r2flow.errors import InputError
 from r2flow.plugins import load_plugins, made_with, take_plugins
 from r2flow.registry import Registry
-from r2flow.runs import read_config
+from r2flow.runs import read_config, write_config
 from r2flow.stages import STAGES
 from r2flow.training import build
 from tests.training.conftest import Run, in_process, tiny
@@ -83,6 +83,16 @@ def test_a_stage_of_ones_own_needs_no_yaml_trains_and_resumes(eager: Path, train
     assert config["plugins"] == [str(eager)]
     assert (config["stage"]["pace"], config["stage"]["loss"], config["stage"]["init"]) == (5, "mse", None)
     assert [int(path.stem[-8:]) for path in checkpoints_of(run)] == [4, 2]
+
+
+@pytest.mark.parametrize("wanted", ["stage=eager", "+callbacks.mine={}"])
+def test_a_forgotten_plugin_is_named_by_the_run(tmp_path: Path, wanted: str):
+    write_config(tmp_path / "runs" / "own", {"plugins": ["their.module"]})
+    done = in_process(tmp_path, [wanted, "name=own"], check=False)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "runs/own was made with" in line
+    assert "--plugin their.module" in line
 
 
 def test_a_stage_that_takes_its_own_steps_clips_for_itself(eager: Path, scans: Path):

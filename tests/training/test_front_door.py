@@ -1,0 +1,163 @@
+"""Values of the wrong kind or out of their range, key by key: one line, exit code 2, nothing written."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import yaml
+
+from r2flow.composing import compose
+from r2flow.errors import InputError
+from r2flow.runs import CONFIG, open_run, read_config
+from r2flow.stages.checkpointing import AtomicCheckpointIO
+from r2flow.training import check
+from tests.training.conftest import in_process
+
+REFUSED = {
+    "stage.learning_rate=nan": "learning_rate must be a finite number of at least 0, found nan",
+    "stage.learning_rate=inf": "learning_rate must be a finite number",
+    "stage.weight_decay=-1": "weight_decay must be a finite number of at least 0",
+    "stage.betas=[0.9]": "betas must be a list of 2, each a finite number in [0, 1)",
+    "stage.betas=[0.9,2]": "betas must be a list of 2",
+    "stage.betas=[a,b]": "betas must be a list of 2",
+    "stage.warmup_images=-4": "warmup_images must be a whole number of at least 0",
+    "stage.init=3": "no checkpoint at 3",
+    "stage=null": "give one of distill, rectify, reflow",
+    "stage=3": "give one of distill, rectify, reflow",
+    "~backbone": "~backbone leaves the run without its backbone",
+    "stage.time={name: logit_normal, men: 2.0}": "Did you mean 'mean'?",
+    "stage.time={name: logit_normal, std: 0}": "std must be a finite number above 0",
+    "stage.time={name: u_shaped, a: -4}": "a must be a finite number above 0",
+    "stage.time={name: discrete, k: 0}": "k must be a whole number of at least 1",
+    "stage.tme={name: uniform}": "no key 'stage.tme'. Did you mean 'stage.time'?",
+    "callbacks.ema={evry: 3}": "no key 'callbacks.ema.evry'. Did you mean 'callbacks.ema.every'?",
+    "callbacks=null": "callbacks=null leaves the run without its callbacks: give one of default",
+    "callbacks.ema=3": "callbacks.ema must be a group of keys, found 3",
+    "+callbacks.emaa={}": "Did you mean 'ema'?",
+    "callbacks.ema.decay=2": "decay must be a finite number in [0, 1)",
+    "callbacks.ema.decay=-1": "decay must be a finite number in [0, 1)",
+    "callbacks.ema.decay=nan": "decay must be a finite number in [0, 1)",
+    "callbacks.ema.warmup_steps=-3": "warmup_steps must be a whole number of at least 0 or null",
+    "callbacks.checkpoint.every=0": "every must be a whole number of at least 1",
+    "callbacks.pictures.num=0": "num must be a whole number of at least 1",
+    "callbacks.pictures.steps=0": "steps must be a whole number of at least 1",
+    "callbacks.curvature.every=-1": "every must be a whole number of at least 0",
+    "callbacks.guard.skips=0": "skips must be a whole number of at least 1",
+    "callbacks.progress.seconds=nan": "seconds must be a finite number of at least 0",
+    "samples=null": "samples must be a group of keys, found None",
+    "sampler=3": "sampler must be a group of keys or null, found 3",
+    "sampler.grid=[a,b]": "grid must be a word or a list, each a finite number",
+    "sampler.steps=1.5": "steps must be a whole number",
+    "sampler.tolerance=-1": "tolerance must be a finite number above 0",
+    "generator=3": "generator must be a group of keys or a word or null, found 3",
+    "generator=rectified_flw": "Did you mean 'rectified_flow'?",
+    "backbone.base_channels=0": "base_channels must be a whole number of at least 1",
+    "backbone.base_channels=-8": "base_channels must be a whole number of at least 1",
+    "backbone.time_channels=0": "time_channels must be a whole number of at least 1",
+    "backbone.depths=[a,b]": "depths must be a list, each a whole number",
+    "backbone.window=[2,9]": "odd sizes",
+    "backbone.dropout=2": "dropout must be a finite number in [0, 1)",
+    "data.split=train": "simulated scans are no files: leave data.split out",
+    "data.drives=[1]": "leave data.drives out",
+    "data.projection=unfolding": "leave data.projection out",
+    "data.on_bad_scan=skip": "leave data.on_bad_scan out",
+    "data.root=/tmp": "leave data.root out",
+    "trainer.val_check_interval=0": "val_check_interval must be a finite number above 0",
+    "trainer.check_val_every_n_epoch=0": "check_val_every_n_epoch must be a whole number of at least 1",
+    "trainer.log_every_n_steps=0": "log_every_n_steps must be a whole number of at least 1",
+    "trainer.accumulate_grad_batches=0": "accumulate_grad_batches must be a whole number of at least 1",
+    "trainer.gradient_clip_val=nan": "gradient_clip_val must be a finite number of at least 0",
+    "trainer.limit_train_batches=0": "limit_train_batches must be null",
+    "trainer.max_epochs=0": "max_epochs must be a whole number other than 0",
+    "trainer.deterministic=foo": "deterministic must be true or false or 'warn' or null",
+    "trainer.accelerator=tpu": "trainer: ",
+    "chain=3": "chain must be a group of keys or null, found 3",
+    "chain={a: 3}": "chain.a must be a group of keys",
+    "seed=99999999999999999999": "seed must be a whole number of at least 0 and below 2^63",
+    "loggers=3": "loggers must be a list",
+    "+foo=3": "the config has no option 'foo'",
+    "~seed": "the config needs the option 'seed'",
+    "~samples": "the config needs the option 'samples'",
+    "run_dir=": "run_dir must be a word that names a folder",
+    "run_dir=null": "run_dir must be a word that names a folder",
+    "name=": "name must be a word of at least one letter",
+    "seed=${foo}": "'foo' not found",
+    "=3": "names no key",
+    "--foo": "unrecognized arguments: --foo; see --help",
+}
+
+
+@pytest.mark.parametrize(("argument", "words"), REFUSED.items(), ids=REFUSED)
+def test_a_wrong_value_is_refused(tmp_path: Path, argument: str, words: str):
+    done = in_process(tmp_path, [argument] if argument.startswith("name=") else ["name=bad", argument], check=False)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert words in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_have_no_scenes(tmp_path: Path):
+    with pytest.raises(InputError, match=r"no simulated scenes: leave data\.scenes out"):
+        check(compose(["data=folder", f"data.root={tmp_path}", "data.scenes=5"]))
+
+
+def test_a_named_choice_has_options_of_its_own():
+    assert compose(["stage.time={name: logit_normal, mean: 2.0}"])["stage"]["time"] == {
+        "name": "logit_normal",
+        "mean": 2.0,
+    }
+    reflow = ["stage=reflow", "stage.time={name: uniform}"]  # whose default density has an option a
+    assert compose(reflow)["stage"]["time"] == {"name": "uniform"}
+
+
+def test_a_generator_without_options_is_given_by_its_name():
+    named = check(compose(["generator=rectified_flow"]))
+    assert named["generator"] == {"name": "rectified_flow"} == check(compose([]))["generator"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("def f(:\n", "SyntaxError"),
+        ("raise RuntimeError('a\\nb')", "RuntimeError: a b"),
+        ("import sys; sys.exit(0)", "SystemExit"),
+        ("from r2flow.stages import STAGES, Rectify\nSTAGES.add('rectify', Rectify)", "named 'rectify' exists already"),
+    ],
+)
+def test_a_plugin_that_does_not_load(tmp_path: Path, text: str, words: str):
+    (tmp_path / "plugin.py").write_text(text)
+    done = in_process(tmp_path, ["--plugin", "plugin.py", "name=bad"], check=False)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: the plug-in plugin.py cannot be imported: ")
+    assert words in line
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_folder_is_no_plugin(tmp_path: Path):
+    (tmp_path / "no_package").mkdir()
+    done = in_process(tmp_path, ["--plugin", "no_package", "name=bad"], check=False)
+    assert done.returncode == 2
+    assert "without an __init__.py" in done.stderr
+
+
+BOMB = "a: &a [1, 2]\n" + "".join(f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}]\n" for a, b in pairwise("abcdefghijk"))
+
+
+@pytest.mark.parametrize("text", ["", "- 1", "x", "a: [", "a: \0", "data: 3", "trainer: [1]", BOMB])
+def test_a_damaged_config_is_refused_in_one_line(tmp_path: Path, text: str):
+    (tmp_path / CONFIG).write_text(text)
+    with pytest.raises(InputError, match=r"config\.yaml is damaged \(.*\); remove it") as caught:
+        read_config(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_lost_config_is_that_of_the_newest_checkpoint(tmp_path: Path):
+    config = {"seed": 1, "trainer": {"max_steps": 4}}
+    AtomicCheckpointIO().save_checkpoint({"config": config}, tmp_path / "checkpoints" / "step-00000004.ckpt")
+    assert read_config(tmp_path) == config
+    with pytest.raises(InputError, match="seed=1 there, 2 here"):
+        open_run(tmp_path, {**config, "seed": 2})
+    assert open_run(tmp_path, config) == tmp_path / "checkpoints" / "step-00000004.ckpt"
+    assert yaml.safe_load((tmp_path / CONFIG).read_text()) == config
