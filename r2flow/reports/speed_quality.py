@@ -119,20 +119,18 @@ def _point(curve: Curve, flow: Checkpoint, label: str, steps: int, work: Work) -
     drawn = sampled_set(flow, label, curve.drawing.num, how, curve.drawing.seed)
     measured = measure(curve.metrics, curve.gathered, drawn, work)
     assert isinstance(drawn.source, SampledScans)
+    # A process without a batch has none; the first one, which writes the page, always has some.
+    evaluations: Sequence[float] = drawn.source.evaluations or [math.nan]
+    seconds = drawn.source.seconds or [math.nan]
     figures = {f"{m.metric}/{name}": value for m in measured for name, value in m.figures.items()}
     remarks = dict.fromkeys(remark for m in measured for remark in m.remarks)
     return {
         "flow": label, "weights": weights_hash(flow), "steps": steps,
         "distilled_for": own.steps if own.fixed else None,
-        "solver": how.method, "evaluations": _or_nan(statistics.fmean, drawn.source.evaluations),
-        "seconds": _or_nan(statistics.median, drawn.source.seconds), "batch_size": work.batch_size,
+        "solver": how.method, "evaluations": statistics.fmean(evaluations),
+        "seconds": statistics.median(seconds), "batch_size": work.batch_size,
         "scans": curve.drawing.num, "seed": curve.drawing.seed, **figures, "remarks": BETWEEN.join(remarks),
     }  # fmt: skip
-
-
-def _or_nan(average: Callable[[Sequence[float]], float], values: Sequence[float]) -> float:
-    """NaN for a process without a batch; the first one, which writes the page, always has some."""
-    return average(values) if values else math.nan
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
@@ -167,7 +165,8 @@ def speed_quality_page(
         done: Rows of earlier calls, which the JSON keeps although this call did not ask for them.
         figures: False while it is still being measured.
     """
-    drawing, keys, names = curve.drawing, {row["key"] for row in rows}, figure_names(rows)
+    drawing, keys = curve.drawing, {row["key"] for row in rows}
+    names = list(dict.fromkeys(name for row in rows for name in row if "/" in name))  # METRIC/FIGURE
     headings = {name: heading(*name.split("/", 1)) for name in names}
     columns = {"flow": "flow", "steps": "steps", "evaluations": "evaluations", "seconds": "s a scan"}
     columns |= {name: said for name, (said, _) in headings.items()}
@@ -188,11 +187,6 @@ def speed_quality_page(
     drawn = {NAME: _figure(rows, names)} if figures and names else {}
     seeds = {"sampled scans": drawing.seed}
     return Page(NAME, "Quality against speed", text, rows, drawn, command, seeds, curve.device, more)
-
-
-def figure_names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """METRIC/FIGURE of every figure that a row has."""
-    return list(dict.fromkeys(key for row in rows for key in row if "/" in key))
 
 
 def _remarks(rows: Sequence[Mapping[str, Any]]) -> list[str]:
