@@ -77,7 +77,10 @@ def entries() -> list[tuple[str, Callable[..., Any], dict[str, Any], set[str]]]:
     return found
 
 
-@pytest.mark.parametrize(("group", "constructor", "options", "added"), entries(), ids=[one[0] for one in entries()])
+ENTRIES = entries()  # before a plug-in of another test adds its own
+
+
+@pytest.mark.parametrize(("group", "constructor", "options", "added"), ENTRIES, ids=[one[0] for one in ENTRIES])
 def test_conf_says_every_option_of_a_constructor(group: str, constructor, options: dict[str, Any], added: set[str]):
     known = set(options_of(constructor)) - added
     if group.startswith("stage=distill"):
@@ -91,7 +94,7 @@ def test_where_conf_and_a_constructor_say_a_default_it_is_the_same(group: str):
         "callbacks.ema": {"every"},
         "data": {"batch_size", "name", "validation", "augment", "pairs"},
     }  # of the budget
-    for name, constructor, options, added in entries():
+    for name, constructor, options, added in ENTRIES:
         if name == group or name == f"backbone={group}" or (name.startswith(f"{group}.") and group == "callbacks"):
             defaults = options_of(constructor)
             for key in set(options) - added - own.get(name, set()):
