@@ -48,7 +48,8 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
         given: What the user gave on the command line. It goes to every link that it concerns, after the link's own.
 
     Raises:
-        InputError: a link starts from one that does not come before it, or the command line says where all do.
+        InputError: a link starts from one that does not come before it, the command line says where all do, or a link
+            names plug-ins, which would be imported because a file says so.
     """
     if any(key_of(one) == "stage.init" for one in given):
         raise InputError("stage.init is each link's own: give +chain.LINK.stage.init=RUN to one of them.")
@@ -59,6 +60,8 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
         own = dict(difference)
         parent = own.pop("init", None)
         overrides = [override(key, value) for key, value in flatten(own) if (key, value) != ("experiment", None)]
+        if any(key_of(one) == "plugins" for one in overrides):
+            raise InputError(f"chain.{name}.plugins: plug-ins are given to all links, as --plugin MODULE.")
         if parent is not None:
             if parent not in [link.name for link in links]:
                 raise InputError(f"chain.{name}.init={parent}: no link of that name comes before it.")

@@ -172,13 +172,14 @@ def _job(arguments: Sequence[str], command: Sequence[str], failed: list[str], co
     """What Hydra runs. Of the exceptions only `Exception` is caught by it: SystemExit says the code."""
     try:
         given = list(HydraConfig.get().overrides.task)
+        # Of the command line, not of the overrides: a file can have a sweeper add some of these.
+        if config["plugins"] and not any(one.startswith("plugins=") for one in arguments):
+            named = " ".join(f"--plugin {name}" for name in config["plugins"])
+            raise InputError(f"plug-ins are named on the command line, never in a file: give {named}.")
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             _sweep_job(command, given, failed)
             return
         settings = plain(config)
-        if settings["plugins"] and not any(one.startswith("plugins=") for one in given):
-            named = " ".join(f"--plugin {name}" for name in settings["plugins"])
-            raise InputError(f"plug-ins are named on the command line, never in a file: give {named}.")
         check_keys(settings)
         code = _chain(settings, given, command) if settings["chain"] else _fit(settings, given)
     except (InputError, OSError, OmegaConfBaseException) as error:  # Hydra would print its own lines around it

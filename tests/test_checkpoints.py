@@ -116,6 +116,21 @@ def test_a_flipped_bit_is_refused_or_changes_nothing(saved, tmp_path: Path, endi
     assert refused > 150  # what is neither weights nor config, padding for one, may pass
 
 
+def test_a_file_written_without_checksums_or_in_torchs_older_format_is_read(saved, tmp_path: Path):
+    path, averaged = saved
+    content = torch.load(path, weights_only=True)
+    before = torch.serialization.get_crc32_options()
+    torch.serialization.set_crc32_options(False)
+    try:
+        torch.save(content, tmp_path / "unsummed.ckpt")
+    finally:
+        torch.serialization.set_crc32_options(before)
+    torch.save(content, tmp_path / "older.ckpt", _use_new_zipfile_serialization=False)
+    for name in ("unsummed.ckpt", "older.ckpt"):
+        for key, value in load_checkpoint(tmp_path / name).generator.state_dict().items():
+            assert torch.equal(value, averaged[f"generator.{key}"])
+
+
 def test_names_of_0_1_0_are_read(saved, tmp_path: Path):
     path, averaged = saved
     content = torch.load(path, weights_only=True)

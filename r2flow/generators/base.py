@@ -55,10 +55,14 @@ class Sampler:
     def changed(self, **options: Any) -> Self:
         """The same with the options that are not None. Given times decide the number of steps.
 
+        Another method starts from a uniform grid and without `straight_first`: those were the former method's.
+
         Raises:
             InputError: fewer than one step, or times and a number of steps that contradict.
         """
         given = {key: value for key, value in options.items() if value is not None}
+        if given.get("method", self.method) != self.method:
+            given = {"grid": "uniform", "straight_first": False, **given}
         grid = given.get("grid", "uniform")
         if not isinstance(grid, str):
             given["grid"] = tuple(float(t) for t in grid)

@@ -40,11 +40,17 @@ class Flow(Generator):
         progress: Progress = None,
         **options: Any,
     ) -> Solution:
-        """The state at t_1 of the ODE from x at t_0, (B, ...); see `r2flow.flow.solvers.solve` for the options."""
+        """The state at t_1 of the ODE from x at t_0, (B, ...); see `r2flow.flow.solvers.solve` for the options.
+
+        Raises:
+            InputError: `straight_first` from or to another time than 0 and 1; a solver's own complaints.
+        """
         how = sampler or self.sampler
         field, x = self.field(condition), x.to(self.device)
         if how.straight_first:
-            return solve_straight_first(field, x, how.tolerance, how.method, progress)
+            if (t_0, t_1) != (0.0, 1.0):
+                raise InputError(f"straight_first is for the way from t = 0 to 1, found {t_0:g} to {t_1:g}.")
+            return solve_straight_first(field, x, how.tolerance, how.method, progress, **options)
         grid = how.grid if isinstance(how.grid, str) else torch.tensor(how.grid, dtype=torch.float64)
         return solve(field, x, t_0, t_1, how.method, how.steps, how.tolerance, progress, grid=grid, **options)
 

@@ -259,5 +259,5 @@ def test_a_folder_that_is_no_run_is_one_line(tmp_path, monkeypatch, capsys, kind
 
 def test_a_broken_config_is_no_run(tmp_path):
     (tmp_path / "config.yaml").write_text("stage: [unclosed\n")
-    with pytest.raises(InputError, match=r"config.yaml cannot be read"):
+    with pytest.raises(InputError, match=r"config.yaml is damaged"):
         read_runs([tmp_path])

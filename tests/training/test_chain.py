@@ -305,6 +305,12 @@ def test_a_link_that_lost_its_last_checkpoint_is_not_finished(chained: tuple[Pat
     assert not is_finished(link)
 
 
+@pytest.mark.parametrize("key", ["plugins", "+plugins", "++plugins"])
+def test_a_link_in_a_file_names_no_plugins(key: str):
+    with pytest.raises(InputError, match="chain.rf1.plugins: .*--plugin"):
+        links_of({"rf1": {key: ["theirs.py"]}}, "runs/x", [])
+
+
 def test_a_link_without_its_parent_is_refused():
     with pytest.raises(InputError, match="chain.b.init=c: no link of that name comes before it"):
         links_of({"a": {}, "b": {"init": "c"}}, "runs", [])

@@ -117,12 +117,14 @@ def test_a_plugin_is_not_imported_because_a_file_names_it(eager: Path, tmp_path:
         STAGES["eager"]
     folder = tmp_path / "conf" / "experiment"
     folder.mkdir(parents=True)
-    (folder / "theirs.yaml").write_text(f"# @package _global_\nplugins: [{eager}]\n")
-    done = in_process(tmp_path, ["--config-dir", str(folder.parent), "experiment=theirs"], check=False)
-    assert done.returncode == 2
-    assert done.stderr.splitlines() == [
-        f"error: plug-ins are named on the command line, never in a file: give --plugin {eager}."
-    ]
+    of_a_sweep = f"hydra:\n  sweeper:\n    params:\n      plugins: '[{eager}]'"
+    for text, flags in ((f"plugins: [{eager}]", ()), (of_a_sweep, ("-m",))):
+        (folder / "theirs.yaml").write_text(f"# @package _global_\n{text}\n")
+        done = in_process(tmp_path, ["--config-dir", str(folder.parent), *flags, "experiment=theirs"], check=False)
+        assert done.returncode == 2
+        assert done.stderr.splitlines() == [
+            f"error: plug-ins are named on the command line, never in a file: give --plugin {eager}."
+        ]
     assert "eager" not in STAGES
 
 
