@@ -22,7 +22,7 @@ from r2flow.registry import Registry, UnknownName
 
 GROUP = "r2flow.plugins"
 
-_loaded: set[str] = set()  # as sys.modules, in which a path has no name
+_loaded: set[str] = set()  # as sys.modules, in which a path has no name; by `_whole`
 
 
 def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -53,14 +53,19 @@ def load_plugins(names: Sequence[str]) -> None:
         InputError: a module that is not there, or whose import ends in an error.
     """
     for name in names:
-        if name in _loaded:
+        if _whole(name) in _loaded:
             continue
         try:
             _import(name)
         except Exception as error:  # whatever somebody's module raises
             said = " ".join(str(error).split()) or "no more is known"
             raise InputError(f"the plug-in {name} cannot be imported: {type(error).__name__}: {said}") from None
-        _loaded.add(name)
+        _loaded.add(_whole(name))
+
+
+def _whole(name: str) -> str:
+    """A module's name, or the whole path of a file: `./a.py` and `a.py` are one plug-in."""
+    return str(Path(name).expanduser().resolve()) if name.endswith(".py") else name
 
 
 def _import(name: str) -> None:
@@ -107,7 +112,7 @@ def made_with(config: Mapping[str, Any], what: str) -> Iterator[None]:
     try:
         yield
     except UnknownName as error:
-        missing = [name for name in config.get("plugins") or () if name not in _loaded]
+        missing = [name for name in config.get("plugins") or () if _whole(name) not in _loaded]
         if not missing:
             raise
         give = " ".join(f"--plugin {name}" for name in missing)
