@@ -23,7 +23,7 @@ from r2flow.signals import Stopped
 
 GROUP = "r2flow.plugins"
 
-_loaded: set[str] = set()  # as sys.modules, in which a path has no name
+_loaded: set[str] = set()  # as sys.modules, in which a path has no name; by `_whole`
 
 
 def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -149,6 +149,14 @@ def test_a_plugin_that_cannot_be_imported_is_one_line(tmp_path: Path, text: str 
     assert words in line
 
 
+def test_one_file_is_imported_once_however_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "counted.py").write_text("open('count', 'a').write('x')")
+    monkeypatch.chdir(tmp_path)
+    load_plugins(["counted.py", "./counted.py", str(tmp_path / "counted.py")])
+    load_plugins([str(tmp_path / "counted.py")])
+    assert Path("count").read_text() == "x"
+
+
 def test_an_installed_plugin_is_looked_for_where_a_name_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "somebodys.py").write_text("from tests.training.test_plugins import TABLE\nTABLE.add('mine', 1)\n")
     found = importlib.metadata.EntryPoint("somebodys", "somebodys", plugins.GROUP)
