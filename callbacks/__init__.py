@@ -117,3 +117,6 @@ __all__ = [
     "build_loggers",
     "keep_checkpoints",
 ]
+
+if __name__ != "r2flow.callbacks":  # a run's callbacks look for each other by class, and a second copy has other ones
+    raise ImportError("import r2flow.callbacks, not callbacks: the folder is part of the package r2flow.")

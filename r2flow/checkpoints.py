@@ -218,7 +218,7 @@ class _Allowance(TorchFunctionMode):
     """
 
     FACTORIES = frozenset({torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.linspace})
-    SPARE = 2**24  # elements of buffers that a checkpoint does not hold, and of what is computed on the way
+    SPARE = 2**28  # elements of buffers that a checkpoint does not hold, and of what is computed on the way
 
     def __init__(self, weights: Mapping[str, Tensor], path: Path) -> None:
         super().__init__()

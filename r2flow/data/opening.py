@@ -104,8 +104,10 @@ def open_scans(
         if options.name == SIMULATED:
             return ScanSet(label, open_source(options, reading, int(options.folder)), reading.sensor)
         return ScanSet(label, open_source(options, reading), reading.sensor).limited(num)
-    refuse_other_samples(file.parent, reading.sensor)
-    if own_size and (image := range_image(file)) is not None:
+    image = range_image(file)
+    if image is not None:  # points can be seen through any sensor
+        refuse_other_samples(file.parent, reading.sensor)
+    if own_size and image is not None:
         reading = replace(reading, sensor=reading.sensor.resized(*image.shape[1:]))
     if reading.reflectance == AUTO:
         reading = replace(reading, reflectance=lacks_reflectance([file], reading.on_bad_scan) is None)
