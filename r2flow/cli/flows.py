@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class PartOptions:
+class RegionOptions:
     """The part of a scan that is asked for."""
 
     sector: Annotated[
@@ -66,7 +66,7 @@ def sample(
     out: OutOption,
     draw: DrawOptions,
     solver: SolverOptions,
-    part: PartOptions,
+    part: RegionOptions,
     grid: Annotated[
         str | None, typer.Option(help="Where fixed steps fall: uniform, quadratic, or a file of 'r2flow calibrate'.")
     ] = None,

@@ -53,7 +53,7 @@ DRAWN = ("train_loss", "val_best", "straightness", "gmac", "seconds")  # the fig
 
 
 @dataclass(frozen=True)
-class Run:
+class ComparedRun:
     """A run, read from its folder.
 
     Attributes:
@@ -74,7 +74,7 @@ class Group:
     """Runs that differ in nothing but their seed; a run alone where they were not to be grouped."""
 
     label: str
-    runs: tuple[Run, ...]
+    runs: tuple[ComparedRun, ...]
 
     def values(self, column: str) -> list[float]:
         """A column or a line of the fidelity panel, of the runs that have it."""
@@ -125,7 +125,7 @@ def labels(folders: Sequence[Path]) -> list[str]:
     return ["/".join(p[-depth:]) for p in parts]
 
 
-def read_runs(paths: Sequence[Path], repeats: int = 0, device: str = "cpu") -> list[Run]:
+def read_runs(paths: Sequence[Path], repeats: int = 0, device: str = "cpu") -> list[ComparedRun]:
     """Every run, each backbone built once.
 
     Args:
@@ -141,7 +141,7 @@ def read_runs(paths: Sequence[Path], repeats: int = 0, device: str = "cpu") -> l
             costs[architecture] = cost(config, repeats, device)
         curves = read_curves(path, (*LOSSES, STRAIGHTNESS))
         values = {**costs[architecture], **_read_values(path, config, curves)}
-        runs.append(Run(label, config, values, curves, read_fidelity(path)))
+        runs.append(ComparedRun(label, config, values, curves, read_fidelity(path)))
     return runs
 
 
@@ -218,9 +218,9 @@ def read_fidelity(path: Path) -> dict[str, float]:
         raise InputError(f"{newest} is no result of 'r2flow report fidelity'; remove it or make it again.") from None
 
 
-def group_runs(runs: Sequence[Run]) -> list[Group]:
+def group_runs(runs: Sequence[ComparedRun]) -> list[Group]:
     """Runs of one configuration and several seeds together, in the order given."""
-    groups: list[list[Run]] = []
+    groups: list[list[ComparedRun]] = []
     for run in runs:
         same = next((g for g in groups if same_but_seed(g[0].config, run.config)), None)
         if same is None:
@@ -249,7 +249,7 @@ def same_but_seed(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
     return bool(parents[0] and parents[1] and same_but_seed(parents[0], parents[1]))
 
 
-def _common_label(runs: Sequence[Run]) -> str:
+def _common_label(runs: Sequence[ComparedRun]) -> str:
     """The common part of several runs' names, without the word seed."""
     if len(runs) == 1:
         return runs[0].label

@@ -66,8 +66,6 @@ def write_samples(
         raise InputError(f"needs at least one scan and a batch of at least one; found {num} and {batch_size}.")
     generator = checkpoint.generator
     sampler = sampler or generator.sampler
-    generator.space.check_channels(channels)
-    generator.check_sampler(sampler)
     formats = formats_of(checkpoint, channels) if formats is None else formats
     check_formats(checkpoint, formats, channels)
     out, rays = Path(out), checkpoint.sensor.rays()

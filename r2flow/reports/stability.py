@@ -36,7 +36,7 @@ JET = "narrow_jet"  # the known exception: nothing evaluated on either side of i
 FINISHED = ("point_mass", "narrow_gaussian", "ray_drop")
 
 
-class Cell(NamedTuple):
+class Trial(NamedTuple):
     """A solver on a problem; `tolerance` is None for one of fixed steps, `finish` is left to a last Euler step."""
 
     problem: str
@@ -50,11 +50,11 @@ def cells(
     problems: Iterable[str] = tuple(PROBLEMS),
     solvers: Iterable[str] = tuple(SOLVERS),
     tolerances: Sequence[float] = (1e-3, 1e-5),
-) -> list[Cell]:
+) -> list[Trial]:
     """Every problem, precision, solver and, of adaptive solvers, tolerance; those of `FINISHED` also with a last Euler
     step of 1e-3."""
     return [
-        Cell(problem, finish, precision, solver, tolerance)
+        Trial(problem, finish, precision, solver, tolerance)
         for problem, precision, solver in itertools.product(problems, PRECISIONS, solvers)
         for finish in ((0.0, 1e-3) if problem in FINISHED else (0.0,))
         for tolerance in (tolerances if adapts(solver) else (None,))
@@ -62,7 +62,7 @@ def cells(
 
 
 def stability(
-    chosen: Sequence[Cell],
+    chosen: Sequence[Trial],
     steps: int = 32,
     scans: int = 8,
     elements: int = 64,
@@ -90,7 +90,7 @@ def stability(
     return rows
 
 
-def _row(cell: Cell, steps: int, x_0: Tensor, max_evaluations: int) -> Row:
+def _row(cell: Trial, steps: int, x_0: Tensor, max_evaluations: int) -> Row:
     problem, tolerance = PROBLEMS[cell.problem](), cell.tolerance
     state, network = PRECISIONS[cell.precision]
     flow = Field(_in_precision(problem, network), x_0.shape[1:])
