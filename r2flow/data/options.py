@@ -8,7 +8,7 @@ from typing import Any, Self
 from r2flow.data.shards import PairRecipe
 from r2flow.errors import InputError
 from r2flow.flow.solvers import check_method, check_tolerance
-from r2flow.registry import check_options
+from r2flow.registry import NonNegative, check_options
 
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # in the table `r2flow.data.opening.SOURCES`
 MIXED, PAIRS = "mixed", "pairs"  # what `data.name` may be besides: several sets of scans, and pairs drawn by a flow
@@ -123,7 +123,7 @@ class DataOptions(SourceOptions):
     augment: Mapping[str, Any] | None = None  # `r2flow.data.augment.Augmentation`, of training scans alone
     batch_size: int = 8  # images in one optimiser step, over all devices and accumulated batches
     workers: int = 0  # loader processes of each device
-    memory_gib: float = 2.0  # training scans are kept in memory where they fit into this, else read when needed
+    memory_gib: NonNegative = 2.0  # training scans are kept in memory where they fit into this, else read when needed
     validation: Mapping[str, Any] | None = None  # `ValidationOptions`
     pairs: Mapping[str, Any] | None = None  # `PairOptions`, where the data are pairs
 

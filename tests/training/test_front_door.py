@@ -22,6 +22,7 @@ REFUSED = {
     "stage.betas=[a,b]": "betas must be a list of 2",
     "stage.warmup_images=-4": "warmup_images must be a whole number of at least 0",
     "stage.init=3": "no checkpoint at 3",
+    "data.memory_gib=-1": "memory_gib must be a finite number of at least 0",
     "stage=null": "leaves the run without its stage: give one of distill, ",
     "stage=3": "leaves the run without its stage: give one of distill, ",
     "~backbone": "~backbone leaves the run without its backbone",
