@@ -1,6 +1,5 @@
 """Many processes, half precision, SLURM and sweeps on a cluster: the same run, however it is spread."""
 
-import importlib.util
 import json
 import os
 import shutil
@@ -247,8 +246,7 @@ def test_a_launcher_that_is_not_installed_says_how_to_get_it(tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_sweep_through_submitit_runs_every_job_and_reports_a_failed_one(train: Run, tmp_path: Path):
-    if importlib.util.find_spec("hydra_plugins.hydra_submitit_launcher") is None:
-        pytest.skip("needs the extra 'slurm' (hydra-submitit-launcher)")
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="needs the extra 'slurm'")
     launcher: list[Any] = ["hydra/launcher=submitit_local", "trainer.max_steps=2"]
     done = train(*launcher, "stage.loss=mse,nonsense", check=False, flags=("-m",))
     assert done.returncode == 2
