@@ -107,3 +107,17 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield from flatten(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
+
+
+def learned(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A config without its free keys: what was learned, and neither where nor how it was computed."""
+    found: dict[str, Any] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping) and value:
+            inner = learned(value, f"{prefix}{key}.")
+            if inner:
+                found[key] = inner
+        elif rule(f"{prefix}{key}").resume == "fixed":
+            groups = isinstance(value, Sequence) and value and all(isinstance(one, Mapping) for one in value)
+            found[key] = [learned(one, f"{prefix}{key}.{n}.") for n, one in enumerate(value)] if groups else value
+    return found
