@@ -324,8 +324,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
 
         weights = _plain(checkpoint.generator)
         if half:
-            named = checkpoint.generator.named_parameters()
-            large = {name for name, value in named if value.ndim > 1 and value.numel() > SMALL}
+            large = large_matrices(checkpoint.generator)
             weights = {name: value.half() if name in large else value for name, value in weights.items()}
         notes = {
             "config": learned(checkpoint.config),
@@ -350,6 +349,11 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
             torch.save(content, file)
     else:
         raise InputError(f"{path}: give .safetensors for our format or .pth for the published one.")
+
+
+def large_matrices(module: nn.Module) -> set[str]:
+    """Names of the parameters that half precision rounds."""
+    return {name for name, value in module.named_parameters() if value.ndim > 1 and value.numel() > SMALL}
 
 
 def _plain(module: nn.Module) -> dict[str, Tensor]:

@@ -15,6 +15,7 @@ from r2flow.data.pairs import default_folder
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import is_checkpoint
 from r2flow.models import MODELS, SHIPPED, Model, add_model, find_model, model_file, name_of
+from r2flow.reports.contents import card, describe
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 
@@ -159,3 +160,11 @@ def test_a_written_config_says_what_was_learned_and_no_folder():
 
 def test_pairs_of_a_model_lie_outside_the_package():
     assert default_folder(find_model("street")) == Path("runs/street-pairs")
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_card_says_what_the_file_says(name):
+    path = Path(__file__).parents[1] / "docs" / "models" / f"{name}.md"
+    if not model_file(name).is_file():
+        pytest.skip(f"{name} does not come with the package")
+    assert card(describe(name)) in path.read_text(), f"r2flow info {name} --card, into {path}"

@@ -130,12 +130,19 @@ def calibrate(
 def info(
     checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file, a run folder or a model.")],
     json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    card: Annotated[bool, typer.Option("--card", help="The table of its model card, as docs/models has it.")] = False,
 ) -> None:
     """Print what is in a checkpoint."""
+    from r2flow.reports.contents import card as card_of
     from r2flow.reports.contents import describe, print_contents
 
     contents = describe(checkpoint)
-    print(to_json(contents, indent=2)) if json else print_contents(contents)
+    if card:
+        print(card_of(contents))
+    elif json:
+        print(to_json(contents, indent=2))
+    else:
+        print_contents(contents)
 
 
 @app.command(epilog="Example: r2flow convert r2flow-kitti360-1rf.pth 1rf.safetensors")
