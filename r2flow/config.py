@@ -17,13 +17,14 @@ class Key:
 
     Attributes:
         resume: `free`: it may differ when a run goes on, for it says where and how is computed, not what.
-        inherited: A run with `stage.init` has its parent's value: `always`, or `unless_given` on the command line.
+        inherited: A run with `stage.init` has its parent's value: `always`, or `unless_given` on the command line;
+            `with_pairs`, which are images of the parent, always, and else unless given.
         links: Which links of a chain take it from the chain's command line: all, those that read `scans` (the others
             inherit from them), those that learn from `pairs`, or none, for it says what the `chain` is.
     """
 
     resume: Literal["fixed", "free"] = "fixed"
-    inherited: Literal["no", "always", "unless_given"] = "no"
+    inherited: Literal["no", "always", "unless_given", "with_pairs"] = "no"
     links: Literal["all", "scans", "pairs", "chain"] = "all"
 
 
@@ -43,7 +44,7 @@ RULES: dict[str, Key] = {
     "samples": FREE,
     "sampler": FREE,
     "parent.path": FREE,
-    "sensor": OF_THE_MODEL,
+    "sensor": replace(OF_THE_MODEL, inherited="with_pairs"),
     "encoding": OF_THE_MODEL,
     "generator": Key(inherited="unless_given", links="scans"),  # see `lineage.generator_of`
     "backbone": OF_THE_MODEL,
