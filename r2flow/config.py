@@ -39,6 +39,7 @@ RULES: dict[str, Key] = {
     "name": OF_THE_CHAIN,
     "run_dir": OF_THE_CHAIN,
     "chain": OF_THE_CHAIN,
+    "preview": OF_THE_CHAIN,
     "plugins": FREE,
     "loggers": FREE,
     "samples": FREE,
