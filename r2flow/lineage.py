@@ -11,6 +11,7 @@ from r2flow.data.options import PairOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.sources import AUTO
 from r2flow.errors import InputError
+from r2flow.models import name_of
 from r2flow.registry import check_options
 from r2flow.stages import STAGES
 
@@ -127,7 +128,7 @@ def check_finished(init: Path, parent: Checkpoint) -> None:
         InputError: the run in a folder has not come to its end.
     """
     wanted = parent.config.get("trainer", {}).get("max_steps", 0)
-    if init.expanduser().is_dir() and parent.step < wanted:
+    if init.expanduser().is_dir() and name_of(parent.path) is None and parent.step < wanted:
         raise InputError(
             f"{init} has stopped at step {parent.step} of {wanted}: finish it, or name the checkpoint to start from, "
             f"{parent.path}."
