@@ -10,12 +10,14 @@ Notation everywhere: `t = 0` is noise and `t = 1` is data; `x_0 ~ N(0, I)`, `x_1
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from r2flow.checkpoints import Checkpoint
 
 __version__ = "0.2.0"
 
 
-def load(name: str, device: str = "cpu") -> "Checkpoint":
+def load(name: "str | Path", device: str = "cpu") -> "Checkpoint":
     """A trained generator: a model by its name (`r2flow weights` lists them), a run folder or a checkpoint file.
 
     Raises:

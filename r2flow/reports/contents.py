@@ -42,7 +42,8 @@ def card(contents: dict[str, Any]) -> str:
     config, sampler = contents["config"], contents["sampler"]
     data, stage, parent = config["data"], config.get("stage") or {}, config.get("parent")
     learned_from = [data["name"], config.get("scans"), *_said(data.get("augment") or {})]
-    steps, batch_size = contents["step"], data.get("batch_size", 1)
+    steps, batch_size = contents["step"], data.get("batch_size")
+    seen = f" of {batch_size} images, {steps * batch_size:,} images" if batch_size else ""
     facts = {
         "draws": contents.get("draws"),
         "image": f"{' x '.join(map(str, contents['image']))}, {' to '.join(map(str, contents['range_m']))} m",
@@ -53,7 +54,7 @@ def card(contents: dict[str, Any]) -> str:
         "learned from": ", ".join(filter(None, learned_from)),
         "stage": ", ".join([contents["stage"], *_said({key: stage.get(key) for key in ("loss", "time")})]),
         "starts from": parent and f"a {parent['stage']} flow of {parent['step']:,} steps, weights {parent['weights']}",
-        "budget": f"{steps:,} steps of {batch_size} images, {steps * batch_size:,} images",
+        "budget": f"{steps:,} steps{seen}",
         "seed": config.get("seed"),
         "licence": contents.get("licence"),
     }
