@@ -103,3 +103,29 @@ def test_built_in_sensors_are_given_by_name(r2flow, scans: Path, tmp_path: Path)
         code, _, _ = r2flow("project", scans / "000000.bin", "--sensor", name, "--reflectance-scale", 255, "-o", out)
         assert code == 0
         assert np.load(out).shape == (2, *SENSORS[name].shape)
+
+
+def test_the_wrong_sensor_is_said_in_one_line_with_the_right_one(r2flow, tmp_path: Path):  # noqa: F811
+    pandar = SENSORS["pandar64"]
+    draw, e = np.random.default_rng(0), pandar.rays().numpy()[0]
+    r = np.minimum(np.where(e < 0, 1.5 / np.sin(np.maximum(-e, 1e-9)), np.inf), 40 / np.cos(e))
+    image = np.stack([r, draw.random(r.shape)]).astype(np.float32) * (draw.random(r.shape) < 0.9)
+    for number in range(2):
+        write_points(tmp_path / "scans" / f"{number}.bin", *image_to_points(image, pandar.rays()))
+    one, out = tmp_path / "scans" / "0.bin", tmp_path / "out"
+    for verb in (
+        ("show", tmp_path / "scans"),
+        ("prepare", "folder", tmp_path / "scans", "--workers", 1),
+        ("project", one, "-o", tmp_path / "x.npy"),
+        ("evaluate", tmp_path / "scans", one, "--metrics", "jsd", "--workers", 0),
+    ):
+        given = verb if "-o" in verb else (*verb, "--out", out / verb[0])
+        code, _, error = r2flow(*given)
+        warnings = [line for line in error.splitlines() if line.startswith("WARNING")]
+        assert code == 0, error
+        assert len(warnings) == (2 if verb[0] == "evaluate" else 1), error  # one for each of its two sets
+        assert "do not look like those of sensor 'hdl64e', which sees +3.0 to -25.0 degrees" in warnings[0]
+        assert "64 beams from +14.9 to -24.9 degrees" in warnings[0]
+        assert "sensor=pandar64 in training, --sensor pandar64 in verbs" in warnings[0]
+    code, _, error = r2flow("show", tmp_path / "scans", "--sensor", "pandar64", "--out", out)
+    assert (code, error) == (0, "")

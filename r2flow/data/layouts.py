@@ -8,7 +8,7 @@ from itertools import accumulate
 from pathlib import Path
 
 from r2flow.data.options import SourceOptions
-from r2flow.data.sources import Reading, ScanFiles, ScanSource, lacks_reflectance
+from r2flow.data.sources import Reading, ScanFiles, ScanSource, lacks_reflectance, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import SCAN_ENDINGS
 
@@ -107,7 +107,9 @@ class Layout(SourceKind):
         drives = {drive.name: span for drive, span in zip(found, spans_of(found), strict=True)}
         about = {"kind": options.name, **({"split": options.split or "all"} if self.splits else {})}
         root = Path(options.folder).expanduser()  # as the paths begin that are found in it, however it was written
-        return ScanFiles([path for drive in found for path in drive.scans], reading, root, drives, about)
+        paths = [path for drive in found for path in drive.scans]
+        warn_of_other_sensor(paths, reading.sensor, root)
+        return ScanFiles(paths, reading, root, drives, about)
 
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
         paths = (path for drive in self.find_drives(options) for path in drive.scans)

@@ -30,7 +30,16 @@ from r2flow.data.options import (
 )
 from r2flow.data.prepared import PreparedScans, find_prepared, read_manifest
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import AUTO, Reading, ScanFiles, ScanSource, SimulatedScans, lacks_reflectance, range_image
+from r2flow.data.sources import (
+    AUTO,
+    Reading,
+    ScanFiles,
+    ScanSource,
+    SimulatedScans,
+    lacks_reflectance,
+    range_image,
+    warn_of_other_sensor,
+)
 from r2flow.data.store import MANIFEST
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
@@ -91,7 +100,7 @@ def open_scans(
         reading: How scans become images; what the scans say of themselves, or `usual_reading`, if left out.
         split: A part of the data set's standard split.
         num: At most so many, by a fixed shuffle; the number of simulated scenes.
-        own_size: Whether a range image's own size is taken in place of the sensor's, as a picture may do.
+        own_size: For pictures: a range image's own size is taken in place of the sensor's, and no beams are compared.
 
     Raises:
         InputError: nothing is there, or what is there cannot become such images.
@@ -107,6 +116,8 @@ def open_scans(
     image = range_image(file)
     if image is not None:  # points can be seen through any sensor
         refuse_other_samples(file.parent, reading.sensor)
+    elif not own_size:
+        warn_of_other_sensor([file], reading.sensor, file)
     if own_size and image is not None:
         reading = replace(reading, sensor=reading.sensor.resized(*image.shape[1:]))
     if reading.reflectance == AUTO:

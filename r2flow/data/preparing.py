@@ -35,7 +35,15 @@ from r2flow.data.prepared import (
     write_manifest,
 )
 from r2flow.data.quantise import OTHER_LEVELS, RangeCodes, ReflectanceCodes, find_levels
-from r2flow.data.sources import Reading, ScanFiles, ScanSource, SimulatedScans, spread, stored_reflectance
+from r2flow.data.sources import (
+    Reading,
+    ScanFiles,
+    ScanSource,
+    SimulatedScans,
+    spread,
+    stored_reflectance,
+    warn_of_other_sensor,
+)
 from r2flow.data.store import MANIFEST, clear_leftovers, refuse_other, shard_bytes, warn_damaged
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
@@ -80,6 +88,7 @@ def plan_files(
     found = find_drives(layout, root, split, drives)
     paths = [path for drive in found for path in drive.scans]
     named = tuple(Drive(d.name, tuple(Path(os.path.relpath(p, root)).as_posix() for p in d.scans)) for d in found)
+    warn_of_other_sensor(paths, sensor, root)
     known = _reflectance_levels(paths, reflectance_scale, levels)
     reading = Reading(sensor, projection, convention, reflectance_scale, known is not None, "error", within_limits=True)  # type: ignore[arg-type]
     return _plan(layout, named, ScanFiles(paths, reading), reading, known, shard_scans, PROJECTION)

@@ -7,6 +7,7 @@ import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +21,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.labels import labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, project, project_indices
+from r2flow.lidar.recognition import other_sensor
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points
 from r2flow.lidar.scan_files.points import FARTHEST
 from r2flow.lidar.sensors import Sensor
@@ -27,6 +29,7 @@ from r2flow.lidar.sensors import Sensor
 log = logging.getLogger(__name__)
 
 AUTO = "auto"
+LOOKED_AT = 3  # scans of a set, whose beams are compared with the sensor's
 
 
 @dataclass(frozen=True)
@@ -252,6 +255,29 @@ def lacks_reflectance(paths: Iterable[str | Path], on_bad_scan: str = "error") -
         if found.size:
             return None if found.any() else f"the reflectance in {path} is 0 throughout"
     return "no scan has a return"
+
+
+def warn_of_other_sensor(paths: Sequence[str | Path], sensor: Sensor, root: str | Path) -> None:
+    """Say in one line that scan files do not look like a sensor's, and which sensor they fit (`other_sensor`).
+
+    Range images have no beams, and files that cannot be read are met again when their turn comes.
+    """
+    scans = []
+    for number in spread(len(paths), LOOKED_AT):
+        with suppress(InputError):
+            scans.append(read_points(paths[number]))
+    found = other_sensor(scans, sensor) if scans else None
+    if found is None:
+        return
+    seen, name = found
+    edges = sensor.row_edges
+    advice = f"give the right one, or estimate it: r2flow sensor {root} --out mine.yaml"
+    if name is not None and name != sensor.name:
+        advice = f"they fit '{name}': sensor={name} in training, --sensor {name} in verbs"
+    log.warning(
+        "%s: the scans do not look like those of sensor '%s', which sees %+.1f to %+.1f degrees: %s; %s",
+        root, sensor.name, edges[0], edges[-1], seen, advice,
+    )  # fmt: skip
 
 
 def stored_reflectance(path: str | Path) -> np.ndarray | None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from r2flow.data.opening import find_drives, open_scans, own_reading, parse, usual_reading
 from r2flow.data.options import FOLDER
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import range_image, read_labelled_scan, spread
+from r2flow.data.sources import range_image, read_labelled_scan, spread, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Sensor
 
@@ -74,6 +74,7 @@ def views_of(
     reading = replace(reading, sensor=sensor, reflectance_scale=reflectance_scale, on_bad_scan="error")
     if own is None and options.name == FOLDER:
         loose = scans_of(file or Path(options.folder), most)
+        warn_of_other_sensor(loose, sensor, spec)
         return [View(path, open_scans(path, reading, own_size=True), 0) for path in loose]
     scans = open_scans(spec, reading).spread(most)
     return [View(Path(options.folder, name), scans, number) for number, name in enumerate(scans.source.names)]
