@@ -22,7 +22,7 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.labels import labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, project, project_indices
 from r2flow.lidar.recognition import other_sensor
-from r2flow.lidar.scan_files import NoPointsError, Points, read_points
+from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
 from r2flow.lidar.scan_files.points import FARTHEST
 from r2flow.lidar.sensors import Sensor
 
@@ -187,23 +187,16 @@ def _scaled_reflectance(path: str | Path, points: Points, scale: float | None) -
 
 
 def range_image(path: Path, shape: tuple[int, int] | None = None) -> np.ndarray | None:
-    """The range image in a .npy of shape (2 or 1, H, W), what is not finite as 0; None where the file is another.
+    """The range image in a file, `read_range_image`; None where the file holds no range image.
 
     Raises:
-        InputError: its size is not the (H, W) of `shape`.
+        InputError: the file cannot be read, or its size is not the (H, W) of `shape`.
     """
-    if path.suffix.lower() != ".npy":
-        return None
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError):
-        return None  # the reader of points explains what is wrong with it
-    if array.ndim != 3 or array.shape[0] not in (1, 2) or array.dtype.kind != "f":
-        return None
-    if shape is not None and array.shape[1:] != shape:
+    array = read_range_image(path)
+    if array is not None and shape is not None and array.shape[1:] != shape:
         found, wanted = ("x".join(map(str, one)) for one in (array.shape[1:], shape))
         raise InputError(f"{path} is a range image of {found}, the sensor's is {wanted}; give --size {found}.")
-    return np.nan_to_num(array.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    return array
 
 
 def read_image(path: Path, reading: Reading) -> np.ndarray:

@@ -14,13 +14,13 @@ from typing import IO
 import numpy as np
 
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
-from r2flow.lidar.scan_files.arrays import read_kitti, read_npy, read_nuscenes
+from r2flow.files import atomic_write, refuse_unreadable
+from r2flow.lidar.scan_files.arrays import read_image, read_kitti, read_npy, read_nuscenes
 from r2flow.lidar.scan_files.pcd import read_pcd, write_pcd
 from r2flow.lidar.scan_files.ply import read_ply, write_ply
 from r2flow.lidar.scan_files.points import NoPointsError, Points
 
-__all__ = ["SCAN_ENDINGS", "NoPointsError", "Points", "read_points", "write_points"]
+__all__ = ["SCAN_ENDINGS", "NoPointsError", "Points", "read_points", "read_range_image", "write_points"]
 
 _READERS: dict[str, Callable[[Path], Points]] = {
     ".pcd.bin": read_nuscenes,  # before ".bin", which it ends with
@@ -58,8 +58,27 @@ def read_points(path: str | Path) -> Points:
     path = Path(path)
     reader = _READERS[_ending(path, _READERS)]
     try:
-        _refuse_unreadable(path)
+        refuse_unreadable(path, LARGEST_FILE, "scan file")
         return reader(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
+
+
+def read_range_image(path: str | Path) -> np.ndarray | None:
+    """The range image in a .npy of floats (2 or 1, H, W), float32, what is not finite as 0; None where it is no .npy.
+
+    None, too, where a .npy is of another shape or type: it may hold points. Nothing is unpickled, and no more memory is
+    taken than the file has bytes.
+
+    Raises:
+        InputError: the file is missing, no regular file or damaged.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".npy":
+        return None
+    try:
+        refuse_unreadable(path, LARGEST_FILE, "range image")
+        return read_image(path)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
 
@@ -96,22 +115,6 @@ def _ending(path: Path, known: Iterable[str]) -> str:
     if ending not in known:
         raise InputError(f"{path}: {ending} is read but not written; choose one of {', '.join(known)}.")
     return ending
-
-
-def _refuse_unreadable(path: Path) -> None:
-    if path.is_symlink() and not path.exists():
-        raise InputError(f"{path} is a link to {path.readlink()}, which does not exist.")
-    if not path.exists():
-        raise InputError(f"{path} does not exist. Is the path right?")
-    if path.is_dir():
-        raise InputError(f"{path} is a folder, not a scan file; name a file in it.")
-    if not path.is_file():  # reading a pipe would wait for ever
-        raise InputError(f"{path} is not a regular file.")
-    size = path.stat().st_size
-    if size == 0:
-        raise InputError(f"{path} is empty (0 bytes); fetch or write it again.")
-    if size > LARGEST_FILE:
-        raise InputError(f"{path} has {size / 2**30:.1f} GiB, too many for one scan (at most 1). Is it a whole drive?")
 
 
 def _table(path: Path, xyz: np.ndarray, reflectance: np.ndarray | None) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Files that are one array: KITTI and nuScenes rows of float32 without a header, and NumPy's .npy."""
 
 import math
+import os
 from pathlib import Path
 from typing import IO
 
@@ -57,22 +58,37 @@ def read_npy(path: Path) -> Points:
     """An array (N, 3) or (N, 4) of floats; see `read_points`. Never unpickles."""
     with path.open("rb") as file:
         shape, fortran_order, dtype = _npy_header(path, file)
-        body = np.fromfile(file, dtype=np.uint8)
-    if dtype.kind != "f":
-        raise InputError(f"{path} holds {dtype} values, not floats: points are float (N, 3) or (N, 4).")
-    if len(shape) != 2 or shape[1] not in (3, 4):
-        raise InputError(
-            f"{path} holds an array of shape {shape}, not points: these are (N, 3) or (N, 4), "
-            f"x y z and perhaps reflectance.{_shape_hint(shape)}"
-        )
-    size = math.prod(shape) * dtype.itemsize
-    if body.size != size:
-        raise InputError(
-            f"{path} declares {shape[0]} rows of {shape[1]} {dtype}, {size} bytes, but {body.size} follow its header. "
-            "Is it damaged?"
-        )
-    array = body.view(dtype).reshape(shape, order="F" if fortran_order else "C")
+        if dtype.kind != "f":
+            raise InputError(f"{path} holds {dtype} values, not floats: points are float (N, 3) or (N, 4).")
+        if len(shape) != 2 or shape[1] not in (3, 4):
+            raise InputError(
+                f"{path} holds an array of shape {shape}, not points: these are (N, 3) or (N, 4), "
+                f"x y z and perhaps reflectance.{_shape_hint(shape)}"
+            )
+        array = _npy_body(path, file, shape, fortran_order, dtype)
     return checked_points(path, array[:, :3], array[:, 3] if shape[1] == 4 else None)
+
+
+def read_image(path: Path) -> np.ndarray | None:
+    """See `read_range_image`; None where the array is of another shape or type."""
+    with path.open("rb") as file:
+        shape, fortran_order, dtype = _npy_header(path, file)
+        if len(shape) != 3 or shape[0] not in (1, 2) or dtype.kind != "f" or 0 in shape:
+            return None
+        array = _npy_body(path, file, shape, fortran_order, dtype)
+    with np.errstate(over="ignore"):  # beyond float32 is infinite, and so no return
+        return np.nan_to_num(array.astype(np.float32), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _npy_body(path: Path, file: IO[bytes], shape: tuple[int, ...], fortran_order: bool, dtype: np.dtype) -> np.ndarray:
+    """The array behind a header, whose size is compared with the file's before it is read."""
+    size, there = math.prod(shape) * dtype.itemsize, os.fstat(file.fileno()).st_size - file.tell()
+    body = np.fromfile(file, dtype=np.uint8) if there == size else None
+    if body is None or body.size != size:
+        raise InputError(
+            f"{path} declares the shape {shape} of {dtype}, {size} bytes, but {there} follow its header. Is it damaged?"
+        )
+    return body.view(dtype).reshape(shape, order="F" if fortran_order else "C")
 
 
 def _npy_header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
