@@ -327,6 +327,9 @@ class PreparedScans(ScanSource):
     def _digest(self) -> str:
         return hashlib.sha256((self.folder / MANIFEST).read_bytes()).hexdigest()
 
+    def files(self) -> dict[str, str | Path]:
+        return {MANIFEST: self.folder / MANIFEST}  # which holds the checksums of all shards
+
     def places(self) -> set[str]:
         real = os.path.realpath(self.folder)
         return {os.path.join(real, name) for name in self.names}

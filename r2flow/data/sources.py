@@ -109,6 +109,10 @@ class ScanSource(ABC):
         """Where the scans lie, by which two sources are known to share some; empty where they lie nowhere."""
         return set()
 
+    def files(self) -> dict[str, str | Path]:
+        """The files that decide what the images are, by names that do not depend on where they lie."""
+        return {}
+
 
 def read_scan(
     path: str | Path,
@@ -312,6 +316,9 @@ class ScanFiles(ScanSource):
     def subset(self, indices: Sequence[int]) -> "ScanFiles":
         return ScanFiles([self.paths[i] for i in indices], self.reading, self.root, about=self.described)
 
+    def files(self) -> dict[str, str | Path]:
+        return dict(zip(self.names, self.paths, strict=True))
+
     def about(self) -> dict[str, Any]:
         return {**self.described, "files": self._digest[:12], "reflectance": bool(self.reading.reflectance)}
 
@@ -323,7 +330,11 @@ class ScanFiles(ScanSource):
         found = [(name, os.stat(path)) for name, path in zip(self.names, self.paths, strict=True)]
         stats = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in found]
         # Some contents, too: unpacked archives have equal names, sizes and times.
-        some = [hashlib.sha256(Path(self.paths[i]).read_bytes()).hexdigest() for i in spread(len(self.paths), 8)]
+        some = []
+        for i in spread(len(self.paths), 8):
+            if os.path.isfile(self.paths[i]):  # a pipe would hang, a device never end
+                with open(self.paths[i], "rb") as file:
+                    some.append(hashlib.file_digest(file, "sha256").hexdigest())
         return hashlib.sha256(json.dumps([stats, some]).encode()).hexdigest()
 
     def places(self) -> set[str]:

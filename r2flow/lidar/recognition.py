@@ -44,7 +44,7 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> tuple[str, str | No
     striped = _share_of_empty_rows(elevation, sensor)
     nearest, near = (None, np.inf) if beams is None else _nearest(beams, elevation)
     if beams is not None and (sensor.name in SENSORS or len(beams) == len(sensor.elevations)):
-        distance = min(_distance(beams, table) for table in _beam_tables(sensor))
+        distance = min(_distance(beams, table) for table in _beam_tables(sensor, len(beams)))
         fits = distance < OFF and not (distance > BEATEN and near < distance / 2)
     else:
         fits = striped <= STRIPED
@@ -54,13 +54,16 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> tuple[str, str | No
     return seen, nearest
 
 
-def _beam_tables(sensor: Sensor) -> list[np.ndarray]:
+def _beam_tables(sensor: Sensor, beams: int) -> list[np.ndarray]:
     """Elevations that its scans may have: its rows, and the beams of the built-in sensor that it is at another size."""
-    found, rows = [sensor.elevations], len(sensor.elevations)
-    if sensor.name in SENSORS and np.allclose(SENSORS[sensor.name].resized(rows).elevations, sensor.elevations):
-        found += [SENSORS[sensor.name].elevations]
-        if sensor.name == "hdl64e":  # whose rows are even bins
-            found += [SENSORS["hdl64e_rings"].elevations]
+    found = [sensor.elevations]
+    if sensor.name not in SENSORS:
+        return [np.asarray(found[0])]
+    rows, known = len(sensor.elevations), SENSORS[sensor.name]
+    if np.allclose(known.resized(rows).elevations, sensor.elevations):
+        found += [known.elevations]
+        if sensor.name == "hdl64e":  # whose rows are even bins: rings, and clouds of images with as many rows or more
+            found += [SENSORS["hdl64e_rings"].elevations, *([known.resized(beams).elevations] if beams >= rows else ())]
     return [np.asarray(elevations) for elevations in found]
 
 

@@ -66,7 +66,9 @@ def test_scans_of_even_rows_are_of_the_sensor_of_even_rows():
     for size in ((64, 1024), (32, 512), (16, 256)):
         sensor = SENSORS["hdl64e"].resized(*size)
         assert other_sensor([scan(sensor, RING_AFTER_RING)], sensor) is None
-    assert other_sensor([scan(SENSORS["hdl64e"].resized(32, 512), RING_AFTER_RING)], SENSORS["hdl64e"]) is not None
+    half = [scan(SENSORS["hdl64e"].resized(32, 512), RING_AFTER_RING)]
+    assert other_sensor(half, SENSORS["hdl64e"].resized(8, 64)) is None
+    assert other_sensor(half, SENSORS["hdl64e"]) is not None
 
 
 def test_a_part_of_the_view_is_enough(shared: Path):
