@@ -11,7 +11,7 @@ from r2flow.cli.options import (
     ConventionOption,
     OutOption,
     ProjectionOption,
-    ScaleOption,
+    ScaleChoice,
     SensorChoice,
     SensorOption,
     SizeOption,
@@ -58,12 +58,12 @@ def project(
     convention: ConventionOption = "centre",
     sensor: SensorOption = "hdl64e",
     size: SizeOption = None,
-    reflectance_scale: ScaleOption = 1.0,
+    reflectance_scale: ScaleChoice = None,
 ) -> None:
     """Project a scan to a range image: float32 (2, H, W), range in metres and reflectance, 0 where missing."""
     import numpy as np
 
-    from r2flow.data.opening import open_scans
+    from r2flow.data.opening import open_scans, usual_scale
     from r2flow.data.sources import Reading
     from r2flow.files import atomic_write
 
@@ -72,7 +72,8 @@ def project(
         raise InputError(f"--out {out}: a range image is written as .npy; r2flow show draws pictures.")
     if scan.is_dir():
         raise InputError(f"{scan} is a folder, not a scan file; name a file in it.")
-    reading = Reading(chosen, projection, convention, reflectance_scale, on_bad_scan="error")  # type: ignore[arg-type]
+    scale = usual_scale(scan, chosen) if reflectance_scale is None else reflectance_scale
+    reading = Reading(chosen, projection, convention, scale, on_bad_scan="error")  # type: ignore[arg-type]
     image = open_scans(scan, reading).source[0]
     image = image if len(image) > 1 else np.concatenate([image, np.zeros_like(image)])
     with atomic_write(out) as file:

@@ -10,7 +10,7 @@
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -168,7 +168,7 @@ def find_drives(
 
 def write_samples_note(folder: Path, reading: Reading, **about: Any) -> None:
     """Say in a folder of samples whose images they are: `open_scans` then needs no sensor and no size."""
-    images = {"sensor": asdict(reading.sensor), "projection": reading.projection, "convention": reading.convention}
+    images = {"sensor": reading.sensor.described(), "projection": reading.projection, "convention": reading.convention}
     with atomic_write(folder / SAMPLES, "w") as file:
         json.dump({"format": "r2flow samples 1", **images, **about}, file, indent=1)
 
@@ -203,6 +203,13 @@ def usual_reading(spec: str | Path) -> Reading:
     """How scans of this kind usually become images."""
     kind = SOURCES[parse(str(spec))[0].name]
     return Reading(SENSORS[kind.sensor], reflectance_scale=kind.reflectance_scale)
+
+
+def usual_scale(spec: str | Path, sensor: Sensor) -> float:
+    """The value in the files of a set of scans that usually means full reflectance; of a folder, its sensor's."""
+    name = parse(str(spec))[0].name
+    is_noted = own_reading(spec) is not None  # samples have reflectances of [0, 1]
+    return (name == FOLDER and not is_noted and sensor.reflectance_scale) or SOURCES[name].reflectance_scale
 
 
 def _noted(folder: Path) -> Reading | None:

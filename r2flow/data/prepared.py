@@ -49,7 +49,7 @@ class ScanRecipe:
     layout: str  # of the data set, or `simulated`
     scans: int
     names: str  # SHA-256 of the names of the scans
-    sensor: dict[str, Any]  # every field of the `Sensor`
+    sensor: dict[str, Any]  # `Sensor.described`
     projection: str  # as in `r2flow.data.sources.Reading`, like the next two
     convention: str
     reflectance_scale: float
@@ -127,8 +127,8 @@ def checksum(content: Any) -> str:
 
 
 def describe_sensor(sensor: Sensor) -> dict[str, Any]:
-    """Every field of a sensor, as JSON gives them back."""
-    fields: dict[str, Any] = json.loads(json.dumps(asdict(sensor)))
+    """What a sensor's images depend on, as JSON gives it back."""
+    fields: dict[str, Any] = json.loads(json.dumps(sensor.described()))
     return fields
 
 

@@ -323,7 +323,7 @@ class ScanFiles(ScanSource):
         return {**self.described, "files": self._digest[:12], "reflectance": bool(self.reading.reflectance)}
 
     def identity(self) -> dict[str, Any]:
-        return {"files": self._digest, **asdict(self.reading)}
+        return {"files": self._digest, **asdict(self.reading), "sensor": self.reading.sensor.described()}
 
     @cached_property
     def _digest(self) -> str:
@@ -380,7 +380,7 @@ class SimulatedScans(ScanSource):
         from r2flow import simulator
 
         numbers = hashlib.sha256(np.asarray(self.scenes, dtype=np.int64).tobytes()).hexdigest()[:16]
-        return {**self.about(), "numbers": numbers, "simulator": simulator.REVISION, "sensor": asdict(self.sensor)}
+        return {**self.about(), "numbers": numbers, "simulator": simulator.REVISION, "sensor": self.sensor.described()}
 
     def __len__(self) -> int:
         return len(self.scenes)

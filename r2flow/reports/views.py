@@ -62,7 +62,7 @@ def views_of(
 
     Args:
         sensor: Of scans that do not say theirs; None takes the usual one.
-        reflectance_scale: As in `Reading`; None guesses it.
+        reflectance_scale: As in `Reading`; None takes the sensor's, else guesses it.
 
     Raises:
         InputError: nothing is there, or it is not of this sensor.
@@ -71,6 +71,8 @@ def views_of(
     own = own_reading(spec)
     reading = own or replace(usual_reading(spec), projection=projection)  # type: ignore[arg-type]
     sensor = sensor or reading.sensor
+    if own is None and reflectance_scale is None:
+        reflectance_scale = sensor.reflectance_scale
     reading = replace(reading, sensor=sensor, reflectance_scale=reflectance_scale, on_bad_scan="error")
     if own is None and options.name == FOLDER:
         loose = scans_of(file or Path(options.folder), most)
