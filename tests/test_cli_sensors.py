@@ -81,7 +81,7 @@ def test_errors_are_one_line(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
     for arguments, words in (
         ([tmp_path / "one.bin"], "1 returns in all are too few"),
         ([tmp_path / "text.bin"], "is text"),
-        ([tmp_path / "notes.txt"], "no ending of a scan file"),
+        ([tmp_path / "notes.txt"], "no field x, y, z; it has: text"),
         ([tmp_path / "empty"], "holds no scan"),
         ([tmp_path / "missing"], "does not exist"),
         ([scans, "--out", tmp_path / "mine.txt"], "--out must be a .yaml"),

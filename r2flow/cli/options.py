@@ -36,6 +36,22 @@ ScaleChoice = Annotated[
     typer.Option(min=1e-6, help="Value in scan files that means full reflectance; the sensor's, else their usual one."),
 ]
 
+ColumnsOption = Annotated[
+    str | None,
+    typer.Option(
+        help="What the columns of files without names hold, as x,y,z,intensity,_; the usual ones if left out."
+    ),
+]
+
+
+def named_columns(text: str | None) -> tuple[str, ...] | None:
+    """The columns that are named by `--columns`, checked."""
+    from r2flow.lidar.scan_files.fields import check_columns
+
+    columns = None if text is None else tuple(name.strip() for name in text.split(","))
+    check_columns(columns)
+    return columns
+
 
 def build_sized(sensor: str, size: str | None) -> "Sensor":
     """The sensor of a name or a YAML file, at an image size written as 64x1024."""
@@ -55,6 +71,7 @@ def choose_reading(
     projection: str | None = None,
     convention: str | None = None,
     reflectance_scale: float | None = None,
+    columns: str | None = None,
     flow: "Reading | None" = None,
 ) -> "Reading":
     """How named scans become images of one sensor: as asked for; else as a flow's or one of theirs were; else usual.
@@ -93,7 +110,7 @@ def choose_reading(
         if options.name == FOLDER:
             refuse_other_samples(Path(options.folder), found.sensor)
     scale = usual_scale(named[0], found.sensor) if reflectance_scale is None else reflectance_scale
-    found = replace(found, reflectance_scale=scale)
+    found = replace(found, reflectance_scale=scale, columns=named_columns(columns))
     asked_for = {"projection": projection, "convention": convention}
     return replace(found, **{key: value for key, value in asked_for.items() if value is not None})  # type: ignore[arg-type]
 

@@ -8,7 +8,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import ReadingOptions, grouped
-from r2flow.cli.options import build_sized, cores
+from r2flow.cli.options import build_sized, cores, named_columns
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -94,6 +94,7 @@ def _plan(
         of_files = {
             "ROOT": root, "--projection": reading.projection, "--convention": reading.convention,
             "--split": files.split, "--drives": files.drives, "--reflectance-scale": reading.reflectance_scale,
+            "--columns": reading.columns,
         }  # fmt: skip
         wrong = [option for option, value in of_files.items() if value is not None]
         if wrong:
@@ -107,7 +108,7 @@ def _plan(
     return plan_files(
         layout, root, sensor, reading.projection or "spherical", reading.convention or "centre", files.split,
         files.drives.split(",") if files.drives else None, reading.reflectance_scale or scale,
-        levels, shard_scans,
+        levels, shard_scans, named_columns(reading.columns),
     )  # fmt: skip
 
 

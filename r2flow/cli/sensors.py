@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from r2flow.cli.app import app
+from r2flow.cli.options import ColumnsOption, named_columns
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ def sensor(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="The .yaml to write; none if left out.")] = None,
     name: Annotated[str | None, typer.Option(help="Name of the sensor; by default from that of the file.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
+    columns: ColumnsOption = None,
     most: Annotated[int, typer.Option(min=1, help="The most scans to read of a folder.")] = 8,
 ) -> None:
     """Estimate a sensor from scans: beams, resolution, limits, height, reflectance; write it as YAML.
@@ -40,8 +42,9 @@ def sensor(
     name = name or _name_of(out)
     if name in SENSORS or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise InputError(f"--name must be letters, digits and _, and not that of a built-in sensor; found {name!r}.")
+    named = named_columns(columns)
     paths = [path for scan in scans for path in scans_of(scan, most)]
-    points = [read_points(path) for path in track(paths, "reading", "scans", least=16)]
+    points = [read_points(path, named) for path in track(paths, "reading", "scans", least=16)]
     estimate = estimate_sensor(points)
     found = estimate.sensor(name)
     _print(estimate)

@@ -132,6 +132,7 @@ class ScanDataModule(L.LightningDataModule):
         reading = Reading(
             self.sensor, options.projection, options.convention, options.reflectance_scale,  # type: ignore[arg-type]
             self.encoding.reflectance, options.on_bad_scan, within_limits=True,
+            columns=None if options.columns is None else tuple(options.columns),
         )  # fmt: skip
         return open_source(options, reading, self.seed, first_scene)
 

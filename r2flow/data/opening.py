@@ -109,7 +109,8 @@ def open_scans(
     options, file = parse(label)
     reading = reading or own_reading(label) or usual_reading(label)
     if file is None:
-        options = replace(options, split=split, scenes=num or SCENES)
+        columns = None if reading.columns is None else list(reading.columns)
+        options = replace(options, split=split, scenes=num or SCENES, columns=columns)
         if options.name == SIMULATED:
             return ScanSet(label, open_source(options, reading, int(options.folder)), reading.sensor)
         return ScanSet(label, open_source(options, reading), reading.sensor).limited(num)
@@ -117,11 +118,11 @@ def open_scans(
     if image is not None:  # points can be seen through any sensor
         refuse_other_samples(file.parent, reading.sensor)
     elif not own_size:
-        warn_of_other_sensor([file], reading.sensor, file)
+        warn_of_other_sensor([file], reading, file)
     if own_size and image is not None:
         reading = replace(reading, sensor=reading.sensor.resized(*image.shape[1:]))
     if reading.reflectance == AUTO:
-        reading = replace(reading, reflectance=lacks_reflectance([file], reading.on_bad_scan) is None)
+        reading = replace(reading, reflectance=lacks_reflectance([file], reading.on_bad_scan, reading.columns) is None)
     return ScanSet(label, ScanFiles([file], reading, file.parent, about={"kind": "file"}), reading.sensor)
 
 

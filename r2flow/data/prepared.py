@@ -57,10 +57,15 @@ class ScanRecipe:
     ranges: dict[str, float]  # the numbers of the formula in `r2flow.data.quantise.RangeCodes`
     shard_scans: int  # scans of the data set a shard; it holds fewer where some were left out
     seed: int | None = None  # of simulated scans
+    columns: tuple[str, ...] | None = None  # of files that do not name them
+
+    def describe(self) -> dict[str, Any]:
+        """All of it as plain values; `columns` only where they were named."""
+        return {key: value for key, value in asdict(self).items() if key != "columns" or value is not None}
 
     @property
     def digest(self) -> str:
-        return checksum(asdict(self))
+        return checksum(self.describe())
 
     @property
     def image_shape(self) -> tuple[int, int]:
@@ -141,7 +146,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     content = {
         "format": FORMAT,
         "made by": f"r2flow {r2flow.__version__}",
-        "recipe": asdict(manifest.recipe),
+        "recipe": manifest.recipe.describe(),
         "left_out": [name for number, name in enumerate(manifest.names) if number in manifest.left_out],
         "shards": [asdict(shard) for shard in manifest.shards] or None,
         "drives": drives,

@@ -47,6 +47,7 @@ class Reading:
             generator that makes such scans is judged by them.
         within_limits: Whether a range beyond the sensor's limits in a range image is a dropped ray, as it is in a file
             of points: what a model is given.
+        columns: What the columns of files without names hold, as in `r2flow.lidar.scan_files.read_points`.
     """
 
     sensor: Sensor
@@ -56,6 +57,7 @@ class Reading:
     reflectance: bool | str = AUTO
     on_bad_scan: str = "empty"
     within_limits: bool = False
+    columns: tuple[str, ...] | None = None
 
 
 class ScanSource(ABC):
@@ -121,6 +123,7 @@ def read_scan(
     convention: Convention = "centre",
     reflectance: bool = True,
     reflectance_scale: float | None = 1.0,
+    columns: Sequence[str] | None = None,
 ) -> np.ndarray:
     """One scan file as a range image, (2, H, W); without `reflectance`, (1, H, W). The options are those of `Reading`.
 
@@ -128,7 +131,7 @@ def read_scan(
         InputError: the file cannot be read, no point of it lies in the sensor's view and range (`NoPointsError`), or it
             has no reflectance, or one beyond the scale, where it is needed.
     """
-    points = read_points(path)
+    points = read_points(path, columns)
     if points.dropped:
         log.warning(
             "%s: dropped %d points with NaN or infinite coordinates, or %g m and more away",
@@ -158,7 +161,7 @@ def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tupl
     file = labels_beside(path)
     if file is None:
         return image, None
-    points = read_points(path)
+    points = read_points(path, options.get("columns"))
     projection, convention = options.get("projection", "spherical"), options.get("convention", "centre")
     pixels, chosen, _ = project_indices(points.xyz, sensor, projection, convention, points.ring)
     labels = np.zeros(math.prod(sensor.shape), dtype=np.uint16)
@@ -213,7 +216,13 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     sensor, channels = reading.sensor, 1 + bool(reading.reflectance)
     image = range_image(path, sensor.shape)
     if image is None:
-        how = (reading.projection, reading.convention, bool(reading.reflectance), reading.reflectance_scale)
+        how = (
+            reading.projection,
+            reading.convention,
+            bool(reading.reflectance),
+            reading.reflectance_scale,
+            reading.columns,
+        )
         try:
             return read_scan(path, sensor, *how)
         except NoPointsError:
@@ -230,7 +239,9 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     return image
 
 
-def lacks_reflectance(paths: Iterable[str | Path], on_bad_scan: str = "error") -> str | None:
+def lacks_reflectance(
+    paths: Iterable[str | Path], on_bad_scan: str = "error", columns: Sequence[str] | None = None
+) -> str | None:
     """Why scan files count as files without reflectance; None where they have it.
 
     The one rule, for training, measuring and pictures: the first scan that has a return decides, and reflectance that
@@ -242,7 +253,7 @@ def lacks_reflectance(paths: Iterable[str | Path], on_bad_scan: str = "error") -
     """
     for path in paths:
         try:
-            found = stored_reflectance(path)
+            found = stored_reflectance(path, columns)
         except InputError as error:
             if on_bad_scan == "error" or (on_bad_scan == "empty" and not isinstance(error, NoPointsError)):
                 raise
@@ -254,15 +265,15 @@ def lacks_reflectance(paths: Iterable[str | Path], on_bad_scan: str = "error") -
     return "no scan has a return"
 
 
-def warn_of_other_sensor(paths: Sequence[str | Path], sensor: Sensor, root: str | Path) -> None:
+def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> None:
     """Say in one line that scan files do not look like a sensor's, and which sensor they fit (`other_sensor`).
 
     Range images have no beams, and files that cannot be read are met again when their turn comes.
     """
-    scans = []
+    scans, sensor = [], reading.sensor
     for number in spread(len(paths), LOOKED_AT):
         with suppress(InputError):
-            scans.append(read_points(paths[number]))
+            scans.append(read_points(paths[number], reading.columns))
     found = other_sensor(scans, sensor) if scans else None
     if found is None:
         return
@@ -277,11 +288,11 @@ def warn_of_other_sensor(paths: Sequence[str | Path], sensor: Sensor, root: str 
     )  # fmt: skip
 
 
-def stored_reflectance(path: str | Path) -> np.ndarray | None:
+def stored_reflectance(path: str | Path, columns: Sequence[str] | None = None) -> np.ndarray | None:
     """The reflectance of all returns of a scan file or a range image, as it is stored; None where there is none."""
     image = range_image(Path(path))
     if image is None:
-        return read_points(path).reflectance
+        return read_points(path, columns).reflectance
     return image[1][image[0] > 0] if len(image) > 1 else None
 
 
