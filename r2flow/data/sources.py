@@ -269,6 +269,9 @@ def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: st
     """Say in one line that scan files do not look like a sensor's, and which sensor they fit (`other_sensor`).
 
     Range images have no beams, and files that cannot be read are met again when their turn comes.
+
+    Raises:
+        InputError: the scans are for a model (`reading.within_limits`), and those of no spinning LiDAR.
     """
     scans, sensor = [], reading.sensor
     for number in spread(len(paths), LOOKED_AT):
@@ -277,7 +280,9 @@ def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: st
     found = other_sensor(scans, sensor) if scans else None
     if found is None:
         return
-    seen, name = found
+    seen, name, hopeless = found
+    if hopeless and reading.within_limits:
+        raise InputError(f"{root}: {seen}.")
     edges = sensor.row_edges
     advice = f"give the right one, or estimate it: r2flow sensor {root} --out mine.yaml"
     if name is not None and name != sensor.name:

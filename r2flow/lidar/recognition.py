@@ -1,11 +1,12 @@
 """Whether scans are of the sensor that they are asked to be of, by the beams that they show."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from r2flow.errors import InputError
-from r2flow.lidar.beams import find_beams
+from r2flow.lidar.beams import NoBeamsError, find_beams
 from r2flow.lidar.scan_files import Points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.unfolding import elevations_of
@@ -18,8 +19,16 @@ BEATEN = 0.5  # degrees from which on a sensor does not fit if another one is tw
 FAINT = 0.05  # share of the usual number of returns below which a row counts as empty
 
 
-def other_sensor(scans: Sequence[Points], sensor: Sensor) -> tuple[str, str | None] | None:
-    """What in some scans speaks against a sensor, in words, and the built-in sensor that they fit, where one does.
+class Doubt(NamedTuple):
+    """What speaks against a sensor, in words; the built-in sensor that the scans fit; whether they fit none at all."""
+
+    seen: str
+    name: str | None
+    hopeless: bool = False
+
+
+def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
+    """What in some scans speaks against a sensor.
 
     A sensor's beams are compared with those that `find_beams` finds. Where it finds none, or where a sensor of the
     user's own has another number of rows (which may be a choice), the share of the returns in view and rows without
@@ -35,6 +44,8 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> tuple[str, str | No
         return None
     try:
         beams = find_beams(scans).elevations
+    except NoBeamsError as error:
+        return Doubt(str(error), None, hopeless=True)
     except InputError:
         beams = None
     share = _share_in_view(elevation, sensor)
@@ -51,7 +62,7 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> tuple[str, str | No
     if fits and share >= IN_VIEW:
         return None
     seen += f", {striped:.0%} of the rows between others stay empty" if striped > STRIPED else ""
-    return seen, nearest
+    return Doubt(seen, nearest)
 
 
 def _beam_tables(sensor: Sensor, beams: int) -> list[np.ndarray]:

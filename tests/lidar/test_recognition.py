@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.lidar.beams import RING_AFTER_RING, RINGS, UNORDERED
+from r2flow.data.preparing import plan_files
+from r2flow.errors import InputError
+from r2flow.lidar.beams import RING_AFTER_RING, RINGS, find_beams
 from r2flow.lidar.recognition import other_sensor
-from r2flow.lidar.scan_files import Points, read_points
+from r2flow.lidar.scan_files import Points, read_points, write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.unfolding import elevations_of
 from tests.lidar.test_calibration import scan
@@ -82,21 +84,65 @@ def test_a_part_of_the_view_is_enough(shared: Path):
         assert other_sensor([Points(part)], SENSORS["vlp16"]) is not None
 
 
-def test_scans_whose_beams_are_lost_are_judged_by_the_view_and_by_empty_rows():
-    hdl64e = scan(SENSORS["hdl64e_rings"], UNORDERED)
-    jitter = np.random.default_rng(0).normal(0, 0.005, hdl64e.xyz.shape) * np.linalg.norm(hdl64e.xyz, axis=1)[:, None]
-    lost = Points((hdl64e.xyz + jitter).astype(np.float32))
+def test_scans_whose_beams_are_lost_are_judged_by_the_view(shared: Path):
+    points = read_points(next((shared / "real" / "kitti360").rglob("*.bin")))
+    lost = Points(np.random.default_rng(0).permutation(points.xyz))
+    with pytest.raises(InputError, match="cannot be told apart"):
+        find_beams([lost])
     assert other_sensor([lost], SENSORS["hdl64e"]) is None
-    seen, name = other_sensor([lost], SENSORS["vlp16"])
+    seen, name, _ = other_sensor([lost], SENSORS["vlp16"])
     assert name is None
     assert "of the returns lie in its view" in seen
+
+
+def test_sensors_of_one_s_own_are_judged_by_empty_rows_too():
     mine = Sensor("mine", tuple(np.linspace(3, -25, 24).tolist()))
     assert other_sensor([scan(mine, RING_AFTER_RING)], mine) is None
     assert other_sensor([scan(SENSORS["vlp16"], RING_AFTER_RING)], mine) is not None
-    seen, _ = other_sensor([scan(mine, RING_AFTER_RING)], Sensor("fine", tuple(np.linspace(4, -26, 64).tolist())))
+    seen, *_ = other_sensor([scan(mine, RING_AFTER_RING)], Sensor("fine", tuple(np.linspace(4, -26, 64).tolist())))
     assert "rows between others stay empty" in seen
 
 
 def test_a_few_returns_tell_nothing():
     few = scan(SENSORS["pandar64"], RING_AFTER_RING)
     assert other_sensor([Points(few.xyz[:900])], SENSORS["vlp16"]) is None
+
+
+def without_beams(pattern: str) -> Points:
+    """The ground and a wall, seen by scanners whose pattern does not repeat: two sweeps whose rates have no ratio."""
+    t, turn = np.linspace(0, 1, 60_000), 2 * np.pi
+    if pattern == "turning":  # all around, up and down
+        azimuth, elevation = turn * 431.7 * t, np.radians(22.5 + 29.5 * np.sin(turn * 1093.37 * t))
+    elif pattern == "rosette":  # two prisms
+        azimuth = np.radians(19.2) * (np.cos(turn * 1215.7 * t) + np.cos(-turn * 777.3 * t))
+        elevation = np.radians(19.2) * (np.sin(turn * 1215.7 * t) + np.sin(-turn * 777.3 * t))
+    else:
+        azimuth, elevation = (
+            np.pi * (1 - 2 * np.random.default_rng(0).random(t.size)),
+            0.4 * np.cos(turn * np.sqrt(2) * t),
+        )
+        elevation = np.random.default_rng(1).permutation(elevation)
+    r = np.minimum(np.where(elevation < 0, 1.7 / np.sin(np.maximum(-elevation, 1e-9)), np.inf), 25 / np.cos(elevation))
+    direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return Points((r * direction).T.astype(np.float32))
+
+
+@pytest.mark.parametrize("pattern", ["turning", "rosette", "random"])
+def test_scanners_without_beams_are_refused_with_the_reason(tmp_path: Path, pattern: str):
+    scan = without_beams(pattern)
+    with pytest.raises(InputError, match="lie on no beams, as those of a Livox"):
+        find_beams([scan])
+    write_points(tmp_path / "0.ply", scan.xyz)
+    with pytest.raises(InputError, match="lie on no beams"):
+        plan_files("folder", tmp_path, SENSORS["hdl64e"])
+    for name in SENSORS:
+        assert other_sensor([scan], SENSORS[name]).hopeless
+
+
+def test_the_beams_of_shuffled_scans_are_there(shared: Path):
+    for pattern, (count, _) in REAL.items():
+        for path in sorted((shared / "real").glob(pattern))[:count]:
+            points = read_points(path)
+            order = np.random.default_rng(0).permutation(len(points.xyz))
+            found = other_sensor([Points(points.xyz[order])], SENSORS["hdl64e"])
+            assert found is None or not found.hopeless
