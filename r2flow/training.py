@@ -22,6 +22,7 @@ from r2flow.callbacks import build_callbacks, build_loggers
 from r2flow.callbacks.stopping import Stopping
 from r2flow.checkpoints import checkpoints_of, step_of
 from r2flow.composing import check_keys, compose
+from r2flow.data.contents import check_contents, record_contents
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import SOURCES, Layout, Prepared, resolve_reflectance
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, SourceOptions
@@ -283,6 +284,8 @@ def _fit_in_folder(run: Run) -> int:
     last = open_run(run.folder, run.config)
     if last is not None and step_of(last) >= run.trainer.max_steps:
         return step_of(last)  # nothing is left to do, nor pairs to make
+    if run.trainer.is_global_zero and run.data.files:
+        (record_contents if last is None else check_contents)(run.folder, run.data.files)
     if last is not None:
         log.info("going on from %s", last)
     run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)

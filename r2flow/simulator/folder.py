@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -174,7 +174,7 @@ def _write_batch(folder: SimulatedFolder, indices: Sequence[int]) -> int:
 
 
 def _note(sensor: Sensor, seed: int) -> dict[str, Any]:
-    described = json.loads(json.dumps(asdict(sensor)))  # tuples as lists, as they come back
+    described = json.loads(json.dumps(sensor.described()))  # tuples as lists, as they come back
     return {"simulator": REVISION, "seed": seed, "sensor": described}
 
 
