@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self, Unpack, cast
+from typing import Annotated, Any, NamedTuple, Self, Unpack, cast
 
 import torch
 import torch.nn.functional as F
@@ -25,7 +25,7 @@ from r2flow.backbones.layers import (
     zero_initialised,
 )
 from r2flow.errors import InputError
-from r2flow.registry import Count, Portion
+from r2flow.registry import Bound, Count, Portion
 
 
 class HDiT(Backbone):
@@ -64,7 +64,7 @@ class HDiT(Backbone):
         base_channels: Count = 128,
         depths: Sequence[int] = (3, 3, 3, 3),
         num_heads: Sequence[int] = (2, 4, 8, 16),
-        time_channels: Count = 256,
+        time_channels: Annotated[int, Bound("of at least 2", lambda n: n >= 2)] = 256,
         position: str | None = "learnable",
         window: Sequence[int] = (3, 9),
         patch: Sequence[int] = (1, 4),
