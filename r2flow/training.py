@@ -194,7 +194,7 @@ def _refuse_unread(data: Mapping[str, Any]) -> None:
     if not simulated and (data["name"] in (PAIRS, MIXED) or not isinstance(SOURCES[data["name"]], Layout | Prepared)):
         return
     usual = SourceOptions()
-    unread = {f.name for f in fields(usual)} - {"name", "scenes"} if simulated else {"scenes"}
+    unread = {f.name for f in fields(usual)} - {"name", "root", "scenes"} if simulated else {"scenes"}
     wrong = sorted(f"data.{key}" for key in unread if data.get(key, getattr(usual, key)) != getattr(usual, key))
     if wrong:
         what = "simulated scans are no files" if simulated else "scans in files are no simulated scenes"

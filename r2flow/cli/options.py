@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from r2flow.lidar.sensors import Sensor
 
 CheckpointOption = Annotated[
-    Path, typer.Option("--checkpoint", "-c", help="A checkpoint file or a run folder.", show_default=False)
+    Path, typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model.", show_default=False)
 ]
 DeviceOption = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", show_default=False)]
