@@ -110,7 +110,7 @@ def test_numbers_out_of_range_are_refused():
         ({"tolerance": math.nan}, "must be positive"),
         ({"finish": 1.0}, "finish must be shorter than the interval"),
         ({"finish": -1e-3}, "finish must be shorter than the interval"),
-        ({"max_evaluations": 1}, "at least 2 evaluations, found 1"),
+        ({"max_evaluations": 0}, "at least 1 evaluation, found 0"),
         ({"max_step": 0.0}, "a share of the interval"),
         ({"t_1": math.inf}, "needs two times"),
     ]:
