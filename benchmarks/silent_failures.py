@@ -297,16 +297,17 @@ def run(kind: str, method: str, tolerance: float, max_step: float, seed: int = 0
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--max-step", type=float, default=1.0)
-    parser.add_argument("--only", default="")
+    parser.add_argument("--only", default="", help="kinds with this in their name")
+    parser.add_argument("--methods", nargs="+", default=METHODS)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    print(f"{'kind':26s}" + "".join(f"{m:>8s} silent of   worst  evals" for m in METHODS))
-    total = {(m, narrow): [0, 0, 0, 0.0] for m in METHODS for narrow in (False, True)}
+    print(f"{'kind':26s}" + "".join(f"{m:>8s} silent of   worst  evals" for m in options.methods))
+    total = {(m, narrow): [0, 0, 0, 0.0] for m in options.methods for narrow in (False, True)}
     for kind in KINDS:
         if options.only not in kind:
             continue
         line = f"{kind:26s}"
-        for method in METHODS:
+        for method in options.methods:
             counts = [run(kind, method, tolerance, options.max_step) for tolerance in TOLERANCES]
             cases, silent, flagged = (sum(getattr(c, n) for c in counts) for n in ("cases", "silent", "flagged"))
             evaluations = sum(c.evaluations for c in counts)

@@ -237,7 +237,7 @@ def test_no_pulse_longer_than_an_eighth_of_the_interval_is_missed(method, width)
         x_0 = torch.zeros(40, 4, dtype=torch.float64)
         found = solve(pulses, x_0, method=method, tolerance=tolerance)
         assert (found.converged & ~found.stiff).all()
-        assert in_tolerances(found, pulses.solution(x_0, 1.0), tolerance).max() < 30
+        assert in_tolerances(found, pulses.solution(x_0, 1.0), tolerance).max() < 10
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
@@ -253,13 +253,13 @@ def test_a_velocity_that_does_not_depend_on_x_is_not_stiff(method):
 
 @pytest.mark.parametrize(("method", "more"), [("dopri5", 1.05), ("bosh3", 1.02)])
 def test_looking_for_pulses_and_jumps_costs_at_most_a_twentieth(method, more):
-    # Of the evaluations that steps and one at the start take, over the exact flows.
+    # Of what the steps take, and the two evaluations of a start by Hairer's rule, over the exact flows.
     looked = 0.0
     stepped = 0.0
     for name in ("straight", "gaussian", "two_modes", "ray_drop", "narrow_gaussian", "anisotropic"):
         for tolerance in (1e-3, 1e-5):
             found = solve(PROBLEMS[name](), noise(8, 64).double(), method=method, tolerance=tolerance)
             looked += found.evaluations.sum().item()
-            stepped += (1 + {"bosh3": 3, "dopri5": 6}[method] * (found.accepted + found.rejected)).sum().item()
+            stepped += (2 + {"bosh3": 3, "dopri5": 6}[method] * (found.accepted + found.rejected)).sum().item()
     print(f"{method}: {looked / stepped:.3f}")
     assert looked < more * stepped

@@ -34,10 +34,14 @@ def attainable(limits: Limits, dtype: torch.dtype) -> float:
     return max(limits.tolerance, least) / limits.tighter
 
 
-def solve_adaptive(
+def advance(
     v: Evaluations, x: Tensor, t_0: float, t_1: float, method: EmbeddedMethod, limits: Limits
-) -> Solution:
-    """Solve every scene of x, (B, ...), from t_0 to t_1; its result does not depend on the others."""
+) -> tuple[Solution, np.ndarray]:
+    """Solve every scene of x, (B, ...), from t_0 to t_1; its result does not depend on the others.
+
+    Returns:
+        The solution, and the time that each scene has reached, (B,).
+    """
     control = StepController(v.scenes, t_0, t_1, method, limits, torch.finfo(x.dtype).eps)
     device = x.device
     results = x.clone()
@@ -62,7 +66,7 @@ def solve_adaptive(
                 break
             v.only(control.scenes)
         x, k_1 = _step(v, control, method, x, k_1, tolerance)
-    return control.solution(results, v.counts)
+    return control.solution(results, v.counts), control.times
 
 
 def _step(
