@@ -4,6 +4,7 @@ import json
 import math
 import pickle
 import re
+import warnings
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -91,7 +92,7 @@ def step_of(path: Path) -> int:
 
 def checkpoints_of(run: str | Path) -> list[Path]:
     """The checkpoints of a run folder, the latest first."""
-    found = [path for path in Path(run, FOLDER).glob("step-*.ckpt") if not path.is_symlink()]
+    found = [path for path in Path(run, FOLDER).glob("step-*.ckpt") if path.is_file() and not path.is_symlink()]
     return sorted(found, key=step_of, reverse=True)
 
 
@@ -128,9 +129,12 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
     Raises:
         InputError: not a checkpoint, a damaged one, or one that holds more than plain values.
     """
+    if not Path(path).is_file():  # a pipe would be waited for
+        raise InputError(f"no checkpoint at {path}. Give a checkpoint file or a run folder.")
     _check_sums(path)
     try:
-        content = torch.load(path, map_location=map_location, weights_only=True)
+        with warnings.catch_warnings(action="ignore"):  # torch's, on bytes that are no checkpoint
+            content = torch.load(path, map_location=map_location, weights_only=True)
     except pickle.UnpicklingError as error:
         if "Unsupported global" in str(error) or "Unsupported class" in str(error):
             name = re.search(r"GLOBAL (\S+)", str(error))
@@ -220,7 +224,11 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
             f"{path} is a torch file but not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
             f"(ours) nor 'cfg' and 'weights' (published); found {', '.join(map(repr, list(content)[:6]))}."
         )
-    with made_with(config, str(path)), _Allowance(weights, path):
+    held = sum(value.numel() for value in weights.values())
+    refused = (
+        f"the weights in {path} do not fit its config: they are {held:,} numbers, and the config asks for far more."
+    )
+    with made_with(config, str(path)), Allowance(2 * held + SPARE, refused):
         generator = build_generator(config)
     check_weights(generator, weights, path)
     generator.load_state_dict(weights)
@@ -232,20 +240,21 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     return Checkpoint(generator.eval().requires_grad_(False).to(device), config, step, path, kind)
 
 
-class _Allowance(TorchFunctionMode):
-    """Refuses tensors that the weights in a file cannot fill, before memory is taken for them.
+SPARE = 2**28  # elements of buffers that a checkpoint does not hold, and of what is computed on the way
+
+
+class Allowance(TorchFunctionMode):
+    """Refuses to make tensors of more than so many `elements` in all, with the line `refused`, before it takes memory.
 
     The meta device would do the same, but its first use imports torch's compiler and sympy, which takes as long as
     `import torch`.
     """
 
     FACTORIES = frozenset({torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.linspace})
-    SPARE = 2**28  # elements of buffers that a checkpoint does not hold, and of what is computed on the way
 
-    def __init__(self, weights: Mapping[str, Tensor], path: Path) -> None:
+    def __init__(self, elements: int, refused: str) -> None:
         super().__init__()
-        self.path, self.held = path, sum(value.numel() for value in weights.values())
-        self.left = 2 * self.held + self.SPARE
+        self.left, self.refused = elements, refused
 
     def __torch_function__(
         self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
@@ -254,10 +263,7 @@ class _Allowance(TorchFunctionMode):
             sizes = [part for arg in args for part in (arg if isinstance(arg, (tuple, list)) else (arg,))]
             self.left -= math.prod(max(size, 1) for size in sizes if isinstance(size, int))
             if self.left < 0:
-                raise InputError(
-                    f"the weights in {self.path} do not fit its config: they are {self.held:,} numbers, and the "
-                    "config asks for far more."
-                )
+                raise InputError(self.refused)
         return func(*args, **(kwargs or {}))
 
 

@@ -127,7 +127,9 @@ def verbs() -> list[str]:
     """Every verb of the command, and of `report`."""
     import typer.main
 
-    top = typer.main.get_command(cli.app).commands
+    from r2flow.cli.verbs import app
+
+    top = typer.main.get_command(app).commands
     names = [name for name in top if name != "report"]
     return sorted([*names, *(f"report {name}" for name in top["report"].commands)])
 
@@ -201,7 +203,7 @@ class TestBadInput:
 
 
 def test_importing_r2flow_loads_neither_lightning_nor_matplotlib():
-    code = "import r2flow, r2flow.cli, r2flow.lidar.projection, r2flow.flow.solvers, r2flow.backbones, sys; "
+    code = "import r2flow, r2flow.cli.verbs, r2flow.lidar.projection, r2flow.flow.solvers, r2flow.backbones, sys; "
     code += "print([m for m in ('lightning', 'matplotlib', 'tensorboard', 'torchdiffeq') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 
 from r2flow.backbones import build_backbone
 from r2flow.errors import InputError
-from r2flow.flow.solvers import GRIDS, SOLVERS, Solution, Velocity, adapts, check_method, check_tolerance, solve
+from r2flow.flow.solvers import SOLVERS, Solution, Velocity, adapts, check_method, check_tolerance, solve
+from r2flow.flow.solvers.grids import build_grid
 from r2flow.flow.straight_exit import solve_straight_first
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.lidar.region import Region
@@ -69,8 +70,8 @@ class Flow(Generator):
     def check_sampler(self, sampler: Sampler) -> None:
         check_method(sampler.method)
         check_tolerance(sampler.tolerance)
-        if isinstance(sampler.grid, str):
-            GRIDS[sampler.grid]
+        grid = sampler.grid
+        build_grid(grid if isinstance(grid, str) else torch.tensor(grid), 0.0, 1.0, sampler.steps)
         if sampler.straight_first and not adapts(sampler.method):
             raise InputError(
                 f"scenes that are not straight need an adaptive solver, dopri5 or bosh3; found {sampler.method!r}."
