@@ -96,7 +96,7 @@ def test_a_closure_clears_the_gradients_of_all_weights():
             ours.zero_grad()
             loss = model(x).square().sum()
             loss.backward()
-            return float(loss)
+            return float(loss.detach())
 
         ours.step(closure)
         other.zero_grad()
