@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from r2flow.lidar.sensors import Sensor
 
 CheckpointOption = Annotated[
-    Path, typer.Option("--checkpoint", "-c", help="A checkpoint file or a run folder.", show_default=False)
+    Path, typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model.", show_default=False)
 ]
 DeviceOption = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", show_default=False)]
@@ -85,7 +85,6 @@ def choose_reading(
     """
     from r2flow.data.opening import own_reading, parse, refuse_other_samples, usual_reading, usual_scale
     from r2flow.data.options import FOLDER
-    from r2flow.lidar.projection import CONVENTIONS, PROJECTIONS
 
     named = [spec for spec in specs if spec is not None]
     own = [reading for spec in named if (reading := own_reading(spec)) is not None]
@@ -102,9 +101,7 @@ def choose_reading(
         found = replace(found, sensor=build_sized(sensor, size))
     elif size is not None:
         found = replace(found, sensor=found.sensor.resized(*_rows_and_columns(size)))
-    for option, value, known in (("projection", projection, PROJECTIONS), ("convention", convention, CONVENTIONS)):
-        if value is not None and value not in known:
-            raise InputError(f"--{option} must be one of {', '.join(known)}; found {value!r}.")
+    check_words(projection=projection, convention=convention)
     for spec in named:  # before anything is read
         options, _ = parse(str(spec))
         if options.name == FOLDER:
@@ -113,6 +110,21 @@ def choose_reading(
     found = replace(found, reflectance_scale=scale, columns=named_columns(columns))
     asked_for = {"projection": projection, "convention": convention}
     return replace(found, **{key: value for key, value in asked_for.items() if value is not None})  # type: ignore[arg-type]
+
+
+def check_words(**options: str | None) -> None:
+    """Check options that are one of a few words each, where they are given.
+
+    Raises:
+        InputError: another word.
+    """
+    from r2flow.lidar.projection import CONVENTIONS, PROJECTIONS
+
+    known = {"projection": PROJECTIONS, "convention": CONVENTIONS, "on_bad_scan": ("error", "skip")}
+    for option, value in options.items():
+        if value is not None and value not in known[option]:
+            words = ", ".join(known[option])
+            raise InputError(f"--{option.replace('_', '-')} must be one of {words}; found {value!r}.")
 
 
 def _rows_and_columns(size: str | None) -> tuple[int | None, int | None]:
@@ -139,7 +151,7 @@ def choose_device(name: str) -> str:
         device = torch.device(name)
     except RuntimeError:
         device = torch.device("meta")
-    if device.type not in ("cpu", "cuda", "mps", "xpu"):
+    if device.type not in ("cpu", "cuda", "mps", "xpu") or (device.type == "cpu" and device.index):
         raise InputError(f"--device must be auto, cpu, cuda, cuda:1, ...; found {name!r}.")
     there = {"cuda": torch.cuda, "mps": torch.mps, "xpu": torch.xpu}.get(device.type)
     if there is not None and (device.index or 0) >= there.device_count():

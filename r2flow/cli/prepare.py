@@ -8,7 +8,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import ReadingOptions, grouped
-from r2flow.cli.options import build_sized, cores, named_columns
+from r2flow.cli.options import build_sized, check_words, cores, named_columns
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -72,6 +72,7 @@ def prepare(
         raise InputError("r2flow prepare needs LAYOUT ROOT --out FOLDER, or --check FOLDER.")
     from r2flow.data.preparing import Preparation
 
+    check_words(projection=reading.projection, convention=reading.convention, on_bad_scan=files.on_bad_scan)
     _run(Preparation(out, _plan(layout, root, reading, files, scenes, shards)), files.on_bad_scan, shards.workers)
 
 

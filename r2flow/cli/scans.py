@@ -30,7 +30,7 @@ def show(
     size: SizeOption = None,
     projection: ProjectionOption = "spherical",
     reflectance_scale: Annotated[
-        float | None, typer.Option(help="Value in the file that means full reflectance; guessed if left out.")
+        float | None, typer.Option(min=1e-6, help="Value in the file that means full reflectance; guessed if left out.")
     ] = None,
     columns: ColumnsOption = None,
     most: Annotated[int, typer.Option(min=1, help="The most scans to draw of a folder.")] = 16,

@@ -3,6 +3,7 @@
 import hashlib
 import logging
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -151,7 +152,7 @@ class ScanDataModule(L.LightningDataModule):
         assert self.training_source is not None
         # Another revision of the simulator draws other scans of the same name.
         revision = [f"simulator {simulator.REVISION}"] if any(p.name == SIMULATED for p in self.parts) else []
-        names = hashlib.sha256("\n".join([*self.names, *revision]).encode()).hexdigest()[:12]
+        names = hashlib.sha256(os.fsencode("\n".join([*self.names, *revision]))).hexdigest()[:12]
         return f"{len(self.training_source)} of {len(self.names)} scans, {names}"
 
     def _kept(self, source: ScanSource, what: str) -> ScanSource:

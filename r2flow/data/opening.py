@@ -57,7 +57,8 @@ class Simulated(SourceKind):
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
         scenes = range(first_scene, first_scene + options.scenes)
-        return SimulatedScans(reading.sensor, seed, scenes, bool(reading.reflectance))
+        folder = None if options.root is None else options.folder
+        return SimulatedScans(reading.sensor, seed, scenes, bool(reading.reflectance), folder)
 
 
 class Prepared(SourceKind):
@@ -112,7 +113,8 @@ def open_scans(
         columns = None if reading.columns is None else list(reading.columns)
         options = replace(options, split=split, scenes=num or SCENES, columns=columns)
         if options.name == SIMULATED:
-            return ScanSet(label, open_source(options, reading, int(options.folder)), reading.sensor)
+            seed = int(options.folder)
+            return ScanSet(label, open_source(replace(options, root=None), reading, seed), reading.sensor)
         return ScanSet(label, open_source(options, reading), reading.sensor).limited(num)
     image = range_image(file)
     if image is not None:  # points can be seen through any sensor
@@ -320,7 +322,11 @@ def held_out_options(options: DataOptions) -> list[SourceOptions]:
     if other is None or options.name == PAIRS:
         return []
     check_options("data.validation.data", SourceOptions, other)
-    held = SourceOptions(**{**options.common, "split": None, "drives": None, **other})
+    common = {**options.common, "split": None, "drives": None}
+    kinds = {options.name, other.get("name", options.name)}
+    if len(kinds) == 2 and SIMULATED in kinds:
+        common["root"] = None  # where simulated scans are kept, no others lie
+    held = SourceOptions(**{**common, **other})
     if held.name in (MIXED, PAIRS):
         raise InputError(f"data.validation.data must name one data set, found {held.name}; hold out a part of it.")
     return [held]

@@ -48,6 +48,7 @@ from r2flow.data.store import MANIFEST, clear_leftovers, refuse_other, shard_byt
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.lidar.sensors import Sensor
+from r2flow.signals import end_with_parent
 
 log = logging.getLogger(__name__)
 
@@ -243,7 +244,7 @@ class Preparation:
         """Make what no other process is making; what is there then is `left` no more."""
         loader = DataLoader(
             CodedScans(self.plan.source, self.recipe), sampler=self._claimed(left, claims, advance), batch_size=None,
-            num_workers=workers, collate_fn=_as_it_is,
+            num_workers=workers, collate_fn=_as_it_is, worker_init_fn=end_with_parent,
         )  # fmt: skip
         scans: list[Coded] = []
         left_out: list[int] = []

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -25,6 +25,9 @@ from r2flow.lidar.recognition import other_sensor
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
 from r2flow.lidar.scan_files.points import FARTHEST
 from r2flow.lidar.sensors import Sensor
+
+if TYPE_CHECKING:
+    from r2flow.simulator.folder import SimulatedFolder
 
 log = logging.getLogger(__name__)
 
@@ -172,7 +175,8 @@ def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tupl
 def _no_reflectance(path: str | Path) -> InputError:
     return InputError(
         f"{path} has no reflectance and the config, the model or the first scan of its set has it. For range alone "
-        "give encoding.reflectance=false in training (auto lets the scans decide), metrics of range in measuring."
+        "give encoding.reflectance=false in training (auto lets the scans decide; a run with stage.init is as its "
+        "parent), metrics of range in measuring."
     )
 
 
@@ -375,19 +379,44 @@ class ScanFiles(ScanSource):
 
 
 class SimulatedScans(ScanSource):
-    """Scenes of the simulator under one seed, by their numbers."""
+    """Scenes of the simulator under one seed, by their numbers.
 
-    slow = True
+    Args:
+        folder: Where they are kept, as `r2flow simulate --format npy` does: each is made when it is asked for first.
 
-    def __init__(self, sensor: Sensor, seed: int, scenes: Sequence[int], reflectance: bool = True) -> None:
-        self.sensor, self.seed, self.scenes, self.reflectance = sensor, seed, scenes, reflectance
+    Raises:
+        InputError: the folder holds scans of another sensor, seed or revision of the simulator.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        seed: int,
+        scenes: Sequence[int],
+        reflectance: bool = True,
+        folder: str | Path | None = None,
+    ) -> None:
+        self.sensor, self.seed, self.scenes, self.reflectance, self.folder = sensor, seed, scenes, reflectance, folder
+        if self._kept is not None:
+            self._kept.check()
+
+    @property
+    def slow(self) -> bool:  # type: ignore[override]
+        return self.folder is None
+
+    @cached_property
+    def _kept(self) -> "SimulatedFolder | None":
+        from r2flow.simulator.folder import SimulatedFolder
+
+        return None if self.folder is None else SimulatedFolder(Path(self.folder), self.sensor, self.seed, ("npy",))
 
     @property
     def names(self) -> list[str]:
         return [f"scene {scene}" for scene in self.scenes]
 
     def subset(self, indices: Sequence[int]) -> "SimulatedScans":
-        return SimulatedScans(self.sensor, self.seed, [self.scenes[i] for i in indices], self.reflectance)
+        scenes = [self.scenes[i] for i in indices]
+        return SimulatedScans(self.sensor, self.seed, scenes, self.reflectance, self.folder)
 
     def about(self) -> dict[str, Any]:
         return {"kind": "simulated", "seed": self.seed, "scenes": len(self), "reflectance": self.reflectance}
@@ -404,7 +433,17 @@ class SimulatedScans(ScanSource):
     def __getitem__(self, index: int) -> np.ndarray:
         from r2flow.simulator import simulate
 
-        return simulate(self.sensor, self.seed, self.scenes[index]).image[: 1 + self.reflectance]
+        scene, channels = self.scenes[index], 1 + self.reflectance
+        if self._kept is None:
+            return simulate(self.sensor, self.seed, scene).image[:channels]
+        if self._kept.missing([scene]):
+            self._kept.begin()
+            self._kept.write(scene)
+        (path,) = self._kept.files(scene)
+        image = range_image(path, self.sensor.shape)
+        if image is None:
+            raise InputError(f"{path} is damaged; remove it, and it is made again.")
+        return image[:channels]
 
 
 class InMemory(ScanSource):

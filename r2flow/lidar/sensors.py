@@ -36,7 +36,7 @@ class Sensor:
 
     Raises:
         InputError: fewer than two rows or one column, more than `MOST_PIXELS`, elevations that do not fall or leave
-            (-90, 90) degrees, range limits that are not 0 < min_range < max_range, a height that is not finite,
+            (-90, 90) degrees, range limits that are not 0 < min_range < max_range, a height that is not positive,
             a firing order that does not name every row once, or a scale of reflectance that is not positive.
     """
 
@@ -68,8 +68,8 @@ class Sensor:
                 f"sensor {self.name!r}: needs 0 < min_range < max_range, "
                 f"found {self.min_range} and {self.max_range} metres."
             )
-        if not math.isfinite(self.height):
-            raise InputError(f"sensor {self.name!r}: height must be in metres, found {self.height}.")
+        if not 0 < self.height < math.inf:
+            raise InputError(f"sensor {self.name!r}: height must be metres above the ground, found {self.height}.")
         if self.firing is not None and sorted(self.firing) != list(range(len(e))):
             raise InputError(
                 f"sensor {self.name!r}: firing must name each of the rows 0 to {len(e) - 1} once, one for each laser; "
