@@ -30,7 +30,7 @@ def show(
     reflectance_scale: Annotated[
         float | None, typer.Option(min=1e-6, help="Value in the file that means full reflectance; guessed if left out.")
     ] = None,
-    most: Annotated[int, typer.Option(min=1, help="The most scans to draw of a folder.")] = 16,
+    most: Annotated[int, typer.Option("--num", min=1, help="The most scans to draw of a folder.")] = 16,
     labels: Annotated[bool, typer.Option("--labels", help="Draw the classes of .label files, too.")] = False,
 ) -> None:
     """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each."""

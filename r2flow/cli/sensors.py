@@ -19,7 +19,7 @@ def sensor(
     scans: Annotated[list[Path], typer.Argument(help="Scan files, or folders of them, of one sensor.")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="The .yaml to write; none if left out.")] = None,
     name: Annotated[str | None, typer.Option(help="Name of the sensor; by default that of the file.")] = None,
-    most: Annotated[int, typer.Option(min=1, help="The most scans to read of a folder.")] = 8,
+    most: Annotated[int, typer.Option("--num", min=1, help="The most scans to read of a folder.")] = 8,
 ) -> None:
     """Estimate a sensor from scans: beams, resolution, limits, height, reflectance; write it as YAML.
 
