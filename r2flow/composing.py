@@ -81,6 +81,7 @@ class Keys:
     generator: Mapping[str, Any] | str | None = None
     sampler: Mapping[str, Any] | None = None
     chain: Mapping[str, Any] | None = None
+    preview: str | None = None
     loggers: Sequence[str] | str | None = None  # a word is answered by `build_loggers`
     plugins: Sequence[str] = ()
     parent: Mapping[str, Any] | None = None

@@ -64,6 +64,28 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
                 os.unlink(temporary)
 
 
+def refuse_unreadable(path: Path, largest: int, what: str = "file") -> None:
+    """Refuse a path that is no regular file, or of 0 or more than `largest` bytes, before it is opened.
+
+    Raises:
+        InputError: in one line, with what was found.
+    """
+    if path.is_symlink() and not path.exists():
+        raise InputError(f"{path} is a link to {path.readlink()}, which does not exist.")
+    if not path.exists():
+        raise InputError(f"{path} does not exist. Is the path right?")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder, not a {what}; name a file in it.")
+    if not path.is_file():  # reading a pipe would wait for ever, a device never end
+        raise InputError(f"{path} is not a regular file.")
+    size = path.stat().st_size
+    if size == 0:
+        raise InputError(f"{path} is empty (0 bytes); fetch or write it again.")
+    if size > largest:
+        most = f"{largest / 2**30:g} GiB" if largest >= 2**30 else f"{largest / 2**20:g} MiB"
+        raise InputError(f"{path} has {size:,} bytes, too many for a {what} (at most {most}). Is it another file?")
+
+
 @contextmanager
 def sole_use(path: Path) -> Iterator[bool]:
     """Use what a file stands for, together with others; whether nobody else did when the block began.

@@ -232,6 +232,8 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
     links = links_of(settings["chain"], folder, given)
     if not all(map(is_finished, links)):
         _check_links(links)
+    if settings["preview"]:
+        _preview(settings["preview"], folder / "preview")
     code, ran = run_chain(links, _restart(command))
     if code:
         return code
@@ -247,6 +249,17 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
     report({link.name: link.run_dir for link in links}, out, device=device, command=" ".join(["python", *sys.argv]))
     record_report(links, out)
     return 0
+
+
+def _preview(model: str, out: Path) -> None:
+    """Draw scans of a trained model, to look at while a chain trains."""
+    from r2flow.checkpoints import load_checkpoint
+    from r2flow.models import find_model
+    from r2flow.reports.outputs import write_samples
+
+    if not (out / "samples.png").is_file():
+        write_samples(load_checkpoint(find_model(model)), out, num=4, seed=0)
+    print(f"preview: scans of the model {model} in {out / 'samples.png'}, point clouds beside it", flush=True)
 
 
 def _check_links(links: Sequence[Any]) -> None:

@@ -23,6 +23,7 @@ from r2flow.callbacks import build_callbacks, build_loggers
 from r2flow.callbacks.stopping import Stopping
 from r2flow.checkpoints import Allowance, checkpoints_of, step_of
 from r2flow.composing import check_keys, compose
+from r2flow.data.contents import check_contents, record_contents
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import SOURCES, Layout, Prepared, resolve_reflectance
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, SourceOptions
@@ -208,7 +209,7 @@ def _refuse_unread(data: Mapping[str, Any]) -> None:
     if not simulated and (data["name"] in (PAIRS, MIXED) or not isinstance(SOURCES[data["name"]], Layout | Prepared)):
         return
     usual = SourceOptions()
-    unread = {f.name for f in fields(usual)} - {"name", "scenes"} if simulated else {"scenes"}
+    unread = {f.name for f in fields(usual)} - {"name", "root", "scenes"} if simulated else {"scenes"}
     wrong = sorted(f"data.{key}" for key in unread if data.get(key, getattr(usual, key)) != getattr(usual, key))
     if wrong:
         what = "simulated scans are no files" if simulated else "scans in files are no simulated scenes"
@@ -303,6 +304,8 @@ def _fit_in_folder(run: Run) -> int:
     last = open_run(run.folder, run.config, run.stage.state_dict())
     if last is not None and step_of(last) >= run.trainer.max_steps:
         return step_of(last)  # nothing is left to do, nor pairs to make
+    if run.trainer.is_global_zero and run.data.files:
+        (record_contents if last is None else check_contents)(run.folder, run.data.files)
     if last is not None:
         log.info("going on from %s", last)
     run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)

@@ -113,7 +113,9 @@ def test_convert_writes_the_averaged_weights_in_both_formats(r2flow, saved, tmp_
     path, averaged = saved
     ours, published, again = tmp_path / "a.safetensors", tmp_path / "b.pth", tmp_path / "c.safetensors"
     for source, out in ((path.parent.parent, ours), (ours, published), (published, again)):
-        assert r2flow("convert", source, out) == (0, f"{out}\n", "")
+        code, said, _ = r2flow("convert", source, out)
+        assert code == 0
+        assert said.startswith(f"{out}: ")
         for name, value in load_checkpoint(out).generator.state_dict().items():
             assert torch.equal(value, averaged[f"generator.{name}"])
     code, _, err = r2flow("convert", path, tmp_path / "d.onnx")

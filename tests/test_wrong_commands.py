@@ -35,7 +35,6 @@ report nope
 report --nope
 sample # Missing
 sample -c run # Missing
-sample -o out # Missing
 sample -c nowhere -o out
 sample -c empty -o out
 sample -c bad.ckpt -o out

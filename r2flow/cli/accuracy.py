@@ -17,7 +17,7 @@ from r2flow.errors import InputError
 
 OptionalCheckpoint = Annotated[
     Path | None,
-    typer.Option("--checkpoint", "-c", help="A checkpoint file or a run folder; exact problems alone if left out."),
+    typer.Option("--checkpoint", "-c", help="A checkpoint, a run or a model; exact problems alone if left out."),
 ]
 ProblemsOption = Annotated[str | None, typer.Option(help="Exact problems by name; all if left out, or none.")]
 
@@ -26,7 +26,7 @@ ProblemsOption = Annotated[str | None, typer.Option(help="Exact problems by name
 @grouped
 def curvature(
     checkpoints: Annotated[
-        list[Path], typer.Option("--checkpoint", "-c", help="A checkpoint file or a run folder; may be repeated.")
+        list[Path], typer.Option("--checkpoint", "-c", help="A checkpoint, a run or a model; may be repeated.")
     ],
     out: OutOption,
     draw: DrawOptions,

@@ -94,7 +94,7 @@ def evaluate(
     work: WorkOptions,
     generated: Annotated[
         str | None,
-        typer.Argument(help="Scans to judge: the same, or a run or checkpoint to sample.", show_default=False),
+        typer.Argument(help="Scans to judge: the same, or a run, checkpoint or model to sample.", show_default=False),
     ] = None,
     checkpoint: Annotated[
         list[Path] | None,

@@ -22,6 +22,7 @@ from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     sensors,
     simulate,
     train,
+    unpack,
     weights,
 )
 from r2flow.cli.app import app

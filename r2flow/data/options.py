@@ -8,6 +8,7 @@ from typing import Any, Self
 from r2flow.data.shards import PairRecipe
 from r2flow.errors import InputError
 from r2flow.flow.solvers import check_tolerance
+from r2flow.lidar.scan_files.fields import check_columns
 from r2flow.registry import NonNegative, Positive, check_options
 
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # in the table `r2flow.data.opening.SOURCES`
@@ -27,6 +28,7 @@ class SourceOptions:
     convention: str = "centre"  # or reference
     reflectance_scale: float = 1.0  # the value in the files that means full reflectance
     on_bad_scan: str = "error"  # or skip: the next usable scan takes the place of one that cannot be used
+    columns: list[str] | None = None  # what the columns of files without names hold: [x, y, z, intensity, _]
 
     def __post_init__(self) -> None:
         if not 0 < self.reflectance_scale < math.inf:
@@ -35,6 +37,7 @@ class SourceOptions:
             raise InputError(f"data.scenes must be at least 1, found {self.scenes}.")
         if self.on_bad_scan not in ("error", "skip"):
             raise InputError(f"data.on_bad_scan must be 'error' or 'skip', found {self.on_bad_scan!r}.")
+        check_columns(self.columns)
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:

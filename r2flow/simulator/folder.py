@@ -6,7 +6,7 @@ import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -63,8 +63,8 @@ class SimulatedFolder:
         """Scans of which a file is missing. Files are written whole or not at all."""
         return [index for index in indices if not all(file.is_file() for file in self.files(index))]
 
-    def begin(self) -> None:
-        """Make the folder and note seed, sensor and revision of the simulator in it.
+    def check(self) -> bool:
+        """Whether the folder has been begun.
 
         Raises:
             InputError: it holds scans of another seed, sensor or revision, or scans and no note.
@@ -79,12 +79,21 @@ class SimulatedFolder:
                     f"{self.path} holds simulated scans with {key} {_short(found.get(key))}, not "
                     f"{_short(ours[key])}; choose another folder, or the same {key}."
                 )
-            return
+            return True
         taken = [file for name in FORMATS for file in self.path.glob(f"*.{name}")] if self.path.is_dir() else []
         if taken:
             raise InputError(f"{self.path} holds scans already ({taken[0].name}) and no {MANIFEST}; choose another.")
-        with atomic_write(note, "w") as file:
-            json.dump(ours, file, indent=2)
+        return False
+
+    def begin(self) -> None:
+        """Make the folder and note seed, sensor and revision of the simulator in it.
+
+        Raises:
+            InputError: what `check` refuses.
+        """
+        if not self.check():
+            with atomic_write(self.path / MANIFEST, "w") as file:
+                json.dump(_note(self.sensor, self.seed), file, indent=2)
 
     def write(self, index: int) -> None:
         """Make one scan and write its files."""
@@ -167,7 +176,7 @@ def _write_batch(folder: SimulatedFolder, indices: Sequence[int]) -> int:
 
 
 def _note(sensor: Sensor, seed: int) -> dict[str, Any]:
-    described = json.loads(json.dumps(asdict(sensor)))  # tuples as lists, as they come back
+    described = json.loads(json.dumps(sensor.described()))  # tuples as lists, as they come back
     return {"simulator": REVISION, "seed": seed, "sensor": described}
 
 

@@ -62,7 +62,6 @@ REFUSED = {
     "data.drives=[1]": "leave data.drives out",
     "data.projection=unfolding": "leave data.projection out",
     "data.on_bad_scan=skip": "leave data.on_bad_scan out",
-    "data.root=/tmp": "leave data.root out",
     "trainer.val_check_interval=0": "val_check_interval must be a finite number above 0",
     "trainer.check_val_every_n_epoch=0": "check_val_every_n_epoch must be a whole number of at least 1",
     "trainer.log_every_n_steps=0": "log_every_n_steps must be a whole number of at least 1",
