@@ -750,7 +750,7 @@ def refused(place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
             cli.main()
         said = capfd.readouterr().err
         assert end.value.code == 2, said
-        (answer,) = said.splitlines()
+        (answer,) = (line for line in said.splitlines() if not line.startswith("WARNING"))
         assert answer.startswith("error: ")
         named = {word for argument in arguments[1:] for word in re.split(r"[^\w²-]+", argument.strip("-"))}
         wanted = {words} if words else named - USUAL
