@@ -108,7 +108,7 @@ def test_a_released_model_is_added_from_a_file(r2flow, released, tmp_path):  # n
     assert name_of(model_file("large")) == "large"
 
 
-def test_another_file_is_no_model(released):
+def test_another_file_is_no_model(r2flow, released):  # noqa: F811
     released.write_bytes(released.read_bytes() + b" ")
     with pytest.raises(InputError, match="is not the model large, or damaged"):
         add_model("large", released)
@@ -116,6 +116,8 @@ def test_another_file_is_no_model(released):
     model_file("large").write_bytes(released.read_bytes())
     with pytest.raises(InputError, match="is not the model large, or damaged"):
         load_checkpoint("large")
+    code, _, said = r2flow("weights", "--add", "larg", released)
+    assert (code, "Did you mean 'large'?" in said) == (2, True)
     with pytest.raises(InputError, match="comes with the package"):
         add_model("street", released)
 

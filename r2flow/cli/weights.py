@@ -6,6 +6,8 @@ from typing import Annotated
 import typer
 
 from r2flow.cli.app import app
+from r2flow.errors import InputError
+from r2flow.registry import did_you_mean
 
 
 @app.command(epilog="Example: r2flow weights --add rangenet53 darknet53-1024.tar.gz")
@@ -32,6 +34,9 @@ def weights(
 
     if add is not None:
         name, path = add
+        if name not in SOURCES:
+            known = [*MODELS, *SOURCES]
+            raise InputError(f"no weights named {name!r}; known: {', '.join(known)}.{did_you_mean(name, known)}")
         found = take(name, path)
         same = {True: "the published file", False: "not the published file", None: "its published hash is not known"}
         print(f"{kept_file(name)}: weights {found.weights} of {found.source} ({same[found.published]})")
