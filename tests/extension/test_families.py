@@ -183,4 +183,4 @@ def test_a_notebook_composes_what_plugins_add():
     with loaded(GAN, BACKBONE):
         config = compose(["stage=toy_gan", "backbone=toy_backbone", "stage.width=8", "backbone.base_channels=4"])
     assert (config["stage"]["name"], config["stage"]["width"]) == ("toy_gan", 8)
-    assert config["backbone"] == {"name": "toy_backbone", "base_channels": 4}
+    assert (config["backbone"]["name"], config["backbone"]["base_channels"]) == ("toy_backbone", 4)
