@@ -100,6 +100,19 @@ def end_with_parent(worker: int = 0) -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
+@contextmanager
+def out_of_reach() -> Iterator[None]:
+    """Start processes that Ctrl-C does not reach, not even while they import: it waits for the end of the block here."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which they inherit
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def outlive_the_signal(worker: int = 0) -> None:
     """In a loader's worker: a signal is for the run, which may need the worker for the step that it is in.
 
