@@ -102,7 +102,7 @@ def end_with_parent(worker: int = 0) -> None:
 
 @contextmanager
 def out_of_reach() -> Iterator[None]:
-    """Start processes that Ctrl-C does not reach, not even while they import: it waits for the end of the block here."""
+    """Start processes that Ctrl-C does not reach, not even as they import; here it waits for the end of the block."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
