@@ -122,7 +122,7 @@ def test_one_channel_is_written_alone(r2flow, run, tmp_path):  # noqa: F811
 
 def test_a_grid_is_calibrated_and_sampled_on(r2flow, run, tmp_path):  # noqa: F811
     path = tmp_path / "grids" / "grid.json"
-    code, said, _ = r2flow("calibrate", run, "--steps", 3, "--solver", "ab2", "--num", 2, "--out", path)
+    code, said, _ = r2flow("calibrate", "-c", run, "--steps", 3, "--solver", "ab2", "--num", 2, "--out", path)
     assert (code, "3 steps of ab2 at t = 0, " in said) == (0, True)
     content = json.loads(path.read_text())
     assert (content["steps"], content["method"], len(content["times"])) == (3, "ab2", 4)
@@ -180,21 +180,21 @@ class TestBadInput:
         self.check(r2flow("invert", files[0], *with_run, "--tolerance", 0), out, "must be positive")
         self.check(r2flow("interpolate", *files, *with_run, "--frames", 1), out, "--frames")
         self.check(r2flow("interpolate", files[0], tmp_path / "no.ply", *with_run), out, "no.ply")
-        self.check(r2flow("report", "savings", tmp_path / "none", "-o", out), out, "no checkpoint")
+        self.check(r2flow("report", "savings", "-c", tmp_path / "none", "-o", out), out, "no checkpoint")
 
     def test_of_grids(self, r2flow, run, tmp_path):  # noqa: F811
         out, bad = tmp_path / "o", tmp_path / "bad.json"
         bad.write_text("{}")
         good = tmp_path / "good.json"
-        assert r2flow("calibrate", run, "--steps", 2, "--num", 1, "--out", good)[0] == 0
+        assert r2flow("calibrate", "-c", run, "--steps", 2, "--num", 1, "--out", good)[0] == 0
         options = ("sample", "-c", run, "-o", out)
         self.check(r2flow(*options, "--grid", "cubic"), out, "no time grid named 'cubic'")
         self.check(r2flow(*options, "--grid", bad), out, "bad.json is no time grid", "r2flow calibrate")
         self.check(r2flow(*options, "--grid", tmp_path / "no.json"), out, "no.json")
         self.check(r2flow(*options, "--grid", good, "--steps", 3), out, "the time grid has 2 steps, found steps=3")
         self.check(r2flow(*options, "--grid", good, "--solver", "dopri5"), out, "dopri5 chooses its own")
-        self.check(r2flow("calibrate", run, "--out", out), out, "ends in .json")
-        self.check(r2flow("calibrate", run, "--out", out / "a.json", "--solver", "bosh3"), out, "fixed steps")
+        self.check(r2flow("calibrate", "-c", run, "--out", out), out, "ends in .json")
+        self.check(r2flow("calibrate", "-c", run, "--out", out / "a.json", "--solver", "bosh3"), out, "fixed steps")
 
     def test_of_seeds_and_tolerances(self, r2flow, run, files, tmp_path):  # noqa: F811
         out = tmp_path / "o"

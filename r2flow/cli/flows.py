@@ -10,6 +10,7 @@ import typer
 from r2flow.cli.app import app
 from r2flow.cli.groups import DrawOptions, SolverOptions, grouped
 from r2flow.cli.options import (
+    CheckpointOption,
     DeviceOption,
     OutOption,
     SensorOption,
@@ -99,9 +100,9 @@ def sample(
     print(f"{draw.num} scans ({', '.join(formats)}) in {out}{seen}")
 
 
-@app.command(epilog="Example: r2flow calibrate runs/NAME --steps 8 --out grid.json")
+@app.command(epilog="Example: r2flow calibrate -c runs/NAME --steps 8 --out grid.json")
 def calibrate(
-    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file, a run folder or a model.")],
+    checkpoint: CheckpointOption,
     out: Annotated[Path, typer.Option("--out", "-o", help="The file to write, .json.", show_default=False)],
     steps: Annotated[int, typer.Option(min=1, help="Steps of the grid.")] = 8,
     solver: Annotated[str, typer.Option(help="The solver that will use it: euler, ab2, midpoint, ...")] = "euler",
