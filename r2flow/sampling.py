@@ -67,7 +67,7 @@ def sample(
             noise as in the whole image.
         channels: `range` or `reflectance` skips the decoding of the other one; `both` takes what the model has.
         progress: Called after every network evaluation of a batch.
-        changes: Single settings of the sampler: steps, method, tolerance, grid, straight_first.
+        changes: Single settings of the sampler: steps, method, tolerance, grid.
 
     Raises:
         InputError: num or batch_size below 1, a sampler or a channel that the generator does not have, a region that

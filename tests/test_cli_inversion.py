@@ -215,14 +215,13 @@ class TestBadInput:
         self.check(r2flow(*options, "--channels", "depth"), out, "both, range or reflectance", "'depth'")
         self.check(r2flow(*options, "--channels", "range", "--format", "bin"), out, "leaves it out", "ply,npy")
         self.check(r2flow(*options, "--channels", "reflectance", "--format", "ply"), out, "need a range")
-        self.check(r2flow(*options, "--straight-first"), out, "adaptive solver", "'euler'")
         alone = write_checkpoint(tmp_path / "range", reflectance=False)
         self.check(r2flow("sample", "-c", alone, "-o", out, "--channels", "reflectance"), out, "range alone")
 
 
 def test_what_is_not_asked_for_is_not_imported():
     shown = "print([m for m in ({}) if m in sys.modules]); "
-    code = "import r2flow.flow.straight_exit, r2flow.flow.problems, r2flow.lidar.region, r2flow.backbones, sys; "
+    code = "import r2flow.flow.solvers, r2flow.flow.problems, r2flow.lidar.region, r2flow.backbones, sys; "
     code += shown.format("'lightning', 'matplotlib', 'torchdiffeq', 'r2flow.simulator'")
     code += "import r2flow.sampling, r2flow.reports.inversion, r2flow.reports.interpolation, r2flow.reports.savings; "
     code += shown.format("'r2flow.simulator', 'tensorboard', 'torchdiffeq', 'plotly', 'natten'")

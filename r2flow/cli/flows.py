@@ -72,9 +72,6 @@ def sample(
     ] = None,
     format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture.")] = 8,
-    straight_first: Annotated[
-        bool, typer.Option("--straight-first", help="One step for the scans that are straight, --solver for others.")
-    ] = False,
 ) -> None:
     """Draw scans from a trained generator: point clouds, range images and pictures.
 
@@ -86,7 +83,7 @@ def sample(
 
     loaded = load_checkpoint(checkpoint, device=choose_device(draw.device))
     times = None if grid is None else grid_of(grid, loaded)
-    sampler = solver.change(loaded.generator.sampler, straight_first=straight_first or None, grid=times)
+    sampler = solver.change(loaded.generator.sampler, grid=times)
     formats = format.split(",") if format else formats_of(loaded, part.channels)
     region = part.region(loaded)
     write_samples(loaded, out, draw.num, draw.seed, sampler, formats, pictures, draw.batch_size, region, part.channels)

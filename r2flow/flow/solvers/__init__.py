@@ -88,7 +88,7 @@ def solve(
         finish: Length of the last part of the interval, which one Euler step takes: 1e-3 avoids a velocity that is
             singular at t_1.
         max_evaluations: Budget of a scene in an adaptive method.
-        max_step: Longest step of our adaptive methods as a share of the interval. They leave no eighth of the interval
+        max_step: Longest step of our adaptive methods as a share of the interval. They leave no 0.16 of the interval
             unseen and locate jumps of v in time; a narrower pulse can be missed without a flag. 1/64 finds all that are
             longer than a 128th.
         global_error: Estimate the error at t_1 by a second solution, with half the steps' lengths or a sixtieth of the
