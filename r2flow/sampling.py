@@ -127,5 +127,5 @@ def batches(num: int, batch_size: int) -> int:
 
 
 def evaluated_region(generator: Generator, region: Region) -> Region:
-    """The region rounded outward to what the generator can be cut to."""
-    return region.rounded(generator.unit)
+    """The region and its margin, rounded outward to what the generator can be cut to."""
+    return region.widened().rounded(generator.unit)

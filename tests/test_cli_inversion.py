@@ -97,6 +97,14 @@ def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):  # no
         "sample", "-c", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "-o", tmp_path / "o"
     )
     assert code == 0
+    # 11.25 degrees are 2 columns, and the network's unit is 8.
+    widened = "generating rows 0-3, columns 16-47, rounded outward from rows 0-2, columns 24-39 with its margin: 25% of"
+    assert widened in said
+    code, said, _ = r2flow(
+        "sample", "-c", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "--margin", 0,
+        "-o", tmp_path / "o",
+    )  # fmt: skip
+    assert code == 0
     assert "generating rows 0-3, columns 24-39, rounded outward from rows 0-2, columns 24-39: 12% of the image" in said
     image = np.load(tmp_path / "o" / "000000.npy")
     assert image.shape == (2, 8, 64)

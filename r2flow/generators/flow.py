@@ -9,7 +9,8 @@ from torch import Tensor, nn
 
 from r2flow.backbones import build_backbone
 from r2flow.errors import InputError
-from r2flow.flow.solvers import GRIDS, SOLVERS, Solution, Velocity, adapts, check_method, check_tolerance, solve
+from r2flow.flow.solvers import SOLVERS, Solution, Velocity, adapts, check_method, check_tolerance, solve
+from r2flow.flow.solvers.grids import build_grid
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
@@ -64,8 +65,8 @@ class Flow(Generator):
     def check_sampler(self, sampler: Sampler) -> None:
         check_method(sampler.method)
         check_tolerance(sampler.tolerance)
-        if isinstance(sampler.grid, str):
-            GRIDS[sampler.grid]
+        grid = sampler.grid
+        build_grid(grid if isinstance(grid, str) else torch.tensor(grid), 0.0, 1.0, sampler.steps)
         if adapts(sampler.method) and sampler.grid != "uniform":
             raise InputError(f"a time grid is for a solver of fixed steps; {sampler.method} chooses its own.")
 
@@ -98,10 +99,25 @@ class RectifiedFlow(Flow):
         return v
 
     def start_from(self, parent: Generator) -> None:
-        """Take over a flow's weights; what a second time adds keeps its own, which change nothing at first."""
-        own = self.backbone.state_dict()
-        new = {f"backbone.{name}": own[name] for name in self.backbone.second_time_names()}
-        self._take(parent, {**new, **parent.state_dict()})
+        """Take over a flow's weights; what a second time adds keeps its own, which change nothing at first.
+
+        A flow that looks elsewhere, as through another sensor, keeps its own rays.
+
+        Raises:
+            InputError: other weights; a network with weights for each place of the image, and another size.
+        """
+        own, theirs = self.state_dict(), parent.state_dict()
+        new = {name: own[name] for name in (f"backbone.{name}" for name in self.backbone.second_time_names())}
+        if not torch.equal(self.space.rays, parent.space.rays):
+            theirs = {**theirs, "backbone.coords": own["backbone.coords"]}
+            sized = [name for name, value in theirs.items() if name in own and value.shape != own[name].shape]
+            if sized:
+                here, there = ("x".join(map(str, one.space.shape)) for one in (self, parent))
+                raise InputError(
+                    f"the network to start from has weights for images of {there} alone ('{sized[0]}'), found {here}: "
+                    "leave sensor out, or start from one that was trained with backbone.position=none."
+                )
+        self._take(parent, {**new, **theirs})
 
     @property
     def unit(self) -> tuple[int, int]:

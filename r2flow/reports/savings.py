@@ -41,6 +41,7 @@ ELEMENTS = 256  # of an exact scan
 FIXED = 32  # steps of the fixed-step rows
 REPEATS = 3  # of every timing
 TOLERANCES = (1e-3, 1e-5)
+MARGINS = (11.25, 22.5, 45.0)  # degrees on either side of a sector
 TIGHT = 1e-6  # tolerance of the solution that a trained flow is compared with
 WHOLE = "the whole image"
 
@@ -151,13 +152,14 @@ def scan_rows(checkpoint: Checkpoint, num: int, tolerance: float, seed: int, pro
 def regions_to_measure(shape: tuple[int, int]) -> dict[str, tuple[Region, Region]]:
     """What is asked for and what is generated for it, before rounding, by name."""
     ahead, half = region(shape, (-45, 45)), region(shape, (-90, 90))
+    margins = {f"90 degrees, a margin of {margin:g}": region(shape, (-45, 45), None, margin) for margin in MARGINS}
     upper = region(shape, None, (0, shape[0] // 2 - 1))
     quarter = region(shape, None, (shape[0] // 4, shape[0] // 2 - 1))
     corner = region(shape, (-45, 45), (0, shape[0] // 2 - 1))
     return {
         "sector of 180 degrees": (half, half),
         "sector of 90 degrees": (ahead, ahead),
-        "90 degrees out of 180 generated": (ahead, half),
+        **{name: (ahead, wider.widened()) for name, wider in margins.items()},
         "upper half of the rows": (upper, upper),
         "a quarter of the rows": (quarter, quarter),
         "90 degrees, upper half of the rows": (corner, corner),
