@@ -1,4 +1,4 @@
-"""How often an adaptive solver is wrong without saying so: problems of 51 kinds with known ends.
+"""How often an adaptive solver is wrong without saying so: problems of 50 kinds with known ends.
 
 A silent failure: the solution has converged, is not flagged as stiff, and is further from the exact end than
 30 tolerances x (1 + RMS of the exact end). Every kind has three scenes with parameters drawn at random; float64, 16

@@ -33,6 +33,7 @@ PRECISIONS: dict[str, tuple[torch.dtype, torch.dtype | None]] = {  # of the stat
 FAILS_AT = 10.0  # times the tolerance
 HONEST_WITHIN = 5.0  # of the true error
 JET = "narrow_jet"  # the known exception: nothing evaluated on either side of it shows it
+COMPARED = tuple(name for name in SOLVERS if name != "exprb43")  # auto takes it where it is needed
 FINISHED = ("point_mass", "narrow_gaussian", "ray_drop")
 
 
@@ -48,7 +49,7 @@ class Trial(NamedTuple):
 
 def cells(
     problems: Iterable[str] = tuple(PROBLEMS),
-    solvers: Iterable[str] = tuple(name for name in SOLVERS if name != "exprb43"),  # auto takes it where it is needed
+    solvers: Iterable[str] = COMPARED,
     tolerances: Sequence[float] = (1e-3, 1e-5),
 ) -> list[Trial]:
     """Every problem, precision, solver and, of adaptive solvers, tolerance; those of `FINISHED` also with a last Euler
