@@ -97,9 +97,10 @@ def test_a_ray_drop_scene_among_easy_ones_stays_below_5e_3_in_at_least_nine_of_t
 @pytest.mark.parametrize("method", ADAPTIVE)
 def test_a_scene_s_result_is_the_same_alone_in_any_batch_and_in_any_place(method):
     problems = [Straight(), TwoModes(), RayDrop(), Gaussian(), Gaussian(std=0.01), StiffLinear(), Rotating()]
+    problems += [Discontinuous(), Pulse()]
     x_0 = noise(len(problems), 96)
     together = solve(Mixed(problems), x_0, method=method, tolerance=1e-4, global_error=True)
-    order = torch.tensor([3, 6, 0, 5, 1, 4, 2])
+    order = torch.tensor([3, 6, 8, 0, 5, 1, 7, 4, 2])
     shuffled = solve(Mixed(problems).select(order), x_0[order], method=method, tolerance=1e-4, global_error=True)
     assert len(set(together.evaluations.tolist())) > 3
     for name in ("x", "evaluations", "accepted", "rejected", "stiff", "converged", "global_error"):
