@@ -17,7 +17,7 @@ from torch.overrides import TorchFunctionMode
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.generators import Generator, RectifiedFlow, Sampler, build_generator
+from r2flow.generators import Budget, Generator, RectifiedFlow, Sampler, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
@@ -39,6 +39,7 @@ class Checkpoint:
         step: Optimiser steps taken.
         path: Where it was read from.
         format: `r2flow`, or `published` for the reference implementation's files.
+        accuracy: What its sampler's errors are, where they have been measured (`r2flow.accuracy.calibrate`).
     """
 
     generator: Generator
@@ -46,6 +47,7 @@ class Checkpoint:
     step: int
     path: Path
     format: str
+    accuracy: tuple[Budget, ...] = ()
 
     @property
     def model(self) -> nn.Module:
@@ -202,12 +204,12 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
         generator = build_generator(config)
     check_weights(generator, weights, path)
     generator.load_state_dict(weights)
-    if sampler is not None:
-        generator.sampler = Sampler.of(sampler)
+    generator.sampler = Sampler.of(sampler or {})  # where none was written down, 32 Euler steps
     if "published" in config and config["data"]["projection"] == "unfolding":
         sensor = published_rings(generator.space.sensor, weights[BACKBONE + "coords"])
         generator.space = replace(generator.space, sensor=sensor)
-    return Checkpoint(generator.eval().requires_grad_(False).to(device), config, step, path, kind)
+    accuracy = tuple(Budget.of(one) for one in content.get("accuracy") or ())
+    return Checkpoint(generator.eval().requires_grad_(False).to(device), config, step, path, kind, accuracy)
 
 
 class _Allowance(TorchFunctionMode):
@@ -265,6 +267,7 @@ def read_safetensors(path: Path) -> dict[str, Any]:
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         config, step = json.loads(notes["config"]), int(notes["step"])
         sampler = json.loads(notes["sampler"]) if "sampler" in notes else None
+        accuracy = json.loads(notes.get("accuracy", "[]"))
     except (SafetensorError, OSError, ValueError) as error:
         raise InputError(f"{path} is not a safetensors file, or a damaged one: {error}.") from None
     except KeyError as error:
@@ -273,11 +276,13 @@ def read_safetensors(path: Path) -> dict[str, Any]:
         raise InputError(_damaged(path, "its weights and config"))
     prefix = PREFIX if sampler is not None else PREFIX + BACKBONE  # 0.1.0 held the backbone alone
     state = {prefix + name: value for name, value in weights.items()}
-    return {"config": config, "global_step": step, "state_dict": state, "sampler": sampler}
+    return {"config": config, "global_step": step, "state_dict": state, "sampler": sampler, "accuracy": accuracy}
 
 
 def _digest(notes: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
-    return state_hash(weights, json.dumps([notes.get(key) for key in ("config", "step", "sampler")]).encode())
+    said = [notes.get(key) for key in ("config", "step", "sampler")]
+    said += [notes["accuracy"]] if "accuracy" in notes else []
+    return state_hash(weights, json.dumps(said).encode())
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
@@ -297,6 +302,8 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
             "step": str(checkpoint.step),
             "sampler": json.dumps(checkpoint.generator.sampler.asdict()),
         }
+        if checkpoint.accuracy:
+            notes["accuracy"] = json.dumps([budget.asdict() for budget in checkpoint.accuracy])
         data = save(weights, metadata={**notes, "digest": _digest(notes, weights)})
         with atomic_write(path) as file:
             file.write(data)
@@ -312,6 +319,26 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
             torch.save(content, file)
     else:
         raise InputError(f"{path}: give .safetensors for our format or .pth for the published one.")
+
+
+def keep_sampler(checkpoint: Checkpoint) -> None:
+    """Write the generator's sampler and the errors that it has into the file that the checkpoint was read from.
+
+    Raises:
+        InputError: a file of the published format, which has no place for them, or one that cannot be written.
+    """
+    path = checkpoint.path
+    if checkpoint.format == "published":
+        own = path.with_suffix(".safetensors")
+        raise InputError(f"{path} has no place for a sampler; give a copy that has: r2flow convert {path} {own}.")
+    if path.suffix == ".safetensors":
+        save_checkpoint(checkpoint, path)
+        return
+    content = torch.load(path, map_location="cpu", weights_only=True)
+    content["sampler"] = checkpoint.generator.sampler.asdict()
+    content["accuracy"] = [budget.asdict() for budget in checkpoint.accuracy]
+    with atomic_write(path) as file:
+        torch.save(content, file)
 
 
 def _plain(module: nn.Module) -> dict[str, Tensor]:

@@ -1,6 +1,6 @@
 """Generators that follow a velocity: dx/dt = v(t, x) from noise at t = 0 to data at t = 1."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 from typing import Any, ClassVar
 
@@ -9,12 +9,23 @@ from torch import Tensor, nn
 
 from r2flow.backbones import build_backbone
 from r2flow.errors import InputError
-from r2flow.flow.solvers import GRIDS, SOLVERS, Solution, Velocity, adapts, check_method, check_tolerance, solve
+from r2flow.flow.solvers import (
+    Solution,
+    Velocity,
+    adapts,
+    check_method,
+    check_tolerance,
+    fixed_step,
+    named_grid,
+    solve,
+)
 from r2flow.flow.straight_exit import solve_straight_first
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
+
+BEST = Sampler("adams3", 16, grid="power:1.75")  # of the solvers and grids compared in docs/results.md
 
 
 class Flow(Generator):
@@ -52,7 +63,11 @@ class Flow(Generator):
                 raise InputError(f"straight_first is for the way from t = 0 to 1, found {t_0:g} to {t_1:g}.")
             return solve_straight_first(field, x, how.tolerance, how.method, progress, **options)
         grid = how.grid if isinstance(how.grid, str) else torch.tensor(how.grid, dtype=torch.float64)
-        return solve(field, x, t_0, t_1, how.method, how.steps, how.tolerance, progress, grid=grid, **options)
+
+        def by(field: Velocity, x: Tensor, steps: int) -> Solution:
+            return solve(field, x, t_0, t_1, how.method, steps, how.tolerance, progress, grid=grid, **options)
+
+        return _by_levels(field, x, how, by) if how.levels else by(field, x, how.steps)
 
     def generate(
         self,
@@ -69,8 +84,11 @@ class Flow(Generator):
     def check_sampler(self, sampler: Sampler) -> None:
         check_method(sampler.method)
         check_tolerance(sampler.tolerance)
+        method = fixed_step(sampler.method)
         if isinstance(sampler.grid, str):
-            GRIDS[sampler.grid]
+            named_grid(sampler.grid)
+        if sampler.levels and not (method and method.corrects):
+            raise InputError(f"only a predictor-corrector says how many steps a scan needs, not {sampler.method}.")
         if sampler.straight_first and not adapts(sampler.method):
             raise InputError(
                 f"scenes that are not straight need an adaptive solver, dopri5 or bosh3; found {sampler.method!r}."
@@ -79,7 +97,8 @@ class Flow(Generator):
             raise InputError(f"a time grid is for a solver of fixed steps; {sampler.method} chooses its own.")
 
     def evaluations_of(self, sampler: Sampler) -> int:
-        return sampler.steps * (SOLVERS[sampler.method].evaluations or 0) if sampler.method in SOLVERS else 0
+        method = fixed_step(sampler.method)
+        return 0 if method is None or sampler.levels else method.cost(sampler.steps)
 
 
 class RectifiedFlow(Flow):
@@ -95,6 +114,7 @@ class RectifiedFlow(Flow):
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space)
+        self.sampler = BEST
         channels = space.shape[0]
         self.backbone = build_backbone(
             backbone, space.rays, channels + self.condition_channels, channels, self.second_time
@@ -153,6 +173,20 @@ class Field(Flow):
     @property
     def device(self) -> torch.device:
         return next((p.device for p in self.parameters()), torch.device("cpu"))
+
+
+def _by_levels(field: Velocity, x: Tensor, how: Sampler, by: Callable[[Velocity, Tensor, int], Solution]) -> Solution:
+    """Each scan by the first number of steps at which its correction is small enough; all evaluations are counted."""
+    solution, left = by(field, x, how.levels[0]), torch.arange(len(x))
+    for steps, most in zip(how.levels[1:], how.limits, strict=True):
+        assert solution.correction is not None
+        left = left[~(solution.correction[left] <= most)]
+        if not len(left):
+            break
+        select = getattr(field, "select", None)
+        again = by(select(left) if select else field, x[left.to(x.device)], steps)
+        solution = solution.continued(left, again)
+    return solution
 
 
 class _Conditioned:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from r2flow.flow.problems import PROBLEMS
-from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, Solution, adapts, check_method
+from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, Solution, adapts, check_method, fixed_step
 from r2flow.generators import Field, Flow, Sampler
 from r2flow.inversion import metres_apart, rms
 from r2flow.lidar.encoding import Encoding
@@ -105,8 +105,9 @@ def configurations(
             chosen += [Configuration(method, tolerance=tolerance) for tolerance in tolerances]
         else:
             ours = method.removeprefix(TORCHDIFFEQ)
-            per_step = SOLVERS[ours].evaluations or 1 if ours in SOLVERS else 1
-            steps = sorted({budget // per_step for budget in budgets if budget >= per_step})
+            own = fixed_step(ours)
+            start, per_step = (own.start, own.evaluations) if own else (0, 1)
+            steps = sorted({(budget - start) // per_step for budget in budgets if budget >= start + per_step})
             chosen += [Configuration(method, steps=count) for count in steps]
     return chosen
 
