@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
+from r2flow.flow.solvers import usual_grid
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
@@ -62,14 +63,15 @@ class Sampler:
     def changed(self, **options: Any) -> Self:
         """The same with the options that are not None. Given times decide the number of steps.
 
-        Another method starts from a uniform grid, without `straight_first` and `levels`: those were the former one's.
+        Another method starts from its usual grid, without `straight_first` and `levels`: those were the former one's.
 
         Raises:
             InputError: fewer than one step, or times and a number of steps that contradict.
         """
         given = {key: value for key, value in options.items() if value is not None}
         if given.get("method", self.method) != self.method:
-            given = {"grid": "uniform", "straight_first": False, "levels": (), "limits": (), **given}
+            usual = usual_grid(given["method"])
+            given = {"grid": usual, "straight_first": False, "levels": (), "limits": (), **given}
         if "steps" in given:
             given = {"levels": (), "limits": (), **given}
         grid = given.get("grid", "uniform")

@@ -28,7 +28,7 @@ from r2flow.registry import Registry
 
 __all__ = [
     "LEAST_TOLERANCE", "SOLVERS", "TORCHDIFFEQ", "EmbeddedMethod", "FixedStep", "Solution", "Velocity", "adapts",
-    "check_method", "check_tolerance", "fixed_step", "named_grid", "solve",
+    "check_method", "check_tolerance", "fixed_step", "named_grid", "solve", "usual_grid",
 ]  # fmt: skip
 
 SOLVERS: Registry[FixedStep | EmbeddedMethod] = Registry(
@@ -202,6 +202,15 @@ def fixed_step(method: str) -> FixedStep | None:
         return None
     found = SOLVERS[method]
     return found if isinstance(found, FixedStep) else None
+
+
+def usual_grid(method: str) -> str:
+    """Where a method's steps fall unless told: denser towards t = 1 for predictor-correctors, else equal.
+
+    P = 1.75 is the best or nearly the best of the flows in docs/results.md.
+    """
+    found = fixed_step(method)
+    return "power:1.75" if found is not None and found.corrects else "uniform"
 
 
 def _order(method: str) -> int:
