@@ -27,9 +27,9 @@ PANELS: tuple[tuple[Axis, Axis], ...] = (  # of a checkpoint
 )
 COLUMNS = {
     "label": "configuration", "grid": "grid", "evaluations": "evaluations", "seconds": "seconds",
-    "seconds_quarter": "quartile", "seconds_three_quarters": "quartile", "error": "error, median", "error_p95": "95th percentile",
-    "error_worst": "worst scan", "range_rms_m": "range, RMS m", "range_median_m": "range, median m",
-    "drop_differs": "ray-drop differs", "front": "Pareto",
+    "seconds_quarter": "quartile", "seconds_three_quarters": "quartile", "error": "error, median",
+    "error_p95": "95th percentile", "error_worst": "worst scan", "range_rms_m": "range, RMS m",
+    "range_median_m": "range, median m", "drop_differs": "ray-drop differs", "front": "Pareto",
 }  # fmt: skip
 NOTE = (
     "All configurations. Errors are RMS over the elements of a scan in model space; in metres, over the rays that both "
