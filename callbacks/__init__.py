@@ -35,12 +35,12 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
     """
     if config["trainer"]["fast_dev_run"]:
         return [Progress()] if config["trainer"]["enable_progress_bar"] else []
-    wanted = {name: options for name, options in (config["callbacks"] or {}).items() if options is not None}
+    for name in config["callbacks"]:
+        CALLBACKS[name]
+    wanted = {name: options for name, options in config["callbacks"].items() if options is not None}
     for name, key in (("checkpoint", "enable_checkpointing"), ("progress", "enable_progress_bar")):
         if not config["trainer"][key]:
             wanted.pop(name, None)
-    for name in wanted:
-        CALLBACKS[name]
     built: list[Callback] = []
     for name, entry in CALLBACKS.items():
         if name in wanted:

@@ -2,6 +2,27 @@
 
 Notation everywhere: `t = 0` is noise and `t = 1` is data; `x_0 ~ N(0, I)`, `x_1` a scan,
 `x_t = (1 - t) x_0 + t x_1`, target `u_t = x_1 - x_0`, estimate `v_t = v(t, x_t)`.
+
+    flow = r2flow.load("street")  # a model by name, a run folder or a checkpoint
+    scans = flow.sample(4)        # range in metres and reflectance, (4, 2, H, W)
 """
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from r2flow.checkpoints import Checkpoint
+
 __version__ = "0.2.0"
+
+
+def load(name: "str | Path", device: str = "cpu") -> "Checkpoint":
+    """A trained generator: a model by its name (`r2flow weights` lists them), a run folder or a checkpoint file.
+
+    Raises:
+        InputError: there is none.
+    """
+    from r2flow.checkpoints import load_checkpoint  # takes as long as torch
+
+    return load_checkpoint(name, device)

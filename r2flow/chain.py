@@ -2,6 +2,7 @@
 
 import ctypes
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -57,7 +58,11 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
     for name, difference in chain.items():
         if not isinstance(difference, Mapping):
             raise InputError(f"chain.{name} must be a group of keys, in which it differs; found {difference!r}.")
+        if not re.fullmatch(r"[\w-][\w.-]*", str(name)):
+            raise InputError(f"chain: a link is a folder of its own, which cannot be called {name!r}.")
         own = dict(difference)
+        if not isinstance(own.get("stage") or {}, Mapping):
+            raise InputError(f"chain.{name}.stage must be a group of keys, found {own['stage']!r}.")
         parent = own.pop("init", None)
         overrides = [override(key, value) for key, value in flatten(own) if (key, value) != ("experiment", None)]
         if any(key_of(one) == "plugins" for one in overrides):

@@ -4,6 +4,7 @@ import json
 import math
 import pickle
 import re
+import warnings
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
+from r2flow.config import learned
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
@@ -21,12 +23,17 @@ from r2flow.generators import Budget, Generator, RectifiedFlow, Sampler, build_g
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
+from r2flow.models import MODELS, find_model
 from r2flow.plugins import made_with
 from r2flow.published import published_cfg, published_config, published_rings, published_step
+from r2flow.registry import did_you_mean
+from r2flow.sampling import sample
 
 FOLDER = "checkpoints"
 PREFIX = "generator."  # of the generator's weights in a LightningModule
 BACKBONE = "backbone."  # of a flow's network in the generator
+NOTES = "r2flow"  # of a .safetensors: all that it says beside its tensors, as JSON under one key
+SMALL = 256  # the most numbers of a matrix that half precision leaves as it is, as it does all vectors
 
 
 @dataclass(frozen=True)
@@ -70,6 +77,14 @@ class Checkpoint:
         """Between model space and metres."""
         return self.generator.space.encoding
 
+    def sample(self, num: int = 1, seed: int = 0, **how: Any) -> Tensor:
+        """Scans 0 to num - 1 of a seed: range in metres and reflectance, (num, 2 or 1, H, W), 0 without a return.
+
+        Args:
+            how: Options of `r2flow.sampling.sample`: steps, method, batch_size, region, ...
+        """
+        return torch.cat([drawn.images for drawn in sample(self, num, seed, **how)])
+
 
 def step_of(path: Path) -> int:
     """The step in a checkpoint's file name, -1 where there is none."""
@@ -79,26 +94,34 @@ def step_of(path: Path) -> int:
 
 def checkpoints_of(run: str | Path) -> list[Path]:
     """The checkpoints of a run folder, the latest first."""
-    found = [path for path in Path(run, FOLDER).glob("step-*.ckpt") if not path.is_symlink()]
+    found = [path for path in Path(run, FOLDER).glob("step-*.ckpt") if path.is_file() and not path.is_symlink()]
     return sorted(found, key=step_of, reverse=True)
 
 
 def find_checkpoint(path: str | Path) -> Path:
-    """A checkpoint file, or the latest one of a run folder.
+    """A checkpoint file, the latest one of a run folder, or the file of a model of this name.
+
+    A file or a run of a model's name in the current folder comes before the model.
 
     Raises:
         InputError: nothing is there.
     """
-    path = Path(path).expanduser()
+    name, path = str(path), Path(path).expanduser()
     if path.is_dir():
         found = checkpoints_of(path) or sorted(path.glob("step-*.ckpt"), key=step_of, reverse=True)
+        if not found and name in MODELS:
+            return find_model(name)
         if not found:
             runs = sorted(str(one.parent) for one in path.glob(f"*/{FOLDER}") if checkpoints_of(one.parent))
             hint = f"It holds runs: give {' or '.join(runs[:8])}." if runs else "Has a run been started there?"
             raise InputError(f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt). {hint}")
         return found[0]
     if not path.is_file():
-        raise InputError(f"no checkpoint at {path}. Give a checkpoint file or a run folder.")
+        if name in MODELS:
+            return find_model(name)
+        known = f"a model ({', '.join(MODELS)})"
+        hint = did_you_mean(name, [*MODELS])
+        raise InputError(f"no checkpoint at {path}. Give a checkpoint file, a run folder or {known}.{hint}")
     return path
 
 
@@ -108,9 +131,12 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
     Raises:
         InputError: not a checkpoint, a damaged one, or one that holds more than plain values.
     """
+    if not Path(path).is_file():  # a pipe would be waited for
+        raise InputError(f"no checkpoint at {path}. Give a checkpoint file or a run folder.")
     _check_sums(path)
     try:
-        content = torch.load(path, map_location=map_location, weights_only=True)
+        with warnings.catch_warnings(action="ignore"):  # torch's, on bytes that are no checkpoint
+            content = torch.load(path, map_location=map_location, weights_only=True)
     except pickle.UnpicklingError as error:
         if "Unsupported global" in str(error) or "Unsupported class" in str(error):
             name = re.search(r"GLOBAL (\S+)", str(error))
@@ -172,7 +198,7 @@ def _not_a_checkpoint(path: str | Path) -> str:
 
 
 def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averaged: bool = True) -> Checkpoint:
-    """A generator from a checkpoint file or run folder, of ours or of the published R2Flow format.
+    """A generator from a checkpoint file or run folder, of ours or of the published R2Flow format, or a model's name.
 
     Args:
         averaged: Take the averaged weights, which a model is judged by; False takes the raw ones of a run
@@ -200,7 +226,11 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
             f"{path} is a torch file but not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
             f"(ours) nor 'cfg' and 'weights' (published); found {', '.join(map(repr, list(content)[:6]))}."
         )
-    with made_with(config, str(path)), _Allowance(weights, path):
+    held = sum(value.numel() for value in weights.values())
+    refused = (
+        f"the weights in {path} do not fit its config: they are {held:,} numbers, and the config asks for far more."
+    )
+    with made_with(config, str(path)), Allowance(2 * held + SPARE, refused):
         generator = build_generator(config)
     check_weights(generator, weights, path)
     generator.load_state_dict(weights)
@@ -212,20 +242,21 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     return Checkpoint(generator.eval().requires_grad_(False).to(device), config, step, path, kind, accuracy)
 
 
-class _Allowance(TorchFunctionMode):
-    """Refuses tensors that the weights in a file cannot fill, before memory is taken for them.
+SPARE = 2**28  # elements of buffers that a checkpoint does not hold, and of what is computed on the way
+
+
+class Allowance(TorchFunctionMode):
+    """Refuses to make tensors of more than so many `elements` in all, with the line `refused`, before it takes memory.
 
     The meta device would do the same, but its first use imports torch's compiler and sympy, which takes as long as
     `import torch`.
     """
 
     FACTORIES = frozenset({torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.linspace})
-    SPARE = 2**28  # elements of buffers that a checkpoint does not hold, and of what is computed on the way
 
-    def __init__(self, weights: Mapping[str, Tensor], path: Path) -> None:
+    def __init__(self, elements: int, refused: str) -> None:
         super().__init__()
-        self.path, self.held = path, sum(value.numel() for value in weights.values())
-        self.left = 2 * self.held + self.SPARE
+        self.left, self.refused = elements, refused
 
     def __torch_function__(
         self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
@@ -234,10 +265,7 @@ class _Allowance(TorchFunctionMode):
             sizes = [part for arg in args for part in (arg if isinstance(arg, (tuple, list)) else (arg,))]
             self.left -= math.prod(max(size, 1) for size in sizes if isinstance(size, int))
             if self.left < 0:
-                raise InputError(
-                    f"the weights in {self.path} do not fit its config: they are {self.held:,} numbers, and the "
-                    "config asks for far more."
-                )
+                raise InputError(self.refused)
         return func(*args, **(kwargs or {}))
 
 
@@ -263,30 +291,38 @@ def read_safetensors(path: Path) -> dict[str, Any]:
 
     try:
         with safe_open(path, framework="pt") as file:
-            notes = file.metadata() or {}
+            kept = file.metadata() or {}
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        config, step = json.loads(notes["config"]), int(notes["step"])
-        sampler = json.loads(notes["sampler"]) if "sampler" in notes else None
-        accuracy = json.loads(notes.get("accuracy", "[]"))
-    except (SafetensorError, OSError, ValueError) as error:
-        raise InputError(f"{path} is not a safetensors file, or a damaged one: {error}.") from None
+        if NOTES in kept:
+            notes, prefix = json.loads(kept[NOTES]), PREFIX
+            whole = notes.pop("digest", None) == _digest(notes, weights)
+        else:  # 0.1.0 held the backbone alone, and said so under several keys
+            notes, prefix = {key: json.loads(kept[key]) for key in ("config", "step")}, PREFIX + BACKBONE
+            whole = True
+        config, step, sampler = notes["config"], int(notes["step"]), notes.get("sampler")
+        accuracy = notes.get("accuracy")
     except KeyError as error:
         raise InputError(f"{path} holds weights but no r2flow config (no {error} in its metadata).") from None
-    if "digest" in notes and notes["digest"] != _digest(notes, weights):
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
+        raise InputError(f"{path} is not a safetensors file, or a damaged one: {error}.") from None
+    if not whole:
         raise InputError(_damaged(path, "its weights and config"))
-    prefix = PREFIX if sampler is not None else PREFIX + BACKBONE  # 0.1.0 held the backbone alone
     state = {prefix + name: value for name, value in weights.items()}
     return {"config": config, "global_step": step, "state_dict": state, "sampler": sampler, "accuracy": accuracy}
 
 
-def _digest(notes: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
-    said = [notes.get(key) for key in ("config", "step", "sampler")]
-    said += [notes["accuracy"]] if "accuracy" in notes else []
-    return state_hash(weights, json.dumps(said).encode())
+def _digest(notes: Mapping[str, Any], weights: Mapping[str, Tensor]) -> str:
+    return state_hash(weights, json.dumps(notes, sort_keys=True).encode())
 
 
-def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
+def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False) -> None:
     """Write a generator with its config: `.safetensors` in our format, `.pth` in the published one, weights bit-equal.
+
+    A `.safetensors` is the same, byte for byte, whenever and wherever it is written, and names no folder of this
+    machine: of its config it holds what was learned (`r2flow.config.learned`).
+
+    Args:
+        half: Round large matrices to float16, which halves a `.safetensors`.
 
     Raises:
         InputError: another ending, or a generator or a config that the published format cannot say.
@@ -296,18 +332,23 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
         from safetensors.torch import save
 
         weights = _plain(checkpoint.generator)
+        if half:
+            large = large_matrices(checkpoint.generator)
+            weights = {name: value.half() if name in large else value for name, value in weights.items()}
         notes = {
-            "format": "r2flow",
-            "config": json.dumps(checkpoint.config),
-            "step": str(checkpoint.step),
-            "sampler": json.dumps(checkpoint.generator.sampler.asdict()),
+            "config": learned(checkpoint.config),
+            "step": checkpoint.step,
+            "sampler": checkpoint.generator.sampler.asdict(),
         }
         if checkpoint.accuracy:
-            notes["accuracy"] = json.dumps([budget.asdict() for budget in checkpoint.accuracy])
-        data = save(weights, metadata={**notes, "digest": _digest(notes, weights)})
+            notes["accuracy"] = [budget.asdict() for budget in checkpoint.accuracy]
+        # Several keys of metadata come in no fixed order.
+        data = save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})})
         with atomic_write(path) as file:
             file.write(data)
     elif path.suffix == ".pth":
+        if half:
+            raise InputError(f"{path}: half precision is for .safetensors; the published format is float32.")
         if type(checkpoint.generator) is not RectifiedFlow:
             what = type(checkpoint.generator).__name__
             raise InputError(f"{path}: the published format cannot hold a {what}; convert to .safetensors instead.")
@@ -332,13 +373,22 @@ def keep_sampler(checkpoint: Checkpoint) -> None:
         own = path.with_suffix(".safetensors")
         raise InputError(f"{path} has no place for a sampler; give a copy that has: r2flow convert {path} {own}.")
     if path.suffix == ".safetensors":
-        save_checkpoint(checkpoint, path)
+        from safetensors import safe_open
+
+        with safe_open(path, framework="pt") as file:
+            half = any(file.get_slice(name).get_dtype() == "F16" for name in file.keys())  # noqa: SIM118
+        save_checkpoint(checkpoint, path, half)
         return
     content = torch.load(path, map_location="cpu", weights_only=True)
     content["sampler"] = checkpoint.generator.sampler.asdict()
     content["accuracy"] = [budget.asdict() for budget in checkpoint.accuracy]
     with atomic_write(path) as file:
         torch.save(content, file)
+
+
+def large_matrices(module: nn.Module) -> set[str]:
+    """Names of the parameters that half precision rounds."""
+    return {name for name, value in module.named_parameters() if value.ndim > 1 and value.numel() > SMALL}
 
 
 def _plain(module: nn.Module) -> dict[str, Tensor]:

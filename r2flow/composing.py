@@ -17,7 +17,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import OverrideType, Sweep
-from hydra.errors import MissingConfigException
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 
 from r2flow.errors import InputError
@@ -57,6 +57,11 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
         return plain(config)
 
 
+def names_folder(text: str) -> bool:
+    """Whether a text names a folder below another one."""
+    return bool(text.strip("./")) and ".." not in Path(text).parts
+
+
 @dataclass(frozen=True)
 class Keys:
     """The keys at the top of a run's config."""
@@ -71,11 +76,12 @@ class Keys:
     samples: Mapping[str, Any]
     run_dir: Annotated[str, Bound("that names a folder", lambda text: text.strip("/ "))]
     seed: Annotated[int, Bound("of at least 0 and below 2^63", lambda n: 0 <= n < 2**63)]
-    name: Annotated[str, Bound("of at least one letter", bool)] | int | float = "run"
+    name: Annotated[str, Bound("that names a folder in runs", names_folder)] | int | float = "run"
     experiment: str | Sequence[str] | None = None
     generator: Mapping[str, Any] | str | None = None
     sampler: Mapping[str, Any] | None = None
     chain: Mapping[str, Any] | None = None
+    preview: str | None = None
     loggers: Sequence[str] | str | None = None  # a word is answered by `build_loggers`
     plugins: Sequence[str] = ()
     parent: Mapping[str, Any] | None = None
@@ -157,23 +163,36 @@ def choices(group: str) -> list[str]:
     return sorted(known | {name.removesuffix(".yaml") for name in stored})
 
 
+CHOICE = str | dict | Sweep  # what a group of configs can be given
+MAY_GO = ("callbacks", "chain", "experiment", "hydra", "plugins")  # from which ~KEY may take something
+
+
 def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
     """Overrides, of which `KEY={name: NAME, ...}` takes the whole place of what was there: it has options of its own.
 
     Raises:
-        InputError: a group of configs without a choice from it.
-        HydraException: what is not Hydra's grammar.
+        InputError: a group of configs without a choice from it, or what is not Hydra's grammar.
     """
     groups = {path.name for path in CONF.iterdir() if path.is_dir()} - {"hydra"}
     found: list[str] = []
-    for text, parsed in zip(overrides, OverridesParser.create().parse_overrides(list(overrides)), strict=True):
+    parser = OverridesParser.create()
+    for text in overrides:
+        try:
+            parsed = parser.parse_override(text)
+        except HydraException:
+            raise InputError(f"{text} cannot be read: give KEY=VALUE, brackets and quotes closed.") from None
         key, value = parsed.key_or_group, parsed.value()
         if not key:
             raise InputError(f"{text} names no key: give KEY=VALUE.")
-        if key in groups and (parsed.is_delete() or not isinstance(value, str | list | dict | Sweep) or value == ""):
-            if key == "experiment":  # as it is by itself
+        if key == "hydra":
+            raise InputError(f"{text}: hydra has keys of its own, as hydra.sweep.dir=FOLDER.")
+        names = value if isinstance(value, list) else [value]
+        if key in groups and (parsed.is_delete() or "" in names or not all(isinstance(one, CHOICE) for one in names)):
+            if key == "experiment" and (parsed.is_delete() or value is None):  # as it is by itself
                 continue
             raise InputError(f"{text} leaves the run without its {key}: give one of {', '.join(choices(key))}.")
+        if parsed.is_delete() and key.partition(".")[0] not in MAY_GO:
+            raise InputError(f"{text}: every run has its {key}; give {key}=VALUE.")
         named = isinstance(value, dict) and "name" in value and "." in key and not key.startswith("chain.")
         found += [f"{key}=null", f"++{text}"] if named and parsed.type == OverrideType.CHANGE else [text]
     return found

@@ -17,13 +17,14 @@ class Key:
 
     Attributes:
         resume: `free`: it may differ when a run goes on, for it says where and how is computed, not what.
-        inherited: A run with `stage.init` has its parent's value: `always`, or `unless_given` on the command line.
+        inherited: A run with `stage.init` has its parent's value: `always`, or `unless_given` on the command line;
+            `with_pairs`, which are images of the parent, always, and else unless given.
         links: Which links of a chain take it from the chain's command line: all, those that read `scans` (the others
             inherit from them), those that learn from `pairs`, or none, for it says what the `chain` is.
     """
 
     resume: Literal["fixed", "free"] = "fixed"
-    inherited: Literal["no", "always", "unless_given"] = "no"
+    inherited: Literal["no", "always", "unless_given", "with_pairs"] = "no"
     links: Literal["all", "scans", "pairs", "chain"] = "all"
 
 
@@ -38,12 +39,13 @@ RULES: dict[str, Key] = {
     "name": OF_THE_CHAIN,
     "run_dir": OF_THE_CHAIN,
     "chain": OF_THE_CHAIN,
+    "preview": OF_THE_CHAIN,
     "plugins": FREE,
     "loggers": FREE,
     "samples": FREE,
     "sampler": FREE,
     "parent.path": FREE,
-    "sensor": OF_THE_MODEL,
+    "sensor": replace(OF_THE_MODEL, inherited="with_pairs"),
     "encoding": OF_THE_MODEL,
     "generator": Key(inherited="unless_given", links="scans"),  # see `lineage.generator_of`
     "backbone": OF_THE_MODEL,
@@ -107,3 +109,17 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield from flatten(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
+
+
+def learned(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A config without its free keys: what was learned, and neither where nor how it was computed."""
+    found: dict[str, Any] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping) and value:
+            inner = learned(value, f"{prefix}{key}.")
+            if inner:
+                found[key] = inner
+        elif rule(f"{prefix}{key}").resume == "fixed":
+            groups = isinstance(value, Sequence) and value and all(isinstance(one, Mapping) for one in value)
+            found[key] = [learned(one, f"{prefix}{key}.{n}.") for n, one in enumerate(value)] if groups else value
+    return found

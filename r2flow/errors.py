@@ -1,6 +1,8 @@
 """The exception for mistakes of the user."""
 
 import errno
+import io
+import sys
 
 
 class InputError(ValueError):
@@ -28,6 +30,24 @@ def explain_mistake(error: InputError | OSError) -> str:
         if error.errno not in MENDABLE:
             raise error
         where = f"{error.filename}: " if error.filename else ""
-        return f"{where}{error.strerror or error}"
-    # A loader's worker process wraps the line into its traceback; the line is the last of it.
-    return str(error).strip().splitlines()[-1].split("InputError: ")[-1] if str(error).strip() else "unknown"
+        return one_line(f"{where}{error.strerror or error}")
+    text = str(error)
+    if "Traceback (most recent call last)" in text:  # of a loader's worker: the line is the last of it
+        text = text.rpartition("InputError: ")[2]
+    return one_line(text) or "unknown"
+
+
+def one_line(text: str) -> str:
+    """A text of which a file's name may be part, with whatever that holds, as one line that every terminal takes."""
+    return "\\n".join(printable(text).strip().splitlines())
+
+
+def printable(text: str) -> str:
+    """A text of which a file's name may be part: bytes of it that are no UTF-8 as \\udcff."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
+def print_any_name() -> None:
+    """Have standard output take such names, as standard error does."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")

@@ -12,6 +12,11 @@ from typing import IO, Any
 
 from r2flow.errors import InputError
 
+try:
+    import fcntl
+except ImportError:  # not of every system
+    fcntl = None  # type: ignore[assignment]
+
 
 @contextmanager
 def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
@@ -33,7 +38,9 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     temporary = None
     try:
         handle, temporary = tempfile.mkstemp(".part", f".{target.name}.", None if is_stream else target.parent)
-        with os.fdopen(handle, mode, encoding=None if "b" in mode else "utf-8") as file:
+        # A file's name may be part of a text, and need not be UTF-8.
+        text = {} if "b" in mode else {"encoding": "utf-8", "errors": "backslashreplace"}
+        with os.fdopen(handle, mode, **text) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -45,14 +52,55 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
             os.replace(temporary, target)
             _sync_folder(target.parent)
     except OSError as error:
+        if error.errno is None:  # numpy's, of fewer bytes written than there are
+            error = OSError(errno.ENOSPC, f"cannot be written whole, is there room? ({error})")
         named = str(error.filename or "")
         if not named or named.endswith(".part"):  # a full disk names no file, a read-only folder the temporary one
             error.filename = str(path)
-        raise
+        raise error
     finally:
         if temporary is not None:
             with suppress(FileNotFoundError):
                 os.unlink(temporary)
+
+
+def refuse_unreadable(path: Path, largest: int, what: str = "file") -> None:
+    """Refuse a path that is no regular file, or of 0 or more than `largest` bytes, before it is opened.
+
+    Raises:
+        InputError: in one line, with what was found.
+    """
+    if path.is_symlink() and not path.exists():
+        raise InputError(f"{path} is a link to {path.readlink()}, which does not exist.")
+    if not path.exists():
+        raise InputError(f"{path} does not exist. Is the path right?")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder, not a {what}; name a file in it.")
+    if not path.is_file():  # reading a pipe would wait for ever, a device never end
+        raise InputError(f"{path} is not a regular file.")
+    size = path.stat().st_size
+    if size == 0:
+        raise InputError(f"{path} is empty (0 bytes); fetch or write it again.")
+    if size > largest:
+        most = f"{largest / 2**30:g} GiB" if largest >= 2**30 else f"{largest / 2**20:g} MiB"
+        raise InputError(f"{path} has {size:,} bytes, too many for a {what} (at most {most}). Is it another file?")
+
+
+@contextmanager
+def sole_use(path: Path) -> Iterator[bool]:
+    """Use what a file stands for, together with others; whether nobody else did when the block began.
+
+    Nobody can tell where the system has no shared locks: then others are taken to be there.
+    """
+    with path.open("rb") as file:
+        alone = False
+        if fcntl is not None:
+            with suppress(OSError):
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                alone = True
+            with suppress(OSError):
+                fcntl.flock(file, fcntl.LOCK_SH)
+        yield alone
 
 
 def _is_stream(path: Path) -> bool:

@@ -36,7 +36,7 @@ from r2flow.composing import (
     override,
     plain,
 )
-from r2flow.errors import InputError, explain_mistake
+from r2flow.errors import InputError, explain_mistake, one_line, print_any_name
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.signals import LATER, Stopped, listening, stop_at_once
 
@@ -61,6 +61,7 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints mistakes itself, over many lines, and exits with 1
     failed: list[str] = []
+    print_any_name()
     try:
         # SLURM signals every process of a job: a run answers, a chain waits for it.
         ignored = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
@@ -88,7 +89,7 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
         print(f"error: {len(failed) or 'some'} of the sweep's jobs failed: {'; '.join(names)}", file=sys.stderr)
         return 2
     except (HydraException, OmegaConfBaseException) as error:
-        print(f"error: {explain(error)}{_forgotten_plugins(arguments)}", file=sys.stderr)
+        print(f"error: {one_line(explain(error))}{_forgotten_plugins(arguments)}", file=sys.stderr)
         return 2
     except (InputError, OSError) as error:
         print(f"error: {explain_mistake(error)}", file=sys.stderr)
@@ -165,7 +166,7 @@ def job_folder(arguments: Sequence[str], overrides: str) -> str:
     swept = {key.lstrip("+~") for key, _, value in given if "," in value}
     parts = [part for part in overrides.split(",") if part.partition("=")[0].lstrip("+~") in swept]
     readable = re.sub(r"[^\w.=+-]+", "_", ",".join(parts) or "job")[:80]
-    return f"{readable}-{hashlib.sha256(overrides.encode()).hexdigest()[:6]}"
+    return f"{readable}-{hashlib.sha256(os.fsencode(overrides)).hexdigest()[:6]}"
 
 
 def _job(arguments: Sequence[str], command: Sequence[str], failed: list[str], config: DictConfig) -> None:
@@ -183,7 +184,7 @@ def _job(arguments: Sequence[str], command: Sequence[str], failed: list[str], co
         check_keys(settings)
         code = _chain(settings, given, command) if settings["chain"] else _fit(settings, given)
     except (InputError, OSError, OmegaConfBaseException) as error:  # Hydra would print its own lines around it
-        said = explain(error) if isinstance(error, OmegaConfBaseException) else explain_mistake(error)
+        said = one_line(explain(error)) if isinstance(error, OmegaConfBaseException) else explain_mistake(error)
         print(f"error: {said}", file=sys.stderr)
         raise SystemExit(2) from None
     if code:
@@ -231,6 +232,8 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
     links = links_of(settings["chain"], folder, given)
     if not all(map(is_finished, links)):
         _check_links(links)
+    if settings["preview"]:
+        _preview(settings["preview"], folder / "preview")
     code, ran = run_chain(links, _restart(command))
     if code:
         return code
@@ -246,6 +249,17 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
     report({link.name: link.run_dir for link in links}, out, device=device, command=" ".join(["python", *sys.argv]))
     record_report(links, out)
     return 0
+
+
+def _preview(model: str, out: Path) -> None:
+    """Draw scans of a trained model, to look at while a chain trains."""
+    from r2flow.checkpoints import load_checkpoint
+    from r2flow.models import find_model
+    from r2flow.reports.outputs import write_samples
+
+    if not (out / "samples.png").is_file():
+        write_samples(load_checkpoint(find_model(model)), out, num=4, seed=0)
+    print(f"preview: scans of the model {model} in {out / 'samples.png'}, point clouds beside it", flush=True)
 
 
 def _check_links(links: Sequence[Any]) -> None:

@@ -11,6 +11,7 @@ from r2flow.data.options import PairOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.sources import AUTO
 from r2flow.errors import InputError
+from r2flow.models import name_of
 from r2flow.registry import check_options
 from r2flow.stages import STAGES
 
@@ -54,7 +55,8 @@ def find_parent(config: Mapping[str, Any]) -> tuple[Parent, Checkpoint] | None:
 def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
     """The config of a run, completed by what its parent says.
 
-    Sensor, encoding and backbone are the parent's; pairs are those of its averaged weights, in its folder.
+    Encoding and backbone are the parent's, and so is the sensor unless another is asked for; pairs are those of its
+    averaged weights, in its folder, and of its sensor.
 
     Args:
         asked: What the command line gave, as `backbone=hdit` or `backbone.depths=[1]`.
@@ -71,12 +73,14 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     keys = [key_of(one) for one in asked]
     for key in keys:
         _check_agrees(key, config, parent)
-    for group in groups_of(inherited="always"):
+    for group in (*groups_of(inherited="always"), *groups_of(inherited="with_pairs")):
         there = parent.config.get(group)
         if not isinstance(there, Mapping):
             config[group] = there
             continue
-        given = [key for key in keys if rule(key).inherited == "unless_given" and key.startswith(f"{group}.")]
+        if group in keys and inherited(group, config) == "unless_given":
+            continue
+        given = [key for key in keys if inherited(key, config) == "unless_given" and key.startswith(f"{group}.")]
         own = {key.partition(".")[2]: dict(flatten({group: config[group]}))[key] for key in given}
         config[group] = {**there, **own}
     config["generator"] = generator_of(config, parent)
@@ -87,6 +91,14 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         data["root"] = data["root"] or str(default_folder(parent.path))
         data["pairs"] = pairs_of(parent, data["pairs"] or {}, parent.weights)
     return config
+
+
+def inherited(key: str, config: Mapping[str, Any]) -> str:
+    """Whether a run of this config has its parent's value of a key: no, always or unless_given."""
+    found = rule(key).inherited
+    if found != "with_pairs":
+        return found
+    return "always" if STAGES[config["stage"]["name"]].needs_pairs else "unless_given"
 
 
 def generator_of(config: Mapping[str, Any], parent: Parent | None) -> dict[str, Any]:
@@ -116,7 +128,7 @@ def check_finished(init: Path, parent: Checkpoint) -> None:
         InputError: the run in a folder has not come to its end.
     """
     wanted = parent.config.get("trainer", {}).get("max_steps", 0)
-    if init.expanduser().is_dir() and parent.step < wanted:
+    if init.expanduser().is_dir() and name_of(parent.path) is None and parent.step < wanted:
         raise InputError(
             f"{init} has stopped at step {parent.step} of {wanted}: finish it, or name the checkpoint to start from, "
             f"{parent.path}."
@@ -126,7 +138,7 @@ def check_finished(init: Path, parent: Checkpoint) -> None:
 def _check_agrees(key: str, config: Mapping[str, Any], parent: Parent) -> None:
     group = key.split(".")[0]
     theirs, ours = parent.config.get(group), config.get(group)
-    if rule(key).inherited != "always" or ours is None:
+    if inherited(key, config) != "always" or ours is None:
         return
     there = dict(flatten({group: theirs}))
     for leaf, value in flatten({group: ours}):
@@ -134,7 +146,7 @@ def _check_agrees(key: str, config: Mapping[str, Any], parent: Parent) -> None:
         if leaf == "encoding.reflectance" and value == AUTO:
             continue
         unknown = leaf not in there and leaf == key
-        if asked and rule(leaf).inherited == "always" and (unknown or there.get(leaf, value) != value):
+        if asked and inherited(leaf, config) == "always" and (unknown or there.get(leaf, value) != value):
             raise InputError(
                 f"{leaf} is {value} here, but {there.get(leaf, 'not known')} in {parent.path}, whose weights this run "
                 f"starts from. Leave {key} out: the {group} is the parent's."

@@ -23,7 +23,7 @@ from r2flow.signals import Stopped
 
 GROUP = "r2flow.plugins"
 
-_loaded: set[str] = set()  # as sys.modules, in which a path has no name; by `_whole`
+_loaded: set[str] = set()  # names and files, as sys.modules, in which a path has no name
 
 
 def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -57,13 +57,13 @@ def load_plugins(names: Sequence[str]) -> None:
         if _known(name) in _loaded:
             continue
         try:
-            _import(name)
+            file = _import(name)
         except (KeyboardInterrupt, Stopped):
             raise
         except BaseException as error:  # whatever somebody's module raises, SystemExit too
             said = " ".join(str(error).split()) or "no more is known"
             raise InputError(f"the plug-in {name} cannot be imported: {type(error).__name__}: {said}") from None
-        _loaded.add(_known(name))
+        _loaded.update({_known(name), file})
 
 
 def _known(name: str) -> str:
@@ -71,14 +71,19 @@ def _known(name: str) -> str:
     return str(Path(name).expanduser().resolve()) if name.endswith(".py") else name
 
 
-def _import(name: str) -> None:
+def _import(name: str) -> str:
+    """Import a module, unless its file has been; its file."""
     if not name.endswith(".py"):
         here = str(Path.cwd())
         if here not in sys.path and "" not in sys.path:
             sys.path.append(here)  # as `python -m` does, but last
-        if importlib.import_module(name).__file__ is None:
+        spec = importlib.util.find_spec(name)
+        if spec is not None and spec.origin is not None and _known(spec.origin) in _loaded:
+            return _known(spec.origin)
+        file = importlib.import_module(name).__file__
+        if file is None:
             raise ImportError("it is a folder without an __init__.py; to name a file, end it in .py")
-        return
+        return _known(file)
     path = Path(name).expanduser().resolve()
     if not path.is_file():
         raise FileNotFoundError(f"{path} is no file")
@@ -92,6 +97,7 @@ def _import(name: str) -> None:
     except BaseException:
         del sys.modules[known]
         raise
+    return str(path)
 
 
 def load_installed() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 from filelock import FileLock, Timeout
+from torch import Tensor
 
 from r2flow.checkpoints import FOLDER, checkpoints_of, read_checkpoint
 from r2flow.config import flatten, rule
@@ -63,12 +64,8 @@ def read_config(run: str | Path) -> dict[str, Any] | None:
         InputError: the file is damaged.
     """
     path = Path(run, CONFIG)
-    config: dict[str, Any] | None
-    if path.is_file():
-        config = _read_yaml(path)
-    else:
-        newest = _newest_whole(run)
-        config = read_checkpoint(newest).get("config") if newest is not None else None
+    kept = (content.get("config") for _, content in _whole(run))
+    config = _read_yaml(path) if path.is_file() else next((one for one in kept if isinstance(one, dict)), None)
     if not config:
         return None
     return {**config, "data": upgraded(config["data"])} if "data" in config else config
@@ -99,11 +96,14 @@ def write_config(run: str | Path, config: Mapping[str, Any]) -> None:
         yaml.safe_dump(dict(config), file, sort_keys=False)
 
 
-def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
-    """Enter a run folder: the newest whole checkpoint to go on from, or None where a run begins.
+def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor] | None = None) -> Path | None:
+    """Enter a run folder: the newest checkpoint to go on from, or None where a run begins.
+
+    Args:
+        state: The state_dict of what is trained; a checkpoint with other names or shapes is passed over.
 
     Raises:
-        InputError: the folder holds a run of another config.
+        InputError: the folder holds a run of another config, or checkpoints of which none fits its config.
     """
     for leftover in Path(run, FOLDER).glob(".*.part"):  # of a writer that was killed
         leftover.unlink(missing_ok=True)
@@ -112,12 +112,13 @@ def open_run(run: str | Path, config: Mapping[str, Any]) -> Path | None:
         write_config(run, config)
         return None
     differing = contradictions(old, config)
-    newest = _newest_whole(run)
+    found = _resumable(run)
+    newest = next(found, None)
     if not differing:
         # Free keys moved: the folder says what runs now.
         if newest is not None and (old != dict(config) or not Path(run, CONFIG).is_file()):
             write_config(run, config)
-        return newest
+        return newest and _fitting(run, [newest, *found] if state else [newest], state)
     if newest is None:  # nothing has been learned there yet
         write_config(run, config)
         return None
@@ -153,11 +154,39 @@ def _another_config(run: str | Path, differing: list[str]) -> str:
     )
 
 
-def _newest_whole(run: str | Path) -> Path | None:
+RESUMED = ("config", "state_dict", "optimizer_states", "lr_schedulers", "loops", "global_step")
+
+
+def _whole(run: str | Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """The checkpoints that are what was written, the newest first."""
     for path in checkpoints_of(run):
         try:
-            read_checkpoint(path)
-            return path
+            content = read_checkpoint(path)
         except InputError as error:
             log.warning("%s Passing it over.", error)
-    return None
+        else:
+            yield path, content
+
+
+def _resumable(run: str | Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Those of them from which a run can go on: weights alone, as of a model that was saved for sampling, are none."""
+    for path, content in _whole(run):
+        lacking = [key for key in RESUMED if key not in content]
+        if lacking:
+            log.warning("%s cannot be gone on from: it has no %s. Passing it over.", path, lacking[0])
+        else:
+            yield path, content
+
+
+def _fitting(run: str | Path, found: Iterable[tuple[Path, dict[str, Any]]], state: Mapping[str, Tensor] | None) -> Path:
+    """The first checkpoint whose weights have the names and shapes of `state`."""
+    for path, content in found:
+        held = content["state_dict"]
+        if state is None or {name: _shape(v) for name, v in held.items()} == {n: v.shape for n, v in state.items()}:
+            return path
+        log.warning("%s has not the weights of this run's config. Passing it over.", path)
+    raise InputError(f"no checkpoint in {run} has the weights of its config; give name=OTHER for a new run.")
+
+
+def _shape(value: Any) -> Any:
+    return value.shape if isinstance(value, Tensor) else None

@@ -1,5 +1,6 @@
 """Being told to stop: what a signal means to a run, and to a process that waits for one."""
 
+import multiprocessing
 import os
 import signal
 import threading
@@ -55,14 +56,38 @@ def listening(handler: Handler, signals: Sequence[int] = STOPPING) -> Iterator[N
 
 def stop_at_once(number: int, frame: FrameType | None = None) -> None:
     """A handler: nothing is under way that would have to be saved."""
+    if multiprocessing.parent_process() is not None:  # a worker, forked with the handler: who started it speaks
+        os._exit(code_of(number))
     raise Stopped(code_of(number))
+
+
+def end_at_once(number: int, frame: FrameType | None = None) -> None:
+    """A handler for a program that is still being imported: there is nothing yet that would have to be cleared away."""
+    os.write(2, b"stopped\n")
+    os._exit(code_of(number))
+
+
+def end_with_parent(worker: int = 0) -> None:
+    """In a worker: end when the process that started it has ended, in whatever way.
+
+    A worker that waits for the reader of its results, which is gone, would wait for ever.
+    """
+
+    def wait() -> None:
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def outlive_the_signal(worker: int = 0) -> None:
     """In a loader's worker: a signal is for the run, which may need the worker for the step that it is in.
 
-    A worker that its run has forgotten goes by itself.
+    A worker that its run has forgotten goes by itself, and with its run.
     """
+    end_with_parent()
 
     def hear(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)

@@ -7,6 +7,7 @@ result.metrics["val/loss"], result.checkpoint
 """
 
 import logging
+import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -20,14 +21,16 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from r2flow.callbacks import build_callbacks, build_loggers
 from r2flow.callbacks.stopping import Stopping
-from r2flow.checkpoints import checkpoints_of, step_of
+from r2flow.checkpoints import Allowance, checkpoints_of, step_of
 from r2flow.composing import check_keys, compose
+from r2flow.data.contents import check_contents, record_contents
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import SOURCES, Layout, Prepared, resolve_reflectance
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, SourceOptions
 from r2flow.data.sources import AUTO
 from r2flow.errors import InputError
-from r2flow.generators import Generator, build_generator
+from r2flow.flow.solvers import check_method
+from r2flow.generators import GENERATORS, Flow, Generator, build_generator
 from r2flow.lineage import Parent, find_parent, inherit
 from r2flow.noise import seed_torch
 from r2flow.plugins import made_with
@@ -68,7 +71,10 @@ class TrainerRanges:
     """Values of Lightning's Trainer with which a run can come to its end, where Lightning itself takes others."""
 
     max_steps: Count
+    min_steps: Natural | None
     max_epochs: Annotated[int, Bound("other than 0", lambda n: n != 0)] | None
+    max_time: str | Mapping[str, Any] | None
+    num_sanity_val_steps: Annotated[int, Bound("of at least -1", lambda n: n >= -1)] | None
     limit_train_batches: Annotated[None, Bound("(trainer.max_steps is the length of a run)", lambda n: True)]
     val_check_interval: Positive | str | Mapping[str, Any] | None
     check_val_every_n_epoch: Count | None
@@ -139,10 +145,11 @@ def _build(config: Mapping[str, Any], asked: Sequence[str]) -> Run:
     config = _checked(config, asked, parent)
     config["encoding"]["reflectance"] = resolve_reflectance(config["encoding"].get("reflectance", AUTO), config["data"])
     seed_torch(config["seed"], "weights")
-    generator = build_generator(config)
+    with _memory():
+        generator = build_generator(config)
     if checkpoint is not None:
         generator.start_from(checkpoint.generator)
-    return _assembled(config, generator)
+    return _assembled(config, generator, parent)
 
 
 def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None) -> dict[str, Any]:
@@ -164,13 +171,21 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
     config = _checked(config, asked, parent)
     if config["encoding"].get("reflectance", AUTO) == AUTO:
         config["encoding"]["reflectance"] = True  # the scans will tell
-    with torch.device("meta"):
+    with torch.device("meta"), _memory():
         generator = build_generator(config)
-    run = _assembled(config, generator)
-    if run.data.pairs is not None:
-        run.data.pairs.recipe(run.data.encoding.shape, run.data.noise_shape)
+    run = _assembled(config, generator, parent)
     check_run(run.folder, config)
     return config
+
+
+def _memory() -> Allowance:
+    """Refuses weights of more than a quarter of this machine's memory: training takes five times their size."""
+    try:
+        size = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError):  # not every system says it
+        size = 1 << 50
+    refused = f"the backbone's weights are more than a quarter of this machine's {size >> 30} GiB; make it smaller."
+    return Allowance(size // 16, refused)
 
 
 def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
@@ -194,16 +209,22 @@ def _refuse_unread(data: Mapping[str, Any]) -> None:
     if not simulated and (data["name"] in (PAIRS, MIXED) or not isinstance(SOURCES[data["name"]], Layout | Prepared)):
         return
     usual = SourceOptions()
-    unread = {f.name for f in fields(usual)} - {"name", "scenes"} if simulated else {"scenes"}
+    unread = {f.name for f in fields(usual)} - {"name", "root", "scenes"} if simulated else {"scenes"}
     wrong = sorted(f"data.{key}" for key in unread if data.get(key, getattr(usual, key)) != getattr(usual, key))
     if wrong:
         what = "simulated scans are no files" if simulated else "scans in files are no simulated scenes"
         raise InputError(f"{what}: leave {', '.join(wrong)} out.")
 
 
-def _assembled(config: dict[str, Any], generator: Generator) -> Run:
+def _assembled(config: dict[str, Any], generator: Generator, parent: Parent | None) -> Run:
     space = generator.space
     data = ScanDataModule(space.sensor, space.encoding, config["seed"], generator.noise_shape, **config["data"])
+    if data.pairs is not None:
+        data.pairs.recipe(data.encoding.shape, data.noise_shape)  # refuses what is out of its range
+        usual = {"name": "rectified_flow"}
+        family = GENERATORS[(parent.config.get("generator") or usual)["name"]] if parent else None
+        if isinstance(family, type) and issubclass(family, Flow):  # others say themselves how they can be run
+            check_method(data.pairs.method)
     check_roll(data.augment, generator)
     stage = build_stage(config, generator)
     trainer = _build_trainer(config, stage)
@@ -280,9 +301,11 @@ def fit(run: Run) -> Result:
 
 def _fit_in_folder(run: Run) -> int:
     """The step that the run has reached."""
-    last = open_run(run.folder, run.config)
+    last = open_run(run.folder, run.config, run.stage.state_dict())
     if last is not None and step_of(last) >= run.trainer.max_steps:
         return step_of(last)  # nothing is left to do, nor pairs to make
+    if run.trainer.is_global_zero and run.data.files:
+        (record_contents if last is None else check_contents)(run.folder, run.data.files)
     if last is not None:
         log.info("going on from %s", last)
     run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)

@@ -113,7 +113,9 @@ def test_convert_writes_the_averaged_weights_in_both_formats(r2flow, saved, tmp_
     path, averaged = saved
     ours, published, again = tmp_path / "a.safetensors", tmp_path / "b.pth", tmp_path / "c.safetensors"
     for source, out in ((path.parent.parent, ours), (ours, published), (published, again)):
-        assert r2flow("convert", source, out) == (0, f"{out}\n", "")
+        code, said, _ = r2flow("convert", source, out)
+        assert code == 0
+        assert said.startswith(f"{out}: ")
         for name, value in load_checkpoint(out).generator.state_dict().items():
             assert torch.equal(value, averaged[f"generator.{name}"])
     code, _, err = r2flow("convert", path, tmp_path / "d.onnx")
@@ -125,7 +127,9 @@ def verbs() -> list[str]:
     """Every verb of the command, and of `report`."""
     import typer.main
 
-    top = typer.main.get_command(cli.app).commands
+    from r2flow.cli.verbs import app
+
+    top = typer.main.get_command(app).commands
     names = [name for name in top if name != "report"]
     return sorted([*names, *(f"report {name}" for name in top["report"].commands)])
 
@@ -199,7 +203,7 @@ class TestBadInput:
 
 
 def test_importing_r2flow_loads_neither_lightning_nor_matplotlib():
-    code = "import r2flow, r2flow.cli, r2flow.lidar.projection, r2flow.flow.solvers, r2flow.backbones, sys; "
+    code = "import r2flow, r2flow.cli.verbs, r2flow.lidar.projection, r2flow.flow.solvers, r2flow.backbones, sys; "
     code += "print([m for m in ('lightning', 'matplotlib', 'tensorboard', 'torchdiffeq') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -16,8 +16,9 @@ from r2flow.data.opening import open_prepared
 from r2flow.data.prepared import read_manifest
 from r2flow.data.sources import read_scan
 from r2flow.lidar.sensors import SENSORS
-from tests.data.conftest import kitti_360, write_scan  # noqa: F401  a fixture
+from tests.data.conftest import kitti_360, numbered, write_scan  # noqa: F401  fixtures
 from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.training.conftest import TINY, in_process
 
 SMALL = SENSORS["hdl64e"].resized(4, 16)
 
@@ -94,7 +95,7 @@ def test_simulated_scans_are_prepared_by_number_and_seed(r2flow, tmp_path):  # n
         (["folder", "ROOT", "--out", "OUT", "--num", "3"], "--num is for simulated scans"),
         (["folders", "ROOT", "--out", "OUT"], "no data set named 'folders'"),
         (["folder", "ROOT", "--out", "OUT", "--reflectance-levels", "300"], "must lie in [1, 256]"),
-        (["folder", "ROOT", "--out", "OUT", "--on-bad-scan", "ignore"], "must be 'error' or 'skip', found 'ignore'"),
+        (["folder", "ROOT", "--out", "OUT", "--on-bad-scan", "ignore"], "must be one of error, skip; found 'ignore'"),
         (["folder", "ROOT", "--out", "FILE/below"], "Not a directory"),
         (["--check", "ROOT"], "holds no prepared scans (no manifest.json); make them: r2flow prepare."),
     ],
@@ -136,3 +137,49 @@ def test_the_command_killed_and_started_twice_ends_with_the_same_bytes(tmp_path:
     processes = [start("killed"), start("killed")]
     assert [process.wait() for process in processes] == [0, 0]
     assert files(folder) == one
+
+
+def test_columns_are_named_where_files_do_not(r2flow, numbered, tmp_path):  # noqa: F811
+    """Rows of time, z, y, x, reflectance and ring: every verb and run that reads them is told by one option."""
+    wide = tmp_path / "wide"
+    wide.mkdir()
+    for path in sorted(numbered.iterdir()):
+        x, y, z, reflectance = np.fromfile(path, np.float32).reshape(-1, 4).T
+        np.column_stack([x * 0 + 7, z, y, x, reflectance, x * 0]).astype(np.float32).tofile(wide / path.name)
+    columns, small = ("--columns", "time,z,y,x,intensity,_"), ("--size", "4x16", "--workers", 1)
+    for out, given in (("one", ("folder", numbered)), ("two", ("folder", wide, *columns))):
+        code, _, error = r2flow("prepare", *given, *small, "--out", tmp_path / out)
+        assert (code, error) == (0, "")
+    for one, two in zip(open_prepared(tmp_path / "one", SMALL), open_prepared(tmp_path / "two", SMALL), strict=False):
+        assert np.array_equal(one, two)
+    assert read_manifest(tmp_path / "one").recipe.columns is None
+    code, _, error = r2flow(
+        "prepare", "folder", wide, "--columns", "z,_,y,x,intensity,_", *small, "--out", tmp_path / "two"
+    )
+    assert code == 2
+    assert "holds other scans: columns are others" in error
+    scan, image = wide / "000000.bin", tmp_path / "image.npy"
+    assert r2flow("project", scan, *columns, "--size", "4x16", "-o", image)[0] == 0
+    np.testing.assert_array_equal(np.load(image), read_scan(numbered / "000000.bin", SMALL))
+    for verb in (
+        ("show", scan, "--out", tmp_path / "v"),
+        ("evaluate", wide, scan, "--size", "4x16", "--metrics", "jsd"),
+    ):
+        assert r2flow(*verb, *columns)[0] == 0
+    for wrong in ("x,y", "x,y,z,x", "x,y,z,intensity,i", ""):
+        code, _, error = r2flow("show", scan, "--columns", wrong, "--out", tmp_path / "v")
+        assert (code, error.count("\n")) == (2, 1)
+        assert "columns must name x, y and z" in error
+
+
+def test_a_run_is_told_the_columns_too(numbered, tmp_path):  # noqa: F811
+    wide = tmp_path / "wide"
+    wide.mkdir()
+    for path in sorted(numbered.iterdir()):
+        x, y, z, reflectance = np.fromfile(path, np.float32).reshape(-1, 4).T
+        np.save(wide / f"{path.stem}.npy", np.column_stack([z, y, x, reflectance, x * 0]))
+    given = [*TINY, f"data.root={wide}", "trainer.max_steps=1", "trainer.fast_dev_run=true"]
+    in_process(tmp_path, [*given, "data.columns=[z,y,x,intensity,_]"])
+    done = in_process(tmp_path, given, check=False)
+    assert done.returncode == 2
+    assert "5 columns without names" in done.stderr.splitlines()[-1]

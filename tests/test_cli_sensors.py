@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import yaml
 
+from r2flow.data.prepared import read_manifest
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.sensor_files import read_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor
 from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.training.conftest import TINY, in_process
 
 MINE = Sensor("mine", (12.0, 5.0, 1.0, 0.0, -1.5, -4.0, -9.0, -20.0), columns=128)
 
@@ -78,7 +81,7 @@ def test_errors_are_one_line(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
     for arguments, words in (
         ([tmp_path / "one.bin"], "1 returns in all are too few"),
         ([tmp_path / "text.bin"], "is text"),
-        ([tmp_path / "notes.txt"], "no ending of a scan file"),
+        ([tmp_path / "notes.txt"], "no field x, y, z; it has: text"),
         ([tmp_path / "empty"], "holds no scan"),
         ([tmp_path / "missing"], "does not exist"),
         ([scans, "--out", tmp_path / "mine.txt"], "--out must be a .yaml"),
@@ -103,3 +106,98 @@ def test_built_in_sensors_are_given_by_name(r2flow, scans: Path, tmp_path: Path)
         code, _, _ = r2flow("project", scans / "000000.bin", "--sensor", name, "--reflectance-scale", 255, "-o", out)
         assert code == 0
         assert np.load(out).shape == (2, *SENSORS[name].shape)
+
+
+def test_the_wrong_sensor_is_said_in_one_line_with_the_right_one(r2flow, tmp_path: Path):  # noqa: F811
+    pandar = SENSORS["pandar64"]
+    draw, e = np.random.default_rng(0), pandar.rays().numpy()[0]
+    r = np.minimum(np.where(e < 0, 1.5 / np.sin(np.maximum(-e, 1e-9)), np.inf), 40 / np.cos(e))
+    image = np.stack([r, draw.random(r.shape)]).astype(np.float32) * (draw.random(r.shape) < 0.9)
+    for number in range(2):
+        write_points(tmp_path / "scans" / f"{number}.bin", *image_to_points(image, pandar.rays()))
+    one, out = tmp_path / "scans" / "0.bin", tmp_path / "out"
+    for verb in (
+        ("show", tmp_path / "scans"),
+        ("prepare", "folder", tmp_path / "scans", "--workers", 1),
+        ("project", one, "-o", tmp_path / "x.npy"),
+        ("evaluate", tmp_path / "scans", one, "--metrics", "jsd", "--workers", 0),
+    ):
+        given = verb if "-o" in verb else (*verb, "--out", out / verb[0])
+        code, _, error = r2flow(*given)
+        warnings = [line for line in error.splitlines() if line.startswith("WARNING")]
+        assert code == 0, error
+        assert len(warnings) == (2 if verb[0] == "evaluate" else 1), error  # one for each of its two sets
+        assert "do not look like those of sensor 'hdl64e', which sees +3.0 to -25.0 degrees" in warnings[0]
+        assert "64 beams from +14.9 to -24.9 degrees" in warnings[0]
+        assert "sensor=pandar64 in training, --sensor pandar64 in verbs" in warnings[0]
+    code, _, error = r2flow("show", tmp_path / "scans", "--sensor", "pandar64", "--out", out)
+    assert (code, error) == (0, "")
+
+
+def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
+    out = tmp_path / "mine.yaml"
+    r2flow("sensor", scans, "--out", out)
+    assert yaml.safe_load(out.read_text())["reflectance_scale"] == 255
+    raw = np.fromfile(scans / "000000.bin", np.float32).reshape(-1, 4)[:, 3]
+    assert raw.max() > 250
+    image = tmp_path / "image.npy"
+    assert r2flow("project", scans / "000000.bin", "--sensor", out, "-o", image)[0] == 0
+    expected = np.unique(raw / np.float32(255))
+    assert set(np.unique(np.load(image)[1])) <= {0, *expected}
+    assert np.load(image)[1].max() > 0.95
+    code, _, error = r2flow("prepare", "folder", scans, "--sensor", out, "--out", tmp_path / "prepared", "--workers", 1)
+    assert (code, error) == (0, "")
+    assert read_manifest(tmp_path / "prepared").recipe.reflectance_scale == 255
+    assert "reflectance_scale" not in read_manifest(tmp_path / "prepared").recipe.sensor
+    given = (scans, scans / "000000.bin", "--sensor", out, "--metrics", "jsd,sensor", "--workers", 0)
+    assert "reflectance" not in r2flow("evaluate", *given, "--json", tmp_path / "e.json")[2]
+    assert r2flow("show", scans / "000000.bin", "--sensor", out, "--out", tmp_path / "views")[:1] == (0,)
+    r2flow("project", scans / "000000.bin", "--sensor", out, "--reflectance-scale", 510, "-o", image)
+    assert np.load(image)[1].max() == pytest.approx(raw.max() / 510, abs=0.01)  # what is given comes first
+
+
+@pytest.mark.parametrize(("file", "name"), [
+    ("s_KITTI-360.yaml", "s_KITTI_360"), ("2nd car.yaml", "my_2nd_car"), ("vlp16.yaml", "my_vlp16"),
+    ("Größe.yaml", "Gr__e"), ("_.yml", "my__"),
+])  # fmt: skip
+def test_a_sensor_is_named_after_its_file(r2flow, scans: Path, tmp_path: Path, file: str, name: str):  # noqa: F811
+    code, _, error = r2flow("sensor", scans, "--out", tmp_path / file, "--most", 1)
+    assert (code, error) == (0, "")
+    assert read_sensor(tmp_path / file).name == name
+
+
+def test_a_sensor_s_file_is_replaced_only_when_asked(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
+    out = tmp_path / "mine.yaml"
+    out.write_text("mine by hand")
+    code, _, error = r2flow("sensor", scans, "--out", out)
+    assert (code, error) == (2, f"error: {out} is there already; give another --out, or --overwrite to replace it.\n")
+    assert out.read_text() == "mine by hand"
+    assert r2flow("sensor", scans, "--out", out, "--overwrite")[0] == 0
+    assert read_sensor(out).reflectance_scale == 255
+
+
+SCALES = {
+    "nuscenes_hdl32e": 255.0,
+    "vlp16": None,
+    "rellis_os1_64": 0.012,
+    "rellis_vlp32c": 255.0,
+}  # None: they have none
+
+
+@pytest.mark.parametrize(
+    "folder",
+    [*list(SCALES)[:2], *(pytest.param(folder, marks=pytest.mark.slow) for folder in list(SCALES)[2:])],
+)
+def test_the_three_commands_of_the_docs_run_as_they_are_written(r2flow, shared: Path, tmp_path: Path, folder):  # noqa: F811
+    data, prepared = shared / "real" / "other_sensors" / folder, tmp_path / "my" / "prepared"
+    mine = tmp_path / "conf" / "sensor" / "mine.yaml"
+    code, _, error = r2flow("sensor", data, "--out", mine)
+    assert (code, error) == (0, "")
+    assert read_sensor(mine).reflectance_scale == SCALES[folder]
+    code, _, error = r2flow("prepare", "folder", data, "--sensor", mine, "--out", prepared, "--workers", 1)
+    assert (code, error) == (0, "")
+    small = [part for part in TINY if not part.startswith(("data", "sensor."))]
+    for given in (["data=prepared", f"data.root={prepared}"], ["data=folder", f"data.root={data}"]):
+        own = ["--config-dir", str(tmp_path / "conf"), *given, "sensor=mine", "data.batch_size=1"]
+        done = in_process(tmp_path, [*own, *small, "trainer.max_steps=1", "trainer.fast_dev_run=true"])
+        assert "WARNING" not in done.stderr

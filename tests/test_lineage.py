@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+import torch
 
 from r2flow.checkpoints import load_checkpoint
 from r2flow.errors import InputError
@@ -55,3 +56,56 @@ def test_a_channel_that_the_parent_lacks_is_refused(parent: Path):
 def test_a_checkpoint_of_before_is_read_in_todays_keys(parent: Path):
     assert load_checkpoint(parent).config["data"]["augment"]["flip"] is True
     assert "flip" not in load_checkpoint(parent).config["data"]
+
+
+def sized(config: dict, rows: int, columns: int, **backbone) -> dict:
+    sensor = {"name": "hdl64e", "rows": rows, "columns": columns}
+    return {**config, "sensor": sensor, "backbone": {**config["backbone"], **backbone}}
+
+
+@pytest.mark.parametrize(
+    ("asked", "shape"),
+    [
+        ([], (8, 64)),  # another default sensor is not asked for
+        (["sensor=vlp16"], (16, 128)),
+        (["sensor.rows=16", "sensor.columns=128"], (16, 128)),
+        (["sensor.columns=128"], (8, 128)),
+    ],
+)
+def test_a_sensor_is_the_parents_unless_another_is_asked_for(parent: Path, asked: list[str], shape: tuple[int, int]):
+    config = completed(sized(child(parent, False), 16, 128), asked)
+    assert (config["sensor"]["rows"], config["sensor"]["columns"]) == shape
+
+
+def test_pairs_are_images_of_the_parents_sensor(parent: Path):
+    pairs = {"name": "pairs", "root": None, "pairs": {}}
+    config = {**sized(child(parent, False), 16, 128), "data": pairs, "stage": {"name": "reflow", "init": str(parent)}}
+    assert completed(config, [])["sensor"]["rows"] == 8
+    with pytest.raises(InputError, match="sensor.rows is 16 here, but 8 in"):
+        completed(config, ["sensor.rows=16"])
+
+
+@pytest.mark.parametrize("position", ["none", "polar", "spherical_harmonics"])
+def test_weights_move_to_another_size_where_none_belongs_to_a_place(position: str):
+    theirs, ours = (build_generator(sized(CONFIG, *size, position=position)) for size in ((8, 64), (16, 128)))
+    with torch.no_grad():
+        for value in theirs.parameters():
+            value.normal_()
+    rays = ours.backbone.coords.clone()
+    ours.start_from(theirs)
+    there = dict(theirs.named_parameters())
+    assert all(torch.equal(value, there[name]) for name, value in ours.named_parameters())
+    assert torch.equal(ours.backbone.coords, rays)
+    # A network made for the size, with these weights, does the same: nothing of the old rays is left.
+    same = build_generator(sized(CONFIG, 16, 128, position=position))
+    state = {**theirs.state_dict(), "backbone.coords": rays}
+    same.load_state_dict(state)
+    x, t = torch.randn(1, 1, 16, 128), torch.tensor(0.3)
+    with torch.no_grad():
+        assert torch.equal(ours.velocity(t, x), same.velocity(t, x))
+
+
+def test_weights_that_belong_to_a_place_do_not_move():
+    theirs, ours = (build_generator(sized(CONFIG, *size, position="learnable")) for size in ((8, 64), (16, 128)))
+    with pytest.raises(InputError, match=r"weights for images of 1x8x64 alone .*found 1x16x128: leave sensor out"):
+        ours.start_from(theirs)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.runs import contradictions, open_run, read_config, write_config
+from r2flow.runs import RESUMED, contradictions, open_run, read_config, write_config
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 
 CONFIG = {"seed": 0, "data": {"root": "a", "batch_size": 4}, "trainer": {"devices": 1, "max_steps": 10}}
@@ -23,7 +23,8 @@ def changed(**leaves) -> dict:
 
 def checkpoint(run: Path, step: int) -> Path:
     path = run / "checkpoints" / f"step-{step:08d}.ckpt"
-    AtomicCheckpointIO().save_checkpoint({"global_step": step, "weights": torch.zeros(100)}, path)
+    content = {**dict.fromkeys(RESUMED), "global_step": step, "state_dict": {"weights": torch.zeros(100)}}
+    AtomicCheckpointIO().save_checkpoint(content, path)
     return path
 
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from r2flow.backbones.layers import ExactBuffers, at_least_float32
 from r2flow.errors import InputError
+from r2flow.registry import Positive
 
 
 class CommonOptions(TypedDict, total=False):
@@ -17,6 +18,7 @@ class CommonOptions(TypedDict, total=False):
     in_channels: int
     out_channels: int | None
     second_time: bool
+    data_std: Positive | None
 
 
 @runtime_checkable
@@ -55,6 +57,7 @@ class Backbone(ExactBuffers):
         in_channels: Channels C of the image, and of the condition that is concatenated to it.
         out_channels: Channels C' of the answer; None for C.
         second_time: Whether the network takes s.
+        data_std: Standard deviation of the data, for `precondition`; None for a network that gives v itself.
 
     Raises:
         InputError: rays of another shape, H or W that is not a multiple of the unit, channels below 1, or
@@ -74,9 +77,10 @@ class Backbone(ExactBuffers):
         in_channels: int = 2,
         out_channels: int | None = None,
         second_time: bool = False,
+        data_std: Positive | None = None,
     ) -> None:
         super().__init__()
-        self.unit, self.second_time = unit, second_time
+        self.unit, self.second_time, self.data_std = unit, second_time, data_std
         self.in_channels, self.out_channels = in_channels, in_channels if out_channels is None else out_channels
         self._check(rays)
         # on the device that parameters are made on, which `with torch.device(...)` may have set
@@ -104,10 +108,19 @@ class Backbone(ExactBuffers):
             raise InputError(f"this backbone was built for images of {expected}, found {tuple(x.shape[1:])}.")
         if s is not None and not self.second_time:
             raise InputError("this backbone was built for one time and takes no s: build it with second_time=True.")
-        y, t = x.to(next(self.parameters()).dtype), _times("t", t, x)
+        t = _times("t", t, x)
+        if self.data_std is None:
+            return self._evaluated(t, x, s).to(x.dtype)
+        image, rest = at_least_float32(x[:, : self.out_channels]), x[:, self.out_channels :]
+        into, skip, out = precondition(t, self.data_std)
+        inner = torch.cat([into * image, rest], dim=1) if rest.shape[1] else into * image
+        return (skip * image + out * self._evaluated(t, inner, s)).to(x.dtype)
+
+    def _evaluated(self, t: Tensor, x: Tensor, s: Tensor | float | None) -> Tensor:
+        y = x.to(next(self.parameters()).dtype)
         if not self.second_time:
-            return self.velocity(t, y).to(x.dtype)
-        return self.velocity(t, y, t if s is None else _times("s", s, x)).to(x.dtype)
+            return self.velocity(t, y)
+        return self.velocity(t, y, t if s is None else _times("s", s, x))
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         """The field for t of shape (B,), or (1,) for the whole batch, in float32 or better.
@@ -197,6 +210,29 @@ class Backbone(ExactBuffers):
                     f"{dimension} {size} cannot be used by {name} with these options: it must be a multiple of {unit}; "
                     f"nearest: {nearest}."
                 )
+
+
+def precondition(t: Tensor, data_std: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Factors of a network F that gives only what a linear estimate of the velocity leaves over:
+
+        v(t, x) = skip(t) x + out(t) F(t, into(t) x)
+
+    For x_1 ~ N(0, s^2) and x_t = t x_1 + (1 - t) x_0, of variance V = t^2 s^2 + (1 - t)^2, the best linear estimate is
+    E[v | x_t] = skip x_t with skip = (t s^2 - (1 - t)) / V, and leaves out^2 = Var[v | x_t] = s^2 / V. With into =
+    V^(-1/2) F sees and gives unit variance at every t (Karras et al. 2022, "Elucidating the design space of
+    diffusion-based generative models", table 1, for the straight path). At t = 0 F need not copy the noise.
+
+    Args:
+        t: Times, (B,) or (1,).
+        data_std: s.
+
+    Returns:
+        into, skip and out, each (B or 1, 1, 1, 1).
+    """
+    t = t[:, None, None, None]
+    variance = (t * data_std).square() + (1 - t).square()
+    into = variance.rsqrt()
+    return into, (t * data_std**2 - (1 - t)) / variance, data_std * into
 
 
 def _follow_loaded_rays(backbone: Backbone, _keys: Any) -> None:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self, Unpack, cast
+from typing import Annotated, Any, NamedTuple, Self, Unpack, cast
 
 import torch
 import torch.nn.functional as F
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from r2flow.backbones.attention import backend_name, check_window, neighbourhood_attention
 from r2flow.backbones.base import Backbone, CommonOptions, integers
+from r2flow.backbones.detail import Detail
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, Rotary, mean_rays, position_name, rotate
 from r2flow.backbones.layers import (
     GEGLU,
@@ -22,10 +23,11 @@ from r2flow.backbones.layers import (
     at_least_float32,
     in_bands,
     mapping_network,
+    unshuffle,
     zero_initialised,
 )
 from r2flow.errors import InputError
-from r2flow.registry import Count, Portion
+from r2flow.registry import Bound, Count, Portion
 
 
 class HDiT(Backbone):
@@ -49,6 +51,8 @@ class HDiT(Backbone):
         ring: Whether the columns are a full turn.
         dropout: Share of attention outputs and of feed-forward activations dropped in training.
         attention: Backend of `neighbourhood_attention`.
+        detail: Blocks and channels of a convolutional path at full resolution beside the tokens (`Detail`), which
+            learns smooth surfaces sooner; None for the paper's network.
         common: See `Backbone`.
 
     Raises:
@@ -64,13 +68,14 @@ class HDiT(Backbone):
         base_channels: Count = 128,
         depths: Sequence[int] = (3, 3, 3, 3),
         num_heads: Sequence[int] = (2, 4, 8, 16),
-        time_channels: Count = 256,
+        time_channels: Annotated[int, Bound("of at least 2", lambda n: n >= 2)] = 256,
         position: str | None = "learnable",
         window: Sequence[int] = (3, 9),
         patch: Sequence[int] = (1, 4),
         ring: bool = True,
         dropout: Portion = 0.0,
         attention: str = "auto",
+        detail: Sequence[int] | None = None,
         **common: Unpack[CommonOptions],
     ) -> None:
         levels = max(len(depths), 1)
@@ -105,6 +110,12 @@ class HDiT(Backbone):
         self.mid_levels = blocks(levels - 1)
         pixels = zero_initialised(nn.Linear(base_channels, math.prod(self.patch) * self.out_channels, bias=False))
         self.detokenizer = nn.Sequential(RMSNorm(base_channels), pixels)
+        if detail is None:
+            self.detail = None
+        else:
+            count, channels = integers("detail", detail, 2)
+            ends = self.in_channels, self.out_channels
+            self.detail = Detail(count, channels, ends, base_channels, self.patch, time_channels, ring)
         if self.second_time:
             last = zero_initialised(ExactLinear(time_channels, time_channels, bias=False))
             self.interval_embedding = time_embedding(time_channels, dropout).append(last)
@@ -127,7 +138,8 @@ class HDiT(Backbone):
             h = self.up_levels[f"expand_{level}"](h, skips.pop())
             for block in _level(self.up_levels, level):
                 h = block(h, condition, self._table(level))
-        return _unshuffle(self.detokenizer(h), self.patch).permute(0, 3, 1, 2)
+        v = unshuffle(self.detokenizer(h), self.patch).permute(0, 3, 1, 2)
+        return v if self.detail is None else v + self.detail(x, h, condition)
 
     def follow_rays(self) -> None:
         """Compute again the rotary table of each level and the position features."""
@@ -381,12 +393,6 @@ class Shuffle(nn.Module):
         return x.permute(0, 1, 3, 2, 4, 5).flatten(3)
 
 
-def _unshuffle(x: Tensor, patch: tuple[int, int]) -> Tensor:
-    """(B, H, W, p q C) to (B, H p, W q, C)."""
-    p, q = patch
-    return x.unflatten(3, (p, q, -1)).permute(0, 1, 3, 2, 4, 5).flatten(3, 4).flatten(1, 2)
-
-
 class Expand(nn.Module):
     """One token of 2C channels becomes 2 x 2 of C, mixed with the tokens skipped: lerp(skip, x, sigmoid(alpha))."""
 
@@ -396,5 +402,5 @@ class Expand(nn.Module):
         self.linear = nn.Linear(2 * channels, 4 * channels, bias=False)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
-        x = _unshuffle(self.linear(x), (2, 2))
+        x = unshuffle(self.linear(x), (2, 2))
         return torch.lerp(skip, x.to(skip.dtype), self.alpha.sigmoid().to(skip.dtype))

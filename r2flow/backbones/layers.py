@@ -129,6 +129,12 @@ def mapping_network(
     return nn.Sequential(RMSNorm(channels), *middle, RMSNorm(channels))
 
 
+def unshuffle(x: Tensor, patch: tuple[int, int]) -> Tensor:
+    """(B, H, W, p q C) to (B, H p, W q, C)."""
+    p, q = patch
+    return x.unflatten(3, (p, q, -1)).permute(0, 1, 3, 2, 4, 5).flatten(3, 4).flatten(1, 2)
+
+
 BAND = 1024  # tokens
 
 

@@ -16,7 +16,7 @@ from r2flow.cli.output import command, finish, numbers
 from r2flow.errors import InputError
 
 OptionalCheckpoint = Annotated[
-    Path | None, typer.Argument(help="A checkpoint file or a run folder; exact problems alone if left out.")
+    Path | None, typer.Argument(help="A checkpoint file, a run folder or a model; exact problems alone if left out.")
 ]
 ProblemsOption = Annotated[str | None, typer.Option(help="Exact problems by name; all if left out, or none.")]
 
@@ -24,7 +24,7 @@ ProblemsOption = Annotated[str | None, typer.Option(help="Exact problems by name
 @report.command(epilog="Example: r2flow report curvature runs/1rf runs/2rf --out reports")
 @grouped
 def curvature(
-    checkpoints: Annotated[list[Path], typer.Argument(help="Checkpoint files or run folders.")],
+    checkpoints: Annotated[list[Path], typer.Argument(help="Checkpoint files, run folders or models.")],
     out: OutOption,
     draw: DrawOptions,
     steps: Annotated[int, typer.Option(min=1, help="Euler steps of a path.")] = 256,

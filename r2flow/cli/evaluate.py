@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from r2flow.evaluation.processes import Process
     from r2flow.evaluation.statistics import Cache
     from r2flow.metrics.base import ScanMetric
+    from r2flow.reports.speed_quality import Drawing
 
 log = logging.getLogger(__name__)
 
@@ -93,7 +94,7 @@ def evaluate(
     work: WorkOptions,
     generated: Annotated[
         str | None,
-        typer.Argument(help="Scans to judge: the same, or a run or checkpoint to sample.", show_default=False),
+        typer.Argument(help="Scans to judge: the same, or a run, checkpoint or model to sample.", show_default=False),
     ] = None,
     checkpoint: Annotated[
         list[Path] | None,
@@ -136,11 +137,12 @@ def evaluate(
             truth, built, work_of(work.batch_size, work.workers, place.rank, place.ranks),
             None if measured.no_cache else Cache(), place.device, sampling,
         )  # fmt: skip
+        drawing, steps = _curve_of(flows, scans.num or SAMPLED, sampling) if checkpoint else (None, [])
         for folder in (output.out, output.json.parent if output.json else None):
             if folder is not None:
                 prepare_folder(folder)
-        if checkpoint and output.out:
-            _measure_curve(job, flows, scans.num or SAMPLED, output.out)
+        if drawing and output.out:
+            _measure_curve(job, flows, drawing, steps, output.out)
         else:
             _compare(job, judged, measured, output)
 
@@ -208,16 +210,24 @@ def _compare(job: Job, judged: "ScanSet | None", measured: MeasureOptions, outpu
             print(path)
 
 
-def _measure_curve(job: Job, flows: "dict[str, Checkpoint]", num: int, out: Path) -> None:
+def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOptions) -> "tuple[Drawing, list[int]]":
+    """What a curve draws, and its numbers of steps; what they cannot be is refused before anything is read."""
+    from r2flow.reports.speed_quality import Drawing, steps_of
+
+    drawing, steps = Drawing(num, sampling.seed, sampling.solver, sampling.tolerance), _many(sampling.steps)
+    for label, flow in flows.items():
+        steps_of(flow, label, steps, drawing)
+    return drawing, steps
+
+
+def _measure_curve(
+    job: Job, flows: "dict[str, Checkpoint]", drawing: "Drawing", steps: Sequence[int], out: Path
+) -> None:
     from r2flow.cli.output import command, finish
     from r2flow.evaluation.measuring import gather_real
     from r2flow.reports.pages import write_page
-    from r2flow.reports.speed_quality import Curve, Drawing, measure_curve, read_rows, speed_quality_page, steps_of
+    from r2flow.reports.speed_quality import Curve, measure_curve, read_rows, speed_quality_page
 
-    drawing = Drawing(num, job.sampling.seed, job.sampling.solver, job.sampling.tolerance)
-    steps = _many(job.sampling.steps)
-    for label, flow in flows.items():
-        steps_of(flow, label, steps, drawing)  # what it refuses is refused before reading
     done = read_rows(out)
     gathered = gather_real(job.metrics, job.truth, job.work, job.cache)
     curve = Curve(job.truth, job.metrics, gathered, drawing, job.device)

@@ -10,7 +10,6 @@ import typer
 from r2flow.cli.app import app
 from r2flow.cli.groups import DrawOptions, SolverOptions, grouped
 from r2flow.cli.options import (
-    CheckpointOption,
     DeviceOption,
     OutOption,
     SensorOption,
@@ -62,11 +61,14 @@ def _pair(option: str, text: str, between: str, kind: type, meaning: str) -> tup
 @app.command(epilog="Example: r2flow sample --checkpoint runs/simulated-hdit_tiny --num 16 --steps 64 --out scans")
 @grouped
 def sample(
-    checkpoint: CheckpointOption,
     out: OutOption,
     draw: DrawOptions,
     solver: SolverOptions,
     part: RegionOptions,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model; street if left out."),
+    ] = None,
     grid: Annotated[
         str | None, typer.Option(help="Where fixed steps fall: uniform, power:P or power-start:P, as power:1.75.")
     ] = None,
@@ -81,13 +83,16 @@ def sample(
 ) -> None:
     """Draw scans from a trained generator: point clouds, range images and pictures.
 
-    Solver, steps and tolerance are the model's own if left out.
+    Solver, steps and tolerance are the generator's own if left out.
     """
     from r2flow.accuracy import sampler_within
     from r2flow.checkpoints import load_checkpoint
+    from r2flow.models import DEFAULT, MODELS, find_model
     from r2flow.reports.outputs import formats_of, write_samples
 
-    loaded = load_checkpoint(checkpoint, device=choose_device(draw.device))
+    if checkpoint is None:
+        print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
+    loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(draw.device))
     if error is None:
         sampler = solver.change(loaded.generator.sampler, straight_first=straight_first or None, grid=grid)
     elif solver != SolverOptions() or grid or straight_first:
@@ -115,10 +120,14 @@ def calibrate(
     from r2flow.accuracy import calibrate as measure
     from r2flow.accuracy import check_predictor_corrector, evaluations_of_calibration
     from r2flow.checkpoints import keep_sampler, load_checkpoint
+    from r2flow.models import MODELS
     from r2flow.progress import Bar
     from r2flow.reports.tables import print_table
 
     check_predictor_corrector(solver)
+    if str(checkpoint) in MODELS:
+        copy = f"r2flow convert {checkpoint} {checkpoint}.safetensors"
+        raise InputError(f"the model {checkpoint} stays as it is; make a copy and give that: {copy}.")
     loaded = load_checkpoint(checkpoint, choose_device(device))
     with Bar("measuring", evaluations_of_calibration(steps), "evaluations") as advance:
         found = measure(loaded, steps, solver, num, advance)
@@ -131,26 +140,42 @@ def calibrate(
 
 @app.command(epilog="Example: r2flow info runs/simulated-hdit_tiny")
 def info(
-    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file or a run folder.")],
+    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file, a run folder or a model.")],
     json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    card: Annotated[bool, typer.Option("--card", help="The table of its model card, as docs/models has it.")] = False,
 ) -> None:
     """Print what is in a checkpoint."""
+    from r2flow.reports.contents import card as card_of
     from r2flow.reports.contents import describe, print_contents
 
     contents = describe(checkpoint)
-    print(to_json(contents, indent=2)) if json else print_contents(contents)
+    if card:
+        print(card_of(contents))
+    elif json:
+        print(to_json(contents, indent=2))
+    else:
+        print_contents(contents)
 
 
 @app.command(epilog="Example: r2flow convert r2flow-kitti360-1rf.pth 1rf.safetensors")
 def convert(
-    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file of any format, or a run folder.")],
+    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file of any format, a run folder or a model.")],
     out: Annotated[Path, typer.Argument(help="What to write: .safetensors (ours) or .pth (the published format).")],
+    half: Annotated[
+        bool, typer.Option("--half", help="Large weights in float16: a .safetensors of half the size.")
+    ] = False,
 ) -> None:
-    """Write a model's averaged weights and config in the other format, the weights bit-equal."""
+    """Write a generator's averaged weights and config as one file, the weights bit-equal but for --half.
+
+    A .safetensors is the same, byte for byte, whenever it is written, and names no folder of this machine.
+    """
+    import hashlib
+
     from r2flow.checkpoints import load_checkpoint, save_checkpoint
 
-    save_checkpoint(load_checkpoint(checkpoint), out)
-    print(out)
+    save_checkpoint(load_checkpoint(checkpoint), out, half)
+    written = out.read_bytes()
+    print(f"{out}: {len(written) / 1e6:.1f} MB, SHA-256 {hashlib.sha256(written).hexdigest()}")
 
 
 @app.command(epilog="Example: r2flow backbones --size 64x1024")

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from r2flow.cli.options import ConventionChoice, DeviceOption, ProjectionChoice, ScaleChoice, SensorChoice, SizeOption
+from r2flow.cli.options import (
+    ColumnsOption,
+    ConventionChoice,
+    DeviceOption,
+    ProjectionChoice,
+    ScaleChoice,
+    SensorChoice,
+    SizeOption,
+)
 
 if TYPE_CHECKING:
     from r2flow.generators import Sampler
@@ -55,6 +63,7 @@ class ReadingOptions:
     projection: ProjectionChoice = None
     convention: ConventionChoice = None
     reflectance_scale: ScaleChoice = None
+    columns: ColumnsOption = None
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from r2flow.lidar.sensors import Sensor
 
 CheckpointOption = Annotated[
-    Path, typer.Option("--checkpoint", "-c", help="A checkpoint file or a run folder.", show_default=False)
+    Path, typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model.", show_default=False)
 ]
 DeviceOption = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", show_default=False)]
@@ -32,9 +32,25 @@ ConventionChoice = Annotated[
     str | None, typer.Option(help="centre, or reference for the published models'; theirs, or centre.")
 ]
 ScaleChoice = Annotated[
-    float | None, typer.Option(min=1e-6, help="Value in scan files that means full reflectance; their usual one, or 1.")
+    float | None,
+    typer.Option(min=1e-6, help="Value in scan files that means full reflectance; the sensor's, else their usual one."),
 ]
-ScaleOption = Annotated[float, typer.Option(min=1e-6, help="Value in the file that means full reflectance, often 255.")]
+
+ColumnsOption = Annotated[
+    str | None,
+    typer.Option(
+        help="What the columns of files without names hold, as x,y,z,intensity,_; the usual ones if left out."
+    ),
+]
+
+
+def named_columns(text: str | None) -> tuple[str, ...] | None:
+    """The columns that are named by `--columns`, checked."""
+    from r2flow.lidar.scan_files.fields import check_columns
+
+    columns = None if text is None else tuple(name.strip() for name in text.split(","))
+    check_columns(columns)
+    return columns
 
 
 def build_sized(sensor: str, size: str | None) -> "Sensor":
@@ -55,6 +71,7 @@ def choose_reading(
     projection: str | None = None,
     convention: str | None = None,
     reflectance_scale: float | None = None,
+    columns: str | None = None,
     flow: "Reading | None" = None,
 ) -> "Reading":
     """How named scans become images of one sensor: as asked for; else as a flow's or one of theirs were; else usual.
@@ -66,14 +83,13 @@ def choose_reading(
     Raises:
         InputError: an unknown name, or another sensor or size than the flow's.
     """
-    from r2flow.data.opening import own_reading, parse, refuse_other_samples, usual_reading
+    from r2flow.data.opening import own_reading, parse, refuse_other_samples, usual_reading, usual_scale
     from r2flow.data.options import FOLDER
-    from r2flow.lidar.projection import CONVENTIONS, PROJECTIONS
 
     named = [spec for spec in specs if spec is not None]
     own = [reading for spec in named if (reading := own_reading(spec)) is not None]
     usual = usual_reading(named[0])
-    found = replace(flow or next(iter(own), None) or usual, reflectance_scale=usual.reflectance_scale)
+    found = flow or next(iter(own), None) or usual
     if flow is not None and (sensor is not None or size is not None):
         chosen = build_sized(sensor or flow.sensor.name, size)
         if chosen.shape != flow.sensor.shape:
@@ -85,15 +101,30 @@ def choose_reading(
         found = replace(found, sensor=build_sized(sensor, size))
     elif size is not None:
         found = replace(found, sensor=found.sensor.resized(*_rows_and_columns(size)))
-    for option, value, known in (("projection", projection, PROJECTIONS), ("convention", convention, CONVENTIONS)):
-        if value is not None and value not in known:
-            raise InputError(f"--{option} must be one of {', '.join(known)}; found {value!r}.")
+    check_words(projection=projection, convention=convention)
     for spec in named:  # before anything is read
         options, _ = parse(str(spec))
         if options.name == FOLDER:
             refuse_other_samples(Path(options.folder), found.sensor)
-    asked_for = {"projection": projection, "convention": convention, "reflectance_scale": reflectance_scale}
+    scale = usual_scale(named[0], found.sensor) if reflectance_scale is None else reflectance_scale
+    found = replace(found, reflectance_scale=scale, columns=named_columns(columns))
+    asked_for = {"projection": projection, "convention": convention}
     return replace(found, **{key: value for key, value in asked_for.items() if value is not None})  # type: ignore[arg-type]
+
+
+def check_words(**options: str | None) -> None:
+    """Check options that are one of a few words each, where they are given.
+
+    Raises:
+        InputError: another word.
+    """
+    from r2flow.lidar.projection import CONVENTIONS, PROJECTIONS
+
+    known = {"projection": PROJECTIONS, "convention": CONVENTIONS, "on_bad_scan": ("error", "skip")}
+    for option, value in options.items():
+        if value is not None and value not in known[option]:
+            words = ", ".join(known[option])
+            raise InputError(f"--{option.replace('_', '-')} must be one of {words}; found {value!r}.")
 
 
 def _rows_and_columns(size: str | None) -> tuple[int | None, int | None]:
@@ -120,7 +151,7 @@ def choose_device(name: str) -> str:
         device = torch.device(name)
     except RuntimeError:
         device = torch.device("meta")
-    if device.type not in ("cpu", "cuda", "mps", "xpu"):
+    if device.type not in ("cpu", "cuda", "mps", "xpu") or (device.type == "cpu" and device.index):
         raise InputError(f"--device must be auto, cpu, cuda, cuda:1, ...; found {name!r}.")
     there = {"cuda": torch.cuda, "mps": torch.mps, "xpu": torch.xpu}.get(device.type)
     if there is not None and (device.index or 0) >= there.device_count():

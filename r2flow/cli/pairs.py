@@ -51,7 +51,7 @@ class ShareOptions:
 @app.command(epilog="Example: torchrun --nproc-per-node 8 -m r2flow.cli pairs runs/r2flow_1rf --num 1000000")
 @grouped
 def pairs(
-    checkpoint: Annotated[Path, typer.Argument(help="The flow that draws them: a run folder or a checkpoint.")],
+    checkpoint: Annotated[Path, typer.Argument(help="The flow that draws them: a run, a checkpoint or a model.")],
     solver: SolverOptions,
     share: ShareOptions,
     num: Annotated[int, typer.Option(min=1, help="Pairs in all.")] = 1000,

@@ -8,7 +8,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import ReadingOptions, grouped
-from r2flow.cli.options import build_sized, cores
+from r2flow.cli.options import build_sized, check_words, cores, named_columns
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -72,6 +72,7 @@ def prepare(
         raise InputError("r2flow prepare needs LAYOUT ROOT --out FOLDER, or --check FOLDER.")
     from r2flow.data.preparing import Preparation
 
+    check_words(projection=reading.projection, convention=reading.convention, on_bad_scan=files.on_bad_scan)
     _run(Preparation(out, _plan(layout, root, reading, files, scenes, shards)), files.on_bad_scan, shards.workers)
 
 
@@ -84,6 +85,7 @@ def _plan(
     shards: ShardOptions,
 ) -> "Plan":
     from r2flow.data.opening import SOURCES
+    from r2flow.data.options import FOLDER
     from r2flow.data.preparing import plan_files, plan_simulated
 
     usual = SOURCES[layout]
@@ -93,6 +95,7 @@ def _plan(
         of_files = {
             "ROOT": root, "--projection": reading.projection, "--convention": reading.convention,
             "--split": files.split, "--drives": files.drives, "--reflectance-scale": reading.reflectance_scale,
+            "--columns": reading.columns,
         }  # fmt: skip
         wrong = [option for option, value in of_files.items() if value is not None]
         if wrong:
@@ -102,10 +105,11 @@ def _plan(
         raise InputError(f"r2flow prepare {layout} needs the folder of its scans: r2flow prepare {layout} ROOT --out.")
     if scenes.num is not None:
         raise InputError("--num is for simulated scans; choose files by --split and --drives.")
+    scale = (layout == FOLDER and sensor.reflectance_scale) or usual.reflectance_scale
     return plan_files(
         layout, root, sensor, reading.projection or "spherical", reading.convention or "centre", files.split,
-        files.drives.split(",") if files.drives else None, reading.reflectance_scale or usual.reflectance_scale,
-        levels, shard_scans,
+        files.drives.split(",") if files.drives else None, reading.reflectance_scale or scale,
+        levels, shard_scans, named_columns(reading.columns),
     )  # fmt: skip
 
 

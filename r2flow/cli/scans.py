@@ -8,14 +8,16 @@ import typer
 from r2flow.cli.app import app
 from r2flow.cli.options import (
     SETS,
+    ColumnsOption,
     ConventionOption,
     OutOption,
     ProjectionOption,
-    ScaleOption,
+    ScaleChoice,
     SensorChoice,
     SensorOption,
     SizeOption,
     build_sized,
+    named_columns,
 )
 from r2flow.errors import InputError
 
@@ -28,8 +30,9 @@ def show(
     size: SizeOption = None,
     projection: ProjectionOption = "spherical",
     reflectance_scale: Annotated[
-        float | None, typer.Option(help="Value in the file that means full reflectance; guessed if left out.")
+        float | None, typer.Option(min=1e-6, help="Value in the file that means full reflectance; guessed if left out.")
     ] = None,
+    columns: ColumnsOption = None,
     most: Annotated[int, typer.Option(min=1, help="The most scans to draw of a folder.")] = 16,
     labels: Annotated[bool, typer.Option("--labels", help="Draw the classes of .label files, too.")] = False,
 ) -> None:
@@ -40,10 +43,11 @@ def show(
     if projection == "unfolding" and sensor in (None, "hdl64e"):
         sensor = "hdl64e_rings"  # rows are rings then, and these are not evenly spaced
     chosen = None if sensor is None and size is None else build_sized(sensor or "hdl64e", size)
-    views = [view for spec in scans for view in views_of(spec, chosen, projection, reflectance_scale, most)]
+    named = named_columns(columns)
+    views = [view for spec in scans for view in views_of(spec, chosen, projection, reflectance_scale, most, named)]
     paths = [view.path for view in views]
     for view in views:
-        classes = label_view(view.path, view.scans.sensor, projection) if labels else None
+        classes = label_view(view.path, view.scans.sensor, projection, named) if labels else None
         figure = scan_figure(view.image, view.rays, view.path.name, classes)
         print(save_figure(figure, out / f"{unique_stem(view.path, paths)}.png"))
 
@@ -58,12 +62,13 @@ def project(
     convention: ConventionOption = "centre",
     sensor: SensorOption = "hdl64e",
     size: SizeOption = None,
-    reflectance_scale: ScaleOption = 1.0,
+    reflectance_scale: ScaleChoice = None,
+    columns: ColumnsOption = None,
 ) -> None:
     """Project a scan to a range image: float32 (2, H, W), range in metres and reflectance, 0 where missing."""
     import numpy as np
 
-    from r2flow.data.opening import open_scans
+    from r2flow.data.opening import open_scans, usual_scale
     from r2flow.data.sources import Reading
     from r2flow.files import atomic_write
 
@@ -72,7 +77,8 @@ def project(
         raise InputError(f"--out {out}: a range image is written as .npy; r2flow show draws pictures.")
     if scan.is_dir():
         raise InputError(f"{scan} is a folder, not a scan file; name a file in it.")
-    reading = Reading(chosen, projection, convention, reflectance_scale, on_bad_scan="error")  # type: ignore[arg-type]
+    scale = usual_scale(scan, chosen) if reflectance_scale is None else reflectance_scale
+    reading = Reading(chosen, projection, convention, scale, on_bad_scan="error", columns=named_columns(columns))  # type: ignore[arg-type]
     image = open_scans(scan, reading).source[0]
     image = image if len(image) > 1 else np.concatenate([image, np.zeros_like(image)])
     with atomic_write(out) as file:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from r2flow.cli.app import app
+from r2flow.cli.options import ColumnsOption, named_columns
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,7 +19,9 @@ if TYPE_CHECKING:
 def sensor(
     scans: Annotated[list[Path], typer.Argument(help="Scan files, or folders of them, of one sensor.")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="The .yaml to write; none if left out.")] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the sensor; by default that of the file.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the sensor; by default from that of the file.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
+    columns: ColumnsOption = None,
     most: Annotated[int, typer.Option(min=1, help="The most scans to read of a folder.")] = 8,
 ) -> None:
     """Estimate a sensor from scans: beams, resolution, limits, height, reflectance; write it as YAML.
@@ -34,11 +37,14 @@ def sensor(
 
     if out is not None and (out.suffix.lower() not in ENDINGS or out.is_dir()):
         raise InputError(f"--out must be a .yaml file, as --sensor expects; found {out}.")
-    name = name or (out.stem if out is not None else "mine")
-    if name in SENSORS or not re.fullmatch(r"[A-Za-z]\w*", name):
+    if out is not None and out.exists() and not overwrite:
+        raise InputError(f"{out} is there already; give another --out, or --overwrite to replace it.")
+    name = name or _name_of(out)
+    if name in SENSORS or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise InputError(f"--name must be letters, digits and _, and not that of a built-in sensor; found {name!r}.")
+    named = named_columns(columns)
     paths = [path for scan in scans for path in scans_of(scan, most)]
-    points = [read_points(path) for path in track(paths, "reading", "scans", least=16)]
+    points = [read_points(path, named) for path in track(paths, "reading", "scans", least=16)]
     estimate = estimate_sensor(points)
     found = estimate.sensor(name)
     _print(estimate)
@@ -48,6 +54,14 @@ def sensor(
         )
         write_sensor(found, out, f"{comment}\nBeams: {_sureness(estimate.beams)}.")
         print(out)
+
+
+def _name_of(out: Path | None) -> str:
+    """A sensor's name from that of its file."""
+    from r2flow.lidar.sensors import SENSORS
+
+    name = re.sub(r"\W", "_", out.stem, flags=re.ASCII) if out is not None else "mine"
+    return f"my_{name}" if name in SENSORS or not name[:1].isalpha() else name
 
 
 def _print(estimate: "Estimate") -> None:
@@ -79,7 +93,7 @@ def _print(estimate: "Estimate") -> None:
         rows.append(("reflectance", "none: encoding.reflectance=false"))
     else:
         values = f"{found.levels} values up to {found.highest:.4g}"
-        rows.append(("reflectance", f"{values}: data.reflectance_scale={found.scale:g}"))
+        rows.append(("reflectance", f"{values}: reflectance_scale={found.scale:g}"))
     rows.append(("storage", beams.order))
     print_table(rows, ("", ""))
 

@@ -1,4 +1,4 @@
-"""Weights of the published feature networks: `r2flow weights`."""
+"""Files of weights by name: models, and the published feature networks: `r2flow weights`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,30 +6,47 @@ from typing import Annotated
 import typer
 
 from r2flow.cli.app import app
+from r2flow.errors import InputError
+from r2flow.registry import did_you_mean
 
 
 @app.command(epilog="Example: r2flow weights --add rangenet53 darknet53-1024.tar.gz")
 def weights(
     add: Annotated[
         tuple[str, Path] | None,
-        typer.Option(metavar="NAME FILE", help="Take a network's weights from a file, a .tar.gz or a folder."),
+        typer.Option(metavar="NAME FILE", help="Take a model from its file, or a network from a file or a folder."),
     ] = None,
 ) -> None:
-    """Which weights the published distances have on this machine, and where the others are to be got.
+    """Which trained models and which networks of published distances are on this machine, and where to get others.
 
-    Nothing is fetched: get the file, then --add it. It is read as tensors alone, checked against its network and
-    kept in R2FLOW_WEIGHTS, or ~/.cache/r2flow/weights.
+    Nothing is fetched: get the file, then --add it. A model is checked by its SHA-256 and kept in R2FLOW_MODELS, or
+    ~/.cache/r2flow/models. A network is read as tensors alone, checked and kept in R2FLOW_WEIGHTS, or
+    ~/.cache/r2flow/weights.
     """
+    from r2flow.models import MODELS, add_model, model_file, models_folder
+    from r2flow.reports.tables import print_table
+
+    if add is not None and add[0] in MODELS:
+        print(f"{add_model(*add)}: the model {add[0]}")
+        return
     from r2flow.metrics.extractors.weights import SOURCES, kept, kept_file, weights_folder
     from r2flow.metrics.extractors.weights import add as take
-    from r2flow.reports.tables import print_table
 
     if add is not None:
         name, path = add
+        if name not in SOURCES:
+            known = [*MODELS, *SOURCES]
+            raise InputError(f"no weights named {name!r}; known: {', '.join(known)}.{did_you_mean(name, known)}")
         found = take(name, path)
         same = {True: "the published file", False: "not the published file", None: "its published hash is not known"}
         print(f"{kept_file(name)}: weights {found.weights} of {found.source} ({same[found.published]})")
         return
+    models = [
+        (name, model.about, "yes" if model_file(name).is_file() else "no", model.page or "in the package")
+        for name, model in MODELS.items()
+    ]
+    print_table(models, ("model", "draws", "here", "file"))
+    print(f"\nLooked for in {models_folder()} (R2FLOW_MODELS) unless in the package. Draw: r2flow sample -c MODEL\n")
     rows = []
     for name, source in SOURCES.items():
         there = kept(name)

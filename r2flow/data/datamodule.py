@@ -3,7 +3,9 @@
 import hashlib
 import logging
 import math
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -58,6 +60,7 @@ class ScanDataModule(L.LightningDataModule):
         self.augment = Augmentation(**augment)
         self.validation = self.options.held
         self.names: list[str] = []
+        self.files: dict[str, str | Path] = {}  # that scans are read from; see `r2flow.data.contents`
         self.training_source: ScanSource | PairSource | None = None
         self.validation_source: ScanSource | PairSource | None = None
         self.pairs = self._pair_options() if self.options.name == PAIRS else None
@@ -100,7 +103,10 @@ class ScanDataModule(L.LightningDataModule):
             refuse_shared_scans(whole)
         # What goes before the names of each part's scans tells them apart.
         labels = [f"{number}: " if len(whole) > 1 else "" for number in range(len(whole))]
-        self.names = [f"{label}{name}" for label, source in zip(labels, whole, strict=True) for name in source.names]
+        self.names, self.files = [], {}
+        for label, source in zip(labels, whole, strict=True):
+            self.names += [f"{label}{name}" for name in source.names]
+            self.files |= {f"{label}{name}": file for name, file in source.files().items()}
         other = held_out_options(self.options)
         if not other:
             training, held = [], []
@@ -119,6 +125,7 @@ class ScanDataModule(L.LightningDataModule):
                     "data.validation.data holds %d scans that are trained on, as %s: give it its own split or drives",
                     len(shared), min(shared),
                 )  # fmt: skip
+            self.files |= {f"held out: {name}": file for name, file in held[0].files().items()}
         validation = _joined(held)
         return _joined(training), validation.subset(spread(len(validation), self.validation.scans))
 
@@ -126,6 +133,7 @@ class ScanDataModule(L.LightningDataModule):
         reading = Reading(
             self.sensor, options.projection, options.convention, options.reflectance_scale,  # type: ignore[arg-type]
             self.encoding.reflectance, options.on_bad_scan, within_limits=True,
+            columns=None if options.columns is None else tuple(options.columns),
         )  # fmt: skip
         return open_source(options, reading, self.seed, first_scene)
 
@@ -144,7 +152,7 @@ class ScanDataModule(L.LightningDataModule):
         assert self.training_source is not None
         # Another revision of the simulator draws other scans of the same name.
         revision = [f"simulator {simulator.REVISION}"] if any(p.name == SIMULATED for p in self.parts) else []
-        names = hashlib.sha256("\n".join([*self.names, *revision]).encode()).hexdigest()[:12]
+        names = hashlib.sha256(os.fsencode("\n".join([*self.names, *revision]))).hexdigest()[:12]
         return f"{len(self.training_source)} of {len(self.names)} scans, {names}"
 
     def _kept(self, source: ScanSource, what: str) -> ScanSource:

@@ -8,9 +8,9 @@ from itertools import accumulate
 from pathlib import Path
 
 from r2flow.data.options import SourceOptions
-from r2flow.data.sources import Reading, ScanFiles, ScanSource, lacks_reflectance
+from r2flow.data.sources import Reading, ScanFiles, ScanSource, lacks_reflectance, warn_of_other_sensor
 from r2flow.errors import InputError
-from r2flow.lidar.scan_files import SCAN_ENDINGS
+from r2flow.lidar.scan_files import ELSEWHERE, LOOSE_ENDINGS, SCAN_ENDINGS
 
 log = logging.getLogger(__name__)
 
@@ -90,12 +90,27 @@ class Layout(SourceKind):
         self.chosen([], split, None)  # a split that is not known is refused before anything is looked for
         if not root.is_dir():
             raise InputError(f"{root} is not a folder. Give the folder of your {name} scans (data.root=FOLDER).")
-        found = self.chosen([drive for drive in self.find(root) if drive.scans], split, None)
-        if not found:
-            part = f" of its {split} split" if split else ""
+        held = [drive for drive in self.find(root) if drive.scans]
+        if not held:
             where = (self.find.__doc__ or "").splitlines()[0]
-            raise InputError(f"{root} holds no scan{part}. Looked for ({name}): {where}")
+            raise InputError(f"{root} holds no scan. Looked for ({name}): {where}{_elsewhere(root)}")
+        found = self.chosen(held, split, None)
+        if not found:
+            raise InputError(f"{root} holds no scan of its {split} split; {self._held(held)}.")
         return self.chosen(found, None, options.drives)
+
+    def _held(self, drives: Sequence[Drive]) -> str:
+        """What there is in place of a split's drives, and how it is taken."""
+        parts: dict[str | None, list[Drive]] = {}
+        for drive in drives:
+            parts.setdefault(self.split_of(drive.name), []).append(drive)
+        there = "; ".join(
+            f"{sum(len(drive.scans) for drive in found)} of {f'its {part} split' if part else 'no split'} "
+            f"({', '.join(drive.name for drive in found[:3])}{', ...' * (len(found) > 3)})"
+            for part, found in parts.items()
+        )
+        ways = [f"data.split={part} (--split {part})" for part in parts if part]
+        return f"it holds {there}: give {', '.join([*ways, 'data.split=null for all'])}"
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanFiles:
         if reading.projection == "unfolding" and reading.sensor.name == "hdl64e":
@@ -107,11 +122,13 @@ class Layout(SourceKind):
         drives = {drive.name: span for drive, span in zip(found, spans_of(found), strict=True)}
         about = {"kind": options.name, **({"split": options.split or "all"} if self.splits else {})}
         root = Path(options.folder).expanduser()  # as the paths begin that are found in it, however it was written
-        return ScanFiles([path for drive in found for path in drive.scans], reading, root, drives, about)
+        paths = [path for drive in found for path in drive.scans]
+        warn_of_other_sensor(paths, reading, root)
+        return ScanFiles(paths, reading, root, drives, about)
 
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
         paths = (path for drive in self.find_drives(options) for path in drive.scans)
-        return lacks_reflectance(paths, on_bad_scan)
+        return lacks_reflectance(paths, on_bad_scan, options.columns)
 
 
 def kitti_360(root: Path) -> list[Drive]:
@@ -156,12 +173,29 @@ def nuscenes(root: Path) -> list[Drive]:
 
 
 def folder(root: Path) -> list[Drive]:
-    """Any folder of .bin, .pcd.bin, .pcd, .ply, .npy files; each folder below it that holds some is a drive.
+    """Any folder of .bin, .pcd.bin, .pcd, .ply, .npy, .xyz, .las, .laz, .feather, .parquet, else of .csv, .txt, .npz.
 
-    Of a scan that lies there in several formats, one file is taken: its range image, else the last by its ending.
+    Each folder below it that holds some is a drive. Of a scan that lies there in several formats, one file is taken:
+    its range image, else the last by its ending.
     """
     below = sorted(Path(place) for place, _, _ in os.walk(root))
-    return [Drive(str(place.relative_to(root)), _one_of_each(_files(place, SCAN_ENDINGS))) for place in below]
+    firm = tuple(ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS)
+    for endings in (firm, LOOSE_ENDINGS):
+        drives = [Drive(str(place.relative_to(root)), _one_of_each(_files(place, endings))) for place in below]
+        if any(drive.scans for drive in drives):
+            break
+    return drives
+
+
+def _elsewhere(root: Path) -> str:
+    """What turns the files of a folder that holds no scan into some, where they hold scans in another form."""
+    for place, _, names in os.walk(root):
+        for name in sorted(names):
+            for ending, advice in ELSEWHERE.items():
+                if name.lower().endswith(ending):
+                    path = os.path.join(place, name)
+                    return f" {path} {advice.format(path=path)}."
+    return ""
 
 
 def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:

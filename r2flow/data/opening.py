@@ -10,7 +10,7 @@
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,16 @@ from r2flow.data.options import (
 )
 from r2flow.data.prepared import PreparedScans, find_prepared, read_manifest
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import AUTO, Reading, ScanFiles, ScanSource, SimulatedScans, lacks_reflectance, range_image
+from r2flow.data.sources import (
+    AUTO,
+    Reading,
+    ScanFiles,
+    ScanSource,
+    SimulatedScans,
+    lacks_reflectance,
+    range_image,
+    warn_of_other_sensor,
+)
 from r2flow.data.store import MANIFEST
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
@@ -48,7 +57,8 @@ class Simulated(SourceKind):
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
         scenes = range(first_scene, first_scene + options.scenes)
-        return SimulatedScans(reading.sensor, seed, scenes, bool(reading.reflectance))
+        folder = None if options.root is None else options.folder
+        return SimulatedScans(reading.sensor, seed, scenes, bool(reading.reflectance), folder)
 
 
 class Prepared(SourceKind):
@@ -91,7 +101,7 @@ def open_scans(
         reading: How scans become images; what the scans say of themselves, or `usual_reading`, if left out.
         split: A part of the data set's standard split.
         num: At most so many, by a fixed shuffle; the number of simulated scenes.
-        own_size: Whether a range image's own size is taken in place of the sensor's, as a picture may do.
+        own_size: For pictures: a range image's own size is taken in place of the sensor's, and no beams are compared.
 
     Raises:
         InputError: nothing is there, or what is there cannot become such images.
@@ -100,17 +110,21 @@ def open_scans(
     options, file = parse(label)
     reading = reading or own_reading(label) or usual_reading(label)
     if file is None:
-        options = replace(options, split=split, scenes=num or SCENES)
+        columns = None if reading.columns is None else list(reading.columns)
+        options = replace(options, split=split, scenes=num or SCENES, columns=columns)
         if options.name == SIMULATED:
-            return ScanSet(label, open_source(options, reading, int(options.folder)), reading.sensor)
+            seed = int(options.folder)
+            return ScanSet(label, open_source(replace(options, root=None), reading, seed), reading.sensor)
         return ScanSet(label, open_source(options, reading), reading.sensor).limited(num)
     image = range_image(file)
     if image is not None:  # points can be seen through any sensor
         refuse_other_samples(file.parent, reading.sensor)
+    elif not own_size:
+        warn_of_other_sensor([file], reading, file)
     if own_size and image is not None:
         reading = replace(reading, sensor=reading.sensor.resized(*image.shape[1:]))
     if reading.reflectance == AUTO:
-        reading = replace(reading, reflectance=lacks_reflectance([file], reading.on_bad_scan) is None)
+        reading = replace(reading, reflectance=lacks_reflectance([file], reading.on_bad_scan, reading.columns) is None)
     return ScanSet(label, ScanFiles([file], reading, file.parent, about={"kind": "file"}), reading.sensor)
 
 
@@ -157,7 +171,7 @@ def find_drives(
 
 def write_samples_note(folder: Path, reading: Reading, **about: Any) -> None:
     """Say in a folder of samples whose images they are: `open_scans` then needs no sensor and no size."""
-    images = {"sensor": asdict(reading.sensor), "projection": reading.projection, "convention": reading.convention}
+    images = {"sensor": reading.sensor.described(), "projection": reading.projection, "convention": reading.convention}
     with atomic_write(folder / SAMPLES, "w") as file:
         json.dump({"format": "r2flow samples 1", **images, **about}, file, indent=1)
 
@@ -192,6 +206,13 @@ def usual_reading(spec: str | Path) -> Reading:
     """How scans of this kind usually become images."""
     kind = SOURCES[parse(str(spec))[0].name]
     return Reading(SENSORS[kind.sensor], reflectance_scale=kind.reflectance_scale)
+
+
+def usual_scale(spec: str | Path, sensor: Sensor) -> float:
+    """The value in the files of a set of scans that usually means full reflectance; of a folder, its sensor's."""
+    name = parse(str(spec))[0].name
+    is_noted = own_reading(spec) is not None  # samples have reflectances of [0, 1]
+    return (name == FOLDER and not is_noted and sensor.reflectance_scale) or SOURCES[name].reflectance_scale
 
 
 def _noted(folder: Path) -> Reading | None:
@@ -301,7 +322,11 @@ def held_out_options(options: DataOptions) -> list[SourceOptions]:
     if other is None or options.name == PAIRS:
         return []
     check_options("data.validation.data", SourceOptions, other)
-    held = SourceOptions(**{**options.common, "split": None, "drives": None, **other})
+    common = {**options.common, "split": None, "drives": None}
+    kinds = {options.name, other.get("name", options.name)}
+    if len(kinds) == 2 and SIMULATED in kinds:
+        common["root"] = None  # where simulated scans are kept, no others lie
+    held = SourceOptions(**{**common, **other})
     if held.name in (MIXED, PAIRS):
         raise InputError(f"data.validation.data must name one data set, found {held.name}; hold out a part of it.")
     return [held]

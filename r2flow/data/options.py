@@ -7,8 +7,9 @@ from typing import Any, Self
 
 from r2flow.data.shards import PairRecipe
 from r2flow.errors import InputError
-from r2flow.flow.solvers import check_method, check_tolerance, named_grid, usual_grid
-from r2flow.registry import NonNegative, check_options
+from r2flow.flow.solvers import check_tolerance, named_grid, usual_grid
+from r2flow.lidar.scan_files.fields import check_columns
+from r2flow.registry import NonNegative, Positive, check_options
 
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # in the table `r2flow.data.opening.SOURCES`
 MIXED, PAIRS = "mixed", "pairs"  # what `data.name` may be besides: several sets of scans, and pairs drawn by a flow
@@ -27,6 +28,7 @@ class SourceOptions:
     convention: str = "centre"  # or reference
     reflectance_scale: float = 1.0  # the value in the files that means full reflectance
     on_bad_scan: str = "error"  # or skip: the next usable scan takes the place of one that cannot be used
+    columns: list[str] | None = None  # what the columns of files without names hold: [x, y, z, intensity, _]
 
     def __post_init__(self) -> None:
         if not 0 < self.reflectance_scale < math.inf:
@@ -35,6 +37,7 @@ class SourceOptions:
             raise InputError(f"data.scenes must be at least 1, found {self.scenes}.")
         if self.on_bad_scan not in ("error", "skip"):
             raise InputError(f"data.on_bad_scan must be 'error' or 'skip', found {self.on_bad_scan!r}.")
+        check_columns(self.columns)
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:
@@ -58,7 +61,7 @@ class SourceOptions:
 class PartOptions(SourceOptions):
     """One of several sets of scans."""
 
-    weight: float | None = None  # its share of the images of a run, beside the other parts' weights
+    weight: Positive | None = None  # its share of the images of a run, beside the other parts' weights
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ class PairOptions:
     """The choices behind a set of pairs (`data.pairs`)."""
 
     num: int = 1000
-    method: str = "adams3"  # the solver's, like steps and tolerance: `r2flow.flow.solvers.solve`
+    method: str = "adams3"  # of the parent, like steps and tolerance: `r2flow.flow.solvers.solve`
     steps: int = 32
     grid: str | None = None  # where fixed steps fall; None: the method's usual one
     tolerance: float = 1e-5
@@ -93,7 +96,7 @@ class PairOptions:
         """All that pairs depend on, where scans and their noise have these shapes in model space.
 
         Raises:
-            InputError: a number out of its range or an unknown solver.
+            InputError: a number out of its range.
         """
         if min(self.num, self.batch_size, self.steps) < 1 or not 0 < self.shard_mib < math.inf:
             raise InputError(
@@ -102,9 +105,10 @@ class PairOptions:
             )
         first = self.first or 0
         if not (0 <= self.seed < 2**63 and 0 <= first < 2**63):
-            raise InputError(f"data.pairs: seed and first must be at least 0, found {self.seed} and {first}.")
+            raise InputError(
+                f"data.pairs: seed and first must be at least 0 and below 2^63, found {self.seed} and {first}."
+            )
         check_tolerance(self.tolerance)
-        check_method(self.method)
         grid = self.grid or usual_grid(self.method)
         named_grid(grid)
         shard_batches = max(round(self.shard_mib * 2**20 / (self.batch_size * 2 * math.prod(shape))), 1)

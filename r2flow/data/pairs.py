@@ -21,6 +21,7 @@ from r2flow.data.loader import Item
 from r2flow.data.shards import Block, PairRecipe, PairStore
 from r2flow.errors import InputError
 from r2flow.generators import Generator
+from r2flow.models import name_of
 
 
 def pair_noise(recipe: PairRecipe, index: int) -> Tensor:
@@ -180,7 +181,12 @@ class PairDataset(Dataset[Item]):
 
 
 def default_folder(checkpoint: Path) -> Path:
-    """Where the pairs of a flow lie unless told otherwise: `pairs` in its run's folder, or beside its file."""
+    """Where the pairs of a flow lie unless told otherwise: `pairs` in its run's folder, or beside its file.
+
+    Those of a model lie in `runs`, for its own folder is that of the package or of the models.
+    """
     if checkpoint.parent.name == "checkpoints":
         return checkpoint.parent.parent / "pairs"
+    if name_of(checkpoint) is not None:
+        return Path("runs", f"{checkpoint.stem}-pairs")
     return checkpoint.with_name(f"{checkpoint.stem}-pairs")

@@ -49,7 +49,7 @@ class ScanRecipe:
     layout: str  # of the data set, or `simulated`
     scans: int
     names: str  # SHA-256 of the names of the scans
-    sensor: dict[str, Any]  # every field of the `Sensor`
+    sensor: dict[str, Any]  # `Sensor.described`
     projection: str  # as in `r2flow.data.sources.Reading`, like the next two
     convention: str
     reflectance_scale: float
@@ -57,10 +57,15 @@ class ScanRecipe:
     ranges: dict[str, float]  # the numbers of the formula in `r2flow.data.quantise.RangeCodes`
     shard_scans: int  # scans of the data set a shard; it holds fewer where some were left out
     seed: int | None = None  # of simulated scans
+    columns: tuple[str, ...] | None = None  # of files that do not name them
+
+    def describe(self) -> dict[str, Any]:
+        """All of it as plain values; `columns` only where they were named."""
+        return {key: value for key, value in asdict(self).items() if key != "columns" or value is not None}
 
     @property
     def digest(self) -> str:
-        return checksum(asdict(self))
+        return checksum(self.describe())
 
     @property
     def image_shape(self) -> tuple[int, int]:
@@ -127,8 +132,8 @@ def checksum(content: Any) -> str:
 
 
 def describe_sensor(sensor: Sensor) -> dict[str, Any]:
-    """Every field of a sensor, as JSON gives them back."""
-    fields: dict[str, Any] = json.loads(json.dumps(asdict(sensor)))
+    """What a sensor's images depend on, as JSON gives it back."""
+    fields: dict[str, Any] = json.loads(json.dumps(sensor.described()))
     return fields
 
 
@@ -141,7 +146,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     content = {
         "format": FORMAT,
         "made by": f"r2flow {r2flow.__version__}",
-        "recipe": asdict(manifest.recipe),
+        "recipe": manifest.recipe.describe(),
         "left_out": [name for number, name in enumerate(manifest.names) if number in manifest.left_out],
         "shards": [asdict(shard) for shard in manifest.shards] or None,
         "drives": drives,
@@ -326,6 +331,9 @@ class PreparedScans(ScanSource):
     @cached_property
     def _digest(self) -> str:
         return hashlib.sha256((self.folder / MANIFEST).read_bytes()).hexdigest()
+
+    def files(self) -> dict[str, str | Path]:
+        return {MANIFEST: self.folder / MANIFEST}  # which holds the checksums of all shards
 
     def places(self) -> set[str]:
         real = os.path.realpath(self.folder)

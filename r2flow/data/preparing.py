@@ -8,7 +8,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,11 +35,20 @@ from r2flow.data.prepared import (
     write_manifest,
 )
 from r2flow.data.quantise import OTHER_LEVELS, RangeCodes, ReflectanceCodes, find_levels
-from r2flow.data.sources import Reading, ScanFiles, ScanSource, SimulatedScans, spread, stored_reflectance
+from r2flow.data.sources import (
+    Reading,
+    ScanFiles,
+    ScanSource,
+    SimulatedScans,
+    spread,
+    stored_reflectance,
+    warn_of_other_sensor,
+)
 from r2flow.data.store import MANIFEST, clear_leftovers, refuse_other, shard_bytes, warn_damaged
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.lidar.sensors import Sensor
+from r2flow.signals import end_with_parent
 
 log = logging.getLogger(__name__)
 
@@ -70,6 +79,7 @@ def plan_files(
     reflectance_scale: float = 1.0,
     levels: int | None = None,
     shard_scans: int = SHARD_SCANS,
+    columns: tuple[str, ...] | None = None,
 ) -> Plan:
     """The scans of a data set (`find_drives`). Without `levels`, some of the scans tell those of reflectance.
 
@@ -80,8 +90,10 @@ def plan_files(
     found = find_drives(layout, root, split, drives)
     paths = [path for drive in found for path in drive.scans]
     named = tuple(Drive(d.name, tuple(Path(os.path.relpath(p, root)).as_posix() for p in d.scans)) for d in found)
-    known = _reflectance_levels(paths, reflectance_scale, levels)
-    reading = Reading(sensor, projection, convention, reflectance_scale, known is not None, "error", within_limits=True)  # type: ignore[arg-type]
+    reading = Reading(sensor, projection, convention, reflectance_scale, "auto", "error", True, columns)  # type: ignore[arg-type]
+    warn_of_other_sensor(paths, reading, root)
+    known = _reflectance_levels(paths, reading, levels)
+    reading = replace(reading, reflectance=known is not None)
     return _plan(layout, named, ScanFiles(paths, reading), reading, known, shard_scans, PROJECTION)
 
 
@@ -105,17 +117,17 @@ def _plan(
     recipe = ScanRecipe(
         revision, layout, len(names), checksum(names), describe_sensor(reading.sensor), reading.projection,
         reading.convention, reading.reflectance_scale or 1.0, levels,
-        RangeCodes(reading.sensor.min_range, reading.sensor.max_range).describe(), shard_scans, seed,
+        RangeCodes(reading.sensor.min_range, reading.sensor.max_range).describe(), shard_scans, seed, reading.columns,
     )  # fmt: skip
     return Plan(recipe, drives, source)
 
 
-def _reflectance_levels(paths: Sequence[str], scale: float, levels: int | None) -> int | None:
+def _reflectance_levels(paths: Sequence[str], reading: Reading, levels: int | None) -> int | None:
     """Levels of reflectance, `levels` where given; None where one of some scans has none, or all have 0 throughout."""
-    found = []
+    found, scale = [], reading.reflectance_scale or 1.0
     for index in spread(len(paths), PROBED):
         with suppress(InputError):  # it is met again, and dealt with, when its turn comes
-            reflectance = stored_reflectance(paths[index])
+            reflectance = stored_reflectance(paths[index], reading.columns)
             if reflectance is None:
                 return None
             found.append(reflectance / np.float32(scale))
@@ -232,7 +244,7 @@ class Preparation:
         """Make what no other process is making; what is there then is `left` no more."""
         loader = DataLoader(
             CodedScans(self.plan.source, self.recipe), sampler=self._claimed(left, claims, advance), batch_size=None,
-            num_workers=workers, collate_fn=_as_it_is,
+            num_workers=workers, collate_fn=_as_it_is, worker_init_fn=end_with_parent,
         )  # fmt: skip
         scans: list[Coded] = []
         left_out: list[int] = []
@@ -304,7 +316,7 @@ class Preparation:
     def _look(self) -> None:
         """Read the manifest again: another process may have finished it."""
         manifest = read_manifest(self.folder)
-        refuse_other(self.folder, "scans", asdict(manifest.recipe), asdict(self.recipe), "--out FOLDER")
+        refuse_other(self.folder, "scans", manifest.recipe.describe(), self.recipe.describe(), "--out FOLDER")
         self.finished = manifest.shards
 
     def _note(self, shard: int) -> Path:

@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader, Dataset
 from r2flow.data.sources import ScanSource, spread
 from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator
+from r2flow.signals import end_with_parent
 
 
 class ScanSet:
@@ -75,7 +76,10 @@ class ScanSet:
         # Processes cost seconds to start; and what is drawn is drawn where the network is.
         alone = self.source.drawn or len(chunks) < 8
         workers = 0 if alone else workers
-        return iter(DataLoader(_Batches(self.source), batch_size=None, sampler=chunks, num_workers=workers))
+        loader = DataLoader(
+            _Batches(self.source), batch_size=None, sampler=chunks, num_workers=workers, worker_init_fn=end_with_parent
+        )
+        return iter(loader)
 
 
 class _Batches(Dataset[Tensor]):

@@ -7,10 +7,11 @@ import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -20,13 +21,18 @@ from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.labels import labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, project, project_indices
-from r2flow.lidar.scan_files import NoPointsError, Points, read_points
+from r2flow.lidar.recognition import other_sensor
+from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
 from r2flow.lidar.scan_files.points import FARTHEST
 from r2flow.lidar.sensors import Sensor
+
+if TYPE_CHECKING:
+    from r2flow.simulator.folder import SimulatedFolder
 
 log = logging.getLogger(__name__)
 
 AUTO = "auto"
+LOOKED_AT = 3  # scans of a set, whose beams are compared with the sensor's
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,7 @@ class Reading:
             generator that makes such scans is judged by them.
         within_limits: Whether a range beyond the sensor's limits in a range image is a dropped ray, as it is in a file
             of points: what a model is given.
+        columns: What the columns of files without names hold, as in `r2flow.lidar.scan_files.read_points`.
     """
 
     sensor: Sensor
@@ -53,6 +60,7 @@ class Reading:
     reflectance: bool | str = AUTO
     on_bad_scan: str = "empty"
     within_limits: bool = False
+    columns: tuple[str, ...] | None = None
 
 
 class ScanSource(ABC):
@@ -106,6 +114,10 @@ class ScanSource(ABC):
         """Where the scans lie, by which two sources are known to share some; empty where they lie nowhere."""
         return set()
 
+    def files(self) -> dict[str, str | Path]:
+        """The files that decide what the images are, by names that do not depend on where they lie."""
+        return {}
+
 
 def read_scan(
     path: str | Path,
@@ -114,6 +126,7 @@ def read_scan(
     convention: Convention = "centre",
     reflectance: bool = True,
     reflectance_scale: float | None = 1.0,
+    columns: Sequence[str] | None = None,
 ) -> np.ndarray:
     """One scan file as a range image, (2, H, W); without `reflectance`, (1, H, W). The options are those of `Reading`.
 
@@ -121,7 +134,7 @@ def read_scan(
         InputError: the file cannot be read, no point of it lies in the sensor's view and range (`NoPointsError`), or it
             has no reflectance, or one beyond the scale, where it is needed.
     """
-    points = read_points(path)
+    points = read_points(path, columns)
     if points.dropped:
         log.warning(
             "%s: dropped %d points with NaN or infinite coordinates, or %g m and more away",
@@ -151,7 +164,7 @@ def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tupl
     file = labels_beside(path)
     if file is None:
         return image, None
-    points = read_points(path)
+    points = read_points(path, options.get("columns"))
     projection, convention = options.get("projection", "spherical"), options.get("convention", "centre")
     pixels, chosen, _ = project_indices(points.xyz, sensor, projection, convention, points.ring)
     labels = np.zeros(math.prod(sensor.shape), dtype=np.uint16)
@@ -162,7 +175,8 @@ def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tupl
 def _no_reflectance(path: str | Path) -> InputError:
     return InputError(
         f"{path} has no reflectance and the config, the model or the first scan of its set has it. For range alone "
-        "give encoding.reflectance=false in training (auto lets the scans decide), metrics of range in measuring."
+        "give encoding.reflectance=false in training (auto lets the scans decide; a run with stage.init is as its "
+        "parent), metrics of range in measuring."
     )
 
 
@@ -184,23 +198,16 @@ def _scaled_reflectance(path: str | Path, points: Points, scale: float | None) -
 
 
 def range_image(path: Path, shape: tuple[int, int] | None = None) -> np.ndarray | None:
-    """The range image in a .npy of shape (2 or 1, H, W), what is not finite as 0; None where the file is another.
+    """The range image in a file, `read_range_image`; None where the file holds no range image.
 
     Raises:
-        InputError: its size is not the (H, W) of `shape`.
+        InputError: the file cannot be read, or its size is not the (H, W) of `shape`.
     """
-    if path.suffix.lower() != ".npy":
-        return None
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError):
-        return None  # the reader of points explains what is wrong with it
-    if array.ndim != 3 or array.shape[0] not in (1, 2) or array.dtype.kind != "f":
-        return None
-    if shape is not None and array.shape[1:] != shape:
+    array = read_range_image(path)
+    if array is not None and shape is not None and array.shape[1:] != shape:
         found, wanted = ("x".join(map(str, one)) for one in (array.shape[1:], shape))
         raise InputError(f"{path} is a range image of {found}, the sensor's is {wanted}; give --size {found}.")
-    return np.nan_to_num(array.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    return array
 
 
 def read_image(path: Path, reading: Reading) -> np.ndarray:
@@ -213,7 +220,13 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     sensor, channels = reading.sensor, 1 + bool(reading.reflectance)
     image = range_image(path, sensor.shape)
     if image is None:
-        how = (reading.projection, reading.convention, bool(reading.reflectance), reading.reflectance_scale)
+        how = (
+            reading.projection,
+            reading.convention,
+            bool(reading.reflectance),
+            reading.reflectance_scale,
+            reading.columns,
+        )
         try:
             return read_scan(path, sensor, *how)
         except NoPointsError:
@@ -230,7 +243,9 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     return image
 
 
-def lacks_reflectance(paths: Iterable[str | Path], on_bad_scan: str = "error") -> str | None:
+def lacks_reflectance(
+    paths: Iterable[str | Path], on_bad_scan: str = "error", columns: Sequence[str] | None = None
+) -> str | None:
     """Why scan files count as files without reflectance; None where they have it.
 
     The one rule, for training, measuring and pictures: the first scan that has a return decides, and reflectance that
@@ -242,7 +257,7 @@ def lacks_reflectance(paths: Iterable[str | Path], on_bad_scan: str = "error") -
     """
     for path in paths:
         try:
-            found = stored_reflectance(path)
+            found = stored_reflectance(path, columns)
         except InputError as error:
             if on_bad_scan == "error" or (on_bad_scan == "empty" and not isinstance(error, NoPointsError)):
                 raise
@@ -254,11 +269,39 @@ def lacks_reflectance(paths: Iterable[str | Path], on_bad_scan: str = "error") -
     return "no scan has a return"
 
 
-def stored_reflectance(path: str | Path) -> np.ndarray | None:
+def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> None:
+    """Say in one line that scan files do not look like a sensor's, and which sensor they fit (`other_sensor`).
+
+    Range images have no beams, and files that cannot be read are met again when their turn comes.
+
+    Raises:
+        InputError: the scans are for a model (`reading.within_limits`), and those of no spinning LiDAR.
+    """
+    scans, sensor = [], reading.sensor
+    for number in spread(len(paths), LOOKED_AT):
+        with suppress(InputError):
+            scans.append(read_points(paths[number], reading.columns))
+    found = other_sensor(scans, sensor) if scans else None
+    if found is None:
+        return
+    seen, name, hopeless = found
+    if hopeless and reading.within_limits:
+        raise InputError(f"{root}: {seen}.")
+    edges = sensor.row_edges
+    advice = f"give the right one, or estimate it: r2flow sensor {root} --out mine.yaml"
+    if name is not None and name != sensor.name:
+        advice = f"they fit '{name}': sensor={name} in training, --sensor {name} in verbs"
+    log.warning(
+        "%s: the scans do not look like those of sensor '%s', which sees %+.1f to %+.1f degrees: %s; %s",
+        root, sensor.name, edges[0], edges[-1], seen, advice,
+    )  # fmt: skip
+
+
+def stored_reflectance(path: str | Path, columns: Sequence[str] | None = None) -> np.ndarray | None:
     """The reflectance of all returns of a scan file or a range image, as it is stored; None where there is none."""
     image = range_image(Path(path))
     if image is None:
-        return read_points(path).reflectance
+        return read_points(path, columns).reflectance
     return image[1][image[0] > 0] if len(image) > 1 else None
 
 
@@ -293,18 +336,25 @@ class ScanFiles(ScanSource):
     def subset(self, indices: Sequence[int]) -> "ScanFiles":
         return ScanFiles([self.paths[i] for i in indices], self.reading, self.root, about=self.described)
 
+    def files(self) -> dict[str, str | Path]:
+        return dict(zip(self.names, self.paths, strict=True))
+
     def about(self) -> dict[str, Any]:
         return {**self.described, "files": self._digest[:12], "reflectance": bool(self.reading.reflectance)}
 
     def identity(self) -> dict[str, Any]:
-        return {"files": self._digest, **asdict(self.reading)}
+        return {"files": self._digest, **asdict(self.reading), "sensor": self.reading.sensor.described()}
 
     @cached_property
     def _digest(self) -> str:
         found = [(name, os.stat(path)) for name, path in zip(self.names, self.paths, strict=True)]
         stats = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in found]
         # Some contents, too: unpacked archives have equal names, sizes and times.
-        some = [hashlib.sha256(Path(self.paths[i]).read_bytes()).hexdigest() for i in spread(len(self.paths), 8)]
+        some = []
+        for i in spread(len(self.paths), 8):
+            if os.path.isfile(self.paths[i]):  # a pipe would hang, a device never end
+                with open(self.paths[i], "rb") as file:
+                    some.append(hashlib.file_digest(file, "sha256").hexdigest())
         return hashlib.sha256(json.dumps([stats, some]).encode()).hexdigest()
 
     def places(self) -> set[str]:
@@ -329,19 +379,44 @@ class ScanFiles(ScanSource):
 
 
 class SimulatedScans(ScanSource):
-    """Scenes of the simulator under one seed, by their numbers."""
+    """Scenes of the simulator under one seed, by their numbers.
 
-    slow = True
+    Args:
+        folder: Where they are kept, as `r2flow simulate --format npy` does: each is made when it is asked for first.
 
-    def __init__(self, sensor: Sensor, seed: int, scenes: Sequence[int], reflectance: bool = True) -> None:
-        self.sensor, self.seed, self.scenes, self.reflectance = sensor, seed, scenes, reflectance
+    Raises:
+        InputError: the folder holds scans of another sensor, seed or revision of the simulator.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        seed: int,
+        scenes: Sequence[int],
+        reflectance: bool = True,
+        folder: str | Path | None = None,
+    ) -> None:
+        self.sensor, self.seed, self.scenes, self.reflectance, self.folder = sensor, seed, scenes, reflectance, folder
+        if self._kept is not None:
+            self._kept.check()
+
+    @property
+    def slow(self) -> bool:  # type: ignore[override]
+        return self.folder is None
+
+    @cached_property
+    def _kept(self) -> "SimulatedFolder | None":
+        from r2flow.simulator.folder import SimulatedFolder
+
+        return None if self.folder is None else SimulatedFolder(Path(self.folder), self.sensor, self.seed, ("npy",))
 
     @property
     def names(self) -> list[str]:
         return [f"scene {scene}" for scene in self.scenes]
 
     def subset(self, indices: Sequence[int]) -> "SimulatedScans":
-        return SimulatedScans(self.sensor, self.seed, [self.scenes[i] for i in indices], self.reflectance)
+        scenes = [self.scenes[i] for i in indices]
+        return SimulatedScans(self.sensor, self.seed, scenes, self.reflectance, self.folder)
 
     def about(self) -> dict[str, Any]:
         return {"kind": "simulated", "seed": self.seed, "scenes": len(self), "reflectance": self.reflectance}
@@ -350,7 +425,7 @@ class SimulatedScans(ScanSource):
         from r2flow import simulator
 
         numbers = hashlib.sha256(np.asarray(self.scenes, dtype=np.int64).tobytes()).hexdigest()[:16]
-        return {**self.about(), "numbers": numbers, "simulator": simulator.REVISION, "sensor": asdict(self.sensor)}
+        return {**self.about(), "numbers": numbers, "simulator": simulator.REVISION, "sensor": self.sensor.described()}
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -358,7 +433,17 @@ class SimulatedScans(ScanSource):
     def __getitem__(self, index: int) -> np.ndarray:
         from r2flow.simulator import simulate
 
-        return simulate(self.sensor, self.seed, self.scenes[index]).image[: 1 + self.reflectance]
+        scene, channels = self.scenes[index], 1 + self.reflectance
+        if self._kept is None:
+            return simulate(self.sensor, self.seed, scene).image[:channels]
+        if self._kept.missing([scene]):
+            self._kept.begin()
+            self._kept.write(scene)
+        (path,) = self._kept.files(scene)
+        image = range_image(path, self.sensor.shape)
+        if image is None:
+            raise InputError(f"{path} is damaged; remove it, and it is made again.")
+        return image[:channels]
 
 
 class InMemory(ScanSource):

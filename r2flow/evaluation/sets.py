@@ -12,6 +12,7 @@ from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.data.sources import Reading, ScanSource
 from r2flow.errors import InputError
 from r2flow.generators import Sampler
+from r2flow.models import MODELS
 from r2flow.sampling import draw
 
 __all__ = ["SampledScans", "ScanSet", "fixed_choice", "is_checkpoint", "reading_of_flow", "sampled_set"]
@@ -20,11 +21,11 @@ CHECKPOINTS = (".ckpt", ".pth", ".safetensors")
 
 
 def is_checkpoint(text: str) -> bool:
-    """Whether a name is that of a flow to sample from: a checkpoint file or a run folder."""
+    """Whether a name is that of a flow to sample from: a checkpoint file, a run folder or a model."""
     path = Path(text).expanduser()
     if path.is_dir():
         return bool(checkpoints_of(path)) or any(path.glob("step-*.ckpt"))
-    return path.suffix in CHECKPOINTS
+    return path.suffix in CHECKPOINTS or (not path.exists() and text in MODELS)
 
 
 def reading_of_flow(flow: Checkpoint) -> Reading:

@@ -2,8 +2,8 @@
 
 All act on states of any shape (B, ...). `Gaussian`, `Anisotropic`, the mixtures and `PointMass` are rectified flows:
 x_0 ~ N(0, 1), x_1 drawn independently of it, v(t, x) = E[x_1 - x_0 | x_t = x]. `Straight` is such a flow reflowed: x_0
-and x_1 are a pair. `Rotating`, `StiffLinear`, `Discontinuous` and `NarrowJet` model no data; each is hard for a solver
-in another way.
+and x_1 are a pair. `Rotating`, `StiffLinear`, `Discontinuous`, `NarrowJet` and `Pulse` model no data; each is hard for
+a solver in another way.
 """
 
 import functools
@@ -224,6 +224,21 @@ class NarrowJet(Problem):
         return x_0 * (-t).exp() + (self.at - t + w**2 / 2).exp() * passed
 
 
+class Pulse(Problem):
+    """x' = 1 / width within width / 2 of `at`, 0 elsewhere, whatever x: it moves all paths by 1."""
+
+    def __init__(self, width: float = 0.2, at: float = 0.45) -> None:
+        self.width, self.at = width, at
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        inside = (expand_time(t, x) - self.at).abs() < self.width / 2
+        return (inside / self.width).to(x.dtype) + torch.zeros_like(x)
+
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        x_0, t = _exact(x_0, t)
+        return x_0 + ((t - self.at) / self.width + 0.5).clamp(0, 1)
+
+
 class Mixed(Problem):
     """A batch in which every scene has a problem of its own; `select` is for solvers whose scenes leave the batch.
 
@@ -290,5 +305,6 @@ PROBLEMS: Registry = Registry(
     stiff_1e6=functools.partial(StiffLinear, rate=1e6),
     discontinuous=Discontinuous,
     narrow_jet=NarrowJet,
+    pulse=Pulse,
     rotating=Rotating,
 )

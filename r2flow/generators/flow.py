@@ -16,10 +16,10 @@ from r2flow.flow.solvers import (
     check_method,
     check_tolerance,
     fixed_step,
-    named_grid,
     solve,
     usual_grid,
 )
+from r2flow.flow.solvers.grids import build_grid
 from r2flow.flow.straight_exit import solve_straight_first
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.lidar.region import Region
@@ -85,9 +85,8 @@ class Flow(Generator):
     def check_sampler(self, sampler: Sampler) -> None:
         check_method(sampler.method)
         check_tolerance(sampler.tolerance)
-        method = fixed_step(sampler.method)
-        if isinstance(sampler.grid, str):
-            named_grid(sampler.grid)
+        grid, method = sampler.grid, fixed_step(sampler.method)
+        build_grid(grid if isinstance(grid, str) else torch.tensor(grid), 0.0, 1.0, sampler.steps)
         if sampler.levels and not (method and method.corrects):
             raise InputError(f"only a predictor-corrector says how many steps a scan needs, not {sampler.method}.")
         if sampler.straight_first and not adapts(sampler.method):
@@ -128,10 +127,25 @@ class RectifiedFlow(Flow):
         return v
 
     def start_from(self, parent: Generator) -> None:
-        """Take over a flow's weights; what a second time adds keeps its own, which change nothing at first."""
-        own = self.backbone.state_dict()
-        new = {f"backbone.{name}": own[name] for name in self.backbone.second_time_names()}
-        self._take(parent, {**new, **parent.state_dict()})
+        """Take over a flow's weights; what a second time adds keeps its own, which change nothing at first.
+
+        A flow that looks elsewhere, as through another sensor, keeps its own rays.
+
+        Raises:
+            InputError: other weights; a network with weights for each place of the image, and another size.
+        """
+        own, theirs = self.state_dict(), parent.state_dict()
+        new = {name: own[name] for name in (f"backbone.{name}" for name in self.backbone.second_time_names())}
+        if not torch.equal(self.space.rays, parent.space.rays):
+            theirs = {**theirs, "backbone.coords": own["backbone.coords"]}
+            sized = [name for name, value in theirs.items() if name in own and value.shape != own[name].shape]
+            if sized:
+                here, there = ("x".join(map(str, one.space.shape)) for one in (self, parent))
+                raise InputError(
+                    f"the network to start from has weights for images of {there} alone ('{sized[0]}'), found {here}: "
+                    "leave sensor out, or start from one that was trained with backbone.position=none."
+                )
+        self._take(parent, {**new, **theirs})
 
     @property
     def unit(self) -> tuple[int, int]:

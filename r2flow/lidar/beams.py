@@ -17,6 +17,11 @@ BIN = 0.005  # degrees
 FAINT = 0.02  # share of the median peak's height below which a peak is no beam
 STABLE = 1.5  # range of bandwidths, as a factor, over which the number of peaks must be constant
 
+SCATTERED = (
+    0.3  # median gap between elevations over their mean gap, above which no beams are there; see `_is_scattered`
+)
+CROWDED = 20  # points of a sector, on average, from which on its gaps tell something
+
 RINGS = "a ring number at each point"
 FIRINGS = "firing after firing, rays without return kept"
 RING_AFTER_RING = "ring after ring"
@@ -49,10 +54,15 @@ class Beams:
     of_point: list[np.ndarray]
 
 
+class NoBeamsError(InputError):
+    """Scans of a sensor without beams."""
+
+
 def find_beams(scans: Sequence[Points]) -> Beams:
     """The beams by ring numbers, else by the order of the points, else by their elevations alone.
 
     Raises:
+        NoBeamsError: the points lie on no beams at all.
         InputError: no beams can be told apart.
     """
     elevations = [elevations_of(scan.xyz) for scan in scans]
@@ -67,12 +77,34 @@ def find_beams(scans: Sequence[Points]) -> Beams:
         # A ring with few returns may be taken as part of the next; exact elevations separate the two.
         return peaks if peaks is not None and len(peaks.counts) > len(by_ring.counts) else by_ring
     found = _by_elevation(elevations, LOSSY_FIRINGS if _is_swept(scans) else UNORDERED)
+    if found is None and all(map(_is_scattered, scans)):
+        raise NoBeamsError(
+            "their points lie on no beams, as those of a Livox or another scanner whose pattern does not repeat, or of "
+            "several scans in one file: they are no rows of a range image, which a spinning LiDAR makes"
+        )
     if found is None:
         raise InputError(
             "the beams cannot be told apart: the files have no ring numbers, the points are in no known order, and "
             "their elevations form no peaks. Are they scans of one sensor, in its own frame? If so, use a built-in one."
         )
     return found
+
+
+def _is_scattered(scan: Points) -> bool:
+    """Whether elevations are spread evenly within sectors of one degree of azimuth.
+
+    Points on beams leave many small gaps between sorted elevations and a few wide ones: the median gap is a small part
+    of the mean (0.06 and less in real scans, whatever their order). Points that were drawn at random have ln 2 of it,
+    and patterns of scanners without beams 0.4 and more.
+    """
+    elevation = elevations_of(scan.xyz)
+    seen = np.isfinite(elevation)
+    elevation, sector = elevation[seen], np.degrees(np.arctan2(scan.xyz[seen, 1], scan.xyz[seen, 0])).astype(np.int64)
+    if len(elevation) < CROWDED * max(len(np.unique(sector)), 1):
+        return False
+    order = np.lexsort((elevation, sector))
+    gaps = np.diff(elevation[order])[np.diff(sector[order]) == 0]
+    return bool(np.median(gaps) > SCATTERED * gaps.mean())
 
 
 def _by_laser(elevations: list[np.ndarray], lasers: list[np.ndarray], order: str) -> Beams:

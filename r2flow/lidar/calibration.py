@@ -74,6 +74,7 @@ class Estimate:
             float(math.ceil(far)),
             Sensor.height if self.height is None else round(self.height, 2),
             self.beams.firing,
+            None if self.reflectance is None else self.reflectance.scale,
         )
 
     def nearest_known(self) -> tuple[str, float] | None:

@@ -64,6 +64,8 @@ def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
         f"max_range: {sensor.max_range}",
         f"height: {sensor.height} # above the ground",
     ]
+    if sensor.reflectance_scale is not None:
+        lines.append(f"reflectance_scale: {sensor.reflectance_scale} # in its files it means full reflectance")
     if sensor.firing is not None:
         lines += _listed("firing", sensor.firing, "row of laser 0, 1, ... in the order of the files")
     with atomic_write(path, "w") as file:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import chain, pairwise
 from types import UnionType
 from typing import Any, Literal
@@ -32,11 +32,12 @@ class Sensor:
         height: Usual height of the sensor above the ground in metres.
         firing: Row of laser 0, 1, ... in the order of the sensor's packets, which scan unfolding needs; None where that
             is from the top row down or from the bottom up.
+        reflectance_scale: The value in its scan files that means full reflectance; None where they do not say.
 
     Raises:
         InputError: fewer than two rows or one column, more than `MOST_PIXELS`, elevations that do not fall or leave
-            (-90, 90) degrees, range limits that are not 0 < min_range < max_range, a height that is not finite,
-            or a firing order that does not name every row once.
+            (-90, 90) degrees, range limits that are not 0 < min_range < max_range, a height that is not positive,
+            a firing order that does not name every row once, or a scale of reflectance that is not positive.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Sensor:
     max_range: float = 80.0
     height: float = 1.73
     firing: tuple[int, ...] | None = None
+    reflectance_scale: float | None = None
 
     def __post_init__(self) -> None:
         e = self.elevations
@@ -66,13 +68,21 @@ class Sensor:
                 f"sensor {self.name!r}: needs 0 < min_range < max_range, "
                 f"found {self.min_range} and {self.max_range} metres."
             )
-        if not math.isfinite(self.height):
-            raise InputError(f"sensor {self.name!r}: height must be in metres, found {self.height}.")
+        if not 0 < self.height < math.inf:
+            raise InputError(f"sensor {self.name!r}: height must be metres above the ground, found {self.height}.")
         if self.firing is not None and sorted(self.firing) != list(range(len(e))):
             raise InputError(
                 f"sensor {self.name!r}: firing must name each of the rows 0 to {len(e) - 1} once, one for each laser; "
                 f"found {len(self.firing)} of them, {list(self.firing)[:4]}..."
             )
+        if self.reflectance_scale is not None and not 0 < self.reflectance_scale < math.inf:
+            raise InputError(
+                f"sensor {self.name!r}: reflectance_scale must be a positive number, found {self.reflectance_scale}."
+            )
+
+    def described(self) -> dict[str, Any]:
+        """What its images depend on, as plain values: all fields but the scale of the files' reflectance."""
+        return {key: value for key, value in asdict(self).items() if key != "reflectance_scale"}
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -210,6 +220,7 @@ def build_sensor(
     height: float | None = None,
     elevations: Sequence[float] | None = None,
     firing: Sequence[int] | None = None,
+    reflectance_scale: float | None = None,
 ) -> Sensor:
     """A built-in sensor by its name, or your own by `elevations`, with the size and limits that are given.
 
@@ -224,7 +235,7 @@ def build_sensor(
         sensor = Sensor(name, tuple(map(float, _numbers(name, "elevations", elevations, int | float))))
     if firing is not None:
         sensor = replace(sensor, firing=_numbers(name, "firing", firing, int))
-    limits = {"min_range": min_range, "max_range": max_range, "height": height}
+    limits = {"min_range": min_range, "max_range": max_range, "height": height, "reflectance_scale": reflectance_scale}
     given = {key: float(value) for key, value in limits.items() if value is not None}
     return replace(sensor.resized(rows, columns), **given)  # type: ignore[arg-type]
 

@@ -3,8 +3,9 @@
 import os
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -21,22 +22,22 @@ class FeatureStore:
     Several processes may write, each its own rows, into one folder of a shared file system; what is read does not
     depend on which process wrote a row, nor when. Rows that are not finite are left out.
 
-    In a folder the files stay, and copies of the store share them. Without one they lie in a temporary folder that goes
-    with the store, and a copy of the store copies them.
+    In a folder the files stay, and copies of the store share them. Without one they are temporary files without a name,
+    which go with the process, however it ends, and a copy of the store copies them.
     """
 
     def __init__(self, name: str, folder: str | Path | None = None) -> None:
         self.name = name
         self.folder = None if folder is None else Path(folder)
-        self._temporary: tempfile.TemporaryDirectory[str] | None = None
+        self._nameless: dict[str, IO[bytes]] = {}
         self._round = 0
 
     def write(self, first: int, rows: Tensor) -> None:
         """Keep rows (B, D) of the scans `first`, `first + 1`, ...; a row written again is replaced."""
         table = np.ascontiguousarray(rows.detach().cpu().numpy(), dtype=np.float32)
         flags = np.where(np.isfinite(table).all(1), KEPT, LEFT_OUT).astype(np.uint8)
-        _write(self._path("rows"), first * table.shape[1] * 4, table.tobytes())
-        _write(self._path("flags"), first, flags.tobytes())
+        self._write("rows", first * table.shape[1] * 4, table.tobytes())
+        self._write("flags", first, flags.tobytes())
 
     def __len__(self) -> int:
         """Rows that are kept."""
@@ -62,49 +63,62 @@ class FeatureStore:
         process may still be reading them.
         """
         self._round += 1
-        gone = self._round - (1 if self.folder is None else 2)
-        for kind in ("rows", "flags"):
-            self._path(kind, gone).unlink(missing_ok=True)
+        self._nameless.clear()
+        if self.folder is not None:
+            for kind in ("rows", "flags"):
+                self._path(kind, self._round - 2).unlink(missing_ok=True)
 
-    def _path(self, kind: str, number: int | None = None) -> Path:
-        if self.folder is None and self._temporary is None:
-            self._temporary = tempfile.TemporaryDirectory(prefix="r2flow-features-")
-        folder = Path(self._temporary.name) if self._temporary else self.folder
-        assert folder is not None
-        folder.mkdir(parents=True, exist_ok=True)
-        return folder / f"{self.name}-{self._round if number is None else number}.{kind}"
+    def _path(self, kind: str, number: int) -> Path:
+        assert self.folder is not None
+        return self.folder / f"{self.name}-{number}.{kind}"
+
+    @contextmanager
+    def _opened(self, kind: str) -> Iterator[IO[bytes]]:
+        """A file of this round, to be read and written."""
+        if self.folder is None:
+            if kind not in self._nameless:
+                self._nameless[kind] = tempfile.TemporaryFile()  # noqa: SIM115 (it lives as long as the store)
+            yield self._nameless[kind]
+            self._nameless[kind].flush()
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        # Never truncated, never locked: other processes write other parts of it at the same time.
+        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
+        with os.fdopen(os.open(self._path(kind, self._round), flags, 0o666), "r+b") as file:
+            yield file
+
+    def _write(self, kind: str, offset: int, content: bytes) -> None:
+        try:
+            with self._opened(kind) as file:
+                file.seek(offset)
+                file.write(content)
+        except OSError as error:
+            raise InputError(
+                f"the rows of single scans cannot be written to {self.folder or tempfile.gettempdir()}: "
+                f"{error.strerror or error}; set TMPDIR to a folder with more room, or measure fewer scans."
+            ) from None
 
     def _table(self) -> tuple[np.ndarray, np.ndarray]:
         """Numbers of the kept rows, and all rows."""
-        flags, rows = self._path("flags"), self._path("rows")
-        if not flags.exists() or not flags.stat().st_size:
+        with self._opened("flags") as file:
+            file.seek(0)
+            kept = np.frombuffer(file.read(), dtype=np.uint8) == KEPT
+        if not len(kept):
             return np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
-        kept = np.fromfile(flags, dtype=np.uint8) == KEPT
-        # Copy on write: the tensors that torch makes of it may be written to, the file may not.
-        table = np.memmap(rows, np.float32, "c", shape=(len(kept), rows.stat().st_size // (4 * len(kept))))
-        return np.flatnonzero(kept), table
+        with self._opened("rows") as file:
+            width = file.seek(0, os.SEEK_END) // (4 * len(kept))
+            # Copy on write: the tensors that torch makes of it may be written to, the file may not.
+            return np.flatnonzero(kept), np.memmap(file, np.float32, "c", shape=(len(kept), width))
 
     def __getstate__(self) -> dict[str, Any]:
-        paths = {kind: self._path(kind) for kind in ("rows", "flags")} if self._temporary else {}
-        files = {kind: path.read_bytes() for kind, path in paths.items() if path.exists()}
+        files = {}
+        for kind, file in self._nameless.items():
+            file.seek(0)
+            files[kind] = file.read()
         return {"name": self.name, "folder": self.folder, "round": self._round, "files": files}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(state["name"], state["folder"])  # type: ignore[misc]
         self._round = state["round"]
         for kind, content in state["files"].items():
-            self._path(kind).write_bytes(content)
-
-
-def _write(path: Path, offset: int, content: bytes) -> None:
-    try:
-        # Never truncated, never locked: other processes write other parts of it at the same time.
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
-        with os.fdopen(descriptor, "r+b") as file:
-            file.seek(offset)
-            file.write(content)
-    except OSError as error:
-        raise InputError(
-            f"the rows of single scans cannot be written to {path.parent}: {error.strerror or error}; "
-            "set TMPDIR to a folder with more room, or measure fewer scans."
-        ) from None
+            self._write(kind, 0, content)

@@ -1,21 +1,27 @@
 """What is in a checkpoint, for a reader and as JSON."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from r2flow.backbones import Backbone
 from r2flow.checkpoints import load_checkpoint
 from r2flow.config import flatten
-from r2flow.reports.tables import print_table
+from r2flow.models import MODELS, name_of
+from r2flow.reports.tables import print_table, table
 
 
 def describe(path: str | Path) -> dict[str, Any]:
     """Generator, parameters, sensor, encoding, step and config of a checkpoint file or run folder."""
     loaded = load_checkpoint(path)
     rows, columns = loaded.sensor.shape
+    model = name_of(loaded.path)
+    known = {"model": model, "draws": MODELS[model].about, "licence": MODELS[model].licence} if model else {}
     with_backbone = any(isinstance(module, Backbone) for module in loaded.generator.modules())
     return {
+        **known,
         "path": str(loaded.path),
+        "bytes": loaded.path.stat().st_size,
         "format": loaded.format,
         "step": loaded.step,
         "stage": loaded.config.get("stage", {}).get("name", "unknown"),
@@ -29,6 +35,36 @@ def describe(path: str | Path) -> dict[str, Any]:
         "sampler": loaded.generator.sampler.asdict(),
         "config": loaded.config,
     }
+
+
+def card(contents: dict[str, Any]) -> str:
+    """What the file of a model says of itself: the table of its model card."""
+    config, sampler = contents["config"], contents["sampler"]
+    data, stage, parent = config["data"], config.get("stage") or {}, config.get("parent")
+    learned_from = [data["name"], config.get("scans"), *_said(data.get("augment") or {})]
+    steps, batch_size = contents["step"], data.get("batch_size")
+    seen = f" of {batch_size} images, {steps * batch_size:,} images" if batch_size else ""
+    facts = {
+        "draws": contents.get("draws"),
+        "image": f"{' x '.join(map(str, contents['image']))}, {' to '.join(map(str, contents['range_m']))} m",
+        "sensor": contents["sensor"],
+        "network": f"{contents['backbone'] or contents['generator']}, {contents['parameters']:,} parameters",
+        "file": f"{contents['bytes'] / 1e6:.1f} MB",
+        "drawn with": f"{sampler['method']}, {sampler['steps']} steps",
+        "learned from": ", ".join(filter(None, learned_from)),
+        "stage": ", ".join([contents["stage"], *_said({key: stage.get(key) for key in ("loss", "time")})]),
+        "starts from": parent and f"a {parent['stage']} flow of {parent['step']:,} steps, weights {parent['weights']}",
+        "budget": f"{steps:,} steps{seen}",
+        "seed": config.get("seed"),
+        "licence": contents.get("licence"),
+    }
+    return table([(key, value) for key, value in facts.items() if value is not None], ("", ""))
+
+
+def _said(options: Mapping[str, Any]) -> list[str]:
+    """Options that are given, in words."""
+    return [f"{key} {' '.join(map(str, value.values())) if isinstance(value, Mapping) else value}"
+            for key, value in options.items() if value]  # fmt: skip
 
 
 def print_contents(contents: dict[str, Any]) -> None:

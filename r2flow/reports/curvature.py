@@ -162,7 +162,7 @@ def curvature_text(flows: Sequence[Paths]) -> list[str]:
 def curvature_figure(flows: Sequence[Paths]) -> Figure:
     """s(t), as it is and over |d|^2, every checkpoint a line with the range over its scans."""
     figure = blank_figure(10, 4.2)
-    panels = {"s": r"$s(t) = \|(x_1 - x_0) - v_t\|^2$", "s_normalised": r"$s(t)\ /\ \|x_1 - x_0\|^2$"}
+    panels = {"s": "s(t) = |(x_1 - x_0) - v_t|²", "s_normalised": "s(t) / |x_1 - x_0|²"}
     for axes, (name, label) in zip(figure.subplots(1, 2), panels.items(), strict=True):
         for index, flow in enumerate(flows):
             style, found = STYLES[index % len(STYLES)], getattr(flow, name)

@@ -20,8 +20,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 import r2flow
-from r2flow.errors import InputError
+from r2flow.errors import InputError, printable
 from r2flow.files import atomic_write
+from r2flow.reports.pictures import take_names_as_they_are
 from r2flow.reports.tables import Row
 
 # Told apart without colour: every line of a figure has a marker and a dash of its own.
@@ -147,12 +148,13 @@ def _write_figure(figure: Figure, path: Path, origin: Mapping[str, Any]) -> Path
 
     canvas = figure.canvas
     assert isinstance(canvas, FigureCanvasAgg)
+    take_names_as_they_are(figure)
     canvas.draw()
     # A palette makes it a third of the size, and figures go into repositories.
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()).quantize(128)
     notes = PngImagePlugin.PngInfo()  # figures travel without their page
     for name, text in (("Title", origin["report"]), ("Source", origin["command"]), ("Description", json.dumps(origin))):
-        notes.add_itxt(name, str(text))
+        notes.add_itxt(name, printable(str(text)))
     with atomic_write(path) as file:
         image.save(file, format="png", optimize=True, pnginfo=notes)
     return path

@@ -10,8 +10,10 @@ from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap, hsv_to_rgb, to_hex, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from torch import Tensor
 
+from r2flow.errors import printable
 from r2flow.files import atomic_write
 from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.projection import image_to_points
@@ -161,9 +163,19 @@ def draw_perspective(axes: Any, xyz: np.ndarray, label: bool = True) -> None:
     _strip(axes, "perspective" if label else "")
 
 
+def take_names_as_they_are(figure: Figure) -> None:
+    """Let texts of which a file's name is part hold any sign: a dollar begins no formula but in the labels of ticks."""
+    for text in figure.findobj(Text):
+        if isinstance(text, Text) and not text.get_text().isascii():
+            text.set_text(printable(text.get_text()))
+        if isinstance(text, Text) and "$" in text.get_text() and not text.get_text().startswith(r"$\mathdefault"):
+            text.set_parse_math(False)
+
+
 def save_figure(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
     """Write a PNG, whole or not at all."""
     path = Path(path)
+    take_names_as_they_are(figure)
     with atomic_write(path) as file:
         figure.savefig(file, format="png", dpi=dpi, facecolor=figure.get_facecolor())
     return path
@@ -171,6 +183,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
 
 def figure_pixels(figure: Figure, dpi: int = 80) -> np.ndarray:
     """The figure as (height, width, 3) uint8."""
+    take_names_as_they_are(figure)
     figure.set_dpi(dpi)
     canvas = figure.canvas
     assert isinstance(canvas, FigureCanvasAgg)

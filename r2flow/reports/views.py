@@ -11,7 +11,7 @@ from torch import Tensor
 from r2flow.data.opening import find_drives, open_scans, own_reading, parse, usual_reading
 from r2flow.data.options import FOLDER
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import range_image, read_labelled_scan, spread
+from r2flow.data.sources import range_image, read_labelled_scan, spread, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Sensor
 
@@ -54,6 +54,7 @@ def views_of(
     projection: str = "spherical",
     reflectance_scale: float | None = None,
     most: int = 16,
+    columns: tuple[str, ...] | None = None,
 ) -> list[View]:
     """At most `most` of the scans that a name stands for (`open_scans`), evenly spread.
 
@@ -62,7 +63,7 @@ def views_of(
 
     Args:
         sensor: Of scans that do not say theirs; None takes the usual one.
-        reflectance_scale: As in `Reading`; None guesses it.
+        columns, reflectance_scale: As in `Reading`; None takes the sensor's, else guesses it.
 
     Raises:
         InputError: nothing is there, or it is not of this sensor.
@@ -71,19 +72,24 @@ def views_of(
     own = own_reading(spec)
     reading = own or replace(usual_reading(spec), projection=projection)  # type: ignore[arg-type]
     sensor = sensor or reading.sensor
-    reading = replace(reading, sensor=sensor, reflectance_scale=reflectance_scale, on_bad_scan="error")
+    if own is None and reflectance_scale is None:
+        reflectance_scale = sensor.reflectance_scale
+    reading = replace(reading, sensor=sensor, reflectance_scale=reflectance_scale, on_bad_scan="error", columns=columns)
     if own is None and options.name == FOLDER:
         loose = scans_of(file or Path(options.folder), most)
+        warn_of_other_sensor(loose, reading, spec)
         return [View(path, open_scans(path, reading, own_size=True), 0) for path in loose]
     scans = open_scans(spec, reading).spread(most)
     return [View(Path(options.folder, name), scans, number) for number, name in enumerate(scans.source.names)]
 
 
-def label_view(path: Path, sensor: Sensor, projection: str = "spherical") -> np.ndarray | None:
+def label_view(
+    path: Path, sensor: Sensor, projection: str = "spherical", columns: tuple[str, ...] | None = None
+) -> np.ndarray | None:
     """The class of each pixel, (H, W); None, with a warning, where the scan has no labels."""
     labels = None
     if path.is_file() and range_image(path) is None:
-        _, labels = read_labelled_scan(path, sensor, projection=projection, reflectance=False)
+        _, labels = read_labelled_scan(path, sensor, projection=projection, reflectance=False, columns=columns)
     if labels is None:
         log.warning("%s: no .label file lies beside it", path)
     return labels

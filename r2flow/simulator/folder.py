@@ -2,23 +2,23 @@
 
 import json
 import multiprocessing
-import os
 import signal
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from r2flow import noise
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, sole_use
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import Sensor
+from r2flow.signals import end_with_parent
 from r2flow.simulator import REVISION, simulate
 
 FORMATS = ("bin", "pcd", "ply", "npy")  # npy is the range image itself
@@ -45,6 +45,7 @@ class SimulatedFolder:
     labels: bool = False
 
     def __post_init__(self) -> None:
+        noise.generator(self.seed, "simulator", 0)  # refuses what is no seed
         for name in self.formats:
             if name not in FORMATS:
                 raise InputError(f"no format named {name!r} for simulated scans; known: {', '.join(FORMATS)}.")
@@ -62,8 +63,8 @@ class SimulatedFolder:
         """Scans of which a file is missing. Files are written whole or not at all."""
         return [index for index in indices if not all(file.is_file() for file in self.files(index))]
 
-    def begin(self) -> None:
-        """Make the folder and note seed, sensor and revision of the simulator in it.
+    def check(self) -> bool:
+        """Whether the folder has been begun.
 
         Raises:
             InputError: it holds scans of another seed, sensor or revision, or scans and no note.
@@ -78,12 +79,21 @@ class SimulatedFolder:
                     f"{self.path} holds simulated scans with {key} {_short(found.get(key))}, not "
                     f"{_short(ours[key])}; choose another folder, or the same {key}."
                 )
-            return
+            return True
         taken = [file for name in FORMATS for file in self.path.glob(f"*.{name}")] if self.path.is_dir() else []
         if taken:
             raise InputError(f"{self.path} holds scans already ({taken[0].name}) and no {MANIFEST}; choose another.")
-        with atomic_write(note, "w") as file:
-            json.dump(ours, file, indent=2)
+        return False
+
+    def begin(self) -> None:
+        """Make the folder and note seed, sensor and revision of the simulator in it.
+
+        Raises:
+            InputError: what `check` refuses.
+        """
+        if not self.check():
+            with atomic_write(self.path / MANIFEST, "w") as file:
+                json.dump(_note(self.sensor, self.seed), file, indent=2)
 
     def write(self, index: int) -> None:
         """Make one scan and write its files."""
@@ -119,6 +129,14 @@ def write_folder(
         InputError: as `SimulatedFolder.begin` does, or a process was killed.
     """
     folder.begin()
+    with sole_use(folder.path / MANIFEST) as alone:
+        if alone:  # what a killed writer has left
+            for leftover in folder.path.glob(".*.part"):
+                leftover.unlink(missing_ok=True)
+        return _write_missing(folder, indices, workers, advance)
+
+
+def _write_missing(folder: SimulatedFolder, indices: Sequence[int], workers: int, advance: Callable[[], None]) -> int:
     missing = folder.missing(indices)
     for _ in range(len(indices) - len(missing)):
         advance()
@@ -146,16 +164,9 @@ def write_folder(
 
 
 def _begin_worker() -> None:
-    """Leave Ctrl-C to the parent process and end when it ends; after a kill the workers would wait for ever."""
+    """Leave Ctrl-C to the parent process and end when it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    end_with_parent()
 
 
 def _write_batch(folder: SimulatedFolder, indices: Sequence[int]) -> int:
@@ -165,7 +176,7 @@ def _write_batch(folder: SimulatedFolder, indices: Sequence[int]) -> int:
 
 
 def _note(sensor: Sensor, seed: int) -> dict[str, Any]:
-    described = json.loads(json.dumps(asdict(sensor)))  # tuples as lists, as they come back
+    described = json.loads(json.dumps(sensor.described()))  # tuples as lists, as they come back
     return {"simulator": REVISION, "seed": seed, "sensor": described}
 
 

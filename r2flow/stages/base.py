@@ -12,6 +12,7 @@ from torch import Tensor
 from r2flow.generators import Generator
 from r2flow.noise import seed_torch
 from r2flow.registry import Count, Natural, NonNegative, Portion
+from r2flow.stages.muon import Muon
 
 Batch = dict[str, Tensor]
 
@@ -31,6 +32,7 @@ class Stage(L.LightningModule):
         learning_rate: AdamW's; warmed up linearly, then a cosine to 0 at the run's last step.
         betas: AdamW's.
         weight_decay: AdamW's.
+        muon: Learning rate of the weight matrices by `Muon`, scheduled as AdamW's; None leaves them to AdamW.
         warmup_images: Images seen during the warm-up.
         batch_size: Images a step, which turns images into steps.
         seed: Run seed.
@@ -49,6 +51,7 @@ class Stage(L.LightningModule):
         learning_rate: NonNegative = 1e-4,
         betas: tuple[Portion, Portion] = (0.9, 0.99),
         weight_decay: NonNegative = 0.0,
+        muon: NonNegative | None = None,
         warmup_images: Natural = 80_000,
         batch_size: Count = 8,
         seed: int = 0,
@@ -56,6 +59,7 @@ class Stage(L.LightningModule):
         super().__init__()
         self.generator = generator
         self.learning_rate, self.betas, self.weight_decay = learning_rate, betas, weight_decay
+        self.muon = muon
         self.warmup_steps = warmup_images // batch_size
         self.seed = seed
         self.config: dict[str, Any] = {}
@@ -75,9 +79,14 @@ class Stage(L.LightningModule):
         return optimizers, [{"scheduler": self.schedule_for(one), "interval": "step"} for one in optimizers]
 
     def optimizer_for(self, parameters: Iterable[torch.nn.Parameter]) -> torch.optim.AdamW:
-        """AdamW with the stage's options."""
-        betas = self.betas[0], self.betas[1]
-        return torch.optim.AdamW(parameters, self.learning_rate, betas, eps=1e-8, weight_decay=self.weight_decay)
+        """AdamW, or `Muon`, with the stage's options."""
+        options: dict[str, Any] = {
+            "lr": self.learning_rate,
+            "betas": (self.betas[0], self.betas[1]),
+            "eps": 1e-8,
+            "weight_decay": self.weight_decay,
+        }
+        return torch.optim.AdamW(parameters, **options) if self.muon is None else Muon(parameters, self.muon, **options)
 
     def schedule_for(self, optimizer: torch.optim.Optimizer) -> torch.optim.lr_scheduler.LambdaLR:
         """`learning_rate_factor` over the run."""

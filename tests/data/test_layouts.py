@@ -102,3 +102,35 @@ def test_the_real_layouts(shared: Path):
     assert sum(len(d.scans) for d in find_drives("folder", real / "other_sensors")) == 6
     assert [len(d.scans) for d in find_drives("object", real / "object", "train")] == [3]
     assert len(find_drives("nuscenes", real / "other_sensors" / "nuscenes_hdl32e")[0].scans) == 1
+
+
+def test_a_split_that_holds_nothing_says_what_there_is_and_how_to_take_it(kitti_360: Path):
+    with pytest.raises(InputError) as caught:
+        find_drives("odometry", odometry_of(kitti_360, "08", "11", "12"), "train")
+    assert str(caught.value).endswith(
+        "holds no scan of its train split; it holds 1 of its validation split (08); 2 of its test split (11, 12): give "
+        "data.split=validation (--split validation), data.split=test (--split test), data.split=null for all."
+    )
+
+
+def odometry_of(folder: Path, *drives: str) -> Path:
+    for drive in drives:
+        write_scan(folder / "odometry" / "sequences" / drive / "velodyne" / "000000.bin", 1)
+    return folder / "odometry"
+
+
+def test_a_folder_of_recordings_says_which_tool_unpacks_them(tmp_path: Path):
+    (tmp_path / "day").mkdir()
+    (tmp_path / "day" / "drive.mcap").write_bytes(b"recorded")
+    with pytest.raises(InputError, match=r"holds no scan\. .*day/drive\.mcap holds many scans: r2flow unpack"):
+        find_drives("folder", tmp_path)
+
+
+def test_notes_beside_scans_are_no_scans(tmp_path: Path):
+    for name in ("notes.txt", "poses.csv", "statistics.npz"):
+        (tmp_path / name).write_text("x,y,z\n1,2,3\n")
+    assert find_drives("folder", tmp_path)[0].scans == tuple(
+        str(tmp_path / name) for name in ("notes.txt", "poses.csv", "statistics.npz")
+    )
+    write_scan(tmp_path / "scans" / "0.bin", 1)
+    assert [d.scans for d in find_drives("folder", tmp_path) if d.scans] == [(str(tmp_path / "scans" / "0.bin"),)]

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.flow.times import TIMES, Discrete, LogitNormal, Uniform, UShaped
+from r2flow.flow.times import TIMES, Discrete, Late, LogitNormal, Uniform, UShaped
 
 N = 400_000
 U = (torch.arange(N, dtype=torch.float64) + 0.5) / N  # every quantile once: no sampling error
@@ -22,6 +22,8 @@ def u_shaped_cdf(t, a=4.0):
         (Uniform(), lambda t: t),
         (UShaped(), u_shaped_cdf),
         (LogitNormal(), lambda t: torch.special.ndtr(torch.logit(t))),
+        (Late(0.3, 2.0, 1.6), lambda t: 0.7 * t + 0.3 * torch.special.ndtr((torch.logit(t) - 2.0) / 1.6)),
+        (Late(0.0), lambda t: t),
     ],
 )
 def test_times_follow_their_distribution(time, cdf):

@@ -260,7 +260,7 @@ def test_writing_over_a_folder_is_an_input_error(tmp_path):
 
 
 def test_the_endings_are_the_longest_first():
-    assert set(SCAN_ENDINGS) == {".bin", ".pcd.bin", ".pcd", ".ply", ".npy"}
+    assert {".bin", ".pcd.bin", ".pcd", ".ply", ".npy", ".npz", ".csv", ".las", ".feather"} <= set(SCAN_ENDINGS)
     assert SCAN_ENDINGS.index(".pcd.bin") < SCAN_ENDINGS.index(".bin")
 
 

@@ -145,7 +145,7 @@ def test_a_user_s_own_sensor_is_built():
         ({"elevations": [90, 2]}, "within (-90, 90)"),
         ({"elevations": [2, 1], "firing": [0, 0]}, "firing must name each of the rows 0 to 1 once"),
         ({"elevations": [2, 1], "firing": [0, 1.0]}, "firing must be a list of whole numbers, found 1.0"),
-        ({"elevations": [2, 1], "height": math.inf}, "height must be in metres"),
+        ({"elevations": [2, 1], "height": math.inf}, "height must be metres above the ground"),
         ({"elevations": [2, 1], "max_range": math.nan}, "min_range < max_range"),
         ({"name": "vlp16", "elevations": [2, 1]}, "another one"),
         ({}, "no sensor named 'mine'"),

@@ -13,10 +13,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from r2flow import launch
 from r2flow.chain import Link, is_finished, links_of
 from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
-from r2flow.composing import override
+from r2flow.composing import compose, override
 from r2flow.errors import InputError
+from r2flow.models import find_model
 from tests.training.conftest import (
     TINY,
     Done,
@@ -30,10 +32,35 @@ from tests.training.conftest import (
 )  # fmt: skip
 
 HELD = Path("held")  # in the folder that a chain is started from
-CHAIN = ["experiment=demo", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8", "data.pairs.batch_size=4",
-         *hold_at(5, HELD)]  # fmt: skip
+CHAIN = ["experiment=demo", "preview=null", "chain.rf2.data.pairs.num=8", "chain.td2.data.pairs.num=8",
+         "data.pairs.batch_size=4", *hold_at(5, HELD)]  # fmt: skip
 LINKS = ("rf1", "rf2", "td2")
 SCANS_ALONE = ("data=", "sensor", "backbone", "data.root")
+
+
+def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatch, capsys):
+    said: list[str] = []
+    out = tmp_path / "preview" / "samples.png"
+
+    def write_samples(checkpoint, folder, num, seed):
+        assert checkpoint.path == find_model("street")
+        said.append(f"{num} scans")
+        folder.mkdir()
+        (folder / "samples.png").touch()
+
+    def run_chain(links, command):
+        said.append("chain")
+        return 2, True
+
+    monkeypatch.setattr(launch, "_check_links", lambda links: None)
+    monkeypatch.setattr(launch, "_restart", lambda command: command)
+    monkeypatch.setattr("r2flow.reports.outputs.write_samples", write_samples)
+    monkeypatch.setattr("r2flow.chain.run_chain", run_chain)
+    settings = compose(["experiment=demo", f"run_dir={tmp_path}"])
+    for _ in range(2):
+        assert launch._chain(settings, [], []) == 2
+    assert said == ["4 scans", "chain", "chain"]
+    assert capsys.readouterr().out.count(f"preview: scans of the model street in {out}") == 2
 
 
 def of_a_child(*overrides: str) -> list[str]:

@@ -153,8 +153,11 @@ def test_one_file_is_imported_once_however_it_is_named(tmp_path: Path, monkeypat
     (tmp_path / "counted.py").write_text("open('count', 'a').write('x')")
     monkeypatch.chdir(tmp_path)
     load_plugins(["counted.py", "./counted.py", str(tmp_path / "counted.py")])
-    load_plugins([str(tmp_path / "counted.py")])
+    load_plugins([str(tmp_path / "counted.py"), "counted"])
     assert Path("count").read_text() == "x"
+    (tmp_path / "named.py").write_text("open('named', 'a').write('x')")
+    load_plugins(["named", "named.py"])
+    assert Path("named").read_text() == "x"
 
 
 def test_an_installed_plugin_is_looked_for_where_a_name_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

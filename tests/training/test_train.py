@@ -133,6 +133,31 @@ def test_a_damaged_last_checkpoint_is_passed_over(train: Run, alone: tuple[Path,
     assert_bit_equal(alone[0], copied)
 
 
+@pytest.mark.parametrize("odd", ["empty", "weights alone", "other shapes", "other names", "a pipe", "a folder"])
+def test_an_odd_last_checkpoint_is_passed_over(train: Run, alone: tuple[Path, str], copied: Path, odd: str):
+    newest, older = checkpoints_of(copied)
+    content = torch.load(newest, weights_only=True)
+    newest.unlink()
+    name, value = next(item for item in content["state_dict"].items() if item[1].ndim > 1)
+    if odd == "a pipe":
+        os.mkfifo(newest.with_name("step-00000011.ckpt"))
+    elif odd == "a folder":
+        newest.with_name("step-00000011.ckpt").mkdir()
+    else:
+        if odd == "empty":
+            content = {}
+        elif odd == "weights alone":
+            del content["optimizer_states"]
+        elif odd == "other shapes":
+            content["state_dict"][name] = value[None]
+        elif odd == "other names":
+            content["state_dict"]["foo"] = content["state_dict"].pop(name)
+        torch.save(content, newest)
+    done = train("name=copied")
+    assert f"going on from {older.relative_to(copied.parents[1])}" in done.stdout
+    assert_bit_equal(alone[0], copied)
+
+
 def test_a_moved_run_goes_on(train: Run, alone: tuple[Path, str], copied: Path):
     moved = copied.rename(copied.parent / "moved")
     checkpoints_of(moved)[0].unlink()  # as if killed before the last step

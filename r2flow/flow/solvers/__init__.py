@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.solvers.adaptive import LEAST_TOLERANCE, solve_adaptive
+from r2flow.flow.solvers.adaptive import LEAST_TOLERANCE, advance
 from r2flow.flow.solvers.embedded import EmbeddedMethod, bosh3, dopri5
+from r2flow.flow.solvers.exponential import ExponentialMethod, automatic, exprb43, solve_exponential
 from r2flow.flow.solvers.external import (
     TORCHDIFFEQ,
     check_torchdiffeq,
@@ -31,7 +32,7 @@ __all__ = [
     "check_method", "check_tolerance", "fixed_step", "named_grid", "solve", "usual_grid",
 ]  # fmt: skip
 
-SOLVERS: Registry[FixedStep | EmbeddedMethod] = Registry(
+SOLVERS: Registry[FixedStep | EmbeddedMethod | ExponentialMethod] = Registry(
     "solver",
     euler=FixedStep(euler, order=1, evaluations=1),
     midpoint=FixedStep(midpoint, order=2, evaluations=2),
@@ -44,6 +45,8 @@ SOLVERS: Registry[FixedStep | EmbeddedMethod] = Registry(
     adams4=adams(3, 4),
     bosh3=bosh3,
     dopri5=dopri5,
+    exprb43=exprb43,
+    auto=automatic,
 )
 # The second solution's tolerance is the first's divided by this. At 10, sometimes at 30, its own error is as large as
 # the first's where the velocity jumps in time; at 100 more scenes exceed their budget of evaluations.
@@ -76,7 +79,8 @@ def solve(
         velocity: v(t, x) with t of shape () in a fixed-step method, (B,) in an adaptive one, where B shrinks as scenes
             arrive; a velocity that differs between scenes has a method `select` (see `Evaluations`).
         x: State at t_0, (B, ...).
-        method: A name in `SOLVERS`, or `torchdiffeq:NAME` for one of torchdiffeq's.
+        method: A name in `SOLVERS`, or `torchdiffeq:NAME` for one of torchdiffeq's. `auto` is dopri5, and exprb43 from
+            where a scene turns out to be stiff; exprb43 gives no gradient and does not look for pulses and jumps.
         steps: Steps of a fixed-step method on a named grid; an adaptive one ignores it.
         tolerance: Absolute and relative tolerance of an adaptive method, for the local error e of a step:
             (mean |e / (tolerance + tolerance |x|)|^6)^(1/6) <= 1 over a scene's elements. It does not bound the error
@@ -87,9 +91,10 @@ def solve(
             the times themselves, (N + 1,) from t_0 to where `finish` begins.
         finish: Length of the last part of the interval, which one Euler step takes: 1e-3 avoids a velocity that is
             singular at t_1.
-        max_evaluations: Budget of a scene in an adaptive method, at least 2: at t_0 and for the first step size.
-        max_step: Longest step of our adaptive methods as a share of the interval: 1/64 makes at least 64 steps, so that
-            no change of that length is missed.
+        max_evaluations: Budget of a scene in an adaptive method.
+        max_step: Longest step of our adaptive methods as a share of the interval. They leave no eighth of the interval
+            unseen and locate jumps of v in time; a narrower pulse can be missed without a flag. 1/64 finds all that are
+            longer than a 128th.
         global_error: Estimate the error at t_1 by a second solution, with half the steps' lengths or a sixtieth of the
             tolerance, and a sixtieth of `finish`; its evaluations are counted.
 
@@ -125,7 +130,9 @@ class _Run(NamedTuple):
         v = Evaluations(velocity, len(x), self.progress)
         method = None if self.method.startswith(TORCHDIFFEQ) else SOLVERS[self.method]
         if isinstance(method, EmbeddedMethod):
-            return solve_adaptive(v, x, self.t_0, self.t_1, method, self.limits)
+            return advance(v, x, self.t_0, self.t_1, method, self.limits)[0]
+        if isinstance(method, ExponentialMethod):
+            return solve_exponential(v, x, self.t_0, self.t_1, method, self.limits)
         finish = torch.tensor(self._signed(self.limits.finish), dtype=torch.float64) if self.limits.finish else None
         if isinstance(method, FixedStep):
             return solve_fixed(v, x, self.times, method, finish)
@@ -193,7 +200,7 @@ def adapts(method: str) -> bool:
     """Whether a method chooses its steps by a tolerance."""
     if method.startswith(TORCHDIFFEQ):
         return not is_fixed(method.removeprefix(TORCHDIFFEQ))
-    return isinstance(SOLVERS[method], EmbeddedMethod)
+    return isinstance(SOLVERS[method], EmbeddedMethod | ExponentialMethod)
 
 
 def fixed_step(method: str) -> FixedStep | None:
@@ -237,7 +244,7 @@ def _check_numbers(
     check_tolerance(tolerance)
     if not (finish == 0 or 0 < finish < abs(t_1 - t_0)):
         raise InputError(f"finish must be shorter than the interval from {t_0} to {t_1}, found {finish}.")
-    if max_evaluations < 2:
-        raise InputError(f"a scene needs a budget of at least 2 evaluations, found {max_evaluations}.")
+    if max_evaluations < 1:
+        raise InputError(f"a scene needs a budget of at least 1 evaluation, found {max_evaluations}.")
     if not 0 < max_step <= 1:
         raise InputError(f"the longest step is a share of the interval, above 0 and at most 1; found {max_step}.")

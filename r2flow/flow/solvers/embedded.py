@@ -1,6 +1,9 @@
 """Embedded Runge-Kutta methods: a step and an estimate of its error from the same stages."""
 
+import math
 from typing import NamedTuple
+
+import numpy as np
 
 
 class EmbeddedMethod(NamedTuple):
@@ -15,6 +18,9 @@ class EmbeddedMethod(NamedTuple):
         grow: Largest factor between one step size and the next.
         stability: |h lambda| above which a step counts as stiff; near the end of the stability region on the negative
             real axis.
+        bump: d_i, the weights of the quartic term of the interpolant.
+        rough: Stages whose third divided difference shows how rough v is along a step.
+        defect: Largest defect of a step in tolerances: several times that of accurate steps of the exact problems.
         evaluations: None, since the evaluations of a solution depend on the scene.
     """
 
@@ -25,12 +31,51 @@ class EmbeddedMethod(NamedTuple):
     safety: float
     grow: float
     stability: float
+    bump: tuple[float, ...]
+    rough: tuple[int, int, int, int]
+    defect: float
     evaluations: None = None
 
     @property
     def stages(self) -> int:
         """Evaluations a step."""
         return len(self.rows)
+
+    @property
+    def same_time(self) -> bool:
+        """Whether the last two stages are at the same t."""
+        return self.nodes[-2] == self.nodes[-1]
+
+    @property
+    def distinct(self) -> dict[float, int]:
+        """The stage at each time of the step, the last one where there are several, in the order of time."""
+        return dict(sorted({c: i for i, c in enumerate((0.0, *self.nodes))}.items()))
+
+    @property
+    def third_difference(self) -> tuple[float, ...]:
+        """Weights of the stages that annihilate quadratic functions of t, the largest 1."""
+        times = [(0.0, *self.nodes)[i] for i in self.rough]
+        weights = [1 / math.prod(c - other for other in times if other != c) for c in times]
+        found = [0.0] * (len(self.nodes) + 1)
+        for i, weight in zip(self.rough, weights, strict=True):
+            found[i] = weight / max(map(abs, weights))
+        return tuple(found)
+
+    def interpolant(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """w_i and dw_i / dtheta of x + h sum_i w_i(theta) k_i, each (stages + 1, B).
+
+        The cubic Hermite interpolant and a quartic bump: Hairer, Norsett, Wanner, Solving Ordinary Differential
+        Equations I, II.6. It is continuous with its derivative.
+        """
+        last = len(self.nodes)
+        b, d = (np.array([*row, *[0.0] * (last + 1 - len(row))])[:, None] for row in (self.rows[-1], self.bump))
+        first, end = (np.eye(last + 1)[[i]].T for i in (0, last))
+        rest = 1 - theta
+        state = b * (theta**2 * (3 - 2 * theta)) + d * (theta * rest) ** 2
+        slope = b * (6 * theta * rest) + d * (2 * theta * rest * (1 - 2 * theta))
+        state += first * (theta * rest**2) - end * (theta**2 * rest)
+        slope += first * (rest * (1 - 3 * theta)) - end * (theta * (2 - 3 * theta))
+        return state, slope
 
 
 # Bogacki, Shampine, A 3(2) pair of Runge-Kutta formulas, 1989.
@@ -42,6 +87,9 @@ bosh3 = EmbeddedMethod(
     safety=0.7,
     grow=3.0,  # measured: longer steps double the error on the mixed batch of benchmarks/solvers.py
     stability=1.75,  # 2.51, reduced because its last two stages are at different times
+    bump=(0, 0, 0, 0),
+    rough=(0, 1, 2, 3),
+    defect=6.0,
 )
 
 # Dormand, Prince, A family of embedded Runge-Kutta formulae, 1980.
@@ -60,4 +108,15 @@ dopri5 = EmbeddedMethod(
     safety=0.95,
     grow=10.0,  # as in dopri5.f; of 32 ray-drop scenes, more were missed with smaller factors
     stability=3.0,  # the region ends at 3.31; Hairer's 3.25 is for longer steps
+    bump=(
+        -12715105075 / 11282082432,
+        0,
+        87487479700 / 32700410799,
+        -10690763975 / 1880347072,
+        701980252875 / 199316789632,
+        -1453857185 / 822651844,
+        69997945 / 29380423,
+    ),
+    rough=(0, 2, 3, 6),
+    defect=60.0,
 )

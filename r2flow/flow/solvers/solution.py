@@ -110,6 +110,17 @@ class Evaluations:
             self._progress()
         return v.to(x.dtype)
 
+    def some(self, places: np.ndarray, t: Tensor, x: Tensor) -> Tensor:
+        """v of some of the scenes that the state holds now."""
+        scenes = self.scenes
+        if len(places) < len(scenes):
+            self.only(scenes[places])
+        try:
+            return self(t, x)
+        finally:
+            if len(places) < len(scenes):
+                self.only(scenes)
+
     def coarsest(self, *tensors: Tensor) -> torch.dtype:
         """The type with the fewest digits among those of the tensors, the autocast and the velocity itself."""
         kind = tensors[0].device.type

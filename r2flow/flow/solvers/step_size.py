@@ -12,6 +12,7 @@ from r2flow.flow.solvers.solution import Solution
 
 SHRINK = 0.2  # smallest factor between one step size and the next
 MEMORY = 0.04  # beta of the PI controller, the weight of the previous error: steadier steps at a stability limit
+REMEMBERED = 3  # steps for which a rejection raises the suspicion of a jump
 STIFF_AFTER, SMOOTH_AFTER = 15, 6  # Hairer: stiff after 15 such steps without 6 others in a row between them
 
 
@@ -24,6 +25,7 @@ class Limits(NamedTuple):
         tighter: The tolerance used is the attainable one divided by this.
         max_step: Longest step as a share of the interval.
         finish: Length of the last part of the interval, which one Euler step takes.
+        until_stiff: Whether a scene is left where it turns out to be stiff.
     """
 
     tolerance: float
@@ -31,6 +33,7 @@ class Limits(NamedTuple):
     tighter: float = 1.0
     max_step: float = 1.0
     finish: float = 0.0
+    until_stiff: bool = False
 
 
 class StepController:
@@ -57,12 +60,24 @@ class StepController:
         self.stiff_run, self.smooth_run = np.zeros(of, int), np.zeros(of, int)
         self.arrived, self.leaving = np.zeros(of, bool), np.zeros(of, bool)
         self.accepted, self.rejected = np.zeros(of, int), np.zeros(of, int)
-        self.stiff, self.converged = np.zeros(of, bool), np.zeros(of, bool)
+        self.stiff, self.converged, self.times = np.zeros(of, bool), np.zeros(of, bool), np.full(of, t_0)
+        # A jump of the velocity: the lengths from t_0 between which it lies, and the step size behind it.
+        self.begin, self.end, self.resume = np.full(of, np.inf), np.full(of, np.inf), np.zeros(of)
+        self.crossing = np.zeros(of, bool)
+        self.roughness, self.rough = np.zeros(of), np.full(of, np.nan)  # third difference; of the last step, over h^4
+        self.troubled = np.zeros(of, int)  # steps for which a rejection is remembered
+        self.factor = np.full(of, np.inf)  # between a step that does not hold and the next one
+        self.doubtful = np.zeros(of, bool)  # seems stiff, by stages at different times
 
     def time(self, reached: np.ndarray) -> np.ndarray:
         """t at a length from t_0, never beyond the end."""
         t = self.t_0 + self.direction * np.minimum(reached, self.length)
         t = np.where(reached >= self.length, self.t_end, t)
+        return np.minimum(np.maximum(t, self.low), self.high)
+
+    def within_step(self, places: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """t of some scenes at a share of the step that they try, (N,); `time` needs all of them."""
+        t = self.t_0 + self.direction * (self.reached[places] + share * self.h[places])
         return np.minimum(np.maximum(t, self.low), self.high)
 
     def shortest(self) -> np.ndarray:
@@ -73,36 +88,63 @@ class StepController:
         """t of every scene, (B,), on the device and in the type of x."""
         return torch.from_numpy(self.time(self.reached)).to(x.device, x.dtype)
 
-    def probe(self, state: np.ndarray, slope: np.ndarray) -> np.ndarray:
-        """Time after and signed length of the Euler step that estimates the curvature, (2, B)."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            h = np.where((state < 1e-5) | (slope < 1e-5), 1e-6 * self.length, 0.01 * state / slope)
-        self.h = np.fmin(h, self.longest)
-        return np.stack([self.time(self.h), self.direction * self.h])
+    def start(self, state: np.ndarray, slope: np.ndarray, evaluations: np.ndarray) -> None:
+        """The first step size, from the norms of x and v in tolerances; a scene whose v is not finite leaves.
 
-    def start(self, slope: np.ndarray, change: np.ndarray, evaluations: np.ndarray) -> None:
-        """The first step size, from |v| and its change over the probe; a scene whose v is not finite leaves."""
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            steepest = np.fmax(slope, change / self.h)
-            h = np.where(steepest <= 1e-15, 1e3 * self.h, (0.01 / steepest) ** (1 / self.method.order))
-        h = np.where(np.isfinite(h), np.minimum(100 * self.h, h), self.h)
-        h = np.where(steepest == 0, self.longest, h)  # an untrained network's 0
-        self.h = np.maximum(h, self.shortest()).astype(np.float32).astype(np.float64)
+        Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, II.4, without its evaluation for the
+        second derivative: a step that is too long is rejected or does not hold.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            h = np.fmin((0.01 / slope) ** (1 / self.method.order), np.where(state < 1e-5, np.inf, state / slope))
+        self.h = np.maximum(np.fmin(h, self.longest), self.shortest()).astype(np.float32).astype(np.float64)
         self.leaving = ~np.isfinite(slope) | self._spent(evaluations)
 
     def propose(self) -> np.ndarray:
-        """Times of the stages and signed steps, (stages + 1, B); the last two steps share the rest of the interval."""
-        left = self.length - self.reached
+        """Times of the stages and signed steps, (stages + 1, B).
+
+        The last two steps to the end, or to a jump, share what is left.
+        """
+        goal = np.minimum(self.length, self.begin)
+        left = goal - self.reached
         h = np.minimum(self.h, self.longest)
         h = np.where(1.01 * h >= left, left, np.where(2 * h > left, left / 2, h))
-        self.h, self.following = h, np.where(h == left, self.length, self.reached + h)
+        self.h, self.following = h, np.where(h == left, goal, self.reached + h)
         stages = self.time(np.where(self.nodes == 1, self.following, self.reached + self.nodes * h))
         return np.concatenate([stages, self.direction * h[None]])
 
-    def judge(self, error: np.ndarray, dk: np.ndarray, dy: np.ndarray, evaluations: np.ndarray) -> np.ndarray:
+    def within(self, error: np.ndarray, dk: np.ndarray, dy: np.ndarray) -> np.ndarray:
+        """Whose step is finite and within the tolerance, (B,) bool."""
+        good: np.ndarray = (error <= 1) & np.isfinite(dk) & np.isfinite(dy)
+        return good
+
+    def rougher(self, least: float, by: float) -> np.ndarray:
+        """Whose third difference is above `least` and `by` times what the step before it foretells, (B,) bool."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            found: np.ndarray = (self.roughness > least) & ~(self.roughness <= by * self.rough * self.h**4)
+        return found & ~self.stiff[self.places]
+
+    def able(self, evaluations: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Which of these scenes can be evaluated once more, (N,) bool."""
+        left: np.ndarray = evaluations[self.scenes[places]] < self.limits.max_evaluations
+        return left
+
+    def shorten(self, place: int, share: float) -> None:
+        """A scene's step does not hold: try again with about this share of it."""
+        self.factor[place] = min(max(share, SHRINK), 0.7)
+
+    def stop_at(self, place: int, left: float, right: float) -> None:
+        """A scene's velocity jumps between two shares of its step."""
+        h = self.h[place]
+        self.begin[place], self.end[place] = (self.reached[place] + share * h for share in (left, right))
+        self.resume[place] = h
+
+    def judge(
+        self, good: np.ndarray, error: np.ndarray, dk: np.ndarray, dy: np.ndarray, evaluations: np.ndarray
+    ) -> np.ndarray:
         """Accept or reject every scene's step and choose its next step size.
 
         Args:
+            good: Whose step is within the tolerance and holds, (B,) bool.
             error: Norm of the local error divided by the tolerance, (B,).
             dk, dy: Norms of the differences in v and x between the last two stages, (B,).
             evaluations: Evaluations so far, (B,).
@@ -111,19 +153,37 @@ class StepController:
             Whose step is accepted, (B,) bool.
         """
         finite = np.isfinite(error) & np.isfinite(dk) & np.isfinite(dy)
-        good = finite & (error <= 1)
         self.accepted[self.places] += good
         self.rejected[self.places] += ~good
         self._look_for_stiffness(good, dk, dy)
-        tried = self.h
+        tried = self.tried = self.h
         self.reached = np.where(good, self.following, self.reached)
         self.h = tried * self._factors(good, finite, error)
+        self.rough = np.where(good, self.roughness / tried**4, self.rough)
+        self.troubled = np.where(good, np.maximum(self.troubled - 1, 0), REMEMBERED)
+        self.factor = np.full_like(self.factor, np.inf)
         self.grow = np.where(good, self.method.grow, 1.0)
         self.last_error = np.where(good, np.maximum(error, 1e-4), self.last_error)
-        self.arrived = good & (self.reached >= self.length)
-        stuck = (self.h < self.shortest()) & ~good
-        self.leaving = self.arrived | stuck | self._spent(evaluations)
+        spent = self._spent(evaluations)
+        self.crossing = (self.begin - self.reached <= self.shortest()) & ~spent
+        self.arrived = good & (self.reached >= self.length) & ~self.crossing
+        stuck = (self.h < self.shortest()) & ~good & (self.begin == np.inf)
+        self.leaving = self.arrived | stuck | spent | self._handed_over()
         return good
+
+    def cross(self) -> np.ndarray:
+        """Time after and signed length of the crossing of a jump, (2, N); these scenes stand behind it then."""
+        here, end = self.reached[self.crossing], np.minimum(self.end[self.crossing], self.length)
+        self.reached[self.crossing], self.h[self.crossing] = end, self.resume[self.crossing]
+        self.begin[self.crossing] = self.end[self.crossing] = np.inf
+        self.arrived |= self.crossing & (self.reached >= self.length)
+        self.leaving |= self.arrived
+        self.grow[self.crossing] = 1.0
+        return np.stack([self.time(end), self.direction * (end - here)])
+
+    def give_up(self, places: np.ndarray) -> None:
+        """These scenes leave without having arrived."""
+        self.arrived[places], self.leaving[places] = False, True
 
     def _spent(self, evaluations: np.ndarray) -> np.ndarray:
         return evaluations + self.method.stages > self.limits.max_evaluations
@@ -134,8 +194,9 @@ class StepController:
         q = 1 / self.method.order
         steady = self.method.safety * error ** -(q - 0.75 * MEMORY) * self.last_error**MEMORY
         retry = self.method.safety * error ** -(q - 0.75 * MEMORY)
-        factors = np.where(good, np.clip(steady, SHRINK, self.grow), np.clip(retry, SHRINK, 1.0))
-        # Rounded as in `_norms`, so that a difference of one ulp is not carried on.
+        shorter = np.minimum(np.clip(retry, SHRINK, 1.0), self.factor)
+        factors = np.where(good, np.clip(steady, SHRINK, self.grow), shorter)
+        # Rounded as in `norms`, so that a difference of one ulp is not carried on.
         return factors.astype(np.float32).astype(np.float64)
 
     def _look_for_stiffness(self, good: np.ndarray, dk: np.ndarray, dy: np.ndarray) -> None:
@@ -148,13 +209,31 @@ class StepController:
         self.stiff_run += touching
         self.smooth_run = np.where(touching, 0, self.smooth_run + (good & ~touching))
         self.stiff_run = np.where(self.smooth_run >= SMOOTH_AFTER, 0, self.stiff_run)
-        self.stiff[self.places] |= self.stiff_run >= STIFF_AFTER
+        seeming = self.stiff_run >= STIFF_AFTER
+        if self.method.same_time:
+            self.stiff[self.places] |= seeming
+        else:
+            self.doubtful = seeming & ~self.stiff[self.places]
+
+    def confirm(self, change: np.ndarray, distance: np.ndarray) -> None:
+        """Whether the doubtful scenes are stiff, from norms of a change of v and of x at one time, (N,) each."""
+        with np.errstate(invalid="ignore"):
+            stiff = self.tried[self.doubtful] * change > self.method.stability * distance
+        self.stiff[self.places[self.doubtful]] = stiff
+        self.stiff_run[self.doubtful] = 0
+        self.leaving |= self._handed_over()
+        self.doubtful[:] = False
+
+    def _handed_over(self) -> np.ndarray:
+        return self.stiff[self.places] & self.limits.until_stiff & ~self.crossing
 
     def keep(self, rest: np.ndarray) -> None:
-        """Keep these scenes; of the others, note which have arrived."""
+        """Keep these scenes; of the others, note which have arrived, and where the others are."""
         self.converged[self.places] |= self.arrived
+        self.times[self.places] = self.time(self.reached)
         for name in (
             "scenes", "places", "reached", "h", "grow", "last_error", "stiff_run", "smooth_run", "arrived", "leaving",
+            "begin", "end", "resume", "crossing", "rough", "troubled", "factor", "doubtful",
         ):  # fmt: skip
             setattr(self, name, getattr(self, name)[rest])
 

@@ -1,4 +1,4 @@
-"""Scan files: KITTI .bin, nuScenes .pcd.bin, PCD, PLY and NPY are read; .bin, PCD, PLY and NPY are written.
+"""Scan files: KITTI .bin, nuScenes .pcd.bin, PCD, PLY, NPY, tables, LAS are read; .bin, PCD, PLY, NPY are written.
 
     points = read_points("000000.bin")
     write_points("000000.ply", points.xyz, points.reflectance)
@@ -7,28 +7,77 @@ The readers are our own: plyfile is under the GPL and allocates whatever a heade
 from half a file, and the bindings to LZF need a compiler.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
-from r2flow.lidar.scan_files.arrays import read_kitti, read_npy, read_nuscenes
+from r2flow.files import atomic_write, refuse_unreadable
+from r2flow.lidar.scan_files.arrays import Columns, named_already, read_image, read_kitti, read_npy, read_nuscenes
+from r2flow.lidar.scan_files.fields import check_columns
 from r2flow.lidar.scan_files.pcd import read_pcd, write_pcd
 from r2flow.lidar.scan_files.ply import read_ply, write_ply
 from r2flow.lidar.scan_files.points import NoPointsError, Points
+from r2flow.lidar.scan_files.tables import read_arrow, read_las, read_npz, read_text
 
-__all__ = ["SCAN_ENDINGS", "NoPointsError", "Points", "read_points", "write_points"]
+__all__ = [
+    "ELSEWHERE",
+    "LOOSE_ENDINGS",
+    "SCAN_ENDINGS",
+    "NoPointsError",
+    "Points",
+    "read_points",
+    "read_range_image",
+    "write_points",
+]
 
-_READERS: dict[str, Callable[[Path], Points]] = {
+
+def _naming(reader: Callable[[Path], Points]) -> Callable[[Path, Columns], Points]:
+    """A reader of files that always name their columns."""
+
+    def read(path: Path, columns: Columns) -> Points:
+        if columns is not None:
+            raise named_already(path)
+        return reader(path)
+
+    return read
+
+
+_READERS: dict[str, Callable[[Path, Columns], Points]] = {
     ".pcd.bin": read_nuscenes,  # before ".bin", which it ends with
     ".bin": read_kitti,
-    ".pcd": read_pcd,
-    ".ply": read_ply,
+    ".pcd": _naming(read_pcd),
+    ".ply": _naming(read_ply),
     ".npy": read_npy,
+    ".npz": read_npz,
+    ".csv": read_text,
+    ".xyz": read_text,
+    ".txt": read_text,
+    ".feather": read_arrow,
+    ".parquet": read_arrow,
+    ".las": read_las,
+    ".laz": read_las,
 }
+# What is not read, and what turns it into files that are.
+ELSEWHERE = {
+    **dict.fromkeys((".mcap", ".db3", ".bag"), "holds many scans: r2flow unpack {path} --out FOLDER writes them"),
+    **dict.fromkeys(
+        (".pcap", ".pcapng"),
+        "holds packets, which the maker's tool turns into scans (Ouster: ouster-cli source {path} save scan.ply; "
+        "Velodyne: VeloView, Save As CSV; Hesai, RoboSense: their ROS driver and r2flow unpack)",
+    ),
+    **dict.fromkeys((".e57", ".pts", ".ptx", ".rcp", ".fls"), "is read by CloudCompare, which saves it as .ply"),
+    **dict.fromkeys((".h5", ".hdf5", ".zarr", ".mat", ".pkl"), "holds arrays: write x, y, z, intensity by numpy.savez"),
+    ".tfrecord": "is read by Waymo's own tools: write x, y, z, intensity by numpy.savez",
+    **dict.fromkeys(
+        (".lvx", ".lvx2", ".lvx3"),
+        "is of a Livox, whose scan never repeats: it has no beams, and so no rows of a range image; r2flow needs a "
+        "spinning LiDAR",
+    ),
+}
+
 _WRITERS: dict[str, Callable[[IO[bytes], np.ndarray], object]] = {
     ".bin": lambda file, table: file.write(table.tobytes()),
     ".pcd": write_pcd,
@@ -37,16 +86,22 @@ _WRITERS: dict[str, Callable[[IO[bytes], np.ndarray], object]] = {
 }
 
 SCAN_ENDINGS = tuple(_READERS)
+LOOSE_ENDINGS = (".csv", ".txt", ".npz")  # which other things than scans have too
 
 LARGEST_FILE = 1 << 30  # bytes: 67 million points, hundreds of scans; reading more exhausts the memory
 
 
-def read_points(path: str | Path) -> Points:
+def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Points:
     """The points of one scan file, in the file's order; rows that are not finite are dropped and counted.
 
     The ending tells the format. .bin: KITTI's float32 rows x y z reflectance. .pcd.bin: nuScenes' x y z intensity ring.
-    .pcd, .ply: fields x y z and, where present, intensity (or reflectance, reflectivity, remission, i) and ring, of any
-    type. .npy: float (N, 3) or (N, 4).
+    .pcd, .ply, .las, .laz, .feather, .parquet: fields x y z and, where present, intensity (or reflectance,
+    reflectivity, remission, i) and ring, of any type. .npy, .npz: float (N, 3) or (N, 4), or named fields. .csv, .xyz,
+    .txt: three or four columns, or columns named in the first line. LAS needs laspy, Arrow tables pyarrow.
+
+    Args:
+        columns: What each column of a .bin, .npy, .npz or text file without names holds: x, y, z and, where present,
+            intensity and ring; any other name is passed over. The usual ones if left out.
 
     Returns:
         xyz float32 (N, 3) in metres, reflectance float32 (N,) as stored or None, ring uint16 (N,) or None.
@@ -56,10 +111,30 @@ def read_points(path: str | Path) -> Points:
             LiDAR measures. The message names the file.
     """
     path = Path(path)
+    check_columns(columns)
     reader = _READERS[_ending(path, _READERS)]
     try:
-        _refuse_unreadable(path)
-        return reader(path)
+        refuse_unreadable(path, LARGEST_FILE, "scan file")
+        return reader(path, columns)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
+
+
+def read_range_image(path: str | Path) -> np.ndarray | None:
+    """The range image in a .npy of floats (2 or 1, H, W), float32, what is not finite as 0; None where it is no .npy.
+
+    None, too, where a .npy is of another shape or type: it may hold points. Nothing is unpickled, and no more memory is
+    taken than the file has bytes.
+
+    Raises:
+        InputError: the file is missing, no regular file or damaged.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".npy":
+        return None
+    try:
+        refuse_unreadable(path, LARGEST_FILE, "range image")
+        return read_image(path)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
 
@@ -90,28 +165,16 @@ def write_points(path: str | Path, xyz: np.ndarray, reflectance: np.ndarray | No
 
 
 def _ending(path: Path, known: Iterable[str]) -> str:
-    ending = next((ending for ending in _READERS if path.name.lower().endswith(ending)), None)
+    name = path.name.lower()
+    ending = next((ending for ending in _READERS if name.endswith(ending)), None)
     if ending is None:
+        for other, advice in ELSEWHERE.items():
+            if name.endswith(other):
+                raise InputError(f"{path} {advice.format(path=path)}.")
         raise InputError(f"{path} has no ending of a scan file; known: {', '.join(known)}. Convert or rename it.")
     if ending not in known:
         raise InputError(f"{path}: {ending} is read but not written; choose one of {', '.join(known)}.")
     return ending
-
-
-def _refuse_unreadable(path: Path) -> None:
-    if path.is_symlink() and not path.exists():
-        raise InputError(f"{path} is a link to {path.readlink()}, which does not exist.")
-    if not path.exists():
-        raise InputError(f"{path} does not exist. Is the path right?")
-    if path.is_dir():
-        raise InputError(f"{path} is a folder, not a scan file; name a file in it.")
-    if not path.is_file():  # reading a pipe would wait for ever
-        raise InputError(f"{path} is not a regular file.")
-    size = path.stat().st_size
-    if size == 0:
-        raise InputError(f"{path} is empty (0 bytes); fetch or write it again.")
-    if size > LARGEST_FILE:
-        raise InputError(f"{path} has {size / 2**30:.1f} GiB, too many for one scan (at most 1). Is it a whole drive?")
 
 
 def _table(path: Path, xyz: np.ndarray, reflectance: np.ndarray | None) -> np.ndarray:

@@ -1,13 +1,25 @@
 """Files that are one array: KITTI and nuScenes rows of float32 without a header, and NumPy's .npy."""
 
 import math
+import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
 from r2flow.errors import InputError
+from r2flow.lidar.scan_files.fields import (
+    MOST_COLUMNS,
+    PointField,
+    column_points,
+    find_roles,
+    named_roles,
+    usual_names,
+)
 from r2flow.lidar.scan_files.points import Points, checked_points
+
+Columns = Sequence[str] | None  # names of the columns of a file that does not name them itself
 
 KITTI = "KITTI rows of 4 little-endian float32 (x, y, z, reflectance)"
 NUSCENES = "nuScenes rows of 5 little-endian float32 (x, y, z, intensity, ring)"
@@ -15,14 +27,20 @@ NUSCENES = "nuScenes rows of 5 little-endian float32 (x, y, z, intensity, ring)"
 _SIGNATURES = {b"ply\n": "ply", b"ply\r": "ply", b"# .PCD": "pcd", b"VERSION": "pcd", b"\x93NUMPY": "npy"}
 
 
-def read_kitti(path: Path) -> Points:
-    """Rows of x, y, z, reflectance; see `read_points`."""
+def read_kitti(path: Path, columns: Columns = None) -> Points:
+    """Rows of x, y, z, reflectance, or of the columns that are named; see `read_points`."""
+    if columns is not None:
+        layout = f"rows of {len(columns)} little-endian float32 ({', '.join(columns)})"
+        rows, roles = _float_rows(path, len(columns), layout), named_roles(path, columns)
+        return column_points(path, {role: rows[:, index] for role, index in roles.items()}, layout)
     rows = _float_rows(path, 4, KITTI)
     return checked_points(path, rows[:, :3], rows[:, 3], layout=KITTI)
 
 
-def read_nuscenes(path: Path) -> Points:
-    """Rows of x, y, z, intensity, ring; see `read_points`."""
+def read_nuscenes(path: Path, columns: Columns = None) -> Points:
+    """Rows of x, y, z, intensity, ring, or of the columns that are named; see `read_points`."""
+    if columns is not None:
+        return read_kitti(path, columns)
     rows = _float_rows(path, 5, NUSCENES)
     return checked_points(path, rows[:, :3], rows[:, 3], rows[:, 4], layout=NUSCENES)
 
@@ -53,26 +71,73 @@ def _refuse_other_content(path: Path, head: bytes, layout: str) -> None:
         raise InputError(f"{path} is not {layout}: it is text, beginning with {head[:24].decode()!r}.")
 
 
-def read_npy(path: Path) -> Points:
-    """An array (N, 3) or (N, 4) of floats; see `read_points`. Never unpickles."""
+def read_npy(path: Path, columns: Columns = None) -> Points:
+    """An array (N, 3) or (N, 4) of floats, of the columns that are named, or with named fields; see `read_points`.
+
+    Never unpickles.
+    """
+    with path.open("rb") as file:
+        return column_points(path, table_columns(path, read_array(path, file, None), columns))
+
+
+def table_columns(path: Path, array: np.ndarray, columns: Columns) -> dict[str, np.ndarray]:
+    """The columns by role of an array (N, K) or a structured one (N,)."""
+    if array.dtype.names is not None and array.ndim == 1:
+        if columns is not None:
+            raise named_already(path)
+        fields = [PointField(name, array.dtype[name]) for name in array.dtype.names]
+        return {role: array[fields[index].name] for role, index in find_roles(path, fields).items()}
+    if array.dtype.kind != "f" and (columns is None or array.dtype.kind not in "iu"):
+        raise InputError(f"{path} holds {array.dtype} values, not floats: points are float (N, 3) or (N, 4).")
+    if array.ndim != 2 or (array.shape[1] not in (3, 4) and columns is None and not 4 < array.shape[1] <= MOST_COLUMNS):
+        raise InputError(
+            f"{path} holds an array of shape {array.shape}, not points: these are (N, 3) or (N, 4), "
+            f"x y z and perhaps reflectance.{_shape_hint(array.shape)}"
+        )
+    names = usual_names(path, array.shape[1], columns)
+    return {role: array[:, index] for role, index in named_roles(path, names).items()}
+
+
+def named_already(path: Path) -> InputError:
+    """That a file names its columns itself."""
+    return InputError(f"{path} names its columns itself: leave --columns (data.columns) out.")
+
+
+def read_array(path: Path, file: IO[bytes], size: int | None) -> np.ndarray:
+    """The array of numbers in an open .npy: `size` bytes of an archive, or the rest of a file.
+
+    Raises:
+        InputError: no such array, one of objects, or one of another size than the header declares.
+    """
+    shape, fortran_order, dtype = _npy_header(path, file)
+    if dtype.hasobject:
+        raise InputError(f"{path} holds objects, not floats: points are float (N, 3) or (N, 4).")
+    return _npy_body(path, file, shape, fortran_order, dtype, size)
+
+
+def read_image(path: Path) -> np.ndarray | None:
+    """See `read_range_image`; None where the array is of another shape or type."""
     with path.open("rb") as file:
         shape, fortran_order, dtype = _npy_header(path, file)
-        body = np.fromfile(file, dtype=np.uint8)
-    if dtype.kind != "f":
-        raise InputError(f"{path} holds {dtype} values, not floats: points are float (N, 3) or (N, 4).")
-    if len(shape) != 2 or shape[1] not in (3, 4):
-        raise InputError(
-            f"{path} holds an array of shape {shape}, not points: these are (N, 3) or (N, 4), "
-            f"x y z and perhaps reflectance.{_shape_hint(shape)}"
-        )
+        if len(shape) != 3 or shape[0] not in (1, 2) or dtype.kind != "f" or 0 in shape:
+            return None
+        array = _npy_body(path, file, shape, fortran_order, dtype)
+    with np.errstate(over="ignore"):  # beyond float32 is infinite, and so no return
+        return np.nan_to_num(array.astype(np.float32), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _npy_body(
+    path: Path, file: IO[bytes], shape: tuple[int, ...], fortran_order: bool, dtype: np.dtype, total: int | None = None
+) -> np.ndarray:
+    """The array behind a header, whose size is compared with the file's, or with `total`, before it is read."""
     size = math.prod(shape) * dtype.itemsize
-    if body.size != size:
+    there = (os.fstat(file.fileno()).st_size if total is None else total) - file.tell()
+    body = np.frombuffer(file.read(size), dtype=np.uint8) if there == size else None
+    if body is None or body.size != size:
         raise InputError(
-            f"{path} declares {shape[0]} rows of {shape[1]} {dtype}, {size} bytes, but {body.size} follow its header. "
-            "Is it damaged?"
+            f"{path} declares the shape {shape} of {dtype}, {size} bytes, but {there} follow its header. Is it damaged?"
         )
-    array = body.view(dtype).reshape(shape, order="F" if fortran_order else "C")
-    return checked_points(path, array[:, :3], array[:, 3] if shape[1] == 4 else None)
+    return body.view(dtype).reshape(shape, order="F" if fortran_order else "C")
 
 
 def _npy_header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:

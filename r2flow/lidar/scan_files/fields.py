@@ -12,13 +12,14 @@ from r2flow.lidar.scan_files.points import Points, checked_points
 
 # The first name that a file has is taken: Ouster writes both an intensity and a calibrated reflectivity.
 ROLES: Mapping[str, tuple[str, ...]] = {
-    "x": ("x",),
-    "y": ("y",),
-    "z": ("z",),
+    "x": ("x", "points_m_xyz:0"),  # VeloView's
+    "y": ("y", "points_m_xyz:1"),
+    "z": ("z", "points_m_xyz:2"),
     "reflectance": ("intensity", "reflectance", "reflectivity", "remission", "i"),
-    "ring": ("ring",),
+    "ring": ("ring", "laser_number"),  # Argoverse's
 }
 
+MOST_COLUMNS = 64  # of a file without names
 HEADER_LIMIT = 1 << 16  # bytes; a header has a few hundred
 
 
@@ -98,9 +99,53 @@ def find_roles(path: Path, fields: Sequence[PointField]) -> dict[str, int]:
         roles[role] = index
     missing = [role for role in ("x", "y", "z") if role not in roles]
     if missing:
-        found = ", ".join(field.name for field in fields)[:120] or "none"
+        found = " ".join(", ".join(field.name for field in fields)[:120].split()) or "none"
         raise InputError(f"{path} has no field {', '.join(missing)}; it has: {found}. Points need x, y and z.")
     return roles
+
+
+def named_roles(path: Path, names: Sequence[str]) -> dict[str, int]:
+    """`find_roles` of columns of one number each."""
+    return find_roles(path, [PointField(name, np.dtype("<f8")) for name in names])
+
+
+def check_columns(columns: Sequence[str] | None) -> None:
+    """Refuse names of columns among which x, y and z are not, once each.
+
+    Raises:
+        InputError: what was found, and an example.
+    """
+    if columns is None:
+        return
+    names = [str(name).lower() for name in columns]
+    counts = {role: sum(name in aliases for name in names) for role, aliases in ROLES.items()}
+    if max(counts.values()) > 1 or min(counts[axis] for axis in "xyz") < 1 or len(columns) > MOST_COLUMNS:
+        raise InputError(
+            f"columns must name x, y and z, and intensity and ring at most once, as x,y,z,intensity,_; found "
+            f"{','.join(map(str, columns))[:80]}."
+        )
+
+
+def usual_names(path: Path, width: int, columns: Sequence[str] | None) -> Sequence[str]:
+    """Names of the columns of a file without any: those given, else x, y, z and perhaps reflectance.
+
+    Raises:
+        InputError: others than were given, or more than four of which nobody said what they are.
+    """
+    if columns is not None:
+        if len(columns) != width:
+            raise InputError(
+                f"{path} has {width} columns, but {len(columns)} were named: {','.join(columns)}. Name each; _ "
+                "passes one over."
+            )
+        return columns
+    if width not in (3, 4):
+        example = ",".join(["x", "y", "z", "intensity", *("_" * width)][:width])
+        raise InputError(
+            f"{path} has {width} columns without names. Points need x, y, z and perhaps reflectance: say which is "
+            f"which, as --columns {example} (data.columns=[{example}])."
+        )
+    return ("x", "y", "z", "reflectance")[:width]
 
 
 def binary_columns(
@@ -152,8 +197,8 @@ def text_lines(path: Path, payload: bytes) -> list[str]:
         raise InputError(f"{path} declares text but holds other bytes. Is it damaged, or binary?") from None
 
 
-def column_points(path: Path, columns: Mapping[str, np.ndarray]) -> Points:
-    """Points from columns by role, checked."""
+def column_points(path: Path, columns: Mapping[str, np.ndarray], layout: str | None = None) -> Points:
+    """Points from columns by role, checked; see `checked_points`."""
     with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, and so dropped
         xyz = np.stack([np.asarray(columns[axis], dtype=np.float32) for axis in ("x", "y", "z")], axis=1)
-    return checked_points(path, xyz, columns.get("reflectance"), columns.get("ring"))
+    return checked_points(path, xyz, columns.get("reflectance"), columns.get("ring"), layout)

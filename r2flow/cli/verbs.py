@@ -1,0 +1,73 @@
+"""Every verb, and how one is run."""
+
+import logging
+import os
+import sys
+from typing import Any
+
+import typer
+
+from r2flow import __version__
+from r2flow.cli import (  # noqa: F401 (each enters its verbs)
+    accuracy,
+    compare,
+    evaluate,
+    flows,
+    inversion,
+    measure,
+    pairs,
+    paper,
+    prepare,
+    scans,
+    sensors,
+    simulate,
+    train,
+    unpack,
+    weights,
+)
+from r2flow.cli.app import app
+from r2flow.errors import InputError, explain_mistake, one_line, print_any_name
+from r2flow.plugins import load_plugins, take_plugins
+from r2flow.signals import Stopped, listening, stop_at_once
+
+# Its home is click in older releases of typer and typer itself in newer ones.
+USAGE_ERROR: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+
+
+def run() -> None:
+    """Run a verb, with `--plugin MODULE` anywhere; what the user can mend is one line and exit code 2."""
+    try:
+        with listening(stop_at_once):
+            _run()
+    except Stopped as stop:
+        print(stop, file=sys.stderr)
+        sys.exit(stop.code)
+    except (KeyboardInterrupt, typer.Abort):  # Ctrl-C where nobody listens: in a library's thread
+        print("stopped", file=sys.stderr)
+        sys.exit(130)
+
+
+def _run() -> None:
+    print_any_name()
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", force=True)
+    try:
+        if "" in sys.argv:
+            raise InputError("an argument is empty; is a variable of the shell not set?")
+        arguments, plugins = take_plugins(sys.argv[1:])
+        load_plugins(plugins)
+        if arguments[:1] == ["train"]:  # which passes them on to its own processes
+            arguments += [f"--plugin={name}" for name in plugins]
+        if arguments[:1] == ["--version"]:
+            print(f"r2flow {__version__}")
+            sys.exit(0)
+        code = app(arguments, prog_name="r2flow", standalone_mode=False)
+    except BrokenPipeError:  # r2flow ... | head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except (InputError, OSError) as error:
+        print(f"error: {explain_mistake(error)}", file=sys.stderr)
+        sys.exit(2)
+    except USAGE_ERROR as error:
+        print(f"error: {one_line(error.format_message()) or 'no verb is given.'} See --help.", file=sys.stderr)
+        sys.exit(2)
+    sys.exit(code if isinstance(code, int) else 0)

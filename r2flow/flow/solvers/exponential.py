@@ -1,0 +1,239 @@
+"""An exponential Rosenbrock method for stiff scenes, and its choice for scenes that turn out to be stiff.
+
+pexprb43: Luan, Ostermann, Parallel exponential Rosenbrock methods, 2016, order 4 with an estimate of order 3. The
+Jacobian J of (t, x) -> (1, v) is never formed: functions of it act in Krylov spaces by Arnoldi's method (Saad, Analysis
+of some Krylov subspace approximations to the matrix exponential operator, 1992), and its products with vectors are
+finite differences of v, one evaluation each. Scenes are solved one after another, each with its own steps.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from r2flow.flow.solvers.adaptive import advance, attainable
+from r2flow.flow.solvers.batched import norms, powered, unpowered
+from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
+from r2flow.flow.solvers.solution import Evaluations, Solution
+from r2flow.flow.solvers.step_size import Limits
+
+LARGEST = 40  # dimension of a Krylov space; where that is not enough the step is halved
+KRYLOV = 0.05  # error of a function of J, in tolerances
+SAFETY, SHRINK, GROW = 0.8, 0.2, 8.0
+
+
+class ExponentialMethod(NamedTuple):
+    """An exponential method.
+
+    Attributes:
+        start: The explicit method that solves the scenes which are not stiff; None where all are taken for stiff.
+        evaluations: None, since the evaluations of a solution depend on the scene.
+    """
+
+    order: int = 4
+    start: EmbeddedMethod | None = None
+    evaluations: None = None
+
+
+exprb43 = ExponentialMethod()
+automatic = ExponentialMethod(start=dopri5)
+
+
+def solve_exponential(
+    v: Evaluations, x: Tensor, t_0: float, t_1: float, method: ExponentialMethod, limits: Limits
+) -> Solution:
+    """Solve every scene of x, (B, ...), from t_0 to t_1: the stiff ones, or all, one after another."""
+    if method.start is None:
+        at = np.full(len(x), t_0)
+        first = Solution.build(x, v.counts, 0, 0, False, False)
+    else:
+        first, at = advance(v, x, t_0, t_1, method.start, limits._replace(until_stiff=True))
+    ends, converged = first.x.clone(), first.converged.numpy().copy()
+    accepted, rejected = first.accepted.numpy().copy(), first.rejected.numpy().copy()
+    stiff = first.stiff.numpy() | (method.start is None)
+    for place in (stiff & ~converged).nonzero()[0]:
+        v.only(np.array([place]))
+        scene = _Scene(v, first.x[place].detach(), float(at[place]), t_0, t_1, limits)
+        converged[place] = scene.solve()
+        ends[place] = scene.u.view(x.shape[1:])
+        accepted[place] += scene.accepted
+        rejected[place] += scene.rejected
+    v.only(np.arange(len(x)))
+    return Solution.build(ends, v.counts, accepted, rejected, first.stiff.numpy(), converged)
+
+
+class _Spent(Exception):
+    """The scene has used its budget of evaluations."""
+
+
+class _Scene:
+    """One scene on its way; vectors are (n + 1,), the elements of x and, last, t."""
+
+    def __init__(self, v: Evaluations, x: Tensor, t: float, t_0: float, t_1: float, limits: Limits) -> None:
+        self.v, self.shape, self.limits = v, x.shape, limits
+        self.u, self.t = x.flatten(), t
+        self.direction = math.copysign(1.0, t_1 - t_0)
+        self.length = abs(t_1 - t_0) - limits.finish
+        self.t_0, self.t_end = t_0, t_0 + self.direction * self.length if limits.finish else t_1
+        self.accepted = self.rejected = 0
+
+    @torch.no_grad()
+    def solve(self) -> bool:
+        """Go to the end; whether it is reached."""
+        try:
+            f = self.velocity(self.t, self.u)
+            self.tolerance = attainable(self.limits, self.v.precision)
+            self.roundoff = torch.finfo(self.v.precision).eps
+            h = self._first_step(f)
+            while self.t != self.t_end and f.isfinite().all():
+                krylov = _Krylov(lambda way, f=f: self.product(f, way), torch.cat([f, f.new_ones(1)]))
+                left = abs(self.t_end - self.t)
+                while True:
+                    h = min(h, self.limits.max_step * self.length)
+                    h = left if 1.01 * h >= left else left / 2 if 2 * h > left else h
+                    if h < self._shortest():
+                        return False
+                    error, h, end = self._try(f, krylov, h)
+                    factor = min(max(SAFETY * max(error, 1e-10) ** -0.25, SHRINK), GROW) if error < math.inf else SHRINK
+                    if error <= 1:
+                        break
+                    self.rejected += 1
+                    h *= min(factor, 0.8)
+                t = self.t_end if h == left else self.t + self.direction * h
+                following = self.velocity(t, end)
+                if not following.isfinite().all():
+                    return False
+                self.accepted += 1
+                self.u, self.t, f, h = end, t, following, h * factor
+            if self.t == self.t_end and self.limits.finish:
+                self.u = self.u + self.direction * self.limits.finish * f
+        except _Spent:
+            return False
+        return self.t == self.t_end
+
+    def velocity(self, t: float, u: Tensor) -> Tensor:
+        """v(t, u) as a vector."""
+        if self.v.counts[self.v.scenes[0]] >= self.limits.max_evaluations:
+            raise _Spent
+        low, high = sorted((self.t_0, self.t_end))
+        return self.v(u.new_full((1,), min(max(t, low), high)), u.view(1, *self.shape)).flatten()
+
+    def product(self, f: Tensor, way: Tensor) -> Tensor:
+        """J times a vector: a difference of v, forward in time, so that no time beyond the interval is needed."""
+        ahead = float(way[-1]) * self.direction
+        scale = (1 + _rms(self.u)) * math.sqrt(len(self.u))
+        step = math.sqrt(self.roundoff) / math.hypot(float(torch.linalg.vector_norm(way[:-1])) / scale, ahead)
+        step = math.copysign(min(step, abs(self.t_end - self.t) / max(abs(ahead), 1e-300)), ahead)
+        moved = self.velocity(self.t + step * float(way[-1]), self.u + step * way[:-1])
+        return torch.cat([(moved - f) / step, f.new_zeros(1)])
+
+    def _shortest(self) -> float:
+        return 4 * torch.finfo(self.u.dtype).eps * max(abs(self.t), 1e-3 * self.length)
+
+    def _first_step(self, f: Tensor) -> float:
+        """As the explicit methods', but not limited by how fast x changes: that is what J tells."""
+        slope = _rms(f / (self.tolerance * (1 + self.u.abs())))
+        return min((0.01 / slope) ** 0.25, self.length) if slope > 0 else self.length
+
+    def _try(self, f: Tensor, krylov: "_Krylov", h: float) -> tuple[float, float, Tensor]:
+        """A step's error in tolerances, its length, which may be less than asked for, and its end."""
+        scale = self.tolerance * (1 + self.u.abs())
+        while not krylov.enough(1, self.direction * h, scale):
+            h /= 2
+            if not krylov.finite or h < self._shortest():
+                return math.inf, h, self.u
+        signed = self.direction * h
+        ways = [krylov.combination(1, share * signed) for share in (0.5, 1.0)]
+        remainders = []
+        for share, y in zip((0.5, 1.0), ways, strict=True):
+            moved, linear = krylov.vector(y)[:-1], krylov.image(y)[:-1]
+            found = self.velocity(self.t + share * signed, self.u + share * signed * moved)
+            remainders.append(found - f - share * signed * linear)
+        end = self.u + signed * krylov.vector(ways[1])[:-1]
+        parts = ((3, 16 * remainders[0] - 2 * remainders[1]), (4, 12 * remainders[1] - 48 * remainders[0]))
+        part = torch.zeros_like(end)
+        for order, start in parts:
+            part = torch.zeros_like(end)
+            if not start.isfinite().all():
+                return math.inf, h, self.u
+            if h * _rms(start / scale) > KRYLOV:
+                space = _Krylov(lambda way: self.product(f, way), torch.cat([start, start.new_zeros(1)]))
+                if not space.enough(order, signed, scale):
+                    return math.inf, h, self.u
+                part = signed * space.vector(space.combination(order, signed))[:-1]
+            end = end + part
+        scale = self.tolerance * (1 + torch.maximum(self.u.abs(), end.abs()))
+        error = float(unpowered(norms(powered(part / scale)[None]))[0, 0])
+        return (error if math.isfinite(error) and end.isfinite().all() else math.inf), h, end
+
+
+class _Krylov:
+    """The space of b, J b, J^2 b, ..., with orthonormal vectors V and J V_m = V_(m+1) H."""
+
+    def __init__(self, product, start: Tensor) -> None:  # type: ignore[no-untyped-def]
+        self._product, self.size = product, float(torch.linalg.vector_norm(start.double()))
+        self.basis = start.new_empty(LARGEST + 1, len(start))
+        self.basis[0] = start / self.size
+        self.matrix = np.zeros((LARGEST + 1, LARGEST))
+        self.m = 0
+
+    def enough(self, order: int, h: float, scale: Tensor) -> bool:
+        """Extend the space until h phi_order(h J) b is known to `KRYLOV` tolerances; False where it would be too large.
+
+        The error is about |b| h_(m+1,m) |h^2 phi_(order+1)(h H)_(m,1)| along the next vector (Saad).
+        """
+        while True:
+            if self.m:
+                beyond = self.matrix[self.m, self.m - 1]
+                tail = abs(self._phi(order + 1, h)[-1]) * h**2 * beyond * self.size
+                if tail == 0 or tail * _rms(self.basis[self.m][:-1] / scale) <= KRYLOV:
+                    return True
+            if self.m == LARGEST or not self.finite:
+                return False
+            self._extend()
+
+    @property
+    def finite(self) -> bool:
+        """Whether all products with J were."""
+        return bool(np.isfinite(self.matrix).all())
+
+    def _extend(self) -> None:
+        m = self.m
+        following, known = self._product(self.basis[m]), self.basis[: m + 1]
+        for _ in range(2):  # the second time for what rounding has left
+            along = known @ following
+            following = following - along @ known
+            self.matrix[: m + 1, m] += along.double().cpu().numpy()
+        beyond = float(torch.linalg.vector_norm(following))
+        self.matrix[m + 1, m] = beyond
+        self.basis[m + 1] = following / beyond if beyond > 0 else following
+        self.m += 1
+
+    def _phi(self, order: int, h: float) -> np.ndarray:
+        """phi_order(h H) e_1 by the exponential of a larger matrix (Al-Mohy, Higham, 2011)."""
+        m = self.m
+        larger = torch.zeros(m + order, m + order, dtype=torch.float64)
+        larger[:m, :m] = h * torch.from_numpy(self.matrix[:m, :m])
+        larger[0, m] = 1
+        for i in range(m, m + order - 1):
+            larger[i, i + 1] = 1
+        found: np.ndarray = torch.linalg.matrix_exp(larger)[:m, -1].numpy()
+        return found
+
+    def combination(self, order: int, h: float) -> np.ndarray:
+        """phi_order(h J) b in the basis."""
+        return self.size * self._phi(order, h)
+
+    def vector(self, y: np.ndarray) -> Tensor:
+        """V y."""
+        return torch.from_numpy(y).to(self.basis) @ self.basis[: len(y)]
+
+    def image(self, y: np.ndarray) -> Tensor:
+        """J V y."""
+        return self.vector(self.matrix[: self.m + 1, : self.m] @ y)
+
+
+def _rms(x: Tensor) -> float:
+    return float(norms(x[None])[0, 0])

@@ -1,0 +1,101 @@
+"""Trained generators by name: `r2flow.load("street")`, `r2flow sample -c street`, `stage.init=street`.
+
+The file of a model is `NAME.safetensors`, in this folder where it comes with the package, else in the folder of models,
+where `r2flow weights --add NAME FILE` puts it. Nothing is downloaded.
+"""
+
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from r2flow.errors import InputError
+from r2flow.files import atomic_write
+from r2flow.registry import Registry
+
+SHIPPED = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained generator that has a name.
+
+    Attributes:
+        about: What it draws, and from what it has learned.
+        sha256: Of its file.
+        licence: Of its weights.
+        page: Where the file is to be got; None where it comes with the package.
+    """
+
+    about: str
+    sha256: str
+    licence: str = "MIT"
+    page: str | None = None
+
+
+MODELS: Registry[Model] = Registry(
+    "model",
+    street=Model(
+        "street scenes, learned from simulated scans",
+        "0eaf42d0d3c28eda8684d89e39d19d000acdc22f3075370609a632492b6441b4",
+    ),
+)
+DEFAULT = "street"
+
+
+def models_folder() -> Path:
+    """The folder of models that do not come with the package: R2FLOW_MODELS, or ~/.cache/r2flow/models."""
+    named = os.environ.get("R2FLOW_MODELS")
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    return Path(named).expanduser() if named else cache / "r2flow" / "models"
+
+
+def model_file(name: str) -> Path:
+    """Where the file of a model lies, or belongs."""
+    return (SHIPPED if MODELS[name].page is None else models_folder()) / f"{name}.safetensors"
+
+
+def find_model(name: str) -> Path:
+    """The file of a model.
+
+    Raises:
+        InputError: no model of that name, its file is not here, or is another.
+    """
+    path, model = model_file(name), MODELS[name]
+    if not path.is_file():
+        get = f"get it from {model.page} and give r2flow weights --add {name} FILE" if model.page else "install again"
+        raise InputError(f"the model {name} is not here (no {path}): {get}.")
+    _check(name, path)
+    return path
+
+
+def add_model(name: str, file: Path) -> Path:
+    """Copy the file of a model to where it is looked for.
+
+    Raises:
+        InputError: no model of that name, one that comes with the package, or another file.
+    """
+    if MODELS[name].page is None:
+        raise InputError(f"the model {name} comes with the package; there is nothing to add.")
+    if not file.is_file():
+        raise InputError(f"{file} is no file; give the one from {MODELS[name].page}.")
+    _check(name, file)
+    path = model_file(name)
+    with atomic_write(path) as out:
+        out.write(file.read_bytes())
+    return path
+
+
+def name_of(path: Path) -> str | None:
+    """The model whose file this is, if it is one."""
+    return next((name for name in MODELS if model_file(name) == path), None)
+
+
+def _check(name: str, path: Path) -> None:
+    with path.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if found != MODELS[name].sha256:
+        raise InputError(
+            f"{path} is not the model {name}, or damaged: its SHA-256 is {found[:16]}..., not "
+            f"{MODELS[name].sha256[:16]}.... Get it again."
+        )

@@ -1,0 +1,87 @@
+"""Muon: momentum whose singular values are made equal, for weight matrices; AdamW for all other weights."""
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+NEWTON_SCHULZ = 3.4445, -4.7750, 2.0315
+LEAST_CHANNELS = 8  # of a matrix between hidden layers: fewer are an image's
+
+
+class Muon(torch.optim.AdamW):
+    """AdamW whose steps for weight matrices are orthogonal matrices (Jordan et al. 2024, "Muon").
+
+    With the gradient G of a weight matrix, (rows, columns), a convolution's flattened to (out, in x height x width):
+
+        M <- m M + (1 - m) G,    W <- W - rate sqrt(max(1, rows / columns)) orthogonalised((1 - m) G + m M)
+
+    All singular directions of the momentum are learned at one speed, not the few large ones first. Weights that no two
+    hidden layers have between them (the first and the last layer, biases, norms) are AdamW's.
+
+    Args:
+        parameters: What is learned.
+        rate: Learning rate of the matrices.
+        momentum: m.
+        options: AdamW's, for all others.
+    """
+
+    def __init__(self, parameters: Iterable[Tensor], rate: float, momentum: float = 0.95, **options: Any) -> None:
+        found = list(parameters)
+        matrices = [p for p in found if is_hidden_matrix(p)]
+        others = [p for p in found if not is_hidden_matrix(p)]
+        groups: list[dict[str, Any]] = [
+            {"params": others, "momentum": None},
+            {"params": matrices, "lr": rate, "momentum": momentum},
+        ]
+        super().__init__([group for group in groups if group["params"]], **options)
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
+        """One step of all weights."""
+        groups = self.param_groups
+        self.param_groups = [group for group in groups if group["momentum"] is None]
+        try:
+            loss = super().step(closure)
+        finally:
+            self.param_groups = groups
+        for group in groups:
+            if group["momentum"] is not None:
+                for p in group["params"]:
+                    if p.grad is not None:
+                        self._step(p, p.grad, group)
+        return loss
+
+    def _step(self, p: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
+        state = self.state[p]
+        if not state:
+            state["momentum"] = torch.zeros_like(p, memory_format=torch.preserve_format)
+            state["step"] = torch.tensor(0.0)  # AdamW asks every state for it when it is loaded
+        average: Tensor = state["momentum"]
+        average.lerp_(gradient, 1 - group["momentum"])
+        direction = orthogonalised(gradient.lerp(average, group["momentum"]).flatten(1))
+        rows, columns = direction.shape
+        p.mul_(1 - group["lr"] * group["weight_decay"])
+        p.add_(direction.reshape(p.shape), alpha=-group["lr"] * math.sqrt(max(1.0, rows / columns)))
+
+
+def is_hidden_matrix(p: Tensor) -> bool:
+    """Whether a weight is a matrix between hidden layers."""
+    return p.ndim >= 2 and min(p.shape[:2]) >= LEAST_CHANNELS
+
+
+def orthogonalised(matrix: Tensor, steps: int = 5) -> Tensor:
+    """U V^T, nearly, of a matrix U S V^T: singular values come out between 0.68 and 1.14, tiny ones below.
+
+    Each step is the polynomial a X + (b A + c A A) X of A = X X^T, in bfloat16, which needs no division.
+    """
+    a, b, c = NEWTON_SCHULZ
+    x = matrix.T if matrix.shape[0] > matrix.shape[1] else matrix
+    x = (x / (torch.linalg.matrix_norm(x) + 1e-7)).bfloat16()
+    for _ in range(steps):
+        square = x @ x.T
+        x = a * x + (b * square + c * square @ square) @ x
+    x = x.to(matrix.dtype)
+    return x.T if matrix.shape[0] > matrix.shape[1] else x

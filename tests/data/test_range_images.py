@@ -1,0 +1,135 @@
+"""A damaged or hostile .npy is one line, and takes no more memory than its own size."""
+
+import io
+import os
+import signal
+import struct
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r2flow.data.sources import Reading, range_image, read_image
+from r2flow.errors import InputError
+from r2flow.lidar.sensors import SENSORS
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+
+SENSOR = SENSORS["hdl64e"].resized(8, 32)
+READING = Reading(SENSOR, reflectance=True, on_bad_scan="error")
+IMAGE = np.random.default_rng(0).uniform(2, 70, (2, 8, 32)).astype(np.float32)
+
+
+class Told:
+    """What its unpickling would do."""
+
+    def __reduce__(self):
+        return (os.mkdir, ("unpickled",))
+
+
+def npy(array: np.ndarray, **options: bool) -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array(file, array, **options)
+    return file.getvalue()
+
+
+def with_header(header: str, body: bytes = IMAGE.tobytes()) -> bytes:
+    text = header.encode() + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + body
+
+
+def zipped() -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("image.npy", npy(IMAGE))
+    return file.getvalue()
+
+
+SHAPE = "{{'descr': '<f4', 'fortran_order': False, 'shape': {}}}"
+FILES = {
+    "a zip": (zipped(), "not a readable .npy"),
+    "cut in its header": (npy(IMAGE)[:40], "not a readable .npy"),
+    "cut in its body": (npy(IMAGE)[:-5], "Is it damaged"),
+    "more than its body": (npy(IMAGE) + b"1234", "Is it damaged"),
+    "a header that is no header": (with_header("[" * 900), "not a readable .npy"),
+    "a huge shape": (with_header(SHAPE.format((2, 2**31, 2**31))), "Is it damaged"),
+    "a huge shape of one channel": (with_header(SHAPE.format((1, 10**6, 10**6))), "Is it damaged"),
+    "a negative shape": (with_header(SHAPE.format((2, -8, 32))), "Is it damaged"),
+    "another type": (npy(IMAGE.astype(np.int32)), "not floats"),
+    "objects": (npy(np.array([[[Told()]]] * 2, dtype=object), allow_pickle=True), "not floats"),
+    "nothing": (b"", "is empty"),
+}
+
+
+def refused(path: Path) -> str:
+    """The one line that refuses a file, within a second and a mebibyte."""
+    signal.alarm(1)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError) as caught:
+            read_image(path, READING)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        signal.alarm(0)
+        tracemalloc.stop()
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("kind", list(FILES))
+def test_a_file_that_is_no_range_image_is_refused_in_one_line(tmp_path: Path, monkeypatch, kind: str):
+    monkeypatch.chdir(tmp_path)
+    content, words = FILES[kind]
+    path = tmp_path / "image.npy"
+    path.write_bytes(content)
+    assert words in refused(path)
+    assert not (tmp_path / "unpickled").exists()
+
+
+def test_pipes_devices_and_links_to_them_are_refused_at_once(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe.npy")
+    for name in ("device.npy", "device.bin"):
+        (tmp_path / name).symlink_to("/dev/zero")
+    (tmp_path / "nothing.npy").symlink_to(tmp_path / "missing")
+    (tmp_path / "folder.npy").mkdir()
+    for name in ("pipe.npy", "device.npy", "device.bin"):
+        assert "not a regular file" in refused(tmp_path / name)
+    assert "does not exist" in refused(tmp_path / "nothing.npy")
+    assert "is a folder" in refused(tmp_path / "folder.npy")
+
+
+def test_the_verbs_say_it_in_one_line(r2flow, tmp_path: Path):  # noqa: F811
+    for number, (content, words) in enumerate(FILES.values()):
+        path = tmp_path / f"{number}.npy"
+        path.write_bytes(content)
+        code, _, error = r2flow("show", path, "--out", tmp_path / "views")
+        assert (code, error.count("\n")) == (2, 1)
+        assert words in error
+    assert not (tmp_path / "views").exists()
+
+
+def test_range_images_are_read_as_they_were(tmp_path: Path):
+    for number, array in enumerate((IMAGE, np.asfortranarray(IMAGE), IMAGE[:1], IMAGE.astype(np.float64))):
+        path = tmp_path / f"{number}.npy"
+        np.save(path, array)
+        np.testing.assert_array_equal(range_image(path), array)
+    holes = IMAGE.copy()
+    holes[0, 0, :3] = np.nan, np.inf, -np.inf
+    np.save(tmp_path / "holes.npy", holes)
+    np.testing.assert_array_equal(range_image(tmp_path / "holes.npy")[0, 0, :3], 0)
+    np.save(tmp_path / "points.npy", np.ones((9, 4), np.float32))
+    assert range_image(tmp_path / "points.npy") is None
+    assert range_image(tmp_path / "image.bin") is None
+
+
+def test_no_more_memory_is_taken_than_a_few_times_the_file(tmp_path: Path):
+    path = tmp_path / "large.npy"
+    np.save(path, np.ones((2, 512, 2048), np.float32))
+    tracemalloc.start()
+    try:
+        range_image(path)
+        assert tracemalloc.get_traced_memory()[1] < 4 * path.stat().st_size
+    finally:
+        tracemalloc.stop()

@@ -1,0 +1,118 @@
+"""Recordings of ROS, written by rosbags' own writers, hold the points that were written."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r2flow.errors import InputError
+from r2flow.lidar.bags import read_bag
+from r2flow.lidar.scan_files import read_points
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+
+rosbags = pytest.importorskip("rosbags", reason="rosbags is not installed")
+
+from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
+from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: E402
+from rosbags.typesys import Stores, get_typestore  # noqa: E402
+
+DRAW = np.random.default_rng(1)
+CLOUDS = [np.round(DRAW.standard_normal((40 * (n + 1), 3)) * [20, 20, 2], 2).astype(np.float32) for n in range(3)]
+POINT = np.dtype({"names": ["x", "y", "z", "intensity", "ring"], "formats": ["f4", "f4", "f4", "f4", "u2"],
+                  "offsets": [0, 4, 8, 16, 20], "itemsize": 24})  # fmt: skip
+CODES = {"f4": 7, "u2": 4}
+
+
+def message(store, xyz: np.ndarray, order: str = "<", extra: int = 0):
+    """A cloud with padding within its points and, in two rows, behind each row."""
+    kind, types = POINT.newbyteorder(order), store.types
+    table = np.zeros(len(xyz), kind)
+    for axis, values in zip("xyz", xyz.T, strict=True):
+        table[axis] = values
+    table["intensity"], table["ring"] = np.arange(len(xyz)) % 256, np.arange(len(xyz)) % 32
+    rows = table.view(np.uint8).reshape(2, -1) if len(xyz) else np.zeros((2, 0), np.uint8)
+    data = np.concatenate([rows, np.zeros((2, extra), np.uint8)], 1)
+    stamp = types["builtin_interfaces/msg/Time"](1, 2)
+    header = {"stamp": stamp, "frame_id": "lidar"}
+    if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__:
+        header["seq"] = 0
+    fields = [
+        types["sensor_msgs/msg/PointField"](name, POINT.fields[name][1], CODES[POINT[name].str[1:]], 1)
+        for name in POINT.names
+    ]
+    return types["sensor_msgs/msg/PointCloud2"](
+        types["std_msgs/msg/Header"](**header),
+        2,
+        len(xyz) // 2,
+        fields,
+        order == ">",
+        24,
+        data.shape[1],
+        data.ravel(),
+        True,
+    )
+
+
+def record(path: Path, storage: str, topics: tuple[str, ...] = ("/points",), kind: str = "cloud") -> Path:
+    """A recording of the three clouds in each topic; the file that a user would name."""
+    one = storage == "bag"
+    store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
+    writer = Writer1(path) if one else Writer(path, version=8, storage_plugin=StoragePlugin[storage])
+    name = "sensor_msgs/msg/PointCloud2" if kind == "cloud" else "std_msgs/msg/String"
+    with writer:
+        for topic in topics:
+            connection = writer.add_connection(topic, name, typestore=store)
+            for number, xyz in enumerate(CLOUDS):
+                content = (
+                    message(store, xyz, "<>"[number % 2], 8 * number) if kind == "cloud" else store.types[name]("text")
+                )
+                data = store.serialize_ros1(content, name) if one else store.serialize_cdr(content, name)
+                writer.write(connection, 10**9 * (number + 1), data)
+    return path if one else next(file for file in path.iterdir() if file.suffix != ".yaml")
+
+
+@pytest.mark.parametrize("storage", ["MCAP", "SQLITE3", "bag"])
+def test_each_cloud_is_read_as_it_was_recorded(tmp_path: Path, storage: str):
+    file = record(tmp_path / "drive.bag" if storage == "bag" else tmp_path / "drive", storage)
+    for path in {file, tmp_path / "drive"} if storage != "bag" else {file}:
+        found = list(read_bag(path))
+        assert [stamp for stamp, _ in found] == [10**9, 2 * 10**9, 3 * 10**9]
+        for (_, points), xyz in zip(found, CLOUDS, strict=True):
+            np.testing.assert_array_equal(points.xyz, xyz)
+            np.testing.assert_array_equal(points.reflectance, np.arange(len(xyz)) % 256)
+            np.testing.assert_array_equal(points.ring, np.arange(len(xyz)) % 32)
+
+
+def test_unpack_writes_files_that_every_verb_reads(r2flow, tmp_path: Path):  # noqa: F811
+    file = record(tmp_path / "drive", "MCAP", ("/front", "/rear"))
+    out = tmp_path / "scans"
+    code, _, error = r2flow("unpack", file, "--out", out)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "several topics of point clouds; give one by --topic: /front, /rear" in error
+    code, said, error = r2flow("unpack", file, "--topic", "/rear", "--every", 2, "--out", out)
+    assert (code, said, error) == (0, f"2 scans in {out}\n", "")
+    for path, xyz in zip(sorted(out.iterdir()), CLOUDS[::2], strict=True):
+        np.testing.assert_array_equal(read_points(path).xyz, xyz)
+    code, said, _ = r2flow("unpack", file, "--topic", "/rear", "--most", 1, "--out", tmp_path / "one")
+    assert (code, said) == (0, f"1 scans in {tmp_path / 'one'}\n")
+
+
+def test_recordings_without_clouds_or_damaged_are_one_line(r2flow, tmp_path: Path):  # noqa: F811
+    whole = record(tmp_path / "text", "MCAP", kind="text")
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(record(tmp_path / "drive", "MCAP").read_bytes()[:300])
+    other = tmp_path / "other.bag"
+    other.write_bytes(b"#ROSBAG V2.0\n" + bytes(400))
+    for path, words in (
+        (whole, "holds no topic of point clouds"),
+        (cut, "not a readable recording"),
+        (other, "not a readable recording"),
+        (tmp_path / "missing.mcap", "is not a recording"),
+        (tmp_path, "no metadata.yaml"),
+    ):
+        code, _, error = r2flow("unpack", path, "--out", tmp_path / "out")
+        assert (code, error.count("\n")) == (2, 1)
+        assert words in error
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match="holds no topic '/rear'"):
+        list(read_bag(tmp_path / "drive", "/rear"))

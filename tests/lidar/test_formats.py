@@ -1,0 +1,222 @@
+"""Scans of other formats, written by their own libraries, are the points that were written."""
+
+import importlib
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r2flow.errors import InputError
+from r2flow.lidar.scan_files import ELSEWHERE, read_points
+
+DRAW = np.random.default_rng(3)
+XYZ = np.round(DRAW.standard_normal((500, 3)) * [20, 20, 2], 3)
+INTENSITY = DRAW.integers(0, 256, 500)
+RING = DRAW.integers(0, 64, 500)
+F4 = XYZ.astype(np.float32)
+
+
+def same(points, ring=None, intensity=INTENSITY, xyz=F4) -> None:
+    np.testing.assert_array_equal(points.xyz, xyz)
+    if intensity is None:
+        assert points.reflectance is None
+    else:
+        np.testing.assert_array_equal(points.reflectance, intensity.astype(np.float32))
+    if ring is None:
+        assert points.ring is None
+    else:
+        np.testing.assert_array_equal(points.ring, ring)
+
+
+TABLE = np.column_stack([XYZ, INTENSITY])
+WIDE = np.column_stack([np.arange(500), XYZ[:, 2], XYZ[:, 0], XYZ[:, 1], RING, INTENSITY]).astype(np.float32)
+NAMES = ("time", "z", "x", "y", "ring", "intensity")
+
+
+@pytest.mark.parametrize("ending", ["csv", "txt", "xyz"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"delimiter": " "},
+        {"delimiter": ","},
+        {"delimiter": "\t"},
+        {"delimiter": ";", "header": "X;Y;Z;Intensity", "comments": ""},
+        {"delimiter": ",", "header": "x [m],y [m],z [m],intensity", "comments": ""},
+        {"delimiter": " ", "header": "X Y Z Intensity", "comments": "//"},
+        {"delimiter": ",", "header": '"Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2","intensity"', "comments": ""},
+        {"delimiter": " ", "header": "a scan of mine\nof today", "comments": "# "},
+    ],
+    ids=["spaces", "commas", "tabs", "semicolons", "units", "CloudCompare", "VeloView", "comments"],
+)
+def test_columns_of_text(tmp_path: Path, ending: str, options: dict):
+    path = tmp_path / f"a.{ending}"
+    np.savetxt(path, TABLE, fmt=["%.3f"] * 3 + ["%d"], **options)
+    same(read_points(path))
+    np.savetxt(path, TABLE[:, :3], fmt="%.3f", delimiter=options["delimiter"])
+    same(read_points(path), intensity=None)
+
+
+def test_a_table_of_pandas(tmp_path: Path):
+    pandas = pytest.importorskip("pandas", reason="pandas is not installed")
+    frame = pandas.DataFrame(
+        {"time": 0.5, "z": XYZ[:, 2], "y": XYZ[:, 1], "x": XYZ[:, 0], "ring": RING, "Intensity": INTENSITY}
+    )
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    same(read_points(tmp_path / "a.csv"), RING)
+    frame.to_csv(tmp_path / "b.csv", index=True, sep=";")
+    same(read_points(tmp_path / "b.csv"), RING)
+
+
+def test_columns_are_named_where_the_file_does_not(tmp_path: Path):
+    WIDE.tofile(tmp_path / "a.bin")
+    np.save(tmp_path / "a.npy", WIDE.astype(np.float64))
+    np.savetxt(tmp_path / "a.txt", WIDE, fmt="%.6g")
+    np.savez(tmp_path / "a.npz", WIDE)
+    for name in ("a.bin", "a.npy", "a.txt", "a.npz"):
+        same(read_points(tmp_path / name, NAMES), RING)
+        same(read_points(tmp_path / name, ("_", "z", "x", "y", "_", "_")), intensity=None)
+        with pytest.raises(InputError, match="columns must name x, y and z"):
+            read_points(tmp_path / name, ("x", "y"))
+        with pytest.raises(InputError, match="columns must name x, y and z"):
+            read_points(tmp_path / name, ("x", "y", "z", "x"))
+    for name in ("a.npy", "a.txt", "a.npz"):
+        with pytest.raises(InputError, match=r"6 columns without names.*--columns x,y,z,intensity,_,_ "):
+            read_points(tmp_path / name)
+        with pytest.raises(InputError, match=r"6 columns, but 5 were named: x,y,z,_,_"):
+            read_points(tmp_path / name, ("x", "y", "z", "_", "_"))
+
+
+def test_files_that_name_their_columns_take_no_others(tmp_path: Path):
+    np.savetxt(tmp_path / "a.csv", TABLE, delimiter=",", header="x,y,z,intensity", comments="")
+    np.savez(tmp_path / "a.npz", x=XYZ[:, 0], y=XYZ[:, 1], z=XYZ[:, 2])
+    for name in ("a.csv", "a.npz"):
+        with pytest.raises(InputError, match="names its columns itself: leave --columns"):
+            read_points(tmp_path / name, ("x", "y", "z", "intensity"))
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_archives_of_numpy(tmp_path: Path, save):
+    path = tmp_path / "a.npz"
+    save(path, points=TABLE.astype(np.float32))
+    same(read_points(path))
+    save(path, xyz=F4, intensity=INTENSITY, ring=RING, pose=np.eye(4))
+    same(read_points(path), RING)
+    save(path, X=XYZ[:, 0], Y=XYZ[:, 1], Z=XYZ[:, 2], Reflectivity=INTENSITY, stamp=3)
+    same(read_points(path))
+    save(path, F4)
+    same(read_points(path), intensity=None)
+    fields = np.zeros(500, [("x", "f4"), ("y", "f4"), ("z", "f8"), ("ring", "u1"), ("intensity", "u2")])
+    fields["x"], fields["y"], fields["z"], fields["ring"], fields["intensity"] = *XYZ.T, RING, INTENSITY
+    save(path, cloud=fields)
+    same(read_points(path), RING)
+    np.save(tmp_path / "a.npy", fields)
+    same(read_points(tmp_path / "a.npy"), RING)
+
+
+def test_archives_that_hold_no_points_are_refused(tmp_path: Path):
+    path = tmp_path / "a.npz"
+    for arrays, words in (
+        ({"pose": np.eye(4), "stamp": np.zeros(1)}, "holds pose, stamp: no array of points"),
+        ({"points": np.array([object()])}, "holds objects"),
+        ({"xyz": F4, "intensity": INTENSITY[:9]}, "no columns of the same points"),
+        ({"points": F4[None]}, "no field x, y, z; it has: points"),
+    ):
+        np.savez(path, **arrays)
+        with pytest.raises(InputError, match=words):
+            read_points(path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", bytes(300 << 20))
+    assert path.stat().st_size < 1 << 20
+    with pytest.raises(InputError, match="far more than its own size"):
+        read_points(path)
+
+
+def test_tables_of_arrow(tmp_path: Path):
+    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed")
+    from pyarrow import feather, parquet
+
+    x, y, z = F4.astype(np.float16).T.copy()
+    bytes_of = {"intensity": INTENSITY.astype(np.uint8), "laser_number": RING.astype(np.uint8)}
+    argoverse = {"x": x, "y": y, "z": z, **bytes_of, "offset_ns": np.arange(500, dtype=np.int32)}
+    for compression in ("uncompressed", "lz4", "zstd"):
+        feather.write_feather(pyarrow.table(argoverse), tmp_path / "a.feather", compression=compression)
+        same(read_points(tmp_path / "a.feather"), RING, xyz=F4.astype(np.float16).astype(np.float32))
+    table = pyarrow.table(
+        {"x": XYZ[:, 0], "y": XYZ[:, 1], "z": XYZ[:, 2], "Intensity": INTENSITY, "label": ["car"] * 500}
+    )
+    for compression in ("none", "snappy"):
+        parquet.write_table(table, tmp_path / "a.parquet", compression=compression, row_group_size=100)
+        same(read_points(tmp_path / "a.parquet"))
+    parquet.write_table(pyarrow.table({"x": ["a"], "y": [1.0], "z": [1.0]}), tmp_path / "b.parquet")
+    with pytest.raises(InputError, match="x is no numbers"):
+        read_points(tmp_path / "b.parquet")
+    parquet.write_table(pyarrow.table({"points": [[1.0, 2.0]]}), tmp_path / "c.parquet")
+    with pytest.raises(InputError, match="no field x, y, z; it has: points"):
+        read_points(tmp_path / "c.parquet")
+
+
+@pytest.mark.parametrize("ending", ["las", "laz"])
+@pytest.mark.parametrize(("version", "form"), [("1.2", 0), ("1.4", 6)])
+def test_las_and_laz(tmp_path: Path, ending: str, version: str, form: int):
+    laspy = pytest.importorskip("laspy", reason="laspy is not installed")
+    if ending == "laz":
+        pytest.importorskip("lazrs", reason="lazrs is not installed")
+    header = laspy.LasHeader(version=version, point_format=form)
+    header.scales = [0.001] * 3
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = XYZ.T
+    path = tmp_path / f"a.{ending}"
+    cloud.write(path)
+    points = read_points(path)
+    np.testing.assert_allclose(points.xyz, XYZ, atol=6e-4)
+    assert points.reflectance is None  # LAS has a field for it, which nobody has filled
+    cloud.add_extra_dim(laspy.ExtraBytesParams(name="ring", type=np.uint16))
+    cloud.intensity, cloud["ring"] = INTENSITY * 256, RING
+    cloud.write(path)
+    points = read_points(path)
+    np.testing.assert_array_equal(points.reflectance, INTENSITY * 256)
+    np.testing.assert_array_equal(points.ring, RING)
+    with pytest.raises(InputError, match="names its columns itself"):
+        read_points(path, ("x", "y", "z"))
+
+
+@pytest.mark.parametrize("name", ["a.las", "a.laz", "a.feather", "a.parquet"])
+def test_an_extra_that_is_missing_is_one_line_with_the_command(tmp_path: Path, monkeypatch, name: str):
+    def missing(module: str) -> None:
+        raise ImportError(module)
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    (tmp_path / name).write_bytes(b"something")
+    with pytest.raises(InputError, match=r"need (laspy|pyarrow): python -m pip install 'r2flow\[formats\]'"):
+        read_points(tmp_path / name)
+
+
+@pytest.mark.parametrize("ending", list(ELSEWHERE))
+def test_what_is_not_read_says_which_tool_converts_it(tmp_path: Path, ending: str):
+    path = tmp_path / f"recording{ending}"
+    path.write_bytes(b"something")
+    with pytest.raises(InputError) as caught:
+        read_points(path)
+    assert str(caught.value).startswith(str(path))
+    assert "{" not in str(caught.value)
+    assert "rename" not in str(caught.value)
+
+
+def test_text_that_is_no_scan_is_refused(tmp_path: Path):
+    for text, words in (
+        ("", "empty"),
+        ("# nothing\n", "no line of numbers"),
+        ("x,y,z\n", "0 points"),
+        ("1,5;2,5;3,5\n" * 3, "damaged line|no field"),  # decimal commas
+        ("1 2\n3 4\n", "2 columns without names"),
+        ("1,2,,4\n" * 3, "no field x"),
+        ("time,lat,lon\n1,2,3\n", "no field x, y, z; it has: time, lat, lon"),
+        ("1 2 3\n4 5\n", "number of columns changed"),
+        ("1 2 3\nfour 5 6\n", "four"),
+        ("1 2 \xe9\n", "other bytes"),
+    ):
+        (tmp_path / "a.txt").write_text(text, encoding="latin-1")
+        with pytest.raises(InputError, match=words) as caught:
+            read_points(tmp_path / "a.txt")
+        assert "\n" not in str(caught.value)

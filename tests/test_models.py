@@ -1,0 +1,172 @@
+"""Generators that have a name: those in the package, and those in the folder of models."""
+
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+
+from r2flow.checkpoints import find_checkpoint, load_checkpoint, save_checkpoint
+from r2flow.config import learned
+from r2flow.data.pairs import default_folder
+from r2flow.errors import InputError
+from r2flow.evaluation.sets import is_checkpoint
+from r2flow.models import MODELS, SHIPPED, Model, add_model, find_model, model_file, name_of
+from r2flow.reports.contents import card, describe
+from tests.test_checkpoints import saved  # noqa: F401  a fixture
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+
+PACKAGED = [name for name, model in MODELS.items() if model.page is None]
+
+
+@pytest.mark.parametrize("name", PACKAGED)
+def test_a_model_of_the_package_draws(name):
+    found = load_checkpoint(name)
+    assert found.path == find_model(name) == SHIPPED / f"{name}.safetensors"
+    assert all(value.isfinite().all() for value in found.generator.state_dict().values())
+    images = found.sample(1, steps=1)
+    assert images.shape == (1, *found.generator.space.shape)
+    assert images.isfinite().all()
+    assert torch.equal(images, found.sample(2, steps=1)[:1])
+
+
+def test_the_wheel_can_bear_the_models():
+    assert {path.stem for path in SHIPPED.glob("*.safetensors")} == set(PACKAGED)
+    assert sum(find_model(name).stat().st_size for name in PACKAGED) <= 20e6
+
+
+def test_two_lines_of_python_without_a_network_and_a_light_import():
+    code = """
+import socket
+import sys
+
+def refuse(*_, **__):
+    raise OSError("no network")
+
+socket.socket.connect = socket.getaddrinfo = refuse
+import r2flow
+assert "torch" not in sys.modules
+flow = r2flow.load("street")
+scans = flow.sample(2, steps=1)
+assert scans.shape == (2, *flow.generator.space.shape)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_sample_without_a_checkpoint_draws_from_the_default_model(r2flow, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.chdir(tmp_path)
+    code, said, _ = r2flow("sample", "--num", 1, "--steps", 1, "--pictures", 0, "--out", "scans")
+    assert code == 0
+    assert said.startswith("the model street: ")
+    r2flow("sample", "-c", "street", "--num", 1, "--steps", 1, "--pictures", 0, "--out", "named")
+    assert Path("scans/000000.ply").read_bytes() == Path("named/000000.ply").read_bytes()
+
+
+def test_a_run_or_a_file_of_a_models_name_comes_first(saved, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.chdir(tmp_path)
+    assert is_checkpoint("street")
+    Path("street").mkdir()  # which holds no run
+    assert find_checkpoint("street") == find_model("street")
+    Path("street").rmdir()
+    Path("street").symlink_to("run")
+    assert find_checkpoint("street") == Path("street/checkpoints/step-00000007.ckpt")
+    assert is_checkpoint("street")
+    Path("street").unlink()
+    Path("street").write_bytes(b"no checkpoint")
+    with pytest.raises(InputError, match="street is not a checkpoint"):
+        load_checkpoint("street")
+
+
+def test_a_misspelt_name_is_a_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"no checkpoint at stret\. .* a model \(street.*Did you mean 'street'\?"):
+        load_checkpoint("stret")
+
+
+@pytest.fixture
+def released(saved, tmp_path, monkeypatch) -> Path:  # noqa: F811
+    """The file of a model `large` that does not come with the package."""
+    monkeypatch.setenv("R2FLOW_MODELS", str(tmp_path / "models"))
+    path = tmp_path / "downloads" / "some.safetensors"
+    save_checkpoint(load_checkpoint(saved[0]), path)
+    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    monkeypatch.setitem(MODELS._entries, "large", Model("anything", found, page="https://example.org/some.safetensors"))
+    return path
+
+
+def test_a_released_model_is_added_from_a_file(r2flow, released, tmp_path):  # noqa: F811
+    with pytest.raises(InputError, match=r"large is not here .*example.org/some.safetensors and give r2flow weights"):
+        load_checkpoint("large")
+    assert "no" in next(line for line in r2flow("weights")[1].splitlines() if line.startswith("large")).split()
+    code, said, _ = r2flow("weights", "--add", "large", released)
+    assert (code, said) == (0, f"{tmp_path / 'models' / 'large.safetensors'}: the model large\n")
+    assert "yes" in next(line for line in r2flow("weights")[1].splitlines() if line.startswith("large")).split()
+    assert load_checkpoint("large").step == 7
+    assert name_of(model_file("large")) == "large"
+
+
+def test_another_file_is_no_model(r2flow, released):  # noqa: F811
+    released.write_bytes(released.read_bytes() + b" ")
+    with pytest.raises(InputError, match="is not the model large, or damaged"):
+        add_model("large", released)
+    model_file("large").parent.mkdir()
+    model_file("large").write_bytes(released.read_bytes())
+    with pytest.raises(InputError, match="is not the model large, or damaged"):
+        load_checkpoint("large")
+    code, _, said = r2flow("weights", "--add", "larg", released)
+    assert (code, "Did you mean 'large'?" in said) == (2, True)
+    with pytest.raises(InputError, match="comes with the package"):
+        add_model("street", released)
+
+
+def test_half_precision_rounds_large_weights_alone(saved, tmp_path):  # noqa: F811
+    original = load_checkpoint(saved[0])
+    save_checkpoint(original, tmp_path / "half.safetensors", half=True)
+    save_checkpoint(original, tmp_path / "again.safetensors", half=True)
+    assert (tmp_path / "half.safetensors").read_bytes() == (tmp_path / "again.safetensors").read_bytes()
+    with safe_open(tmp_path / "half.safetensors", framework="pt") as file:
+        kinds = {name: file.get_tensor(name).dtype for name in file.keys()}  # noqa: SIM118
+    named = original.generator.named_parameters()
+    large = {name for name, value in named if value.ndim > 1 and value.numel() > 256}
+    assert {name for name, kind in kinds.items() if kind == torch.float16} == large != set()
+    read = load_checkpoint(tmp_path / "half.safetensors").generator.state_dict()
+    for name, value in original.generator.state_dict().items():
+        assert read[name].dtype == value.dtype
+        # float16 has 11 significant bits, and steps of 2^-24 below 2^-14.
+        allowed = (value.abs() * 2.0**-11).clamp(min=2.0**-25) if name in large else torch.zeros_like(value)
+        assert ((read[name] - value).abs() <= allowed).all(), name
+    with pytest.raises(InputError, match=r"half precision is for \.safetensors"):
+        save_checkpoint(original, tmp_path / "half.pth", half=True)
+
+
+def test_a_written_config_says_what_was_learned_and_no_folder():
+    config = {
+        "run_dir": "/home/me/runs/a",
+        "seed": 3,
+        "stage": {"name": "rectify", "init": "/home/me/runs/b"},
+        "data": {"name": "mixed", "root": "/data", "workers": 4, "parts": [{"name": "folder", "root": "/data/a"}]},
+        "parent": {"path": "/home/me/runs/b", "step": 7},
+        "samples": {"num": 4},
+        "sampler": {},
+    }
+    assert learned(config) == {
+        "seed": 3,
+        "stage": {"name": "rectify"},
+        "data": {"name": "mixed", "parts": [{"name": "folder"}]},
+        "parent": {"step": 7},
+    }
+
+
+def test_pairs_of_a_model_lie_outside_the_package():
+    assert default_folder(find_model("street")) == Path("runs/street-pairs")
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_card_says_what_the_file_says(name):
+    path = Path(__file__).parents[1] / "docs" / "models" / f"{name}.md"
+    if not model_file(name).is_file():
+        pytest.skip(f"{name} does not come with the package")
+    assert card(describe(name)) in path.read_text(), f"r2flow info {name} --card, into {path}"

@@ -1,0 +1,97 @@
+"""Names of files that are no plain words, and a disk that is full."""
+
+import os
+import resource
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r2flow.errors import InputError, explain_mistake
+from r2flow.files import atomic_write
+from r2flow.reports.pages import blank_figure
+from r2flow.reports.pictures import figure_pixels
+from tests.data.conftest import write_scan
+from tests.test_checkpoints import saved  # noqa: F401  a fixture
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+
+ODD = [r"a$b$c", r"$\frac$", "a\nb", os.fsdecode(b"caf\xe9"), "ä ß 日", "-x", "a'b\"c"]
+NAMES = ["".join(ODD), *(pytest.param(name, marks=pytest.mark.slow) for name in ODD)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_scans_of_any_name_are_drawn_measured_and_prepared(r2flow, tmp_path, monkeypatch, name):  # noqa: F811
+    monkeypatch.chdir(tmp_path)
+    folder = Path(f"./{name}")
+    folder.mkdir()
+    for number in range(2):
+        write_scan(folder / f"{name}{number}.bin", number)
+    for arguments in (
+        ("show", folder, "-o", "views"),
+        ("prepare", "folder", folder, "-o", "prepared", "--size", "16x64", "--workers", 1),
+        ("evaluate", folder, folder, "--metrics", "jsd", "--out", "page", "--size", "16x64", "--workers", 0),
+    ):
+        code, _, err = r2flow(*[f"./{one}" if one is folder else one for one in arguments])
+        assert code == 0, err
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_mistake_in_a_scan_of_any_name_is_one_line(r2flow, tmp_path, monkeypatch, name):  # noqa: F811
+    monkeypatch.chdir(tmp_path)
+    Path(f"./{name}.bin").write_bytes(b"\0" * 30)
+    code, _, err = r2flow("project", f"./{name}.bin", "-o", "out.npy")
+    assert code == 2
+    (line,) = err.splitlines()
+    assert "bin is not a whole number" in line
+    assert name.partition("\n")[0].encode("utf-8", "backslashreplace").decode() in line
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_models_of_any_name_sample(r2flow, saved, tmp_path, monkeypatch, name):  # noqa: F811
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(saved[0].parents[1], f"./{name}")
+    code, _, err = r2flow("sample", "-c", f"./{name}", "-o", f"./{name}/s", "--num", 1, "--steps", 1)
+    assert code == 0, err
+    code, _, err = r2flow("report", "curvature", f"./{name}", "-o", "page", "--num", 1, "--steps", 2)
+    assert code == 0, err
+
+
+def test_a_dollar_in_a_text_is_drawn_as_one():
+    def drawn(text: str, parsed: bool) -> np.ndarray:
+        figure = blank_figure(4, 1)
+        figure.text(0.1, 0.5, text, parse_math=parsed)
+        return figure_pixels(figure)
+
+    np.testing.assert_array_equal(drawn("a$b$c", True), drawn("a$b$c", False))
+    axes = blank_figure(4, 3).subplots()
+    axes.set(xscale="log", xlim=(1, 1e4))
+    as_usual = blank_figure(4, 3)
+    as_usual.subplots().set(xscale="log", xlim=(1, 1e4))
+    as_usual.canvas.draw()
+    before = np.asarray(as_usual.canvas.buffer_rgba())[..., :3]
+    np.testing.assert_array_equal(figure_pixels(axes.figure, int(axes.figure.dpi)), before)
+
+
+def test_a_full_disk_is_one_line_that_names_the_file(tmp_path: Path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    image = np.zeros((2, 64, 1024), np.float32)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with (
+            pytest.raises(OSError, match="cannot be written whole") as caught,
+            atomic_write(tmp_path / "a.npy") as file,
+        ):
+            np.save(file, image)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert explain_mistake(caught.value).startswith(f"{tmp_path / 'a.npy'}: cannot be written whole")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_newline_in_a_name_does_not_eat_the_line():
+    assert explain_mistake(InputError("a\nb.bin is empty.")) == r"a\nb.bin is empty."
+    assert explain_mistake(FileNotFoundError(2, "No such file", "a\nb")) == r"a\nb: No such file"
+    of_a_worker = "Caught InputError in DataLoader worker process 0.\nOriginal Traceback (most recent call last):\n"
+    of_a_worker += '  File "x", line 1\nr2flow.errors.InputError: a\nb.bin is empty.\n'
+    assert explain_mistake(InputError(of_a_worker)) == r"a\nb.bin is empty."

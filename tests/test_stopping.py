@@ -1,0 +1,91 @@
+"""Ctrl-C and SIGTERM at moments when nothing of a run is under way yet: one line and the signal's exit code."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+from tests.killing import wait_until
+
+# Sends this process a signal when it begins to import a module, then does what a command does.
+AT_IMPORT = """
+import os, runpy, sys
+
+class Told:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), {number})
+
+sys.meta_path.insert(0, Told())
+sys.argv = {argv!r}
+{command}
+"""
+VERB = "from r2flow.cli import main; main()"
+TRAIN = f"runpy.run_path({str(ROOT / 'train.py')!r}, run_name='__main__')"
+
+
+@pytest.mark.parametrize(
+    ("command", "argv", "module"),
+    [
+        (VERB, ["r2flow", "info", "x"], "typer"),
+        (VERB, ["r2flow", "sample", "-c", "x", "-o", "out"], "torch"),
+        (VERB, ["r2flow", "train", "name=x"], "hydra"),
+        (TRAIN, ["train.py", "name=x"], "hydra"),
+        (TRAIN, ["train.py", "name=x"], "torch"),
+        (TRAIN, ["train.py", "name=x"], "lightning"),
+    ],
+)
+def test_told_to_stop_during_an_import(tmp_path: Path, command: str, argv: list[str], module: str):
+    number = signal.SIGTERM if module == "lightning" else signal.SIGINT
+    script = AT_IMPORT.format(module=module, number=int(number), argv=argv, command=command)
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    assert done.returncode == 128 + number
+    assert (done.stdout + done.stderr).splitlines() == ["stopped"]
+    assert list(tmp_path.iterdir()) == []
+
+
+PARENT = """
+import os, time
+from pathlib import Path
+from torch.utils.data import DataLoader
+from r2flow.signals import end_with_parent
+
+class Big:
+    def __len__(self):
+        return 100
+    def __getitem__(self, index):
+        Path(f"pid-{os.getpid()}").touch()
+        return b"x" * 2**20  # more than a pipe takes: a worker waits for its reader
+
+if __name__ == "__main__":
+    loader = iter(DataLoader(Big(), batch_size=None, num_workers=2, worker_init_fn=end_with_parent))
+    next(loader)
+    time.sleep(100)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+def test_workers_end_when_their_parent_is_killed(tmp_path: Path):
+    parent = subprocess.Popen([sys.executable, "-c", PARENT], cwd=tmp_path)
+    try:
+        wait_until(lambda: len(list(tmp_path.glob("pid-*"))) == 2)
+        time.sleep(0.2)  # until both wait
+    finally:
+        parent.kill()
+        parent.wait()
+    workers = [Path("/proc", path.name.removeprefix("pid-")) for path in tmp_path.glob("pid-*")]
+    wait_until(lambda: not any(is_running(worker) for worker in workers), seconds=20)
+
+
+def is_running(process: Path) -> bool:
+    try:
+        return (process / "stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return False

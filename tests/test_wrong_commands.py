@@ -1,0 +1,785 @@
+"""Several hundred wrong commands over every verb and config group: one line, exit code 2, nothing written.
+
+A line of the lists is a command and, after a ` # `, what its answer must say. Without that, it must name one of the
+command's own options, keys or values.
+"""
+
+import contextlib
+import logging
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import r2flow.chain
+import r2flow.training
+from r2flow import cli
+from r2flow.generators import build_generator
+from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.sensors import SENSORS
+from r2flow.stages import build_stage
+from r2flow.stages.checkpointing import AtomicCheckpointIO
+from tests.test_checkpoints import CONFIG
+
+VERBS = """
+nope # No such command 'nope'
+--nope # No such option: --nope
+sampel -c run -o out # Did you mean 'sample'?
+report nope
+report --nope
+sample # Missing
+sample -c run # Missing
+sample -o out # Missing
+sample -c nowhere -o out
+sample -c empty -o out
+sample -c bad.ckpt -o out
+sample -c file.txt -o out
+sample -c scans -o out # scans holds no checkpoint
+sample -c run -o file.txt
+sample -c run -o file.txt/a
+sample -c run -o out --num 0
+sample -c run -o out --num a
+sample -c run -o out --num 1.5
+sample -c run -o out --steps 0
+sample -c run -o out --steps a
+sample -c run -o out --solver nope
+sample -c run -o out --solver torchdiffeq:nope
+sample -c run -o out --tolerance 0
+sample -c run -o out --tolerance nan
+sample -c run -o out --tolerance a
+sample -c run -o out --tolerance -1
+sample -c run -o out --seed -1
+sample -c run -o out --seed 99999999999999999999999
+sample -c run -o out --seed a
+sample -c run -o out --batch-size 0
+sample -c run -o out --device nope
+sample -c run -o out --device meta
+sample -c run -o out --device cuda:99
+sample -c run -o out --device cpu:7
+sample -c run -o out --device '' # an argument is empty
+sample -c run -o out --format las
+sample -c run -o out --format ply,
+sample -c run -o out --pictures -1
+sample -c run -o out --sector 3
+sample -c run -o out --sector a,b
+sample -c run -o out --sector 10,10
+sample -c run -o out --sector nan,3
+sample -c run -o out --sector 0,inf
+sample -c run -o out --sector 1,2,3
+sample -c run -o out --rows 3
+sample -c run -o out --rows 5-3
+sample -c run -o out --rows 0-99
+sample -c run -o out --rows a-b
+sample -c run -o out --rows ' -1-3'
+sample -c run -o out --channels nope
+sample -c run -o out --channels reflectance --format ply
+sample -c run -o out --channels range --format bin
+sample -c run -o out --grid nope
+sample -c run -o out --grid nowhere.json
+sample -c run -o out --grid bad.json
+sample -c run -o out --grid file.txt
+sample -c run -o out --grid empty
+sample -c run -o out --solver dopri5 --grid quadratic
+sample -c run -o out --straight-first --grid quadratic # an adaptive solver
+sample -c run -o out --straight-first --solver nope
+sample -c run -o out --plugin nope
+sample -c run -o out --plugin plugin.py
+sample -c run -o out --plugin empty
+sample -c run -o out extra
+sample -c run -c run -o out -o # '-o' requires an argument
+sample -c '' -o out # an argument is empty
+calibrate # Missing
+calibrate run # Missing
+calibrate run -o out # ends in .json
+calibrate run -o empty
+calibrate run -o out.json --steps 0
+calibrate run -o out.json --steps a
+calibrate run -o out.json --solver dopri5
+calibrate run -o out.json --solver nope
+calibrate run -o out.json --num 0
+calibrate nowhere -o out.json
+calibrate bad.ckpt -o out.json
+calibrate run -o file.txt/a.json
+info # Missing
+info nowhere
+info empty
+info bad.ckpt
+info scans/000000.bin
+info run run # extra argument
+info run --jsn
+convert # Missing
+convert run # Missing
+convert run out # give .safetensors
+convert run out.onnx
+convert run empty
+convert nowhere out.pth
+convert bad.ckpt out.pth
+convert run file.txt/a.pth
+backbones --only nope
+backbones --size 64
+backbones --size 0x0
+backbones --size ²x²
+backbones --size 99999999x99999999 # at most 16,777,216 pixels
+backbones --sensor nope
+backbones --channels 0
+backbones --repeats -1
+backbones --device nope
+backbones extra
+simulate # Missing
+simulate -o out --num 0 # --num
+simulate -o out --num -3
+simulate -o out --sensor nope
+simulate -o out --sensor bad.yaml
+simulate -o out --sensor nowhere.yaml
+simulate -o out --sensor file.txt
+simulate -o out --size 1x1 # found 1
+simulate -o out --size 64
+simulate -o out --seed -1
+simulate -o out --seed 99999999999999999999999 --num 1 --size 8x64
+simulate -o out --first -1
+simulate -o out --format nope
+simulate -o out --format '' # an argument is empty
+simulate -o out --format npy --labels
+simulate -o out --workers 0
+simulate -o file.txt --num 1 --size 8x64
+simulate -o scans --num 1 --size 8x64 # holds scans already
+simulate -o file.txt/a --num 1 --size 8x64
+invert # Missing
+invert scans # Missing
+invert scans -c run # Missing
+invert nowhere -c run -o out
+invert empty -c run -o out
+invert bad.bin -c run -o out
+invert file.txt -c run -o out
+invert scans -c nowhere -o out
+invert scans -c run -o out --most 0
+invert scans -c run -o out --solver nope
+invert scans -c run -o out --solver bosh3 --steps 0
+invert scans -c run -o out --tolerance 0
+invert scans -c run -o out --reflectance-scale 0
+invert scans -c run -o out --reflectance-scale nan
+invert scans -c run -o out --batch-size 0
+invert scans -c run -o file.txt
+invert simulated:x -c run -o out
+invert nope:x -c run -o out
+interpolate scans/000000.bin -c run -o out # Missing
+interpolate scans/000000.bin nowhere.bin -c run -o out
+interpolate scans/000000.bin bad.bin -c run -o out
+interpolate scans/000000.bin scans/000001.bin -c run -o out --frames 1
+interpolate scans/000000.bin scans/000001.bin -c run -o out --solver nope
+interpolate scans/000000.bin scans/000001.bin -c run -o file.txt
+interpolate scans scans -c run -o out # scan
+show # Missing
+show scans # Missing
+show nowhere -o out
+show empty -o out
+show bad.bin -o out
+show file.txt -o out
+show scans -o file.txt
+show scans -o out --sensor nope
+show scans -o out --sensor bad.yaml
+show scans -o out --size ²x²
+show scans -o out --size 8
+show scans -o out --size -8x64
+show scans -o out --projection nope
+show scans -o out --projection unfolding
+show scans -o out --reflectance-scale 0
+show scans -o out --reflectance-scale nan
+show scans -o out --most 0
+show run -o out # a run without samples
+show nope:scans -o out
+show simulated:a -o out
+show kitti_360:nowhere -o out
+project # Missing
+project scans/000000.bin # Missing
+project scans -o out.npy # is a folder, not a scan file
+project nowhere.bin -o out.npy
+project scans/000000.bin -o out # written as .npy
+project scans/000000.bin -o out.npy --size 0x0
+project scans/000000.bin -o out.npy --convention nope
+project scans/000000.bin -o out.npy --projection unfolding
+project scans/000000.bin -o out.npy --reflectance-scale 0
+project scans/000000.bin -o out.npy --sensor nope
+project scans/000000.bin -o file.txt/out.npy
+project image.npy -o out.npy --sensor vlp16
+project bad.ckpt -o out.npy
+sensor # Missing
+sensor nowhere
+sensor empty
+sensor bad.bin
+sensor file.txt
+sensor image.npy
+sensor scans --most 0
+sensor scans -o out # a .yaml file
+sensor scans -o out.yaml --name 'a b'
+sensor scans -o out.yaml --name hdl64e
+sensor scans -o file.txt/out.yaml
+prepare # needs LAYOUT
+prepare folder # needs LAYOUT
+prepare folder scans # needs LAYOUT
+prepare nope scans -o out
+prepare folder nowhere -o out
+prepare folder empty -o out
+prepare folder -o out
+prepare folder scans -o file.txt
+prepare folder scans -o out --split train # no split named 'train'
+prepare folder scans -o out --drives 77
+prepare folder scans -o out --num 3
+prepare folder scans -o out --on-bad-scan ignore
+prepare folder scans -o out --reflectance-levels 0
+prepare folder scans -o out --reflectance-levels 999999
+prepare folder scans -o out --shard-scans 0
+prepare folder scans -o out --workers 0
+prepare folder scans -o out --sensor nope
+prepare folder scans -o out --projection nope
+prepare folder scans -o out --convention nope
+prepare folder scans -o out --reflectance-scale 0
+prepare folder scans -o out --reflectance-scale nan
+prepare kitti_360 scans -o out
+prepare kitti_360 scans -o out --split nope
+prepare simulated scans -o out
+prepare simulated -o out --num 0
+prepare simulated -o out --seed -1
+prepare simulated -o out --split train
+prepare simulated -o out --size 8
+prepare prepared scans -o out
+prepare --check nowhere
+prepare --check empty
+prepare --check scans # no prepared scans
+prepare --check file.txt
+pairs # Missing
+pairs nowhere
+pairs empty
+pairs stopped
+pairs bad.ckpt
+pairs run --num 0
+pairs run --num 1 --solver nope
+pairs run --num 1 --steps 0
+pairs run --num 1 --tolerance 0
+pairs run --num 1 --tolerance nan
+pairs run --num 1 --batch-size 0
+pairs run --num 1 --shard-mib 0
+pairs run --num 1 --shard-mib nan
+pairs run --num 1 --shard-mib inf
+pairs run --num 1 --seed -1
+pairs run --num 1 --seed 99999999999999999999
+pairs run --num 1 --first -1
+pairs run --num 1 --first 99999999999999999999
+pairs run --num 1 --rank 1
+pairs run --num 1 --rank 2 --ranks 2
+pairs run --num 1 --ranks 2
+pairs run --num 1 --device nope
+pairs run --num 1 -o file.txt
+weights --add
+weights --add nope file.txt
+weights --add rangenet53
+weights --add rangenet53 nowhere
+weights --add rangenet53 file.txt
+weights --add rangenet53 empty
+weights nope
+compare # Missing
+compare nowhere
+compare empty
+compare file.txt
+compare scans # is no run
+compare run --repeats -1
+compare run --device nope
+compare run -o file.txt
+evaluate # Missing
+evaluate scans # nothing to compare with
+evaluate nowhere scans
+evaluate scans nowhere
+evaluate empty scans
+evaluate scans empty
+evaluate scans file.txt
+evaluate scans scans --metrics nope
+evaluate scans scans --bootstrap -1
+evaluate scans scans --num 0
+evaluate scans scans --real-num 0
+evaluate scans scans --split train # no split named 'train'
+evaluate scans scans --generated-split train # no split named 'train'
+evaluate scans scans --generated-scale 0
+evaluate scans scans --json empty
+evaluate scans scans --json file.txt/a.json
+evaluate scans scans -o file.txt
+evaluate scans scans --sensor nope
+evaluate scans scans --size 8
+evaluate scans scans --projection nope
+evaluate scans scans --convention nope
+evaluate scans scans --batch-size 0
+evaluate scans scans --workers -1
+evaluate scans scans --device nope
+evaluate scans -c run # a curve needs --out
+evaluate scans -c nowhere -o out
+evaluate scans scans -c run -o out # not both
+evaluate scans -c run -o out --floor
+evaluate scans -c run -o out --steps 0
+evaluate scans -c run -o out --steps a
+evaluate scans -c run -o out --steps 1,,2
+evaluate scans -c run -o out --solver nope
+evaluate scans -c run -o out --tolerance 0
+evaluate scans run --steps 1,2
+evaluate scans run --solver nope
+evaluate scans run --sensor vlp16
+evaluate scans run --size 16x64
+evaluate scans run --seed -1
+evaluate image.npy # nothing to compare with
+evaluate simulated:x scans
+report fidelity scans # Missing
+report fidelity scans nowhere
+report fidelity nowhere scans
+report fidelity scans scans --train nowhere
+report fidelity scans scans --floor nowhere
+report fidelity scans scans --also nowhere
+report fidelity scans scans --most 0
+report fidelity scans scans --size 8
+report fidelity scans scans -o file.txt
+report neighbours scans # Missing
+report neighbours scans scans # Missing
+report neighbours nowhere scans -o out
+report neighbours scans nowhere -o out
+report neighbours scans scans -o out --by nope
+report neighbours scans scans -o out --pairs 0
+report neighbours scans scans -o out --num 0
+report neighbours scans scans -o out --split train # no split named 'train'
+report neighbours scans scans -o file.txt
+report neighbours scans scans -o out --real nowhere
+report curvature # Missing
+report curvature run # Missing
+report curvature nowhere -o out
+report curvature run -o out --steps 0
+report curvature run -o out --num 0
+report curvature run -o out --most-curved 0
+report curvature run -o file.txt
+report curvature run -o out --device nope
+report work-precision # Missing
+report work-precision nowhere -o out
+report work-precision -o out --methods nope
+report work-precision -o out --budgets 0
+report work-precision -o out --budgets a
+report work-precision -o out --budgets '' # an argument is empty
+report work-precision -o out --tolerances -1
+report work-precision -o out --tolerances nan
+report work-precision -o out --problems nope
+report work-precision -o out --problems none
+report work-precision -o out --problem-scenes 0
+report work-precision -o out --repeats 0
+report work-precision -o file.txt
+report work-precision run -o out --reference-steps 0
+report work-precision run -o out --reference-tolerance 0
+report work-precision run -o out --reference-tolerance nan
+report stability # Missing
+report stability -o out --problems nope
+report stability -o out --problems none
+report stability -o out --solvers nope
+report stability -o out --tolerances 0
+report stability -o out --steps 0
+report stability -o out --scenes 0
+report stability -o out --seed -1
+report stability -o out --max-evaluations 0
+report stability -o file.txt
+report savings nowhere
+report savings -o file.txt
+report savings --num 0
+report savings --steps 0
+report savings --tolerance 0
+report savings --tolerance nan
+report savings run -o out --device nope
+report paper # Missing
+report paper --runs run # Missing
+report paper --runs nowhere -o out
+report paper --runs empty -o out
+report paper --runs run -o out --num 1
+report paper --runs run -o out --steps 0
+report paper --runs run -o out --curved -1
+report paper --runs run -o out --tolerance -1
+report paper --runs run -o out --metrics nope
+report paper --runs run -o out --real nowhere
+report paper --runs run -o file.txt
+report paper --runs run -o out --bootstrap -1
+sample -c run -o out --format '' # an argument is empty
+sample -c run -o '' # an argument is empty
+evaluate scans scans --metrics '' # an argument is empty
+backbones --only '' # an argument is empty
+"""
+
+TRAIN = """
+name=x callbacks.checkpoint.every=1.5
+name=x callbacks.checkpoint=5
+name=x callbacks.guard.lowest_scale=-1
+name=x callbacks.guard.lowest_scale=nan
+name=x callbacks.guard.skips=a
+name=x callbacks.requeue.every=0
+name=x callbacks.pictures.every=-1
+name=x callbacks.curvature.num=0
+name=x callbacks.curvature.steps=0
+name=x callbacks.progress.seconds=-1
+name=x callbacks.ema.every=a
+name=x +callbacks.ema.foo=1
+name=x callbacks=other
+name=x callbacks=[1]
+name=x +callbacks.mine=null
+name=x +callbacks.mine={}
+name=x samples.num=-1
+name=x samples.num=1.5
+name=x +samples.steps=3
+name=x samples=3
+name=x sampler.method=3
+name=x sampler.method=null sampler.steps=0
+name=x sampler.method=torchdiffeq:foo
+name=x sampler.tolerance=0
+name=x sampler.tolerance=a
+name=x sampler.grid=wave
+name=x sampler.grid=[0,0.5]
+name=x sampler.grid=[1,0]
+name=x +sampler.foo=1
+name=x sampler.method=dopri5 sampler.grid=quadratic
+name=x backbone.base_channels=7
+name=x backbone.depths=[]
+name=x backbone.depths=[0,0]
+name=x backbone.num_heads=[3,5,7]
+name=x backbone.num_heads=[0,1,2]
+name=x backbone.patch=[3,5] # multiple of 12
+name=x backbone.patch=[0,1]
+name=x backbone.patch=2
+name=x backbone.window=0
+name=x backbone.window=[1,2,3]
+name=x backbone.attention=foo
+name=x backbone.position=foo
+name=x backbone.dropout=nan
+name=x backbone.time_channels=1
+name=x backbone=adm_unet backbone.base_channels=33
+name=x backbone=adm_unet backbone.channel_multipliers=[]
+name=x backbone=efficient_unet backbone.base_channels=0
+name=x backbone=efficient_unet backbone.base_channels=1000000000
+name=x backbone=nope
+name=x backbone=
+name=x backbone.name=null
+name=x sensor=nope
+name=x sensor.height=-5
+name=x sensor.height=nan
+name=x sensor.height=a
+name=x sensor.rows=1
+name=x sensor.rows=-8
+name=x sensor.rows=100000000
+name=x sensor.columns=0
+name=x sensor.columns=100000000
+name=x sensor.columns=7
+name=x sensor.min_range=0
+name=x sensor.min_range=100
+name=x sensor.max_range=inf
+name=x sensor.max_range=-1
+name=x sensor.rays=foo
+name=x sensor.name=nope
+name=x +sensor.elevations=[1,2]
+name=x sensor.name=mine +sensor.elevations=[1]
+name=x sensor.name=mine +sensor.elevations=[1,2,3]
+name=x sensor.name=mine +sensor.elevations=[a,b]
+name=x +sensor.firing=[0,1]
+name=x encoding=nope
+name=x encoding.format=null
+name=x encoding.reflectance=3
+name=x +encoding.gamma=3
+name=x data=nope
+name=x data=null
+name=x data=kitti_raw
+name=x data=kitti_raw data.root=/nowhere
+name=x data=kitti_raw data.root=empty
+name=x data=kitti_raw data.root=file.txt
+name=x data=kitti_360 data.root=empty
+name=x data=odometry data.root=empty
+name=x data=object data.root=empty
+name=x data=nuscenes data.root=empty
+name=x data=folder data.root=empty
+name=x data=folder data.root=scans data.split=train
+name=x data=folder data.root=scans data.drives=[7]
+name=x data=folder data.root=scans data.drives=7
+name=x data=folder data.root=scans data.projection=flat
+name=x data=folder data.root=scans data.projection=unfolding
+name=x data=folder data.root=scans data.convention=foo
+name=x data=folder data.root=scans data.reflectance_scale=0
+name=x data=folder data.root=scans data.reflectance_scale=nan
+name=x data=folder data.root=scans data.on_bad_scan=ignore
+name=x data=folder data.root=scans data.validation.share=2
+name=x data=folder data.root=scans data.validation.share=-1
+name=x data=folder data.root=scans data.validation.share=nan
+name=x data=folder data.root=scans data.validation.scans=-1
+name=x data=folder data.root=scans data.validation.scans=1.5
+name=x data=folder data.root=scans data.validation=3
+name=x data=folder data.root=scans data.validation.data=3
+name=x data=folder data.root=scans data.validation.data={root:empty}
+name=x data=folder data.root=scans data.pairs=3
+name=x data=folder data.root=scans data.augment.flip=3
+name=x data=folder data.root=scans data.augment=3
+name=x data=folder data.root=scans data.augment.beam_dropout=-1
+name=x data=folder data.root=scans data.batch_size=0
+name=x data=folder data.root=scans data.workers=-1
+name=x data=folder data.root=scans data.workers=a
+name=x data=folder data.root=scans data.scenes=0
+name=x data=folder data.root=scans data.parts=[{name:folder}]
+name=x data.scenes=0
+name=x data.scenes=-1
+name=x data.scenes=1.5
+name=x data.memory_gib=nan
+name=x data=prepared data.root=empty
+name=x data=prepared data.root=scans
+name=x data=prepared
+name=x data=mixed data.parts=[]
+name=x data=mixed data.parts=3
+name=x data=mixed data.parts=[3]
+name=x data=mixed 'data.parts=[{name: folder}]'
+name=x data=mixed 'data.parts=[{name: folder, root: empty}]'
+name=x data=mixed 'data.parts=[{name: folder, root: scans, weight: -1}]'
+name=x data=mixed 'data.parts=[{name: folder, root: scans, weight: 1}, {name: folder, root: scans}]'
+name=x data=mixed 'data.parts=[{name: folder, root: scans, weight: nan}]'
+name=x data=pairs
+name=x data=pairs data.root=empty
+name=x stage=reflow
+name=x stage=distill
+name=x stage=reflow stage.init=nowhere
+name=x stage=reflow stage.init=empty
+name=x stage=reflow stage.init=bad.ckpt
+name=x stage=reflow stage.init=stopped
+name=x stage=reflow stage.init=run
+name=x stage=reflow data=pairs stage.init=run data.pairs.num=0
+name=x stage=reflow data=pairs stage.init=run data.pairs.method=eulr
+name=x stage=reflow data=pairs stage.init=run data.pairs.steps=0
+name=x stage=reflow data=pairs stage.init=run data.pairs.tolerance=0
+name=x stage=reflow data=pairs stage.init=run data.pairs.shard_mib=0
+name=x stage=reflow data=pairs stage.init=run data.pairs.batch_size=0
+name=x stage=reflow data=pairs stage.init=run data.pairs.seed=-1
+name=x stage=reflow data=pairs stage.init=run data.pairs.first=-1
+name=x stage=reflow data=pairs stage.init=run data.pairs.num=a
+name=x stage=reflow data=pairs stage.init=run +data.pairs.foo=1
+name=x stage=distill data=pairs stage.init=run stage.steps=0
+name=x stage=distill data=pairs stage.init=run stage.steps=a
+name=x stage=reflow data=pairs stage.init=run backbone=hdit
+name=x stage=reflow data=pairs stage.init=run sensor.rows=32
+name=x stage=reflow data=pairs stage.init=run encoding=metric
+name=x stage.learning_rate=-1
+name=x stage.learning_rate=null
+name=x stage.weight_decay=nan
+name=x stage.loss=null
+name=x stage.time=uniform
+name=x stage.time.name=null
+name=x stage.time=[]
+name=x +stage.foo=1
+name=x stage.steps=3
+name=x stage.name=nope
+name=x trainer=nope
+name=x trainer.devices=0
+name=x trainer.devices=-3
+name=x trainer.devices=foo
+name=x trainer.num_nodes=0
+name=x trainer.max_steps=0
+name=x trainer.max_steps=-1
+name=x trainer.max_steps=null
+name=x trainer.max_steps=1.5
+name=x trainer.max_time=foo
+name=x trainer.max_time=-1
+name=x trainer.precision=foo
+name=x trainer.accelerator=cuda
+name=x trainer.strategy=ddp_foo
+name=x trainer.gradient_clip_algorithm=foo
+name=x trainer.gradient_clip_val=-1
+name=x trainer.profiler=foo
+name=x trainer.overfit_batches=-1
+name=x trainer.limit_val_batches=-1
+name=x trainer.num_sanity_val_steps=-5
+name=x trainer.val_check_interval=-1
+name=x trainer.val_check_interval=1.5
+name=x trainer.val_check_interval=foo
+name=x trainer.fast_dev_run=-1
+name=x trainer.fast_dev_run=foo
+name=x trainer.min_steps=-1
+name=x trainer.min_epochs=foo
+name=x trainer.barebones=true
+name=x trainer.reload_dataloaders_every_n_epochs=-1
+name=x trainer.benchmark=foo
+name=x trainer.enable_progress_bar=3
+name=x trainer.detect_anomaly=foo
+name=x trainer.default_root_dir=3
+name=x trainer.logger=true
+name=x trainer=3
+name=x trainer=null
+name=x loggers=[foo]
+name=x loggers=[3]
+name=x loggers=csv
+name=x loggers={a:1}
+name=x seed=a
+name=x seed=null
+name=x seed=1.5
+name=x plugins=[nope]
+name=x +plugins.a=3
+name=x --plugin nope
+name=x --plugin plugin.py
+name=x --plugin nowhere.py
+--plugin
+name=x experiment=nope
+name=x experiment=reflow
+name=x experiment=distill stage.init=empty
+name=x experiment=3
+name=x chain=[]
+name=x 'chain={a: {init: b}}'
+name=x 'chain={a: {init: a}}'
+name=x 'chain={a: {foo: 1}}'
+name=x 'chain={a: {experiment: nope}}'
+name=x 'chain={a: {plugins: [b]}}'
+name=x 'chain={a: {stage: 3}}'
+name=x 'chain={a/b: {seed: 3}}'
+name=x 'chain={"..": {seed: 3}}' # cannot be read
+name=x experiment=demo chain.rf1=null
+name=x experiment=demo chain.rf1.trainer.max_steps=0
+name=x experiment=demo stage.init=run
+name=x experiment=demo trainer.fast_dev_run=true
+name=x run_dir=3
+name=a/../../b
+name=. # names a folder
+name=.. # names a folder
+name=null # names a folder
+name=[1] # names a folder
+name=x foo
+name=x foo=
+name=x == # KEY=VALUE
+name=x a=b=c
+name=x + # KEY=VALUE
+name=x ~ # KEY=VALUE
+name=x data.=3 # data.=3 cannot be read
+name=x .data=3 # .data=3 cannot be read
+name=x [a]=3 # [a]=3 cannot be read
+name=x 'data={' # data={ cannot be read
+name=x 'data=[a' # data=[a cannot be read
+name=x "seed='3"
+name=x seed=${oc.env:NOPE}
+name=x seed=${seed} # interpolation
+name=x --cfg
+name=x --cfg foo
+name=x --config-dir nowhere
+name=x --config-name nope
+name=x --config-path nope
+name=x --multirun -x # -x; see --help
+name=x -m hydra/launcher=nope
+name=x -m hydra/sweeper=nope
+name=x seed=1,2
+name=x hydra.run.dir=file.txt
+name=x hydra=3
+name=x generator=nope
+name=x generator={name:nope}
+name=x generator=[1]
+name=x 'generator={name: rectified_flow, foo: 1}'
+name=x data@foo=kitti_raw
+name=x override
+name=x ~data.batch_size
+name=x ~sensor.rows
+name=x ~trainer.max_steps
+name=x ~run_dir
+name=x ~name # every run has its name
+name=x scans=3 # no key 'scans'
+name=x parent=3
+name=x +parent=3
+"""
+
+
+USUAL = {"", "-", "c", "o", "x", "a", "1", "0", "3", "name", "run", "out", "scans", "train", "data", "report"}
+
+
+def commands(text: str) -> list[str]:
+    return [line for line in text.splitlines() if line]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Scans, a finished run and one that has stopped, and files that are none of these."""
+    place = tmp_path_factory.mktemp("place")
+    sensor = SENSORS["hdl64e"].resized(16, 128)
+    e = sensor.rays()[0].numpy()
+    for number in range(3):
+        r = np.where(e < -0.03, -1.73 / np.sin(np.minimum(e, -0.03)), 20 + number)
+        image = np.stack([r, np.full_like(r, 0.3)]).astype(np.float32)
+        write_points(place / "scans" / f"{number:06d}.bin", *image_to_points(image, sensor.rays()))
+    for name, more in (("run", {}), ("stopped", {"trainer": {"max_steps": 20}})):
+        config = {**CONFIG, **more}
+        state = build_stage(config, build_generator(config)).state_dict()
+        content = {"state_dict": state, "current_model_state": state, "config": config, "global_step": 7}
+        AtomicCheckpointIO().save_checkpoint(content, place / name / "checkpoints" / "step-00000007.ckpt")
+        (place / name / "config.yaml").write_text(yaml.safe_dump(config))
+    (place / "empty").mkdir()
+    np.save(place / "image.npy", np.stack([np.full((8, 64), 9.0), np.full((8, 64), 0.5)]).astype(np.float32))
+    (place / "bad.bin").write_bytes(b"\0" * 30)
+    contents = {
+        "file.txt": "in the way",
+        "bad.ckpt": "nothing",
+        "bad.json": "{",
+        "bad.yaml": "name: mine\nelevations: [3]\n",
+        "plugin.py": "raise RuntimeError('no')\n",
+    }
+    for name, text in contents.items():
+        (place / name).write_text(text)
+    return place
+
+
+def listing(folder: Path) -> dict[Path, tuple[int, int]]:
+    found = {path: path.stat() for path in sorted(folder.rglob("*"))}
+    return {path: (stat.st_size, 0 if path.is_dir() else stat.st_mtime_ns) for path, stat in found.items()}
+
+
+@pytest.fixture
+def refused(place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
+    """Runs a command in that place, and sees to it that it is refused."""
+
+    def ready(run: r2flow.training.Run) -> None:
+        """In place of `fit`: what it reads before the first step."""
+        if run.config["data"]["name"] != "simulated":
+            run.data.setup()
+        raise AssertionError("it would train")
+
+    monkeypatch.setattr(r2flow.training, "fit", ready)
+    monkeypatch.setattr(r2flow.chain, "run_process", lambda command: pytest.fail("it would start a run"))
+
+    def check(line: str) -> None:
+        command, _, words = line.partition(" # ")
+        arguments = shlex.split(command)
+        monkeypatch.setattr(sys, "argv", ["r2flow", *arguments])
+        before = listing(place)
+        with contextlib.chdir(place), pytest.raises(SystemExit) as end:
+            cli.main()
+        said = capfd.readouterr().err
+        assert end.value.code == 2, said
+        (answer,) = said.splitlines()
+        assert answer.startswith("error: ")
+        named = {word for argument in arguments[1:] for word in re.split(r"[^\w²-]+", argument.strip("-"))}
+        wanted = {words} if words else named - USUAL
+        assert any(word in answer for word in wanted), answer
+        assert listing(place) == before
+
+    return check
+
+
+@pytest.fixture(autouse=True)
+def _quiet() -> Iterator[None]:
+    """What verbs set up for the whole process."""
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    yield
+    root.handlers[:], root.level = handlers, level
+
+
+@pytest.mark.parametrize("line", commands(VERBS))
+def test_a_wrong_verb_or_option_is_refused(refused, line: str):
+    refused(line)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", commands(TRAIN))
+def test_a_wrong_config_is_refused(refused, line: str):
+    refused(f"train {line}")
+
+
+def test_there_are_at_least_three_hundred_kinds():
+    assert len({*commands(VERBS), *commands(TRAIN)}) >= 300
