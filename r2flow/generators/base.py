@@ -52,7 +52,7 @@ class Sampler:
             InputError: an unknown option, or a value of the wrong type.
         """
         # An option of earlier development versions, which did nothing on trained flows.
-        options = {key: options[key] for key in options if key != "straight_first"}
+        options = {str(key): value for key, value in options.items() if key != "straight_first"}
         check_options("sampler", cls, options)
         grid = options.get("grid", "uniform")
         if grid == "quadratic":  # its name in version 0.1.0
