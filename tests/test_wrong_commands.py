@@ -89,7 +89,7 @@ sample -c run -o out --grid power:0
 sample -c run -o out --error 0.05m # measure them
 sample -c run -o out --error nope
 sample -c run -o out --error 0.05m --steps 4 # leave solver
-sample -c run -o out --straight-first --solver nope
+sample -c run -o out --margin 10 --solver nope
 sample -c run -o out --plugin nope
 sample -c run -o out --plugin plugin.py
 sample -c run -o out --plugin empty
