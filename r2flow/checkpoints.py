@@ -233,7 +233,8 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     check_weights(generator, weights, path)
     generator.load_state_dict(weights)
     if sampler is not None:
-        generator.sampler = Sampler.of(sampler)
+        # An option of earlier development versions, which did nothing on trained flows.
+        generator.sampler = Sampler.of({key: value for key, value in sampler.items() if key != "straight_first"})
     if "published" in config and config["data"]["projection"] == "unfolding":
         sensor = published_rings(generator.space.sensor, weights[BACKBONE + "coords"])
         generator.space = replace(generator.space, sensor=sensor)

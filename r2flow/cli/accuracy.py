@@ -166,7 +166,7 @@ def savings(
     seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0,
     device: DeviceOption = "auto",
 ) -> None:
-    """What a scan need not cost: own steps, leaving early, one step for the straight, regions, single channels."""
+    """What a scan need not cost: own steps, leaving early, regions, single channels."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.flow.solvers import check_tolerance
     from r2flow.generators import as_flow

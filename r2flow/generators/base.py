@@ -30,7 +30,6 @@ class Sampler:
         steps: Steps from noise to data, of a method of fixed steps.
         tolerance: Absolute and relative tolerance of an adaptive method.
         grid: Where fixed steps fall: a name, or the times themselves.
-        straight_first: Whether a scan that is straight to the tolerance takes one step (`r2flow.flow.straight_exit`).
         fixed: Whether the generator was trained for this number of steps and is worse at any other.
     """
 
@@ -38,7 +37,6 @@ class Sampler:
     steps: Count = 32
     tolerance: Positive = 1e-5
     grid: str | tuple[float, ...] = "uniform"
-    straight_first: bool = False
     fixed: bool = False
 
     @classmethod
@@ -55,14 +53,14 @@ class Sampler:
     def changed(self, **options: Any) -> Self:
         """The same with the options that are not None. Given times decide the number of steps.
 
-        Another method starts from a uniform grid and without `straight_first`: those were the former method's.
+        Another method starts from a uniform grid: the former one's was for it alone.
 
         Raises:
             InputError: fewer than one step, or times and a number of steps that contradict.
         """
         given = {key: value for key, value in options.items() if value is not None}
         if given.get("method", self.method) != self.method:
-            given = {"grid": "uniform", "straight_first": False, **given}
+            given = {"grid": "uniform", **given}
         grid = given.get("grid", "uniform")
         if not isinstance(grid, str):
             given["grid"] = tuple(float(t) for t in grid)

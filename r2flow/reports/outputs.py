@@ -70,6 +70,11 @@ def write_samples(
     formats = formats_of(checkpoint, channels) if formats is None else formats
     check_formats(checkpoint, formats, channels)
     out, rays = Path(out), checkpoint.sensor.rays()
+    if {"ply", "bin"} & set(formats) and not torch.equal(generator.space.rays, rays):
+        log.warning(
+            "the model was told rays through the corners of the bins (rays=reference); points are written along rays "
+            "through their middles, where returns lie nearer (docs/data.md, Projection)"
+        )
     shown: list[np.ndarray] = []
     with ScanBar("sampling", num, batches(num, batch_size) * generator.evaluations_of(sampler)) as bar:
         for drawn in sample(
@@ -107,7 +112,8 @@ def keep_note(checkpoint: Checkpoint, out: Path, seed: int, **sampler: Any) -> N
     about = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
     about |= {"min_range": checkpoint.sensor.min_range, "max_range": checkpoint.sensor.max_range}
     reading, step = reading_of_flow(checkpoint), checkpoint.step
-    write_samples_note(out, reading, encoding=about, seed=seed, sampler=sampler, step=step)
+    # Points lie on rays through the middles of the bins, whatever rays the model was told.
+    write_samples_note(out, reading, encoding=about, seed=seed, sampler=sampler, step=step, rays="centre")
 
 
 def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str) -> None:
