@@ -85,8 +85,6 @@ sample -c run -o out --grid bad.json
 sample -c run -o out --grid file.txt
 sample -c run -o out --grid empty
 sample -c run -o out --solver dopri5 --grid quadratic
-sample -c run -o out --straight-first --grid quadratic # an adaptive solver
-sample -c run -o out --straight-first --solver nope
 sample -c run -o out --plugin nope
 sample -c run -o out --plugin plugin.py
 sample -c run -o out --plugin empty
