@@ -19,7 +19,7 @@ from r2flow.config import learned
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
-from r2flow.generators import Generator, RectifiedFlow, Sampler, build_generator
+from r2flow.generators import Budget, Generator, RectifiedFlow, Sampler, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
@@ -46,6 +46,7 @@ class Checkpoint:
         step: Optimiser steps taken.
         path: Where it was read from.
         format: `r2flow`, or `published` for the reference implementation's files.
+        accuracy: What its sampler's errors are, where they have been measured (`r2flow.accuracy.calibrate`).
     """
 
     generator: Generator
@@ -53,6 +54,7 @@ class Checkpoint:
     step: int
     path: Path
     format: str
+    accuracy: tuple[Budget, ...] = ()
 
     @property
     def model(self) -> nn.Module:
@@ -232,13 +234,12 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
         generator = build_generator(config)
     check_weights(generator, weights, path)
     generator.load_state_dict(weights)
-    if sampler is not None:
-        # An option of earlier development versions, which did nothing on trained flows.
-        generator.sampler = Sampler.of({key: value for key, value in sampler.items() if key != "straight_first"})
+    generator.sampler = Sampler.of(sampler or {})  # where none was written down, 32 Euler steps
     if "published" in config and config["data"]["projection"] == "unfolding":
         sensor = published_rings(generator.space.sensor, weights[BACKBONE + "coords"])
         generator.space = replace(generator.space, sensor=sensor)
-    return Checkpoint(generator.eval().requires_grad_(False).to(device), config, step, path, kind)
+    accuracy = tuple(Budget.of(one) for one in content.get("accuracy") or ())
+    return Checkpoint(generator.eval().requires_grad_(False).to(device), config, step, path, kind, accuracy)
 
 
 SPARE = 2**28  # elements of buffers that a checkpoint does not hold, and of what is computed on the way
@@ -299,6 +300,7 @@ def read_safetensors(path: Path) -> dict[str, Any]:
             notes, prefix = {key: json.loads(kept[key]) for key in ("config", "step")}, PREFIX + BACKBONE
             whole = True
         config, step, sampler = notes["config"], int(notes["step"]), notes.get("sampler")
+        accuracy = notes.get("accuracy")
     except KeyError as error:
         raise InputError(f"{path} holds weights but no r2flow config (no {error} in its metadata).") from None
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
@@ -306,7 +308,7 @@ def read_safetensors(path: Path) -> dict[str, Any]:
     if not whole:
         raise InputError(_damaged(path, "its weights and config"))
     state = {prefix + name: value for name, value in weights.items()}
-    return {"config": config, "global_step": step, "state_dict": state, "sampler": sampler}
+    return {"config": config, "global_step": step, "state_dict": state, "sampler": sampler, "accuracy": accuracy}
 
 
 def _digest(notes: Mapping[str, Any], weights: Mapping[str, Tensor]) -> str:
@@ -338,6 +340,8 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
             "step": checkpoint.step,
             "sampler": checkpoint.generator.sampler.asdict(),
         }
+        if checkpoint.accuracy:
+            notes["accuracy"] = [budget.asdict() for budget in checkpoint.accuracy]
         # Several keys of metadata come in no fixed order.
         data = save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})})
         with atomic_write(path) as file:
@@ -356,6 +360,30 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
             torch.save(content, file)
     else:
         raise InputError(f"{path}: give .safetensors for our format or .pth for the published one.")
+
+
+def keep_sampler(checkpoint: Checkpoint) -> None:
+    """Write the generator's sampler and the errors that it has into the file that the checkpoint was read from.
+
+    Raises:
+        InputError: a file of the published format, which has no place for them, or one that cannot be written.
+    """
+    path = checkpoint.path
+    if checkpoint.format == "published":
+        own = path.with_suffix(".safetensors")
+        raise InputError(f"{path} has no place for a sampler; give a copy that has: r2flow convert {path} {own}.")
+    if path.suffix == ".safetensors":
+        from safetensors import safe_open
+
+        with safe_open(path, framework="pt") as file:
+            half = any(file.get_slice(name).get_dtype() == "F16" for name in file.keys())  # noqa: SIM118
+        save_checkpoint(checkpoint, path, half)
+        return
+    content = torch.load(path, map_location="cpu", weights_only=True)
+    content["sampler"] = checkpoint.generator.sampler.asdict()
+    content["accuracy"] = [budget.asdict() for budget in checkpoint.accuracy]
+    with atomic_write(path) as file:
+        torch.save(content, file)
 
 
 def large_matrices(module: nn.Module) -> set[str]:

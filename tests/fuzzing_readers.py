@@ -18,7 +18,6 @@ from r2flow.lidar.sensor_files import read_sensor
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.extractors.weights import read_published
 from r2flow.runs import read_config
-from r2flow.time_grids import read_grid
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
 
@@ -87,12 +86,8 @@ def weights(path: Path) -> None:
     read_published(path)
 
 
-def grid(path: Path) -> None:
-    read_grid(path, load_checkpoint(path.parents[2] / "beside" / "model.safetensors"))
-
-
 READERS: dict[str, Callable[[Path], object]] = {
     "points": points, "image": image, "labels": labels, "prepared": prepared, "pairs": pairs, "checkpoint": checkpoint,
     "samples": samples, "config": config, "contents": contents, "weights": weights,
-    "sensor": read_sensor, "grid": grid,
+    "sensor": read_sensor,
 }  # fmt: skip

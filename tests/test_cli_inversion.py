@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from r2flow.checkpoints import load_checkpoint
+from r2flow.data.opening import SAMPLES
 from r2flow.errors import InputError
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import read_points, write_points
@@ -128,19 +130,25 @@ def test_one_channel_is_written_alone(r2flow, run, tmp_path):  # noqa: F811
     assert [path.suffix for path in sorted((tmp_path / "reflectance").iterdir())] == [".npy", ".png"]
 
 
-def test_a_grid_is_calibrated_and_sampled_on(r2flow, run, tmp_path):  # noqa: F811
-    path = tmp_path / "grids" / "grid.json"
-    code, said, _ = r2flow("calibrate", "-c", run, "--steps", 3, "--solver", "ab2", "--num", 2, "--out", path)
-    assert (code, "3 steps of ab2 at t = 0, " in said) == (0, True)
-    content = json.loads(path.read_text())
-    assert (content["steps"], content["method"], len(content["times"])) == (3, "ab2", 4)
-    for grid in (path, "quadratic", "uniform"):
-        out = tmp_path / f"scans-{Path(grid).stem}"
-        steps = () if grid == path else ("--steps", 3)
-        assert r2flow("sample", "-c", run, "--num", 1, "--solver", "ab2", *steps, "--grid", grid, "-o", out)[0] == 0
-    images = [np.load(tmp_path / f"scans-{name}" / "000000.npy") for name in ("grid", "quadratic", "uniform")]
-    assert not np.array_equal(images[0], images[2])
-    assert not np.array_equal(images[1], images[2])
+def test_named_grids_are_sampled_on(r2flow, run, tmp_path):  # noqa: F811
+    images = {}
+    for grid in ("uniform", "power:2", "power-start:1.5"):
+        out = tmp_path / grid.replace(":", "-")
+        assert r2flow("sample", "-c", run, "--num", 1, "--steps", 3, "--grid", grid, "-o", out)[0] == 0
+        images[grid] = np.load(out / "000000.npy").tobytes()
+    assert len(set(images.values())) == 3
+
+
+def test_a_calibrated_flow_is_sampled_to_an_error(r2flow, run, tmp_path):  # noqa: F811
+    code, said, _ = r2flow("calibrate", "-c", run, "--steps", 4, "--num", 1)
+    assert code == 0
+    assert "adams3, 4 steps, grid " in said
+    error = load_checkpoint(run).accuracy[2].errors[0]  # of 8 steps
+    code, *_ = r2flow("sample", "-c", run, "--num", 2, "--error", 2.02 * error, "-o", tmp_path / "scans")
+    assert code == 0
+    assert load_checkpoint(run).generator.sampler.levels == ()
+    note = json.loads((tmp_path / "scans" / SAMPLES).read_text())["sampler"]
+    assert note["levels"][0] <= 8
 
 
 def test_savings_of_exact_problems_need_no_checkpoint(r2flow, tmp_path):  # noqa: F811
@@ -190,19 +198,18 @@ class TestBadInput:
         self.check(r2flow("interpolate", files[0], tmp_path / "no.ply", *with_run), out, "no.ply")
         self.check(r2flow("report", "savings", "-c", tmp_path / "none", "-o", out), out, "no checkpoint")
 
-    def test_of_grids(self, r2flow, run, tmp_path):  # noqa: F811
-        out, bad = tmp_path / "o", tmp_path / "bad.json"
-        bad.write_text("{}")
-        good = tmp_path / "good.json"
-        assert r2flow("calibrate", "-c", run, "--steps", 2, "--num", 1, "--out", good)[0] == 0
+    def test_of_grids_and_errors(self, r2flow, run, tmp_path):  # noqa: F811
+        out = tmp_path / "o"
         options = ("sample", "-c", run, "-o", out)
-        self.check(r2flow(*options, "--grid", "cubic"), out, "no time grid named 'cubic'")
-        self.check(r2flow(*options, "--grid", bad), out, "bad.json is no time grid", "r2flow calibrate")
-        self.check(r2flow(*options, "--grid", tmp_path / "no.json"), out, "no.json")
-        self.check(r2flow(*options, "--grid", good, "--steps", 3), out, "the time grid has 2 steps, found steps=3")
-        self.check(r2flow(*options, "--grid", good, "--solver", "dopri5"), out, "dopri5 chooses its own")
-        self.check(r2flow("calibrate", "-c", run, "--out", out), out, "ends in .json")
-        self.check(r2flow("calibrate", "-c", run, "--out", out / "a.json", "--solver", "bosh3"), out, "fixed steps")
+        for grid in ("cubic", "power", "power:0", tmp_path / "no.json"):
+            self.check(r2flow(*options, "--grid", grid), out, "power:P or power-start:P with P from 1 to 10", str(grid))
+        self.check(r2flow(*options, "--grid", "power:2", "--solver", "dopri5"), out, "dopri5 chooses its own")
+        self.check(r2flow(*options, "--error", "0.1m"), out, "are not known yet; measure them: r2flow calibrate")
+        self.check(r2flow(*options, "--error", "0.1m", "--steps", 3), out, "leave solver, steps, tolerance and grid")
+        self.check(
+            r2flow("calibrate", "-c", run, "--solver", "bosh3"), out, "only predictor-correctors", "adams3", "'bosh3'"
+        )
+        self.check(r2flow("calibrate", "-c", tmp_path / "none"), out, "no checkpoint")
 
     def test_of_seeds_and_tolerances(self, r2flow, run, files, tmp_path):  # noqa: F811
         out = tmp_path / "o"

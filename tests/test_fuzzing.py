@@ -24,7 +24,6 @@ from r2flow.data.sources import Reading
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensor_files import write_sensor
 from r2flow.lidar.sensors import SENSORS
-from r2flow.time_grids import write_grid
 from tests.lidar.test_scan_files_damage import PCD_OF_4, TEXT, compressed, ply_ascii
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 
@@ -113,8 +112,6 @@ def write_weights(folder: Path, beside: Path, run: Path) -> None:
     for path in (model, published):
         save_checkpoint(loaded, path)
     keep(folder, "checkpoint", run, model, published)
-    write_grid(beside / "grid.json", torch.linspace(0, 1, 5, dtype=torch.float64), loaded, "euler")
-    keep(folder, "grid", beside / "grid.json")
     weights = beside / "weights.pth"
     torch.save({"fc.weight": torch.randn(16, 16), "fc.bias": torch.randn(16)}, weights)
     torch.save({"fc.weight": torch.randn(16, 16)}, beside / "legacy.pth", _use_new_zipfile_serialization=False)

@@ -76,3 +76,12 @@ def test_a_folder_in_which_nothing_was_learned_is_free(tmp_path: Path):
     open_run(tmp_path, CONFIG)
     assert open_run(tmp_path, changed(seed=3)) is None
     assert read_config(tmp_path) == changed(seed=3)
+
+
+def test_settings_of_pairs_matter_only_to_a_run_on_pairs():
+    def config(name, method):
+        return {"data": {"name": name, "pairs": {"method": method}}}
+
+    assert contradictions(config("simulated", "dopri5"), config("simulated", "adams3")) == []
+    told = contradictions(config("pairs", "dopri5"), config("pairs", "adams3"))
+    assert told == ["data.pairs.method=dopri5 there, adams3 here"]

@@ -19,7 +19,6 @@ from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.reports.outputs import write_samples
 from r2flow.sampling import evaluated_region, sample
-from r2flow.time_grids import calibrate, evaluations_of_calibration, grid_of, read_grid, write_grid
 from tests.test_checkpoints import CONFIG
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
@@ -204,7 +203,7 @@ def test_a_region_is_generated_from_the_whole_image_s_noise():
     checkpoint = network()
     wanted = region(SENSOR.shape, (-30, 40), (2, 5))
     seen = evaluated_region(checkpoint.generator, wanted)
-    (drawn,) = sample(checkpoint, 2, steps=3, batch_size=2, seed=9, region=wanted)
+    (drawn,) = sample(checkpoint, 2, method="euler", steps=3, batch_size=2, seed=9, region=wanted)
     shapes = []
     part = checkpoint.generator.part(seen).backbone
     x = seen.crop(Draws(9, range(2)).start((2, 8, 64)))
@@ -270,73 +269,20 @@ def test_range_alone_decodes_no_reflectance(monkeypatch):
     assert widths == [1]
 
 
-class Turning(GaussianFlow):
-    """v = 8 exp(-8 t), known to t = 1: nearly all of the way lies near t = 0."""
-
-    def forward(self, t, x):
-        return 8 * torch.exp(-8 * t) * torch.ones_like(x) * self.scale
-
-
-def test_a_calibrated_grid_is_written_read_and_sampled_on(tmp_path, caplog):
-    checkpoint = replace(flow(Turning()), config={"sensor": {}, "encoding": {}})
-    calls: list[int] = []
-    times = calibrate(checkpoint, 4, "euler", 2, lambda: calls.append(1))
-    assert len(calls) == evaluations_of_calibration(4)
-    assert times.diff().argmax() == 3  # the longest step is where nothing turns any more
-    path = tmp_path / "grid.json"
-    write_grid(path, times, checkpoint, "euler")
-    read = grid_of(str(path), checkpoint)
-    assert read == times.tolist()
-
-    def moved(grid):
-        x_0 = Draws(0, range(1)).start((2, *SENSOR.shape))
-        return (checkpoint.generator.generate(x_0, sampler=Sampler("euler", 4, grid=grid)).x - x_0).mean()
-
-    exact = 1 - math.exp(-8)
-    assert abs(moved(tuple(read)) - exact) < 0.6 * abs(moved("uniform") - exact)
-    (drawn,) = sample(checkpoint, 1, grid=read)
-    with pytest.raises(InputError, match="the time grid has 4 steps, found steps=99"):
-        next(sample(checkpoint, 1, steps=99, grid=read))
-    (same,) = sample(checkpoint, 1, steps=4, grid=read)
-    (uniform,) = sample(checkpoint, 1, steps=4)
-    assert torch.equal(drawn.images, same.images)
-    assert drawn.evaluations.tolist() == [4]
-    assert not torch.equal(drawn.images, uniform.images)
-    assert "another flow" not in caplog.text
-    read_grid(path, replace(checkpoint, generator=flow(Turning(2.0)).generator))
-    assert "calibrated on another flow" in caplog.text
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        "", "[]", "{}", '{"steps": 1, "times": 3, "checkpoint": "a"}', '{"steps": 2, "times": [0], "checkpoint": ""}',
-        '{"steps": 2, "times": [0, NaN, 1], "checkpoint": "a"}', '{"steps": 0, "times": [], "checkpoint": "a"}',
-        '{"steps": 2, "times": [0, 0.5, 0.9], "checkpoint": "a"}', '{"steps": 2, "times": ["a", 1], "checkpoint": ""}',
-        '{"steps": 1, "times": [0, [1]], "checkpoint": "a"}', '{"steps": 2, "times": [0, 0, 1], "checkpoint": "a"}',
-    ],
-)  # fmt: skip
-def test_what_is_no_grid_is_refused(tmp_path, content):
-    (tmp_path / "grid.json").write_text(content)
-    with pytest.raises(InputError, match=r"grid\.json is no time grid"):
-        read_grid(tmp_path / "grid.json", network())
-
-
 def test_grids_and_tolerances_are_refused_where_they_do_not_fit():
     with pytest.raises(InputError, match="dopri5 chooses its own"):
-        next(sample(flow(), 1, method="dopri5", grid="quadratic"))
+        next(sample(flow(), 1, method="dopri5", grid="power:2"))
     with pytest.raises(InputError, match="positive and finite"):
         next(sample(flow(), 1, method="dopri5", tolerance=math.inf))
-    with pytest.raises(InputError, match="Did you mean 'quadratic'"):
-        grid_of("quadratik", flow())
-    for method in ("dopri5", "torchdiffeq:euler"):
-        with pytest.raises(InputError, match="solvers of fixed steps"):
-            calibrate(flow(), 4, method)
+    with pytest.raises(InputError, match="uniform, power:P or power-start:P"):
+        next(sample(flow(), 1, grid="quadratic"))
+    with pytest.raises(InputError, match="only a predictor-corrector says how many steps a scan needs, not euler"):
+        next(sample(flow(), 1, method="euler", levels=(4, 8), limits=(0.1,)))
 
 
 def test_another_method_does_not_take_over_the_grid_of_the_former_one():
     one, own = Field(lambda t, x: x, (1,)), Sampler("euler", 2, grid=(0.0, 0.3, 1.0))
     assert own.changed(method="dopri5").grid == own.changed(steps=4).grid == "uniform"
     assert own.changed(method="euler", tolerance=1e-3).grid == own.grid
-    assert own.changed(method="heun2", grid="quadratic").grid == "quadratic"
+    assert own.changed(method="heun2", grid="power:2").grid == "power:2"
     one.check_sampler(own.changed(method="dopri5"))

@@ -84,7 +84,11 @@ sample -c run -o out --grid nowhere.json
 sample -c run -o out --grid bad.json
 sample -c run -o out --grid file.txt
 sample -c run -o out --grid empty
-sample -c run -o out --solver dopri5 --grid quadratic
+sample -c run -o out --solver dopri5 --grid power:2
+sample -c run -o out --grid power:0
+sample -c run -o out --error 0.05m # measure them
+sample -c run -o out --error nope
+sample -c run -o out --error 0.05m --steps 4 # leave solver
 sample -c run -o out --plugin nope
 sample -c run -o out --plugin plugin.py
 sample -c run -o out --plugin empty
@@ -92,17 +96,14 @@ sample -c run -o out extra
 sample -c run -c run -o out -o # '-o' requires an argument
 sample -c '' -o out # an argument is empty
 calibrate # Missing
-calibrate -c run # Missing
-calibrate -c run -o out # ends in .json
-calibrate -c run -o empty
-calibrate -c run -o out.json --steps 0
-calibrate -c run -o out.json --steps a
-calibrate -c run -o out.json --solver dopri5
-calibrate -c run -o out.json --solver nope
-calibrate -c run -o out.json --num 0
-calibrate -c nowhere -o out.json
-calibrate -c bad.ckpt -o out.json
-calibrate -c run -o file.txt/a.json
+calibrate -c run --steps 0
+calibrate -c run --steps a
+calibrate -c run --solver dopri5
+calibrate -c run --solver nope
+calibrate -c run --num 0
+calibrate -c nowhere
+calibrate -c bad.ckpt
+calibrate -c street # stays as it is
 info # Missing
 info nowhere
 info empty
@@ -436,7 +437,7 @@ name=x sampler.grid=wave
 name=x sampler.grid=[0,0.5]
 name=x sampler.grid=[1,0]
 name=x +sampler.foo=1
-name=x sampler.method=dopri5 sampler.grid=quadratic
+name=x sampler.method=dopri5 sampler.grid=power:2
 name=x backbone.base_channels=7
 name=x backbone.depths=[]
 name=x backbone.depths=[0,0]

@@ -84,7 +84,10 @@ def sample(
         typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model; street if left out."),
     ] = None,
     grid: Annotated[
-        str | None, typer.Option(help="Where fixed steps fall: uniform, quadratic, or a file of 'r2flow calibrate'.")
+        str | None, typer.Option(help="Where fixed steps fall: uniform, power:P or power-start:P, as power:1.75.")
+    ] = None,
+    error: Annotated[
+        str | None, typer.Option(help="Largest error of a scan, as 0.05m of range or 0.002 in model space.")
     ] = None,
     format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture.")] = 8,
@@ -93,16 +96,20 @@ def sample(
 
     Solver, steps and tolerance are the generator's own if left out.
     """
+    from r2flow.accuracy import sampler_within
     from r2flow.checkpoints import load_checkpoint
     from r2flow.models import DEFAULT, MODELS, find_model
     from r2flow.reports.outputs import formats_of, write_samples
-    from r2flow.time_grids import grid_of
 
     if checkpoint is None:
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
     loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(draw.device))
-    times = None if grid is None else grid_of(grid, loaded)
-    sampler = solver.change(loaded.generator.sampler, grid=times)
+    if error is None:
+        sampler = solver.change(loaded.generator.sampler, grid=grid)
+    elif solver != SolverOptions() or grid:
+        raise InputError("--error says how many steps each scan takes: leave solver, steps, tolerance and grid out.")
+    else:
+        sampler = sampler_within(loaded, error)
     formats = format.split(",") if format else formats_of(loaded, part.channels)
     region = part.region(loaded)
     write_samples(loaded, out, draw.num, draw.seed, sampler, formats, pictures, draw.batch_size, region, part.channels)
@@ -110,31 +117,36 @@ def sample(
     print(f"{draw.num} scans ({', '.join(formats)}) in {out}{seen}")
 
 
-@app.command(epilog="Example: r2flow calibrate -c runs/NAME --steps 8 --out grid.json")
+@app.command(epilog="Example: r2flow calibrate -c runs/NAME")
 def calibrate(
     checkpoint: CheckpointOption,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write, .json.", show_default=False)],
-    steps: Annotated[int, typer.Option(min=1, help="Steps of the grid.")] = 8,
-    solver: Annotated[str, typer.Option(help="The solver that will use it: euler, ab2, midpoint, ...")] = "euler",
-    num: Annotated[int, typer.Option(min=1, help="Scans to find it on.")] = 4,
+    steps: Annotated[
+        int, typer.Option(min=1, help="Steps that the grid shall suit; the flow's own from then on.")
+    ] = 16,
+    solver: Annotated[str, typer.Option(help="adams2, adams3 or adams4; the flow's own from then on.")] = "adams3",
+    num: Annotated[int, typer.Option(min=1, help="Scans to measure on.")] = 4,
     device: DeviceOption = "auto",
 ) -> None:
-    """Find the times at which a flow's steps have equal errors: a grid for `r2flow sample --grid`."""
-    from r2flow.checkpoints import load_checkpoint
+    """Find the time grid that suits a flow, measure its errors, and keep both in the checkpoint."""
+    from r2flow.accuracy import calibrate as measure
+    from r2flow.accuracy import check_predictor_corrector, evaluations_of_calibration
+    from r2flow.checkpoints import keep_sampler, load_checkpoint
+    from r2flow.models import MODELS
     from r2flow.progress import Bar
-    from r2flow.reports.pages import prepare_folder
-    from r2flow.time_grids import calibrate as find_grid
-    from r2flow.time_grids import check_grid_solver, evaluations_of_calibration, write_grid
+    from r2flow.reports.tables import print_table
 
-    if out.suffix != ".json" or out.is_dir():
-        raise InputError(f"--out must be a file that ends in .json, found {out}.")
-    check_grid_solver(solver)
+    check_predictor_corrector(solver)
+    if str(checkpoint) in MODELS:
+        copy = f"r2flow convert {checkpoint} {checkpoint}.safetensors"
+        raise InputError(f"the model {checkpoint} stays as it is; make a copy and give that: {copy}.")
     loaded = load_checkpoint(checkpoint, choose_device(device))
-    prepare_folder(out.parent)
     with Bar("measuring", evaluations_of_calibration(steps), "evaluations") as advance:
-        times = find_grid(loaded, steps, solver, num, advance)
-    write_grid(out, times, loaded, solver)
-    print(f"{steps} steps of {solver} at t = {', '.join(f'{t:.3g}' for t in times.tolist())} in {out}")
+        found = measure(loaded, steps, solver, num, advance)
+    keep_sampler(found)
+    rows = [{"steps": b.steps, "error": max(b.errors), "metres": max(b.metres)} for b in found.accuracy]
+    print_table(rows, {"steps": "steps", "error": "error, worst scan", "metres": "range, RMS m"})
+    sampler = found.generator.sampler
+    print(f"{sampler.method}, {sampler.steps} steps, grid {sampler.grid}: from now on the sampler of {found.path}")
 
 
 @app.command(epilog="Example: r2flow info runs/simulated-hdit_tiny")

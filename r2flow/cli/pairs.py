@@ -68,7 +68,8 @@ def pairs(
     """Draw reflow pairs from a flow: what is missing or damaged, as one of any number of processes.
 
     `python train.py experiment=reflow stage.init=RUN` makes them itself; this makes them alone, under torchrun or as a
-    SLURM array, with the settings of `data.pairs`. The solver is dopri5 at a tolerance of 1e-5 if left out.
+    SLURM array, with the settings of `data.pairs`. The solver is adams3 in 32 steps if left out; --solver dopri5 is the
+    paper's.
     """
     from r2flow.checkpoints import load_checkpoint, weights_hash
     from r2flow.data.options import PairOptions

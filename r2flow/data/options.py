@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from r2flow.data.shards import PairRecipe
 from r2flow.errors import InputError
-from r2flow.flow.solvers import check_tolerance
+from r2flow.flow.solvers import check_tolerance, named_grid, usual_grid
 from r2flow.lidar.scan_files.fields import check_columns
 from r2flow.registry import NonNegative, Positive, check_options
 
@@ -82,8 +82,9 @@ class PairOptions:
     """The choices behind a set of pairs (`data.pairs`)."""
 
     num: int = 1000
-    method: str = "dopri5"  # of the parent, like steps and tolerance: `r2flow.flow.solvers.solve`; here the paper's
+    method: str = "adams3"  # of the parent, like steps and tolerance: `r2flow.flow.solvers.solve`
     steps: int = 32
+    grid: str | None = None  # where fixed steps fall; None: the method's usual one
     tolerance: float = 1e-5
     batch_size: int = 16  # pairs solved together; the last bits of a pair depend on it
     shard_mib: float = 256.0
@@ -108,11 +109,13 @@ class PairOptions:
                 f"data.pairs: seed and first must be at least 0 and below 2^63, found {self.seed} and {first}."
             )
         check_tolerance(self.tolerance)
+        grid = self.grid or usual_grid(self.method)
+        named_grid(grid)
         shard_batches = max(round(self.shard_mib * 2**20 / (self.batch_size * 2 * math.prod(shape))), 1)
         tolerance = float(self.tolerance)  # 1 and 1.0 are one recipe
         return PairRecipe(
             self.parent or "", shape, self.seed, first, self.method, self.steps, tolerance, self.batch_size,
-            shard_batches, None if noise_shape == shape else noise_shape,
+            shard_batches, None if noise_shape == shape else noise_shape, grid,
         )  # fmt: skip
 
 

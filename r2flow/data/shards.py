@@ -44,15 +44,17 @@ class PairRecipe:
     batch_size: int  # consecutive indices that are solved together
     shard_batches: int  # batches in a shard
     noise_shape: tuple[int, ...] | None = None  # of x_0, where it is not the scan's
+    grid: str = "uniform"  # where fixed steps fall
 
     def describe(self) -> dict[str, Any]:
-        """All of it as plain values; `noise_shape` only where it has one."""
-        return {key: value for key, value in asdict(self).items() if key != "noise_shape" or value is not None}
+        """All of it as plain values; what pairs of older versions did not have only where it is not as it was then."""
+        then = {"noise_shape": None, "grid": "uniform"}
+        return {key: value for key, value in asdict(self).items() if key not in then or value != then[key]}
 
     @property
     def sampler(self) -> Sampler:
         """How the generator is run."""
-        return Sampler(self.method, self.steps, self.tolerance)
+        return Sampler(self.method, self.steps, self.tolerance, self.grid)
 
     @cached_property
     def digest(self) -> str:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
+from r2flow.flow.solvers import usual_grid
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
@@ -29,7 +30,9 @@ class Sampler:
         method: A solver's name for a flow (`r2flow.flow.solvers`); other families have names of their own.
         steps: Steps from noise to data, of a method of fixed steps.
         tolerance: Absolute and relative tolerance of an adaptive method.
-        grid: Where fixed steps fall: a name, or the times themselves.
+        grid: Where fixed steps fall: a name (`r2flow.flow.solvers.named_grid`), or the times themselves.
+        levels: Numbers of steps to try on a scan one after the other, instead of `steps` (`r2flow.generators.budgets`).
+        limits: For each of them but the last one the largest correction of a scan that needs no more steps.
         fixed: Whether the generator was trained for this number of steps and is worse at any other.
     """
 
@@ -37,6 +40,8 @@ class Sampler:
     steps: Count = 32
     tolerance: Positive = 1e-5
     grid: str | tuple[float, ...] = "uniform"
+    levels: tuple[int, ...] = ()
+    limits: tuple[float, ...] = ()
     fixed: bool = False
 
     @classmethod
@@ -46,21 +51,28 @@ class Sampler:
         Raises:
             InputError: an unknown option, or a value of the wrong type.
         """
+        # An option of earlier development versions, which did nothing on trained flows.
+        options = {key: options[key] for key in options if key != "straight_first"}
         check_options("sampler", cls, options)
         grid = options.get("grid", "uniform")
-        return cls(**{**options, "grid": grid if isinstance(grid, str) else tuple(grid)})
+        if grid == "quadratic":  # its name in version 0.1.0
+            grid = "power:2"
+        lists = {key: tuple(options[key]) for key in ("levels", "limits") if key in options}
+        return cls(**{**options, "grid": grid if isinstance(grid, str) else tuple(grid), **lists})
 
     def changed(self, **options: Any) -> Self:
         """The same with the options that are not None. Given times decide the number of steps.
 
-        Another method starts from a uniform grid: the former one's was for it alone.
+        Another method starts from its usual grid and without `levels`: those were the former one's.
 
         Raises:
             InputError: fewer than one step, or times and a number of steps that contradict.
         """
         given = {key: value for key, value in options.items() if value is not None}
         if given.get("method", self.method) != self.method:
-            given = {"grid": "uniform", **given}
+            given = {"grid": usual_grid(given["method"]), "levels": (), "limits": (), **given}
+        if "steps" in given:
+            given = {"levels": (), "limits": (), **given}
         grid = given.get("grid", "uniform")
         if not isinstance(grid, str):
             given["grid"] = tuple(float(t) for t in grid)
@@ -75,7 +87,7 @@ class Sampler:
 
     def asdict(self) -> dict[str, Any]:
         """Plain values, as a config or a checkpoint holds them."""
-        return {**asdict(self), "grid": self.grid if isinstance(self.grid, str) else list(self.grid)}
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
 
 
 @dataclass(frozen=True)

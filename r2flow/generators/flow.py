@@ -1,6 +1,6 @@
 """Generators that follow a velocity: dx/dt = v(t, x) from noise at t = 0 to data at t = 1."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 from typing import Any, ClassVar
 
@@ -9,12 +9,23 @@ from torch import Tensor, nn
 
 from r2flow.backbones import build_backbone
 from r2flow.errors import InputError
-from r2flow.flow.solvers import SOLVERS, Solution, Velocity, adapts, check_method, check_tolerance, solve
+from r2flow.flow.solvers import (
+    Solution,
+    Velocity,
+    adapts,
+    check_method,
+    check_tolerance,
+    fixed_step,
+    solve,
+    usual_grid,
+)
 from r2flow.flow.solvers.grids import build_grid
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
+
+USUAL = Sampler("adams3", 16, grid=usual_grid("adams3"))  # of a new flow
 
 
 class Flow(Generator):
@@ -48,7 +59,11 @@ class Flow(Generator):
         how = sampler or self.sampler
         field, x = self.field(condition), x.to(self.device)
         grid = how.grid if isinstance(how.grid, str) else torch.tensor(how.grid, dtype=torch.float64)
-        return solve(field, x, t_0, t_1, how.method, how.steps, how.tolerance, progress, grid=grid, **options)
+
+        def by(field: Velocity, x: Tensor, steps: int) -> Solution:
+            return solve(field, x, t_0, t_1, how.method, steps, how.tolerance, progress, grid=grid, **options)
+
+        return _by_levels(field, x, how, by) if how.levels else by(field, x, how.steps)
 
     def generate(
         self,
@@ -65,13 +80,16 @@ class Flow(Generator):
     def check_sampler(self, sampler: Sampler) -> None:
         check_method(sampler.method)
         check_tolerance(sampler.tolerance)
-        grid = sampler.grid
+        grid, method = sampler.grid, fixed_step(sampler.method)
         build_grid(grid if isinstance(grid, str) else torch.tensor(grid), 0.0, 1.0, sampler.steps)
+        if sampler.levels and not (method and method.corrects):
+            raise InputError(f"only a predictor-corrector says how many steps a scan needs, not {sampler.method}.")
         if adapts(sampler.method) and sampler.grid != "uniform":
             raise InputError(f"a time grid is for a solver of fixed steps; {sampler.method} chooses its own.")
 
     def evaluations_of(self, sampler: Sampler) -> int:
-        return sampler.steps * (SOLVERS[sampler.method].evaluations or 0) if sampler.method in SOLVERS else 0
+        method = fixed_step(sampler.method)
+        return 0 if method is None or sampler.levels else method.cost(sampler.steps)
 
 
 class RectifiedFlow(Flow):
@@ -87,6 +105,7 @@ class RectifiedFlow(Flow):
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space)
+        self.sampler = USUAL
         channels = space.shape[0]
         self.backbone = build_backbone(
             backbone, space.rays, channels + self.condition_channels, channels, self.second_time
@@ -160,6 +179,20 @@ class Field(Flow):
     @property
     def device(self) -> torch.device:
         return next((p.device for p in self.parameters()), torch.device("cpu"))
+
+
+def _by_levels(field: Velocity, x: Tensor, how: Sampler, by: Callable[[Velocity, Tensor, int], Solution]) -> Solution:
+    """Each scan by the first number of steps at which its correction is small enough; all evaluations are counted."""
+    solution, left = by(field, x, how.levels[0]), torch.arange(len(x))
+    for steps, most in zip(how.levels[1:], how.limits, strict=True):
+        assert solution.correction is not None
+        left = left[~(solution.correction[left] <= most)]
+        if not len(left):
+            break
+        select = getattr(field, "select", None)
+        again = by(select(left) if select else field, x[left.to(x.device)], steps)
+        solution = solution.continued(left, again)
+    return solution
 
 
 class _Conditioned:

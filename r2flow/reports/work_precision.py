@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from r2flow.flow.problems import PROBLEMS
-from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, Solution, adapts, check_method
+from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, Solution, adapts, check_method, fixed_step
 from r2flow.generators import Field, Flow, Sampler
 from r2flow.inversion import metres_apart, rms
 from r2flow.lidar.encoding import Encoding
@@ -44,8 +44,11 @@ class Configuration:
 
     def solve(self, flow: Flow, x_0: Tensor) -> Solution:
         """x_1 from x_0."""
-        sampler = Sampler(self.method).changed(steps=self.steps, tolerance=self.tolerance)
-        return flow.solve(x_0, sampler=sampler, max_evaluations=MOST_EVALUATIONS)
+        return flow.solve(x_0, sampler=self.sampler(flow), max_evaluations=MOST_EVALUATIONS)
+
+    def sampler(self, flow: Flow) -> Sampler:
+        """The solver on its usual grid; on that of the flow, where it is the flow's own solver."""
+        return flow.sampler.changed(method=self.method, steps=self.steps, tolerance=self.tolerance)
 
 
 @dataclass(frozen=True)
@@ -105,8 +108,9 @@ def configurations(
             chosen += [Configuration(method, tolerance=tolerance) for tolerance in tolerances]
         else:
             ours = method.removeprefix(TORCHDIFFEQ)
-            per_step = SOLVERS[ours].evaluations or 1 if ours in SOLVERS else 1
-            steps = sorted({budget // per_step for budget in budgets if budget >= per_step})
+            own = fixed_step(ours)
+            start, per_step = (own.start, own.evaluations) if own else (0, 1)
+            steps = sorted({(budget - start) // per_step for budget in budgets if budget >= start + per_step})
             chosen += [Configuration(method, steps=count) for count in steps]
     return chosen
 
@@ -196,7 +200,8 @@ def _row(
     scans = {name: torch.cat([batch[name] for batch in found]).cpu().numpy() for name in found[0]}
     error, evaluations = scans["error"], scans["evaluations"]
     row = {
-        "problem": subject.name, **asdict(of), "label": of.label, "scenes": len(error),
+        "problem": subject.name, **asdict(of), "grid": str(of.sampler(subject.flow).grid), "label": of.label,
+        "scenes": len(error),
         "evaluations": float(np.mean(evaluations)), "evaluations_most": int(max(evaluations)),
         "seconds": float(np.median(seconds)), "timings": len(seconds),
         "seconds_quarter": float(np.quantile(seconds, 0.25)),
@@ -236,6 +241,19 @@ def best_within(
     """The row of least error whose work is within a budget; of equals, the one of least work."""
     within = [row for row in rows if row[work] <= budget and math.isfinite(reached(row))]
     return min(within, key=lambda row: (reached(row), row[work]), default=None)
+
+
+def recommended(rows: Sequence[Mapping[str, Any]], metres: float = 0.05) -> Mapping[str, Any] | None:
+    """The row of fewest evaluations whose range error is within so many metres; where none is, that of least error.
+
+    Args:
+        metres: Root mean square, the median over scans.
+    """
+    solved = [row for row in rows if math.isfinite(reached(row))]
+    near = [row for row in solved if row["range_rms_m"] is not None and row["range_rms_m"] <= metres]
+    if near:
+        return min(near, key=lambda row: (row["evaluations"], reached(row)))
+    return min(solved, key=lambda row: (reached(row), row["evaluations"]), default=None)
 
 
 def problem_subjects(names: Sequence[str], scenes: int = 16, elements: int = 64) -> list[Subject]:

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.tables import shown, table
-from r2flow.reports.work_precision import METHODS, TRUST, Reference, best_within, reached
+from r2flow.reports.work_precision import METHODS, TRUST, Reference, best_within, reached, recommended
 
 Row = Mapping[str, Any]
 Axis = tuple[str, str]  # key of a row, label
@@ -26,10 +26,10 @@ PANELS: tuple[tuple[Axis, Axis], ...] = (  # of a checkpoint
     (EVALUATIONS, ("drop_differs", "share of rays that differ in ray-drop")),
 )
 COLUMNS = {
-    "label": "configuration", "evaluations": "evaluations", "seconds": "seconds", "seconds_quarter": "quartile",
-    "seconds_three_quarters": "quartile", "error": "error, median", "error_p95": "95th percentile",
-    "error_worst": "worst scan", "range_rms_m": "range, RMS m", "range_median_m": "range, median m",
-    "drop_differs": "ray-drop differs", "front": "Pareto",
+    "label": "configuration", "grid": "grid", "evaluations": "evaluations", "seconds": "seconds",
+    "seconds_quarter": "quartile", "seconds_three_quarters": "quartile", "error": "error, median",
+    "error_p95": "95th percentile", "error_worst": "worst scan", "range_rms_m": "range, RMS m",
+    "range_median_m": "range, median m", "drop_differs": "ray-drop differs", "front": "Pareto",
 }  # fmt: skip
 NOTE = (
     "All configurations. Errors are RMS over the elements of a scan in model space; in metres, over the rays that both "
@@ -68,7 +68,7 @@ def work_precision_page(
         works = ("evaluations", "seconds")
         fronts = [" and ".join(work for work in works if row[f"pareto_{work}"]) for row in of_checkpoint]
         lines = [{**row, "front": front} for row, front in zip(of_checkpoint, fronts, strict=True)]
-        text += [NOTE, table(lines, COLUMNS)]
+        text += [NOTE, table(lines, COLUMNS), recommendation(of_checkpoint)]
     return Page("work_precision", "Error against work", text, rows, figures, command, seeds, device)
 
 
@@ -90,6 +90,16 @@ def checkpoint_text(rows: Sequence[Row], name: str, found: Reference, budgets: S
         times = {f"{steps} Euler steps' time ({shown(euler[steps])} s)": euler[steps] for steps in sorted(euler)}
         text += ["By time a scan:", best_table(rows, times, "seconds")]
     return text
+
+
+def recommendation(rows: Sequence[Row]) -> str:
+    """Which solver to take for a flow, in one line."""
+    row = recommended(rows)
+    if row is None:
+        return "For this flow: no configuration solves it."
+    how = row["label"] if row["steps"] is None else f"{row['method']} on the grid {row['grid']}"
+    metres = "" if row["range_rms_m"] is None else f", {shown(row['range_rms_m'])} m"
+    return f"For this flow: {how}, {row['evaluations']:.0f} evaluations, error {shown(reached(row))}{metres}."
 
 
 def best_table(rows: Sequence[Row], budgets: Mapping[str, float], work: str) -> str:

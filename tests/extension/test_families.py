@@ -129,7 +129,7 @@ CANNOT = {
     "report curvature": (["-c", "RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
     "report savings": (["-c", "RUN", "-o", "OUT"], "a savings report needs the velocity of a flow, which a ToyG"),
     "report work-precision": (["-c", "RUN", "-o", "OUT"], "a work-precision report needs the velocity of a flow"),
-    "calibrate": (["-c", "RUN", "-o", "OUT.json"], "a time grid needs the velocity of a flow, which a ToyGenerator"),
+    "calibrate": (["-c", "RUN"], "a time grid needs the velocity of a flow, which a ToyGenerator"),
     "convert": (["RUN", "OUT.pth"], "the published format cannot hold a ToyGenerator; convert to .safetensors"),
     "pairs": (["-c", "RUN"], "a ToyGenerator can be run in one way only, direct with 1 step; found dopri5"),
     "sample": (["-c", "RUN", "--steps", "4", "-o", "OUT"], "a ToyGenerator can be run in one way only"),

@@ -8,7 +8,7 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.flow.problems import PROBLEMS
-from r2flow.generators import Field
+from r2flow.generators import Field, Sampler
 from r2flow.inversion import metres_apart
 from r2flow.reports import work_precision
 from r2flow.reports.work_precision import (
@@ -22,7 +22,13 @@ from r2flow.reports.work_precision import (
     reference,
     runs,
 )
-from r2flow.reports.work_precision_page import best_table, problems_text, steadiest, work_precision_page
+from r2flow.reports.work_precision_page import (
+    best_table,
+    problems_text,
+    recommendation,
+    steadiest,
+    work_precision_page,
+)
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 
@@ -227,3 +233,33 @@ def test_bad_input_is_one_line(r2flow, saved, tmp_path):  # noqa: F811
         assert words in err
         assert len(err.splitlines()) == 1
         assert not out.exists()
+
+
+def test_the_recommended_solver_has_the_fewest_evaluations_within_five_centimetres():
+    def row(method, evaluations, error, metres, **more):
+        return {
+            "method": method, "label": f"{method}, 8 steps", "steps": 8, "grid": "power:1.75",
+            "evaluations": evaluations,
+            "error": error, "range_rms_m": metres, "floor": 0.0, "length": 1.0, "scenes": 2, "converged": 2, **more,
+        }  # fmt: skip
+
+    rows = [
+        row("euler", 4, 1e-1, 3.0), row("adams3", 16, 1e-3, 0.03), row("heun3", 16, 2e-3, 0.05),
+        row("lost", 2, 1e-5, 0.001, converged=1), row("rk4", 32, 1e-5, 1e-4),
+    ]  # fmt: skip
+    assert recommendation(rows) == (
+        "For this flow: adams3 on the grid power:1.75, 16 evaluations, error 0.001, 0.03 m."
+    )
+    assert recommendation(rows[:1]).startswith("For this flow: euler on the grid power:1.75, 4 evaluations")
+    assert recommendation([rows[3]]) == "For this flow: no configuration solves it."
+    assert "error 0.1." in recommendation([row("euler", 4, 1e-1, None)])
+    assert "For this flow: dopri5, 1e-03, 20 eval" in recommendation(
+        [row("dopri5", 20, 1e-4, 0.01, steps=None, label="dopri5, 1e-03")]
+    )
+
+
+def test_a_flow_s_own_solver_is_measured_on_its_own_grid():
+    one = Field(lambda t, x: x, (2,))
+    one.sampler = Sampler("adams3", 8, grid="power:2.5")
+    for method, grid in (("adams3", "power:2.5"), ("adams4", "power:1.75"), ("midpoint", "uniform")):
+        assert Configuration(method, 4).sampler(one) == Sampler(method, 4, grid=grid)

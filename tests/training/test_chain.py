@@ -179,7 +179,7 @@ def test_a_killed_chain_ends_as_the_one_left_alone(
         (["experiment=reflow", "stage.init=RF1", "data.augment.flip=true"], "data.augment changes scans"),
         (["experiment=reflow", "stage.init=RF1", "data.pairs.num=0"], "num, batch_size, steps must be at least 1"),
         (["experiment=reflow", "stage.init=RF1", "data.pairs.method=dopri"], "Did you mean 'dopri5'"),
-        (["experiment=reflow", "stage.init=RF1"], "holds other pairs: method is midpoint there, dopri5 here"),
+        (["experiment=reflow", "stage.init=RF1"], "holds other pairs: method is midpoint there, adams3 here"),
         (
             ["experiment=distill", "stage.init=RF1", "stage.steps=0", "data.root=x"],
             "steps must be a whole number of at least 1",

@@ -20,15 +20,16 @@ from r2flow.flow.solvers.external import (
     solve_torchdiffeq,
     torchdiffeq_methods,
 )
-from r2flow.flow.solvers.fixed import AB2, FixedStep, euler, heun2, heun3, midpoint, rk4, solve_fixed
-from r2flow.flow.solvers.grids import GRIDS, build_grid, calibrated_grid, extended, halved
+from r2flow.flow.solvers.fixed import FixedStep, euler, heun2, heun3, midpoint, rk4, solve_fixed
+from r2flow.flow.solvers.grids import build_grid, extended, halved, named_grid
+from r2flow.flow.solvers.multistep import adams
 from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite
 from r2flow.flow.solvers.step_size import Limits
 from r2flow.registry import Registry
 
 __all__ = [
-    "GRIDS", "LEAST_TOLERANCE", "SOLVERS", "TORCHDIFFEQ", "EmbeddedMethod", "FixedStep", "Solution", "Velocity",
-    "adapts", "calibrated_grid", "check_method", "check_tolerance", "solve",
+    "LEAST_TOLERANCE", "SOLVERS", "TORCHDIFFEQ", "EmbeddedMethod", "FixedStep", "Solution", "Velocity", "adapts",
+    "check_method", "check_tolerance", "fixed_step", "named_grid", "solve", "usual_grid",
 ]  # fmt: skip
 
 SOLVERS: Registry[FixedStep | EmbeddedMethod | ExponentialMethod] = Registry(
@@ -38,7 +39,10 @@ SOLVERS: Registry[FixedStep | EmbeddedMethod | ExponentialMethod] = Registry(
     heun2=FixedStep(heun2, order=2, evaluations=2),
     heun3=FixedStep(heun3, order=3, evaluations=3),
     rk4=FixedStep(rk4, order=4, evaluations=4),
-    ab2=FixedStep(AB2, order=2, evaluations=1),
+    ab2=adams(2),
+    adams2=adams(2, 2),
+    adams3=adams(2, 3),
+    adams4=adams(3, 4),
     bosh3=bosh3,
     dopri5=dopri5,
     exprb43=exprb43,
@@ -84,8 +88,8 @@ def solve(
             at t_1. Tolerances below `LEAST_TOLERANCE` of the state's or the velocity's type are raised to it, with a
             warning.
         progress: Called after every evaluation.
-        grid: Time grid of a fixed-step method: `uniform`, `quadratic` (denser towards t = 1) or the times themselves,
-            (N + 1,) from t_0 to where `finish` begins.
+        grid: Time grid of a fixed-step method: `uniform`, `power:P` (t = 1 - (1 - u)^P), `power-start:P` (t = u^P) or
+            the times themselves, (N + 1,) from t_0 to where `finish` begins.
         finish: Length of the last part of the interval, which one Euler step takes: 1e-3 avoids a velocity that is
             singular at t_1.
         max_evaluations: Budget of a scene in an adaptive method.
@@ -201,6 +205,23 @@ def adapts(method: str) -> bool:
     if method.startswith(TORCHDIFFEQ):
         return not is_fixed(method.removeprefix(TORCHDIFFEQ))
     return isinstance(SOLVERS[method], EmbeddedMethod | ExponentialMethod)
+
+
+def fixed_step(method: str) -> FixedStep | None:
+    """The method of fixed steps of this name; None where it is one of another kind or of torchdiffeq's."""
+    if method not in SOLVERS:
+        return None
+    found = SOLVERS[method]
+    return found if isinstance(found, FixedStep) else None
+
+
+def usual_grid(method: str) -> str:
+    """Where a method's steps fall unless told: denser towards t = 1 for predictor-correctors, else equal.
+
+    P = 1.75 is the best or nearly the best of the flows in docs/results.md.
+    """
+    found = fixed_step(method)
+    return "power:1.75" if found is not None and found.corrects else "uniform"
 
 
 def _order(method: str) -> int:

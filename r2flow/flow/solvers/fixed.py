@@ -1,8 +1,9 @@
 """Solvers that take the steps of a time grid."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -14,14 +15,32 @@ Step = Callable[[Velocity, Tensor, Tensor, Tensor], Tensor]
 
 
 class FixedStep(NamedTuple):
-    """One step x(t) -> x(t + h), the order of its global error, and its evaluations of the velocity.
+    """One step x(t) -> x(t + h).
 
-    A multistep method is a class: every solution makes an instance, which remembers the earlier steps.
+    Attributes:
+        step: A function of v, t, h and x; in a multistep method, whose steps remember the earlier ones, what makes
+            that function from the times of a solution, (N + 1,) float64.
+        order: Of the global error.
+        evaluations: Of the velocity, in a step.
+        start: Further ones in the first step.
+        multistep: Whether `step` makes the step function.
+        corrects: Whether that function has a corrector and sums what it changes in its attribute `correction`.
     """
 
-    step: Step | type
+    step: Step | Callable[[Tensor], Step]
     order: int
     evaluations: int
+    start: int = 0
+    multistep: bool = False
+    corrects: bool = False
+
+    def begin(self, times: Tensor) -> Step:
+        """The step function of a solution on these times."""
+        return cast(Callable[[Tensor], Step], self.step)(times) if self.multistep else cast(Step, self.step)
+
+    def cost(self, steps: int) -> int:
+        """Evaluations of a number of steps."""
+        return self.start + steps * self.evaluations
 
 
 def euler(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
@@ -55,34 +74,12 @@ def rk4(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
     return x + h / 6 * (k_1 + 2 * k_2 + 2 * k_3 + k_4)
 
 
-class AB2:
-    """Two-step Adams-Bashforth, x + h ((1 + w/2) v_n - w/2 v_(n-1)) with w = h_n / h_(n-1); Euler first.
-
-    Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, III.5: steps may differ in length. The one Euler
-    step has an error of second order, so that the order stays 2.
-    """
-
-    def __init__(self) -> None:
-        self.before: tuple[Tensor, Tensor] | None = None
-
-    def __call__(self, v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
-        k = v(t, x)
-        if self.before is None:
-            following = x + h * k
-        else:
-            k_before, h_before = self.before
-            w = h / h_before
-            following = x + h * ((1 + w / 2) * k - w / 2 * k_before)
-        self.before = k, h
-        return following
-
-
 def solve_fixed(v: Evaluations, x: Tensor, times: Tensor, method: FixedStep, finish: Tensor | None) -> Solution:
     """Take the steps of a time grid, (N + 1,) float64, then an Euler step of length `finish` if there is one.
 
     A scene whose state is no longer finite keeps its last finite one; the others are not affected.
     """
-    step = method.step() if isinstance(method.step, type) else method.step
+    step = method.begin(times)
     steps = [(t, following - t, step) for t, following in pairwise(times)]
     if finish is not None:
         steps.append((times[-1], finish, euler))
@@ -96,4 +93,8 @@ def solve_fixed(v: Evaluations, x: Tensor, times: Tensor, method: FixedStep, fin
         following = advance(inside, t.to(x), h.to(x), x)
         alive = alive & finite(following)
         x = torch.where(expand_time(alive, x), following, x)
-    return Solution.build(x, v.counts, len(times) - 1, 0, False, alive.cpu().numpy())
+    solution = Solution.build(x, v.counts, len(times) - 1, 0, False, alive.cpu().numpy())
+    if not method.corrects:
+        return solution
+    correction = step.correction.double().square().flatten(1).mean(1).sqrt().cpu()  # type: ignore[attr-defined]
+    return replace(solution, correction=correction)

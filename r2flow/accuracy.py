@@ -1,0 +1,102 @@
+"""The error of a flow's samples: which time grid makes it least, and which number of steps keeps it below a bound."""
+
+import math
+from dataclasses import replace
+
+import torch
+
+from r2flow.checkpoints import Checkpoint
+from r2flow.errors import InputError
+from r2flow.flow.solvers import SOLVERS, FixedStep, check_method, fixed_step
+from r2flow.generators import Budget, Sampler, as_flow, levels
+from r2flow.generators.base import Progress
+from r2flow.inversion import metres_apart, rms
+from r2flow.noise import Draws
+
+GRIDS = ("uniform", *(f"power:{p}" for p in (1.25, 1.5, 1.75, 2, 2.5, 3)), "power-start:1.5", "power-start:2")
+STEPS = (4, 6, 8, 12, 16, 24, 32, 48, 64)
+EXACT = Sampler("dopri5", tolerance=1e-6)
+
+
+@torch.no_grad()
+def calibrate(
+    checkpoint: Checkpoint, steps: int = 16, method: str = "adams3", num: int = 4, progress: Progress = None
+) -> Checkpoint:
+    """The checkpoint with the sampler whose time grid suits its flow best, and with the errors that it has.
+
+    Of `GRIDS` the one is taken whose largest error of a scan, against a tight solution, is least in this number of
+    steps. The scans are other ones than those of `r2flow.sampling.sample`.
+
+    Args:
+        method: A predictor-corrector: adams2, adams3 or adams4.
+        num: Scans.
+        progress: Called after every evaluation; there are about `evaluations_of_calibration`.
+
+    Raises:
+        InputError: another method, fewer than one step, or a flow that cannot be solved.
+    """
+    check_predictor_corrector(method)
+    flow = as_flow(checkpoint.generator, "a time grid")
+    x_0 = Draws(0, range(num), "validation").start(flow.noise_shape).to(flow.device)
+    exact = flow.solve(x_0.double(), sampler=EXACT, progress=progress)
+    if not exact.converged.all():
+        raise InputError("dopri5 does not solve this flow at a tolerance of 1e-6: there is nothing to measure against.")
+
+    def worst(grid: str) -> float:
+        found = flow.solve(x_0, sampler=Sampler(method, steps, grid=grid), progress=progress)
+        return float((rms(found.x - exact.x) if found.converged.all() else torch.tensor(math.inf)).max())
+
+    sampler = Sampler(method, steps, grid=min(GRIDS, key=worst))
+    decoded = checkpoint.encoding.decode(exact.x.float())
+    budgets = []
+    for count in STEPS:
+        found = flow.solve(x_0, sampler=replace(sampler, steps=count), progress=progress)
+        assert found.correction is not None
+        _, metres, _ = metres_apart(checkpoint.encoding.decode(found.x), decoded)
+        budgets.append(Budget(count, *(_plain(x) for x in (rms(found.x - exact.x), metres, found.correction))))
+    flow.sampler = sampler
+    return replace(checkpoint, accuracy=tuple(budgets))
+
+
+def _plain(x: torch.Tensor) -> tuple[float, ...]:
+    return tuple(x.nan_to_num(math.inf).tolist())
+
+
+def check_predictor_corrector(method: str) -> None:
+    """Refuse another solver than a predictor-corrector.
+
+    Raises:
+        InputError: it is none.
+    """
+    check_method(method)
+    found = fixed_step(method)
+    if found is None or not found.corrects:
+        known = ", ".join(n for n, solver in SOLVERS.items() if isinstance(solver, FixedStep) and solver.corrects)
+        raise InputError(f"only predictor-correctors are calibrated: {known}; found {method!r}.")
+
+
+def evaluations_of_calibration(steps: int) -> int:
+    """About how many evaluations `calibrate` takes."""
+    return 200 + len(GRIDS) * steps + sum(STEPS)
+
+
+def sampler_within(checkpoint: Checkpoint, error: str) -> Sampler:
+    """The flow's sampler with the number of steps that each scan needs for an error.
+
+    Args:
+        error: The largest one of a scan, root mean square: in metres of range as 0.05m, or in model space as 0.002.
+
+    Raises:
+        InputError: no such number, one that is out of reach, or a flow that has not been calibrated.
+    """
+    metres = error.endswith("m")
+    try:
+        value = float(error.removesuffix("m"))
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise InputError(f"--error must be metres of range, as 0.05m, or a number in model space; found {error!r}.")
+    if not checkpoint.accuracy:
+        raise InputError(f"the errors of {checkpoint.path} are not known yet; measure them: r2flow calibrate -c RUN.")
+    steps, limits = levels(checkpoint.accuracy, value, metres)
+    return replace(checkpoint.generator.sampler, levels=steps, limits=limits)
