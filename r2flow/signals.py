@@ -59,7 +59,15 @@ def stop_at_once(number: int, frame: FrameType | None = None) -> None:
     """A handler: nothing is under way that would have to be saved."""
     if multiprocessing.parent_process() is not None:  # a worker, forked with the handler: who started it speaks
         os._exit(code_of(number))
+    if _is_importing(frame):  # compiled modules swallow an exception, or make another one of it
+        end_at_once(number)
     raise Stopped(code_of(number))
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+        frame = frame.f_back
+    return frame is not None
 
 
 def end_at_once(number: int, frame: FrameType | None = None) -> None:
