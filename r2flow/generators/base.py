@@ -31,8 +31,8 @@ class Sampler:
         steps: Steps from noise to data, of a method of fixed steps.
         tolerance: Absolute and relative tolerance of an adaptive method.
         grid: Where fixed steps fall: a name (`r2flow.flow.solvers.named_grid`), or the times themselves.
-        finish: Length of the last part of the way to t = 1, which the last step takes by Euler's rule. That smooths what a
-            flow leaves rough that was not trained to the end.
+        finish: Length of the last part of the way to t = 1, which the last step takes by Euler's rule. That smooths
+            what a flow leaves rough that was not trained to the end.
         straight_first: Whether a scan that is straight to the tolerance takes one step (`r2flow.flow.straight_exit`).
         levels: Numbers of steps to try on a scan one after the other, instead of `steps` (`r2flow.generators.budgets`).
         limits: For each of them but the last one the largest correction of a scan that needs no more steps.
