@@ -14,10 +14,10 @@ The same command again goes on from the run's last checkpoint. `--cfg job` shows
 import sys
 from pathlib import Path
 
-from r2flow.signals import end_at_once, listening
+from r2flow.signals import heard_from_the_first_import
 
 if __name__ == "__main__":
-    with listening(end_at_once):  # Ctrl-C while this is imported is one line, too
+    with heard_from_the_first_import():
         from r2flow.launch import main
 
         sys.exit(main(sys.argv[1:], [sys.executable, str(Path(__file__).resolve())]))

@@ -3,7 +3,7 @@
 Equal steps are given the least number that keeps the worst error of these very scans below the bound, which nobody
 knows beforehand. On a mixed batch of exact problems, whose errors are measured on other noise, and on calibrated flows.
 
-r2flow calibrate runs/demo/rf1 && python benchmarks/levels.py runs/demo/rf1
+r2flow calibrate -c runs/demo/rf1 && python benchmarks/levels.py runs/demo/rf1
 """
 
 import argparse

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from r2flow.backbones import build_backbone
-from r2flow.flow.problems import Gaussian, Mixed, Problem, RayDrop, Straight, TwoModes
+from r2flow.flow.problems import Discontinuous, Gaussian, Mixed, Problem, RayDrop, Straight, TwoModes
 from r2flow.flow.solvers import Velocity, solve
 from r2flow.generators import Field
 from r2flow.lidar.sensors import build_sensor
@@ -35,11 +35,11 @@ def errors(x: Tensor, exact: Tensor) -> Tensor:
     return (x.double() - exact).square().mean(1).sqrt()
 
 
-def mixed_batch(seeds: int, elements: int) -> None:
+def mixed_batch(name: str, last: list[Problem], seeds: int, elements: int) -> None:
     """Evaluations and the hardest scene's error against one common step."""
-    straight, smooth, modes, drop = Straight(), Gaussian(), TwoModes(), RayDrop()
-    batch = Mixed([straight] * 8 + [smooth] * 4 + [modes] * 3 + [drop])
-    print(f"mixed batch of 16, {elements} elements, float32: median (worst) of {seeds} seeds")
+    straight, smooth, modes = Straight(), Gaussian(), TwoModes()
+    batch = Mixed([straight] * 8 + [smooth] * 4 + [modes] * (4 - len(last)) + last)
+    print(f"{name} of 16, {elements} elements, float32: median (worst) of {seeds} seeds")
     for method in ("bosh3", "dopri5"):
         for tolerance in (1e-3, 1e-5):
             shares, ours, theirs = [], [], []
@@ -131,7 +131,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    mixed_batch(options.seeds, options.elements)
+    mixed_batch("mixed batch", [RayDrop()], options.seeds, options.elements)
+    mixed_batch("mixed batch with a jump in time", [RayDrop(), Discontinuous()], options.seeds, options.elements)
     hard_among_easy(options.elements)
     if options.overhead:
         overhead(options.device, options.batch, options.repeats, options.rows, options.columns)

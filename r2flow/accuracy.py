@@ -97,6 +97,6 @@ def sampler_within(checkpoint: Checkpoint, error: str) -> Sampler:
     if not 0 < value < math.inf:
         raise InputError(f"--error must be metres of range, as 0.05m, or a number in model space; found {error!r}.")
     if not checkpoint.accuracy:
-        raise InputError(f"the errors of {checkpoint.path} are not known yet; measure them: r2flow calibrate RUN.")
+        raise InputError(f"the errors of {checkpoint.path} are not known yet; measure them: r2flow calibrate -c RUN.")
     steps, limits = levels(checkpoint.accuracy, value, metres)
     return replace(checkpoint.generator.sampler, finish=0.0, levels=steps, limits=limits)

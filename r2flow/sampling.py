@@ -67,7 +67,7 @@ def sample(
             noise as in the whole image.
         channels: `range` or `reflectance` skips the decoding of the other one; `both` takes what the model has.
         progress: Called after every network evaluation of a batch.
-        changes: Single settings of the sampler: steps, method, tolerance, grid, straight_first.
+        changes: Single settings of the sampler: steps, method, tolerance, grid.
 
     Raises:
         InputError: num or batch_size below 1, a sampler or a channel that the generator does not have, a region that
@@ -127,5 +127,5 @@ def batches(num: int, batch_size: int) -> int:
 
 
 def evaluated_region(generator: Generator, region: Region) -> Region:
-    """The region rounded outward to what the generator can be cut to."""
-    return region.rounded(generator.unit)
+    """The region and its margin, rounded outward to what the generator can be cut to."""
+    return region.widened().rounded(generator.unit)

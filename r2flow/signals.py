@@ -1,5 +1,6 @@
 """Being told to stop: what a signal means to a run, and to a process that waits for one."""
 
+import atexit
 import multiprocessing
 import os
 import signal
@@ -62,9 +63,26 @@ def stop_at_once(number: int, frame: FrameType | None = None) -> None:
 
 
 def end_at_once(number: int, frame: FrameType | None = None) -> None:
-    """A handler for a program that is still being imported: there is nothing yet that would have to be cleared away."""
+    """A handler for a program that is still being imported, or ends: there is nothing to clear away."""
     os.write(2, b"stopped\n")
     os._exit(code_of(number))
+
+
+@contextmanager
+def heard_from_the_first_import() -> Iterator[None]:
+    """Answer Ctrl-C and SIGTERM in one line around a whole program, whose imports take seconds, and at its exit."""
+    with listening(end_at_once):
+        try:
+            yield
+        finally:
+            atexit.unregister(_hear_at_exit)
+            atexit.register(_hear_at_exit)  # last, so that it is called first
+
+
+def _hear_at_exit() -> None:
+    for number in STOPPING:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, end_at_once)
 
 
 def end_with_parent(worker: int = 0) -> None:
@@ -80,6 +98,19 @@ def end_with_parent(worker: int = 0) -> None:
             os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
+
+
+@contextmanager
+def out_of_reach() -> Iterator[None]:
+    """Start processes that Ctrl-C does not reach, not even as they import; here it waits for the end of the block."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which they inherit
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def outlive_the_signal(worker: int = 0) -> None:

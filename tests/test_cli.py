@@ -1,5 +1,6 @@
 """r2flow VERB as a user types it."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -207,3 +208,24 @@ def test_importing_r2flow_loads_neither_lightning_nor_matplotlib():
     code += "print([m for m in ('lightning', 'matplotlib', 'tensorboard', 'torchdiffeq') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_bins(r2flow, saved, tmp_path):  # noqa: F811
+    published, out = tmp_path / "published.pth", tmp_path / "out"
+    assert r2flow("convert", saved[0].parent.parent, published)[0] == 0
+    drawn = ("--num", 1, "--steps", 1, "--pictures", 0, "--out", out)
+    code, _, error = r2flow("sample", "-c", published, *drawn, "--format", "npy,ply")
+    assert code == 0
+    assert error.count("points are written along rays through their middles") == 1
+    assert json.loads((out / "scans.json").read_text())["rays"] == "centre"
+    h, w, image = 8, 64, np.load(out / "000000.npy")
+    xyz = read_points(out / "000000.ply").xyz
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    column = w * (1 - azimuth / np.pi) / 2 - 0.5
+    row = h * (3 - np.degrees(np.arcsin(xyz[:, 2] / np.linalg.norm(xyz, axis=1)))) / 28 - 0.5
+    for place in (column, row):
+        np.testing.assert_allclose(place, place.round(), atol=1e-3)
+    found = image[0][row.round().astype(int), column.round().astype(int)]
+    np.testing.assert_allclose(np.linalg.norm(xyz, axis=1), found, rtol=1e-5)
+    assert "middles" not in r2flow("sample", "-c", published, *drawn, "--format", "npy")[2]
+    assert "middles" not in r2flow("sample", "-c", saved[0], *drawn, "--format", "ply")[2]

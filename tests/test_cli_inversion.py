@@ -99,6 +99,14 @@ def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):  # no
         "sample", "-c", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "-o", tmp_path / "o"
     )
     assert code == 0
+    # 11.25 degrees are 2 columns, and the network's unit is 8.
+    widened = "generating rows 0-3, columns 16-47, rounded outward from rows 0-2, columns 24-39 with its margin: 25% of"
+    assert widened in said
+    code, said, _ = r2flow(
+        "sample", "-c", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "--margin", 0,
+        "-o", tmp_path / "o",
+    )  # fmt: skip
+    assert code == 0
     assert "generating rows 0-3, columns 24-39, rounded outward from rows 0-2, columns 24-39: 12% of the image" in said
     image = np.load(tmp_path / "o" / "000000.npy")
     assert image.shape == (2, 8, 64)
@@ -132,7 +140,7 @@ def test_named_grids_are_sampled_on(r2flow, run, tmp_path):  # noqa: F811
 
 
 def test_a_calibrated_flow_is_sampled_to_an_error(r2flow, run, tmp_path):  # noqa: F811
-    code, said, _ = r2flow("calibrate", run, "--steps", 4, "--num", 1)
+    code, said, _ = r2flow("calibrate", "-c", run, "--steps", 4, "--num", 1)
     assert code == 0
     assert "adams3, 4 steps, grid " in said
     error = load_checkpoint(run).accuracy[2].errors[0]  # of 8 steps
@@ -188,7 +196,7 @@ class TestBadInput:
         self.check(r2flow("invert", files[0], *with_run, "--tolerance", 0), out, "must be positive")
         self.check(r2flow("interpolate", *files, *with_run, "--frames", 1), out, "--frames")
         self.check(r2flow("interpolate", files[0], tmp_path / "no.ply", *with_run), out, "no.ply")
-        self.check(r2flow("report", "savings", tmp_path / "none", "-o", out), out, "no checkpoint")
+        self.check(r2flow("report", "savings", "-c", tmp_path / "none", "-o", out), out, "no checkpoint")
 
     def test_of_grids_and_errors(self, r2flow, run, tmp_path):  # noqa: F811
         out = tmp_path / "o"
@@ -198,8 +206,10 @@ class TestBadInput:
         self.check(r2flow(*options, "--grid", "power:2", "--solver", "dopri5"), out, "dopri5 chooses its own")
         self.check(r2flow(*options, "--error", "0.1m"), out, "are not known yet; measure them: r2flow calibrate")
         self.check(r2flow(*options, "--error", "0.1m", "--steps", 3), out, "leave solver, steps, tolerance and grid")
-        self.check(r2flow("calibrate", run, "--solver", "bosh3"), out, "only predictor-correctors", "adams3", "'bosh3'")
-        self.check(r2flow("calibrate", tmp_path / "none"), out, "no checkpoint")
+        self.check(
+            r2flow("calibrate", "-c", run, "--solver", "bosh3"), out, "only predictor-correctors", "adams3", "'bosh3'"
+        )
+        self.check(r2flow("calibrate", "-c", tmp_path / "none"), out, "no checkpoint")
 
     def test_of_seeds_and_tolerances(self, r2flow, run, files, tmp_path):  # noqa: F811
         out = tmp_path / "o"
@@ -220,14 +230,13 @@ class TestBadInput:
         self.check(r2flow(*options, "--channels", "depth"), out, "both, range or reflectance", "'depth'")
         self.check(r2flow(*options, "--channels", "range", "--format", "bin"), out, "leaves it out", "ply,npy")
         self.check(r2flow(*options, "--channels", "reflectance", "--format", "ply"), out, "need a range")
-        self.check(r2flow(*options, "--straight-first"), out, "adaptive solver", "'euler'")
         alone = write_checkpoint(tmp_path / "range", reflectance=False)
         self.check(r2flow("sample", "-c", alone, "-o", out, "--channels", "reflectance"), out, "range alone")
 
 
 def test_what_is_not_asked_for_is_not_imported():
     shown = "print([m for m in ({}) if m in sys.modules]); "
-    code = "import r2flow.flow.straight_exit, r2flow.flow.problems, r2flow.lidar.region, r2flow.backbones, sys; "
+    code = "import r2flow.flow.solvers, r2flow.flow.problems, r2flow.lidar.region, r2flow.backbones, sys; "
     code += shown.format("'lightning', 'matplotlib', 'torchdiffeq', 'r2flow.simulator'")
     code += "import r2flow.sampling, r2flow.reports.inversion, r2flow.reports.interpolation, r2flow.reports.savings; "
     code += shown.format("'r2flow.simulator', 'tensorboard', 'torchdiffeq', 'plotly', 'natten'")

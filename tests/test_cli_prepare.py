@@ -166,7 +166,7 @@ def test_columns_are_named_where_files_do_not(r2flow, numbered, tmp_path):  # no
         ("evaluate", wide, scan, "--size", "4x16", "--metrics", "jsd"),
     ):
         assert r2flow(*verb, *columns)[0] == 0
-    for wrong in ("x,y", "x,y,z,x", "x,y,z,intensity,i", ""):
+    for wrong in ("x,y", "x,y,z,x", "x,y,z,intensity,i"):
         code, _, error = r2flow("show", scan, "--columns", wrong, "--out", tmp_path / "v")
         assert (code, error.count("\n")) == (2, 1)
         assert "columns must name x, y and z" in error

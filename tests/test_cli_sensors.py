@@ -161,7 +161,7 @@ def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, 
     ("Größe.yaml", "Gr__e"), ("_.yml", "my__"),
 ])  # fmt: skip
 def test_a_sensor_is_named_after_its_file(r2flow, scans: Path, tmp_path: Path, file: str, name: str):  # noqa: F811
-    code, _, error = r2flow("sensor", scans, "--out", tmp_path / file, "--most", 1)
+    code, _, error = r2flow("sensor", scans, "--out", tmp_path / file, "--num", 1)
     assert (code, error) == (0, "")
     assert read_sensor(tmp_path / file).name == name
 

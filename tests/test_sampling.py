@@ -269,13 +269,11 @@ def test_range_alone_decodes_no_reflectance(monkeypatch):
     assert widths == [1]
 
 
-def test_grids_and_straight_exits_are_refused_where_they_do_not_fit():
-    with pytest.raises(InputError, match="needs? an adaptive solver"):
-        next(sample(flow(), 1, straight_first=True))
+def test_grids_and_tolerances_are_refused_where_they_do_not_fit():
     with pytest.raises(InputError, match="dopri5 chooses its own"):
         next(sample(flow(), 1, method="dopri5", grid="power:2"))
     with pytest.raises(InputError, match="positive and finite"):
-        next(sample(flow(), 1, method="dopri5", tolerance=math.inf, straight_first=True))
+        next(sample(flow(), 1, method="dopri5", tolerance=math.inf))
     with pytest.raises(InputError, match="uniform, power:P or power-start:P"):
         next(sample(flow(), 1, grid="quadratic"))
     with pytest.raises(InputError, match="only a predictor-corrector says how many steps a scan needs, not euler"):
@@ -288,25 +286,3 @@ def test_another_method_does_not_take_over_the_grid_of_the_former_one():
     assert own.changed(method="euler", tolerance=1e-3).grid == own.grid
     assert own.changed(method="heun2", grid="power:2").grid == "power:2"
     one.check_sampler(own.changed(method="dopri5"))
-    one.check_sampler(Sampler("dopri5", straight_first=True).changed(method="euler", steps=4))
-    assert Sampler("dopri5").changed(method="bosh3", straight_first=True).straight_first
-
-
-def test_straight_first_goes_forward_only_and_takes_the_options_of_solve():
-    one, how = Field(lambda t, x: x, (1,)), Sampler("dopri5", tolerance=1e-6, straight_first=True)  # x_t = x_0 e^t
-    assert one.solve(torch.ones(2, 1), sampler=how).x.flatten().tolist() == pytest.approx([math.e] * 2, abs=1e-4)
-    with pytest.raises(InputError, match="from t = 0 to 1, found 1 to 0"):
-        one.solve(torch.ones(2, 1), 1.0, 0.0, sampler=how)
-    assert not one.solve(torch.ones(2, 1), sampler=how, max_evaluations=3).converged.any()
-
-
-def test_straight_scenes_take_one_step():
-    class Straight(GaussianFlow):
-        def forward(self, t, x):
-            return torch.full_like(x, 0.1) * self.scale
-
-    (drawn,) = sample(flow(Straight()), 2, method="dopri5", tolerance=1e-3, batch_size=2, straight_first=True)
-    assert drawn.evaluations.tolist() == [3, 3]
-    (bent,) = sample(flow(), 1, method="dopri5", tolerance=1e-3, straight_first=True)
-    (alone,) = sample(flow(), 1, method="dopri5", tolerance=1e-3)
-    assert torch.equal(bent.images, alone.images)

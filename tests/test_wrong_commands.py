@@ -35,7 +35,6 @@ report nope
 report --nope
 sample # Missing
 sample -c run # Missing
-sample -o out # Missing
 sample -c nowhere -o out
 sample -c empty -o out
 sample -c bad.ckpt -o out
@@ -85,8 +84,11 @@ sample -c run -o out --grid nowhere.json
 sample -c run -o out --grid bad.json
 sample -c run -o out --grid file.txt
 sample -c run -o out --grid empty
-sample -c run -o out --solver dopri5 --grid quadratic
-sample -c run -o out --straight-first --grid quadratic # an adaptive solver
+sample -c run -o out --solver dopri5 --grid power:2
+sample -c run -o out --grid power:0
+sample -c run -o out --error 0.05m # measure them
+sample -c run -o out --error nope
+sample -c run -o out --error 0.05m --steps 4 # leave solver
 sample -c run -o out --straight-first --solver nope
 sample -c run -o out --plugin nope
 sample -c run -o out --plugin plugin.py
@@ -95,17 +97,14 @@ sample -c run -o out extra
 sample -c run -c run -o out -o # '-o' requires an argument
 sample -c '' -o out # an argument is empty
 calibrate # Missing
-calibrate run # Missing
-calibrate run -o out # ends in .json
-calibrate run -o empty
-calibrate run -o out.json --steps 0
-calibrate run -o out.json --steps a
-calibrate run -o out.json --solver dopri5
-calibrate run -o out.json --solver nope
-calibrate run -o out.json --num 0
-calibrate nowhere -o out.json
-calibrate bad.ckpt -o out.json
-calibrate run -o file.txt/a.json
+calibrate -c run --steps 0
+calibrate -c run --steps a
+calibrate -c run --solver dopri5
+calibrate -c run --solver nope
+calibrate -c run --num 0
+calibrate -c nowhere
+calibrate -c bad.ckpt
+calibrate -c street # stays as it is
 info # Missing
 info nowhere
 info empty
@@ -158,7 +157,7 @@ invert empty -c run -o out
 invert bad.bin -c run -o out
 invert file.txt -c run -o out
 invert scans -c nowhere -o out
-invert scans -c run -o out --most 0
+invert scans -c run -o out --num 0
 invert scans -c run -o out --solver nope
 invert scans -c run -o out --solver bosh3 --steps 0
 invert scans -c run -o out --tolerance 0
@@ -191,7 +190,7 @@ show scans -o out --projection nope
 show scans -o out --projection unfolding
 show scans -o out --reflectance-scale 0
 show scans -o out --reflectance-scale nan
-show scans -o out --most 0
+show scans -o out --num 0
 show run -o out # a run without samples
 show nope:scans -o out
 show simulated:a -o out
@@ -215,7 +214,7 @@ sensor empty
 sensor bad.bin
 sensor file.txt
 sensor image.npy
-sensor scans --most 0
+sensor scans --num 0
 sensor scans -o out # a .yaml file
 sensor scans -o out.yaml --name 'a b'
 sensor scans -o out.yaml --name hdl64e
@@ -254,28 +253,28 @@ prepare --check empty
 prepare --check scans # no prepared scans
 prepare --check file.txt
 pairs # Missing
-pairs nowhere
-pairs empty
-pairs stopped
-pairs bad.ckpt
-pairs run --num 0
-pairs run --num 1 --solver nope
-pairs run --num 1 --steps 0
-pairs run --num 1 --tolerance 0
-pairs run --num 1 --tolerance nan
-pairs run --num 1 --batch-size 0
-pairs run --num 1 --shard-mib 0
-pairs run --num 1 --shard-mib nan
-pairs run --num 1 --shard-mib inf
-pairs run --num 1 --seed -1
-pairs run --num 1 --seed 99999999999999999999
-pairs run --num 1 --first -1
-pairs run --num 1 --first 99999999999999999999
-pairs run --num 1 --rank 1
-pairs run --num 1 --rank 2 --ranks 2
-pairs run --num 1 --ranks 2
-pairs run --num 1 --device nope
-pairs run --num 1 -o file.txt
+pairs -c nowhere
+pairs -c empty
+pairs -c stopped
+pairs -c bad.ckpt
+pairs -c run --num 0
+pairs -c run --num 1 --solver nope
+pairs -c run --num 1 --steps 0
+pairs -c run --num 1 --tolerance 0
+pairs -c run --num 1 --tolerance nan
+pairs -c run --num 1 --batch-size 0
+pairs -c run --num 1 --shard-mib 0
+pairs -c run --num 1 --shard-mib nan
+pairs -c run --num 1 --shard-mib inf
+pairs -c run --num 1 --seed -1
+pairs -c run --num 1 --seed 99999999999999999999
+pairs -c run --num 1 --first -1
+pairs -c run --num 1 --first 99999999999999999999
+pairs -c run --num 1 --rank 1
+pairs -c run --num 1 --rank 2 --ranks 2
+pairs -c run --num 1 --ranks 2
+pairs -c run --num 1 --device nope
+pairs -c run --num 1 -o file.txt
 weights --add
 weights --add nope file.txt
 weights --add rangenet53
@@ -337,7 +336,7 @@ report fidelity nowhere scans
 report fidelity scans scans --train nowhere
 report fidelity scans scans --floor nowhere
 report fidelity scans scans --also nowhere
-report fidelity scans scans --most 0
+report fidelity scans scans --num 0
 report fidelity scans scans --size 8
 report fidelity scans scans -o file.txt
 report neighbours scans # Missing
@@ -351,16 +350,16 @@ report neighbours scans scans -o out --split train # no split named 'train'
 report neighbours scans scans -o file.txt
 report neighbours scans scans -o out --real nowhere
 report curvature # Missing
-report curvature run # Missing
-report curvature nowhere -o out
-report curvature run -o out --steps 0
-report curvature run -o out --num 0
-report curvature run -o out --most-curved 0
-report curvature run -o file.txt
-report curvature run -o out --device nope
+report curvature -c run # Missing
+report curvature -c nowhere -o out
+report curvature -c run -o out --steps 0
+report curvature -c run -o out --num 0
+report curvature -c run -o out --most-curved 0
+report curvature -c run -o file.txt
+report curvature -c run -o out --device nope
 report work-precision # Missing
-report work-precision nowhere -o out
-report work-precision -o out --methods nope
+report work-precision -c nowhere -o out
+report work-precision -o out --solvers nope
 report work-precision -o out --budgets 0
 report work-precision -o out --budgets a
 report work-precision -o out --budgets '' # an argument is empty
@@ -371,9 +370,9 @@ report work-precision -o out --problems none
 report work-precision -o out --problem-scenes 0
 report work-precision -o out --repeats 0
 report work-precision -o file.txt
-report work-precision run -o out --reference-steps 0
-report work-precision run -o out --reference-tolerance 0
-report work-precision run -o out --reference-tolerance nan
+report work-precision -c run -o out --reference-steps 0
+report work-precision -c run -o out --reference-tolerance 0
+report work-precision -c run -o out --reference-tolerance nan
 report stability # Missing
 report stability -o out --problems nope
 report stability -o out --problems none
@@ -384,25 +383,25 @@ report stability -o out --scenes 0
 report stability -o out --seed -1
 report stability -o out --max-evaluations 0
 report stability -o file.txt
-report savings nowhere
+report savings -c nowhere
 report savings -o file.txt
 report savings --num 0
 report savings --steps 0
 report savings --tolerance 0
 report savings --tolerance nan
-report savings run -o out --device nope
+report savings -c run -o out --device nope
 report paper # Missing
-report paper --runs run # Missing
-report paper --runs nowhere -o out
-report paper --runs empty -o out
-report paper --runs run -o out --num 1
-report paper --runs run -o out --steps 0
-report paper --runs run -o out --curved -1
-report paper --runs run -o out --tolerance -1
-report paper --runs run -o out --metrics nope
-report paper --runs run -o out --real nowhere
-report paper --runs run -o file.txt
-report paper --runs run -o out --bootstrap -1
+report paper run # Missing
+report paper nowhere -o out
+report paper empty -o out
+report paper run -o out --num 1
+report paper run -o out --steps 0
+report paper run -o out --curved -1
+report paper run -o out --tolerance -1
+report paper run -o out --metrics nope
+report paper run -o out --real nowhere
+report paper run -o file.txt
+report paper run -o out --bootstrap -1
 sample -c run -o out --format '' # an argument is empty
 sample -c run -o '' # an argument is empty
 evaluate scans scans --metrics '' # an argument is empty
@@ -439,7 +438,7 @@ name=x sampler.grid=wave
 name=x sampler.grid=[0,0.5]
 name=x sampler.grid=[1,0]
 name=x +sampler.foo=1
-name=x sampler.method=dopri5 sampler.grid=quadratic
+name=x sampler.method=dopri5 sampler.grid=power:2
 name=x backbone.base_channels=7
 name=x backbone.depths=[]
 name=x backbone.depths=[0,0]
@@ -751,7 +750,7 @@ def refused(place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
             cli.main()
         said = capfd.readouterr().err
         assert end.value.code == 2, said
-        (answer,) = said.splitlines()
+        (answer,) = (line for line in said.splitlines() if not line.startswith("WARNING"))
         assert answer.startswith("error: ")
         named = {word for argument in arguments[1:] for word in re.split(r"[^\w²-]+", argument.strip("-"))}
         wanted = {words} if words else named - USUAL

@@ -16,15 +16,18 @@ from r2flow.cli.output import command, finish, numbers
 from r2flow.errors import InputError
 
 OptionalCheckpoint = Annotated[
-    Path | None, typer.Argument(help="A checkpoint file, a run folder or a model; exact problems alone if left out.")
+    Path | None,
+    typer.Option("--checkpoint", "-c", help="A checkpoint, a run or a model; exact problems alone if left out."),
 ]
 ProblemsOption = Annotated[str | None, typer.Option(help="Exact problems by name; all if left out, or none.")]
 
 
-@report.command(epilog="Example: r2flow report curvature runs/1rf runs/2rf --out reports")
+@report.command(epilog="Example: r2flow report curvature -c runs/1rf -c runs/2rf --out reports")
 @grouped
 def curvature(
-    checkpoints: Annotated[list[Path], typer.Argument(help="Checkpoint files, run folders or models.")],
+    checkpoints: Annotated[
+        list[Path], typer.Option("--checkpoint", "-c", help="A checkpoint, a run or a model; may be repeated.")
+    ],
     out: OutOption,
     draw: DrawOptions,
     steps: Annotated[int, typer.Option(min=1, help="Euler steps of a path.")] = 256,
@@ -56,7 +59,7 @@ def curvature(
 class SolversOptions:
     """What is compared, and on which exact problems."""
 
-    methods: Annotated[str | None, typer.Option(help="Solvers, separated by commas; all of ours if left out.")] = None
+    solvers: Annotated[str | None, typer.Option(help="Solvers, separated by commas; all of ours if left out.")] = None
     budgets: Annotated[str, typer.Option(help="Evaluations of the fixed-step solvers.")] = "4,8,16,32,64"
     tolerances: Annotated[str, typer.Option(help="Of the adaptive solvers.")] = "1e-2,1e-3,1e-4,1e-5"
     problems: ProblemsOption = None
@@ -72,7 +75,7 @@ class ReferenceOptions:
     reference_tolerance: Annotated[float, typer.Option(min=1e-13, help="Of the dopri5 that confirms it.")] = 1e-7
 
 
-@report.command("work-precision", epilog="Example: r2flow report work-precision runs/simulated-hdit_tiny --out reports")
+@report.command("work-precision", epilog="Example: r2flow report work-precision -c runs/NAME --out reports")
 @grouped
 def work_precision(
     out: OutOption,
@@ -92,7 +95,7 @@ def work_precision(
     from r2flow.reports.work_precision_page import work_precision_page
 
     where = choose_device(draw.device)
-    names = solvers.methods.split(",") if solvers.methods else measuring.METHODS
+    names = solvers.solvers.split(",") if solvers.solvers else measuring.METHODS
     budgets = numbers("budgets", solvers.budgets, int)
     chosen = measuring.configurations(names, budgets, numbers("tolerances", solvers.tolerances))
     if not chosen:
@@ -153,7 +156,7 @@ def stability(
     finish(page, out, page.text[:1])
 
 
-@report.command(epilog="Example: r2flow report savings runs/NAME --out reports")
+@report.command(epilog="Example: r2flow report savings -c runs/NAME --out reports")
 def savings(
     checkpoint: OptionalCheckpoint = None,
     out: OutOption = Path("reports"),
@@ -163,7 +166,7 @@ def savings(
     seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0,
     device: DeviceOption = "auto",
 ) -> None:
-    """What a scan need not cost: own steps, leaving early, one step for the straight, regions, single channels."""
+    """What a scan need not cost: own steps, leaving early, regions, single channels."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.flow.solvers import check_tolerance
     from r2flow.generators import as_flow

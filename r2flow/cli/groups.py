@@ -81,7 +81,9 @@ class SolverOptions:
 
     solver: Annotated[
         str | None,
-        typer.Option(help="adams2-4, euler, midpoint, heun2-3, rk4, ab2; adaptive: dopri5, bosh3, torchdiffeq:NAME."),
+        typer.Option(
+            help="adams2-4, euler, midpoint, heun2-3, rk4, ab2; adaptive: dopri5, bosh3, auto, torchdiffeq:NAME."
+        ),
     ] = None
     steps: Annotated[int | None, typer.Option(min=1, help="Steps from noise to data, of a solver of fixed steps.")] = (
         None

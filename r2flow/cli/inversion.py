@@ -30,7 +30,7 @@ def invert(
     out: OutOption,
     solver: SolverOptions,
     how: ScanOptions,
-    most: Annotated[int, typer.Option(min=1, help="The most scans of a folder, evenly spread over it.")] = 16,
+    num: Annotated[int, typer.Option(min=1, help="The most scans of a folder, evenly spread over it.")] = 16,
 ) -> None:
     """Carry scans to their noise, and forward again: how far from themselves they end.
 
@@ -43,7 +43,7 @@ def invert(
     from r2flow.reports.pages import write_page
 
     loaded = load_checkpoint(checkpoint, choose_device(how.device))
-    real = real_scans(loaded, scans, how.reflectance_scale, most)
+    real = real_scans(loaded, scans, how.reflectance_scale, num)
     page = invert_scans(loaded, real, out, solver.change(TIGHT), how.batch_size, command())
     written = write_page(page, out)
     print_rows(page.rows)  # type: ignore[arg-type]

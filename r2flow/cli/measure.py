@@ -23,7 +23,7 @@ def fidelity(
     ] = None,
     train: Annotated[str | None, typer.Option(help="The scans that were learned from.")] = None,
     name: Annotated[str, typer.Option(help="What the judged set is called on the page.")] = "judged",
-    most: Annotated[int, typer.Option(min=1, help="The most scans of a set, evenly spread over it.")] = 1000,
+    num: Annotated[int, typer.Option(min=1, help="The most scans of a set, evenly spread over it.")] = 1000,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page and its figures.")] = None,
 ) -> None:
     """Set scans against real ones, beside real drives and beside controls: noise, flat ground, mean, shuffle."""
@@ -37,10 +37,10 @@ def fidelity(
     reading = replace(choose_reading(named, **vars(how)), on_bad_scan="error")
     if out is not None:
         prepare_folder(out)
-    training = None if train is None else load_scans(train, reading, most)[0]
-    apart = joined([load_scans(path, reading, most)[0] for path in floor]) if floor else None
-    judged, _ = load_scans(other, reading, most)
-    loaded = [load_scans(path, reading, most) for path in folders]
+    training = None if train is None else load_scans(train, reading, num)[0]
+    apart = joined([load_scans(path, reading, num)[0] for path in floor]) if floor else None
+    judged, _ = load_scans(other, reading, num)
+    loaded = [load_scans(path, reading, num) for path in folders]
     truth = joined([images for images, _ in loaded])
     drives = [drive for _, names in loaded for drive in names]
     chosen = reading.sensor

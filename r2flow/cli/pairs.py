@@ -8,7 +8,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import SolverOptions, grouped
-from r2flow.cli.options import DeviceOption, choose_device
+from r2flow.cli.options import CheckpointOption, DeviceOption, choose_device
 from r2flow.errors import InputError
 
 
@@ -48,10 +48,10 @@ class ShareOptions:
         return rank, ranks, where
 
 
-@app.command(epilog="Example: torchrun --nproc-per-node 8 -m r2flow.cli pairs runs/r2flow_1rf --num 1000000")
+@app.command(epilog="Example: torchrun --nproc-per-node 8 -m r2flow.cli pairs -c runs/r2flow_1rf --num 1000000")
 @grouped
 def pairs(
-    checkpoint: Annotated[Path, typer.Argument(help="The flow that draws them: a run, a checkpoint or a model.")],
+    checkpoint: CheckpointOption,
     solver: SolverOptions,
     share: ShareOptions,
     num: Annotated[int, typer.Option(min=1, help="Pairs in all.")] = 1000,

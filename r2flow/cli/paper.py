@@ -32,12 +32,10 @@ class BudgetOptions:
     tolerance: Annotated[float, typer.Option(min=0, help="Of the inversion in figure 3; 0 leaves it out.")] = 1e-3
 
 
-@report.command(epilog="Example: r2flow report paper --runs runs/r2flow --runs runs/sweep --out paper")
+@report.command(epilog="Example: r2flow report paper runs/r2flow runs/sweep --out paper")
 @grouped
 def paper(
-    runs: Annotated[
-        list[Path], typer.Option("--runs", help="Run folders, or folders of them: chains, sweeps; may be repeated.")
-    ],
+    runs: Annotated[list[Path], typer.Argument(help="Run folders, or folders of them: a chain's, a sweep's.")],
     out: OutOption,
     budget: BudgetOptions,
     work: WorkOptions,

@@ -33,7 +33,7 @@ def show(
         float | None, typer.Option(min=1e-6, help="Value in the file that means full reflectance; guessed if left out.")
     ] = None,
     columns: ColumnsOption = None,
-    most: Annotated[int, typer.Option(min=1, help="The most scans to draw of a folder.")] = 16,
+    most: Annotated[int, typer.Option("--num", min=1, help="The most scans to draw of a folder.")] = 16,
     labels: Annotated[bool, typer.Option("--labels", help="Draw the classes of .label files, too.")] = False,
 ) -> None:
     """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each."""

@@ -22,7 +22,7 @@ def sensor(
     name: Annotated[str | None, typer.Option(help="Name of the sensor; by default from that of the file.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
     columns: ColumnsOption = None,
-    most: Annotated[int, typer.Option(min=1, help="The most scans to read of a folder.")] = 8,
+    most: Annotated[int, typer.Option("--num", min=1, help="The most scans to read of a folder.")] = 8,
 ) -> None:
     """Estimate a sensor from scans: beams, resolution, limits, height, reflectance; write it as YAML.
 

@@ -19,7 +19,9 @@ def unpack(
     out: OutOption,
     topic: Annotated[str | None, typer.Option(help="Topic of the point clouds, where there are several.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Take one message of so many.")] = 1,
-    most: Annotated[int | None, typer.Option(min=1, help="The most scans to write.", show_default=False)] = None,
+    most: Annotated[
+        int | None, typer.Option("--num", min=1, help="The most scans to write.", show_default=False)
+    ] = None,
 ) -> None:
     """Write the PointCloud2 messages of a recording as scan files: x, y, z and intensity, named by their time in ns."""
     from r2flow.lidar.bags import read_bag

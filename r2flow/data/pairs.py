@@ -133,7 +133,7 @@ class PairSource:
         self.store = store
         if not store.is_whole(num):
             lacking = len(store.missing(num)) * store.recipe.batch_size
-            raise InputError(f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
+            raise InputError(f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs -c RUN.")
         self.indices = np.flatnonzero(store.usable(num))
         self._opened: dict[int, Any] = {}
 

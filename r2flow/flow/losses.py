@@ -26,10 +26,12 @@ def pseudo_huber(v_t: Tensor, u_t: Tensor) -> Tensor:
     """
     r = (v_t.float() - u_t.float()).flatten(1)
     d = r.shape[1]
-    # vector_norm has gradient 0 at r = 0, where sqrt of a sum of squares has NaN. Dividing first keeps |r|^2 finite;
-    # the quotient has no cancellation at small r.
-    rms = torch.linalg.vector_norm(r, dim=1) / math.sqrt(d)
-    return rms.square() / ((rms.square() + PSEUDO_HUBER_SCALE**2).sqrt() + PSEUDO_HUBER_SCALE)
+    # vector_norm has gradient 0 at r = 0, where sqrt of a sum of squares has NaN. The scale keeps |r|^2 finite where an
+    # element is large; the quotient has no cancellation at small r.
+    scale = r.detach().abs().amax(1).clamp(min=1)
+    rms = torch.linalg.vector_norm(r / scale[:, None], dim=1) / math.sqrt(d) * scale
+    c = torch.full_like(rms, PSEUDO_HUBER_SCALE)
+    return rms * (rms / (torch.hypot(rms, c) + c))
 
 
 def pseudo_huber_elementwise(v_t: Tensor, u_t: Tensor) -> Tensor:

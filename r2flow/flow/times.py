@@ -12,6 +12,8 @@ from torch import Tensor
 
 from r2flow.registry import Count, Portion, Positive, Registry
 
+GOLDEN = -7046029254386353131  # (sqrt(5) - 1) / 2 of 2^64, as a signed integer
+
 TimeDensity = Callable[[Tensor], Tensor]
 
 
@@ -76,6 +78,15 @@ class Discrete:
     def __call__(self, u: Tensor) -> Tensor:
         # u just below 1 times k can round up to k in float32.
         return torch.floor(u * self.k).clamp(max=self.k - 1) / self.k
+
+
+def golden_sequence(k: Tensor) -> Tensor:
+    """(k + 1/2) (sqrt(5) - 1) / 2 mod 1 of integers k, float32: a low-discrepancy sequence over [0, 1).
+
+    In 64-bit integers that wrap around, so that no k is too large.
+    """
+    turns = k.long() * GOLDEN + GOLDEN % 2**64 // 2
+    return (turns >> 40 & 0xFFFFFF).float() / 2**24
 
 
 TIMES: Registry[Callable[..., TimeDensity]] = Registry(

@@ -33,7 +33,6 @@ class Sampler:
         grid: Where fixed steps fall: a name (`r2flow.flow.solvers.named_grid`), or the times themselves.
         finish: Length of the last part of the way to t = 1, which the last step takes by Euler's rule. That smooths
             what a flow leaves rough that was not trained to the end.
-        straight_first: Whether a scan that is straight to the tolerance takes one step (`r2flow.flow.straight_exit`).
         levels: Numbers of steps to try on a scan one after the other, instead of `steps` (`r2flow.generators.budgets`).
         limits: For each of them but the last one the largest correction of a scan that needs no more steps.
         fixed: Whether the generator was trained for this number of steps and is worse at any other.
@@ -44,7 +43,6 @@ class Sampler:
     tolerance: Positive = 1e-5
     grid: str | tuple[float, ...] = "uniform"
     finish: Portion = 0.0
-    straight_first: bool = False
     levels: tuple[int, ...] = ()
     limits: tuple[float, ...] = ()
     fixed: bool = False
@@ -56,6 +54,8 @@ class Sampler:
         Raises:
             InputError: an unknown option, or a value of the wrong type.
         """
+        # An option of earlier development versions, which did nothing on trained flows.
+        options = {str(key): value for key, value in options.items() if key != "straight_first"}
         check_options("sampler", cls, options)
         grid = options.get("grid", "uniform")
         if grid == "quadratic":  # its name in version 0.1.0
@@ -66,16 +66,14 @@ class Sampler:
     def changed(self, **options: Any) -> Self:
         """The same with the options that are not None. Given times decide the number of steps.
 
-        Another method starts from its usual grid, without `finish`, `straight_first` and `levels`, which were those of
-        the former one.
+        Another method starts from its usual grid, without `finish` and `levels`: those were the former one's.
 
         Raises:
             InputError: fewer than one step, or times and a number of steps that contradict.
         """
         given = {key: value for key, value in options.items() if value is not None}
         if given.get("method", self.method) != self.method:
-            usual = usual_grid(given["method"])
-            given = {"grid": usual, "finish": 0.0, "straight_first": False, "levels": (), "limits": (), **given}
+            given = {"grid": usual_grid(given["method"]), "finish": 0.0, "levels": (), "limits": (), **given}
         if "steps" in given:
             given = {"levels": (), "limits": (), **given}
         grid = given.get("grid", "uniform")

@@ -20,7 +20,6 @@ from r2flow.flow.solvers import (
     solve,
 )
 from r2flow.flow.solvers.grids import build_grid
-from r2flow.flow.straight_exit import solve_straight_first
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
@@ -55,14 +54,10 @@ class Flow(Generator):
         """The state at t_1 of the ODE from x at t_0, (B, ...); see `r2flow.flow.solvers.solve` for the options.
 
         Raises:
-            InputError: `straight_first` from or to another time than 0 and 1; a solver's own complaints.
+            InputError: as `solve` does.
         """
         how = sampler or self.sampler
         field, x = self.field(condition), x.to(self.device)
-        if how.straight_first:
-            if (t_0, t_1) != (0.0, 1.0):
-                raise InputError(f"straight_first is for the way from t = 0 to 1, found {t_0:g} to {t_1:g}.")
-            return solve_straight_first(field, x, how.tolerance, how.method, progress, **options)
         grid = how.grid if isinstance(how.grid, str) else torch.tensor(how.grid, dtype=torch.float64)
 
         def by(field: Velocity, x: Tensor, steps: int) -> Solution:
@@ -93,10 +88,6 @@ class Flow(Generator):
         build_grid(grid if isinstance(grid, str) else torch.tensor(grid), 0.0, 1.0, sampler.steps)
         if sampler.levels and not (method and method.corrects):
             raise InputError(f"only a predictor-corrector says how many steps a scan needs, not {sampler.method}.")
-        if sampler.straight_first and not adapts(sampler.method):
-            raise InputError(
-                f"scenes that are not straight need an adaptive solver, dopri5 or bosh3; found {sampler.method!r}."
-            )
         if adapts(sampler.method) and sampler.grid != "uniform":
             raise InputError(f"a time grid is for a solver of fixed steps; {sampler.method} chooses its own.")
 

@@ -54,7 +54,8 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
         raise InputError(f"{path} is no ROS 2 bag (no metadata.yaml); give the .mcap or .db3 file in it.")
     if path.suffix.lower() == ".bag" and path.is_file():
         store = get_typestore(Stores.ROS1_NOETIC)
-        kind, deserialize = Reader1, store.deserialize_ros1
+        kind: Any = Reader1
+        deserialize = store.deserialize_ros1
     else:
         store = get_typestore(Stores.ROS2_HUMBLE)
         kind, deserialize = Reader2, store.deserialize_cdr

@@ -10,6 +10,10 @@ from r2flow.errors import InputError
 
 Rectangle = tuple[int, int]
 
+# Degrees beside a sector that `r2flow sample` generates with it. On the demo's 1-RF a sector of 90 degrees is 0.065
+# from the whole scan in model space without a margin, 0.015 with this one, 0.006 with 45 degrees.
+MARGIN = 11.25
+
 
 @dataclass(frozen=True)
 class Region:
@@ -21,6 +25,7 @@ class Region:
         height: Number of rows.
         left: First column.
         width: Number of columns, which go on at column 0 behind the last.
+        margin: Number of columns on either side that are generated with it and cut off.
     """
 
     shape: tuple[int, int]
@@ -28,6 +33,7 @@ class Region:
     height: int
     left: int
     width: int
+    margin: int = 0
 
     @property
     def rows(self) -> Tensor:
@@ -56,6 +62,13 @@ class Region:
         image[..., rows[:, None], columns] = part
         return image
 
+    def widened(self) -> "Region":
+        """The region and its margin."""
+        left, width = self.left - self.margin, self.width + 2 * self.margin
+        if width >= self.shape[1]:
+            left, width = 0, self.shape[1]
+        return Region(self.shape, self.top, self.height, left % self.shape[1], width)
+
     def rounded(self, unit: tuple[int, int]) -> "Region":
         """The smallest region around this one that is made of whole units of rows and columns.
 
@@ -81,7 +94,10 @@ def _outward(first: int, count: int, unit: int) -> tuple[int, int]:
 
 
 def region(
-    shape: tuple[int, int], sector: tuple[float, float] | None = None, rows: tuple[int, int] | None = None
+    shape: tuple[int, int],
+    sector: tuple[float, float] | None = None,
+    rows: tuple[int, int] | None = None,
+    margin: float = 0.0,
 ) -> Region:
     """The pixels that look into an azimuth sector and belong to a block of rows.
 
@@ -91,17 +107,21 @@ def region(
             (135, -135) the one behind. Pixels that are partly inside belong to it. Two azimuths a whole turn apart,
             such as (180, -180), are the full turn. None for all.
         rows: First and last row, both included, 0 at the top. None for all.
+        margin: Degrees on either side of the sector that are generated with it and cut off, as what is next to a cut is
+            not what it is in the whole scan.
 
     Raises:
-        InputError: an empty sector, or one narrower than a column; angles beyond 360 degrees, or rows that the image
-            does not have.
+        InputError: a margin below 0 or without a sector; an empty sector, or one narrower than a column; angles beyond
+            360 degrees, or rows that the image does not have.
     """
     height, width = shape
     first_row, last_row = rows or (0, height - 1)
     if not 0 <= first_row <= last_row < height:
         raise InputError(f"rows must be FIRST-LAST within 0-{height - 1}, found {first_row}-{last_row}.")
+    if not (0 <= margin <= 180 and (sector is not None or margin == 0)):
+        raise InputError(f"a margin is 0 to 180 degrees on either side of a sector, found {margin:g}.")
     left, count = _columns(width, sector) if sector is not None else (0, width)
-    return Region(shape, first_row, last_row - first_row + 1, left, count)
+    return Region(shape, first_row, last_row - first_row + 1, left, count, math.ceil(margin / 360 * width))
 
 
 def _columns(width: int, sector: tuple[float, float]) -> tuple[int, int]:

@@ -85,13 +85,14 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     written = write_page(page, out)[-1]
     print_table(rows, COLUMNS)
     last, folder = list(runs.items())[-1]
+    learned = {**flows[last].config, "data": first.config.get("data", {})}  # the chain's scans are its first link's
     print(
         f"""
 pictures      {out / "chain.png"} (every generator, few and many steps), {out / "samples.png"} ({last})
 point clouds  {out / "000000.ply"} ...
 table         {written}
 flows         {", ".join(str(run) for run in runs.values())}
-{what_next(folder, out)}""",
+{what_next(folder, out, config=learned)}""",
         flush=True,
     )
     return written

@@ -1,7 +1,8 @@
 """Generated scans as files and pictures."""
 
 import logging
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,11 @@ def write_samples(
     formats = formats_of(checkpoint, channels) if formats is None else formats
     check_formats(checkpoint, formats, channels)
     out, rays = Path(out), checkpoint.sensor.rays()
+    if {"ply", "bin"} & set(formats) and not torch.equal(generator.space.rays, rays):
+        log.warning(
+            "the model was told rays through the corners of the bins (rays=reference); points are written along rays "
+            "through their middles, where returns lie nearer (docs/data.md, Projection)"
+        )
     shown: list[np.ndarray] = []
     with ScanBar("sampling", num, batches(num, batch_size) * generator.evaluations_of(sampler)) as bar:
         for drawn in sample(
@@ -106,7 +112,8 @@ def keep_note(checkpoint: Checkpoint, out: Path, seed: int, **sampler: Any) -> N
     about = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
     about |= {"min_range": checkpoint.sensor.min_range, "max_range": checkpoint.sensor.max_range}
     reading, step = reading_of_flow(checkpoint), checkpoint.step
-    write_samples_note(out, reading, encoding=about, seed=seed, sampler=sampler, step=step)
+    # Points lie on rays through the middles of the bins, whatever rays the model was told.
+    write_samples_note(out, reading, encoding=about, seed=seed, sampler=sampler, step=step, rays="centre")
 
 
 def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str) -> None:
@@ -184,13 +191,28 @@ def draw_reflectances(images: Sequence[np.ndarray], out: Path) -> Path:
     return save_figure(figure, out / "samples.png")
 
 
-def what_next(checkpoint: Path, out: Path, options: str = "") -> str:
-    """The commands that come after scans were written to `out`."""
+def what_next(checkpoint: Path, out: Path, options: str = "", config: Mapping[str, Any] | None = None) -> str:
+    """The commands that come after scans were written to `out`.
+
+    Args:
+        config: The run's, if it is one run: what has been trained decides what can be trained next.
+    """
     return f"""
 next
   r2flow sample --checkpoint {checkpoint} --num 16{options} --seed 1 --out {out.parent / "more"}
   r2flow show {out / "000000.ply"} --out {out.parent / "views"}
-  r2flow train data=kitti_raw data.root=FOLDER backbone=hdit_small"""
+  {_what_to_train(checkpoint, config)}"""
+
+
+def _what_to_train(run: Path, config: Mapping[str, Any] | None) -> str:
+    """Real scans after simulated ones, then the links of the paper's chain, then how good it is."""
+    data, stage = (config or {}).get("data", {}), (config or {}).get("stage", {})
+    if config is None or data.get("name") == "simulated":
+        return "r2flow train data=kitti_raw data.root=FOLDER backbone=hdit_small"
+    experiment = {"rectify": "reflow", "reflow": "distill"}.get(stage.get("name"))
+    if experiment is not None:
+        return f"r2flow train experiment={experiment} stage.init={shlex.quote(str(run))}"
+    return f"r2flow evaluate REAL {shlex.quote(str(run))} --floor"
 
 
 def _save(image: np.ndarray, path: Path) -> None:

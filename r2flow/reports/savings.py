@@ -15,7 +15,6 @@ from torch import Tensor
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
 from r2flow.flow.problems import PROBLEMS, Mixed
-from r2flow.flow.straight_exit import probes
 from r2flow.generators import Field, Flow, Sampler, as_flow
 from r2flow.generators.base import Progress
 from r2flow.inversion import metres_apart, rms
@@ -42,6 +41,7 @@ ELEMENTS = 256  # of an exact scan
 FIXED = 32  # steps of the fixed-step rows
 REPEATS = 3  # of every timing
 TOLERANCES = (1e-3, 1e-5)
+MARGINS = (11.25, 22.5, 45.0)  # degrees on either side of a sector
 TIGHT = 1e-6  # tolerance of the solution that a trained flow is compared with
 WHOLE = "the whole image"
 
@@ -49,7 +49,6 @@ EULER, AB2 = f"euler, {FIXED} steps", f"ab2, {FIXED} steps"
 ONE_STATE = "dopri5, the batch as one state (torchdiffeq)"
 STAYING = "dopri5, own steps, the finished stay"
 LEAVING = "dopri5, own steps, the finished leave"
-STRAIGHT = "the same, and one step for the straight"
 
 
 WAYS: dict[str, Sampler | None] = {
@@ -57,7 +56,6 @@ WAYS: dict[str, Sampler | None] = {
     AB2: Sampler("ab2", FIXED),
     ONE_STATE: None,
     LEAVING: Sampler("dopri5"),
-    STRAIGHT: Sampler("dopri5", straight_first=True),
 }
 
 
@@ -101,11 +99,11 @@ def solve_in_all_ways(
     for way, (x_1, evaluations) in ends.items():
         errors = rms(x_1 - truth)
         row: Row = {"part": part, "way": way, "tolerance": None if way in (EULER, AB2) else tolerance}
-        row |= {"evaluations": int(evaluations.sum()), "seconds": median(seconds[way])}
+        row |= {"evaluations": int(evaluations.sum()), **spread("seconds", seconds[way])}
         row["worst_error"] = float(errors.max())
         if way == LEAVING:  # what solvers with own steps spend that keep the batch whole (torchode): same ends
             most = torch.full_like(evaluations, int(evaluations.max()))
-            whole = {**row, "way": STAYING, "evaluations": int(most.sum()), "seconds": float("nan")}
+            whole = {**row, "way": STAYING, "evaluations": int(most.sum()), **spread("seconds", [float("nan")])}
             yield whole, most, errors
         yield row, evaluations, errors
 
@@ -146,8 +144,7 @@ def scan_rows(checkpoint: Checkpoint, num: int, tolerance: float, seed: int, pro
                 "with. Leave the checkpoint out for the exact problems alone."
             )
         found = list(solve_in_all_ways("scenes of the flow", flow, x_0, tight.x, tolerance, 1, progress))
-    for row, evaluations, errors in found:
-        row["straight"] = int((evaluations == 1 + len(probes(tolerance))).sum()) if row["way"] == STRAIGHT else None
+    for row, _, errors in found:
         row["median_error"] = float(errors.median())
     return [row for row, _, _ in found]
 
@@ -155,13 +152,14 @@ def scan_rows(checkpoint: Checkpoint, num: int, tolerance: float, seed: int, pro
 def regions_to_measure(shape: tuple[int, int]) -> dict[str, tuple[Region, Region]]:
     """What is asked for and what is generated for it, before rounding, by name."""
     ahead, half = region(shape, (-45, 45)), region(shape, (-90, 90))
+    margins = {f"90 degrees, a margin of {margin:g}": region(shape, (-45, 45), None, margin) for margin in MARGINS}
     upper = region(shape, None, (0, shape[0] // 2 - 1))
     quarter = region(shape, None, (shape[0] // 4, shape[0] // 2 - 1))
     corner = region(shape, (-45, 45), (0, shape[0] // 2 - 1))
     return {
         "sector of 180 degrees": (half, half),
         "sector of 90 degrees": (ahead, ahead),
-        "90 degrees out of 180 generated": (ahead, half),
+        **{name: (ahead, wider.widened()) for name, wider in margins.items()},
         "upper half of the rows": (upper, upper),
         "a quarter of the rows": (quarter, quarter),
         "90 degrees, upper half of the rows": (corner, corner),
@@ -184,8 +182,9 @@ def region_rows(checkpoint: Checkpoint, num: int, steps: int, seed: int, progres
     seconds = _in_turns(calls, 1.0, flow.device)
     rows: list[Row] = []
     for name, (asked, _) in wanted.items():
-        row: Row = {"part": "regions", "way": name, "share": seen[name].share, "seconds": steps * seconds[name]}
-        row["time"] = seconds[name] / seconds[WHOLE]
+        row: Row = {"part": "regions", "way": name, "share": seen[name].share}
+        row |= spread("seconds", [steps * taken for taken in seconds[name]])
+        row |= spread("time", [one / whole for one, whole in zip(seconds[name], seconds[WHOLE], strict=True)])
         if name != WHOLE:
             mine, truth = asked.crop(ends[name]), asked.crop(ends[WHOLE])
             # all rays of all scans as one image
@@ -223,18 +222,19 @@ def channel_rows(checkpoint: Checkpoint, budget: float = 1.0) -> list[Row]:
         network = _in_turns(networks, budget, device)
         decoding, writing = _in_turns(decoders, budget), _in_turns(writers, budget)
         for name in networks:
-            row: Row = {"part": "channels", "way": name, "network": network[name], "decoding": decoding[name]}
-            size = sum(path.stat().st_size for path in Path(folder, name).iterdir())
-            rows.append({**row, "writing": writing[name], "bytes": size})
+            row: Row = {"part": "channels", "way": name}
+            for what, taken in (("network", network), ("decoding", decoding), ("writing", writing)):
+                row |= spread(what, taken[name])
+            rows.append({**row, "bytes": sum(path.stat().st_size for path in Path(folder, name).iterdir())})
     return rows
 
 
 def _in_turns(
     calls: Mapping[str, Callable[[], Any]], budget: float, device: torch.device | str = "cpu"
-) -> dict[str, float]:
-    """Seconds of each call: the least of 3 to 40, as many as fit into a budget of seconds, after one to warm up.
+) -> dict[str, list[float]]:
+    """Seconds of each call, 3 to 40 times, as many as fit into a budget of seconds, after one to warm up.
 
-    In turns, and the least: what else the machine does slows all of them alike, and can only add.
+    In turns, so that what else the machine does slows all of them alike.
     """
     seconds: list[dict[str, float]] = []
     rounds = 1 + 40
@@ -242,7 +242,12 @@ def _in_turns(
         while len(seconds) < rounds:
             seconds.append({name: timed(call, device)[1] for name, call in calls.items()})
             rounds = min(rounds, 1 + max(3, int(budget / max(seconds[-1].values()))))
-    return {name: min(one[name] for one in seconds[1:]) for name in calls}
+    return {name: [one[name] for one in seconds[1:]] for name in calls}
+
+
+def spread(name: str, values: Sequence[float]) -> Row:
+    """The median under a name, the least and the most beside it."""
+    return {name: median(values), f"{name}_least": min(values), f"{name}_most": max(values)}
 
 
 # The page: a part is its conditions in a sentence and its rows as a table.
@@ -250,11 +255,14 @@ def _in_turns(
 OF_KINDS = {"evaluations": "evaluations, all", "share": "of one state's", "worst_error": "worst error"}
 OF_KINDS |= {f"evaluations_{kind}": f"a {name} scan" for kind, (name, _, _) in KINDS.items()}
 OF_KINDS |= {f"error_{kind}": f"error, {name}" for kind, (name, _, _) in KINDS.items()}
-OF_SCANS = {"evaluations": "evaluations", "share": "of one state's", "seconds": "seconds"}
-OF_SCANS |= {"median_error": "median error", "worst_error": "worst error", "straight": "straight scans"}
-OF_REGIONS = {"share": "of the pixels", "seconds": "seconds a scan", "time": "of the time", "error": "RMS, model space"}
+SECONDS = {"seconds": "seconds", "seconds_least": "least", "seconds_most": "most"}
+OF_SCANS = {"evaluations": "evaluations", "share": "of one state's", **SECONDS}
+OF_SCANS |= {"median_error": "median error", "worst_error": "worst error"}
+OF_REGIONS = {"share": "of the pixels", "seconds": "seconds a scan", "time": "of the time", "time_least": "least"}
+OF_REGIONS |= {"time_most": "most", "error": "RMS, model space"}
 OF_REGIONS |= {"unrelated": "unrelated scans", "median_m": "median, m", "dropped": "rays lost or gained"}
-OF_CHANNELS = {"network": "network, s", "decoding": "decoding, s", "writing": "writing, s", "bytes": "bytes"}
+OF_CHANNELS = {"network": "network, s", "network_least": "least", "network_most": "most", "decoding": "decoding, s"}
+OF_CHANNELS |= {"writing": "writing, s", "bytes": "bytes"}
 
 
 def savings_page(
@@ -281,7 +289,7 @@ def savings_page(
     text = [
         f"## Easy and hard scans in one batch\n\nExact problems, {ELEMENTS} elements a scan, float64: {kinds}. Seconds "
         "are the solver's own work, without a network.",
-        table(_with_share(mixed), {"way": "way", "tolerance": "tolerance", **OF_KINDS, "seconds": "seconds"}),
+        table(_with_share(mixed), {"way": "way", "tolerance": "tolerance", **OF_KINDS, **SECONDS}),
         "### One hard scan among 255 easy ones\n\nWhere the batch is one state, its error norm hides the hard one.",
         table(_with_share(lone), {"way": "way", **{k: v for k, v in OF_KINDS.items() if any(k in r for r in lone)}}),
     ]
@@ -297,9 +305,9 @@ def savings_page(
             f"against the flow's own dopri5 solution at {TIGHT:g}.",
             table(_with_share(scans), {"way": "way", **OF_SCANS}),
             f"## A part of the image\n\n{name}, {num} scans, {steps} AB2 steps; the part against the same pixels of "
-            "the whole image from the same noise. Seconds are an evaluation's, the least of several, times the steps. "
-            "The network sees the part alone, so it makes another scan, the more so the more is cut off. How "
-            "realistic that scan is, is not measured here.",
+            "the whole image from the same noise. Seconds are an evaluation's times the steps, the median of "
+            "several, with the least and the most. The network sees the part alone, so it makes another scan, the more "
+            "so the more is cut off. How realistic that scan is, is not measured here.",
             table(regions, {"way": "region", **OF_REGIONS}),
         ]
         figures["savings_regions"] = regions_figure(regions)

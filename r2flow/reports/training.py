@@ -63,6 +63,6 @@ checkpoint    {path}
 pictures      {out / "samples.png"} and one page a scan beside it; during training: {run / "pictures"}
 point clouds  {out / "000000.ply"} ...
 loss curve    {run / "loss.png"}; tensorboard --logdir {run / "tensorboard"}
-{what_next(run, out, "" if checkpoint.generator.sampler.fixed else " --steps 64")}""",
+{what_next(run, out, "" if checkpoint.generator.sampler.fixed else " --steps 64", checkpoint.config)}""",
         flush=True,
     )

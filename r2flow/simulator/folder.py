@@ -18,7 +18,7 @@ from r2flow.files import atomic_write, sole_use
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import Sensor
-from r2flow.signals import end_with_parent
+from r2flow.signals import end_with_parent, out_of_reach
 from r2flow.simulator import REVISION, simulate
 
 FORMATS = ("bin", "pcd", "ply", "npy")  # npy is the range image itself
@@ -150,7 +150,9 @@ def _write_missing(folder: SimulatedFolder, indices: Sequence[int], workers: int
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(min(workers, len(batches)), context, _begin_worker)
     try:
-        for done in as_completed([pool.submit(_write_batch, folder, batch) for batch in batches]):
+        with out_of_reach():
+            results = [pool.submit(_write_batch, folder, batch) for batch in batches]
+        for done in as_completed(results):
             for _ in range(done.result()):
                 advance()
     except BrokenProcessPool:

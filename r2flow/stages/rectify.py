@@ -1,6 +1,5 @@
 """1-RF: a velocity learned on straight lines from noise to data."""
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,11 +8,9 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.flow.losses import LOSSES
 from r2flow.flow.path import interpolate
-from r2flow.flow.times import TIMES
+from r2flow.flow.times import TIMES, golden_sequence
 from r2flow.generators import Condition, Flow, Generator
 from r2flow.stages.base import Batch, Stage
-
-GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 
 
 class Rectify(Stage):
@@ -57,6 +54,6 @@ class Rectify(Stage):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         # A low-discrepancy sequence over [0, 1) instead of random times: a steadier figure from few scans.
-        u = ((batch["k"].double() + 0.5) * GOLDEN_RATIO % 1).to(batch["x_1"].dtype)
+        u = golden_sequence(batch["k"])
         loss = self.regression_loss(batch, u)
         self.log("val/loss", loss, prog_bar=True, batch_size=len(batch["x_1"]), sync_dist=True)

@@ -131,7 +131,7 @@ def test_weights_are_shares_and_without_them_every_scan_counts_once(tmp_path: Pa
 
 
 def test_a_weight_of_nothing_is_refused_before_a_run_begins(tmp_path: Path):
-    with pytest.raises(InputError, match=r"each weight must be a positive number, found \[3, 0\]"):
+    with pytest.raises(InputError, match=r"weight must be a finite number above 0 or null, found 0"):
         mixed(tmp_path, weights=(3, 0))  # set up, and no loader made yet
 
 

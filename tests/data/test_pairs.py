@@ -221,6 +221,15 @@ def test_numbers_out_of_range_are_refused(option: str, value):
         PairOptions(**{option: value}).recipe(SHAPE)
 
 
+def test_how_pairs_are_drawn_is_for_their_generator_to_say(tmp_path: Path):
+    store = PairStore(
+        tmp_path / "pairs", PairOptions(method="ancestral").recipe(SHAPE)
+    )  # no solver, and no mistake yet
+    with pytest.raises(InputError, match="no solver named 'ancestral'"):  # of a flow it is one
+        make_pairs(store, grow, 8)
+    assert not store.folder.exists()
+
+
 def test_a_shorter_shard_never_replaces_a_longer_one(tmp_path: Path, monkeypatch):
     store = store_in(tmp_path / "both")
     for batch in range(3):

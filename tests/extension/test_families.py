@@ -126,12 +126,12 @@ CANNOT = {
     "interpolate": (
         ["SCAN", "SCAN", "-c", "RUN", "-o", "OUT"], "interpolation needs the velocity of a flow, which a ToyGenerator"
     ),
-    "report curvature": (["RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
-    "report savings": (["RUN", "-o", "OUT"], "a savings report needs the velocity of a flow, which a ToyGenerator"),
-    "report work-precision": (["RUN", "-o", "OUT"], "a work-precision report needs the velocity of a flow"),
-    "calibrate": (["RUN"], "a time grid needs the velocity of a flow, which a ToyGenerator"),
+    "report curvature": (["-c", "RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
+    "report savings": (["-c", "RUN", "-o", "OUT"], "a savings report needs the velocity of a flow, which a ToyG"),
+    "report work-precision": (["-c", "RUN", "-o", "OUT"], "a work-precision report needs the velocity of a flow"),
+    "calibrate": (["-c", "RUN"], "a time grid needs the velocity of a flow, which a ToyGenerator"),
     "convert": (["RUN", "OUT.pth"], "the published format cannot hold a ToyGenerator; convert to .safetensors"),
-    "pairs": (["RUN"], "a ToyGenerator can be run in one way only, direct with 1 step; found dopri5"),
+    "pairs": (["-c", "RUN"], "a ToyGenerator can be run in one way only, direct with 1 step; found adams3"),
     "sample": (["-c", "RUN", "--steps", "4", "-o", "OUT"], "a ToyGenerator can be run in one way only"),
 }  # fmt: skip
 
@@ -183,4 +183,4 @@ def test_a_notebook_composes_what_plugins_add():
     with loaded(GAN, BACKBONE):
         config = compose(["stage=toy_gan", "backbone=toy_backbone", "stage.width=8", "backbone.base_channels=4"])
     assert (config["stage"]["name"], config["stage"]["width"]) == ("toy_gan", 8)
-    assert config["backbone"] == {"name": "toy_backbone", "base_channels": 4}
+    assert (config["backbone"]["name"], config["backbone"]["base_channels"]) == ("toy_backbone", 4)

@@ -10,7 +10,6 @@ from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, Mixed, PointMass, Rotating, StiffLinear, Straight
 from r2flow.flow.solvers import LEAST_TOLERANCE, SOLVERS, solve
-from r2flow.flow.straight_exit import solve_straight_first
 
 METHODS = [*SOLVERS, "torchdiffeq:dopri5", "torchdiffeq:rk4"]
 ADAPTIVE = ["bosh3", "dopri5"]
@@ -182,16 +181,6 @@ def test_the_type_of_the_weights_sets_the_precision(method, caplog):
     torch.testing.assert_close(floored.x, math.exp(0.5) * X_0, rtol=2e-2, atol=2e-2)
 
 
-@pytest.mark.parametrize(
-    "network", [Polite(torch.bfloat16), lambda t, x: 0.5 * x.bfloat16()], ids=["weights", "answer"]
-)
-def test_scenes_that_are_not_straight_keep_the_network_s_precision(network, caplog):
-    # what is known of v(0, x) is in the state's type by then
-    with caplog.at_level(logging.WARNING):
-        solve_straight_first(network, X_0, 1e-6)
-    assert "below what bfloat16 can hold" in caplog.text
-
-
 @pytest.mark.parametrize("method", ADAPTIVE)
 def test_a_velocity_of_0_takes_one_step(method):
     solution = solve(lambda t, x: 0 * x, X_0, method=method, tolerance=1e-3)
@@ -209,12 +198,6 @@ def test_a_network_that_is_being_trained_can_be_solved(method):
     assert not solution.global_error.requires_grad
     solution.x.sum().backward()
     assert network.weight.grad.abs().max() > 0
-
-
-def test_a_network_that_is_being_trained_can_be_solved_straight_first():
-    network = torch.nn.Linear(16, 16, bias=False)
-    alone = solve(lambda t, x: network(x), X_0, method="dopri5", tolerance=1e-3)
-    assert torch.equal(solve_straight_first(lambda t, x: network(x), X_0, 1e-3).x, alone.x)
 
 
 @pytest.mark.parametrize("method", [*ADAPTIVE, "torchdiffeq:dopri5"])

@@ -56,3 +56,13 @@ class TestEveryLoss:
         with torch.no_grad():
             difference = (LOSSES[name](v + h, u) - LOSSES[name](v - h, u)).item() / 2e-2
         assert gradient[0, 0, 1, 1].item() == pytest.approx(difference, rel=0.01, abs=1e-3)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e12, 1e18, 1e30])
+def test_pseudo_huber_is_finite_wherever_its_value_is(size):
+    # d = 131,072 elements of +-size: sqrt(d size^2 + c^2) - c over sqrt(d), so size within 1e-3.
+    v = torch.full((1, 2, 64, 1024), size, requires_grad=True)
+    loss = LOSSES["pseudo_huber"](v, torch.zeros_like(v))
+    loss.sum().backward()
+    assert loss.item() == pytest.approx(size, rel=1e-3)
+    assert v.grad.sum().item() == pytest.approx(1, rel=1e-3)

@@ -1,10 +1,11 @@
 import math
+from decimal import Decimal, getcontext
 
 import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.flow.times import TIMES, Discrete, Late, LogitNormal, Uniform, UShaped
+from r2flow.flow.times import TIMES, Discrete, Late, LogitNormal, Uniform, UShaped, golden_sequence
 
 N = 400_000
 U = (torch.arange(N, dtype=torch.float64) + 0.5) / N  # every quantile once: no sampling error
@@ -70,3 +71,15 @@ def test_bad_options_are_refused():
 
 def test_a_config_of_version_0_1_0_has_the_discrete_density_by_its_old_name():
     assert TIMES.build({"name": "grid", "k": 4})(U).unique().tolist() == [0, 0.25, 0.5, 0.75]
+
+
+@pytest.mark.parametrize("first", [0, 10**6, 10**8, 2**40])
+def test_the_golden_sequence_is_exact_and_even_however_late_it_begins(first):
+    getcontext().prec = 60
+    ratio = (Decimal(5).sqrt() - 1) / 2
+    found = golden_sequence(torch.arange(first, first + 64))
+    exact = [float((k + Decimal("0.5")) * ratio % 1) for k in range(first, first + 64)]
+    assert found.tolist() == pytest.approx(exact, abs=2**-22)
+    assert found.dtype == torch.float32
+    # By the three-distance theorem 64 points lie at least phi^-9 / sqrt(5) apart.
+    assert found.sort().values.diff().min() > 0.005

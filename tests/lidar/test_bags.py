@@ -93,7 +93,7 @@ def test_unpack_writes_files_that_every_verb_reads(r2flow, tmp_path: Path):  # n
     assert (code, said, error) == (0, f"2 scans in {out}\n", "")
     for path, xyz in zip(sorted(out.iterdir()), CLOUDS[::2], strict=True):
         np.testing.assert_array_equal(read_points(path).xyz, xyz)
-    code, said, _ = r2flow("unpack", file, "--topic", "/rear", "--most", 1, "--out", tmp_path / "one")
+    code, said, _ = r2flow("unpack", file, "--topic", "/rear", "--num", 1, "--out", tmp_path / "one")
     assert (code, said) == (0, f"1 scans in {tmp_path / 'one'}\n")
 
 

@@ -3,7 +3,10 @@ import hashlib
 import io
 import os
 import pickle
+import signal
 import tarfile
+import tracemalloc
+import zipfile
 
 import pytest
 import torch
@@ -149,7 +152,7 @@ def test_weights_of_another_network_are_refused_in_a_line(tmp_path, pointnet, fo
     odd += ({"a": torch.ones(1, device="meta")},)
     for content in (b"", b"\x80\x02}q\x00.", b"nonsense" * 100, saved([1]), saved({"a": 1}), *map(saved, odd)):
         path.write_bytes(content)
-        with pytest.raises(InputError, match="not a file of weights|no table of tensors"):
+        with pytest.raises(InputError, match="not a file of weights|no table of tensors|is empty"):
             add("pointnet", path)
     with pytest.raises(InputError, match="does not exist"):
         add("pointnet", tmp_path / "none")
@@ -233,3 +236,78 @@ def test_what_is_kept_is_safetensors(pointnet, folder):
     add("pointnet", path)
     assert set(load_file(folder / "pointnet.safetensors")) == set(network.state_dict())
     assert [file.name for file in folder.iterdir()] == ["pointnet.safetensors"]
+
+
+def grown(read) -> int:
+    """The most bytes of Python's and NumPy's memory that reading a refused file takes."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError) as caught:
+            read()
+        assert "\n" not in str(caught.value)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", ["model.ckpt", "notes.txt"])
+def test_an_archive_that_unpacks_to_far_more_is_refused_before_it_does(tmp_path, name):
+    path = tmp_path / "bomb.tar.gz"
+    with tarfile.open(path, "w:gz") as tar:
+        info = tarfile.TarInfo(name)
+        info.size = 100 << 20
+        tar.addfile(info, Zeros(info.size))
+    assert path.stat().st_size < 1 << 20
+    assert grown(lambda: read_published(path)) < 8 << 20
+
+
+class Zeros(io.RawIOBase):
+    """So many bytes of zero."""
+
+    def __init__(self, size: int) -> None:
+        self.left = size
+
+    def readable(self) -> bool:
+        return True
+
+    def read(self, size: int = -1) -> bytes:
+        size = min(size, self.left)
+        self.left -= size
+        return bytes(size)
+
+
+def test_bombs_of_zip_of_gzip_and_of_views_are_refused(tmp_path):
+    path = tmp_path / "weights.pth"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("archive/data/0", "w") as entry:
+        for _ in range(100):
+            entry.write(bytes(1 << 20))
+    assert grown(lambda: read_published(path)) < 8 << 20
+    path.write_bytes(gzip.compress(bytes(100 << 20)))
+    assert grown(lambda: read_published(path)) < 8 << 20
+    torch.save({"weight": torch.zeros(1).expand(10**5, 10**5)}, path)  # four bytes that say they are forty gigabytes
+    assert grown(lambda: read_published(path)) < 8 << 20
+
+
+def test_pipes_and_devices_are_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe.pth")
+    os.mkfifo(tmp_path / "pipe.safetensors")
+    (tmp_path / "zero.tar.gz").symlink_to("/dev/zero")
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "folder" / "model.ckpt")
+    signal.alarm(5)
+    try:
+        for name in ("pipe.pth", "pipe.safetensors", "zero.tar.gz"):
+            with pytest.raises(InputError, match="not a regular file"):
+                add("pointnet", tmp_path / name)
+        with pytest.raises(InputError, match="holds none of"):
+            add("pointnet", tmp_path / "folder")
+    finally:
+        signal.alarm(0)
+
+
+def test_settings_that_repeat_themselves_are_refused(tmp_path):
+    (tmp_path / "model.ckpt").write_bytes(saved(PARTS["backbone"]))
+    lines = ["a0: &a0 [1, 1]", *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 30))]
+    (tmp_path / "arch_cfg.yaml").write_text("\n".join(lines))
+    with pytest.raises(InputError, match="no table of settings"):
+        read_published(tmp_path)

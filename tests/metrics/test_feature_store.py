@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import tempfile
 
 import pytest
 import torch
@@ -71,3 +72,12 @@ def test_a_process_that_clears_first_takes_nothing_from_one_that_still_reads(row
     assert torch.equal(slow.tensor(), rows[:3])
     fast.clear()
     assert len(list(tmp_path.iterdir())) == 2  # rows and flags of the last round: those before it are gone
+
+
+def test_nothing_of_it_lies_in_the_temporary_folder(rows, tmp_path, monkeypatch):
+    """What has no name is gone with its process, also with a killed one."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    store = FeatureStore("real")
+    store.write(0, rows)
+    assert torch.equal(store.tensor(), rows)
+    assert list(tmp_path.iterdir()) == []

@@ -133,7 +133,8 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
     path, out = saved[0], tmp_path / "reports"
     copy = path.with_name("step-00000009.ckpt")
     copy.write_bytes(path.read_bytes())
-    code, said, _ = r2flow("report", "curvature", path, copy, "-o", out, "--steps", 4, "--num", 2, "--most-curved", 9)
+    how = ("-o", out, "--steps", 4, "--num", 2, "--most-curved", 9)
+    code, said, _ = r2flow("report", "curvature", "-c", path, "-c", copy, *how)
     assert code == 0
     names = {"curvature.png", "trajectories.png", "curvature.csv", "curvature.json", "curvature.md"}
     assert {file.name for file in out.iterdir()} == names
@@ -142,7 +143,7 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
     assert len(content["rows"]) == 2 * 4
     assert len(content["trajectories"]) == 2 * 9
     assert {row["checkpoint"] for row in content["summary"]} == {str(path), str(copy)}
-    assert content["origin"]["command"].startswith(f"r2flow report curvature {path}")
+    assert content["origin"]["command"].startswith(f"r2flow report curvature -c {path}")
 
 
 def test_bad_input_is_one_line(r2flow, saved, tmp_path):  # noqa: F811
@@ -151,7 +152,7 @@ def test_bad_input_is_one_line(r2flow, saved, tmp_path):  # noqa: F811
         ((saved[0], "-o", tmp_path / "o", "--steps", 0), "--steps"),
         ((saved[0], "-o", saved[0] / "o"), "cannot be a folder"),
     ):
-        code, _, err = r2flow("report", "curvature", *arguments)
+        code, _, err = r2flow("report", "curvature", "-c", *arguments)
         assert code == 2
         assert words in err
         assert len([line for line in err.splitlines() if not line.startswith("WARNING")]) == 1

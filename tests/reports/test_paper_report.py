@@ -68,9 +68,9 @@ def test_a_child_finds_its_parent_in_any_order_where_the_first_flow_is_not_there
 
 
 def test_a_cell_that_was_kept_belongs_to_the_chain_that_is_known_now(r2flow, chains, tmp_path):  # noqa: F811
-    command = paper(chains / "0" / "a", tmp_path, "--runs", chains / "0" / "c", "--bootstrap", 0, "--curved", 0,
+    command = paper(chains / "0" / "a", tmp_path, chains / "0" / "c", "--bootstrap", 0, "--curved", 0,
                     "--tolerance", 0)  # fmt: skip
-    for more in ((), ("--runs", chains / "0" / "b")):
+    for more in ((), (chains / "0" / "b",)):
         assert r2flow(*command, *more)[0] == 0
     rows = json.loads((tmp_path / "paper.json").read_text())["rows"]
     assert len({row["family"] for row in rows}) == 1
@@ -109,7 +109,7 @@ def test_runs_without_a_first_flow_or_of_two_sensors_are_refused(chains, tmp_pat
 
 
 def paper(runs: Path, out: Path, *options: object) -> tuple[object, ...]:
-    return ("report", "paper", "--runs", runs, "--out", out, "--num", 3, "--steps", "1,2", "--repeats", 0,
+    return ("report", "paper", runs, "--out", out, "--num", 3, "--steps", "1,2", "--repeats", 0,
             "--metrics", "mmd", "--device", "cpu", *options)  # fmt: skip
 
 

@@ -196,8 +196,8 @@ def test_unknown_problems_are_refused():
 def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
     out = tmp_path / "reports"
     code, said, _ = r2flow(
-        "report", "work-precision", saved[0], "-o", out, "--num", 2, "--methods", "euler,heun2,dopri5", "--budgets",
-        "2,4", "--tolerances", "1e-2", "--problems", "gaussian,rotating", "--problem-scenes", 3,
+        "report", "work-precision", "-c", saved[0], "-o", out, "--num", 2, "--solvers", "euler,heun2,dopri5",
+        "--budgets", "2,4", "--tolerances", "1e-2", "--problems", "gaussian,rotating", "--problem-scenes", 3,
         "--reference-steps", 8, "--reference-tolerance", 1e-4, "--repeats", 1,
     )  # fmt: skip
     assert code == 0
@@ -219,14 +219,14 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
 def test_bad_input_is_one_line(r2flow, saved, tmp_path):  # noqa: F811
     out = tmp_path / "o"
     for arguments, words in (
-        (("--methods", "eulr"), "Did you mean 'euler'?"),
+        (("--solvers", "eulr"), "Did you mean 'euler'?"),
         (("--budgets", "4,x"), "--budgets must be positive numbers"),
         (("--tolerances", "-1"), "--tolerances must be positive numbers"),
-        (("--budgets", "1", "--methods", "rk4"), "leaves no solver a step"),
+        (("--budgets", "1", "--solvers", "rk4"), "leaves no solver a step"),
         (("--reference-tolerance", "inf"), "must be positive and finite"),
         (("--problems", "none"), "nothing to measure"),
         (("--problems", "gausian"), "Did you mean 'gaussian'?"),
-        ((tmp_path / "none",), "no checkpoint"),
+        (("-c", tmp_path / "none"), "no checkpoint"),
     ):
         code, _, err = r2flow("report", "work-precision", *arguments, "-o", out)
         assert code == 2

@@ -9,11 +9,12 @@ import pytest
 
 from r2flow import cli
 from r2flow.errors import InputError
+from r2flow.files import sole_use
 from r2flow.lidar.projection import project
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator import simulate
-from r2flow.simulator.folder import SimulatedFolder, write_folder
+from r2flow.simulator.folder import MANIFEST, SimulatedFolder, write_folder
 
 SMALL = SENSORS["hdl64e"].resized(16, 128)
 
@@ -55,6 +56,18 @@ def test_a_scan_does_not_depend_on_the_others(tmp_path):
         write_folder(SimulatedFolder(tmp_path / "some", SMALL, 1), [index], workers=1)
     everything = contents(tmp_path / "all")
     assert {name: everything[name] for name in contents(tmp_path / "some")} == contents(tmp_path / "some")
+
+
+def test_what_a_killed_writer_has_left_goes_and_what_another_one_writes_stays(tmp_path):
+    folder = SimulatedFolder(tmp_path, SMALL, 3)
+    write_folder(folder, range(1), workers=1)
+    part = tmp_path / ".000001.bin.abcdefgh.part"
+    part.touch()
+    with sole_use(tmp_path / MANIFEST):  # as another command does that still runs
+        write_folder(folder, range(1), workers=1)
+        assert part.exists()
+    write_folder(folder, range(1), workers=1)
+    assert not part.exists()
 
 
 @pytest.mark.slow

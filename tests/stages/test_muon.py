@@ -85,6 +85,26 @@ def test_it_goes_on_from_its_state_bit_for_bit():
     assert all(torch.equal(p, q) for p, q in zip(model.parameters(), later.parameters(), strict=True))
 
 
+def test_a_closure_clears_the_gradients_of_all_weights():
+    """Lightning hands the whole of a step over as a closure; gradients of earlier steps must not stay."""
+    model, other = network(), network()
+    ours, theirs = (Muon(net.parameters(), RATE, **ADAMW) for net in (model, other))
+    rng = torch.Generator().manual_seed(0)
+    for x in torch.randn(3, 2, 2, 5, 5, generator=rng):
+
+        def closure(x: torch.Tensor = x) -> float:
+            ours.zero_grad()
+            loss = model(x).square().sum()
+            loss.backward()
+            return float(loss.detach())
+
+        ours.step(closure)
+        other.zero_grad()
+        other(x).square().sum().backward()
+        theirs.step()
+    assert all(torch.equal(p, q) for p, q in zip(model.parameters(), other.parameters(), strict=True))
+
+
 def test_a_schedule_moves_both_rates():
     ours = Muon(network().parameters(), RATE, **ADAMW)
     schedule = torch.optim.lr_scheduler.LambdaLR(ours, lambda step: 0.5)

@@ -3,11 +3,9 @@
 import contextlib
 import json
 import os
-import random
 import shutil
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
@@ -164,20 +162,6 @@ def test_a_killed_chain_ends_as_the_one_left_alone(
     wait_for(tmp_path / HELD, process)
     kill(process, all_of_it)
     let_go(tmp_path / HELD)
-    run_train(tmp_path, scans, *CHAIN)
-    assert_alike(chained[0], tmp_path / "runs" / "demo")
-
-
-@pytest.mark.slow
-def test_a_chain_killed_at_ten_random_moments_ends_as_the_one_left_alone(
-    chained: tuple[Path, str], scans: Path, tmp_path: Path
-):
-    let_go(tmp_path / HELD)
-    draw = random.Random(1)
-    for number in range(10):
-        process = start(tmp_path, tiny(scans, *CHAIN))
-        time.sleep(draw.uniform(4, 8.5))
-        kill(process, all_of_it=number % 2 == 0)
     run_train(tmp_path, scans, *CHAIN)
     assert_alike(chained[0], tmp_path / "runs" / "demo")
 

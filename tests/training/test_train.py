@@ -1,8 +1,6 @@
 """train.py as a user runs it: from a folder, with overrides."""
 
-import contextlib
 import os
-import random
 import shutil
 import signal
 import time
@@ -15,7 +13,8 @@ import yaml
 from hydra.core.global_hydra import GlobalHydra
 
 from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint, step_of
-from tests.training.conftest import Run, hold_at, let_go, run_train, start, tiny, wait_for
+from r2flow.reports.outputs import what_next
+from tests.training.conftest import Run, hold_at, let_go, start, tiny, wait_for
 
 
 def weights(run: Path) -> tuple[dict, dict]:
@@ -40,6 +39,18 @@ def test_a_run_leaves_everything_in_its_folder_and_says_where(alone: tuple[Path,
     loaded = load_checkpoint(run)
     assert loaded.step == 12
     assert loaded.config == yaml.safe_load((run / "config.yaml").read_text())
+
+
+def test_next_is_what_has_not_been_done(alone: tuple[Path, str]):
+    run, said = alone  # of a flow that was trained on scans in files
+    assert f"r2flow train experiment=reflow stage.init={run.relative_to(run.parents[1])}" in said
+    for stage, data, words in (
+        ("rectify", "simulated", "data=kitti_raw data.root=FOLDER"),
+        ("reflow", "pairs", "experiment=distill stage.init=a"),
+        ("distill", "pairs", "r2flow evaluate REAL a --floor"),
+    ):
+        config = {"stage": {"name": stage}, "data": {"name": data}}
+        assert words in what_next(Path("a"), Path("a/samples"), config=config).splitlines()[-1]
 
 
 def test_a_finished_run_is_not_trained_again(train: Run, copied: Path):
@@ -76,21 +87,6 @@ def test_a_killed_run_ends_as_the_one_left_alone(
     assert_bit_equal(alone[0], tmp_path / "runs" / "killed")
 
 
-@pytest.mark.slow
-def test_a_run_killed_at_ten_random_moments_ends_as_the_one_left_alone(
-    alone: tuple[Path, str], scans: Path, tmp_path: Path
-):
-    draw = random.Random(2)
-    for _ in range(10):
-        process = start(tmp_path, tiny(scans, "name=killed"))
-        time.sleep(draw.uniform(4, 8))
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.communicate(timeout=100)
-    run_train(tmp_path, scans, "name=killed")
-    assert_bit_equal(alone[0], tmp_path / "runs" / "killed")
-
-
 @pytest.mark.parametrize(
     ("by", "code", "workers"), [(signal.SIGTERM, 143, 2), pytest.param(signal.SIGINT, 130, 2, marks=pytest.mark.slow)]
 )
@@ -123,6 +119,21 @@ def test_handlers_and_hydra_are_as_they_were(train: Run, tmp_path: Path):
     assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)] == before
     assert warnings.filters == filters
     assert not GlobalHydra.instance().is_initialized()
+
+
+@pytest.mark.parametrize(("workers", "threads"), [(2, 1), pytest.param(3, 2, marks=pytest.mark.slow)])
+def test_a_run_goes_on_with_other_workers_and_threads(
+    train: Run, alone: tuple[Path, str], copied: Path, workers: int, threads: int, monkeypatch: pytest.MonkeyPatch
+):
+    """Bit-equal with any number of loader workers, and with as many threads: sums of another number round otherwise."""
+    checkpoints_of(copied)[0].unlink()
+    set_threads = torch.set_num_threads
+    monkeypatch.setattr(torch, "set_num_threads", lambda number: set_threads(threads if number == 1 else number))
+    train("name=copied", f"data.workers={workers}", "data.memory_gib=0")
+    if threads == 1:
+        assert_bit_equal(alone[0], copied)
+    for a, b in zip(weights(alone[0]), weights(copied), strict=True):
+        assert all(torch.allclose(a[name], b[name], rtol=1e-4, atol=1e-6) for name in a)
 
 
 def test_a_damaged_last_checkpoint_is_passed_over(train: Run, alone: tuple[Path, str], copied: Path):

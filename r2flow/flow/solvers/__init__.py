@@ -51,6 +51,7 @@ SOLVERS: Registry[FixedStep | EmbeddedMethod | ExponentialMethod] = Registry(
 # The second solution's tolerance is the first's divided by this. At 10, sometimes at 30, its own error is as large as
 # the first's where the velocity jumps in time; at 100 more scenes exceed their budget of evaluations.
 TIGHTER = 60.0
+FALL_BACK = 10.0  # for the scenes whose budget ends before
 
 
 def solve(
@@ -92,11 +93,11 @@ def solve(
         finish: Length of the last part of the interval, which one Euler step takes: 1e-3 avoids a velocity that is
             singular at t_1.
         max_evaluations: Budget of a scene in an adaptive method.
-        max_step: Longest step of our adaptive methods as a share of the interval. They leave no eighth of the interval
+        max_step: Longest step of our adaptive methods as a share of the interval. They leave no 0.16 of the interval
             unseen and locate jumps of v in time; a narrower pulse can be missed without a flag. 1/64 finds all that are
             longer than a 128th.
         global_error: Estimate the error at t_1 by a second solution, with half the steps' lengths or a sixtieth of the
-            tolerance, and a sixtieth of `finish`; its evaluations are counted.
+            tolerance (a tenth, where the budget ends before) and of `finish`; its evaluations are counted.
 
     Raises:
         InputError: an unknown method or grid, fewer than one step, or a number out of its range.
@@ -138,14 +139,14 @@ class _Run(NamedTuple):
             return solve_fixed(v, x, self.times, method, finish)
         return solve_torchdiffeq(v, x, self.times, self.method.removeprefix(TORCHDIFFEQ), self.limits, finish)
 
-    def tighter(self) -> "_Run":
+    def tighter(self, by: float) -> "_Run":
         """The run with smaller errors that the estimate of the global error compares with."""
         times = self.times if adapts(self.method) else halved(self.times)
         # The Euler step at the end has an error too: it must be smaller in the second solution.
-        finish = max(self.limits.finish / TIGHTER, min(self.limits.finish, 1e-6 * abs(self.t_1 - self.t_0)))
+        finish = max(self.limits.finish / by, min(self.limits.finish, 1e-6 * abs(self.t_1 - self.t_0)))
         if finish:
             times = extended(times, self.t_1, self._signed(finish))
-        return self._replace(times=times, limits=self.limits._replace(tighter=TIGHTER, finish=finish))
+        return self._replace(times=times, limits=self.limits._replace(tighter=by, finish=finish))
 
     def _signed(self, length: float) -> float:
         return math.copysign(length, self.t_1 - self.t_0)
@@ -154,22 +155,25 @@ class _Run(NamedTuple):
 def _with_global_error(solution: Solution, run: _Run, velocity: Velocity, x: Tensor) -> Solution:
     """The solution with an estimate of its error: the difference to a second, tighter one.
 
-    An adaptive method solves only those scenes again that have converged.
+    An adaptive method solves only those scenes again that have converged; where the second solution's budget ends, it
+    solves them once more at a tenth of the tolerance.
     """
     scenes = solution.converged.nonzero()[:, 0] if adapts(run.method) else torch.arange(len(x))
     error = torch.full((len(x),), math.inf, dtype=torch.float64)
     extra = torch.zeros_like(solution.evaluations)
-    if len(scenes):
-        select = getattr(velocity, "select", None)
-        if len(scenes) < len(x) and select is not None:
-            velocity = select(scenes)
+    select = getattr(velocity, "select", None)
+    for by in (TIGHTER, FALL_BACK) if adapts(run.method) else (TIGHTER,):
+        if not len(scenes):
+            break
+        own = select(scenes) if len(scenes) < len(x) and select is not None else velocity
         here = scenes.to(x.device)
-        second = run.tighter().solve(velocity, x[here])
+        second = run.tighter(by).solve(own, x[here])
         rms = (solution.x[here] - second.x).detach().double().square().flatten(1).mean(1).sqrt().cpu()
         if not adapts(run.method):
             rms = rms / (1 - 2.0 ** -_order(run.method))  # with h and h/2 the solutions differ by (1 - 2^-p) e_h
         error[scenes] = torch.where(second.converged & solution.converged[scenes], rms, math.inf)
-        extra[scenes] = second.evaluations
+        extra[scenes] += second.evaluations
+        scenes = scenes[~second.converged]
     evaluations = solution.evaluations + extra
     return replace(solution, evaluations=evaluations, global_error=error, estimate_evaluations=extra)
 

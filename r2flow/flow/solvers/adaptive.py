@@ -49,7 +49,8 @@ def advance(
     tolerance = attainable(limits, v.precision)
     with torch.no_grad():
         scale = x.abs().mul(tolerance).add_(tolerance)
-        control.start(*norms(x / scale, k_1 / scale), v.counts)
+        state, slope = norms(x / scale, k_1 / scale)
+        control.start(state, slope, v.counts)
     closing = math.copysign(limits.finish, t_1 - t_0)
     while True:
         if control.leaving.any():

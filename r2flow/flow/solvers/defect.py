@@ -21,7 +21,7 @@ from r2flow.flow.solvers.embedded import EmbeddedMethod
 from r2flow.flow.solvers.solution import Evaluations
 from r2flow.flow.solvers.step_size import REMEMBERED, StepController
 
-UNSEEN = 0.125  # longest part of the interval between two evaluations
+UNSEEN = 0.15  # longest part of the interval between two evaluations
 OFF_CENTRE = 0.5 - 1 / math.sqrt(5)  # of a probe in its part of a gap, so that no regular pattern escapes
 # Third difference of v over a step, in tolerances, and how many times what the step before it foretells: above both, v
 # is compared once in an accepted step; bisected; bisected in a step that is rejected for the first time.

@@ -7,6 +7,8 @@ finite differences of v, one evaluation each. Scenes are solved one after anothe
 """
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -88,7 +90,7 @@ class _Scene:
             self.roundoff = torch.finfo(self.v.precision).eps
             h = self._first_step(f)
             while self.t != self.t_end and f.isfinite().all():
-                krylov = _Krylov(lambda way, f=f: self.product(f, way), torch.cat([f, f.new_ones(1)]))
+                krylov = _Krylov(partial(self.product, f), torch.cat([f, f.new_ones(1)]))
                 left = abs(self.t_end - self.t)
                 while True:
                     h = min(h, self.limits.max_step * self.length)
@@ -153,13 +155,12 @@ class _Scene:
             remainders.append(found - f - share * signed * linear)
         end = self.u + signed * krylov.vector(ways[1])[:-1]
         parts = ((3, 16 * remainders[0] - 2 * remainders[1]), (4, 12 * remainders[1] - 48 * remainders[0]))
-        part = torch.zeros_like(end)
         for order, start in parts:
             part = torch.zeros_like(end)
             if not start.isfinite().all():
                 return math.inf, h, self.u
             if h * _rms(start / scale) > KRYLOV:
-                space = _Krylov(lambda way: self.product(f, way), torch.cat([start, start.new_zeros(1)]))
+                space = _Krylov(partial(self.product, f), torch.cat([start, start.new_zeros(1)]))
                 if not space.enough(order, signed, scale):
                     return math.inf, h, self.u
                 part = signed * space.vector(space.combination(order, signed))[:-1]
@@ -172,7 +173,7 @@ class _Scene:
 class _Krylov:
     """The space of b, J b, J^2 b, ..., with orthonormal vectors V and J V_m = V_(m+1) H."""
 
-    def __init__(self, product, start: Tensor) -> None:  # type: ignore[no-untyped-def]
+    def __init__(self, product: Callable[[Tensor], Tensor], start: Tensor) -> None:
         self._product, self.size = product, float(torch.linalg.vector_norm(start.double()))
         self.basis = start.new_empty(LARGEST + 1, len(start))
         self.basis[0] = start / self.size

@@ -163,12 +163,15 @@ def read_las(path: Path, columns: Columns = None) -> Points:
     if columns is not None:
         raise named_already(path)
     laspy = _extra("laspy", path)
+    _refuse_records(path)
     try:
-        with laspy.open(path) as reader:
+        with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
             count, header = reader.header.point_count, reader.header
             _refuse_many(path, count)
             if not header.are_points_compressed and count * header.point_format.size > path.stat().st_size:
                 raise InputError(f"{path} declares {count} points, more than its bytes hold. Is it whole?")
+            if header.are_points_compressed:
+                _refuse_chunks(path, header.offset_to_point_data)
             point_count(path, count)
             points = reader.read()
         if len(points.points) != count:
@@ -190,8 +193,39 @@ def read_las(path: Path, columns: Columns = None) -> Points:
     return column_points(path, roles)
 
 
+def _refuse_records(path: Path) -> None:
+    """Refuse more records in a LAS header than fit into the file: laspy would go through all that it declares."""
+    with path.open("rb") as file:
+        head = file.read(375).ljust(375, b"\0")
+    records = 54 * int.from_bytes(head[100:104], "little")
+    if head[24:26] == b"\x01\x04":
+        records += 60 * int.from_bytes(head[243:247], "little")
+    if head[:4] != b"LASF" or records > path.stat().st_size:
+        raise InputError(f"{path} is not a LAS file, or its header is damaged.")
+
+
+def _refuse_chunks(path: Path, start: int) -> None:
+    """Refuse compressed points of more chunks than the file has bytes: lazrs ends the process where memory is short.
+
+    Points begin with the place of the chunk table, int64, or -1 where it is in the last 8 bytes; the table with its
+    version and its number of chunks, uint32 each.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        for place in (start, size - 8):
+            file.seek(min(max(place, 0), size))
+            table = int.from_bytes(file.read(8), "little", signed=True)
+            if table != -1:
+                break
+        file.seek(min(max(table, 0), size))
+        head = file.read(8)
+    if len(head) < 8 or int.from_bytes(head[4:], "little") > size:
+        raise InputError(f"{path} has a damaged table of compressed points.")
+
+
 def _refuse_many(path: Path, count: int) -> None:
-    if not 0 <= count <= MOST_POINTS:
+    """Refuse more points than a scan has, or than a file of its size holds, by 8 bytes each."""
+    if not 0 <= count <= min(MOST_POINTS, (MOST_UNPACKED * path.stat().st_size + (1 << 20)) // 8):
         raise InputError(f"{path} declares {count:,} points, more than one scan has. Is it damaged, or a whole map?")
 
 

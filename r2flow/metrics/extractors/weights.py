@@ -15,6 +15,7 @@ import tarfile
 import zipfile
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, TypeVar
@@ -25,7 +26,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, refuse_unreadable
 from r2flow.hashing import state_hash
 from r2flow.metrics.extractors import extractor_class
 from r2flow.metrics.extractors.base import Extractor
@@ -68,10 +69,16 @@ SOURCES: Registry[Source] = Registry(
     spvcnn=Source("FPVD", f"{R2FLOW}spvcnn_lidm.tar.gz"),
 )
 
+GZIP = b"\x1f\x8b"  # with which such a file begins
+DAMAGES = (tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError, ValueError, OSError)
+
 # Files of an archive that hold parameters, and its config.
 PARTS = ("backbone", "segmentation_decoder", "segmentation_head", "model.ckpt")
 CONFIG = "arch_cfg.yaml"
-LARGEST = 2**31  # bytes of a part: the largest of these networks has 0.2 GB
+LARGEST = 2**31  # bytes of a file: the largest of these networks has 0.2 GB
+MOST_UNPACKED = 4  # times the bytes of its file that weights may take: these hardly compress
+MOST_ALIASES = 20
+SPARE = 2**24  # bytes more, for small files
 
 
 def weights_folder() -> Path:
@@ -174,30 +181,93 @@ def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
     if not path.exists():
         raise InputError(f"{path} does not exist; give a file, a .tar.gz or a folder of weights.")
+    if not path.is_dir():
+        refuse_unreadable(path, LARGEST, "file of weights")
     if path.suffix == ".safetensors":
         tensors, notes = read_safetensors(path)
         return tensors, notes["config"]
-    if not (path.is_dir() or tarfile.is_tarfile(path)):
+    most = _most_unpacked(path)
+    if not (path.is_dir() or _is_tar(path)):
         with path.open("rb") as file:
-            return _read_torch(file, str(path)), {}
-    members = _read_members(path)
-    parts = [_read_torch(io.BytesIO(members[part]), f"{path}: {part}") for part in PARTS if part in members]
+            return _read_torch(file, str(path), most), {}
+    members = _read_members(path, most)
+    parts = [_read_torch(io.BytesIO(members[part]), f"{path}: {part}", most) for part in PARTS if part in members]
     if not parts:
         raise InputError(f"{path} holds none of {', '.join(PARTS)}; give the archive as it was published.")
+    text = members.get(CONFIG, b"{}")
     try:
-        config = yaml.safe_load(members.get(CONFIG, b"{}"))
-    except yaml.YAMLError:
+        # A few lines of aliases of aliases stand for billions of values.
+        aliases = sum(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader))
+        config = yaml.safe_load(text) if aliases <= MOST_ALIASES else None
+    except (yaml.YAMLError, ValueError, RecursionError):
         config = None
     if not isinstance(config, dict):
         raise InputError(f"{path}: {CONFIG} is no table of settings; is the archive whole?")
     return {name: tensor for part in parts for name, tensor in part.items()}, config
 
 
-def _read_members(path: Path) -> dict[str, bytes]:
+def _most_unpacked(path: Path) -> int:
+    """The bytes that the weights in a file or folder may take."""
+    files = path.iterdir() if path.is_dir() else [path]
+    return MOST_UNPACKED * sum(file.stat().st_size for file in files if file.is_file()) + SPARE
+
+
+class _Bounded(io.RawIOBase):
+    """An unpacked stream that ends in an error where it is longer than it may be."""
+
+    def __init__(self, stream: IO[bytes], most: int) -> None:
+        self.stream, self.most = stream, most
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self.stream.tell()
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        if whence == io.SEEK_SET and offset > self.most:
+            raise _TooLong
+        return self.stream.seek(offset, whence)
+
+    def readinto(self, buffer: Any) -> int:
+        data = self.stream.read(len(buffer))
+        if self.stream.tell() > self.most:
+            raise _TooLong
+        buffer[: len(data)] = data
+        return len(data)
+
+
+class _TooLong(Exception):
+    """More bytes than weights of a file take."""
+
+
+@contextmanager
+def _unpacked(path: Path, most: int) -> Iterator[IO[bytes]]:
+    """The bytes of a tar archive, compressed by gzip or not at all."""
+    with path.open("rb") as file:
+        is_packed = file.read(2) == GZIP
+    with gzip.open(path) if is_packed else path.open("rb") as stream:
+        yield io.BufferedReader(_Bounded(stream, most))  # type: ignore[arg-type]
+
+
+def _is_tar(path: Path) -> bool:
+    """Whether a file is a tar archive: one that is compressed is nothing else."""
+    with path.open("rb") as file:
+        return file.read(2) == GZIP or tarfile.is_tarfile(path)
+
+
+def _too_long(path: Path) -> InputError:
+    return InputError(f"{path} unpacks to far more bytes than weights take; get it again.")
+
+
+def _read_members(path: Path, most: int) -> dict[str, bytes]:
     """The files of `PARTS` and `CONFIG` in a folder or a tar archive, by their last name."""
     found: dict[str, bytes] = {}
     try:
-        for name, size, file in _opened(path):
+        for name, size, file in _opened(path, most):
             last = PurePosixPath(name).name
             if last not in (*PARTS, CONFIG):
                 continue
@@ -205,15 +275,19 @@ def _read_members(path: Path) -> dict[str, bytes]:
                 raise InputError(
                     f"{path} holds several networks ('{last}' twice); unpack it and give the folder of one."
                 )
-            if size > LARGEST:
-                raise InputError(f"{path}: {name} is {size / 2**30:.1f} GiB, which is too large for such a network.")
-            found[last] = file.read(LARGEST)
-    except (tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError):
+            if size > most:
+                raise _too_long(path)
+            found[last] = file.read(size)
+    except InputError:
+        raise
+    except _TooLong:
+        raise _too_long(path) from None
+    except DAMAGES:
         raise InputError(f"{path} is a damaged archive; get it again.") from None
     return found
 
 
-def _opened(path: Path) -> Iterator[tuple[str, int, IO[bytes]]]:
+def _opened(path: Path, most: int) -> Iterator[tuple[str, int, IO[bytes]]]:
     """Name, size and content of each plain file in a folder or a tar archive."""
     if path.is_dir():
         for child in sorted(path.iterdir()):
@@ -221,18 +295,18 @@ def _opened(path: Path) -> Iterator[tuple[str, int, IO[bytes]]]:
                 with child.open("rb") as part:
                     yield child.name, child.stat().st_size, part
         return
-    with tarfile.open(path) as tar:
+    with _unpacked(path, most) as stream, tarfile.open(fileobj=stream, mode="r:") as tar:
         for member in tar:
             if member.isreg() and (content := tar.extractfile(member)) is not None:
                 yield member.name, member.size, content
         # A compressed archive ends with a check sum, which is compared when the end is read.
-        while tar.fileobj is not None and tar.fileobj.read(2**20):
+        while stream.read(2**20):
             pass
 
 
-def _read_torch(file: IO[bytes], what: str) -> dict[str, Tensor]:
-    """The tensors of one of torch's files, by name."""
-    _check_sums(file, what)
+def _read_torch(file: IO[bytes], what: str, most: int) -> dict[str, Tensor]:
+    """The tensors of one of torch's files, by name, of at most so many bytes."""
+    _check_sums(file, what, most)
     try:
         content = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds of errors on other files
@@ -247,16 +321,22 @@ def _read_torch(file: IO[bytes], what: str) -> dict[str, Tensor]:
         content = content["state_dict"]
     if not isinstance(content, dict) or not content or not all(_is_plain(*item) for item in content.items()):
         raise InputError(f"{what} holds no table of tensors.")
+    if sum(tensor.numel() * tensor.element_size() for tensor in content.values()) > most:
+        raise InputError(f"{what} declares larger tensors than its bytes hold; get it again.")
     return dict(content)
 
 
-def _check_sums(file: IO[bytes], what: str) -> None:
+def _check_sums(file: IO[bytes], what: str, most: int) -> None:
     """Verify the check sums of a file of torch's, a .zip, which torch itself does not."""
     if zipfile.is_zipfile(file):
         try:
             with zipfile.ZipFile(file) as archive:
+                if sum(entry.file_size for entry in archive.infolist()) > most:
+                    raise InputError(f"{what} unpacks to far more bytes than weights take; get it again.")
                 whole = archive.testzip() is None
-        except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError):
+        except InputError:
+            raise
+        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, OSError):
             whole = False
         if not whole:
             raise InputError(f"{what} is damaged: its check sums do not hold; get it again.")

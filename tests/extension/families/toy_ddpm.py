@@ -40,7 +40,7 @@ class ToyDDPM(Generator):
         return Generated.after(x, evaluations=how.steps)
 
     def check_sampler(self, sampler):
-        if sampler.method not in ("ddpm", "ddim") or sampler.grid != "uniform" or sampler.straight_first:
+        if sampler.method not in ("ddpm", "ddim") or sampler.grid != "uniform":
             raise InputError(f"a DDPM is sampled by ddpm or ddim in equal steps, found {sampler.method!r}.")
 
 

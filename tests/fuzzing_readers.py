@@ -1,0 +1,93 @@
+"""What reads each kind of file in the fuzzing; a reader of a file with a checksum returns its content as bytes."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from r2flow.checkpoints import load_checkpoint
+from r2flow.data.contents import check_contents
+from r2flow.data.opening import open_prepared, own_reading
+from r2flow.data.prepared import check_prepared
+from r2flow.data.shards import PairRecipe, PairStore
+from r2flow.data.sources import Reading, read_image
+from r2flow.errors import InputError
+from r2flow.lidar.labels import read_labels
+from r2flow.lidar.scan_files import read_points
+from r2flow.lidar.sensor_files import read_sensor
+from r2flow.lidar.sensors import SENSORS
+from r2flow.metrics.extractors.weights import read_published
+from r2flow.runs import read_config
+
+SENSOR = SENSORS["hdl64e"].resized(8, 64)
+
+
+def points(path: Path) -> None:
+    found = read_points(path)
+    assert np.isfinite(found.xyz).all()
+    assert len(found.xyz)
+
+
+def image(path: Path) -> None:
+    assert np.isfinite(read_image(path, Reading(SENSOR, reflectance=True, on_bad_scan="error"))).all()
+
+
+def labels(path: Path) -> None:
+    read_labels(path, path.parents[2] / "beside" / "scan.bin")
+
+
+def in_folder(name: str) -> Callable[[Path], Path]:
+    """A damaged file takes its place among undamaged ones, which lie in `beside/NAME`."""
+
+    def place(path: Path) -> Path:
+        folder = path.parents[2] / "beside" / name
+        (folder / path.name).write_bytes(path.read_bytes())
+        return folder
+
+    return place
+
+
+def prepared(path: Path) -> bytes:
+    folder = in_folder("prepared")(path)
+    source = open_prepared(folder, SENSOR)
+    check_prepared(folder)
+    return b"".join(source[number].tobytes() for number in range(len(source)))
+
+
+def pairs(path: Path) -> bytes:
+    folder = in_folder("pairs")(path)
+    store = PairStore(folder, PairRecipe("0" * 16, (2, 8, 64), 0, 0, "euler", 1, 1e-5, 2, 2))
+    store.begin()
+    if store.check(0, 4) or not store.is_whole(4):
+        raise InputError("damage was found, and is made again")
+    block = store._read(store.shard_path(0), 0)
+    return block.x_1.tobytes()
+
+
+def checkpoint(path: Path) -> bytes:
+    state = load_checkpoint(path).generator.state_dict()
+    return b"".join(state[name].numpy().tobytes() for name in sorted(state))
+
+
+def samples(path: Path) -> None:
+    own_reading(in_folder("samples")(path))
+
+
+def config(path: Path) -> None:
+    read_config(in_folder("run")(path))
+
+
+def contents(path: Path) -> None:
+    folder = in_folder("run")(path)
+    check_contents(folder, {"scan.bin": folder.parent / "scan.bin"})
+
+
+def weights(path: Path) -> None:
+    read_published(path)
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "points": points, "image": image, "labels": labels, "prepared": prepared, "pairs": pairs, "checkpoint": checkpoint,
+    "samples": samples, "config": config, "contents": contents, "weights": weights,
+    "sensor": read_sensor,
+}  # fmt: skip

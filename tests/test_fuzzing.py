@@ -1,0 +1,154 @@
+"""Ten thousand damaged files over every reader: one line, or what was written; no crash, no hang, no memory."""
+
+import importlib.util
+import io
+import json
+import os
+import subprocess
+import sys
+import tarfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from r2flow.checkpoints import load_checkpoint, save_checkpoint
+from r2flow.data.contents import RECORD, record_contents
+from r2flow.data.opening import write_samples_note
+from r2flow.data.preparing import Preparation, plan_files
+from r2flow.data.shards import Block, PairRecipe, PairStore
+from r2flow.data.sources import Reading
+from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.sensor_files import write_sensor
+from r2flow.lidar.sensors import SENSORS
+from tests.lidar.test_scan_files_damage import PCD_OF_4, TEXT, compressed, ply_ascii
+from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
+
+ROOT, SEED = Path(__file__).resolve().parents[1], 20261120
+EACH = 320  # damaged files made of each original
+DRAW = np.random.default_rng(0)
+XYZ = np.round(DRAW.standard_normal((64, 3)) * [20, 20, 2], 2).astype(np.float32)
+REFLECTANCE = np.round(DRAW.random(64), 2).astype(np.float32)
+TABLE = np.column_stack([XYZ, REFLECTANCE])
+SENSOR = SENSORS["hdl64e"].resized(8, 64)
+
+
+def write_scans(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    TABLE.tofile(folder / "a.bin")
+    np.column_stack([TABLE, np.arange(64) % 32]).astype(np.float32).tofile(folder / "a.pcd.bin")
+    for ending in ("npy", "ply", "pcd"):
+        write_points(folder / f"a.{ending}", XYZ, REFLECTANCE)
+    (folder / "ascii.ply").write_bytes(ply_ascii())
+    (folder / "ascii.pcd").write_bytes(PCD_OF_4.format("ascii").encode() + TEXT)
+    (folder / "packed.pcd").write_bytes(PCD_OF_4.format("binary_compressed").encode() + compressed(TABLE.T.tobytes()))
+    np.savetxt(folder / "a.csv", TABLE, delimiter=",", header="x,y,z,intensity", comments="", fmt="%.2f")
+    np.savetxt(folder / "a.xyz", TABLE, fmt="%.2f")
+    np.savez(folder / "a.npz", xyz=XYZ, intensity=REFLECTANCE)
+    np.savez_compressed(folder / "packed.npz", x=XYZ[:, 0], y=XYZ[:, 1], z=XYZ[:, 2])
+    if importlib.util.find_spec("pyarrow"):
+        import pyarrow
+        from pyarrow import feather, parquet
+
+        table = pyarrow.table({"x": XYZ[:, 0], "y": XYZ[:, 1], "z": XYZ[:, 2], "intensity": REFLECTANCE})
+        feather.write_feather(table, folder / "a.feather")
+        parquet.write_table(table, folder / "a.parquet")
+    if importlib.util.find_spec("laspy"):
+        import laspy
+
+        cloud = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
+        cloud.x, cloud.y, cloud.z, cloud.intensity = *XYZ.T.astype(np.float64), np.arange(64)
+        cloud.write(folder / "a.las")
+        if importlib.util.find_spec("lazrs"):
+            cloud.write(folder / "a.laz")
+
+
+def keep(folder: Path, kind: str, *files: Path) -> None:
+    """Originals to be damaged."""
+    for file in files:
+        target = folder / kind / file.name
+        target.parent.mkdir(exist_ok=True)
+        target.write_bytes(file.read_bytes())
+
+
+def write_stores(folder: Path, beside: Path) -> None:
+    scans = beside / "scans"
+    scans.mkdir(parents=True)
+    for number in range(3):
+        write_points(scans / f"{number}.bin", XYZ * [1, 1, 0.1], REFLECTANCE)
+    work = Preparation(beside / "prepared", plan_files("folder", scans, SENSOR))
+    work.make(work.begin())
+    keep(folder, "prepared", *(beside / "prepared").iterdir())
+    recipe = PairRecipe("0" * 16, (2, 8, 64), 0, 0, "euler", 1, 1e-5, 2, 2)
+    store = PairStore(beside / "pairs", recipe)
+    store.begin()
+    for batch in range(2):
+        x_1 = DRAW.standard_normal((2, 2, 8, 64)).astype(np.float16)
+        store.commit(batch, Block(x_1, np.ones(2, np.int32), np.ones(2, bool)))
+    assert store.seal(0, 4)
+    keep(folder, "pairs", *(file for file in (beside / "pairs").iterdir() if file.is_file()))
+    write_points(beside / "scan.bin", XYZ, REFLECTANCE)
+    (folder / "labels").mkdir()
+    DRAW.integers(0, 100, 64).astype("<u4").tofile(folder / "labels" / "scan.label")
+    (folder / "image").mkdir()
+    np.save(folder / "image" / "image.npy", DRAW.uniform(2, 70, (2, 8, 64)).astype(np.float32))
+    write_samples_note(beside / "samples", Reading(SENSOR), seed=0)
+    keep(folder, "samples", beside / "samples" / "scans.json")
+    (beside / "run").mkdir()
+    (beside / "run" / "config.yaml").write_text(yaml.safe_dump(CONFIG))
+    record_contents(beside / "run", {"scan.bin": beside / "scan.bin"})
+    keep(folder, "config", beside / "run" / "config.yaml")
+    keep(folder, "contents", beside / "run" / RECORD)
+    write_sensor(replace(SENSORS["vlp16"], name="mine"), beside / "mine.yaml", "of a test")
+    keep(folder, "sensor", beside / "mine.yaml")
+
+
+def write_weights(folder: Path, beside: Path, run: Path) -> None:
+    loaded = load_checkpoint(run)
+    model, published = beside / "model.safetensors", beside / "published.pth"
+    for path in (model, published):
+        save_checkpoint(loaded, path)
+    keep(folder, "checkpoint", run, model, published)
+    weights = beside / "weights.pth"
+    torch.save({"fc.weight": torch.randn(16, 16), "fc.bias": torch.randn(16)}, weights)
+    torch.save({"fc.weight": torch.randn(16, 16)}, beside / "legacy.pth", _use_new_zipfile_serialization=False)
+    with tarfile.open(beside / "release.tar.gz", "w:gz") as tar:
+        for name, data in (("model.ckpt", weights.read_bytes()), ("arch_cfg.yaml", b"name: net\n")):
+            info = tarfile.TarInfo(f"net/{name}")
+            info.size = len(data)
+            tar.addfile(info, io.BytesIO(data))
+    keep(folder, "weights", weights, beside / "legacy.pth", beside / "release.tar.gz")
+
+
+def refuse_findings(folder: Path, run: Path, each: int) -> dict[str, tuple[int, int]]:
+    """Damage and read every kind of file in a process of its own; how many were made and read, by their name."""
+    beside = folder / "beside"
+    write_scans(folder / "points")
+    write_stores(folder, beside)
+    write_weights(folder, beside, run)
+    command = [sys.executable, "-m", "tests.fuzz", str(folder), str(SEED), str(each)]
+    threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, env={**os.environ, **threads}, timeout=3000
+    )
+    said = [json.loads(line) for line in done.stdout.splitlines()]
+    found = [line for line in said if line[0] != "done"]
+    assert not found, "\n".join(map(str, found[:20]))
+    assert done.returncode == 0, f"{said[-1:]} {done.stderr[-2000:]}"  # a crash ends the process
+    return {name: (made, read) for _, name, made, read in said}
+
+
+def test_damaged_files_are_one_line_or_what_was_written(tmp_path: Path, saved):  # noqa: F811
+    """A few of each kind, in each run of the tests."""
+    assert len(refuse_findings(tmp_path / "fuzz", saved[0], 4)) >= 25
+
+
+@pytest.mark.slow
+def test_ten_thousand_damaged_files_are_one_line_or_what_was_written(tmp_path: Path, saved):  # noqa: F811
+    found = refuse_findings(tmp_path / "fuzz", saved[0], EACH)
+    if all(importlib.util.find_spec(name) for name in ("pyarrow", "laspy", "lazrs")):
+        assert sum(made for made, _ in found.values()) >= 10_000
+    assert all(read < made for made, read in found.values())  # some of each kind are found out

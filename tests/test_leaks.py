@@ -1,0 +1,116 @@
+"""Long work holds no more memory and no more files at its end than after its first fifth."""
+
+import gc
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+
+from r2flow.data.sets import ScanSet
+from r2flow.data.sources import ScanSource
+from r2flow.evaluation.measuring import Work, gather_real, measure
+from r2flow.generators import build_generator
+from r2flow.lidar.sensors import SENSORS
+from r2flow.metrics import METRICS
+from r2flow.sampling import sample
+from r2flow.training import build, compose, fit
+from tests.test_checkpoints import CONFIG
+from tests.training.conftest import scans, tiny  # noqa: F401  a fixture
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads its memory from /proc"),
+]
+
+ALLOWED = 8 * 2**20  # bytes: pages that the allocator keeps
+
+
+class Held:
+    """(bytes of memory, open files) of this process, noted on the way."""
+
+    def __init__(self) -> None:
+        self.noted: list[tuple[int, int]] = []
+
+    def note(self) -> None:
+        gc.collect()
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        self.noted.append((pages * os.sysconf("SC_PAGE_SIZE"), len(os.listdir("/proc/self/fd"))))
+
+    def check(self) -> None:
+        """From the first note to the last."""
+        (memory, files), *_, (memory_now, files_now) = self.noted
+        assert files_now <= files, self.noted
+        assert memory_now - memory < ALLOWED, self.noted
+
+
+class Noting(L.Callback):
+    def __init__(self, held: Held, every: int) -> None:
+        self.held, self.every = held, every
+
+    def on_train_batch_end(self, trainer: L.Trainer, *others: Any) -> None:
+        if trainer.global_step % self.every == 0:
+            self.held.note()
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_two_thousand_training_steps(scans, tmp_path, workers):  # noqa: F811
+    options = tiny(
+        scans, f"run_dir={tmp_path / 'run'}", "trainer.max_steps=2000", "callbacks.checkpoint.every=100",
+        "trainer.val_check_interval=100", f"data.workers={workers}", "data.memory_gib=0", "samples.num=0",
+        "loggers=[csv,tensorboard]",
+    )  # fmt: skip
+    run, held = build(compose(options)), Held()
+    run.trainer.callbacks.append(Noting(held, 400))
+    assert fit(run).finished
+    assert len(held.noted) == 5
+    held.check()
+
+
+def test_a_thousand_samples():
+    torch.manual_seed(0)
+    generator, held = build_generator(CONFIG).eval(), Held()
+    for number, drawn in enumerate(sample(generator, 1000, 0, steps=2, batch_size=10), 1):
+        assert len(drawn.images) == 10
+        if number % 20 == 0:
+            held.note()
+    held.check()
+
+
+class Noted(ScanSource):
+    """100,000 images, eight in turn."""
+
+    def __init__(self, held: Held, numbers: Sequence[int] = range(100_000)) -> None:
+        self.held, self.numbers = held, numbers
+        draw = np.random.default_rng(0)
+        self.images = np.stack([draw.uniform(2, 70, (8, 8, 64)), draw.uniform(0, 1, (8, 8, 64))], 1).astype(np.float32)
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        if index % 20_000 == 19_999:
+            self.held.note()
+        return self.images[self.numbers[index] % 8]
+
+    @property
+    def names(self) -> list[str]:
+        return [str(number) for number in self.numbers]
+
+    def subset(self, indices: Sequence[int]) -> "Noted":
+        return Noted(self.held, [self.numbers[i] for i in indices])
+
+
+def test_a_hundred_thousand_scans_evaluated():
+    held, sensor = Held(), SENSORS["hdl64e"].resized(8, 64)
+    metrics = {name: METRICS[name]() for name in ("jsd", "frechet_embedded", "drop_rate")}
+    work = Work(batch_size=100)
+    real = gather_real(metrics, ScanSet("real", Noted(Held(), range(64)), sensor, about={"reflectance": True}), work)
+    results = measure(metrics, real, ScanSet("other", Noted(held), sensor, about={"reflectance": True}), work)
+    assert {result.metric for result in results} == set(metrics)
+    assert len(held.noted) == 5
+    held.check()

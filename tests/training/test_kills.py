@@ -1,0 +1,132 @@
+"""Each long verb, ended ten times at random moments by SIGTERM, SIGINT and SIGKILL in turn, ends as one left alone."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from r2flow.checkpoints import checkpoints_of
+from tests.data.conftest import write_scan
+from tests.killing import wait_until
+from tests.test_checkpoints import saved  # noqa: F401  a fixture
+from tests.training.conftest import COMMAND, TINY, let_go, tiny
+from tests.training.test_chain import CHAIN, HELD, assert_alike
+from tests.training.test_train import assert_bit_equal
+
+pytestmark = pytest.mark.slow
+
+VERB = [sys.executable, "-m", "r2flow.cli"]
+TIMES = 10
+
+
+def start(cwd: Path, command: Sequence[object]) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [str(part) for part in command], cwd=cwd, env={**os.environ, "OMP_NUM_THREADS": "1"}, start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+
+
+def finish(cwd: Path, command: Sequence[object]) -> float:
+    """Run a command to its end; seconds."""
+    begin = time.monotonic()
+    process = start(cwd, command)
+    said, _ = process.communicate(timeout=600)
+    assert process.returncode == 0, said
+    return time.monotonic() - begin
+
+
+def is_gone(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def end_ten_times(cwd: Path, command: Sequence[object], seconds: float, seed: int) -> None:
+    """End a command that takes so long ten times, then let it come to its end.
+
+    Signals go to the process alone and to its whole group by turns, as `kill` and a terminal send them.
+    """
+    draw, ended = random.Random(seed), 0
+    for number in range(TIMES):
+        by = (signal.SIGTERM, signal.SIGINT, signal.SIGKILL)[number % 3]
+        process = start(cwd, command)
+        time.sleep(draw.uniform(0.05, 0.6) * seconds)
+        if process.poll() is None:
+            (os.kill if number % 2 else os.killpg)(process.pid, by)
+        said, _ = process.communicate(timeout=120)
+        code = process.returncode
+        assert code in (0, -by if by == signal.SIGKILL else 128 + by), (by, said)
+        assert "Traceback" not in said, said
+        if code not in (0, -signal.SIGKILL):
+            lines = [line for line in said.splitlines() if "stopped" in line]
+            assert lines, said
+        ended += code != 0
+        wait_until(lambda: is_gone(process.pid), seconds=40)  # noqa: B023
+    assert ended >= 3
+    finish(cwd, command)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """All that lies in a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_simulate(tmp_path: Path):
+    command = [*VERB, "simulate", "--num", 40, "--size", "32x512", "--labels", "--workers", 2, "--out"]
+    seconds = finish(tmp_path, [*command, "one"])
+    end_ten_times(tmp_path, [*command, "ended"], seconds, 0)
+    assert files(tmp_path / "ended") == files(tmp_path / "one")
+
+
+def test_prepare(tmp_path: Path):
+    for number in range(60):
+        write_scan(tmp_path / "scans" / f"{number}.bin", number)
+    command = [*VERB, "prepare", "folder", "scans", "--shard-scans", 2, "--workers", 2, "--out"]
+    seconds = finish(tmp_path, [*command, "one"])
+    end_ten_times(tmp_path, [*command, "ended"], seconds, 1)
+    assert files(tmp_path / "ended") == files(tmp_path / "one")
+
+
+def test_pairs(saved, tmp_path: Path):  # noqa: F811
+    command = [*VERB, "pairs", "-c", saved[0], "--num", 200, "--solver", "midpoint", "--steps", 8, "--batch-size", 4,
+               "--shard-mib", 0.05, "--device", "cpu", "--out"]  # fmt: skip
+    seconds = finish(tmp_path, [*command, "one"])
+    end_ten_times(tmp_path, [*command, "ended"], seconds, 2)
+    assert files(tmp_path / "ended") == files(tmp_path / "one")
+
+
+def test_training(scans: Path, tmp_path: Path):
+    def command(name: str) -> list[str]:
+        return [*COMMAND, *tiny(scans, f"name={name}", "data.workers=2", "data.memory_gib=0")]
+
+    seconds = finish(tmp_path, command("one"))
+    end_ten_times(tmp_path, command("ended"), seconds, 3)
+    assert_bit_equal(tmp_path / "runs" / "one", tmp_path / "runs" / "ended")
+
+
+def test_a_sweep(scans: Path, tmp_path: Path):
+    def command(folder: str) -> list[str]:
+        return [*COMMAND, "-m", *tiny(scans, "seed=1,2", f"hydra.sweep.dir={folder}", "samples.num=0")]
+
+    seconds = finish(tmp_path, command("one"))
+    end_ten_times(tmp_path, command("ended"), seconds, 4)
+    jobs = [path.name for path in (tmp_path / "one").iterdir() if checkpoints_of(path)]
+    assert len(jobs) == 2
+    for first, second in zip(sorted((tmp_path / "one").iterdir()), sorted((tmp_path / "ended").iterdir()), strict=True):
+        assert_bit_equal(first, second)
+
+
+def test_a_chain(scans: Path, tmp_path: Path):
+    let_go(tmp_path / HELD)
+    seconds = finish(tmp_path, [*COMMAND, *TINY, f"data.root={scans}", *CHAIN, "name=one"])
+    end_ten_times(tmp_path, [*COMMAND, *TINY, f"data.root={scans}", *CHAIN, "name=ended"], seconds, 5)
+    assert_alike(tmp_path / "runs" / "one", tmp_path / "runs" / "ended")
