@@ -140,3 +140,18 @@ def test_samplers_of_older_versions_are_read():
     own = Sampler("adams3", 8, levels=(8, 16), limits=(0.1,))
     assert Sampler.of(own.asdict()) == own
     assert own.changed(steps=4).levels == own.changed(method="euler").levels == ()
+
+
+def test_the_last_step_of_a_finish_is_euler_s_and_counted():
+    # x' = 2 t: exact up to 1 - f, then f 2 (1 - f), which lacks f^2.
+    one, f = Field(lambda t, x: 2 * t + 0 * x, (3,)), 1 / 8
+    how = Sampler("adams2", 5, finish=f)
+    made = one.generate(torch.zeros(2, 3, dtype=torch.float64), sampler=how)
+    torch.testing.assert_close(made.x, torch.full_like(made.x, 1 - f**2))
+    assert made.evaluations.tolist() == [5, 5]
+    assert one.generate(torch.zeros(2, 3), sampler=replace(how, steps=1)).evaluations.tolist() == [1, 1]
+    assert one.solve(torch.zeros(1, 3), sampler=how).evaluations.tolist() == [5]
+    assert how.changed(method="euler").finish == how.changed(grid=(0.0, 0.5, 1.0), steps=2).finish == 0
+    assert how.changed(steps=9).finish == f
+    with pytest.raises(InputError, match="finish must be a finite number in"):
+        Sampler.of({"finish": 1.0})

@@ -49,7 +49,7 @@ def sampled_set(flow: Checkpoint, label: str, num: int, sampler: Sampler | None 
     flow.generator.check_sampler(sampler)
     about = {
         "kind": "sampled", "weights": weights_hash(flow), "step": flow.step, "num": num, "solver": sampler.method,
-        "steps": sampler.steps, "grid": sampler.grid, "seed": seed, "noise": "evaluation",
+        "steps": sampler.steps, "grid": sampler.grid, "finish": sampler.finish, "seed": seed, "noise": "evaluation",
         "reflectance": flow.encoding.reflectance,
     }  # fmt: skip
     return ScanSet(label, SampledScans(flow, range(num), sampler, seed), flow.sensor, about)

@@ -8,12 +8,12 @@ import torch
 from r2flow.errors import InputError
 from r2flow.generators.base import Condition, Generated, Generator, Sampler
 from r2flow.generators.budgets import Budget, levels
-from r2flow.generators.flow import Field, Flow, RectifiedFlow, as_flow
+from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
 from r2flow.lidar.space import build_space
 from r2flow.registry import Registry
 
 __all__ = [
-    "GENERATORS", "Budget", "Condition", "Field", "Flow", "Generated", "Generator", "RectifiedFlow", "Sampler",
+    "GENERATORS", "USUAL", "Budget", "Condition", "Field", "Flow", "Generated", "Generator", "RectifiedFlow", "Sampler",
     "as_flow", "build_generator", "levels",
 ]  # fmt: skip
 

@@ -12,7 +12,7 @@ from r2flow.flow.solvers import usual_grid
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
-from r2flow.registry import Count, Positive, check_options
+from r2flow.registry import Count, Portion, Positive, check_options
 
 Condition = Mapping[str, Tensor]
 """What is known of each scan, by name: tensors of shape (B, ...). Which names there are, the generator says."""
@@ -31,6 +31,8 @@ class Sampler:
         steps: Steps from noise to data, of a method of fixed steps.
         tolerance: Absolute and relative tolerance of an adaptive method.
         grid: Where fixed steps fall: a name (`r2flow.flow.solvers.named_grid`), or the times themselves.
+        finish: Length of the last part of the way to t = 1, which the last step takes by Euler's rule. That smooths
+            what a flow leaves rough that was not trained to the end.
         levels: Numbers of steps to try on a scan one after the other, instead of `steps` (`r2flow.generators.budgets`).
         limits: For each of them but the last one the largest correction of a scan that needs no more steps.
         fixed: Whether the generator was trained for this number of steps and is worse at any other.
@@ -40,6 +42,7 @@ class Sampler:
     steps: Count = 32
     tolerance: Positive = 1e-5
     grid: str | tuple[float, ...] = "uniform"
+    finish: Portion = 0.0
     levels: tuple[int, ...] = ()
     limits: tuple[float, ...] = ()
     fixed: bool = False
@@ -63,19 +66,19 @@ class Sampler:
     def changed(self, **options: Any) -> Self:
         """The same with the options that are not None. Given times decide the number of steps.
 
-        Another method starts from its usual grid and without `levels`: those were the former one's.
+        Another method starts from its usual grid, without `finish` and `levels`: those were the former one's.
 
         Raises:
             InputError: fewer than one step, or times and a number of steps that contradict.
         """
         given = {key: value for key, value in options.items() if value is not None}
         if given.get("method", self.method) != self.method:
-            given = {"grid": usual_grid(given["method"]), "levels": (), "limits": (), **given}
+            given = {"grid": usual_grid(given["method"]), "finish": 0.0, "levels": (), "limits": (), **given}
         if "steps" in given:
             given = {"levels": (), "limits": (), **given}
         grid = given.get("grid", "uniform")
         if not isinstance(grid, str):
-            given["grid"] = tuple(float(t) for t in grid)
+            given = {"finish": 0.0, **given, "grid": tuple(float(t) for t in grid)}
             if given.setdefault("steps", len(given["grid"]) - 1) != len(given["grid"]) - 1:
                 raise InputError(f"the time grid has {len(given['grid']) - 1} steps, found steps={given['steps']}.")
         elif "steps" in given and "grid" not in given and not isinstance(self.grid, str):

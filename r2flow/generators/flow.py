@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from copy import copy
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
@@ -17,7 +18,6 @@ from r2flow.flow.solvers import (
     check_tolerance,
     fixed_step,
     solve,
-    usual_grid,
 )
 from r2flow.flow.solvers.grids import build_grid
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
@@ -25,7 +25,7 @@ from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 
-USUAL = Sampler("adams3", 16, grid=usual_grid("adams3"))  # of a new flow
+USUAL = Sampler("adams3", 16, grid="power:1.5", finish=1 / 32)  # of a new flow: docs/results.md
 
 
 class Flow(Generator):
@@ -74,7 +74,11 @@ class Flow(Generator):
         draws: Draws | None = None,
         progress: Progress = None,
     ) -> Generated:
-        end = self.solve(noise, sampler=sampler, condition=condition, progress=progress)
+        how = sampler or self.sampler
+        options: dict[str, Any] = {}
+        if how.finish and how.steps > 1:
+            how, options = replace(how, steps=how.steps - 1), {"finish": how.finish}
+        end = self.solve(noise, sampler=how, condition=condition, progress=progress, **options)
         return Generated(end.x, end.evaluations, end.converged)
 
     def check_sampler(self, sampler: Sampler) -> None:

@@ -61,7 +61,8 @@ class Curve:
         how = self.drawing.sampler(flow, steps)
         return point_key(
             self.real, self.metrics, weights=weights_hash(flow), steps=steps, num=self.drawing.num,
-            seed=self.drawing.seed, method=how.method, grid=how.grid, tolerance=how.tolerance, device=self.device,
+            seed=self.drawing.seed, method=how.method, grid=how.grid, finish=how.finish, tolerance=how.tolerance,
+            device=self.device,
         )  # fmt: skip
 
 
