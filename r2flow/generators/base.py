@@ -55,13 +55,13 @@ class Sampler:
             InputError: an unknown option, or a value of the wrong type.
         """
         # An option of earlier development versions, which did nothing on trained flows.
-        options = {str(key): value for key, value in options.items() if key != "straight_first"}
-        check_options("sampler", cls, options)
-        grid = options.get("grid", "uniform")
+        known: dict[str, Any] = {key: value for key, value in options.items() if key != "straight_first"}
+        check_options("sampler", cls, known)
+        grid = known.get("grid", "uniform")
         if grid == "quadratic":  # its name in version 0.1.0
             grid = "power:2"
-        lists = {key: tuple(options[key]) for key in ("levels", "limits") if key in options}
-        return cls(**{**options, "grid": grid if isinstance(grid, str) else tuple(grid), **lists})
+        lists = {key: tuple(known[key]) for key in ("levels", "limits") if key in known}
+        return cls(**{**known, "grid": grid if isinstance(grid, str) else tuple(grid), **lists})
 
     def changed(self, **options: Any) -> Self:
         """The same with the options that are not None. Given times decide the number of steps.
