@@ -60,8 +60,9 @@ class Sampler:
         grid = known.get("grid", "uniform")
         if grid == "quadratic":  # its name in version 0.1.0
             grid = "power:2"
-        lists = {key: tuple(known[key]) for key in ("levels", "limits") if key in known}
-        return cls(**{**known, "grid": grid if isinstance(grid, str) else tuple(grid), **lists})
+        known["grid"] = grid if isinstance(grid, str) else tuple(grid)
+        known |= {key: tuple(known[key]) for key in ("levels", "limits") if key in known}
+        return cls(**known)
 
     def changed(self, **options: Any) -> Self:
         """The same with the options that are not None. Given times decide the number of steps.
