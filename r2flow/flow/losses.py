@@ -10,6 +10,7 @@ from r2flow.registry import Registry
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 
+HUGE = 1e15  # its square is finite in float32
 PSEUDO_HUBER_SCALE = 0.00054  # c = 0.00054 sqrt(d), paper, below eq. 3
 
 
@@ -26,12 +27,14 @@ def pseudo_huber(v_t: Tensor, u_t: Tensor) -> Tensor:
     """
     r = (v_t.float() - u_t.float()).flatten(1)
     d = r.shape[1]
-    # vector_norm has gradient 0 at r = 0, where sqrt of a sum of squares has NaN. The scale keeps |r|^2 finite where an
-    # element is large; the quotient has no cancellation at small r.
-    scale = r.detach().abs().amax(1).clamp(min=1)
+    # vector_norm has gradient 0 at r = 0, where sqrt of a sum of squares has NaN; the quotient has no cancellation at
+    # small r. Where an element's square leaves float32, r is scaled and c no longer seen.
+    largest = r.detach().abs().amax(1)
+    scale = torch.where(largest > HUGE, largest, torch.ones_like(largest))
     rms = torch.linalg.vector_norm(r / scale[:, None], dim=1) / math.sqrt(d) * scale
-    c = torch.full_like(rms, PSEUDO_HUBER_SCALE)
-    return rms * (rms / (torch.hypot(rms, c) + c))
+    small = rms.clamp(max=HUGE)
+    loss = small.square() / ((small.square() + PSEUDO_HUBER_SCALE**2).sqrt() + PSEUDO_HUBER_SCALE)
+    return torch.where(rms > HUGE, rms - PSEUDO_HUBER_SCALE, loss)
 
 
 def pseudo_huber_elementwise(v_t: Tensor, u_t: Tensor) -> Tensor:
