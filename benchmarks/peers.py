@@ -5,8 +5,8 @@
     python benchmarks/peers.py                                         # exact problems alone, seconds
 
 Every solver gets the same relative and absolute tolerance and chooses its own first step. Evaluations are those that
-the velocity has seen. The error is the RMS in model space, median over the scenes, against the exact end, or for a trained
-flow against dopri5 at 1e-6.
+the velocity has seen. The error is the RMS in model space, median over the scenes, against the exact end; for a
+trained flow against dopri5 at 1e-6.
 """
 
 import argparse
