@@ -37,7 +37,7 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes, learned from simulated scans",
-        "0eaf42d0d3c28eda8684d89e39d19d000acdc22f3075370609a632492b6441b4",
+        "77aed21462351e4d8ddc571c34d1f4d0c3c96a4d639c5bcd431cf4cb23904ece",
     ),
 )
 DEFAULT = "street"
