@@ -79,12 +79,19 @@ def end_at_once(number: int, frame: FrameType | None = None) -> None:
 @contextmanager
 def heard_from_the_first_import() -> Iterator[None]:
     """Answer Ctrl-C and SIGTERM in one line around a whole program, whose imports take seconds, and at its exit."""
+    atexit.register(_end_in_peace)  # first, so that it is called last
     with listening(end_at_once):
         try:
             yield
         finally:
             atexit.unregister(_hear_at_exit)
             atexit.register(_hear_at_exit)  # last, so that it is called first
+
+
+def _end_in_peace() -> None:
+    """Ignore signals while the interpreter takes itself apart, handlers too: the program has ended already."""
+    for number in STOPPING:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _hear_at_exit() -> None:
