@@ -8,7 +8,7 @@ import torch
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
 from r2flow.flow.solvers import SOLVERS, FixedStep, check_method, fixed_step
-from r2flow.generators import USUAL, Budget, Sampler, as_flow, levels
+from r2flow.generators import Budget, Sampler, as_flow, levels
 from r2flow.generators.base import Progress
 from r2flow.inversion import metres_apart, rms
 from r2flow.noise import Draws
@@ -54,7 +54,7 @@ def calibrate(
         assert found.correction is not None
         _, metres, _ = metres_apart(checkpoint.encoding.decode(found.x), decoded)
         budgets.append(Budget(count, *(_plain(x) for x in (rms(found.x - exact.x), metres, found.correction))))
-    flow.sampler = replace(USUAL, method=method, steps=steps, grid=sampler.grid)
+    flow.sampler = sampler
     return replace(checkpoint, accuracy=tuple(budgets))
 
 
@@ -99,4 +99,4 @@ def sampler_within(checkpoint: Checkpoint, error: str) -> Sampler:
     if not checkpoint.accuracy:
         raise InputError(f"the errors of {checkpoint.path} are not known yet; measure them: r2flow calibrate -c RUN.")
     steps, limits = levels(checkpoint.accuracy, value, metres)
-    return replace(checkpoint.generator.sampler, finish=0.0, levels=steps, limits=limits)
+    return replace(checkpoint.generator.sampler, levels=steps, limits=limits)

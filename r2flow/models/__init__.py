@@ -37,7 +37,7 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes, learned from simulated scans",
-        "77aed21462351e4d8ddc571c34d1f4d0c3c96a4d639c5bcd431cf4cb23904ece",
+        "ced1705675e7c9f315a83a96b039f368202ac02474a9e52e3fcfeafa765e6b05",
     ),
 )
 DEFAULT = "street"
