@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 NEWTON_SCHULZ = 3.4445, -4.7750, 2.0315
-LEAST_CHANNELS = 8  # of a matrix between hidden layers: fewer are an image's
+LEAST_CHANNELS = 8  # fewer are an image's
 
 
 class Muon(torch.optim.AdamW):
@@ -18,8 +18,8 @@ class Muon(torch.optim.AdamW):
 
         M <- m M + (1 - m) G,    W <- W - rate sqrt(max(1, rows / columns)) orthogonalised((1 - m) G + m M)
 
-    All singular directions of the momentum are learned at one speed, not the few large ones first. Weights that no two
-    hidden layers have between them (the first and the last layer, biases, norms) are AdamW's.
+    All singular directions of the momentum are learned at one speed, not the few large ones first. Biases, norms and
+    matrices of fewer than 8 rows or columns, such as those that see an image's channels, are AdamW's.
 
     Args:
         parameters: What is learned.
@@ -72,12 +72,12 @@ class Muon(torch.optim.AdamW):
 
 
 def is_hidden_matrix(p: Tensor) -> bool:
-    """Whether a weight is a matrix between hidden layers."""
+    """Whether a weight has at least `LEAST_CHANNELS` rows and columns; of a convolution, channels out and in."""
     return p.ndim >= 2 and min(p.shape[:2]) >= LEAST_CHANNELS
 
 
 def orthogonalised(matrix: Tensor, steps: int = 5) -> Tensor:
-    """U V^T, nearly, of a matrix U S V^T: singular values come out between 0.68 and 1.14, tiny ones below.
+    """U V^T, nearly, of a matrix U S V^T, (rows, columns): singular values become 0.68 to 1.14, tiny ones less.
 
     Each step is the polynomial a X + (b A + c A A) X of A = X X^T, in bfloat16, which needs no division.
     """
