@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
@@ -38,11 +39,11 @@ SMALL = 256  # the most numbers of a matrix that half precision leaves as it is,
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A trained generator.
+    """A trained generator. `Checkpoint(generator, config)` is one that was trained without a run.
 
     Attributes:
         generator: With its averaged weights, in eval mode.
-        config: The config it was trained with, as plain dicts.
+        config: The config it was trained with, as plain dicts; `build_generator` makes the same generator of it.
         step: Optimiser steps taken.
         path: Where it was read from.
         format: `r2flow`, or `published` for the reference implementation's files.
@@ -51,9 +52,9 @@ class Checkpoint:
 
     generator: Generator
     config: dict[str, Any]
-    step: int
-    path: Path
-    format: str
+    step: int = 0
+    path: Path = Path("unsaved")
+    format: str = "r2flow"
     accuracy: tuple[Budget, ...] = ()
 
     @property
@@ -84,6 +85,14 @@ class Checkpoint:
             how: Options of `r2flow.sampling.sample`: steps, method, batch_size, region, ...
         """
         return torch.cat([drawn.images for drawn in sample(self, num, seed, **how)])
+
+    def points(self, images: Tensor) -> list[np.ndarray]:
+        """The returns of each range image, (N, 4): x, y, z in metres and reflectance; see `ModelSpace.points`."""
+        return self.generator.space.points(images)
+
+    def save(self, path: str | Path) -> None:
+        """Write it as one file that `r2flow.load` reads; see `save_checkpoint`."""
+        save_checkpoint(self, path)
 
 
 def step_of(path: Path) -> int:

@@ -132,7 +132,7 @@ def _checked_arguments(arguments: list[str]) -> list[str]:
         raise InputError(f"{message}; see --help.")
 
     parser.error = refuse  # type: ignore[method-assign]  # its own prints all of the flags
-    overrides = parser.parse_args(arguments).overrides
+    overrides = parser.parse_intermixed_args(arguments).overrides  # flags may stand between them
     return [*(one for one in arguments if one not in overrides), *as_hydra_takes(overrides)]
 
 

@@ -10,7 +10,7 @@ import pytest
 import safetensors.torch
 import torch
 
-from r2flow.checkpoints import checkpoints_of, load_checkpoint, save_checkpoint, weights_hash
+from r2flow.checkpoints import Checkpoint, checkpoints_of, load_checkpoint, save_checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.generators import Sampler, build_generator
 from r2flow.stages import build_stage
@@ -278,3 +278,12 @@ print([name for name in heavy if name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_what_was_trained_without_a_run_is_saved_and_loaded(tmp_path: Path):
+    config = {key: CONFIG[key] for key in ("sensor", "encoding", "backbone")}
+    mine = Checkpoint(build_generator(config).eval(), config)
+    mine.save(tmp_path / "mine.safetensors")
+    loaded = load_checkpoint(tmp_path / "mine.safetensors")
+    torch.testing.assert_close(loaded.generator.state_dict(), mine.generator.state_dict(), rtol=0, atol=0)
+    assert loaded.config == config

@@ -198,6 +198,6 @@ def test_the_three_commands_of_the_docs_run_as_they_are_written(r2flow, shared: 
     assert (code, error) == (0, "")
     small = [part for part in TINY if not part.startswith(("data", "sensor."))]
     for given in (["data=prepared", f"data.root={prepared}"], ["data=folder", f"data.root={data}"]):
-        own = ["--config-dir", str(tmp_path / "conf"), *given, "sensor=mine", "data.batch_size=1"]
+        own = [*given, "--config-dir", str(tmp_path / "conf"), "sensor=mine", "data.batch_size=1"]
         done = in_process(tmp_path, [*own, *small, "trainer.max_steps=1", "trainer.fast_dev_run=true"])
         assert "WARNING" not in done.stderr

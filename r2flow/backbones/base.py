@@ -37,14 +37,16 @@ class Backbone(ExactBuffers):
 
     A subclass implements `velocity`; layers that see times are `ExactLinear`, because times stay float32 whatever
     the network computes in. That is enough. A class that can do more says so:
-        unit: What the rows and columns of the image, and of each part of it, are multiples of.
-        follow_rays: What it derives from the rays goes into buffers here, of fixed size, outside the state_dict and
-            always float32; called by its constructor and whenever `coords` is loaded.
-        takes_second_time: It can be built with `second_time=True`. It then has an `interval_embedding` of s - t,
-            made after all else, whose last layer is zero, and `velocity` is given s (see `condition`).
-        croppable: It can be evaluated on a part of its image. Layers that use the ring are `OnRing`.
-        learns_directions: It learns a vector for each direction, so that scans must not be turned in training.
-        tiny_options: Options that build it in milliseconds, for tests.
+
+    - unit: What the rows and columns of the image, and of each part of it, are multiples of.
+    - follow_rays: What it derives from the rays goes into buffers here, of fixed size, outside the state_dict and
+      always float32; called by its constructor and whenever `coords` is loaded.
+    - takes_second_time: It can be built with `second_time=True`. It then has an `interval_embedding` of s - t, made
+      after all else, whose last layer is zero, and `velocity` is given s (see `condition`).
+    - croppable: It can be evaluated on a part of its image. Layers that use the ring are `OnRing`.
+    - learns_directions: It learns a vector for each direction, so that scans must not be turned in training.
+    - tiny_options: Options that build it in milliseconds, for tests.
+
     A module in it whose multiply-accumulates are not those of its torch layers has a method `macs`
     (`r2flow.backbones.cost.Counted`).
 

@@ -1,6 +1,7 @@
 """What a backbone costs: parameters, and multiply-accumulates by the paper's rule (its table II, "FLOPs").
 
 For one image, the rule counts
+
 - a convolution, resampling filters included: taps x input channels for each output value;
 - a linear layer, the four of `nn.MultiheadAttention` included: inputs for each output value;
 - neighbourhood attention: 2 x window x channels for each token of the map padded by half a window on both

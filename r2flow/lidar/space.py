@@ -5,10 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding, build_encoding
+from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Convention, Sensor, build_sensor
 from r2flow.registry import check_options
 
@@ -57,6 +59,26 @@ class ModelSpace:
             x = x[:, : encoding.channels]
         image = encoding.decode(x)
         return image[:, 1:] if channels == "reflectance" else image
+
+    def points(self, images: Tensor) -> list[np.ndarray]:
+        """The returns of each range image as a point cloud, along rays through the middles of the pixels.
+
+        Args:
+            images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W); 0 where a ray was dropped.
+
+        Returns:
+            For each image x, y, z in metres (x ahead, y left, z up) and reflectance, (N, 4) float32; N differs from
+            scan to scan. Reflectance is 0 where it is not known.
+
+        Raises:
+            InputError: images of another shape.
+        """
+        if images.ndim != 4 or images.shape[1] not in (1, 2) or tuple(images.shape[2:]) != self.sensor.shape:
+            h, w = self.sensor.shape
+            raise InputError(f"range images have the shape (B, 2 or 1, {h}, {w}), found {tuple(images.shape)}.")
+        rays = self.sensor.rays()
+        clouds = (image_to_points(image, rays) for image in images.float().cpu().numpy())
+        return [np.column_stack(cloud) for cloud in clouds]
 
 
 def build_space(config: Mapping[str, Any]) -> ModelSpace:

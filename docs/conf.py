@@ -1,0 +1,49 @@
+"""The site: python -m sphinx -W -b html docs site"""
+
+import re
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import r2flow
+
+project, author, copyright = "r2flow", "The r2flow authors", "The r2flow authors"
+version = release = r2flow.__version__
+
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb"]
+html_theme = "furo"
+html_title = f"r2flow {version}"
+html_static_path = ["_static"]
+
+myst_heading_anchors = 4  # #links to headings, as GitHub makes them
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 120
+
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_class_signature = "mixed"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+python_maximum_signature_line_length = 100
+napoleon_use_ivar = True
+
+NAME = re.compile(r"[A-Za-z_][\w.]*")
+
+
+def from_markdown(_app, _what, _name, _object, _options, lines):
+    """Docstrings are Markdown, autodoc reads reStructuredText: `names` become links, the rest loses its stars."""
+
+    def part(text):
+        if text.startswith("`"):
+            return f":py:obj:{text}" if NAME.fullmatch(text.strip("`")) else f"`{text}`"
+        return re.sub(r"(?<![\s*])(_)(?!\w)|(?<=\S)([*|])|([*|])(?=\S)", r"\\\g<0>", text)
+
+    for i, line in enumerate(lines):
+        argument = re.match(r"\s*\*{1,2}\w+(?=:)", line)  # napoleon writes these itself
+        start = argument.end() if argument else 0
+        lines[i] = line[:start] + "".join(map(part, re.split(r"(`[^`]*`)", line[start:])))
+
+
+def setup(app):
+    app.connect("autodoc-process-docstring", from_markdown, priority=400)  # napoleon's is 500
