@@ -99,7 +99,9 @@ def drawn() -> str:
     for room, (_, _, _, subject) in ROOMS.items():
         parts += box(*corner(room), WIDE, room, subject, "#dbe9fb", "#4a7fc1")
     ground = "config, registry, noise, files, errors, ..."
-    parts += box(EDGE, height - EDGE - HIGH, width - 2 * EDGE, ground, "every room may import these", "#e9ebee", "#9aa3ad")
+    parts += box(
+        EDGE, height - EDGE - HIGH, width - 2 * EDGE, ground, "every room may import these", "#e9ebee", "#9aa3ad"
+    )
     return "\n".join([*parts, "</svg>", ""])
 
 

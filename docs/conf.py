@@ -1,10 +1,10 @@
-"""The site: python -m sphinx -W -b html docs site"""
+"""The site: python -m sphinx -W -b html docs site
+
+Sphinx with furo, and not mkdocs: its search works from a folder on disk, no page loads anything from elsewhere, and one
+tool holds links, docstrings and the executed notebook to account.
+"""
 
 import re
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 import r2flow
 
@@ -14,14 +14,16 @@ version = release = r2flow.__version__
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb"]
 html_theme = "furo"
 html_title = f"r2flow {version}"
-html_static_path = ["_static"]
+exclude_patterns = ["**.ipynb_checkpoints"]
 
 myst_heading_anchors = 4  # #links to headings, as GitHub makes them
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
-nb_execution_timeout = 120
+nb_execution_timeout = 300
+nb_output_stderr = "remove"
 
 autodoc_member_order = "bysource"
+autodoc_inherit_docstrings = False
 autodoc_typehints_format = "short"
 autodoc_class_signature = "mixed"
 autodoc_default_options = {"members": True, "show-inheritance": True}
@@ -45,5 +47,13 @@ def from_markdown(_app, _what, _name, _object, _options, lines):
         lines[i] = line[:start] + "".join(map(part, re.split(r"(`[^`]*`)", line[start:])))
 
 
+def without_bounds(_app, _what, _name, _object, _options, signature, returned):
+    """`Annotated[int, Bound(...)]` is an int to a reader."""
+    return signature and re.sub(
+        r"~?(?:typing\.)?Annotated\[(.+?), Bound\(.+? at 0x\w+>\)\]", r"\1", signature
+    ), returned
+
+
 def setup(app):
+    app.connect("autodoc-process-signature", without_bounds)
     app.connect("autodoc-process-docstring", from_markdown, priority=400)  # napoleon's is 500

@@ -1,7 +1,7 @@
 """Draws docs/images/idea.svg, a rectified flow of one number: python docs/idea.py
 
-The data are two groups of numbers, so that the velocity of the 1-RF and its paths are known by formula. Paths of a number
-cannot cross, and so the 2-RF is exactly straight.
+The data are two groups of numbers, so that the velocity of the 1-RF and its paths are known by formula. Paths of a
+number cannot cross, and so the 2-RF is exactly straight.
 """
 
 from pathlib import Path
