@@ -41,10 +41,21 @@ def from_markdown(_app, _what, _name, _object, _options, lines):
             return f":py:obj:{text}" if NAME.fullmatch(text.strip("`")) else f"`{text}`"
         return re.sub(r"(?<![\s*])(_)(?!\w)|(?<=\S)([*|])|([*|])(?=\S)", r"\\\g<0>", text)
 
-    for i, line in enumerate(lines):
+    written, above, code = [], "", False
+    for line in lines:
+        indented = line.startswith("    ")
+        if not line or (code and indented):
+            written.append(line)
+            continue
+        code = indented and bool(written) and not written[-1] and not above.startswith(" ")
+        above = line
+        if code:  # an indented block of its own
+            written += ["::", "", line]
+            continue
         argument = re.match(r"\s*\*{1,2}\w+(?=:)", line)  # napoleon writes these itself
         start = argument.end() if argument else 0
-        lines[i] = line[:start] + "".join(map(part, re.split(r"(`[^`]*`)", line[start:])))
+        written.append(line[:start] + "".join(map(part, re.split(r"(`[^`]*`)", line[start:]))))
+    lines[:] = written
 
 
 def without_bounds(_app, _what, _name, _object, _options, signature, returned):

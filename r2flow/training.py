@@ -1,9 +1,9 @@
 """The front door: what a config describes is built, and fitted.
 
-from r2flow.training import build, compose, fit
+    from r2flow.training import build, compose, fit
 
-result = fit(build(compose(["data=kitti_raw", "data.root=FOLDER", "trainer.max_steps=1000"])))
-result.metrics["val/loss"], result.checkpoint
+    result = fit(build(compose(["data=kitti_raw", "data.root=FOLDER", "trainer.max_steps=1000"])))
+    result.metrics["val/loss"], result.checkpoint
 """
 
 import logging
