@@ -65,7 +65,7 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
     """The coefficients of a sampler.
 
     Raises:
-        InputError: its number of evaluations depends on the scan.
+        InputError: its number of evaluations depends on the scan, or it needs more than the noise.
     """
     flow.check_sampler(sampler)
     count = flow.evaluations_of(sampler)
@@ -78,7 +78,11 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
     recorder, shadow = _Recorder(), copy(flow)
     shadow._modules = {**flow._modules, "backbone": recorder}
     basis = torch.eye(count + 1, dtype=torch.float64)[:, :1, None, None]  # x_0 is the first unit vector
-    x_1 = shadow.generate(basis, sampler=sampler).x
+    try:
+        x_1 = shadow.generate(basis, sampler=sampler).x
+    except InputError as error:  # it draws noise on the way
+        problem = str(error).rstrip(".")
+        raise InputError(f"{sampler.method} cannot be exported, {problem!r}: give another --solver.") from None
     times, states, second = zip(*recorder.calls, strict=True)
     rows = torch.stack([*states, x_1]).reshape(-1, count + 1)[:, : len(times) + 1]  # a `finish` takes fewer than count
     return Tableau([float(t) for t in times], [float(s) for s in second] if flow.second_time else None, rows)

@@ -4,7 +4,6 @@ import json
 import re
 import sys
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,35 +15,22 @@ from r2flow.backbones import BACKBONES
 from r2flow.checkpoints import Checkpoint, save_checkpoint
 from r2flow.errors import InputError
 from r2flow.export import NOTES, compare, export, tableau
-from r2flow.generators import Generated, RectifiedFlow, Sampler, build_generator
-from r2flow.lidar.space import build_space
+from r2flow.generators import Sampler, build_generator
 from r2flow.noise import Draws
 from tests.conftest import ROOT
 
 SHORT = Sampler("adams3", 3, grid="power:1.5", finish=1 / 32)
 
 
-class Jumps(RectifiedFlow):
-    """A flow map that jumps: x_s = x_t + (s - t) u(x_t, t, s)."""
-
-    second_time = True
-
-    def generate(self, noise, condition=None, *, sampler=None, draws=None, progress=None):
-        x = noise
-        for t, s in pairwise(torch.linspace(0, 1, sampler.steps + 1).to(x)):
-            x = x + (s - t) * self.backbone(t, x, s)
-        return Generated.after(x, sampler.steps)
-
-
-def flow(name: str, kind: type[RectifiedFlow] | None = None) -> Checkpoint:
+def flow(name: str, generator: str = "rectified_flow") -> Checkpoint:
     """A small flow whose weights are not zero."""
     config = {
         "sensor": {"name": "hdl64e", "rows": 16, "columns": 64},
         "encoding": {"format": "logscale", "reflectance": True},
         "backbone": {"name": name, **BACKBONES[name].tiny_options()},
+        "generator": {"name": generator},
     }
-    made = kind(build_space(config), config["backbone"]) if kind else build_generator(config)
-    made.eval().requires_grad_(False)
+    made = build_generator(config).eval().requires_grad_(False)
     for parameter in made.parameters():
         if not parameter.any():
             torch.nn.init.normal_(parameter, std=0.1)
@@ -80,10 +66,15 @@ def test_a_sampler_is_its_butcher_tableau(sampler, times, states):
 
 
 def test_jumps_have_two_times():
-    found = tableau(flow("efficient_unet", Jumps).generator, Sampler("euler", 2))
+    found = tableau(flow("efficient_unet", "flow_map").generator, Sampler("jump", 2))
     assert found.times == [0, 0.5]
     assert found.second == [0.5, 1]
     torch.testing.assert_close(found.states, torch.tensor([[1, 0, 0], [1, 0.5, 0], [1, 0.5, 0.5]]).double())
+
+
+def test_a_sampler_that_draws_noise_on_the_way_is_refused():
+    with pytest.raises(InputError, match="renoise cannot be exported, .*: give another --solver"):
+        tableau(flow("efficient_unet", "flow_map").generator, Sampler("renoise", 2))
 
 
 def snippets() -> list[str]:
@@ -194,7 +185,7 @@ def test_a_flow_map_goes_through_the_loop_and_the_page_s_program_runs(tmp_path, 
     pytest.importorskip("onnxscript")
     pytest.importorskip("onnxruntime")
     monkeypatch.chdir(tmp_path)
-    checkpoint, sampler = flow("efficient_unet", Jumps), Sampler("euler", 3)
+    checkpoint, sampler = flow("efficient_unet", "flow_map"), Sampler("jump", 3)
     apart = compare(checkpoint, export(checkpoint, "street.onnx", sampler), sampler)
     assert apart.metres < 1e-3
     assert apart.rays == 0
