@@ -14,6 +14,7 @@ PICTURE = Path(__file__).parent / "images" / "architecture.svg"
 ROOMS = {
     "cli": (0, 1, ("cli", "launch"), "verbs and processes"),
     "training": (1, 1, ("training", "chain", "composing"), "from a config to a run"),
+    "export": (1, 2, ("export", "onnx_graphs", "hub"), "a flow for other programs"),
     "callbacks": (2, 1, ("callbacks",), "when things happen in a run"),
     "reports": (3, 1, ("reports", "accuracy", "inversion"), "tables, pictures, pages"),
     "evaluation": (4, 0, ("evaluation",), "sets of scans compared"),
