@@ -16,6 +16,7 @@ from r2flow.metrics.store import FeatureStore
 
 Side = Literal["real", "generated"]
 SIDES: tuple[Side, Side] = ("real", "generated")
+Better = Literal["smaller", "larger"]
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,7 @@ class ScanMetric(Metric):
         resamples: Whether it has bootstrap intervals, which are made of kept rows.
         counts_empty: Whether a scan without a return is compared as well.
         of_equal_sets: The value of its figures for two equal sets; None where it depends on the sets.
+        better: Which way its figures are better; a distance's smaller ones are.
 
     Args:
         keep: Whether the rows are kept, for bootstrap intervals.
@@ -81,6 +83,7 @@ class ScanMetric(Metric):
     resamples: ClassVar[bool] = True
     counts_empty: ClassVar[bool] = False
     of_equal_sets: ClassVar[float | None] = 0.0
+    better: ClassVar[Better] = "smaller"
 
     def __init__(self, keep: bool = False, folder: str | Path | None = None, *, name: str | None = None) -> None:
         super().__init__()
