@@ -24,7 +24,7 @@ from r2flow.metrics.base import ScanMetric, Side
 from r2flow.metrics.bootstrap import bootstrap
 from r2flow.metrics.scans import Scans
 
-SENSOR = SENSORS["hdl64e"].resized(64, 1024)
+SENSOR = SENSORS["hdl64e"].resized(16, 256)
 NOISE, LOST = 0.1, 0.1  # metres; share of returns
 
 

@@ -23,7 +23,7 @@ def bootstrap(
     seed: int = 0,
     advance: Callable[[], None] | None = None,
 ) -> dict[str, tuple[float, float]]:
-    """Intervals of a metric's figures around what is expected of sets of this size, d +- t sigma.
+    """Intervals of a metric's figures for what is expected of sets of this size: d times or over exp(t sigma / d).
 
     Every scan's weight becomes 1 + a e, then 1 - a e, with random signs e that add up to 0: figures d_+ and d_-. Of a
     figure that is smooth in its scans, with a linear part of variance L and a part of pairs of scans of variance Q,
@@ -33,7 +33,7 @@ def bootstrap(
     so that sigma^2 = Var l - Var q estimates its variance, L + Q (Efron and Stein 1981). Scans drawn with repetition,
     Efron's bootstrap, spread it by L + 3 Q: near equal sets, where L vanishes, such intervals are 1.7 times too wide.
     Small weights, because sets with some scans left out or repeated have other distances, not only more widely spread
-    ones. Quantiles are Student's; no interval goes below 0 where the figure does not.
+    ones. t is Student's quantile. Where t sigma > d, the interval is d +- t sigma, cut off at 0.
 
     Weights act on the kept rows: nothing is copied and no network runs again.
 
@@ -96,4 +96,6 @@ def _interval(value: float, drawn: np.ndarray, level: float) -> tuple[float, flo
     paired = drawn.mean(0).var(ddof=1) / A**4
     sigma = math.sqrt(max(linear - paired, linear / 2))  # L + Q is at least half of L + 2 Q
     half = float(stdtrit(drawn.shape[1], (1 + level) / 2)) * sigma
+    if half < value:  # a distance spreads by factors: larger ones more than smaller ones
+        return value * math.exp(-half / value), value * math.exp(half / value)
     return max(value - half, min(value, 0.0)), value + half

@@ -127,7 +127,7 @@ def summary(flow: Paths) -> dict[str, Any]:
         "t_of_most": float(flow.t[mean.argmax()]),
         "first_tenth": _share(mean[flow.t < 0.1], mean),
         "last_tenth": _share(mean[flow.t >= 0.9], mean),
-        "ends_over_middle": ends / middle if middle > 0 else math.nan,  # the straighter end, the most bent tenth between
+        "ends_over_middle": ends / middle if middle > 0 else math.nan,
         "paths": len(flow.bends),
         "paths_share": len(flow.bends) / flow.elements,
         "paths_dropped": float(flow.dropped.mean()) if len(flow.dropped) else math.nan,

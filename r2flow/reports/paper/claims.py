@@ -14,7 +14,7 @@ from r2flow.errors import InputError
 from r2flow.metrics.base import Better
 from r2flow.reports.paper.printed import PAPER_KIND
 from r2flow.reports.tables import Row, shown
-from r2flow.reports.verdicts import HOLDS, UNKNOWN, ERROR, FAILS, all_above_0, any_above_0, interval
+from r2flow.reports.verdicts import FAILS, HOLDS, UNKNOWN, all_above_0, any_above_0, interval
 
 PRIMARY = ("frd", "frechet_embedded", "frechet_embedded_range", "jsd")  # what judges: the first that is measured
 CLOSE = 1.1  # a distance up to a tenth larger counts as comparable; the paper's own lie at 0.99 to 1.26
@@ -59,7 +59,7 @@ def primary_of(metrics: Sequence[str], asked: str | None = None) -> str:
     Raises:
         InputError: it is not measured.
     """
-    found = asked or next((name for name in PRIMARY if name in metrics), None)
+    found = asked or next((name for name in PRIMARY if name in metrics), "none")
     if found not in metrics:
         raise InputError(f"--primary must be one of {', '.join(metrics)}, which are measured; found {found!r}.")
     return found
@@ -151,9 +151,7 @@ def claims(
     ]  # fmt: skip
 
 
-def all_better(
-    rows: Sequence[Row], metrics: Mapping[str, Better], primary: str, *pairs: tuple[At, At]
-) -> Verdict:
+def all_better(rows: Sequence[Row], metrics: Mapping[str, Better], primary: str, *pairs: tuple[At, At]) -> Verdict:
     """Whether in every pair the first flow is better than the second, by the primary metric."""
     found = {f"{a} / {b}": compare(rows, a, b, primary, metrics[primary]) for a, b in pairs}
     said = "; ".join(one.said if len(pairs) == 1 else f"{name} {one.said}" for name, one in found.items())
