@@ -1,6 +1,6 @@
 """How often the 95 % intervals of `--bootstrap` hold the figure that is expected of sets of their size.
 
-    python benchmarks/intervals.py --scans simulated:31        # about 40 minutes on one core; --trials 100 for a look
+    python benchmarks/intervals.py --scans simulated:31        # about 15 minutes on one core; --trials 100 for a look
 
 A population is a pool of scans; sets are drawn from it with repetition, so that what is expected is known: the mean
 over the trials. Generated scans come from the same pool (equal: nearly all of a distance is due to the sets' size) or
@@ -74,9 +74,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scans", default="simulated:31")
     parser.add_argument("--pool", type=int, default=1000)
-    parser.add_argument("--sizes", default="50,200")
-    parser.add_argument("--trials", type=int, default=400)
-    parser.add_argument("--draws", type=int, default=100)
+    parser.add_argument("--sizes", default="50,100,200")
+    parser.add_argument("--trials", type=int, default=200)
+    parser.add_argument("--draws", type=int, default=60)
     parser.add_argument("--metrics", default="jsd,mmd,frechet_embedded,beams,drop_rate")
     options = parser.parse_args()
     names = options.metrics.split(",")

@@ -48,7 +48,7 @@ def bootstrap(
         advance: Called after every draw.
 
     Returns:
-        (low, high) of each figure that exists; none for a metric that cannot be resampled (`resamples`).
+        (low, high) of each figure that exists and can be resampled (`ScanMetric.resamples`, `resampled`, `fewest`).
 
     Raises:
         InputError: a metric that keeps no rows; fewer than four draws; a level outside (0, 1).
@@ -61,18 +61,18 @@ def bootstrap(
         raise InputError(f"an interval needs 4 draws and a level within (0, 1), found {draws} and {level}.")
     values = {name: value for name, value in metric.compute().items() if not np.isnan(value)}
     sizes = {side: len(metric.store(side)) for side in SIDES}
-    if not values or min(sizes.values()) < 2:
+    if not values or min(sizes.values()) < metric.fewest:
         return {}
-    found: dict[str, list[Tensor]] = {name: [] for name in values}
+    found: dict[str, list[Tensor]] = {}
     for start in range(0, draws // 2, AT_ONCE // 2):
         signs = range(start, min(start + AT_ONCE // 2, draws // 2))
         drawn = metric.resampled(_weights(sizes, signs, seed))
-        for name in values:
-            found[name].append(drawn[name].view(2, -1))
+        for name in values.keys() & drawn.keys():
+            found.setdefault(name, []).append(drawn[name].view(2, -1))
         for _ in range(2 * len(signs)):
             if advance:
                 advance()
-    return {name: _interval(values[name], torch.cat(parts, 1).numpy(), level) for name, parts in found.items()}
+    return {name: _interval(values[name], torch.cat(found[name], 1).numpy(), level) for name in values if name in found}
 
 
 def _weights(sizes: dict[Side, int], draws: range, seed: int) -> dict[Side, Tensor]:
