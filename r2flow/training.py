@@ -4,6 +4,8 @@
 
     result = fit(build(compose(["data=kitti_raw", "data.root=FOLDER", "trainer.max_steps=1000"])))
     result.metrics["val/loss"], result.checkpoint
+
+The same command again, and the same config, go on from the last checkpoint.
 """
 
 import logging
