@@ -64,8 +64,10 @@ class FrechetDistance(FeatureMetric):
     names = FIELD_NAMES
     settings: ClassVar[Mapping[str, Any]] = {"covariance": "unbiased, n - 1"}
 
-    def __init__(self, extractor: Extractor | str, keep: bool = False, folder: str | Path | None = None) -> None:
-        super().__init__(extractor, keep, folder)
+    def __init__(
+        self, extractor: Extractor | str, keep: bool = False, folder: str | Path | None = None, **options: Any
+    ) -> None:
+        super().__init__(extractor, keep, folder, **options)
         for side in SIDES:
             self.add_state(f"{side}_moments", no_moments(self.extractor.dim), dist_reduce_fx=merge_moments)
 
