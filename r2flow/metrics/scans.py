@@ -83,6 +83,8 @@ class Scans:
         """Points in metres of every pixel, (B, 3, H, W); the origin where there is no return."""
         if self._measured is not None:
             return self._measured.to(self.images) * self.returned
+        if self.rays == "reference":
+            return on_bin_corners(self.images[:, :1], self.sensor)
         return unproject(self.images[:, :1], self.sensor.rays(self.rays).to(self.images.device))
 
     @cached_property
@@ -97,6 +99,17 @@ class Scans:
         for i, points in enumerate(self.points):
             counts[i] = birds_eye_histogram(points.cpu().numpy())
         return counts
+
+
+def on_bin_corners(r: Tensor, sensor: Sensor) -> Tensor:
+    """Points (B, 3, H, W) on the rays through the upper left corners of the bins, of ranges (B, 1, H, W).
+
+    Four of these columns run along the axes, where cells of the bird's-eye view meet: the last bit of float32 decides,
+    and so it is computed here in the order of the published code, degrees first.
+    """
+    degrees = np.meshgrid(sensor.row_edges[:-1], 180 - 360 * np.arange(sensor.columns) / sensor.columns, indexing="ij")
+    e, a = (torch.from_numpy(one).float().deg2rad().to(r.device) for one in degrees)
+    return torch.cat([r * e.cos() * a.cos(), r * e.cos() * a.sin(), r * e.sin()], 1)
 
 
 def check_values(images: Tensor, names: Sequence[object] | None = None) -> None:
