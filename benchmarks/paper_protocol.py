@@ -136,7 +136,7 @@ def main() -> None:
             metric.update(scans, real=side)
         mine |= metric.compute()
         metric.reset()
-    for name, value in (("jsd", jsd), ("mmd", mmd)):
+    for name, value in (("jsd", float(jsd)), ("mmd", mmd)):
         print(f"{name}: published {value:.9g}, ours {mine[name]:.9g}, {abs(mine[name] / value - 1):.2g} relative")
     exact = [count.double().sum(0).numpy() for count in counts]
     print(f"jsd of the published histograms in float64: {js_distance(*exact):.9g}")

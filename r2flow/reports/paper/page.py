@@ -107,7 +107,7 @@ def paper_page(
     runs = [{"label": one.label, "role": one.role, "family": one.family, "seed": one.seed} for one in known.values()]
     more = {
         "claims": [vars(claim) for claim in found], "architectures": measured.architectures, "curvature": curved,
-        "runs": runs, "protocol": measured.protocol.describe(),
+        "runs": runs, "protocol": [measured.protocol.describe()],
     }  # fmt: skip
     title, seeds = "The paper's tables and figures", {"sampled scans": SEED}
     return Page("paper", title, text, rows, figures, command, seeds, device, more)
