@@ -315,26 +315,21 @@ def neighbours(
     held_out: HeldOutOptions,
     how: ReadingOptions,
     work: WorkOptions,
-    by: Annotated[
-        str | None, typer.Option(help="embedded (features) or pixels (log-range); embedded if left out.")
-    ] = None,
-    pairs: Annotated[int, typer.Option(min=1, help="Nearest pairs to draw, and half as many of the farthest.")] = 4,
+    pairs: Annotated[int, typer.Option(min=1, help="Nearest pairs to draw, of whole scans and of parts.")] = 4,
     split: Annotated[str | None, typer.Option("--split", help="Part of TRAIN's standard split.")] = None,
 ) -> None:
-    """Generated scans beside their nearest training scans, the most suspicious first: is anything memorised?"""
+    """Generated scans beside their nearest training scans, turned, mirrored or in parts: is anything memorised?"""
     from r2flow.cli.output import command, finish
-    from r2flow.reports.neighbours import find_neighbours, neighbours_page, representation_of
+    from r2flow.reports.neighbours import find_neighbours, neighbours_page
     from r2flow.reports.pages import prepare_folder
 
     where = choose_device(work.device)
-    reading = reading_of([train, generated, held_out.real], [], how)
-    reading = replace(reading, reflectance=False) if by == "pixels" else reading
+    reading = replace(reading_of([train, generated, held_out.real], [], how), reflectance=False)
     trained = _open(train, reading, split, None)
     judged = _open(generated, reading, None, held_out.num)
     held = None if held_out.real is None else _open(held_out.real, reading, held_out.real_split, held_out.num)
-    what = representation_of(by, [s for s in (trained, judged, held) if s is not None], where)
     prepare_folder(out)
-    found = find_neighbours(judged, trained, held, what, work_of(work.batch_size, work.workers))
+    found = find_neighbours(judged, trained, held, work_of(work.batch_size, work.workers), where)
     finish(neighbours_page(found, pairs, command(), where), out)
 
 

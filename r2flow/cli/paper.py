@@ -48,6 +48,9 @@ def paper(
     protocol: Annotated[
         str | None, typer.Option(help="paper or r2flow; the paper's where the real scans allow it if left out.")
     ] = None,
+    primary: Annotated[
+        str | None, typer.Option(help="The metric that judges the claims; frd, else frechet_embedded if left out.")
+    ] = None,
 ) -> None:
     """The paper's tables I and II and figures 3, 5, 6, 7, 8 from runs, its printed numbers and claims beside ours.
 
@@ -57,6 +60,7 @@ def paper(
     from r2flow.cli.output import command, finish, numbers
     from r2flow.evaluation.protocols import named_rules
     from r2flow.reports.pages import prepare_folder
+    from r2flow.reports.paper.claims import primary_of
     from r2flow.reports.paper.report import Budget, report
     from r2flow.reports.paper.subjects import find_subjects
 
@@ -68,10 +72,11 @@ def paper(
     truth = None if real is None else real_set(real, split, subjects[0].run, protocol)
     reflectance = bool(subjects[0].config["encoding"]["reflectance"])
     chosen, missing = build_metrics(metrics.split(",") if metrics else None, amount.bootstrap > 0, reflectance, where)
+    judging = primary_of(list(chosen), primary)
     prepare_folder(out)
     print(f"{len(subjects)} runs: {', '.join(f'{one.label} ({one.role})' for one in subjects)}")
     doing = work_of(work.batch_size, work.workers)
-    page = report(subjects, out, chosen, missing, amount, doing, truth, where, command(), rules)
+    page = report(subjects, out, chosen, judging, missing, amount, doing, truth, where, command(), rules)
     finish(page, out, page.text[2:4])
 
 

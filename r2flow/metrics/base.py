@@ -18,6 +18,7 @@ from r2flow.metrics.store import FeatureStore
 
 Side = Literal["real", "generated"]
 SIDES: tuple[Side, Side] = ("real", "generated")
+Better = Literal["smaller", "larger"]
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,10 @@ class ScanMetric(Metric):
             there is some.
         keeping: Whether the rows are kept: "on request" (`keep=True`), "always" or "never".
         resamples: Whether it has bootstrap intervals, which are made of kept rows.
+        fewest: Scans of each set that an interval takes.
         counts_empty: Whether a scan without a return is compared as well.
         of_equal_sets: The value of its figures for two equal sets; None where it depends on the sets.
+        better: Which way its figures are better; a distance's smaller ones are.
 
     Args:
         keep: Whether the rows are kept, for bootstrap intervals.
@@ -86,8 +89,10 @@ class ScanMetric(Metric):
     uses_reflectance: ClassVar[bool] = False
     keeping: ClassVar[Literal["on request", "always", "never"]] = "on request"
     resamples: ClassVar[bool] = True
+    fewest: ClassVar[int] = 2
     counts_empty: ClassVar[bool] = False
     of_equal_sets: ClassVar[float | None] = 0.0
+    better: ClassVar[Better] = "smaller"
 
     def __init__(
         self,
@@ -343,7 +348,8 @@ class ScanMetric(Metric):
         return self
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        """Figures of resampled sets, (R) for each name; `weights` says how often each kept scan was drawn, (R, N)."""
+        """Figures of resampled sets, (R) for each name that has intervals; `weights` is how much each kept scan counts,
+        (R, N)."""
         raise NotImplementedError
 
     def _left_out(self) -> list[str]:

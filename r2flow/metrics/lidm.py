@@ -81,6 +81,7 @@ class MMDLiDM(ScanMetric):
         "cell": COARSE, "metres": [-EXTENT, EXTENT], "distance": "Chamfer, squared, halved"
     }  # fmt: skip
     keeping = "always"
+    resamples = False  # which scan is nearest is no smooth function of the scans
 
     def rows(self, scans: Scans) -> Tensor:
         side = round(2 * EXTENT / COARSE)
@@ -94,13 +95,6 @@ class MMDLiDM(ScanMetric):
         if not all(self.count(side) for side in SIDES):
             return {"mmd_lidm": float("nan")}, ["mmd_lidm does not exist where a set has no return."]
         return {"mmd_lidm": float(self._nearest().mean())}, []
-
-    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        """Means over the resampled real scans.
-
-        The generated scans stay: one that is drawn twice is no nearer, so that resampled sets would only lack some.
-        """
-        return {"mmd_lidm": weights["real"] @ self._nearest() / weights["real"].sum(1)}
 
     def _nearest(self) -> Tensor:
         """Chamfer distance of every real scan to the nearest generated one, (N)."""

@@ -55,6 +55,7 @@ def report(
     subjects: Sequence[PaperRun],
     out: Path,
     metrics: Mapping[str, ScanMetric],
+    primary: str,
     missing: Mapping[str, str],
     budget: Budget,
     work: Work,
@@ -67,7 +68,8 @@ def report(
 
     Args:
         subjects: From `find_subjects`.
-        metrics: The distances by name, `jsd` among them.
+        metrics: By name, `jsd` among them.
+        primary: The one that judges the paper's claims.
         missing: The paper's metrics that are not measured, and why.
         real: The scans to compare with; those that the first 1-RF held out if left out.
         protocol: The paper's where the real scans allow it, else ours, if left out.
@@ -109,7 +111,8 @@ def report(
         if subject is first and budget.tolerance is not None and len(real) > 1:
             measured.between = _interpolate(flow, ends, Sampler("dopri5", tolerance=budget.tolerance), work)
         del flow
-    return paper_page(measured, list(metrics), missing, budget.num, command, device)
+    better = {name: metric.better for name, metric in metrics.items()}
+    return paper_page(measured, better, primary, missing, budget.num, command, device)
 
 
 def not_as_printed(real: ScanSet) -> str | None:

@@ -7,12 +7,11 @@ from typing import Any
 
 from r2flow.evaluation.protocols import PAPER, WORDS, Rules
 from r2flow.reports.paper.claims import Claim
-from r2flow.reports.paper.printed import COLUMNS, TABLE_I, TABLE_II, Architecture
+from r2flow.reports.paper.printed import COLUMNS, PAPER_KIND, TABLE_I, TABLE_II, Architecture
 from r2flow.reports.tables import Row, shown, table
 
 # The paper's settings.
 SCANS, REAL, IMAGES, SIZE = 10_000, 81_106, 2_560_000, (64, 1024)
-PAPER_KIND = "hdit with APE"  # the network of its chains
 
 
 def over_seeds(rows: Sequence[Row], metrics: Sequence[str]) -> list[dict[str, Any]]:
