@@ -46,8 +46,8 @@ class JSDLiDM(ScanMetric):
     keeping = "never"
     resamples = False
 
-    def __init__(self, keep: bool = False, folder: str | Path | None = None) -> None:
-        super().__init__(keep, folder)
+    def __init__(self, keep: bool = False, folder: str | Path | None = None, **options: Any) -> None:
+        super().__init__(keep, folder, **options)
         cells = round(2 * EXTENT / FINE) ** 2
         for side in SIDES:
             self.add_state(f"{side}_cells", torch.zeros(cells, dtype=torch.int32), dist_reduce_fx="sum")

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from r2flow.evaluation.protocols import PAPER, Rules
 from r2flow.evaluation.sets import ScanSet
 from r2flow.inversion import Interpolation
 from r2flow.metrics.base import Better
@@ -51,6 +52,8 @@ class PaperResults:
     paths: dict[str, Paths] = field(default_factory=dict)
     architectures: list[dict[str, Any]] = field(default_factory=list)
     between: Interpolation | None = None
+    protocol: Rules = PAPER
+    why: str | None = None  # another one than the paper's
 
 
 def paper_page(
@@ -78,11 +81,12 @@ def paper_page(
         "; ".join(f"{name} ({which})" if which else name for name, which in scans.items()),
         len(measured.real), num, measured.real.sensor.shape, [row["parameters"] for row in measured.architectures],
         [int(config["trainer"]["max_steps"]) * int(config["data"]["batch_size"]) for config in roots], missing,
+        measured.protocol, measured.why,
     )  # fmt: skip
     side_by_side = beside(rows, list(metrics))
     text = [
         f"{len(measured.subjects)} runs; {num} scans of each flow and number of Euler steps, all from the same noise, "
-        f"against {len(measured.real)} scans ({measured.real.label}).",
+        f"against {len(measured.real)} scans ({measured.real.label}), under the protocol `{measured.protocol.name}`.",
         "## The paper's claims, judged here",
         tally(found),
         claims_table(found),
@@ -113,7 +117,7 @@ def paper_page(
     runs = [{"label": one.label, "role": one.role, "family": one.family, "seed": one.seed} for one in known.values()]
     more = {
         "claims": [vars(claim) for claim in found], "architectures": measured.architectures, "curvature": curved,
-        "runs": runs,
+        "runs": runs, "protocol": [measured.protocol.describe()],
     }  # fmt: skip
     title, seeds = "The paper's tables and figures", {"sampled scans": SEED}
     return Page("paper", title, text, rows, figures, command, seeds, device, more)
