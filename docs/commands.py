@@ -20,7 +20,6 @@ from r2flow.errors import InputError
 from r2flow.plugins import take_plugins
 
 DOCS = Path(__file__).resolve().parent
-TRAIN = ("python train.py", "train.py", "r2flow train")
 BLOCK = re.compile(r"^```sh\n(.*?)^```", re.M | re.S)
 
 
@@ -31,7 +30,7 @@ def commands(text: str) -> Iterator[list[str]]:
             for one in re.split(r"&&|\|", line):
                 if "$" in one or "NAME=" in one:  # the shell's, or a placeholder's
                     continue
-                found = re.search(r"(?:^|\s)(r2flow|-m r2flow\.cli|(?:python )?train\.py)(?:\s|$)", one)
+                found = re.search(r"(^\s*r2flow|-m r2flow\.cli|train\.py)(?:\s|$)", one)
                 if found:
                     verb = [] if "r2flow" in found[1] else ["train"]
                     yield verb + shlex.split(one[found.end() :], comments=True)
