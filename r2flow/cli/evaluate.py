@@ -181,6 +181,7 @@ def _compare(job: Job, judged: "ScanSet | None", measured: MeasureOptions, outpu
     from r2flow.evaluation.measuring import Gathered, gather_real, measure
     from r2flow.reports.evaluation import Comparison, evaluation_page, print_comparisons, write_json
     from r2flow.reports.pages import write_page
+    from r2flow.reports.view.panels import write_sets
 
     pairs = {} if judged is None else {"generated": (job.truth, judged)}
     if measured.floor:
@@ -208,6 +209,8 @@ def _compare(job: Job, judged: "ScanSet | None", measured: MeasureOptions, outpu
     if output.out is not None:
         for path in write_page(page, output.out):
             print(path)
+        sets = {"real": job.truth} if judged is None else {"real": job.truth, "generated": judged}
+        print(write_sets(output.out / "evaluation.html", sets, title="Generated scans against real ones"))
 
 
 def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOptions) -> "tuple[Drawing, list[int]]":
