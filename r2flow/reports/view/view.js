@@ -606,7 +606,7 @@ function followPoints(scan) {
   };
   box.addEventListener("pointerup", released);
   box.addEventListener("pointercancel", (event) => held.delete(event.pointerId));
-  box.addEventListener("pointerleave", () => !held.size && pick(scan, null));
+  box.addEventListener("pointerleave", (event) => event.pointerType !== "touch" && !held.size && pick(scan, null));
   box.addEventListener("contextmenu", (event) => event.preventDefault());
   box.addEventListener("wheel", (event) => {
     event.preventDefault();
