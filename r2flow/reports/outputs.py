@@ -20,7 +20,7 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.region import Region
 from r2flow.lidar.scan_files import write_points
 from r2flow.progress import Bar, track
-from r2flow.reports.view import write_page
+from r2flow.reports.view import most_images, write_page
 from r2flow.sampling import batches, sample
 
 log = logging.getLogger(__name__)
@@ -99,9 +99,9 @@ def write_samples(
     elif parts:
         seen = rays if region is None else region.crop(rays)
         draw_pages(parts, seen, out)
-        write_page(
-            out / "samples.html", parts, seen, [f"sample {number}" for number in range(len(parts))], title=out.name
-        )
+        parts = parts[: most_images(seen.shape)]
+        captions = [f"sample {number}" for number in range(len(parts))]
+        write_page(out / "samples.html", parts, seen, captions, title=out.name)
     return shown
 
 

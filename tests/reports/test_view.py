@@ -145,8 +145,8 @@ def test_the_page_allows_its_own_script_alone_and_loads_nothing():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (lambda: page([], RAYS), "found 0"),
-        (lambda: page([np.zeros((MOST + 1, 1, 8, 32))], RAYS), f"found {MOST + 1}; take fewer"),
+        (lambda: page([], RAYS), "found 0 images"),
+        (lambda: page([np.broadcast_to(np.float32(0), (MOST // 256 + 1, 1, 8, 32))], RAYS), "found 65537 images"),
         (lambda: page(images(2), [RAYS]), "1 rays"),
         (lambda: page(images(2), RAYS, ["one"]), "1 captions"),
         (lambda: page(images(1), SENSORS["hdl64e"].rays()), "need rays of as many pixels"),

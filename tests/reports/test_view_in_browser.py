@@ -56,8 +56,8 @@ def opened(chromium, tmp_path):
         shown.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
         shown.on("request", lambda request: requests.append(request.url))
         shown.on("dialog", lambda dialog: errors.append(f"dialog {dialog.message}"))
-        shown.goto(path.as_uri())
-        shown.wait_for_selector("html[data-ready]", state="attached", timeout=60_000)
+        shown.goto(path.as_uri(), timeout=120_000)
+        shown.wait_for_selector("html[data-ready]", state="attached", timeout=120_000)
         settle(shown)
         return shown
 

@@ -25,7 +25,7 @@ from r2flow.errors import InputError, printable
 from r2flow.files import atomic_write
 from r2flow.reports.pictures import HEIGHTS, RANGES, class_colours, colour_table
 
-MOST = 256  # images of a page, frames counted: 33 MB at 64 x 1024
+MOST = 256 * 64 * 1024  # pixels of a page, all images together: about 33 MB
 STEP = 0.004  # metres of a range code: uint16 reaches 262 m, and a range is off by 2 mm at most
 CODES = 2**16
 
@@ -58,12 +58,15 @@ def page(
         The page, about 50 kB and 130 kB for each image of 64 x 1024. Texts in it are never read as HTML.
 
     Raises:
-        InputError: no scan, more than `MOST` images, or rays, captions or labels that do not fit them.
+        InputError: no scan, more than `MOST` pixels, or rays, captions or labels that do not fit them.
     """
     stacks = [_frames_of(one) for one in images]
-    count = sum(map(len, stacks))
-    if not 0 < count <= MOST:
-        raise InputError(f"a page shows 1 to {MOST} images, found {count}; take fewer scans or frames (--num).")
+    count, pixels = sum(map(len, stacks)), sum(stack[:, 0].size for stack in stacks)
+    if not 0 < pixels <= MOST:
+        raise InputError(
+            f"a page holds 1 to 256 images of 64 x 1024 (33 MB), or as many pixels, {MOST:,}; found {count} images with "
+            f"{pixels:,}. Take fewer scans or frames (--num)."
+        )
     shared = isinstance(rays, np.ndarray | Tensor) and rays.ndim == 3
     each_rays = [np.asarray(one, dtype=np.float64) for one in ([rays] * len(stacks) if shared else rays)]
     each_labels = [None if one is None else np.asarray(one) for one in labels or [None] * len(stacks)]
@@ -99,6 +102,11 @@ def page(
         "shown": {"reflectance": any(s["reflectance"] for s in scans), "label": any(s["labels"] for s in scans)},
     }
     return _filled(contents, title)
+
+
+def most_images(shape: Sequence[int]) -> int:
+    """How many images of (..., H, W) a page holds."""
+    return MOST // int(np.prod(shape[-2:]))
 
 
 def write_page(path: str | Path, *args: Any, **options: Any) -> Path:

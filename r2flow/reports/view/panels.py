@@ -135,6 +135,8 @@ def write_sets(path: str | Path, sets: Mapping[str, ScanSet], num: int = 4, titl
     panels = []
     for name, scans in sets.items():
         some = scans.spread(num)
+        if not len(some):
+            continue
         images = some.source.batch(range(len(some))).nan_to_num(0.0).numpy()
         panels.append(Panel(f"{name}: {scans.label}", images, scans.sensor.rays()))
     return write_panels(path, panels, title=title)

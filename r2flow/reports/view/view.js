@@ -305,11 +305,16 @@ function redraw() {
   asked = true;
 }
 
-/** After a movement of the camera; the picture is drawn once more when it rests. */
+/** After a movement of the camera. */
 function moved() {
   moving = true;
   clearTimeout(resting);
-  resting = setTimeout(() => { moving = false; redraw(); }, 250);
+  redraw();
+}
+
+/** The camera rests: the picture is drawn once more, whole. */
+function rest() {
+  moving = false;
   redraw();
 }
 
@@ -326,6 +331,8 @@ function draw(now) {
   if (late < 3) late = moving && now - last > SLOW ? late + 1 : 0;
   last = moving ? now : Infinity;
   const coarse = moving && late === 3;
+  clearTimeout(resting);
+  if (moving) resting = setTimeout(rest, 250);
   const ratio = Math.min(devicePixelRatio, 2);
   const [width, height] = [tiles.clientWidth, tiles.clientHeight].map((length) => Math.round(length * ratio));
   if (!width || !height) return;
