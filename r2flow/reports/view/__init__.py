@@ -64,7 +64,7 @@ def page(
     count, pixels = sum(map(len, stacks)), sum(stack[:, 0].size for stack in stacks)
     if not 0 < pixels <= MOST:
         raise InputError(
-            f"a page holds 1 to 256 images of 64 x 1024 (33 MB), or as many pixels, {MOST:,}; found {count} images with "
+            f"a page holds 1 to 256 images of 64 x 1024 (33 MB), or {MOST:,} pixels; found {count} images with "
             f"{pixels:,}. Take fewer scans or frames (--num)."
         )
     shared = isinstance(rays, np.ndarray | Tensor) and rays.ndim == 3
