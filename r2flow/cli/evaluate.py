@@ -227,6 +227,7 @@ def _compare(job: Job, judged: "dict[str, ScanSet]", measured: MeasureOptions, o
     from r2flow.evaluation.measuring import Gathered, gather_real, measure
     from r2flow.reports.evaluation import Comparison, Kind, evaluation_page, print_comparisons, write_json
     from r2flow.reports.pages import write_page
+    from r2flow.reports.view.panels import write_sets
 
     kinds: dict[Kind, dict[str, tuple[ScanSet, ScanSet]]]
     kinds = {"judged": {name: (job.truth, one) for name, one in judged.items()}}
@@ -261,6 +262,9 @@ def _compare(job: Job, judged: "dict[str, ScanSet]", measured: MeasureOptions, o
     if output.out is not None:
         for path in write_page(page, output.out):
             print(path)
+        print(
+            write_sets(output.out / "evaluation.html", {"real": job.truth, **judged}, title="Generated and real scans")
+        )
 
 
 def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOptions) -> "tuple[Drawing, list[int]]":
