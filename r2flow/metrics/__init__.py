@@ -35,7 +35,9 @@ def _lazily(where: str, *given: Any) -> Callable[..., ScanMetric]:
 METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     "metric",
     jsd=_lazily("jsd:JSD"),
+    jsd_extrapolated=_lazily("jsd:JSDExtrapolated"),
     mmd=_lazily("mmd:MMD"),
+    mmd_unbiased=_lazily("mmd:MMDUnbiased"),
     jsd_lidm=_lazily("lidm:JSDLiDM"),
     mmd_lidm=_lazily("lidm:MMDLiDM"),
     beams=_lazily("beams:BeamHistograms"),
