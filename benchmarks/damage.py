@@ -304,7 +304,9 @@ SHARES = (0.1, 0.3, 1.0)
 KINDS: Mapping[str, Kind] = {
     # ranges
     "noise of range": Kind(bent(lambda r, s, g: r + s * normal(g, r.shape)), (0.03, 0.1, 0.3), "metres"),
-    "noise that grows with range": Kind(bent(lambda r, s, g: r * (1 + s * normal(g, r.shape))), (0.003, 0.01, 0.03), "of range"),
+    "noise that grows with range": Kind(
+        bent(lambda r, s, g: r * (1 + s * normal(g, r.shape))), (0.003, 0.01, 0.03), "of range"
+    ),
     "offset of each beam": Kind(bent(lambda r, s, g: r + s * beam(g, r)), (0.03, 0.1, 0.3), "metres"),
     "gain of each beam": Kind(bent(lambda r, s, g: r * (1 + s * beam(g, r))), (0.003, 0.01, 0.03), "of range"),
     "range in steps": Kind(bent(lambda r, s, g: np.rint(r / s) * s), (0.1, 0.3, 1.0), "metres"),
@@ -320,7 +322,9 @@ KINDS: Mapping[str, Kind] = {
     "sharpened": Kind(bent(sharpened), SHARES, "of what blur takes"),
     "checkerboard": Kind(bent(lambda r, s, g: r + s * checkers(r)), (0.03, 0.1, 0.3), "metres"),
     "noise of patches": Kind(bent(lambda r, s, g: r + s * patches(g, r)), (0.03, 0.1, 0.3), "metres"),
-    "ripple of 8 columns": Kind(bent(lambda r, s, g: r * (1 + s * np.sin(azimuths(r) * r.shape[-1] / 8))), (0.003, 0.01, 0.03), "of range"),
+    "ripple of 8 columns": Kind(
+        bent(lambda r, s, g: r * (1 + s * np.sin(azimuths(r) * r.shape[-1] / 8))), (0.003, 0.01, 0.03), "of range"
+    ),
     "longer ahead": Kind(bent(lambda r, s, g: r * (1 - s * np.cos(azimuths(r)))), (0.02, 0.06, 0.2), "of range"),
     "tilt": Kind(tilted, (1, 2, 4), "rows"),
     # returns
@@ -360,8 +364,12 @@ KINDS: Mapping[str, Kind] = {
     "reflectance in steps": Kind(relit(lambda q, s, g: np.rint(q * s) / s), (32, 16, 6), "steps"),
     "reflectance of each beam": Kind(relit(lambda q, s, g: q * np.exp(s * beam(g, q))), (0.05, 0.15, 0.4), "log-gain"),
     "reflectance blurred": Kind(lambda x, s, g: relight(x, s), (0.5, 1.0, 2.0), "pixels"),
-    "reflectance of another scan": Kind(lambda x, s, g: some(x, s, g, reflecting(x.copy(), np.roll(x[:, 1], 1, 0))), SHARES, "of scans"),
-    "reflectance faded to its mean": Kind(relit(lambda q, s, g: q + s * (q.mean((1, 2), keepdims=True) - q)), SHARES, "of the mean"),
+    "reflectance of another scan": Kind(
+        lambda x, s, g: some(x, s, g, reflecting(x.copy(), np.roll(x[:, 1], 1, 0))), SHARES, "of scans"
+    ),
+    "reflectance faded to its mean": Kind(
+        relit(lambda q, s, g: q + s * (q.mean((1, 2), keepdims=True) - q)), SHARES, "of the mean"
+    ),
     "reflectance swapped in rows": Kind(swapped_reflectance, (0.05, 0.2, 1.0), "of pixels"),
 }  # fmt: skip
 CHOOSING, HIDDEN = tuple(KINDS)[::2], tuple(KINDS)[1::2]

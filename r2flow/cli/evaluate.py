@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-EMBEDDED = "frechet_embedded"
-DEFAULT = ("jsd", "mmd", EMBEDDED)
 SAMPLED = 1000  # scans of a flow
 
 
@@ -38,7 +36,7 @@ class MeasureOptions:
 
     metrics: Annotated[
         str | None,
-        typer.Option(help="Names, separated by commas; jsd,mmd,frechet_embedded (or _range of it) if left out."),
+        typer.Option(help="Names, separated by commas; KID and Frechet of hand-made features, JSD, MMD if left out."),
     ] = None
     floor: Annotated[bool, typer.Option("--floor", help="Real against real beside it: halves, and two drives.")] = False
     bootstrap: Annotated[int, typer.Option(min=0, help="Resamples for 95 % intervals; 0 for none.")] = 0
@@ -359,10 +357,12 @@ def _build(names: Sequence[str], bootstrap: int, place: "Process") -> "dict[str,
 
 def _build_default(reflectance: bool, bootstrap: int, place: "Process") -> "dict[str, ScanMetric]":
     """The default metrics; a warning says which of them cannot be computed here."""
+    from r2flow.metrics import default_metrics
+
     built: dict[str, ScanMetric] = {}
-    for name in DEFAULT:
+    for name in default_metrics(reflectance):
         try:
-            built |= _build([name if reflectance or name != EMBEDDED else f"{EMBEDDED}_range"], bootstrap, place)
+            built |= _build([name], bootstrap, place)
         except InputError as error:
             log.warning("%s is left out: %s", name, error)
     return built

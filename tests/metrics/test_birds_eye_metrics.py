@@ -47,6 +47,7 @@ def test_mmd_is_the_mean_over_all_pairs_in_blocks_of_any_size(monkeypatch):
         return np.mean([math.exp(-2 * ((x - y) ** 2).sum()) for x, y in product(a, b)])  # 1 / (2 sigma^2) = 2
 
     expected = mean(p[:10], p[:10]) + mean(p[10:], p[10:]) - 2 * mean(p[:10], p[10:])
+
     def others(a):
         return np.mean([math.exp(-2 * ((x - y) ** 2).sum()) for x, y in permutations(a, 2)])
 

@@ -218,7 +218,9 @@ class Handcrafted(Extractor):
         """(B, D), float32, D = `dim`; a row of NaN for a scan without a single return."""
         h, w = scans.sensor.shape
         parts = scans.images.split(max(PIXELS // (h * w), 1))
-        rows = torch.cat([self._features(part) for part in parts]) if len(scans) else scans.images.new_zeros(0, self.dim)
+        rows = (
+            torch.cat([self._features(part) for part in parts]) if len(scans) else scans.images.new_zeros(0, self.dim)
+        )
         return nan_where_empty(rows, scans)
 
     def _features(self, images: Tensor) -> Tensor:
@@ -268,7 +270,7 @@ def _cells(total: Tensor, count: Tensor, cells: int, rays: int) -> tuple[Tensor,
 
 
 def _unevenness(total: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-    """|x(h - 1) - 2 x(h) + x(h + 1)| of the rows' means x, as `_cells`; a row counts where it and both others have one."""
+    """|x(h - 1) - 2 x(h) + x(h + 1)| of the rows' means x, as `_cells`; of rows where all three have one."""
     mean, there = total / count.clamp(min=1), (count > 0).to(total)
     known = F.pad(there[:, 2:] * there[:, 1:-1] * there[:, :-2], (1, 1))
     apart = F.pad((mean[:, 2:] - 2 * mean[:, 1:-1] + mean[:, :-2]).abs(), (1, 1))
