@@ -8,7 +8,7 @@ import torch
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
 from r2flow.flow.solvers import SOLVERS, FixedStep, check_method, fixed_step
-from r2flow.generators import Budget, Sampler, as_flow, levels
+from r2flow.generators import Budget, FlowMap, Sampler, as_flow, levels
 from r2flow.generators.base import Progress
 from r2flow.inversion import metres_apart, rms
 from r2flow.noise import Draws
@@ -33,10 +33,15 @@ def calibrate(
         progress: Called after every evaluation; there are about `evaluations_of_calibration`.
 
     Raises:
-        InputError: another method, fewer than one step, or a flow that cannot be solved.
+        InputError: another method, fewer than one step, a flow that has learned its steps, or that cannot be solved.
     """
     check_predictor_corrector(method)
     flow = as_flow(checkpoint.generator, "a time grid")
+    if flow.sampler.fixed or isinstance(flow, FlowMap):
+        raise InputError(
+            f"{checkpoint.path} is drawn by {flow.sampler.method} in steps that it has learned: there is no time grid "
+            "to find."
+        )
     x_0 = Draws(0, range(num), "validation").start(flow.noise_shape).to(flow.device)
     exact = flow.solve(x_0.double(), sampler=EXACT, progress=progress)
     if not exact.converged.all():

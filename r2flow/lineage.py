@@ -66,7 +66,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     """
     config = {key: dict(value) if isinstance(value, Mapping) else value for key, value in config.items()}
     if parent is None:
-        if STAGES[config["stage"]["name"]].needs_pairs:
+        if _on_pairs(config):
             raise InputError(f"stage={config['stage']['name']} starts from a trained flow: give stage.init=RUN.")
         config["generator"] = generator_of(config, parent)
         return config
@@ -98,7 +98,11 @@ def inherited(key: str, config: Mapping[str, Any]) -> str:
     found = rule(key).inherited
     if found != "with_pairs":
         return found
-    return "always" if STAGES[config["stage"]["name"]].needs_pairs else "unless_given"
+    return "always" if _on_pairs(config) else "unless_given"
+
+
+def _on_pairs(config: Mapping[str, Any]) -> bool:
+    return STAGES[config["stage"]["name"]].needs_pairs or config["data"]["name"] == "pairs"
 
 
 def generator_of(config: Mapping[str, Any], parent: Parent | None) -> dict[str, Any]:

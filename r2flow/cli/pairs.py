@@ -64,6 +64,7 @@ def pairs(
     first: Annotated[
         int | None, typer.Option(min=0, help="Index of the first pair; behind the flow's own pairs if left out.")
     ] = None,
+    knots: Annotated[int, typer.Option(min=0, help="Inner states to keep of each path, for a flow map.")] = 0,
 ) -> None:
     """Draw reflow pairs from a flow: what is missing or damaged, as one of any number of processes.
 
@@ -85,6 +86,7 @@ def pairs(
     options = {
         **{key: value for key, value in asked.items() if value is not None},
         "num": num, "batch_size": batch_size, "shard_mib": shard_mib, "seed": seed, "first": first,
+        "knots": knots,
     }  # fmt: skip
     recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(
         flow.encoding.shape, flow.generator.noise_shape

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from r2flow.data.shards import PairRecipe
 from r2flow.errors import InputError
-from r2flow.flow.solvers import check_tolerance, named_grid, usual_grid
+from r2flow.flow.solvers import check_knots, check_tolerance, named_grid, usual_grid
 from r2flow.lidar.scan_files.fields import check_columns
 from r2flow.registry import NonNegative, Positive, check_options
 
@@ -90,6 +90,7 @@ class PairOptions:
     shard_mib: float = 256.0
     seed: int = 0  # of the noise; not the run's: runs of several seeds can share one set of pairs
     first: int | None = None  # index of the first pair; None: behind the pairs that the flow itself was trained on
+    knots: int = 0  # inner states of each path to keep with its pair, for stage=flow_map
     parent: str | None = None  # hash of the flow; the run fills it in
 
     def recipe(self, shape: tuple[int, int, int], noise_shape: tuple[int, ...] | None = None) -> PairRecipe:
@@ -111,11 +112,14 @@ class PairOptions:
         check_tolerance(self.tolerance)
         grid = self.grid or usual_grid(self.method)
         named_grid(grid)
-        shard_batches = max(round(self.shard_mib * 2**20 / (self.batch_size * 2 * math.prod(shape))), 1)
+        if self.knots:
+            check_knots(self.method, self.steps, self.knots)
+        size = self.batch_size * 2 * math.prod(shape) * (1 + self.knots)
+        shard_batches = max(round(self.shard_mib * 2**20 / size), 1)
         tolerance = float(self.tolerance)  # 1 and 1.0 are one recipe
         return PairRecipe(
             self.parent or "", shape, self.seed, first, self.method, self.steps, tolerance, self.batch_size,
-            shard_batches, None if noise_shape == shape else noise_shape, grid,
+            shard_batches, None if noise_shape == shape else noise_shape, grid, self.knots,
         )  # fmt: skip
 
 

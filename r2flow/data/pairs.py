@@ -20,7 +20,8 @@ from r2flow import noise
 from r2flow.data.loader import Item
 from r2flow.data.shards import Block, PairRecipe, PairStore
 from r2flow.errors import InputError
-from r2flow.generators import Generator
+from r2flow.flow.solvers import Solution, knot_times
+from r2flow.generators import Generated, Generator, as_flow
 from r2flow.models import name_of
 
 
@@ -116,10 +117,16 @@ def solve_batch(recipe: PairRecipe, generator: Generator, batch: int) -> Block:
     """The pairs first + [b B, (b + 1) B) of batch b."""
     first = recipe.first + batch * recipe.batch_size
     x_0 = torch.stack([pair_noise(recipe, index) for index in range(first, first + recipe.batch_size)])
-    end = generator.generate(x_0.to(generator.device), sampler=recipe.sampler)
-    x_1 = end.x.to(torch.float16).cpu()
-    usable = end.converged.cpu() & x_1.isfinite().flatten(1).all(1)
-    return Block(x_1.numpy(), end.evaluations.cpu().numpy().astype(np.int32), usable.numpy())
+    x_0 = x_0.to(generator.device)
+    end: Generated | Solution
+    if recipe.knots:
+        end = as_flow(generator, "data.pairs.knots").solve(x_0, sampler=recipe.sampler, knots=recipe.knots)
+    else:
+        end = generator.generate(x_0, sampler=recipe.sampler)
+    x_1, usable = end.x.to(torch.float16).cpu(), end.converged.cpu()
+    usable = usable & x_1.isfinite().flatten(1).all(1)
+    block = Block(x_1.numpy(), end.evaluations.cpu().numpy().astype(np.int32), usable.numpy())
+    return block if not isinstance(end, Solution) else block.with_knots(end.knots)
 
 
 class PairSource:
@@ -135,7 +142,7 @@ class PairSource:
             lacking = len(store.missing(num)) * store.recipe.batch_size
             raise InputError(f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs -c RUN.")
         self.indices = np.flatnonzero(store.usable(num))
-        self._opened: dict[int, Any] = {}
+        self._opened: dict[tuple[int, str], Any] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_opened": {}}  # memory maps stay in their process
@@ -149,26 +156,39 @@ class PairSource:
         return part
 
     def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
+        recipe, number = self.store.recipe, int(self.indices[index])
+        return pair_noise(recipe, recipe.first + number), self._read("x_1", number)
+
+    def knots(self, index: int) -> Tensor:
+        """Inner states of the pair's path, (K, C, H, W) float32."""
+        return self._read("knots", int(self.indices[index]))
+
+    def _read(self, name: str, number: int) -> Tensor:
         recipe = self.store.recipe
-        number = int(self.indices[index])
         shard, offset = divmod(number, recipe.shard_batches * recipe.batch_size)
         try:
-            if shard not in self._opened:
-                self._opened[shard] = safe_open(self.store.shard_path(shard), framework="pt").get_slice("x_1")
-            x_1 = self._opened[shard][offset : offset + 1][0].float()
+            if (shard, name) not in self._opened:
+                self._opened[shard, name] = safe_open(self.store.shard_path(shard), framework="pt").get_slice(name)
+            values: Tensor = self._opened[shard, name][offset : offset + 1][0].float()
         except (SafetensorError, OSError, IndexError) as error:
             raise InputError(
                 f"{self.store.shard_path(shard)} was lost or damaged while it was in use ({error}). "
                 "The same command makes it again and goes on."
             ) from None
-        return pair_noise(recipe, recipe.first + number), x_1
+        return values
 
 
 class PairDataset(Dataset[Item]):
-    """A pair as a training item, with the keys of `FlowDataset`; u is a function of (seed, purpose, k) alone."""
+    """A pair as a training item, with the keys of `FlowDataset`; u is a function of (seed, purpose, k) alone.
+
+    With knots there are two keys more: knots, (K, C, H, W), the inner states of the path, and times, (K + 2,), those of
+    x_0, the knots and x_1.
+    """
 
     def __init__(self, source: PairSource, seed: int, purpose: str) -> None:
         self.source, self.seed, self.purpose = source, seed, purpose
+        recipe = source.store.recipe
+        self.times = knot_times(recipe.method, recipe.grid, recipe.knots).float() if recipe.knots else None
 
     def __len__(self) -> int:
         return len(self.source)
@@ -177,7 +197,8 @@ class PairDataset(Dataset[Item]):
         k, index = key
         x_0, x_1 = self.source[index]
         u = torch.tensor(noise.generator(self.seed, self.purpose, k).random(dtype=np.float32))
-        return {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
+        item = {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
+        return item if self.times is None else {**item, "knots": self.source.knots(index), "times": self.times}
 
 
 def default_folder(checkpoint: Path) -> Path:

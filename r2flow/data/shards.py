@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from safetensors import SafetensorError, safe_open
+from torch import Tensor
 
 from r2flow.data.store import (
     MANIFEST,
@@ -45,10 +47,11 @@ class PairRecipe:
     shard_batches: int  # batches in a shard
     noise_shape: tuple[int, ...] | None = None  # of x_0, where it is not the scan's
     grid: str = "uniform"  # where fixed steps fall
+    knots: int = 0  # inner states of each path that are kept with it
 
     def describe(self) -> dict[str, Any]:
         """All of it as plain values; what pairs of older versions did not have only where it is not as it was then."""
-        then = {"noise_shape": None, "grid": "uniform"}
+        then = {"noise_shape": None, "grid": "uniform", "knots": 0}
         return {key: value for key, value in asdict(self).items() if key not in then or value != then[key]}
 
     @property
@@ -61,17 +64,34 @@ class PairRecipe:
         return hashlib.sha256(json.dumps(self.describe(), sort_keys=True).encode()).hexdigest()[:16]
 
 
+NO_KNOTS = np.empty(0, np.float16)
+
+
 class Block(NamedTuple):
-    """Consecutive pairs: x_1 float16 (n, C, H, W), evaluations int32 (n,), usable bool (n,)."""
+    """Consecutive pairs.
+
+    Attributes:
+        x_1: (n, C, H, W) float16.
+        evaluations: (n,) int32.
+        usable: (n,) bool.
+        knots: Inner states of each path, (n, K, C, H, W) float16, at `r2flow.flow.solvers.knot_times`; or none.
+    """
 
     x_1: np.ndarray
     evaluations: np.ndarray
     usable: np.ndarray
+    knots: np.ndarray = NO_KNOTS
+
+    def with_knots(self, knots: Tensor | None) -> "Block":
+        """With inner states, (n, K, C, H, W); a path with one that half precision cannot hold is not usable."""
+        assert knots is not None
+        kept = knots.to(torch.float16).cpu()
+        return self._replace(knots=kept.numpy(), usable=self.usable & kept.isfinite().flatten(1).all(1).numpy())
 
     @property
     def checksum(self) -> str:
         digest = hashlib.sha256(self.usable.astype(bool).tobytes())
-        for values in (self.evaluations, self.x_1):
+        for values in (self.evaluations, self.x_1, self.knots):
             digest.update(np.ascontiguousarray(values).data)
         return digest.hexdigest()
 
@@ -232,7 +252,10 @@ class PairStore:
             "usable": [int(one) for one in block.usable],
             "sha256": block.checksum,
         }
-        data = shard_bytes({"evaluations": block.evaluations, "x_1": block.x_1}, "pairs", notes)
+        tensors = {"evaluations": block.evaluations, "x_1": block.x_1}
+        if self.recipe.knots:
+            tensors["knots"] = block.knots
+        data = shard_bytes(tensors, "pairs", notes)
         with suppress(_Unwanted), atomic_write(path) as file:
             file.write(data)
             if unless():
@@ -267,7 +290,9 @@ class PairStore:
     def _read(self, path: Path, batch: int) -> Block:
         """A file that begins with a batch, every byte of it checked."""
         with self._opened(path) as (file, notes):
-            block = Block(file.get_tensor("x_1"), file.get_tensor("evaluations"), np.array(notes["usable"], dtype=bool))
+            x_1, evaluations = file.get_tensor("x_1"), file.get_tensor("evaluations")
+            knots = file.get_tensor("knots") if self.recipe.knots else NO_KNOTS
+            block = Block(x_1, evaluations, np.array(notes["usable"], dtype=bool), knots)
         if notes["first"] != self.recipe.first + batch * self.recipe.batch_size:
             raise Damaged(f"it begins with pair {notes['first']}")
         if notes["sha256"] != block.checksum or len(block.usable) != len(block.x_1):

@@ -13,6 +13,7 @@ from torch import Tensor
 from r2flow.registry import Count, Portion, Positive, Registry
 
 GOLDEN = -7046029254386353131  # (sqrt(5) - 1) / 2 of 2^64, as a signed integer
+PLASTIC = -4521708957497675121, -7935046062780286180  # 1/p and 1/p^2 of 2^64, p^3 = p + 1
 
 TimeDensity = Callable[[Tensor], Tensor]
 
@@ -85,8 +86,16 @@ def golden_sequence(k: Tensor) -> Tensor:
 
     In 64-bit integers that wrap around, so that no k is too large.
     """
-    turns = k.long() * GOLDEN + GOLDEN % 2**64 // 2
-    return (turns >> 40 & 0xFFFFFF).float() / 2**24
+    return _turns(k, GOLDEN)
+
+
+def plastic_sequence(k: Tensor) -> Tensor:
+    """The same in two dimensions, (..., 2) float32: steps 1 / p and 1 / p^2 with p^3 = p + 1 (Roberts 2018, R2)."""
+    return torch.stack([_turns(k, step) for step in PLASTIC], -1)
+
+
+def _turns(k: Tensor, step: int) -> Tensor:
+    return (k.long() * step + step % 2**64 // 2 >> 40 & 0xFFFFFF).float() / 2**24
 
 
 TIMES: Registry[Callable[..., TimeDensity]] = Registry(

@@ -173,6 +173,10 @@ class Generator(nn.Module):
         """Network evaluations of a batch, for a progress bar; 0 where they depend on the scans."""
         return sampler.steps
 
+    def in_steps(self, steps: int) -> Sampler:
+        """The simplest sampler with this many steps, one evaluation each, by which generators are compared."""
+        return self.sampler.changed(steps=steps)
+
     @property
     def unit(self) -> tuple[int, int]:
         """Rows and columns that a part of the image must be a multiple of, and begin at a multiple of.

@@ -91,6 +91,9 @@ class Flow(Generator):
         if adapts(sampler.method) and sampler.grid != "uniform":
             raise InputError(f"a time grid is for a solver of fixed steps; {sampler.method} chooses its own.")
 
+    def in_steps(self, steps: int) -> Sampler:
+        return Sampler("euler", steps)
+
     def evaluations_of(self, sampler: Sampler) -> int:
         method = fixed_step(sampler.method)
         return 0 if method is None or sampler.levels else method.cost(sampler.steps)

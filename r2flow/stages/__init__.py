@@ -8,10 +8,13 @@ from r2flow.errors import InputError
 from r2flow.generators import Generator, Sampler
 from r2flow.registry import Registry, check_options
 from r2flow.stages.base import Stage
+from r2flow.stages.flow_map import LearnFlowMap
 from r2flow.stages.rectify import Rectify
 from r2flow.stages.reflow import Distill, Reflow
 
-STAGES: Registry[type[Stage]] = Registry("stage", rectify=Rectify, reflow=Reflow, distill=Distill)
+STAGES: Registry[type[Stage]] = Registry(
+    "stage", rectify=Rectify, reflow=Reflow, distill=Distill, flow_map=LearnFlowMap
+)
 
 
 def check_roll(augment: Augmentation, generator: Generator) -> None:
@@ -36,11 +39,7 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
     options = {"batch_size": config["data"]["batch_size"], "seed": config["seed"], **config["stage"]}
     options.pop("init", None)  # the generator has its weights already
     stage: Stage = STAGES.build(options, generator)
-    on_pairs = config["data"]["name"] == "pairs"
-    if stage.needs_pairs and not on_pairs:
-        raise InputError(f"stage={options['name']} learns from pairs: give data=pairs, found {config['data']['name']}.")
-    if on_pairs and not stage.needs_pairs:
-        raise InputError(f"stage={options['name']} learns from scans, and data=pairs has none; give stage=reflow.")
+    stage.check_data(options["name"], config["data"])
     wanted = {key: value for key, value in (config.get("sampler") or {}).items() if value is not None}
     check_options("sampler", Sampler, wanted)
     sampler = generator.sampler.changed(**wanted)

@@ -1,7 +1,7 @@
 """What every stage has in common: a generator that learns, its optimiser, and what a checkpoint says of it."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar
 
 import lightning as L
@@ -9,6 +9,7 @@ import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
+from r2flow.errors import InputError
 from r2flow.generators import Generator
 from r2flow.noise import seed_torch
 from r2flow.registry import Count, Natural, NonNegative, Portion
@@ -64,6 +65,18 @@ class Stage(L.LightningModule):
         self.seed = seed
         self.config: dict[str, Any] = {}
         self.gradient_clip_val: float | None = None
+
+    def check_data(self, name: str, data: Mapping[str, Any]) -> None:
+        """Refuse a config's `data` that the stage of this name cannot learn from.
+
+        Raises:
+            InputError: pairs for a stage that learns from scans, or the other way round.
+        """
+        on_pairs = data["name"] == "pairs"
+        if self.needs_pairs and not on_pairs:
+            raise InputError(f"stage={name} learns from pairs: give data=pairs, found {data['name']}.")
+        if on_pairs and not self.needs_pairs:
+            raise InputError(f"stage={name} learns from scans, and data=pairs has none; give stage=reflow.")
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         # Dropout draws from torch's own generator: seeded by position, a resumed run draws the same.

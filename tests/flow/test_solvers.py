@@ -8,7 +8,7 @@ import torch
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, RayDrop
-from r2flow.flow.solvers import SOLVERS, EmbeddedMethod, FixedStep, named_grid, solve
+from r2flow.flow.solvers import SOLVERS, EmbeddedMethod, FixedStep, knot_times, named_grid, solve, usual_grid
 from r2flow.flow.solvers.external import is_fixed, torchdiffeq_methods
 from r2flow.flow.solvers.multistep import weights
 
@@ -256,3 +256,37 @@ def test_bad_requests_are_refused():
         solve(logistic, X_0, method="torchdiffeq:explicit_adams")
     with pytest.raises(InputError, match="must be positive"):
         solve(logistic, X_0, method="torchdiffeq:dopri5", tolerance=0)
+
+
+@pytest.mark.parametrize("method", ["euler", "adams3", "dopri5", "auto"])
+def test_knots_are_states_of_the_path(method):
+    """dx/dt = x: (1 + h)^n after n Euler steps, e^t else."""
+    x_0 = torch.tensor([[1.0, -2.0], [0.5, 3.0]], dtype=torch.float64)
+    grid = "uniform" if method == "euler" else usual_grid(method)
+    found = solve(lambda t, x: x, x_0, method=method, steps=64, tolerance=1e-9, grid=grid, knots=3)
+    times = knot_times(method, grid, 3)[1:-1]
+    growth = (1 + 1 / 64) ** (64 * times) if method == "euler" else times.exp()
+    assert found.knots is not None
+    error = 1e-4 if method == "adams3" else 1e-7
+    torch.testing.assert_close(found.knots, x_0[:, None] * growth[:, None], rtol=error, atol=0)
+    whole = solve(lambda t, x: x, x_0, method=method, steps=64, tolerance=1e-9, grid=grid)
+    torch.testing.assert_close(found.x, whole.x, rtol=1e-7, atol=0)
+    assert found.converged.all()
+    if method in ("euler", "adams3"):
+        assert torch.equal(found.evaluations, whole.evaluations)
+
+
+@pytest.mark.parametrize(
+    ("method", "steps", "said"),
+    [("adams3", 10, "multiple of 4"), ("torchdiffeq:rk4", 8, "keeps no knots"), ("euler", 8, "at least 0")],
+)
+def test_knots_that_a_method_does_not_have_are_refused(method, steps, said):
+    with pytest.raises(InputError, match=said):
+        solve(lambda t, x: x, torch.ones(1, 1), method=method, steps=steps, knots=-1 if method == "euler" else 3)
+
+
+def test_a_scene_that_fails_between_two_knots_stays_failed():
+    x_0 = torch.tensor([[0.5], [3.0]], dtype=torch.float64)  # dx/dt = x^2 reaches infinity at t = 1 / x_0
+    found = solve(lambda t, x: x * x, x_0, method="dopri5", knots=3, max_evaluations=400)
+    assert found.converged.tolist() == [True, False]
+    torch.testing.assert_close(found.x[0], torch.tensor([1.0], dtype=torch.float64), rtol=1e-3, atol=0)

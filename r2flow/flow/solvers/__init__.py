@@ -21,7 +21,7 @@ from r2flow.flow.solvers.external import (
     torchdiffeq_methods,
 )
 from r2flow.flow.solvers.fixed import FixedStep, euler, heun2, heun3, midpoint, rk4, solve_fixed
-from r2flow.flow.solvers.grids import build_grid, extended, halved, named_grid
+from r2flow.flow.solvers.grids import build_grid, extended, halved, named_grid, uniform
 from r2flow.flow.solvers.multistep import adams
 from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite
 from r2flow.flow.solvers.step_size import Limits
@@ -29,7 +29,7 @@ from r2flow.registry import Registry
 
 __all__ = [
     "LEAST_TOLERANCE", "SOLVERS", "TORCHDIFFEQ", "EmbeddedMethod", "FixedStep", "Solution", "Velocity", "adapts",
-    "check_method", "check_tolerance", "fixed_step", "named_grid", "solve", "usual_grid",
+    "check_knots", "check_method", "check_tolerance", "fixed_step", "knot_times", "named_grid", "solve", "usual_grid",
 ]  # fmt: skip
 
 SOLVERS: Registry[FixedStep | EmbeddedMethod | ExponentialMethod] = Registry(
@@ -69,6 +69,7 @@ def solve(
     max_evaluations: int = 20_000,
     max_step: float = 1.0,
     global_error: bool = False,
+    knots: int = 0,
 ) -> Solution:
     """Solve dx/dt = v(t, x) from x at t_0 to t_1, forward or backward in time.
 
@@ -98,18 +99,23 @@ def solve(
             longer than a 128th.
         global_error: Estimate the error at t_1 by a second solution, with half the steps' lengths or a sixtieth of the
             tolerance (a tenth, where the budget ends before) and of `finish`; its evaluations are counted.
+        knots: Inner states to keep, at `knot_times`, of a method of fixed steps on a named grid or of an adaptive one,
+            which is solved from each to the next.
 
     Raises:
-        InputError: an unknown method or grid, fewer than one step, or a number out of its range.
+        InputError: an unknown method or grid, fewer than one step, a number out of its range, or steps that have no
+            such knots.
     """
     check_method(method)
     _check_numbers(t_0, t_1, steps, tolerance, finish, max_evaluations, max_step)
     x = x if x.dtype == torch.float64 else x.float()
     if t_0 == t_1 or not len(x):
-        return _at_rest(x, global_error)
+        return _at_rest(x, global_error, knots)
     times = build_grid(grid, t_0, t_1 - math.copysign(finish, t_1 - t_0) if finish else t_1, steps)
     run = _Run(method, t_0, t_1, times, Limits(tolerance, max_evaluations, max_step=max_step, finish=finish), progress)
-    solution = run.solve(velocity, x)
+    if knots:
+        check_knots(method, steps, knots)
+    solution = run.in_pieces(velocity, x, knots) if knots and adapts(method) else run.solve(velocity, x, knots)
     return _with_global_error(solution, run, velocity, x) if global_error else solution
 
 
@@ -127,7 +133,7 @@ class _Run(NamedTuple):
     limits: Limits
     progress: Callable[[], None] | None
 
-    def solve(self, velocity: Velocity, x: Tensor) -> Solution:
+    def solve(self, velocity: Velocity, x: Tensor, knots: int = 0) -> Solution:
         v = Evaluations(velocity, len(x), self.progress)
         method = None if self.method.startswith(TORCHDIFFEQ) else SOLVERS[self.method]
         if isinstance(method, EmbeddedMethod):
@@ -136,8 +142,23 @@ class _Run(NamedTuple):
             return solve_exponential(v, x, self.t_0, self.t_1, method, self.limits)
         finish = torch.tensor(self._signed(self.limits.finish), dtype=torch.float64) if self.limits.finish else None
         if isinstance(method, FixedStep):
-            return solve_fixed(v, x, self.times, method, finish)
+            return solve_fixed(v, x, self.times, method, finish, knots)
         return solve_torchdiffeq(v, x, self.times, self.method.removeprefix(TORCHDIFFEQ), self.limits, finish)
+
+    def in_pieces(self, velocity: Velocity, x: Tensor, knots: int) -> Solution:
+        """An adaptive solution from each knot to the next; a scene that fails in one piece stays failed."""
+        ends = [*uniform(self.t_0, self.t_1, knots + 1).tolist()[1:-1], self.t_1]
+        states, pieces, t = [x], [], self.t_0
+        for end in ends:
+            finish = self.limits.finish if end == self.t_1 else 0.0
+            piece = self._replace(t_0=t, t_1=end, limits=self.limits._replace(finish=finish))
+            pieces.append(piece.solve(velocity, states[-1]))
+            states.append(pieces[-1].x)
+            t = end
+        sums = {name: sum(getattr(piece, name) for piece in pieces) for name in ("evaluations", "accepted", "rejected")}
+        stiff = torch.stack([piece.stiff for piece in pieces]).any(0)
+        converged = torch.stack([piece.converged for piece in pieces]).all(0)
+        return Solution(states[-1], **sums, stiff=stiff, converged=converged, knots=torch.stack(states[1:-1], 1))
 
     def tighter(self, by: float) -> "_Run":
         """The run with smaller errors that the estimate of the global error compares with."""
@@ -190,6 +211,28 @@ def check_method(method: str) -> None:
         SOLVERS[method]
 
 
+def check_knots(method: str, steps: int, knots: int) -> None:
+    """Check that a method can keep this many inner states.
+
+    Raises:
+        InputError: one of torchdiffeq's methods of fixed steps, or steps that they do not divide.
+    """
+    if knots < 0:
+        raise InputError(f"the number of knots must be at least 0, found {knots}.")
+    if not adapts(method) and fixed_step(method) is None:
+        raise InputError(f"{method} keeps no knots; take one of our own solvers, such as adams3.")
+    if not adapts(method) and steps % (knots + 1):
+        raise InputError(f"{steps} steps have no {knots} inner knots: the steps must be a multiple of {knots + 1}.")
+
+
+def knot_times(method: str, grid: str, knots: int) -> Tensor:
+    """The times from 0 to 1 of both ends and of the inner knots that a method keeps, (K + 2,) float64.
+
+    They are equally many fixed steps apart, or equally long times for an adaptive method.
+    """
+    return named_grid("uniform" if adapts(method) else grid)(0.0, 1.0, knots + 1)
+
+
 def check_tolerance(tolerance: float) -> None:
     """Check a tolerance.
 
@@ -229,9 +272,11 @@ def _order(method: str) -> int:
     return int(torchdiffeq_methods()[name].order) if name != method else SOLVERS[method].order
 
 
-def _at_rest(x: Tensor, global_error: bool) -> Solution:
+def _at_rest(x: Tensor, global_error: bool, knots: int) -> Solution:
     """The solution of an empty interval or an empty batch."""
     solution = Solution.build(x, np.zeros(len(x)), 0, 0, False, finite(x).cpu().numpy())
+    if knots:
+        solution = replace(solution, knots=torch.stack([x] * knots, 1))
     if not global_error:
         return solution
     nothing = torch.zeros(len(x), dtype=torch.float64)

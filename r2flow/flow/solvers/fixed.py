@@ -74,8 +74,12 @@ def rk4(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
     return x + h / 6 * (k_1 + 2 * k_2 + 2 * k_3 + k_4)
 
 
-def solve_fixed(v: Evaluations, x: Tensor, times: Tensor, method: FixedStep, finish: Tensor | None) -> Solution:
+def solve_fixed(
+    v: Evaluations, x: Tensor, times: Tensor, method: FixedStep, finish: Tensor | None, knots: int = 0
+) -> Solution:
     """Take the steps of a time grid, (N + 1,) float64, then an Euler step of length `finish` if there is one.
+
+    `knots` inner states are kept, equally many steps apart.
 
     A scene whose state is no longer finite keeps its last finite one; the others are not affected.
     """
@@ -89,11 +93,16 @@ def solve_fixed(v: Evaluations, x: Tensor, times: Tensor, method: FixedStep, fin
         return v(t.clamp(low, high), state)  # t + h can round to 1 + 1e-7
 
     alive = finite(x)
-    for t, h, advance in steps:
+    kept = []
+    for n, (t, h, advance) in enumerate(steps):
+        if knots and n and n % (len(steps) // (knots + 1)) == 0:
+            kept.append(x)
         following = advance(inside, t.to(x), h.to(x), x)
         alive = alive & finite(following)
         x = torch.where(expand_time(alive, x), following, x)
     solution = Solution.build(x, v.counts, len(times) - 1, 0, False, alive.cpu().numpy())
+    if knots:
+        solution = replace(solution, knots=torch.stack(kept, 1))
     if not method.corrects:
         return solution
     correction = step.correction.double().square().flatten(1).mean(1).sqrt().cpu()  # type: ignore[attr-defined]

@@ -29,6 +29,7 @@ class Solution:
         correction: What a corrector has changed in all its steps together, root mean square over a scene's elements,
             (B,) float64: about the error that the predictor alone would have, and mostly more than the solution's. None
             for a method without a corrector.
+        knots: Inner states that were asked for, (B, K, ...), at the times of `knot_times`; None when not asked for.
     """
 
     x: Tensor
@@ -40,6 +41,7 @@ class Solution:
     global_error: Tensor | None = None
     estimate_evaluations: Tensor | None = None
     correction: Tensor | None = None
+    knots: Tensor | None = None
 
     @classmethod
     def build(
@@ -63,7 +65,7 @@ class Solution:
         values: dict[str, Tensor | None] = {"x": self.x.index_copy(0, here, again.x)}
         for name in ("evaluations", "accepted", "rejected"):
             values[name] = getattr(self, name).index_add(0, scenes, getattr(again, name))
-        for name in ("stiff", "converged", "global_error", "estimate_evaluations", "correction"):
+        for name in ("stiff", "converged", "global_error", "estimate_evaluations", "correction", "knots"):
             before = getattr(self, name)
             values[name] = before if before is None else before.index_copy(0, scenes, getattr(again, name))
         return Solution(**values)  # type: ignore[arg-type]

@@ -13,7 +13,6 @@ from r2flow.checkpoints import Checkpoint
 from r2flow.evaluation.measuring import Gathered, Work, measure, point_key
 from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
 from r2flow.files import atomic_write
-from r2flow.generators import Flow, Sampler
 from r2flow.metrics.base import ScanMetric, Side
 from r2flow.metrics.birds_eye import BINS
 from r2flow.metrics.jsd import JSD
@@ -77,9 +76,7 @@ def measure_cells(settings: CellSettings, flow: Checkpoint, subject: PaperRun, s
 
 
 def _measure(settings: CellSettings, flow: Checkpoint, subject: PaperRun, steps: int) -> Cell:
-    sampler = flow.generator.sampler.changed(steps=steps)
-    if isinstance(flow.generator, Flow):
-        sampler = Sampler("euler", steps)  # as in the paper
+    sampler = flow.generator.in_steps(steps)  # Euler for a flow, as in the paper
     drawn = sampled_set(flow, f"{subject.label}, {steps} steps", settings.num, sampler, SEED)
     found = measure(settings.metrics, settings.gathered, drawn, settings.work, settings.bootstrap)
     assert isinstance(drawn.source, SampledScans)

@@ -98,7 +98,7 @@ def _role(one: PaperRun, parent: PaperRun | None) -> str:
         return f"{int(number) + 1}-RF"
     if one.role == "distill":
         return f"{one.steps}-TD" if above == "2-RF" else f"{one.steps}-TD of {above}"
-    return f"{one.role} of {above}"
+    return f"{'map' if one.role == 'flow_map' else one.role} of {above}"
 
 
 def _check_comparable(subjects: Sequence[PaperRun]) -> None:

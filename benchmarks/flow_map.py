@@ -1,0 +1,354 @@
+"""One flow map against the paper's chain, at equal processor time from the same 1-RF.
+
+    python benchmarks/flow_map.py plane                        # two minutes
+    python benchmarks/flow_map.py scans --out flow_map         # an hour and a half on one quiet core; resumes
+
+Everything below was written down before the first run.
+
+Plane: x_1 from eight Gaussians on a circle, whose velocity and paths are known. The 1-RF is a network of three layers
+that has learned the velocity; pairs and knots are exact. Chain: a 2-RF on the pairs, pairs of that, k-TD from it for
+k = 1, 2, 4. Map: from the 1-RF on the exact knots, for as many processor seconds as the whole chain took. Figure: root
+mean square distance to the exact ends of 4,096 other starts. Verdict: the map is nearer than each k-TD at k
+evaluations in 3 of 3 seeds.
+
+Scans: 16 x 128, hdit_tiny, 1,024 simulated scenes, batches of 8; the 1-RF learns for 2,000 steps. `chain` is
+experiment=r2flow_small: 2-RF 1,200 steps on 1,000 pairs (16 evaluations each), k-TD 800 steps each on 1,000 pairs (8
+evaluations each), 3,600 steps in all. `knots of 1-RF` learns the knots of 1,500 pairs (16 evaluations each) for 3,400
+steps, `consistency of 2-RF` the ends of 1,000 pairs (8 evaluations each) of the chain's 2-RF for 1,940; processor
+seconds, the teacher's evaluations and the 2-RF included, must not exceed the chain's by more than 2 %. Figures of 256
+samples: the fidelity panel's mean to 512 held-out scans, MMD and JSD to them, recall and precision, root mean square
+distance to the 1-RF's exact ends from the same noise (64 scans). Verdict at k = 1, 2, 4: the map's panel is no worse
+than the better of 2-RF and k-TD in any of seeds 0, 1, 2 and better in the mean, with a 95 % interval of Student's t
+over seeds; at 8 and at 16 evaluations it is better than at 4. Other objectives and numbers of pairs: seed 0 alone.
+
+Changed after the first run, of `consistency of 1-RF` on seed 0: with the jumps of the knots, of which 5 % are
+velocities (s = t), it drifts away (panel 0.143, 0.186 and 0.215 at 1, 2 and 4); now 25 % are.
+"""
+
+import argparse
+import json
+import math
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from r2flow.checkpoints import load_checkpoint
+from r2flow.files import atomic_write
+from r2flow.flow.losses import pseudo_huber
+from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, jump
+from r2flow.flow.path import expand_time, interpolate
+from r2flow.flow.solvers import knot_times, solve
+from r2flow.flow.times import UShaped
+from r2flow.generators import Sampler
+from r2flow.lidar.sensors import build_sensor
+from r2flow.metrics.fidelity import distances, panel
+from r2flow.noise import Draws
+from r2flow.reports.tables import table
+from r2flow.sampling import sample
+from r2flow.simulator import simulate
+
+ROOT = Path(__file__).resolve().parents[1]
+SEEDS = 0, 1, 2
+COUNTS = 1, 2, 4, 8, 16
+JUMPS = JumpTimes(steps=(1, 1, 2, 4, 8), share=0.8)
+
+# ---- the plane
+
+
+class Ring:
+    """v of a rectified flow from N(0, I) to eight Gaussians of standard deviation 0.15 on a circle of radius 1.5."""
+
+    def __init__(self, std: float = 0.15) -> None:
+        angles = torch.arange(8) * (2 * math.pi / 8)
+        self.means, self.std = 1.5 * torch.stack([angles.cos(), angles.sin()], 1), std
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        t = expand_time(t, x)
+        variance = (1 - t) ** 2 + (t * self.std) ** 2
+        offset = x[:, None] - (t * torch.ones_like(x[:, :1]))[:, None] * self.means.to(x)
+        scores = -0.5 * offset.square().sum(2) / variance
+        slopes = self.means.to(x) + ((t * self.std**2 - (1 - t)) / variance)[..., None] * offset
+        return (scores.softmax(1)[..., None] * slopes).sum(1)
+
+    def draw(self, count: int, draws: torch.Generator) -> Tensor:
+        which = torch.randint(8, (count,), generator=draws)
+        return self.means[which] + self.std * torch.randn(count, 2, generator=draws)
+
+
+class Plane(nn.Module):
+    """u(t, x, s) on the plane; u = v for every s before it has learned otherwise."""
+
+    def __init__(self, width: int = 128) -> None:
+        super().__init__()
+        self.register_buffer("frequencies", torch.arange(1, 9) * (math.pi / 2))
+        self.time, self.interval = nn.Linear(17, width), nn.Linear(17, width, bias=False)
+        nn.init.zeros_(self.interval.weight)
+        self.into = nn.Linear(2, width)
+        self.inner = nn.ModuleList([nn.Linear(width, width) for _ in range(3)])
+        self.out = nn.Linear(width, 2)
+
+    def features(self, t: Tensor) -> Tensor:
+        angles = t[:, None] * self.frequencies
+        return torch.cat([t[:, None], angles.sin(), angles.cos()], 1)
+
+    def forward(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
+        t = t.expand(len(x))
+        s = t if s is None else s.expand(len(x))
+        condition = self.time(self.features(t)) + self.interval(self.features(s - t))
+        h = self.into(x)
+        for layer in self.inner:
+            h = h + layer(nn.functional.silu(h + condition))
+        return self.out(h)
+
+
+Loss = Callable[[Plane, Tensor], Tensor]
+
+
+def learn(model: Plane, loss: Loss, draws: torch.Generator, steps: int = 0, seconds: float = 0.0) -> float:
+    """AdamW with a cosine to 0, for a number of steps or of processor seconds; the average of its weights is kept."""
+    start, average = time.process_time(), {k: v.clone() for k, v in model.state_dict().items()}
+    optimizer = torch.optim.AdamW(model.parameters(), 1e-3, (0.9, 0.99), weight_decay=0.0)
+    done = 0.0
+    step = 0
+    while done < 1:
+        for group in optimizer.param_groups:
+            group["lr"] = 2e-3 * 0.5 * (1 + math.cos(math.pi * done))
+        optimizer.zero_grad()
+        loss(model, torch.rand(256, 3, generator=draws)).backward()
+        optimizer.step()
+        step += 1
+        for key, value in model.state_dict().items():
+            average[key].lerp_(value, 1 - min(0.998, step / (step + 10)))
+        done = step / steps if steps else (time.process_time() - start) / seconds
+    model.load_state_dict(average)
+    return time.process_time() - start
+
+
+def plane(pairs: int = 20_000, steps: int = 3000) -> None:
+    ring, rows = Ring(), []
+    for seed in SEEDS:
+        draws = torch.Generator().manual_seed(seed)
+        torch.manual_seed(seed)
+        x_0 = torch.randn(pairs, 2, generator=draws)
+        paths = solve(ring, x_0.double(), method="dopri5", tolerance=1e-8, knots=15)
+        assert paths.knots is not None
+        times = knot_times("dopri5", "uniform", 15).float()
+        states = torch.cat([x_0[:, None], paths.knots.float(), paths.x.float()[:, None]], 1)
+        fresh = torch.randn(4096, 2, generator=torch.Generator().manual_seed(1000 + seed))
+        exact = solve(ring, fresh.double(), method="dopri5", tolerance=1e-8).x.float()
+
+        def rms(x: Tensor, exact: Tensor = exact) -> float:
+            return float((x - exact).square().mean().sqrt())
+
+        def on_scans(model: Plane, u: Tensor, draws: torch.Generator = draws) -> Tensor:
+            x_t, v = interpolate(torch.randn(256, 2, generator=draws), ring.draw(256, draws), u[:, 0])
+            return pseudo_huber(model(u[:, 0], x_t), v).mean()
+
+        first = Plane()
+        learn(first, on_scans, draws, steps)
+
+        def on_pairs(x_0: Tensor, x_1: Tensor, density: Callable[[Tensor], Tensor]) -> Loss:
+            def loss(model: Plane, u: Tensor) -> Tensor:
+                rows = torch.randint(len(x_0), (256,), generator=draws)  # noqa: B023
+                t = density(u[:, 0])
+                x_t, v = interpolate(x_0[rows], x_1[rows], t)
+                return pseudo_huber(model(t, x_t), v).mean()  # noqa: B023
+
+            return loss
+
+        def copied(model: Plane) -> Plane:
+            found = Plane()
+            found.load_state_dict(model.state_dict())
+            return found
+
+        start = time.process_time()
+        second = copied(first)
+        learn(second, on_pairs(x_0, states[:, -1], UShaped()), draws, steps)
+        with torch.no_grad():
+            x_1 = solve(second, x_0, method="adams3", steps=8).x
+        of_second = time.process_time() - start
+        chain: dict[int, float] = {}
+        for k in (1, 2, 4):
+            student = copied(second)
+            learn(student, on_pairs(x_0, x_1, lambda u, k=k: (u * k).floor().clamp(max=k - 1) / k), draws, steps)
+            with torch.no_grad():
+                chain[k] = rms(solve(student, fresh, steps=k).x)
+        seconds = time.process_time() - start
+        with torch.no_grad():
+            rows.append([seed, "1-RF, Euler", 0.0, *(rms(solve(first, fresh, steps=k).x) for k in COUNTS)])
+            rows.append([seed, "2-RF, Euler", of_second, *(rms(solve(second, fresh, steps=k).x) for k in COUNTS)])
+        rows.append([seed, "k-TD", seconds, *(chain.get(k, math.nan) for k in COUNTS)])
+        for name, objective in OBJECTIVES.items():
+            model, start = copied(first), time.process_time()
+
+            def jumps(
+                model: Plane, u: Tensor, objective: Any = objective, name: str = name, start: float = start
+            ) -> Tensor:
+                batch = torch.randint(pairs, (256,), generator=draws)  # noqa: B023
+                t, s = JUMPS(u)
+                share = min((time.process_time() - start) / seconds, 1)  # noqa: B023
+                rho = torch.where((t == s) | (s - t == 1), 1.0, 0.01**share)
+                x_t, target = objective(model, Paths(times, states[batch]), t, s, rho)  # noqa: B023
+                return pseudo_huber(model(t, x_t, s), target).mean()
+
+            learn(model, jumps, draws, seconds=seconds)
+            ends = []
+            with torch.no_grad():
+                for k in COUNTS:
+                    x = fresh
+                    for n in range(k):
+                        x = jump(model, torch.tensor(n / k), x, torch.tensor((n + 1) / k))
+                    ends.append(rms(x))
+            rows.append([seed, f"map, {name}", time.process_time() - start, *ends])
+        print(table([[f"{c:.3g}" if isinstance(c, float) else str(c) for c in row] for row in rows[-6:]],
+                    ["seed", "", "seconds", *map(str, COUNTS)]), flush=True)  # fmt: skip
+
+
+# ---- scans
+
+SENSOR = build_sensor("hdl64e", 16, 128)
+HELD_OUT_SEED, HELD_OUT, SAMPLES, ENDS = 1000, 512, 256, 64
+SHARED = [
+    "sensor.rows=16", "sensor.columns=128", "data.batch_size=8", "samples.num=0", "callbacks.pictures=null",
+    "callbacks.curvature=null", "loggers=[csv]", "trainer=cpu", "callbacks.checkpoint.every=1000000",
+    "trainer.val_check_interval=1000000",
+]  # fmt: skip
+PAIRED = [one for one in SHARED if not one.startswith("sensor")]
+MAP = ["experiment=flow_map", "stage.jumps.steps=[1,1,2,4,8]", "stage.jumps.share=0.8"]
+OF_1RF = ["stage.init={0}/rf1", "data.pairs.steps=16", "data.root={0}/knots1"]
+OF_2RF = ["stage.init={0}/rf2", "data.pairs.steps=8", "data.root={0}/knots2"]
+PAIRS = "pairs of 1-RF"
+CONSISTENCY = [
+    "stage.objective=consistency", "stage.jumps.steps=[1]", "stage.jumps.share=0.25", "stage.jumps.diagonal=0.333",
+]  # fmt: skip
+
+
+def pairs_of(num: int, steps: int, method: str = "midpoint") -> list[str]:
+    return [f"data.pairs.num={num}", f"data.pairs.method={method}", f"data.pairs.steps={steps}"]
+
+
+RUNS: dict[str, tuple[int, list[str]]] = {
+    "rf1": (2000, [*SHARED, "data.scenes=1024"]),
+    "rf2": (1200, [*PAIRED, "experiment=reflow", "stage.init={0}/rf1", *pairs_of(1000, 8)]),
+    **{
+        f"td{k}": (
+            800, [*PAIRED, "experiment=distill", "stage.init={0}/rf2", f"stage.steps={k}", *pairs_of(1000, 4),
+                  "data.root={0}/rf2/pairs"],
+        )
+        for k in (1, 2, 4)
+    },
+    PAIRS: (1, [*PAIRED, *MAP, *OF_1RF, "data.pairs.num=1500"]),  # of both maps of the 1-RF
+    "knots of 1-RF": (3400, [*PAIRED, *MAP, *OF_1RF, "data.pairs.num=1500"]),
+    "consistency of 2-RF": (1940, [*PAIRED, *MAP, *OF_2RF, *CONSISTENCY, "data.pairs.num=1000"]),
+}  # fmt: skip
+TRIED: dict[str, tuple[int, list[str]]] = {  # on seed 0 alone
+    "consistency of 1-RF": (2900, [*PAIRED, *MAP, *OF_1RF, *CONSISTENCY, "data.pairs.num=1500"]),
+    "knots of 2-RF": (2270, [*PAIRED, *MAP, *OF_2RF, "data.pairs.num=1000"]),
+    "two halves of 1-RF": (2400, [*PAIRED, *MAP, *OF_1RF, "stage.objective=two_halves", "data.pairs.num=1500"]),
+    **{
+        f"consistency of 1-RF, {num} pairs": (2900, [*PAIRED, *MAP, *OF_1RF, *CONSISTENCY, f"data.pairs.num={num}"])
+        for num in (250, 4000)
+    },
+    "consistency of 2-RF, 800 steps": (800, RUNS["consistency of 2-RF"][1]),
+}
+
+
+def train(overrides: list[str], steps: int, folder: Path, seed: int) -> float:
+    """Train by the command line; CPU seconds of the child process."""
+    command = [sys.executable, str(ROOT / "train.py"), *(one.format(folder.parent) for one in overrides)]
+    command += [f"seed={seed}", f"run_dir={folder}", f"trainer.max_steps={steps}"]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.DEVNULL)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def figures(folder: Path, truth: np.ndarray, real: dict[str, np.ndarray], first: Path) -> dict[str, Any]:
+    """Panel, precision, recall and distance to the 1-RF's own ends, by number of evaluations."""
+    flow, parent = load_checkpoint(folder).generator, load_checkpoint(first).generator
+    noise = Draws(0, range(ENDS)).start(parent.noise_shape)
+    exact = parent.generate(noise, sampler=Sampler("adams3", 64, grid="power:1.75")).x
+    found: dict[str, Any] = {}
+    own = flow.sampler
+    for k in [own.steps] if own.fixed else [*COUNTS, *([32] if folder == first else [])]:
+        how = flow.in_steps(k)
+        images = torch.cat([drawn.images for drawn in sample(flow, SAMPLES, batch_size=16, sampler=how)]).numpy()
+        lines = distances(panel(images, SENSOR), real)
+        ends = flow.generate(noise, sampler=how).x
+        found[str(k)] = {
+            "panel": float(np.mean(list(lines.values()))), "lines": lines,
+            "ends": float((ends - exact).square().mean().sqrt()),
+            **other_distances(images, truth),
+        }  # fmt: skip
+    return found
+
+
+def other_distances(images: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """JSD and MMD of bird's-eye views; precision and recall of the embedded network's features."""
+    from r2flow.metrics import METRICS
+
+    found = {}
+    for name in ("jsd", "mmd", "manifold_embedded"):
+        metric = METRICS[name]()
+        for real, scans in ((True, truth), (False, images)):
+            for start in range(0, len(scans), 64):
+                add(metric, scans[start : start + 64], real, start)
+        found |= {f"{name}/{key}": float(value) for key, value in metric.compute().items()}
+    return found
+
+
+def add(metric: Any, images: np.ndarray, real: bool, first: int) -> None:
+    from r2flow.metrics.scans import Scans
+
+    metric.update(Scans(torch.from_numpy(images), SENSOR), real=real, first=first)
+
+
+def scans(out: Path, seeds: list[int], runs: list[str]) -> None:
+    torch.set_num_threads(1)
+    held = np.stack([simulate(SENSOR, HELD_OUT_SEED, k).image for k in range(HELD_OUT + SAMPLES)])
+    truth, real = held[:HELD_OUT], panel(held[:HELD_OUT], SENSOR)
+    floor = distances(panel(held[HELD_OUT:], SENSOR), real)
+    print(f"floor, {SAMPLES} other simulated scans: {np.mean(list(floor.values())):.4f}", flush=True)
+    for seed in seeds:
+        folder = out / f"seed-{seed}"
+        for name, (steps, overrides) in {**RUNS, **TRIED}.items():
+            if (runs and name not in runs) or (not runs and name in TRIED and seed != seeds[0]):
+                continue
+            note = folder / f"{name}.json"
+            if not note.exists():
+                run = folder / name.replace(" ", "-").replace(",", "")
+                seconds = train(overrides, steps, run, seed)
+                at = {} if name == PAIRS else figures(run, truth, real, folder / "rf1")
+                values = {"seconds": seconds, "steps": steps, "at": at}
+                with atomic_write(note) as file:
+                    file.write(json.dumps(values).encode())
+            values = json.loads(note.read_text())
+            shown = "  ".join(f"{k}: {v['panel']:.4f} {v['ends']:.4f}" for k, v in values["at"].items())
+            print(f"seed {seed}  {name}, {values['seconds']:.0f} s  {shown}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=["plane", "scans"])
+    parser.add_argument("--out", type=Path, default=Path("flow_map"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
+    parser.add_argument("--runs", nargs="+", default=[], choices=[*RUNS, *TRIED])
+    given = parser.parse_args()
+    if given.part == "plane":
+        torch.set_num_threads(1)
+        plane()
+    else:
+        scans(given.out, given.seeds, given.runs)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,183 @@
+"""Flow maps: where the flow carries a state from time t to time s, by its mean velocity u on the way.
+
+    X_{t->s}(x) = x + (s - t) u(x, t, s),    u(x, t, t) = v(t, x)
+
+An objective gives the point x_t at which u is learned and what it shall be there. None needs forward-mode derivatives.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.flow.path import expand_time
+from r2flow.registry import Portion, Registry
+
+MeanVelocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # u(t, x, s), as a backbone of two times takes them
+NEAREST = 4  # knots of the polynomial between two of them: its error is of order 4 in their distance
+
+
+def jump(u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+    """X_{t->s}(x), (B, ...), for times of shape () or (B,); backward in time where s < t."""
+    return x + expand_time(s - t, x) * u(t, x, s)
+
+
+class Paths:
+    """A path of each scan by its states at some times: a polynomial through the four nearest.
+
+    With the two ends alone it is the straight line between them.
+
+    Args:
+        times: Rising, (N,), N >= 2.
+        states: (B, N, ...).
+    """
+
+    def __init__(self, times: Tensor, states: Tensor) -> None:
+        self.times, self.states = times.double(), states
+
+    @property
+    def chord(self) -> "Paths":
+        """The straight lines between the ends."""
+        return Paths(self.times[[0, -1]], self.states[:, [0, -1]])
+
+    def at(self, t: Tensor) -> Tensor:
+        """x_t, (B, ...), at times t, (B,)."""
+        first, weights, _ = self._weights(t)
+        return self._sum(first, weights)
+
+    def velocity(self, t: Tensor) -> Tensor:
+        """dx_t / dt, (B, ...)."""
+        first, _, slopes = self._weights(t)
+        return self._sum(first, slopes)
+
+    def mean_velocity(self, t: Tensor, s: Tensor) -> Tensor:
+        """(x_s - x_t) / (s - t), (B, ...); the velocity where s = t."""
+        between = self.at(s) - self.at(t)
+        apart = s != t
+        mean = between / expand_time(torch.where(apart, s - t, 1), between)
+        return mean if bool(apart.all()) else torch.where(expand_time(apart, mean), mean, self.velocity(t))
+
+    def _weights(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The first of the nearest knots, (B,), and the weights of x_t and of its derivative in them, (B, n) each."""
+        knots, count = self.times, min(NEAREST, len(self.times))
+        t = t.double()
+        interval = torch.searchsorted(knots[1:-1].contiguous(), t.contiguous(), right=True)
+        first = (interval - (count // 2 - 1)).clamp(0, len(knots) - count)
+        nodes = knots[first[:, None] + torch.arange(count, device=t.device)]
+        values, slopes = [], []
+        for i in range(count):
+            others = [j for j in range(count) if j != i]
+            scale = torch.stack([nodes[:, i] - nodes[:, j] for j in others]).prod(0)
+            factors = torch.stack([t - nodes[:, j] for j in others])
+            values.append(factors.prod(0) / scale)
+            without = [torch.cat([factors[:j], factors[j + 1 :]]).prod(0) for j in range(len(others))]
+            slopes.append(torch.stack(without).sum(0) / scale)
+        return first, torch.stack(values, 1), torch.stack(slopes, 1)
+
+    def _sum(self, first: Tensor, weights: Tensor) -> Tensor:
+        rows = torch.arange(len(first), device=first.device)
+        total = torch.zeros_like(self.states[:, 0])
+        for i in range(weights.shape[1]):
+            state = self.states[rows, first + i]
+            total = total + expand_time(weights[:, i].to(state), state) * state
+        return total
+
+
+@dataclass(frozen=True)
+class JumpTimes:
+    """Which jumps (t, s) are learned: those of some numbers of equal steps, velocities (s = t), and any others.
+
+    Args:
+        steps: Numbers of steps; each is asked for as often as the others.
+        share: Of the jumps that these steps take.
+        diagonal: Share of the rest with s = t.
+        backward: Share of the rest with s < t.
+    """
+
+    steps: Sequence[int] = (1, 2, 4, 8)
+    share: Portion = 0.75
+    diagonal: Portion = 0.25
+    backward: Portion = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.steps or min(self.steps) < 1:
+            raise InputError(f"the steps of a flow map's jumps must be numbers of at least 1, found {self.steps}.")
+        if self.diagonal + self.backward > 1:
+            raise InputError(
+                f"diagonal and backward are shares of one rest; found {self.diagonal} and {self.backward}."
+            )
+
+    def __call__(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """t and s, (B,) each, from uniform draws in [0, 1), (B, 3)."""
+        which, a, b = u.unbind(1)
+        count = torch.tensor(tuple(self.steps), device=u.device)
+        count = count[(a * len(self.steps)).long().clamp(max=len(self.steps) - 1)]
+        step = torch.minimum((b * count).floor(), count - 1)
+        low, high = torch.minimum(a, b), torch.maximum(a, b)
+        rest = (which - self.share) / (1 - self.share)
+        high = torch.where(rest < self.diagonal, low, high)
+        turned = (rest >= self.diagonal) & (rest < self.diagonal + self.backward)
+        low, high = torch.where(turned, high, low), torch.where(turned, low, high)
+        given = which < self.share
+        return torch.where(given, step / count, low), torch.where(given, (step + 1) / count, high)
+
+
+class Aim(NamedTuple):
+    """Where u is learned, and what it shall be there, (B, ...) each."""
+
+    x_t: Tensor
+    target: Tensor
+
+
+Objective = Callable[[MeanVelocity, Paths, Tensor, Tensor, Tensor], Aim]
+
+
+def along_knots(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
+    """u(x_t, t, s) = (x_s - x_t) / (s - t) on the path of an earlier flow itself, which its knots tell."""
+    return Aim(paths.at(t), paths.mean_velocity(t, s))
+
+
+def consistency(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
+    """u(x_t, t, s) = rho v + (1 - rho) u(x_l, l, s), l = t + rho (s - t), x_l = x_t + rho (s - t) v.
+
+    On the straight line from x_0 to x_1, v = x_1 - x_0; the second u has no gradient (Luo et al. 2025, SoFlow; Zhang et
+    al. 2025, alpha-Flow). rho = 1 is k-TD's regression, rho to 0 is MeanFlow's.
+    """
+    chord = paths.chord
+    x_t, v = chord.at(t), chord.velocity(t)
+    if bool((rho == 1).all()):
+        return Aim(x_t, v)
+    with torch.no_grad():
+        ahead = rho * (s - t)
+        later = u(t + ahead, x_t + expand_time(ahead, v) * v, s)
+    share = expand_time(rho, v)
+    return Aim(x_t, share * v + (1 - share) * later)
+
+
+def two_halves(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
+    """u(x_t, t, s) = rho (x_s - x_t) / (s - t) + (1 - rho) [u(x_t, t, m) + u(x_m, m, s)] / 2.
+
+    m = (t + s) / 2 and x_m = X_{t->m}(x_t); the two halves have no gradient (Frans et al. 2024, shortcut models; Guo et
+    al. 2025, SplitMeanFlow).
+    """
+    x_t, known = paths.at(t), paths.mean_velocity(t, s)
+    with torch.no_grad():
+        middle = (t + s) / 2
+        first = u(t, x_t, middle)
+        second = u(middle, x_t + expand_time(middle - t, x_t) * first, s)
+    share = expand_time(rho, known)
+    return Aim(x_t, torch.where(share == 1, known, share * known + (1 - share) * (first + second) / 2))
+
+
+OBJECTIVES: Registry[Objective] = Registry(
+    "objective of a flow map", knots=along_knots, consistency=consistency, two_halves=two_halves
+)
+
+
+def residual(u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+    """One jump less two half jumps, X_{t->s}(x) - X_{m->s}(X_{t->m}(x)), (B, ...): 0 for the map of a flow."""
+    middle = (t + s) / 2
+    return jump(u, t, x, s) - jump(u, middle, jump(u, t, x, middle), s)

@@ -1,0 +1,118 @@
+"""A flow map: one network that jumps from any time to any other."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.flow.maps import jump
+from r2flow.flow.path import expand_time
+from r2flow.flow.solvers import Solution
+from r2flow.flow.solvers.grids import build_grid
+from r2flow.generators.base import Condition, Generated, Progress, Sampler
+from r2flow.generators.flow import RectifiedFlow
+from r2flow.lidar.space import ModelSpace
+from r2flow.noise import Draws
+
+JUMP, RENOISE = "jump", "renoise"
+
+
+class FlowMap(RectifiedFlow):
+    """X_{t->s}(x) = x + (s - t) u(x, t, s) with u by a backbone of two times: any number of steps, one evaluation each.
+
+    Samplers beside a flow's solvers, which follow v(t, x) = u(x, t, t):
+
+    - `jump`: from each time of the grid to the next;
+    - `renoise`: from each time t to the end, then back to the next time s along a line to fresh noise,
+      x_s = (1 - s) e + s X_{t->1}(x_t): a sample of the same distribution where the map is exact, and not the end of
+      this noise's own path (Song et al. 2023, consistency models, algorithm 1).
+
+    Args:
+        space: The images it makes.
+        backbone: Name and options, as in conf/backbone, of one that takes a second time.
+    """
+
+    second_time: ClassVar[bool] = True
+
+    def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
+        super().__init__(space, backbone)
+        self.sampler = Sampler(JUMP, 4)
+
+    def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+        """u(x, t, s), (B, C, H, W), the mean velocity from time t to time s, of shape () or (B,)."""
+        u: Tensor = self.backbone(t, x, s)
+        return u
+
+    @torch.no_grad()
+    def solve(
+        self,
+        x: Tensor,
+        t_0: float = 0.0,
+        t_1: float = 1.0,
+        *,
+        sampler: Sampler | None = None,
+        condition: Condition | None = None,
+        progress: Progress = None,
+        **options: Any,
+    ) -> Solution:
+        how = sampler or self.sampler
+        if how.method != JUMP:
+            return super().solve(x, t_0, t_1, sampler=how, condition=condition, progress=progress, **options)
+        if options:
+            raise InputError(f"jumps have no {', '.join(options)}; give a solver, as --solver adams3.")
+        end = self._jumps(x, self._times(how, t_0, t_1), None, progress)
+        return Solution.build(end.x, end.evaluations.cpu().numpy(), how.steps, 0, False, end.converged.cpu().numpy())
+
+    def generate(
+        self,
+        noise: Tensor,
+        condition: Condition | None = None,
+        *,
+        sampler: Sampler | None = None,
+        draws: Draws | None = None,
+        progress: Progress = None,
+    ) -> Generated:
+        how = sampler or self.sampler
+        if how.method != RENOISE:
+            return super().generate(noise, condition, sampler=how, draws=draws, progress=progress)
+        if draws is None:
+            raise InputError("renoise draws further noise: give draws.")
+        with torch.no_grad():
+            return self._jumps(noise, self._times(how, 0.0, 1.0), draws, progress)
+
+    def _times(self, how: Sampler, t_0: float, t_1: float) -> Tensor:
+        grid = how.grid if isinstance(how.grid, str) else torch.tensor(how.grid, dtype=torch.float64)
+        return build_grid(grid, t_0, t_1, how.steps)
+
+    def _jumps(self, x: Tensor, times: Tensor, draws: Draws | None, progress: Progress) -> Generated:
+        x = x.to(self.device)
+        for n, (t, s) in enumerate(pairwise(times.to(x)), start=1):
+            if draws is None:
+                following = jump(self.mean_velocity, t, x, s)
+            else:
+                following = jump(self.mean_velocity, t, x, times[-1].to(x))
+                if n < len(times) - 1:
+                    following = (1 - s) * draws.step(self.noise_shape, n).to(x) + s * following
+            alive = following.isfinite().flatten(1).all(1)
+            x = following if bool(alive.all()) else torch.where(expand_time(alive, x), following, x)
+            if progress is not None:
+                progress()
+        return Generated.after(x, len(times) - 1)
+
+    def check_sampler(self, sampler: Sampler) -> None:
+        if sampler.method not in (JUMP, RENOISE):
+            super().check_sampler(sampler)
+            return
+        if sampler.levels or sampler.finish:
+            raise InputError("jumps have neither levels nor a finish; leave them out, or give a solver.")
+        self._times(sampler, 0.0, 1.0)
+
+    def evaluations_of(self, sampler: Sampler) -> int:
+        return sampler.steps if sampler.method in (JUMP, RENOISE) else super().evaluations_of(sampler)
+
+    def in_steps(self, steps: int) -> Sampler:
+        return replace(Sampler(JUMP), steps=steps)

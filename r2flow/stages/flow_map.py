@@ -1,0 +1,79 @@
+"""A flow map: jumps of any length, learned from the paths of an earlier flow, from its pairs or from scans."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, along_knots
+from r2flow.flow.times import plastic_sequence
+from r2flow.generators import FlowMap, Generator
+from r2flow.registry import Positive, check_options
+from r2flow.stages.base import Batch
+from r2flow.stages.reflow import Reflow
+
+
+class LearnFlowMap(Reflow):
+    """Flow map: regress u(x_t, t, s) onto what an objective of `r2flow.flow.maps` says.
+
+    From a 1-RF or a 2-RF on its pairs, with the inner states of their paths (`data.pairs.knots`) for the objective
+    `knots`; or on scans, where noise and scan are drawn independently and `consistency` learns the 1-RF's own map.
+
+    Args:
+        objective: Name in `r2flow.flow.maps.OBJECTIVES`.
+        jumps: Options of `r2flow.flow.maps.JumpTimes`.
+        rho: Where the share rho ends that a bootstrapped objective takes from the path: it falls from 1, by equal
+            factors, over the run. It is always 1 where s = t and for the jump from 0 to 1.
+    """
+
+    generator_name = "flow_map"
+    needs_pairs = False
+
+    def __init__(
+        self,
+        generator: Generator,
+        objective: str = "knots",
+        jumps: Mapping[str, Any] | None = None,
+        rho: Positive = 0.01,
+        loss: str = "pseudo_huber",
+        **options: Any,
+    ) -> None:
+        if options.pop("time", None) is not None:
+            raise InputError("a flow map learns jumps from time to time: give stage.jumps and leave stage.time out.")
+        super().__init__(generator, loss, {"name": "uniform"}, **options)
+        if not isinstance(generator, FlowMap):
+            raise InputError(f"this stage learns jumps, which a {type(generator).__name__} does not have.")
+        self.objective, self.rho = OBJECTIVES[objective], rho
+        check_options("stage.jumps", JumpTimes, jumps or {})
+        self.jumps = JumpTimes(**(jumps or {}))
+
+    def check_data(self, name: str, data: Mapping[str, Any]) -> None:
+        knots = data["name"] == "pairs" and (data.get("pairs") or {}).get("knots")
+        if self.objective is along_knots and not knots:
+            raise InputError(
+                "stage.objective=knots learns from inner states of paths: give data=pairs data.pairs.knots=7, or "
+                "stage.objective=consistency."
+            )
+
+    def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
+        assert isinstance(self.generator, FlowMap)
+        t, s = self.jumps(torch.cat([u[:, None], plastic_sequence(batch["k"])], 1))
+        paths = paths_of(batch)
+        if self.training:
+            known = (t == s) | (s - t == 1)
+            rho = torch.where(known, 1.0, self.rho ** (self.global_step / max(int(self.trainer.max_steps), 1)))
+            aim = self.objective(self.generator.mean_velocity, paths, t, s, rho)
+        else:  # one figure for all objectives
+            aim = along_knots(self.generator.mean_velocity, paths, t, s, torch.ones_like(t))
+        found = self.generator.mean_velocity(t, aim.x_t, s)
+        return self.loss(found, aim.target).mean()
+
+
+def paths_of(batch: Batch) -> Paths:
+    """The paths from x_0 to x_1 of a batch, straight ones where it has no inner states."""
+    ends = batch["x_0"][:, None], batch["x_1"][:, None]
+    if "knots" not in batch:
+        return Paths(torch.tensor([0.0, 1.0], device=batch["x_1"].device), torch.cat(ends, 1))
+    return Paths(batch["times"][0], torch.cat([ends[0], batch["knots"], ends[1]], 1))

@@ -1,0 +1,178 @@
+"""Flow maps as mathematics: paths by their knots, jump times, objectives against exact maps."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from r2flow.errors import InputError
+from r2flow.flow.losses import pseudo_huber
+from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, consistency, jump, residual, two_halves
+from r2flow.flow.path import expand_time
+from r2flow.flow.problems import Gaussian, Straight
+
+TIMES = torch.tensor([0.0, 0.3, 0.55, 0.75, 0.9, 1.0], dtype=torch.float64)
+X_0 = torch.linspace(-2, 2, 12, dtype=torch.float64).view(3, 2, 2)
+T, S = torch.tensor([0.0, 0.37, 0.8], dtype=torch.float64), torch.tensor([1.0, 0.37, 0.81], dtype=torch.float64)
+
+
+def paths_of(function, times: Tensor = TIMES) -> Paths:
+    return Paths(times, torch.stack([function(X_0, t) for t in times], 1))
+
+
+def exact_map(problem):
+    """u(t, x, s) of a problem whose paths x_t = m_t + c_t x_0 are known."""
+
+    def u(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+        zero, one = torch.zeros_like(x), torch.ones_like(x)
+        at = [problem.solution(zero, time) for time in (t, s)]
+        scale = [problem.solution(one, time) - shift for time, shift in zip((t, s), at, strict=True)]
+        moved = at[1] + scale[1] / scale[0] * (x - at[0]) - x
+        length = expand_time(s - t, x) * torch.ones_like(x)
+        return torch.where(length == 0, problem(t, x), moved / torch.where(length == 0, 1.0, length))
+
+    return u
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_a_polynomial_path_is_known_exactly_from_its_knots(degree):
+    paths = paths_of(lambda x, t: x + 0.5 * t**degree, TIMES if degree > 1 else TIMES[[0, -1]])
+    t = torch.tensor([0.0, 0.41, 1.0], dtype=torch.float64)
+    slope = 0.5 * degree * t ** (degree - 1)
+    torch.testing.assert_close(paths.at(t), X_0 + expand_time(0.5 * t**degree, X_0), rtol=0, atol=1e-13)
+    torch.testing.assert_close(paths.velocity(t), expand_time(slope, X_0).expand_as(X_0), rtol=0, atol=1e-12)
+    means = [0.5, slope[1], 0.5 * (0.81**degree - 0.8**degree) / 0.01]
+    begin, end = torch.tensor([[0.0, 0.41, 0.8], [1.0, 0.41, 0.81]], dtype=torch.float64)
+    for row, mean in zip(paths.mean_velocity(begin, end), means, strict=True):
+        torch.testing.assert_close(row, torch.full_like(row, float(mean)), rtol=0, atol=1e-11)
+
+
+def test_between_knots_the_error_is_of_fourth_order():
+    errors = []
+    for knots in (9, 33):
+        paths = paths_of(lambda x, t: x * torch.sin(3 * t), torch.linspace(0, 1, knots, dtype=torch.float64))
+        at = [t.expand(3) for t in torch.linspace(0, 1, 321, dtype=torch.float64)]
+        errors.append(max(float((paths.at(t) - X_0 * torch.sin(3 * t[0])).abs().max()) for t in at))
+    assert math.log2(errors[0] / errors[1]) / 2 == pytest.approx(4, abs=0.3)
+
+
+def test_the_chord_is_straight_between_the_ends():
+    chord = paths_of(lambda x, t: x * (1 - t) ** 3 + t**2).chord
+    torch.testing.assert_close(chord.at(T), X_0 * expand_time(1 - T, X_0) + expand_time(T, X_0))
+    torch.testing.assert_close(chord.mean_velocity(T, S), 1 - X_0)
+
+
+def test_jump_times_keep_their_shares():
+    u = torch.rand(200_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    t, s = JumpTimes(steps=(1, 1, 4), share=0.6, diagonal=0.25, backward=0.25)(u)
+    whole = float(((t == 0) & (s == 1)).double().mean())
+    assert abs(whole - 0.6 * 2 / 3) < 0.005
+    quarter = (s - t - 0.25).abs() < 1e-9
+    for begin in (0, 0.25, 0.5, 0.75):
+        assert abs(float((quarter & (t == begin)).double().mean()) - 0.6 / 3 / 4) < 0.003
+    assert abs(float((s == t).double().mean()) - 0.1) < 0.003
+    assert abs(float((s < t).double().mean()) - 0.1) < 0.003
+    assert float(torch.cat([t, s]).min()) >= 0
+    assert float(torch.cat([t, s]).max()) <= 1
+
+
+def test_the_last_draw_below_one_is_still_a_jump():
+    top = torch.full((1, 3), 1 - 2**-24)
+    for share in (0.0, 0.999999):
+        t, s = JumpTimes(steps=(1, 2, 16), share=share)(torch.cat([top[:, :1] * share, top[:, 1:]], 1))
+        assert 0 <= float(t) <= float(s) <= 1
+
+
+@pytest.mark.parametrize("options", [{"steps": ()}, {"steps": (0, 1)}, {"diagonal": 0.6, "backward": 0.6}])
+def test_jump_times_that_cannot_be_are_refused(options):
+    with pytest.raises(InputError, match="found"):
+        JumpTimes(**options)
+
+
+@pytest.mark.parametrize("problem", [Gaussian(), Straight(), Gaussian(std=2.0)])
+def test_the_map_of_a_flow_has_no_residual(problem):
+    u = exact_map(problem)
+    arrived = torch.stack([problem.solution(x_0, s) for x_0, s in zip(starts(problem), S, strict=True)])
+    torch.testing.assert_close(jump(u, T, X_0, S), arrived)
+    assert float(residual(u, T, X_0, S).abs().max()) < 1e-13
+    assert float(residual(u, S, X_0, T).abs().max()) < 1e-13
+    torch.testing.assert_close(jump(u, S, jump(u, T, X_0, S), T), X_0)  # there and back
+
+
+def starts(problem) -> list[Tensor]:
+    """x_0 of the paths that pass through X_0 at the times T."""
+    found = []
+    for x, t in zip(X_0, T, strict=True):
+        shift = problem.solution(torch.zeros_like(x), t)
+        found.append((x - shift) / (problem.solution(torch.ones_like(x), t) - shift))
+    return found
+
+
+@pytest.mark.parametrize("name", list(OBJECTIVES))
+@pytest.mark.parametrize("rho", [0.0, 0.3, 1.0])
+def test_the_exact_map_of_a_straight_flow_is_what_every_objective_asks_for(name, rho):
+    problem = Straight()
+    paths = paths_of(problem.solution)
+    u = exact_map(problem)
+    x_t, target = OBJECTIVES[name](u, paths, T, S, torch.full_like(T, rho))
+    torch.testing.assert_close(x_t, torch.stack([problem.solution(x, t) for x, t in zip(X_0, T, strict=True)]))
+    torch.testing.assert_close(target, u(T, x_t, S))
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.4])
+def test_two_halves_ask_for_the_exact_map_of_a_curved_flow(rho):
+    problem = Gaussian()
+    paths = paths_of(problem.solution, torch.linspace(0, 1, 65, dtype=torch.float64))
+    x_t, target = two_halves(exact_map(problem), paths, T, S, torch.where(T == S, 1.0, torch.full_like(T, rho)))
+    torch.testing.assert_close(target, exact_map(problem)(T, x_t, S), rtol=0, atol=1e-5)
+
+
+def test_consistency_ends_at_both_of_its_limits():
+    paths, u = paths_of(lambda x, t: x * (1 - t) + t**2), exact_map(Gaussian())
+    x_t, target = consistency(u, paths, T, S, torch.ones_like(T))
+    torch.testing.assert_close(target, 1 - X_0)  # k-TD's
+    x_t, target = consistency(u, paths, T, S, torch.zeros_like(T))
+    torch.testing.assert_close(target, u(T, x_t, S))  # itself
+
+
+class Tiny(nn.Module):
+    """A smooth network of two times, in float64."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(6, 5), nn.Tanh(), nn.Linear(5, 4)).double()
+
+    def forward(self, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+        times = torch.stack([t, s], 1)
+        return self.layers(torch.cat([x.flatten(1), times], 1)).view_as(x)
+
+
+@pytest.mark.parametrize("name", list(OBJECTIVES))
+def test_the_gradient_is_that_of_the_prediction_alone(name):
+    """By central differences, the target held where it is: an objective's own evaluations have no gradient."""
+    model, rho = Tiny(), torch.full_like(T, 0.3)
+    paths = paths_of(lambda x, t: x * torch.cos(2 * t) + t)
+
+    def prediction(x_t: Tensor, target: Tensor) -> Tensor:
+        return pseudo_huber(model(T, x_t, S), target).mean()
+
+    x_t, target = OBJECTIVES[name](model, paths, T, S, rho)
+    prediction(x_t, target).backward()
+    weight = model.layers[0].weight
+    assert weight.grad is not None
+    for index in ((0, 0), (2, 4), (4, 5)):
+        values = []
+        for step in (1e-3, -1e-3):
+            with torch.no_grad():
+                weight[index] += step
+                values.append(float(pseudo_huber_64(model(T, x_t, S), target.detach())))
+                weight[index] -= step
+        assert float(weight.grad[index]) == pytest.approx((values[0] - values[1]) / 2e-3, rel=1e-4)
+
+
+def pseudo_huber_64(v: Tensor, u: Tensor) -> Tensor:
+    """The paper's loss over sqrt(d), in float64, written again."""
+    r = (v - u).flatten(1)
+    c = 0.00054 * math.sqrt(r.shape[1])
+    return (((r.square().sum(1) + c**2).sqrt() - c) / math.sqrt(r.shape[1])).mean()

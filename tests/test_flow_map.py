@@ -1,0 +1,233 @@
+"""The generator `FlowMap`: jumps of a network of two times, and the stage that learns them."""
+
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from r2flow.data.options import PairOptions
+from r2flow.data.pairs import PairDataset, PairSource, make_pairs
+from r2flow.data.shards import PairStore
+from r2flow.errors import InputError
+from r2flow.flow.path import interpolate
+from r2flow.flow.problems import Gaussian
+from r2flow.generators import Field, FlowMap, RectifiedFlow, Sampler, build_generator
+from r2flow.noise import Draws
+from r2flow.stages import build_stage
+from r2flow.stages.flow_map import LearnFlowMap, paths_of
+
+CONFIG = {
+    "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
+    "encoding": {"format": "logscale", "reflectance": True},
+    "backbone": {"name": "hdit", "base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
+}
+
+
+def parent() -> RectifiedFlow:
+    """A flow whose velocity is not zero."""
+    torch.manual_seed(1)
+    flow = build_generator(CONFIG)
+    assert isinstance(flow, RectifiedFlow)
+    with torch.no_grad():
+        for weight in flow.backbone.parameters():
+            if not weight.any():
+                weight.normal_(std=0.05)
+    return flow.eval()
+
+
+def flow_map() -> FlowMap:
+    found = build_generator({**CONFIG, "generator": {"name": "flow_map"}})
+    assert isinstance(found, FlowMap)
+    return found.eval()
+
+
+@pytest.fixture
+def grown() -> FlowMap:
+    found = flow_map()
+    found.start_from(parent())
+    return found
+
+
+class Exact(FlowMap):
+    """The map of a Gaussian problem: x_s = s m + sigma_s / sigma_t (x_t - t m)."""
+
+    problem = Gaussian()
+
+    def mean_velocity(self, t, x, s):
+        scale = [((1 - time) ** 2 + (time * self.problem.std) ** 2).sqrt() for time in (t, s)]
+        moved = s * self.problem.mean + scale[1] / scale[0] * (x - t * self.problem.mean) - x
+        return moved / (s - t)
+
+
+@pytest.fixture
+def exact() -> Exact:
+    found = flow_map()
+    found.__class__ = Exact
+    return found  # type: ignore[return-value]
+
+
+def test_before_it_has_learned_jumps_are_its_parent_s_euler_steps(grown):
+    x_0 = Draws(0, range(2)).start(grown.noise_shape)
+    for steps in (1, 3):
+        jumped = grown.generate(x_0, sampler=Sampler("jump", steps))
+        walked = parent().generate(x_0, sampler=Sampler("euler", steps))
+        torch.testing.assert_close(jumped.x, walked.x, rtol=0, atol=1e-5)  # s - t is rounded otherwise
+        assert jumped.evaluations.tolist() == [steps, steps]
+    t = torch.tensor([0.3, 0.6])
+    assert torch.equal(grown.velocity(t, x_0), parent().velocity(t, x_0))
+
+
+@pytest.mark.parametrize(("steps", "grid"), [(1, "uniform"), (4, "power:2"), (3, (0.0, 0.2, 0.7, 1.0))])
+def test_jumps_of_an_exact_map_end_where_the_flow_does(exact, steps, grid):
+    x_0 = Draws(0, range(3)).start(exact.noise_shape)
+    found = exact.generate(x_0, sampler=Sampler("jump", steps, grid=grid))
+    torch.testing.assert_close(found.x.double(), Exact.problem.solution(x_0, 1.0), rtol=0, atol=1e-5)
+    assert found.converged.all()
+
+
+def test_backward_jumps_lead_back_to_the_noise(exact):
+    x_0 = Draws(0, range(2)).start(exact.noise_shape)
+    there = exact.solve(x_0, sampler=Sampler("jump", 2)).x
+    back = exact.solve(there, 1.0, 0.0, sampler=Sampler("jump", 3))
+    torch.testing.assert_close(back.x, x_0, rtol=0, atol=1e-4)
+    assert back.evaluations.tolist() == [3, 3]
+
+
+def test_renoised_samples_of_an_exact_map_have_the_data_s_distribution(exact):
+    draws = Draws(5, range(64))
+    x_0 = draws.start(exact.noise_shape)
+    found = exact.generate(x_0, sampler=Sampler("renoise", 3), draws=draws).x
+    count = found.numel()  # 32,768 values of N(0.7, 0.25^2)
+    assert float(found.mean()) == pytest.approx(0.7, abs=5 * 0.25 / count**0.5)
+    assert float(found.std()) == pytest.approx(0.25, abs=5 * 0.25 / (2 * count) ** 0.5)
+    twice = exact.generate(x_0, sampler=Sampler("renoise", 2), draws=draws).x
+    between = 0.5 * draws.step(exact.noise_shape, 1) + 0.5 * (0.7 + 0.25 * x_0)
+    expected = 0.7 + 0.25 / (0.25 + 0.25 * 0.25**2) ** 0.5 * (between - 0.5 * 0.7)
+    torch.testing.assert_close(twice, expected, rtol=0, atol=1e-5)
+
+
+def test_it_can_also_be_solved_as_the_flow_that_it_is(grown):
+    x_0 = Draws(0, range(2)).start(grown.noise_shape)
+    how = Sampler("adams3", 4)
+    assert torch.equal(grown.generate(x_0, sampler=how).x, parent().generate(x_0, sampler=how).x)
+
+
+def test_a_scan_that_leaves_the_numbers_is_flagged_and_keeps_its_last_state(exact):
+    x_0 = Draws(0, range(2)).start(exact.noise_shape)
+    x_0[1, 0, 0, 0] = float("inf")
+    assert exact.generate(x_0, sampler=Sampler("jump", 2)).converged.tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("sampler", "said"),
+    [
+        (Sampler("jump", 4, finish=0.1), "neither levels nor a finish"),
+        (Sampler("jump", 4, grid=(0.0, 0.5)), "time grid"),
+        (Sampler("jumps", 4), "no solver named 'jumps'"),
+    ],
+)
+def test_samplers_that_jumps_do_not_have_are_refused(grown, sampler, said):
+    with pytest.raises(InputError, match=said):
+        grown.check_sampler(sampler)
+
+
+def test_renoising_needs_draws(grown):
+    with pytest.raises(InputError, match="give draws"):
+        grown.generate(torch.zeros(1, *grown.noise_shape), sampler=Sampler("renoise", 2))
+
+
+# ---- the stage
+
+DATA = {"name": "pairs", "batch_size": 4, "pairs": {"knots": 3}}
+
+
+def stage(data: dict = DATA, generator: RectifiedFlow | None = None, **options) -> LearnFlowMap:
+    config = {"stage": {"name": "flow_map", **options}, "data": data, "seed": 0}
+    found = build_stage(config, generator or flow_map())
+    assert isinstance(found, LearnFlowMap)
+    return found
+
+
+def batch_of(**further) -> dict[str, torch.Tensor]:
+    draws = torch.Generator().manual_seed(0)
+    x_0, x_1 = torch.randn(2, 4, 2, 8, 32, generator=draws).unbind(0)
+    return {"x_0": x_0, "x_1": x_1, "u": torch.rand(4, generator=draws), "k": torch.arange(4), **further}
+
+
+def test_on_pairs_alone_the_path_is_the_straight_line_between_them():
+    batch = batch_of()
+    t = torch.tensor([0.0, 0.25, 0.5, 1.0])
+    x_t, v = interpolate(batch["x_0"], batch["x_1"], t)
+    torch.testing.assert_close(paths_of(batch).at(t), x_t)
+    torch.testing.assert_close(paths_of(batch).velocity(t), v)
+
+
+def test_the_knots_of_pairs_on_disk_are_the_path_of_the_flow_that_drew_them(tmp_path: Path):
+    """dx/dt = x: x_t = e^t x_0, and the mean velocity (e^s - e^t) / (s - t) x_0."""
+    options = PairOptions(num=6, method="adams3", steps=64, knots=7, batch_size=2, parent="a")
+    store = PairStore(tmp_path, options.recipe((2, 4, 8)))
+    make_pairs(store, Field(lambda t, x: x, (2, 4, 8)), 6)
+    dataset = PairDataset(PairSource(store, 6), 0, "training")
+    batch = torch.utils.data.default_collate([dataset[k, k] for k in range(6)])
+    assert batch["knots"].shape == (6, 7, 2, 4, 8)
+    t = torch.tensor([0.0, 0.11, 0.4, 0.63, 0.9, 1.0])
+    s = torch.tensor([1.0, 0.5, 0.9, 1.0, 1.0, 1.0])
+    paths, x_0, wide = paths_of(batch), batch["x_0"], (6, 1, 1, 1)
+    torch.testing.assert_close(paths.at(t), t.exp().view(wide) * x_0, rtol=1e-3, atol=1e-4)
+    t[-1] = s[-1] = 0.5
+    mean = torch.where(s == t, t.exp(), (s.exp() - t.exp()) / (s - t).clamp(min=1e-9))
+    torch.testing.assert_close(paths.mean_velocity(t, s), mean.view(wide) * x_0, rtol=1e-2, atol=2e-2)
+
+
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_pairs_with_knots_are_the_same_bytes_from_any_number_of_processes(tmp_path: Path, ranks: int):
+    options = PairOptions(num=12, method="adams3", steps=4, knots=1, batch_size=2, shard_mib=0.001, parent="a")
+    for folder, count in ((tmp_path / "one", 1), (tmp_path / "many", ranks)):
+        store = PairStore(folder, options.recipe((2, 4, 8)))
+        for rank in range(count):
+            make_pairs(store, Field(lambda t, x: x, (2, 4, 8)), 12, rank, count)
+    shards = {p.name: p.read_bytes() for p in (tmp_path / "one").glob("*.safetensors")}
+    assert len(shards) > 1
+    assert shards == {p.name: p.read_bytes() for p in (tmp_path / "many").glob("*.safetensors")}
+
+
+@pytest.mark.parametrize("objective", ["knots", "consistency", "two_halves"])
+def test_a_flow_map_learns_a_map_that_it_can_know(objective, monkeypatch):
+    """Pairs x_1 = 0.5 x_0, whose map is u = -0.5 x / (1 - t / 2) at every s: the loss falls in a few steps."""
+    torch.manual_seed(0)
+    monkeypatch.setattr(LearnFlowMap, "log", lambda *_, **__: None)
+    learned = stage(objective=objective)
+    trainer = type("Trainer", (), {"max_steps": 60, "global_step": 30})()
+    monkeypatch.setattr(LearnFlowMap, "trainer", trainer, raising=False)
+    monkeypatch.setattr(LearnFlowMap, "global_step", 30, raising=False)
+    optimizer = torch.optim.AdamW(learned.parameters(), 1e-2)
+    learned.train()
+    losses = []
+    for step in range(16):
+        batch = batch_of(k=torch.arange(4) + 4 * step)
+        batch["x_1"] = 0.5 * batch["x_0"]
+        loss = learned.training_step(batch, step)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert sum(losses[-3:]) < 0.6 * sum(losses[:3])
+
+
+def test_a_stage_of_jumps_says_what_it_lacks():
+    with pytest.raises(InputError, match=r"data\.pairs\.knots=7"):
+        stage({**DATA, "pairs": {"knots": 0}})
+    with pytest.raises(InputError, match=r"leave stage\.time out"):
+        stage(time={"name": "uniform"})
+    with pytest.raises(InputError, match="'step'"):
+        stage(jumps={"step": [1]})
+    with pytest.raises(InputError, match="which a RectifiedFlow does not have"):
+        stage(generator=parent())
+    assert stage({"name": "simulated", "batch_size": 4}, objective="consistency").objective is not None
+
+
+def test_the_stage_s_options_are_those_of_its_config():
+    text = (Path(__file__).parent.parent / "conf/stage/flow_map.yaml").read_text(encoding="utf-8")
+    options = {key: value for key, value in yaml.safe_load(text).items() if key not in ("defaults", "init")}
+    assert stage(**{key: value for key, value in options.items() if key != "name"}).jumps.steps
