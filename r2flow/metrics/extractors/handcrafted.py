@@ -199,6 +199,7 @@ class Handcrafted(Extractor):
     layer = f"means over {BANDS} bands of rows and {SECTORS} sectors of azimuth"
     weights = "none"
     needs_reflectance: ClassVar[bool] = True
+    table: Tensor  # centre and spread of every feature, (D, 2)
 
     def __init__(self) -> None:
         super().__init__()
