@@ -1,19 +1,18 @@
 """What happens during a run, and when; what it does is r2flow's."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 from r2flow.checkpoints import FOLDER
-from r2flow.errors import InputError
 from r2flow.registry import Count, Registry, check_options
 
 from .curvature import Curvature
 from .ema import EMA
 from .guard import Guard
+from .loggers import LOGGERS, build_loggers, log_config, log_figures
 from .pictures import SamplePictures
 from .progress import Progress
 from .reflow_pairs import ReflowPairs
@@ -87,26 +86,9 @@ CALLBACKS = Registry(
 )
 
 
-def _csv(run_dir: Path) -> Logger:
-    return CSVLogger(run_dir, name="metrics")
-
-
-def _tensorboard(run_dir: Path) -> Logger:
-    return TensorBoardLogger(run_dir, name="tensorboard", version="", default_hp_metric=False)
-
-
-LOGGERS = Registry("logger", csv=_csv, tensorboard=_tensorboard)
-
-
-def build_loggers(names: Sequence[str] | None, run_dir: Path) -> list[Logger]:
-    """CSV and TensorBoard logs below the run's folder."""
-    if isinstance(names, str):
-        raise InputError(f"loggers must be a list, found {names!r}; write loggers=[{names}].")
-    return [LOGGERS[name](run_dir) for name in names or []]
-
-
 __all__ = [
     "EMA",
+    "LOGGERS",
     "Curvature",
     "Guard",
     "Progress",
@@ -116,6 +98,8 @@ __all__ = [
     "build_callbacks",
     "build_loggers",
     "keep_checkpoints",
+    "log_config",
+    "log_figures",
 ]
 
 if __name__ != "r2flow.callbacks":  # a run's callbacks look for each other by class, and a second copy has other ones

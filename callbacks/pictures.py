@@ -3,17 +3,17 @@
 from pathlib import Path
 
 import lightning as L
-from lightning.pytorch.loggers import TensorBoardLogger
 
 from r2flow.generators import Generator
 from r2flow.registry import Count, Natural
 from r2flow.sampling import draw
 
+from .loggers import log_picture
 from .periodic import Periodic
 
 
 class SamplePictures(Periodic):
-    """Draws a few scans from the same noise every time, into the run's folder and TensorBoard.
+    """Draws a few scans from the same noise every time, into the run's folder and its loggers.
 
     Args:
         folder: Where `step-XXXXXXXX.png` goes.
@@ -38,6 +38,4 @@ class SamplePictures(Periodic):
         drawn = draw(generator, range(self.num), self.seed, generator.sampler.changed(steps=self.steps))
         figure = contact_sheet(list(drawn.images.numpy()), generator.space.sensor.rays(), [f"step {step}"])
         save_figure(figure, path)
-        for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger):
-                logger.experiment.add_image("samples", figure_pixels(figure), step, dataformats="HWC")
+        log_picture(trainer.loggers, "samples", figure_pixels(figure), step)

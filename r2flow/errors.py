@@ -3,6 +3,7 @@
 import errno
 import io
 import sys
+from importlib.util import find_spec
 
 
 class InputError(ValueError):
@@ -11,6 +12,17 @@ class InputError(ValueError):
     The message is one line: what was wrong, what was found, what to do. The command line prints it
     without a traceback and exits with 2; any other exception is a defect of ours and keeps its traceback.
     """
+
+
+def require(what: str, extra: str, *packages: str) -> None:
+    """Refuse what needs a package that is not installed, and say which extra of r2flow brings it.
+
+    Raises:
+        InputError: one is missing.
+    """
+    for package in packages:
+        if find_spec(package) is None:
+            raise InputError(f"{what} needs the package {package}: python -m pip install 'r2flow[{extra}]'.")
 
 
 # System errors that a user can mend; others (a lost connection, a broken pipe) keep their traceback.

@@ -19,7 +19,7 @@ import lightning as L
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
-from r2flow.callbacks import build_callbacks, build_loggers
+from r2flow.callbacks import build_callbacks, build_loggers, log_config, log_figures
 from r2flow.callbacks.stopping import Stopping
 from r2flow.checkpoints import Allowance, checkpoints_of, step_of
 from r2flow.composing import check_keys, compose
@@ -296,6 +296,7 @@ def fit(run: Run) -> Result:
                     "cuda" if gpu else "cpu",
                     run.trainer.max_steps,
                 )
+                log_figures(run.trainer.loggers, run.folder, step)
     return _result(run, step, finished=step >= run.trainer.max_steps)
 
 
@@ -308,6 +309,8 @@ def _fit_in_folder(run: Run) -> int:
         (record_contents if last is None else check_contents)(run.folder, run.data.files)
     if last is not None:
         log.info("going on from %s", last)
+    if run.trainer.is_global_zero:
+        log_config(run.trainer.loggers, run.config)
     run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)
     return run.trainer.global_step
 

@@ -10,6 +10,7 @@ from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairDataset, PairSource, make_pairs
 from r2flow.data.shards import PairStore
 from r2flow.errors import InputError
+from r2flow.flow.maps import OBJECTIVES
 from r2flow.flow.path import interpolate
 from r2flow.flow.problems import Gaussian
 from r2flow.generators import Field, FlowMap, RectifiedFlow, Sampler, build_generator
@@ -192,7 +193,7 @@ def test_pairs_with_knots_are_the_same_bytes_from_any_number_of_processes(tmp_pa
     assert shards == {p.name: p.read_bytes() for p in (tmp_path / "many").glob("*.safetensors")}
 
 
-@pytest.mark.parametrize("objective", ["knots", "consistency", "two_halves"])
+@pytest.mark.parametrize("objective", list(OBJECTIVES))
 def test_a_flow_map_learns_a_map_that_it_can_know(objective, monkeypatch):
     """Pairs x_1 = 0.5 x_0, whose map is u = -0.5 x / (1 - t / 2) at every s: the loss falls in a few steps."""
     torch.manual_seed(0)
@@ -217,14 +218,14 @@ def test_a_flow_map_learns_a_map_that_it_can_know(objective, monkeypatch):
 
 def test_a_stage_of_jumps_says_what_it_lacks():
     with pytest.raises(InputError, match=r"data\.pairs\.knots=7"):
-        stage({**DATA, "pairs": {"knots": 0}})
+        stage({**DATA, "pairs": {"knots": 0}}, objective="corrected")
     with pytest.raises(InputError, match=r"leave stage\.time out"):
         stage(time={"name": "uniform"})
     with pytest.raises(InputError, match="'step'"):
         stage(jumps={"step": [1]})
     with pytest.raises(InputError, match="which a RectifiedFlow does not have"):
         stage(generator=parent())
-    assert stage({"name": "simulated", "batch_size": 4}, objective="consistency").objective is not None
+    assert stage({"name": "simulated", "batch_size": 4}).objective is not None
 
 
 def test_the_stage_s_options_are_those_of_its_config():

@@ -261,5 +261,5 @@ class UNet(Backbone):
         """The first convolution, on the image and its rays' features."""
         if self.coords_encoding is None:
             return self.in_conv(x)
-        features = self.features.to(x.dtype).expand(len(x), -1, -1, -1)
+        features = self.features.to(x.dtype).expand(x.shape[0], -1, -1, -1)
         return self.in_conv(torch.cat([x, features], dim=1))

@@ -12,6 +12,7 @@ from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     accuracy,
     compare,
     evaluate,
+    export,
     flows,
     inversion,
     measure,

@@ -7,13 +7,14 @@ An objective gives the point x_t at which u is learned and what it shall be ther
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
+from r2flow.flow.times import UShaped
 from r2flow.registry import Portion, Registry
 
 MeanVelocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # u(t, x, s), as a backbone of two times takes them
@@ -91,16 +92,18 @@ class JumpTimes:
     """Which jumps (t, s) are learned: those of some numbers of equal steps, velocities (s = t), and any others.
 
     Args:
-        steps: Numbers of steps; each is asked for as often as the others.
+        steps: Numbers of steps; one that stands here twice is asked for twice as often.
         share: Of the jumps that these steps take.
-        diagonal: Share of the rest with s = t.
+        diagonal: Share of the rest with s = t, at the times of `UShaped`, by which reflow learns its velocity.
         backward: Share of the rest with s < t.
     """
 
-    steps: Sequence[int] = (1, 2, 4, 8)
-    share: Portion = 0.75
-    diagonal: Portion = 0.25
+    steps: Sequence[int] = (1, 1, 1, 2, 4, 8)
+    share: Portion = 0.55
+    diagonal: Portion = 0.55
     backward: Portion = 0.0
+
+    velocities: ClassVar = UShaped()
 
     def __post_init__(self) -> None:
         if not self.steps or min(self.steps) < 1:
@@ -118,7 +121,8 @@ class JumpTimes:
         step = torch.minimum((b * count).floor(), count - 1)
         low, high = torch.minimum(a, b), torch.maximum(a, b)
         rest = (which - self.share) / (1 - self.share)
-        high = torch.where(rest < self.diagonal, low, high)
+        velocity = self.velocities(a)
+        low, high = (torch.where(rest < self.diagonal, velocity, time) for time in (low, high))
         turned = (rest >= self.diagonal) & (rest < self.diagonal + self.backward)
         low, high = torch.where(turned, high, low), torch.where(turned, low, high)
         given = which < self.share
@@ -138,6 +142,22 @@ Objective = Callable[[MeanVelocity, Paths, Tensor, Tensor, Tensor], Aim]
 def along_knots(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
     """u(x_t, t, s) = (x_s - x_t) / (s - t) on the path of an earlier flow itself, which its knots tell."""
     return Aim(paths.at(t), paths.mean_velocity(t, s))
+
+
+def corrected(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
+    """u(y, t, s) = (x_s - y) / (s - t) from where the map itself arrives, y = X_{r->t}(x_r), r = max(t - (s - t), 0).
+
+    The jump before has errors, and this one learns to mend them; y has no gradient. Where s <= t, as `along_knots`.
+    """
+    x_t, known = paths.at(t), paths.mean_velocity(t, s)
+    after = (s > t) & (t > 0)
+    if not bool(after.any()):
+        return Aim(x_t, known)
+    with torch.no_grad():
+        r = torch.where(after, (2 * t - s).clamp(min=0), t)
+        y = torch.where(expand_time(after, x_t), jump(u, r, paths.at(r), t), x_t)
+    missing = expand_time(torch.where(after, s - t, 1), x_t)
+    return Aim(y, known + (x_t - y) / missing)
 
 
 def consistency(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
@@ -173,7 +193,7 @@ def two_halves(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor)
 
 
 OBJECTIVES: Registry[Objective] = Registry(
-    "objective of a flow map", knots=along_knots, consistency=consistency, two_halves=two_halves
+    "objective of a flow map", knots=along_knots, corrected=corrected, consistency=consistency, two_halves=two_halves
 )
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, along_knots
+from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, along_knots, corrected
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import FlowMap, Generator
 from r2flow.registry import Positive, check_options
@@ -18,8 +18,8 @@ from r2flow.stages.reflow import Reflow
 class LearnFlowMap(Reflow):
     """Flow map: regress u(x_t, t, s) onto what an objective of `r2flow.flow.maps` says.
 
-    From a 1-RF or a 2-RF on its pairs, with the inner states of their paths (`data.pairs.knots`) for the objective
-    `knots`; or on scans, where noise and scan are drawn independently and `consistency` learns the 1-RF's own map.
+    From a 1-RF or a 2-RF on its pairs, with the inner states of their paths (`data.pairs.knots`) for the objectives
+    `knots` and `corrected`; or on scans, where noise and scan are drawn independently.
 
     Args:
         objective: Name in `r2flow.flow.maps.OBJECTIVES`.
@@ -34,7 +34,7 @@ class LearnFlowMap(Reflow):
     def __init__(
         self,
         generator: Generator,
-        objective: str = "knots",
+        objective: str = "consistency",
         jumps: Mapping[str, Any] | None = None,
         rho: Positive = 0.01,
         loss: str = "pseudo_huber",
@@ -45,16 +45,16 @@ class LearnFlowMap(Reflow):
         super().__init__(generator, loss, {"name": "uniform"}, **options)
         if not isinstance(generator, FlowMap):
             raise InputError(f"this stage learns jumps, which a {type(generator).__name__} does not have.")
-        self.objective, self.rho = OBJECTIVES[objective], rho
+        self.objective, self.objective_name, self.rho = OBJECTIVES[objective], objective, rho
         check_options("stage.jumps", JumpTimes, jumps or {})
         self.jumps = JumpTimes(**(jumps or {}))
 
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
         knots = data["name"] == "pairs" and (data.get("pairs") or {}).get("knots")
-        if self.objective is along_knots and not knots:
+        if self.objective in (along_knots, corrected) and not knots:
             raise InputError(
-                "stage.objective=knots learns from inner states of paths: give data=pairs data.pairs.knots=7, or "
-                "stage.objective=consistency."
+                f"stage.objective={self.objective_name} learns from inner states of paths: give data=pairs "
+                "data.pairs.knots=7, or stage.objective=consistency."
             )
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:

@@ -1,0 +1,320 @@
+"""A trained flow as one file that runs without r2flow: its network, or noise in and scan out; `.pt2` or `.onnx`.
+
+A sampler of fixed steps is linear in the noise and in what the network answers. Its coefficients are found once, by
+running the generator with another network, and the exported graph is those coefficients, the network and the decoding.
+"""
+
+import io
+import json
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from copy import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from r2flow import __version__
+from r2flow.checkpoints import Checkpoint, weights_hash
+from r2flow.errors import InputError, require
+from r2flow.files import atomic_write
+from r2flow.generators import USUAL, RectifiedFlow, Sampler
+from r2flow.lidar.projection import unproject
+from r2flow.lidar.space import ModelSpace
+from r2flow.noise import Draws
+from r2flow.registry import Registry
+
+NOTES = "r2flow.json"  # of a .pt2: its metadata; an .onnx has them under `r2flow`
+LARGEST = 2**31 - 2**25  # bytes of weights in an .onnx, which is one protocol buffer
+
+
+class Tableau(NamedTuple):
+    """A sampler of E evaluations, v_j = v(t_j, y_j) or u(y_j, t_j, s_j), with y_j = a_j0 x_0 + sum_{i<j} a_j,i+1 v_i.
+
+    Attributes:
+        times: t_j, (E,).
+        second: s_j, (E,); None for a network of one time.
+        states: a, (E + 1, E + 1) float64; its last row makes x_1.
+    """
+
+    times: list[float]
+    second: list[float] | None
+    states: Tensor
+
+
+class _Recorder(nn.Module):
+    """In the place of a network: answers the j-th call with the j-th unit vector and keeps what it was asked."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.precision = nn.Parameter(torch.zeros((), dtype=torch.float64), requires_grad=False)
+        self.calls: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def forward(self, t: Tensor | float, x: Tensor, s: Tensor | float | None = None) -> Tensor:
+        self.calls.append((torch.as_tensor(t), x, torch.as_tensor(t if s is None else s)))
+        v = torch.zeros_like(x)
+        v[len(self.calls) :][:1] = 1
+        return v
+
+
+def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
+    """The coefficients of a sampler.
+
+    Raises:
+        InputError: its number of evaluations depends on the scan, or it needs more than the noise.
+    """
+    flow.check_sampler(sampler)
+    count = flow.evaluations_of(sampler)
+    if count == 0:
+        found = "one whose steps depend on the scan" if sampler.levels else sampler.method
+        raise InputError(
+            f"an exported sampler takes a fixed number of steps by a solver of ours, found {found}: give "
+            f"--solver {USUAL.method} --steps {USUAL.steps}."
+        )
+    recorder, shadow = _Recorder(), copy(flow)
+    shadow._modules = {**flow._modules, "backbone": recorder}
+    basis = torch.eye(count + 1, dtype=torch.float64)[:, :1, None, None]  # x_0 is the first unit vector
+    try:
+        x_1 = shadow.generate(basis, sampler=sampler).x
+    except InputError as error:  # it draws noise on the way
+        problem = str(error).rstrip(".")
+        raise InputError(f"{sampler.method} cannot be exported, {problem!r}: give another --solver.") from None
+    times, states, second = zip(*recorder.calls, strict=True)
+    rows = torch.stack([*states, x_1]).reshape(-1, count + 1)[:, : len(times) + 1]  # a `finish` takes fewer than count
+    return Tableau([float(t) for t in times], [float(s) for s in second] if flow.second_time else None, rows)
+
+
+class Decoded(nn.Module):
+    """x_1 in model space to range in metres and reflectance, (B, 2 or 1, H, W), and points in metres, (B, 3, H, W)."""
+
+    rays: Tensor
+
+    def __init__(self, space: ModelSpace) -> None:
+        super().__init__()
+        self.space = space
+        self.register_buffer("rays", space.sensor.rays())
+
+    def forward(self, x_1: Tensor) -> tuple[Tensor, Tensor]:
+        scan = self.space.decode(x_1)
+        return scan, unproject(scan[:, :1], self.rays)
+
+
+class Scans(nn.Module):
+    """x_0 to `Decoded`, every evaluation of the network written out."""
+
+    def __init__(self, flow: RectifiedFlow, how: Tableau) -> None:
+        super().__init__()
+        self.network, self.decoded, self.how = flow.backbone, Decoded(flow.space), how
+
+    def forward(self, noise: Tensor) -> tuple[Tensor, Tensor]:
+        *states, last = self.how.states.tolist()
+        known = [noise]
+        for j, row in enumerate(states):
+            times = [noise.new_tensor(of[j]) for of in (self.how.times, self.how.second) if of]
+            known.append(self.network(times[0], _sum(row, known), *times[1:]))
+        return self.decoded(_sum(last, known))
+
+
+def _sum(row: list[float], known: list[Tensor]) -> Tensor:
+    x = row[0] * known[0]
+    for a, v in zip(row[1:], known[1:], strict=False):
+        x = x + a * v if a else x
+    return x
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A file that was written.
+
+    Attributes:
+        path: Its place.
+        any_batch: Whether it takes any number of scans at once; else one.
+        notes: Its metadata.
+    """
+
+    path: Path
+    any_batch: bool
+    notes: dict[str, Any]
+
+
+def export(checkpoint: Checkpoint, path: str | Path, sampler: Sampler | None = None, network: bool = False) -> Exported:
+    """Write a flow as a `.pt2` (torch.export) or an `.onnx`.
+
+    It takes `noise` (B, C, H, W) and gives `scan`, range in metres and reflectance, (B, 2 or 1, H, W), 0 without a
+    return, and `points` in metres, (B, 3, H, W), the origin without one; float32. A `.pt2` holds every evaluation one
+    after the other, an `.onnx` the network once, in a loop.
+
+    Args:
+        path: Its ending says the format.
+        sampler: How the flow is run; its own if left out.
+        network: Write v(t, x) alone: `t` (B,) and `x` (B, C, H, W) to `v`; a flow map takes `s` (B,) too.
+
+    Raises:
+        InputError: another ending, no flow, a sampler without a fixed number of steps, a package that is missing, or
+            a network that torch cannot export.
+    """
+    path, flow = Path(path), checkpoint.generator
+    write = FORMATS[path.suffix.removeprefix(".")]
+    if not isinstance(flow, RectifiedFlow):
+        raise InputError(f"only flows can be exported, and {checkpoint.path} holds a {type(flow).__name__}.")
+    how = sampler or flow.sampler
+    steps = None if network else tableau(flow, how)
+    notes = _notes(checkpoint, how, steps)
+    with _quiet():
+        data, any_batch = write(flow, steps, notes)
+    with atomic_write(path) as file:
+        file.write(data)
+    return Exported(path, any_batch, notes)
+
+
+def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> dict[str, Any]:
+    """What the file says of itself."""
+    flow = checkpoint.generator
+    channels = ["range in metres", "reflectance of [0, 1]"][: 1 + flow.space.encoding.reflectance]
+    scan = {
+        "sampler": how.asdict(),
+        "evaluations": steps and len(steps.times),
+        "outputs": {
+            "scan": f"(batch, {len(channels)}, H, W): {', '.join(channels)}; 0 without a return",
+            "points": "(batch, 3, H, W): x ahead, y left, z up in metres; the origin without a return",
+        },
+    }
+    return {
+        "r2flow": __version__,
+        "weights": weights_hash(checkpoint),
+        "step": checkpoint.step,
+        "image": list(flow.space.shape),
+        "sensor": flow.space.sensor.described(),
+        "encoding": checkpoint.config["encoding"],
+        **(scan if steps else {"outputs": {"v": "dx/dt at x and t, in model space"}}),
+    }
+
+
+def _write_pt2(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) -> tuple[bytes, bool]:
+    module, inputs = (flow.backbone, _network_inputs(flow, (2,))) if how is None else (Scans(flow, how), _noise(flow))
+    program, any_batch = _traced(module, inputs)
+    file = io.BytesIO()
+    torch.export.save(program, file, extra_files={NOTES: json.dumps(notes)})
+    return file.getvalue(), any_batch
+
+
+def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) -> tuple[bytes, bool]:
+    require("an .onnx", "export", "onnx", "onnxscript")
+    size = sum(value.numel() * value.element_size() for value in flow.state_dict().values())
+    if size > LARGEST:
+        raise InputError(f"an .onnx holds at most 2 GiB, and these weights are {size:,} bytes: use --to pt2.")
+    from r2flow.onnx_graphs import sampler_graph, to_onnx
+
+    program, any_batch = _traced(flow.backbone, _network_inputs(flow, (2,) if how is None else ()))
+    network = to_onnx(program, ["t", "x", "s"][: 2 + flow.backbone.second_time], ["v"])
+    if how is not None:
+        decoded, any_too = _traced(Decoded(flow.space), _noise(flow))
+        any_batch = any_batch and any_too
+        network = sampler_graph(
+            network, to_onnx(decoded, ["x_1"], ["scan", "points"]), how.times, how.second, how.states.numpy()
+        )
+    entry = network.metadata_props.add()
+    entry.key, entry.value = "r2flow", json.dumps(notes)
+    network.producer_name, network.producer_version = "r2flow", __version__
+    return network.SerializeToString(), any_batch
+
+
+FORMATS = Registry("export format", pt2=_write_pt2, onnx=_write_onnx)
+
+
+def _noise(flow: RectifiedFlow) -> dict[str, Tensor]:
+    return {"noise": torch.zeros(2, *flow.noise_shape)}
+
+
+def _network_inputs(flow: RectifiedFlow, of_times: tuple[int, ...]) -> dict[str, Tensor]:
+    """Examples for v(t, x), t of shape () or (2,)."""
+    network = flow.backbone
+    x = torch.zeros(2, network.in_channels, *network.coords.shape[2:])
+    inputs = {"t": torch.full(of_times, 0.25), "x": x}
+    return (
+        {**inputs, "s": torch.full(of_times, 0.5)} if network.second_time else inputs
+    )  # one tensor would be one input
+
+
+def _traced(module: nn.Module, inputs: dict[str, Tensor]) -> tuple[torch.export.ExportedProgram, bool]:
+    """The module's graph for a batch of any size; else for one scan."""
+    batch = torch.export.Dim("batch")
+    module = module.cpu().eval()
+    problem = ""
+    for any_batch in (True, False):
+        given = tuple(value if any_batch else value[:1] for value in inputs.values())
+        free = tuple({0: batch} if value.ndim and any_batch else {} for value in given)
+        try:
+            with torch.no_grad():
+                # not strict: what Python decides, as the backend of attention, is decided now
+                return torch.export.export(module, given, dynamic_shapes=free, strict=False), any_batch
+        except Exception as error:  # torch raises nearly anything here
+            problem = problem or str(error).strip().split("\n")[0]
+    raise InputError(f"torch cannot export this {type(module).__name__}: {problem}")
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Plain operations, which every runtime has, and no words of the exporters."""
+    fast, log = torch.backends.mha.get_fastpath_enabled(), logging.getLogger("torch.onnx")
+    level = log.level
+    torch.backends.mha.set_fastpath_enabled(False)
+    log.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            yield
+    finally:
+        torch.backends.mha.set_fastpath_enabled(fast)
+        log.setLevel(level)
+
+
+class Difference(NamedTuple):
+    """Of the scans of an exported file to those of the flow.
+
+    Attributes:
+        metres: Largest difference of range over the rays that both return.
+        reflectance: Largest difference of reflectance over the same rays; 0 where there is none.
+        rays: Rays that one returns and the other does not.
+    """
+
+    metres: float
+    reflectance: float
+    rays: int
+
+
+def compare(checkpoint: Checkpoint, exported: Exported, sampler: Sampler | None = None, num: int = 2) -> Difference:
+    """Draw the first scans of seed 0 by the file and by the flow.
+
+    Raises:
+        InputError: the runtime of an `.onnx` is missing.
+    """
+    flow = checkpoint.generator
+    noise = Draws(0, range(num if exported.any_batch else 1)).start(flow.noise_shape)
+    mine = flow.space.decode(flow.generate(noise, sampler=sampler).x)
+    theirs = run(exported.path, noise)["scan"]
+    one, other = mine[:, 0] > 0, theirs[:, 0] > 0
+    both = one & other
+    apart = (mine - theirs).abs().movedim(1, 0)[:, both].amax(1).tolist() if both.any() else [0.0]
+    return Difference(apart[0], sum(apart[1:]), int((one != other).sum()))
+
+
+def run(path: Path, noise: Tensor) -> dict[str, Tensor]:
+    """`scan` and `points` of an exported sampler.
+
+    Raises:
+        InputError: the runtime of an `.onnx` is missing.
+    """
+    if path.suffix == ".pt2":
+        with torch.no_grad(), warnings.catch_warnings(action="ignore"):
+            scan, points = torch.export.load(path).module()(noise)
+        return {"scan": scan, "points": points}
+    require("running an .onnx", "export", "onnxruntime")
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    names = [output.name for output in session.get_outputs()]
+    return dict(zip(names, map(torch.from_numpy, session.run(names, {"noise": noise.numpy()})), strict=True))

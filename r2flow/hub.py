@@ -1,0 +1,63 @@
+"""Flows on the Hugging Face Hub, as `.safetensors` alone; needs the extra `hub`.
+
+HubFlow("runs/NAME").push_to_hub("me/my-flow")
+scans = HubFlow.from_pretrained("me/my-flow").sample(4)
+"""
+
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from r2flow.checkpoints import load_checkpoint, save_checkpoint
+from r2flow.errors import require
+
+require("r2flow.hub", "hub", "huggingface_hub")
+
+from huggingface_hub import ModelHubMixin, hf_hub_download  # noqa: E402
+
+FILE = "model.safetensors"
+CARD = """---
+{{ card_data }}
+---
+
+A generator of LiDAR scans, made with r2flow.
+
+```python
+from r2flow.hub import HubFlow
+
+scans = HubFlow.from_pretrained("{{ repo_id | default('FOLDER', true) }}").sample(4)  # range in metres and reflectance
+```
+"""
+
+
+class HubFlow(ModelHubMixin, library_name="r2flow", tags=["lidar", "rectified-flow"], model_card_template=CARD):
+    """A trained generator with `save_pretrained(folder)`, `from_pretrained(folder or name)`, `push_to_hub(name)`.
+
+    Args:
+        name: As for `r2flow.load`: a run folder, a checkpoint or a model.
+
+    Attributes:
+        checkpoint: What `r2flow.load` gives.
+
+    Raises:
+        InputError: there is none.
+    """
+
+    def __init__(self, name: str | Path) -> None:
+        self.checkpoint = load_checkpoint(name)
+        self._hub_mixin_config = None  # it would be `name`; the config is in the weights' file
+
+    def sample(self, num: int = 1, seed: int = 0, **how: Any) -> Tensor:
+        """As `Checkpoint.sample`."""
+        return self.checkpoint.sample(num, seed, **how)
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        save_checkpoint(self.checkpoint, save_directory / FILE)
+
+    @classmethod
+    def _from_pretrained(cls, *, model_id: str, **where: Any) -> "HubFlow":
+        if Path(model_id).is_dir():
+            return cls(Path(model_id, FILE))
+        known = ("revision", "cache_dir", "force_download", "local_files_only", "token")
+        return cls(hf_hub_download(model_id, FILE, **{key: where[key] for key in known if key in where}))

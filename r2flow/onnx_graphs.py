@@ -1,0 +1,121 @@
+"""ONNX graphs of a flow; needs the extra `export`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, compose, helper, numpy_helper
+
+
+def to_onnx(program: torch.export.ExportedProgram, inputs: Sequence[str], outputs: Sequence[str]) -> onnx.ModelProto:
+    """A traced module in ONNX, with these names and the first dimension called `batch`."""
+    made = torch.onnx.export(
+        program, (), dynamo=True, verbose=False, optimize=True, input_names=inputs, output_names=outputs
+    )
+    assert made is not None
+    model: onnx.ModelProto = made.model_proto
+    graph = model.graph
+    del graph.value_info[:]
+    for value in (*graph.input, *graph.output):
+        del value.metadata_props[:]
+        sizes = value.type.tensor_type.shape.dim
+        if len(sizes) and sizes[0].dim_param:
+            sizes[0].dim_param = "batch"
+    for node in graph.node:
+        del node.metadata_props[:]  # where in torch and in our files each came from
+    return model
+
+
+def sampler_graph(
+    network: onnx.ModelProto,
+    decoded: onnx.ModelProto,
+    times: Sequence[float],
+    second: Sequence[float] | None,
+    states: np.ndarray,
+) -> onnx.ModelProto:
+    """noise to scan and points: a loop over the sampler's evaluations, and the decoding.
+
+    What is known in the loop are the noise and the answers of the network, zeros for those that are still to come.
+
+    Args:
+        network: `t` () and `x`, perhaps `s` (), to `v`.
+        decoded: `x_1` to `scan` and `points`.
+        times, second, states: As of `r2flow.export.Tableau`.
+    """
+    network = compose.add_prefix(network, "network.", rename_inputs=False, rename_outputs=False)
+    decoded = compose.add_prefix(decoded, "decoded.", rename_inputs=False, rename_outputs=False)
+    count = len(times)
+    noise = onnx.ValueInfoProto()
+    noise.CopyFrom(next(value for value in decoded.graph.input if value.name == "x_1"))
+    noise.name = "noise"
+    image = [1 + count, *_sizes(noise)]
+    constants = {
+        "times": np.array(times, dtype=np.float32),
+        "states": states.astype(np.float32),
+        "numbers": np.arange(1 + count).reshape(-1, 1, 1, 1, 1),
+        "evaluations": np.array(count),
+        "last": np.array(count),
+        "true": np.array(True),
+        "one": np.array(1),
+        "flat": np.array([1 + count, -1]),
+        "front": np.array([0]),
+        "zero": np.array(0, dtype=np.float32),
+        **({"second": np.array(second, dtype=np.float32)} if second else {}),
+    }
+
+    def state(row: str, known: str, name: str) -> list[onnx.NodeProto]:
+        """The sum of what is known, each times its coefficient in a row of `states`."""
+        return [
+            helper.make_node("Gather", ["states", row], [f"{name}.row"]),
+            helper.make_node("Reshape", [known, "flat"], [f"{name}.flat"]),
+            helper.make_node("MatMul", [f"{name}.row", f"{name}.flat"], [f"{name}.sum"]),
+            helper.make_node("Reshape", [f"{name}.sum", "shape"], [name]),
+        ]
+
+    answer = [
+        helper.make_node("Add", ["j", "one"], ["next"]),
+        helper.make_node("Equal", ["numbers", "next"], ["here"]),
+        helper.make_node("Unsqueeze", ["v", "front"], ["answer"]),
+        helper.make_node("Where", ["here", "answer", "known"], ["known.next"]),
+        helper.make_node("Identity", ["going"], ["going.next"]),
+    ]
+    body = helper.make_graph(
+        [
+            helper.make_node("Gather", ["times", "j"], ["t"]),
+            *([helper.make_node("Gather", ["second", "j"], ["s"])] if second else []),
+            *state("j", "known", "x"),
+            *network.graph.node,
+            *answer,
+        ],
+        "evaluation",
+        [_value("j", TensorProto.INT64, []), _value("going", TensorProto.BOOL, []), _value("known", 1, image)],
+        [_value("going.next", TensorProto.BOOL, []), _value("known.next", 1, image)],
+    )
+    nodes = [
+        helper.make_node("Shape", ["noise"], ["shape"]),
+        helper.make_node("Unsqueeze", ["noise", "front"], ["noise.first"]),
+        helper.make_node("Equal", ["numbers", "front"], ["first"]),
+        helper.make_node("Where", ["first", "noise.first", "zero"], ["known.0"]),
+        helper.make_node("Loop", ["evaluations", "true", "known.0"], ["known.all"], body=body),
+        *state("last", "known.all", "x_1"),
+        *decoded.graph.node,
+    ]
+    initializers = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
+    graph = helper.make_graph(
+        nodes, "sampler", [noise], list(decoded.graph.output),
+        [*initializers, *network.graph.initializer, *decoded.graph.initializer],
+    )  # fmt: skip
+    versions = {one.domain: one for model in (decoded, network) for one in model.opset_import}
+    model = helper.make_model(graph, opset_imports=list(versions.values()), functions=[*network.functions])
+    model.ir_version = network.ir_version
+    return model
+
+
+def _sizes(value: onnx.ValueInfoProto) -> list[Any]:
+    return [size.dim_param or size.dim_value for size in value.type.tensor_type.shape.dim]
+
+
+def _value(name: str, kind: int, shape: list[Any]) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(name, kind, shape)

@@ -1,0 +1,196 @@
+"""An exported flow gives the flow's own scans, without r2flow."""
+
+import json
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow import __version__, cli
+from r2flow.backbones import BACKBONES
+from r2flow.checkpoints import Checkpoint, save_checkpoint
+from r2flow.errors import InputError
+from r2flow.export import NOTES, compare, export, tableau
+from r2flow.generators import Sampler, build_generator
+from r2flow.noise import Draws
+from tests.conftest import ROOT
+
+SHORT = Sampler("adams3", 3, grid="power:1.5", finish=1 / 32)
+
+
+def flow(name: str, generator: str = "rectified_flow") -> Checkpoint:
+    """A small flow whose weights are not zero."""
+    config = {
+        "sensor": {"name": "hdl64e", "rows": 16, "columns": 64},
+        "encoding": {"format": "logscale", "reflectance": True},
+        "backbone": {"name": name, **BACKBONES[name].tiny_options()},
+        "generator": {"name": generator},
+    }
+    made = build_generator(config).eval().requires_grad_(False)
+    for parameter in made.parameters():
+        if not parameter.any():
+            torch.nn.init.normal_(parameter, std=0.1)
+    return Checkpoint(made, config, 7, Path("tiny.ckpt"), "r2flow")
+
+
+@pytest.mark.parametrize(
+    ("sampler", "times", "states"),
+    [
+        (Sampler("euler", 2), [0, 0.5], [[1, 0, 0], [1, 0.5, 0], [1, 0.5, 0.5]]),
+        (Sampler("euler", 2, finish=0.25), [0, 0.75], [[1, 0, 0], [1, 0.75, 0], [1, 0.75, 0.25]]),
+        (Sampler("euler", 2, grid=(0.0, 0.8, 1.0)), [0, 0.8], [[1, 0, 0], [1, 0.8, 0], [1, 0.8, 0.2]]),
+        (Sampler("midpoint", 1), [0, 0.5], [[1, 0, 0], [1, 0.5, 0], [1, 0, 1]]),
+        (
+            Sampler("midpoint", 2, finish=0.25),
+            [0, 0.375, 0.75],
+            [[1, 0, 0, 0], [1, 0.375, 0, 0], [1, 0, 0.75, 0], [1, 0, 0.75, 0.25]],
+        ),
+        # Adams and Bashforth: after Euler's first step h (3/2 v_1 - 1/2 v_0)
+        (Sampler("ab2", 2), [0, 0.5], [[1, 0, 0], [1, 0.5, 0], [1, 0.25, 0.75]]),
+        (
+            Sampler("rk4", 1),
+            [0, 0.5, 0.5, 1],
+            [[1, 0, 0, 0, 0], [1, 0.5, 0, 0, 0], [1, 0, 0.5, 0, 0], [1, 0, 0, 1, 0], [1, 1 / 6, 1 / 3, 1 / 3, 1 / 6]],
+        ),
+    ],
+)
+def test_a_sampler_is_its_butcher_tableau(sampler, times, states):
+    found = tableau(flow("efficient_unet").generator, sampler)
+    assert found.times == pytest.approx(times)
+    assert found.second is None
+    torch.testing.assert_close(found.states, torch.tensor(states, dtype=torch.float64))
+
+
+def test_jumps_have_two_times():
+    found = tableau(flow("efficient_unet", "flow_map").generator, Sampler("jump", 2))
+    assert found.times == [0, 0.5]
+    assert found.second == [0.5, 1]
+    torch.testing.assert_close(found.states, torch.tensor([[1, 0, 0], [1, 0.5, 0], [1, 0.5, 0.5]]).double())
+
+
+def test_a_sampler_that_draws_noise_on_the_way_is_refused():
+    with pytest.raises(InputError, match="renoise cannot be exported, .*: give another --solver"):
+        tableau(flow("efficient_unet", "flow_map").generator, Sampler("renoise", 2))
+
+
+def snippets() -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "export.md").read_text(), flags=re.DOTALL)
+
+
+def test_the_noise_of_the_page_is_that_of_a_scan():
+    names: dict = {}
+    exec(next(code for code in snippets() if "Philox" in code), names)
+    np.testing.assert_array_equal(names["noise_of"](3, 5, (2, 4, 8)), Draws(3, [5]).start((2, 4, 8))[0])
+
+
+@pytest.mark.parametrize(
+    "sampler", [Sampler("dopri5"), Sampler("torchdiffeq:rk4"), Sampler("adams3", levels=(4, 8), limits=(1.0,))]
+)
+def test_a_sampler_without_a_fixed_number_of_steps_is_refused(sampler, tmp_path):
+    with pytest.raises(InputError, match=r"fixed number of steps .* give --solver adams3 --steps 16\."):
+        export(flow("efficient_unet"), tmp_path / "flow.pt2", sampler)
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize(
+    ("options", "answer"),
+    [
+        (["--to", "onx"], "no export format named 'onx'"),
+        (["--what", "all"], "--what must be sampler or network"),
+        (["--what", "network", "--steps", "4"], "has no sampler: leave solver, steps"),
+        (["--to", "pt2", "--out", "a.onnx"], "--to pt2 writes a .pt2, found --out a.onnx"),
+        (["--solver", "dopri5"], "give --solver adams3 --steps 16"),
+    ],
+)
+def test_wrong_options_are_one_line(options, answer, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    save_checkpoint(flow("efficient_unet"), "flow.safetensors")
+    monkeypatch.setattr(sys, "argv", ["r2flow", "export", "flow.safetensors", *options])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    error = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert answer in error
+    assert error.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["flow.safetensors"]
+
+
+def test_a_missing_package_names_its_extra(tmp_path, monkeypatch):
+    monkeypatch.setattr("r2flow.errors.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"an .onnx needs the package onnx: python -m pip install 'r2flow\[export\]'"):
+        export(flow("efficient_unet"), tmp_path / "flow.onnx", SHORT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["pt2", "onnx"])
+@pytest.mark.parametrize("name", BACKBONES)
+def test_an_exported_sampler_gives_the_same_scans(name, kind, tmp_path):
+    if kind == "onnx":
+        pytest.importorskip("onnxscript")
+        pytest.importorskip("onnxruntime")
+    checkpoint = flow(name)
+    written = export(checkpoint, tmp_path / f"flow.{kind}", SHORT)
+    assert written.any_batch
+    for num in (1, 2, 3):
+        apart = compare(checkpoint, written, SHORT, num)
+        assert apart.metres < 1e-3
+        assert apart.reflectance < 1e-5
+        assert apart.rays == 0
+    assert compare(checkpoint, written, replace(SHORT, steps=9)).metres > 1e-2  # another sampler is another scan
+
+
+@pytest.mark.slow
+def test_points_and_notes_come_with_the_scan(tmp_path):
+    checkpoint = flow("efficient_unet")
+    export(checkpoint, tmp_path / "flow.pt2", SHORT)
+    found = {NOTES: ""}
+    program = torch.export.load(tmp_path / "flow.pt2", extra_files=found)
+    with torch.no_grad():
+        scan, points = program.module()(Draws(0, [5]).start(checkpoint.generator.noise_shape))
+    torch.testing.assert_close(points.norm(dim=1), scan[:, 0], rtol=1e-5, atol=1e-4)
+    up = torch.asin((points[:, 2] / scan[:, 0])[scan[:, 0] > 0]).rad2deg()
+    assert up.min() > -25  # HDL-64E: 3 to -25 degrees
+    assert up.max() < 3
+    notes = json.loads(found[NOTES])
+    assert notes["r2flow"] == __version__
+    assert notes["sensor"]["name"] == "hdl64e"
+    assert notes["sensor"]["columns"] == 64
+    assert notes["sampler"]["steps"] == 3
+    assert notes["evaluations"] == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["pt2", "onnx"])
+def test_the_network_alone_takes_a_time_for_each_image(kind, tmp_path):
+    checkpoint = flow("efficient_unet")
+    path = export(checkpoint, tmp_path / f"network.{kind}", network=True).path
+    t, x = torch.tensor([0.1, 0.5, 0.9]), torch.randn(3, 2, 16, 64)
+    with torch.no_grad():
+        expected = checkpoint.model(t, x)
+        if kind == "pt2":
+            v = torch.export.load(path).module()(t, x)
+        else:
+            pytest.importorskip("onnxscript")
+            session = pytest.importorskip("onnxruntime").InferenceSession(str(path))
+            (v,) = map(torch.from_numpy, session.run(["v"], {"t": t.numpy(), "x": x.numpy()}))
+    torch.testing.assert_close(v, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_flow_map_goes_through_the_loop_and_the_page_s_program_runs(tmp_path, monkeypatch):
+    pytest.importorskip("onnxscript")
+    pytest.importorskip("onnxruntime")
+    monkeypatch.chdir(tmp_path)
+    checkpoint, sampler = flow("efficient_unet", "flow_map"), Sampler("jump", 3)
+    apart = compare(checkpoint, export(checkpoint, "street.onnx", sampler), sampler)
+    assert apart.metres < 1e-3
+    assert apart.rays == 0
+    names: dict = {}
+    exec(next(code for code in snippets() if "InferenceSession" in code), names)
+    scan, cloud = names["scan"][0], names["cloud"]
+    np.testing.assert_allclose(np.linalg.norm(cloud, axis=1), scan[0][scan[0] > 0], rtol=1e-5, atol=1e-4)
+    assert names["notes"]["evaluations"] == 3
