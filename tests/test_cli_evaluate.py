@@ -36,11 +36,13 @@ def refuse(constant: str) -> None:
 
 
 def test_the_json_holds_everything_about_a_figure(r2flow, real, generated, tmp_path):  # noqa: F811
-    code, said, _ = r2flow("evaluate", real, generated, *QUICK, "--floor", "--json", tmp_path / "e.json")
+    code, said, _ = r2flow("evaluate", real, generated, *QUICK, "--json", tmp_path / "e.json")
     assert code == 0
     content = json.loads((tmp_path / "e.json").read_text(), parse_constant=refuse)
-    names = [one["comparison"] for one in content["comparisons"]]
-    assert names == ["generated", "real halves", "generated, as many"]
+    found = {one["comparison"]: (one["kind"], one["generated"]["scans"]) for one in content["comparisons"]}
+    controls = dict.fromkeys(("noise", "flat ground", "mean scan", "shuffled pixels"), ("control", 10))
+    floor = {"real halves": ("floor", 6), "generated, as many": ("floor", 6)}
+    assert found == {"generated": ("judged", 10), **floor, **controls}
     jsd, mmd = content["comparisons"][0]["metrics"]
     assert jsd["printed"]["JSD x 10^2"] == pytest.approx(100 * jsd["figures"]["jsd"])
     assert mmd["printed"]["MMD x 10^4"] == pytest.approx(1e4 * mmd["figures"]["mmd"])
@@ -101,7 +103,7 @@ def test_a_figure_that_does_not_exist_is_null_and_said(r2flow, real, tmp_path): 
     assert any("2 generated scans" in remark for remark in metric["remarks"])
     assert "none" in said
     assert {path.name for path in (tmp_path / "page").iterdir()} == {
-        f"evaluation.{ending}" for ending in ("png", "csv", "json", "md")
+        f"evaluation.{ending}" for ending in ("png", "csv", "json", "md", "html")
     }
 
 

@@ -204,14 +204,14 @@ class CountReturns(JSD):
     def protocol(self):
         return type(super().protocol)("returns", "range image", extractor="counter")
 
-    def update(self, scans, real, first=0):
+    def update(self, scans, real, first=None):
         self.real_returns += scans.returned.sum()
 
 
 def test_the_fixed_shuffle_is_stated_and_does_not_change():
     assert fixed_choice(7, 7) == list(range(7))
     assert fixed_choice(81106, 10000)[:3] == sorted(np.random.Generator(philox()).permutation(81106)[:10000])[:3]
-    assert real_rule(JSD(), 10_000) == (None, "all 10000")
+    assert real_rule(JSD(), open_scans("simulated:0", READING, num=10_000)) == (None, "all 10000")
 
 
 def philox() -> np.random.Philox:
@@ -285,7 +285,7 @@ class TestExtremes:
     def test_an_empty_scan_counts_and_is_said(self, real, tmp_path):
         made = images(4, 2)
         made[1] = 0
-        made[2] = np.where(made[2] > 0, 70, 0)  # beyond the mask
+        made[2, 0] = np.where(made[2, 0] > 0, 70, 0)  # beyond the mask
         found = self.measured(real, folder(tmp_path / "g", made))
         assert all(math.isfinite(value) for one in found for value in one.figures.values())
         assert all(one.protocol["sizes"]["generated_empty"] == 2 for one in found)
@@ -321,7 +321,7 @@ def test_intervals_hold_their_figure(real, generated):
 def test_the_floor_is_halves_by_block_and_two_drives(kitti_360, tmp_path):  # noqa: F811
     real = open_scans(f"kitti_360:{kitti_360}", READING, "train")
     other = open_scans(str(folder(tmp_path / "g", images(8, 2))), READING)
-    found = floor_sets(real, other)
+    found = floor_sets(real, {"generated": other})
     assert list(found) == ["real halves", "generated, as many", "real drives"]
     names = real.source.names
     halves = [one.source.names for one in found["real halves"]]

@@ -21,12 +21,14 @@ if TYPE_CHECKING:
     from r2flow.data.sources import Reading
     from r2flow.evaluation.measuring import Work
     from r2flow.evaluation.processes import Process
+    from r2flow.evaluation.protocols import Rules
     from r2flow.evaluation.statistics import Cache
     from r2flow.metrics.base import ScanMetric
     from r2flow.reports.speed_quality import Drawing
 
 log = logging.getLogger(__name__)
 
+ALL = "all"
 SAMPLED = 1000  # scans of a flow
 
 
@@ -36,9 +38,24 @@ class MeasureOptions:
 
     metrics: Annotated[
         str | None,
-        typer.Option(help="Names, separated by commas; KID and Frechet of hand-made features, JSD, MMD if left out."),
+        typer.Option(
+            help="Names, separated by commas; KID and Frechet of hand-made features, JSD, MMD if left out; "
+            "all: whatever can be computed here."
+        ),
     ] = None
-    floor: Annotated[bool, typer.Option("--floor", help="Real against real beside it: halves, and two drives.")] = False
+    protocol: Annotated[
+        str, typer.Option(help="r2flow, or paper: measured points of real scans against generated ones' bin corners.")
+    ] = "r2flow"
+    floor: Annotated[
+        bool | None,
+        typer.Option("--floor/--no-floor", help="Real against real beside it: halves, two drives.", show_default="on"),
+    ] = None
+    controls: Annotated[
+        bool | None,
+        typer.Option(
+            "--controls/--no-controls", help="Beside it noise, flat ground, mean, shuffled pixels.", show_default="on"
+        ),
+    ] = None
     bootstrap: Annotated[int, typer.Option(min=0, help="Resamples for 95 % intervals; 0 for none.")] = 0
     no_cache: Annotated[bool, typer.Option("--no-cache", help="Read the real scans again.")] = False
 
@@ -56,7 +73,7 @@ class SetOptions:
         None
     )
     generated_scale: Annotated[
-        float | None, typer.Option(min=1e-6, help="--reflectance-scale of GENERATED's files, if other.")
+        float | None, typer.Option(min=1e-6, help="--reflectance-scale of the files in GENERATED, if other.")
     ] = None
 
 
@@ -80,7 +97,9 @@ class OutputOptions:
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for a page.", show_default=False)] = None
 
 
-@app.command(epilog="Example: r2flow evaluate kitti_360:/data/KITTI-360 runs/1rf --split test --num 1000 --json e.json")
+@app.command(
+    epilog="Example: r2flow evaluate kitti_360:/data/KITTI-360 runs/1rf runs/2rf others/ --split test --json e.json"
+)
 @grouped
 def evaluate(
     real: Annotated[str, typer.Argument(help=f"Real scans: {SETS}.", show_default=False)],
@@ -91,8 +110,11 @@ def evaluate(
     how: ReadingOptions,
     work: WorkOptions,
     generated: Annotated[
-        str | None,
-        typer.Argument(help="Scans to judge: the same, or a run, checkpoint or model to sample.", show_default=False),
+        list[str] | None,
+        typer.Argument(
+            help="Scans to judge, one or several sets: the same, or a run, checkpoint or model to sample.",
+            show_default=False,
+        ),
     ] = None,
     checkpoint: Annotated[
         list[Path] | None,
@@ -101,39 +123,46 @@ def evaluate(
 ) -> None:
     """Measure generated scans against real ones: distances, each with the protocol that it holds under.
 
-    With --checkpoint it measures how the distance falls with the number of steps, against evaluations and seconds;
-    points that are in --out already are not measured again. Under torchrun the processes share the scans.
+    Several sets make one table, with what real scans and controls come to. With --checkpoint it measures how the
+    distance falls with the number of steps, against evaluations and seconds; points that are in --out already are not
+    measured again. Under torchrun the processes share the scans.
     """
     from r2flow.evaluation.measuring import check_reflectance
     from r2flow.evaluation.processes import joined
     from r2flow.evaluation.statistics import Cache
     from r2flow.reports.pages import prepare_folder
 
-    _check_evaluation(generated, checkpoint, measured, output)
-    sampled = generated if _is_flow(generated) else None
+    named = list(dict.fromkeys(generated or []))
+    rules = _check_evaluation(named, checkpoint, measured, output)
+    sampled = [one for one in named if _is_flow(one)]
     with joined(choose_device(work.device)) as place:
-        built = _build(measured.metrics.split(","), measured.bootstrap, place) if measured.metrics else None
-        flows = _load_flows([*(checkpoint or []), *([Path(sampled)] if sampled else [])], place.device)
-        reading = reading_of([real, None if sampled else generated], list(flows.values()), how)
-        if built is not None:  # where no metric reads reflectance, its scale does not matter
-            looks = any(m.needs_reflectance or m.uses_reflectance for m in built.values())
+        wanted = (
+            None if measured.metrics in (None, ALL) else _build(measured.metrics.split(","), measured.bootstrap, place)
+        )
+        flows = _load_flows([*(checkpoint or []), *map(Path, sampled)], place.device)
+        reading = reading_of([real, *(one for one in named if one not in sampled)], list(flows.values()), how)
+        if rules.convention is not None and how.convention is None:
+            reading = replace(reading, convention=rules.convention)
+        if wanted is not None:  # where no metric reads reflectance, its scale does not matter
+            looks = any(m.needs_reflectance or m.uses_reflectance for m in wanted.values())
             reading = replace(reading, reflectance=reading.reflectance if looks else False)
         truth = _open(real, reading, scans.split, scans.real_num)
-        judged: ScanSet | None = None
-        if sampled:
-            judged = _sampled(sampled, flows[sampled], scans.num or SAMPLED, sampling)
-        elif generated is not None:
-            own = _rescaled(generated, reading, scans.generated_scale)
-            judged = _open(generated, own, scans.generated_split, scans.num)
-        sets = [truth, *([judged] if judged else [])]
-        if built is None:
-            reflectance = all(s.about["reflectance"] for s in sets)
-            reflectance = reflectance and all(flow.encoding.reflectance for flow in flows.values())
-            built = _build_default(reflectance, measured.bootstrap, place)
+        rules.check(truth)
+        judged: dict[str, ScanSet] = {}
+        for text, name in zip(named, _names(named), strict=True):
+            if text in sampled:
+                judged[name] = _sampled(text, flows[text], scans.num or SAMPLED, sampling)
+            else:
+                own = _rescaled(text, reading, scans.generated_scale)
+                judged[name] = _open(text, own, scans.generated_split, scans.num)
+        sets = [truth, *judged.values()]
+        reflectance = all(s.about["reflectance"] for s in sets)
+        reflectance = reflectance and all(flow.encoding.reflectance for flow in flows.values())
+        built = wanted or _build_those_possible(measured.metrics == ALL, reflectance, measured.bootstrap, place)
         check_reflectance(built, sets)
         job = Job(
             truth, built, work_of(work.batch_size, work.workers, place.rank, place.ranks),
-            None if measured.no_cache else Cache(), place.device, sampling,
+            None if measured.no_cache else Cache(), place.device, sampling, rules,
         )  # fmt: skip
         drawing, steps = _curve_of(flows, scans.num or SAMPLED, sampling) if checkpoint else (None, [])
         for folder in (output.out, output.json.parent if output.json else None):
@@ -155,46 +184,71 @@ class Job:
     cache: "Cache | None"
     device: str
     sampling: SamplingOptions
+    rules: "Rules"
 
 
 def _check_evaluation(
-    generated: str | None, checkpoint: list[Path] | None, measured: MeasureOptions, output: OutputOptions
-) -> None:
-    """Refuse options that do not go together before anything is read."""
-    if checkpoint and generated is not None:
+    generated: list[str], checkpoint: list[Path] | None, measured: MeasureOptions, output: OutputOptions
+) -> "Rules":
+    """The protocol; options that do not go together are refused before anything is read."""
+    from r2flow.evaluation.protocols import named_rules
+
+    rules = named_rules(measured.protocol)
+    if checkpoint and generated:
         raise InputError("give GENERATED for one comparison or --checkpoint for a curve, not both.")
     if checkpoint and output.out is None:
         raise InputError("a curve needs --out FOLDER, where its points are kept.")
-    if generated is None and not checkpoint and not measured.floor:
+    if not generated and not checkpoint and not (measured.floor or measured.controls):
         raise InputError("nothing to compare with: give GENERATED, --checkpoint RUN or --floor.")
-    if checkpoint and (measured.floor or measured.bootstrap or output.json):
-        raise InputError("--floor, --bootstrap and --json belong to one comparison; a curve writes its page to --out.")
+    if checkpoint and (measured.floor or measured.controls or measured.bootstrap or output.json):
+        raise InputError(
+            "--floor, --controls, --bootstrap and --json belong to a comparison; a curve writes its page to --out."
+        )
     if output.json is not None and output.json.is_dir():
         raise InputError(f"--json {output.json} is a folder; name a file to write to.")
+    return rules
 
 
-def _compare(job: Job, judged: "ScanSet | None", measured: MeasureOptions, output: OutputOptions) -> None:
+def _names(generated: Sequence[str]) -> list[str]:
+    """What each judged set is called: `generated` where it is the only one, else the shortest end of its name."""
+    if len(generated) < 2:
+        return ["generated"] * len(generated)
+    from r2flow.reports.compare import labels
+
+    return labels([Path(text) for text in generated])
+
+
+def _compare(job: Job, judged: "dict[str, ScanSet]", measured: MeasureOptions, output: OutputOptions) -> None:
     from r2flow.cli.output import command
+    from r2flow.evaluation.controls import control_sets
     from r2flow.evaluation.floor import floor_sets
     from r2flow.evaluation.measuring import Gathered, gather_real, measure
-    from r2flow.reports.evaluation import Comparison, evaluation_page, print_comparisons, write_json
+    from r2flow.reports.evaluation import Comparison, Kind, evaluation_page, print_comparisons, write_json
     from r2flow.reports.pages import write_page
+    from r2flow.reports.view.panels import write_sets
 
-    pairs = {} if judged is None else {"generated": (job.truth, judged)}
-    if measured.floor:
-        pairs |= floor_sets(job.truth, judged)
+    kinds: dict[Kind, dict[str, tuple[ScanSet, ScanSet]]]
+    kinds = {"judged": {name: (job.truth, one) for name, one in judged.items()}}
+    usual = bool(judged)
+    if measured.floor or (usual and measured.floor is None and len(job.truth) > 1):
+        kinds["floor"] = floor_sets(job.truth, judged)
+    if measured.controls or (usual and measured.controls is None):
+        num = max((len(one) for one in judged.values()), default=len(job.truth))
+        made = control_sets(job.truth, min(num, SAMPLED))
+        kinds["control"] = {name: (job.truth, one) for name, one in made.items()}
     found: list[Comparison] = []
     known: dict[int, Gathered] = {}
-    for name, (real, other) in pairs.items():
+    for kind, (name, (real, other)) in ((kind, pair) for kind, pairs in kinds.items() for pair in pairs.items()):
         start = time.monotonic()
         if id(real) not in known:
-            known[id(real)] = gather_real(job.metrics, real, job.work, job.cache)
-        results = measure(job.metrics, known[id(real)], other, job.work, measured.bootstrap)
-        found.append(Comparison(name, real, other, results, time.monotonic() - start))
+            known[id(real)] = gather_real(job.metrics, real, job.work, job.cache, job.rules)
+        draws = 0 if kind == "control" else measured.bootstrap
+        results = measure(job.metrics, known[id(real)], other, job.work, draws)
+        found.append(Comparison(name, real, other, results, time.monotonic() - start, kind))
     if job.work.rank > 0:
         return
     seeds = {"subsets": 0}
-    if judged is not None and judged.about["kind"] == "sampled":
+    if any(one.about["kind"] == "sampled" for one in judged.values()):
         seeds["sampled scans"] = job.sampling.seed
     if measured.bootstrap:
         seeds["bootstrap"] = 0
@@ -206,6 +260,9 @@ def _compare(job: Job, judged: "ScanSet | None", measured: MeasureOptions, outpu
     if output.out is not None:
         for path in write_page(page, output.out):
             print(path)
+        print(
+            write_sets(output.out / "evaluation.html", {"real": job.truth, **judged}, title="Generated and real scans")
+        )
 
 
 def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOptions) -> "tuple[Drawing, list[int]]":
@@ -227,7 +284,7 @@ def _measure_curve(
     from r2flow.reports.speed_quality import Curve, measure_curve, read_rows, speed_quality_page
 
     done = read_rows(out)
-    gathered = gather_real(job.metrics, job.truth, job.work, job.cache)
+    gathered = gather_real(job.metrics, job.truth, job.work, job.cache, job.rules)
     curve = Curve(job.truth, job.metrics, gathered, drawing, job.device)
 
     def keep(rows: list[dict[str, Any]]) -> None:
@@ -260,26 +317,21 @@ def neighbours(
     held_out: HeldOutOptions,
     how: ReadingOptions,
     work: WorkOptions,
-    by: Annotated[
-        str | None, typer.Option(help="embedded (features) or pixels (log-range); embedded if left out.")
-    ] = None,
-    pairs: Annotated[int, typer.Option(min=1, help="Nearest pairs to draw, and half as many of the farthest.")] = 4,
+    pairs: Annotated[int, typer.Option(min=1, help="Nearest pairs to draw, of whole scans and of parts.")] = 4,
     split: Annotated[str | None, typer.Option("--split", help="Part of TRAIN's standard split.")] = None,
 ) -> None:
-    """Generated scans beside their nearest training scans, the most suspicious first: is anything memorised?"""
+    """Generated scans beside their nearest training scans, turned, mirrored or in parts: is anything memorised?"""
     from r2flow.cli.output import command, finish
-    from r2flow.reports.neighbours import find_neighbours, neighbours_page, representation_of
+    from r2flow.reports.neighbours import find_neighbours, neighbours_page
     from r2flow.reports.pages import prepare_folder
 
     where = choose_device(work.device)
-    reading = reading_of([train, generated, held_out.real], [], how)
-    reading = replace(reading, reflectance=False) if by == "pixels" else reading
+    reading = replace(reading_of([train, generated, held_out.real], [], how), reflectance=False)
     trained = _open(train, reading, split, None)
     judged = _open(generated, reading, None, held_out.num)
     held = None if held_out.real is None else _open(held_out.real, reading, held_out.real_split, held_out.num)
-    what = representation_of(by, [s for s in (trained, judged, held) if s is not None], where)
     prepare_folder(out)
-    found = find_neighbours(judged, trained, held, what, work_of(work.batch_size, work.workers))
+    found = find_neighbours(judged, trained, held, work_of(work.batch_size, work.workers), where)
     finish(neighbours_page(found, pairs, command(), where), out)
 
 
@@ -355,16 +407,29 @@ def _build(names: Sequence[str], bootstrap: int, place: "Process") -> "dict[str,
     return {name: METRICS[name](**options).to(place.device) for name in dict.fromkeys(names)}
 
 
-def _build_default(reflectance: bool, bootstrap: int, place: "Process") -> "dict[str, ScanMetric]":
-    """The default metrics; a warning says which of them cannot be computed here."""
-    from r2flow.metrics import default_metrics
+def _build_those_possible(
+    everything: bool, reflectance: bool, bootstrap: int, place: "Process"
+) -> "dict[str, ScanMetric]":
+    """The default metrics, or every one of the table; one warning says which of them cannot be computed here."""
+    from r2flow.metrics import METRICS, default_metrics
 
+    names = METRICS if everything else default_metrics(reflectance)
     built: dict[str, ScanMetric] = {}
-    for name in default_metrics(reflectance):
+    left_out: dict[str, list[str]] = {}
+    for name in names:
         try:
-            built |= _build([name], bootstrap, place)
+            (metric,) = _build([name], bootstrap, place).values()
         except InputError as error:
-            log.warning("%s is left out: %s", name, error)
+            left_out.setdefault("their weights are not here (r2flow weights)" if everything else str(error), []).append(
+                name
+            )
+            continue
+        if metric.needs_reflectance and not reflectance:
+            left_out.setdefault("a set has no reflectance", []).append(name)
+        else:
+            built[name] = metric
+    for why, those in left_out.items():
+        log.warning("%s left out: %s", ", ".join(those), why)
     return built
 
 

@@ -1,6 +1,6 @@
 """`r2flow report paper`: the paper's tables and figures from run folders."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -45,6 +45,12 @@ def paper(
     ] = None,
     split: Annotated[str | None, typer.Option(help="Of the real scans' standard split.")] = None,
     metrics: Annotated[str | None, typer.Option(help="By name; all that can be computed here if left out.")] = None,
+    protocol: Annotated[
+        str | None, typer.Option(help="paper or r2flow; the paper's where the real scans allow it if left out.")
+    ] = None,
+    primary: Annotated[
+        str | None, typer.Option(help="The metric that judges the claims; frd, else frechet_embedded if left out.")
+    ] = None,
 ) -> None:
     """The paper's tables I and II and figures 3, 5, 6, 7, 8 from runs, its printed numbers and claims beside ours.
 
@@ -52,31 +58,41 @@ def paper(
     """
     from r2flow.cli.evaluate import work_of
     from r2flow.cli.output import command, finish, numbers
+    from r2flow.evaluation.protocols import named_rules
     from r2flow.reports.pages import prepare_folder
+    from r2flow.reports.paper.claims import primary_of
     from r2flow.reports.paper.report import Budget, report
     from r2flow.reports.paper.subjects import find_subjects
 
+    rules = None if protocol is None else named_rules(protocol)
     where = choose_device(work.device)
     euler = tuple(sorted(set(numbers("steps", budget.steps, int))))
     amount = Budget(budget.num, euler, budget.curved, budget.repeats, budget.bootstrap, budget.tolerance or None)
     subjects = find_subjects(runs)
-    truth = None if real is None else real_set(real, split, subjects[0].run)
+    truth = None if real is None else real_set(real, split, subjects[0].run, protocol)
     reflectance = bool(subjects[0].config["encoding"]["reflectance"])
     chosen, missing = build_metrics(metrics.split(",") if metrics else None, amount.bootstrap > 0, reflectance, where)
+    judging = primary_of(list(chosen), primary)
     prepare_folder(out)
     print(f"{len(subjects)} runs: {', '.join(f'{one.label} ({one.role})' for one in subjects)}")
     doing = work_of(work.batch_size, work.workers)
-    page = report(subjects, out, chosen, missing, amount, doing, truth, where, command())
+    page = report(subjects, out, chosen, judging, missing, amount, doing, truth, where, command(), rules)
     finish(page, out, page.text[2:4])
 
 
-def real_set(text: str, split: str | None, run: Path) -> "ScanSet":
-    """The real scans as a run's flow sees them."""
+def real_set(text: str, split: str | None, run: Path, protocol: str | None = None) -> "ScanSet":
+    """The real scans as a run's flow sees them; those that may be compared as in the paper, projected as there."""
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.evaluate import reading_of
     from r2flow.data.opening import open_scans
+    from r2flow.evaluation.protocols import PAPER
+    from r2flow.reports.paper.report import not_as_printed
 
-    return open_scans(text, reading_of([text], [load_checkpoint(run)]), split)
+    reading = reading_of([text], [load_checkpoint(run)])
+    found = open_scans(text, reading, split)
+    if protocol == "r2flow" or (protocol is None and not_as_printed(found)):
+        return found
+    return open_scans(text, replace(reading, convention=PAPER.convention or reading.convention), split)
 
 
 def build_metrics(

@@ -22,6 +22,10 @@ class Mixture(ScanSource):
         self.starts = np.cumsum([0, *(len(part) for part in parts)])
 
     @property
+    def measured(self) -> bool:  # type: ignore[override]
+        return all(part.measured for part in self.parts)
+
+    @property
     def names(self) -> list[str]:
         return [name for part in self.parts for name in part.names]
 
@@ -38,6 +42,10 @@ class Mixture(ScanSource):
     def __getitem__(self, index: int) -> np.ndarray:
         part, number = self.locate(index)
         return self.parts[part][number]
+
+    def with_points(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        part, number = self.locate(index)
+        return self.parts[part].with_points(number)
 
     def encoded(self, index: int, encoding: Encoding) -> Tensor:
         part, number = self.locate(index)

@@ -6,12 +6,12 @@ import logging
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.labels import labels_beside, read_labels
-from r2flow.lidar.projection import Convention, Projection, project, project_indices
+from r2flow.lidar.projection import Convention, Projection, project_indices, project_measured
 from r2flow.lidar.recognition import other_sensor
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
 from r2flow.lidar.scan_files.points import FARTHEST
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from r2flow.simulator.folder import SimulatedFolder
 
 log = logging.getLogger(__name__)
+
+Read = TypeVar("Read")
 
 AUTO = "auto"
 LOOKED_AT = 3  # scans of a set, whose beams are compared with the sensor's
@@ -72,11 +74,14 @@ class ScanSource(ABC):
         slow: Whether an image takes long to get, so that those that fit are kept in memory.
         drawn: Whether a network draws the images when they are asked for: in this process alone, and no image twice
             where once will do.
+        measured: Whether the points that the pixels stand for are known: of range images, prepared shards, samples and
+            simulated scans they are not.
         drives: Numbers of the scans of each recording, by its name, where recordings are known.
     """
 
     slow = False
     drawn = False
+    measured = False
     drives: Mapping[str, Sequence[int]] = {}
 
     @abstractmethod
@@ -97,6 +102,14 @@ class ScanSource(ABC):
     def batch(self, indices: Sequence[int]) -> Tensor:
         """Several scans at once, (B, 2 or 1, H, W)."""
         return torch.from_numpy(np.stack([self[index] for index in indices]))
+
+    def with_points(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """An image, and the measured x, y, z of each pixel's point in metres, (3, H, W) float32, 0 where missing.
+
+        Raises:
+            InputError: the points are not known.
+        """
+        raise InputError(f"{self.names[index]} holds ranges alone, not the measured coordinates of its points.")
 
     def encoded(self, index: int, encoding: Encoding) -> Tensor:
         """A scan in model space, (C, H, W)."""
@@ -119,7 +132,12 @@ class ScanSource(ABC):
         return {}
 
 
-def read_scan(
+def read_scan(path: str | Path, sensor: Sensor, *options: Any, **more: Any) -> np.ndarray:
+    """One scan file as a range image, (2 or 1, H, W): the first part of `read_measured_scan`, with its arguments."""
+    return read_measured_scan(path, sensor, *options, **more)[0]
+
+
+def read_measured_scan(
     path: str | Path,
     sensor: Sensor,
     projection: Projection = "spherical",
@@ -127,8 +145,10 @@ def read_scan(
     reflectance: bool = True,
     reflectance_scale: float | None = 1.0,
     columns: Sequence[str] | None = None,
-) -> np.ndarray:
-    """One scan file as a range image, (2, H, W); without `reflectance`, (1, H, W). The options are those of `Reading`.
+) -> tuple[np.ndarray, np.ndarray]:
+    """One scan file as a range image, (2, H, W), without `reflectance` (1, H, W), and its pixels' points, (3, H, W).
+
+    The options are those of `Reading`.
 
     Raises:
         InputError: the file cannot be read, no point of it lies in the sensor's view and range (`NoPointsError`), or it
@@ -141,7 +161,7 @@ def read_scan(
             path, points.dropped, FARTHEST,
         )  # fmt: skip
     scaled = _scaled_reflectance(path, points, reflectance_scale) if reflectance else None
-    image = project(points.xyz, scaled, sensor, projection, convention, points.ring)
+    image, xyz = project_measured(points.xyz, scaled, sensor, projection, convention, points.ring)
     if not image[0].any():
         r = np.linalg.norm(points.xyz, axis=1)
         raise NoPointsError(
@@ -149,7 +169,7 @@ def read_scan(
             f"view of sensor '{sensor.name}' (ranges found: {r.min():.3g}-{r.max():.3g} m). "
             "Are its units metres and its sensor the configured one?"
         )
-    return image if reflectance else image[:1]
+    return (image if reflectance else image[:1]), xyz
 
 
 def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tuple[np.ndarray, np.ndarray | None]:
@@ -220,19 +240,7 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     sensor, channels = reading.sensor, 1 + bool(reading.reflectance)
     image = range_image(path, sensor.shape)
     if image is None:
-        how = (
-            reading.projection,
-            reading.convention,
-            bool(reading.reflectance),
-            reading.reflectance_scale,
-            reading.columns,
-        )
-        try:
-            return read_scan(path, sensor, *how)
-        except NoPointsError:
-            if reading.on_bad_scan != "empty":
-                raise
-            return np.zeros((channels, *sensor.shape), np.float32)
+        return read_points_image(path, reading)[0]
     if len(image) < channels:
         raise _no_reflectance(path)
     image = image[:channels]
@@ -241,6 +249,28 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
         image = np.where(seen, image, np.float32(0))
         image[1:] = image[1:].clip(0, 1)
     return image
+
+
+def read_points_image(path: Path, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
+    """A file of points as an image, (2 or 1, H, W), and its pixels' points, (3, H, W).
+
+    Raises:
+        InputError: as `read_image`.
+    """
+    sensor = reading.sensor
+    how = (
+        reading.projection,
+        reading.convention,
+        bool(reading.reflectance),
+        reading.reflectance_scale,
+        reading.columns,
+    )
+    try:
+        return read_measured_scan(path, sensor, *how)
+    except NoPointsError:
+        if reading.on_bad_scan != "empty":
+            raise
+        return tuple(np.zeros((n, *sensor.shape), np.float32) for n in (1 + bool(reading.reflectance), 3))  # type: ignore[return-value]
 
 
 def lacks_reflectance(
@@ -328,6 +358,11 @@ class ScanFiles(ScanSource):
         self.drives, self.described = drives or {}, about or {}
         self.bad: set[int] = set()
 
+    @cached_property
+    def measured(self) -> bool:  # type: ignore[override]
+        arrays = (path for path in self.paths if str(path).lower().endswith((".npy", ".npz")))
+        return next((range_image(Path(path)) is None for path in arrays), True)
+
     @property
     def names(self) -> list[str]:
         below = os.path.join(self.root, "")
@@ -365,13 +400,20 @@ class ScanFiles(ScanSource):
         return len(self.paths)
 
     def __getitem__(self, index: int) -> np.ndarray:
+        return self._first_usable(index, lambda path: read_image(path, self.reading))
+
+    def with_points(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        return self._first_usable(index, lambda path: read_points_image(path, self.reading))
+
+    def _first_usable(self, index: int, read: Callable[[Path], Read]) -> Read:
+        """What is read of a file, or with `on_bad_scan="skip"` of the first usable one from there on."""
         if self.reading.on_bad_scan != "skip":
-            return read_image(Path(self.paths[index]), self.reading)
+            return read(Path(self.paths[index]))
         for candidate in (*range(index, len(self)), *range(index)):
             if candidate in self.bad:
                 continue
             try:
-                return read_image(Path(self.paths[candidate]), self.reading)
+                return read(Path(self.paths[candidate]))
             except InputError as error:
                 self.bad.add(candidate)
                 log.warning("left out: %s", error)

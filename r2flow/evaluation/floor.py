@@ -1,10 +1,12 @@
 """The floor of a distance: what it is between real scans, which a generator cannot be expected to go below."""
 
+from collections.abc import Mapping
+
 from r2flow.data.sets import ScanSet
 from r2flow.errors import InputError
 
 
-def floor_sets(real: ScanSet, generated: ScanSet | None = None) -> dict[str, tuple[ScanSet, ScanSet]]:
+def floor_sets(real: ScanSet, generated: Mapping[str, ScanSet] | None = None) -> dict[str, tuple[ScanSet, ScanSet]]:
     """The two halves of the real scans, and two drives where there are two; by name.
 
     Halves are contiguous blocks: neighbouring scans of a drive are near-duplicates, and random halves would share
@@ -20,8 +22,9 @@ def floor_sets(real: ScanSet, generated: ScanSet | None = None) -> dict[str, tup
     first, second = range(count // 2), range(count // 2, count)
     half, other = real.part(first, "first half"), real.part(second, "second half")
     found = {"real halves": (half, other)}
-    if generated is not None and not generated.source.drawn and len(generated) >= len(other):
-        found["generated, as many"] = half, generated.limited(len(other))
+    for name, one in (generated or {}).items():
+        if not one.source.drawn and len(one) >= len(other):
+            found[f"{name}, as many"] = half, one.limited(len(other))
     largest = sorted(real.drives, key=lambda drive: -len(real.drives[drive]))[:2]
     if len(largest) == 2:
         a, b = (real.part(list(real.drives[drive]), f"drive {drive}") for drive in sorted(largest))

@@ -10,7 +10,8 @@ from typing import Any
 import torch
 
 from r2flow.errors import InputError
-from r2flow.evaluation.sets import SampledScans, ScanSet, fixed_choice
+from r2flow.evaluation.protocols import R2FLOW, WORDS, Rules
+from r2flow.evaluation.sets import SampledScans, ScanSet
 from r2flow.evaluation.statistics import Cache, Statistics, key_of
 from r2flow.metrics.base import ScanMetric
 from r2flow.metrics.bootstrap import bootstrap
@@ -56,13 +57,15 @@ class Gathered:
     statistics: Mapping[str, Statistics]
     rules: Mapping[str, str]  # how the scans that each metric saw were chosen
     kept: frozenset[str]  # the metrics whose statistics the cache held
+    protocol: Rules = R2FLOW  # under which generated scans are compared with them
 
 
-def real_rule(metric: ScanMetric, count: int) -> tuple[list[int] | None, str]:
-    """The real scans, of `count`, that a metric is given: their numbers, or None for all, and the rule in words."""
+def real_rule(metric: ScanMetric, real: ScanSet, protocol: Rules = R2FLOW) -> tuple[Sequence[int] | None, str]:
+    """The real scans that a metric is given: their numbers, or None for all, and the rule in words."""
+    count = len(real)
     if metric.protocol.extractor is not None or count <= REAL_SCANS:
         return None, f"all {count}"
-    return fixed_choice(count, REAL_SCANS), f"{REAL_SCANS} of {count}, fixed shuffle, seed 0"
+    return protocol.choose(real, REAL_SCANS), f"{REAL_SCANS} of {count}, {protocol.chosen}"
 
 
 def check_reflectance(metrics: Mapping[str, ScanMetric], sets: Iterable[ScanSet]) -> None:
@@ -73,17 +76,21 @@ def check_reflectance(metrics: Mapping[str, ScanMetric], sets: Iterable[ScanSet]
             raise InputError(f"{scans.label} has no reflectance, which {', '.join(needing)} needs; leave it out.")
 
 
-def gather_real(metrics: Mapping[str, ScanMetric], real: ScanSet, work: Work, cache: Cache | None = None) -> Gathered:
+def gather_real(
+    metrics: Mapping[str, ScanMetric], real: ScanSet, work: Work, cache: Cache | None = None, protocol: Rules = R2FLOW
+) -> Gathered:
     """Each metric's statistics of the real scans, from the cache where it holds them.
 
     Raises:
-        InputError: no real scan, or one that cannot be read.
+        InputError: no real scan, one that cannot be read, or scans without what the protocol compares.
     """
     if len(real) == 0:
         raise InputError(f"{real.label} holds no scan to compare with.")
-    chosen = {name: real_rule(metric, len(real)) for name, metric in metrics.items()}
+    protocol.check(real)
+    chosen = {name: real_rule(metric, real, protocol) for name, metric in metrics.items()}
     rules = {name: rule for name, (_, rule) in chosen.items()}
-    keys = {name: key_of(metric, real, rules[name]) for name, metric in metrics.items()}
+    points = "" if protocol.real == "centre" else f", points {WORDS[protocol.real]}"
+    keys = {name: key_of(metric, real, rules[name] + points) for name, metric in metrics.items()}
     held = {name: cache.read(key) for name, key in keys.items()} if cache is not None else {}
     common = _common({name for name, one in held.items() if one is not None}, work)
     found = {name: one for name, one in held.items() if one is not None and name in common}
@@ -94,14 +101,14 @@ def gather_real(metrics: Mapping[str, ScanMetric], real: ScanSet, work: Work, ca
     some = next((chosen[name][0] for name in missing if chosen[name][0] is not None), None) or []
     whole_set = {name: metric for name, metric in missing.items() if chosen[name][0] is None}
     rest = sorted(set(range(len(real))) - set(some)) if whole_set else []
-    first = _update(missing, real, some, 0, True, work)
-    second = _update(whole_set, real, rest, len(some), True, work)
+    first = _update(missing, real, some, 0, True, work, protocol)
+    second = _update(whole_set, real, rest, len(some), True, work, protocol)
     for name, metric in missing.items():
         counts = (len(real), first + second) if name in whole_set else (len(some), first)
         found[name] = Statistics(metric.real_state(), *counts)
         if cache is not None and work.rank == 0:
             cache.write(keys[name], found[name])
-    return Gathered(found, rules, frozenset(metrics.keys() - missing.keys()))
+    return Gathered(found, rules, frozenset(metrics.keys() - missing.keys()), protocol)
 
 
 def measure(
@@ -121,7 +128,7 @@ def measure(
     for name, metric in metrics.items():
         metric.reset()
         metric.load_real_state(gathered.statistics[name].states)
-    empty = _update(metrics, generated, range(len(generated)), 0, False, work)
+    empty = _update(metrics, generated, range(len(generated)), 0, False, work, gathered.protocol)
     results = []
     unsolved = generated.source.unsolved if isinstance(generated.source, SampledScans) else 0
     for name, metric in metrics.items():
@@ -135,7 +142,9 @@ def measure(
             "generated": len(generated), "generated_empty": empty,
         }  # fmt: skip
         image = {"sensor": generated.sensor.name, "image": list(generated.sensor.shape)}
-        protocol: dict[str, Any] = {**metric.protocol.asdict(), **image, "sizes": sizes}
+        protocol: dict[str, Any] = {
+            **gathered.protocol.describe(), **metric.protocol.asdict(), **image, "sizes": sizes
+        }  # fmt: skip
         intervals: dict[str, tuple[float, float]] = {}
         if draws and not metric.resamples:
             remarks.append(f"{name} has no bootstrap interval.")
@@ -151,11 +160,19 @@ def point_key(real: ScanSet, metrics: Mapping[str, ScanMetric], **sampling: Any)
     """16 hex digits of everything that the figures of a sampled flow depend on; `sampling` is how it is sampled."""
     protocols = {name: metric.protocol.asdict() for name, metric in metrics.items()}
     parts = {"real": real.identity or real.label, "metrics": protocols, **sampling}
+    if parts.get("protocol") == R2FLOW.name:  # as before there was another one
+        del parts["protocol"]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _update(
-    metrics: Mapping[str, ScanMetric], scans: ScanSet, numbers: Sequence[int], first: int, real: bool, work: Work
+    metrics: Mapping[str, ScanMetric],
+    scans: ScanSet,
+    numbers: Sequence[int],
+    first: int,
+    real: bool,
+    work: Work,
+    protocol: Rules,
 ) -> int:
     """Give this process's share of the scans to the metrics; returns how many of all have no return within the mask."""
     if not metrics or not numbers:
@@ -163,15 +180,26 @@ def _update(
     device = next(iter(metrics.values())).device
     starts = range(0, len(numbers), work.batch_size)[work.rank :: work.ranks]
     own = [number for start in starts for number in numbers[start : start + work.batch_size]]
+    names, side = scans.source.names, "real" if real else "generated"
     empty = 0
-    with work.bar(f"reading {'real' if real else 'generated'} scans", len(own)) as advance, torch.no_grad():
-        for start, images in zip(starts, scans.batches(own, work.batch_size, work.workers), strict=True):
-            batch = Scans(images.to(device), scans.sensor)
+    with work.bar(f"reading {side} scans", len(own)) as advance, torch.no_grad():
+        for start, (images, points) in zip(starts, _read(scans, own, work, protocol, real), strict=True):
+            said = [f"{names[number]} of {scans.label}" for number in numbers[start : start + work.batch_size]]
+            batch = Scans(images.to(device), scans.sensor, protocol.rays(real), points, said)
             empty += int((~batch.returned.flatten(1).any(1)).sum())
             for metric in metrics.values():
                 metric.update(batch, real=real, first=first + start)
             advance(len(batch))
     return _sum_over_processes(empty, work)
+
+
+def _read(
+    scans: ScanSet, numbers: Sequence[int], work: Work, protocol: Rules, real: bool
+) -> Iterable[tuple[torch.Tensor, torch.Tensor | None]]:
+    """Batches of images and, where the protocol compares these, of measured points."""
+    if real and protocol.real == "measured":
+        return scans.batches_with_points(numbers, work.batch_size, work.workers)
+    return ((images, None) for images in scans.batches(numbers, work.batch_size, work.workers))
 
 
 def _remarks(real: Statistics, generated: int, figures: Mapping[str, float]) -> list[str]:

@@ -168,13 +168,14 @@ def consistency(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor
     """
     chord = paths.chord
     x_t, v = chord.at(t), chord.velocity(t)
-    if bool((rho == 1).all()):
-        return Aim(x_t, v)
-    with torch.no_grad():
-        ahead = rho * (s - t)
-        later = u(t + ahead, x_t + expand_time(ahead, v) * v, s)
-    share = expand_time(rho, v)
-    return Aim(x_t, share * v + (1 - share) * later)
+    target, learned = v.clone(), rho < 1
+    if bool(learned.any()):
+        t, s, rho, v = t[learned], s[learned], rho[learned], v[learned]
+        ahead, share = rho * (s - t), expand_time(rho, v)
+        with torch.no_grad():
+            later = u(t + ahead, x_t[learned] + expand_time(ahead, v) * v, s)
+        target[learned] = share * v + (1 - share) * later
+    return Aim(x_t, target)
 
 
 def two_halves(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:

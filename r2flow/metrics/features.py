@@ -19,7 +19,7 @@ class FeatureMetric(ScanMetric):
 
     Args:
         extractor: The network, or its name in `EXTRACTORS`: then it is loaded with its weights.
-        keep, folder: As `ScanMetric`.
+        keep, folder, options: As `ScanMetric`.
 
     Raises:
         InputError: no network of that name, or no weights for it on this machine.
@@ -29,11 +29,13 @@ class FeatureMetric(ScanMetric):
     kind: ClassVar[str]
     names: ClassVar[Mapping[str, str]] = {}
 
-    def __init__(self, extractor: Extractor | str, keep: bool = False, folder: str | Path | None = None) -> None:
+    def __init__(
+        self, extractor: Extractor | str, keep: bool = False, folder: str | Path | None = None, **options: Any
+    ) -> None:
         network = extractor.eval() if isinstance(extractor, Extractor) else extractors.load_extractor(extractor)
         random = "_random" if network.weights == "random" else ""
         name = "" if random else self.names.get(network.name, "")
-        super().__init__(keep, folder, name=name or f"{self.kind}_{network.name}{random}")
+        super().__init__(keep, folder, name=name or f"{self.kind}_{network.name}{random}", **options)
         self.extractor = network
         self.needs_reflectance = network.needs_reflectance
 

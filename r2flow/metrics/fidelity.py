@@ -16,8 +16,8 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
+from r2flow.metrics.controls import CONTROLS, Control
 from r2flow.metrics.surfaces import bridged, drop_rate, normals
-from r2flow.noise import generator, standard_normal
 
 GRADIENTS = np.concatenate([[0], np.geomspace(0.01, 80, 24)])  # metres
 STEPS, SECTORS = np.array([-20, -6, -2, -0.6, -0.2, -0.05, -0.02, 0.02, 0.05, 0.2, 0.6, 2, 6, 20]), 8  # metres
@@ -228,36 +228,8 @@ def distances(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray]) -> dict[
 
 
 def controls(training: np.ndarray, sensor: Sensor, num: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Sets made without knowledge of scenes, (num, 2 or 1, H, W) each.
-
-    `noise` is x_0 ~ N(0, I) decoded as if it were a scan; `flat ground` measures r = -height / sin e;
-    `mean scan` is the mean of the training scans where over half of them returned; `shuffled pixels` takes
-    each pixel from a training scan of its own.
-    """
-    channels = training.shape[1]
-    encoding = Encoding(sensor, reflectance=channels > 1)
-    noise = [encoding.decode(standard_normal(training.shape[1:], seed, "evaluation", k)).numpy() for k in range(num)]
-
-    e = sensor.rays()[0].numpy().astype(np.float64)
-    r = np.where(e < 0, -sensor.height / np.sin(np.minimum(e, -1e-6)), 0)
-    r = np.where((r >= sensor.min_range) & (r <= sensor.max_range), r, 0)
-    flat = np.stack([r, 0.3 * (r > 0)])[:channels]
-
-    returned = training[:, 0] > 0
-    mean = training.sum(0) / np.maximum(returned.sum(0), 1)
-    mean = np.where(returned.mean(0) > 0.5, mean, 0)
-
-    rows, columns = np.indices(sensor.shape)
-    shuffled = []
-    for k in range(num):
-        scan = generator(seed, "shuffle", k).integers(len(training), size=sensor.shape)
-        shuffled.append(np.moveaxis(training[scan, :, rows, columns], -1, 0))
-    return {
-        "noise": np.stack(noise),
-        "flat ground": np.repeat(flat[None], num, 0).astype(np.float32),
-        "mean scan": np.repeat(mean[None], num, 0).astype(np.float32),
-        "shuffled pixels": np.stack(shuffled),
-    }
+    """The sets of `r2flow.metrics.controls.Control`, (num, 2 or 1, H, W) each."""
+    return {name: Control(name, training, sensor, seed).first(num) for name in CONTROLS}
 
 
 def nearest(images: np.ndarray, training: np.ndarray, sensor: Sensor, leave_self: bool = False) -> np.ndarray:

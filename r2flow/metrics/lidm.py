@@ -46,8 +46,8 @@ class JSDLiDM(ScanMetric):
     keeping = "never"
     resamples = False
 
-    def __init__(self, keep: bool = False, folder: str | Path | None = None) -> None:
-        super().__init__(keep, folder)
+    def __init__(self, keep: bool = False, folder: str | Path | None = None, **options: Any) -> None:
+        super().__init__(keep, folder, **options)
         cells = round(2 * EXTENT / FINE) ** 2
         for side in SIDES:
             self.add_state(f"{side}_cells", torch.zeros(cells, dtype=torch.int32), dist_reduce_fx="sum")
@@ -81,6 +81,7 @@ class MMDLiDM(ScanMetric):
         "cell": COARSE, "metres": [-EXTENT, EXTENT], "distance": "Chamfer, squared, halved"
     }  # fmt: skip
     keeping = "always"
+    resamples = False  # which scan is nearest is no smooth function of the scans
 
     def rows(self, scans: Scans) -> Tensor:
         side = round(2 * EXTENT / COARSE)
@@ -94,13 +95,6 @@ class MMDLiDM(ScanMetric):
         if not all(self.count(side) for side in SIDES):
             return {"mmd_lidm": float("nan")}, ["mmd_lidm does not exist where a set has no return."]
         return {"mmd_lidm": float(self._nearest().mean())}, []
-
-    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        """Means over the resampled real scans.
-
-        The generated scans stay: one that is drawn twice is no nearer, so that resampled sets would only lack some.
-        """
-        return {"mmd_lidm": weights["real"] @ self._nearest() / weights["real"].sum(1)}
 
     def _nearest(self) -> Tensor:
         """Chamfer distance of every real scan to the nearest generated one, (N)."""

@@ -36,6 +36,7 @@ class Manifold(FeatureMetric):
     keeping = "always"
     resamples = False
     of_equal_sets = None
+    better = "larger"
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         names = [f"{name}_{self.name.removeprefix('manifold_')}" for name in NAMES]

@@ -1,5 +1,6 @@
-"""A batch of scans as every metric sees it: masked, in the representation that it asks for."""
+"""A batch of scans as every metric sees it: checked, masked, in the representation that it asks for."""
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -8,8 +9,11 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.lidar.projection import unproject
-from r2flow.lidar.sensors import Sensor
+from r2flow.lidar.sensors import Convention, Sensor
 from r2flow.metrics.birds_eye import BINS, birds_eye_histogram
+
+FULL = 1 + 1e-3  # reflectance; more is another scale, not rounding
+FAR = 300.0  # metres: no scan's median range
 
 # Metres between which the published evaluation keeps returns, on both sides and before every metric.
 MASK = (0.5, 63.0)
@@ -21,12 +25,23 @@ class Scans:
     Args:
         images: Range in metres and, where known, reflectance of [0, 1], (B, 2 or 1, H, W); 0 where missing.
         sensor: The sensor of the images.
+        rays: Where in its bin the ray of a pixel runs, on which its point lies: as `Sensor.rays`.
+        xyz: The points of the pixels where they are known, (B, 3, H, W) in metres: then `rays` are not used.
+        names: What each scan is called in a message; its number in the batch if left out.
 
     Raises:
-        InputError: images of another size than the sensor's.
+        InputError: images of another size than the sensor's; or values that no scan has, with the name of the first
+            such scan: NaN, a range below 0 or in millimetres, a reflectance outside [0, 1].
     """
 
-    def __init__(self, images: Tensor, sensor: Sensor) -> None:
+    def __init__(
+        self,
+        images: Tensor,
+        sensor: Sensor,
+        rays: Convention = "centre",
+        xyz: Tensor | None = None,
+        names: Sequence[object] | None = None,
+    ) -> None:
         if images.ndim != 4 or images.shape[1] not in (1, 2) or tuple(images.shape[2:]) != sensor.shape:
             h, w = sensor.shape
             raise InputError(
@@ -34,6 +49,8 @@ class Scans:
                 f"found {tuple(images.shape)}."
             )
         images = images.float()
+        check_values(images, names)
+        self.rays, self._measured = rays, xyz
         r = images[:, :1]
         self.images = torch.where((r > MASK[0]) & (r < MASK[1]), images, torch.zeros_like(images))
         self.sensor = sensor
@@ -64,7 +81,11 @@ class Scans:
     @cached_property
     def xyz(self) -> Tensor:
         """Points in metres of every pixel, (B, 3, H, W); the origin where there is no return."""
-        return unproject(self.images[:, :1], self.sensor.rays().to(self.images.device))
+        if self._measured is not None:
+            return self._measured.to(self.images) * self.returned
+        if self.rays == "reference":
+            return on_bin_corners(self.images[:, :1], self.sensor)
+        return unproject(self.images[:, :1], self.sensor.rays(self.rays).to(self.images.device))
 
     @cached_property
     def points(self) -> list[Tensor]:
@@ -78,3 +99,52 @@ class Scans:
         for i, points in enumerate(self.points):
             counts[i] = birds_eye_histogram(points.cpu().numpy())
         return counts
+
+
+def on_bin_corners(r: Tensor, sensor: Sensor) -> Tensor:
+    """Points (B, 3, H, W) on the rays through the upper left corners of the bins, of ranges (B, 1, H, W).
+
+    Four of these columns run along the axes, where cells of the bird's-eye view meet: the last bit of float32 decides,
+    and so it is computed here in the order of the published code, degrees first.
+    """
+    degrees = np.meshgrid(sensor.row_edges[:-1], 180 - 360 * np.arange(sensor.columns) / sensor.columns, indexing="ij")
+    e, a = (torch.from_numpy(one).float().deg2rad().to(r.device) for one in degrees)
+    return torch.cat([r * e.cos() * a.cos(), r * e.cos() * a.sin(), r * e.sin()], 1)
+
+
+def check_values(images: Tensor, names: Sequence[object] | None = None) -> None:
+    """Refuse images, (B, 2 or 1, H, W), with values that no scan has; one look where there are none.
+
+    Raises:
+        InputError: what is wrong with the first such scan.
+    """
+    if not images.numel():
+        return
+    low, high = images.aminmax(dim=-1)  # NaN wherever a row has one
+    low, high = low.amin((0, 2)), high.amax((0, 2))
+    if (low >= 0).all() and high[0] < FAR and (high[1:] <= FULL).all():
+        return
+    for number, image in enumerate(images):
+        wrong = _wrong_with(image)
+        if wrong:
+            name = number if names is None else names[number]
+            raise InputError(f"scan {name}: {wrong}.")
+
+
+def _wrong_with(image: Tensor) -> str | None:
+    """What is wrong with an image, (2 or 1, H, W), and what to do."""
+    for channel, what in zip(image, ("range", "reflectance"), strict=False):
+        if not channel.isfinite().all():
+            bad = int((~channel.isfinite()).sum())
+            return f"{bad} pixels of its {what} are NaN or infinite; 0 stands for a ray without a return"
+        if channel.min() < 0:
+            hint = "is it in model space ([-1, 1])? Decode it" if channel.abs().max() <= 1 else "0 stands for no return"
+            return f"its {what} goes down to {float(channel.min()):.4g}; {hint}"
+    returned = image[0][image[0] > 0]
+    if len(returned) and returned.median() >= FAR:
+        middle = float(returned.median())
+        return f"its median range is {middle:.4g} m; are these millimetres? Give metres"
+    if len(image) > 1 and image[1].max() > FULL:
+        highest = float(image[1].max())
+        return f"its reflectance goes up to {highest:.4g}, where [0, 1] is meant; divide by its full scale, often 255"
+    return None

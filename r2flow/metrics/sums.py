@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -26,8 +26,8 @@ class SumMetric(ScanMetric):
     real_sum: Tensor
     generated_sum: Tensor
 
-    def __init__(self, keep: bool = False, folder: str | Path | None = None) -> None:
-        super().__init__(keep, folder)
+    def __init__(self, keep: bool = False, folder: str | Path | None = None, **options: Any) -> None:
+        super().__init__(keep, folder, **options)
         for side in SIDES:
             self.add_state(f"{side}_sum", torch.zeros(self.width, dtype=torch.float64), dist_reduce_fx="sum")
             self.add_state(f"{side}_width", torch.tensor(0), dist_reduce_fx="max")

@@ -117,6 +117,8 @@ def curvature_rows(flows: Sequence[Paths]) -> list[dict[str, Any]]:
 def summary(flow: Paths) -> dict[str, Any]:
     """One checkpoint in one row."""
     mean = flow.s.mean(0)
+    tenths = [_mean(mean[(flow.t >= k / 10) & (flow.t < (k + 1) / 10)]) for k in range(10)]
+    ends, middle = min(tenths[0], tenths[-1]), float(np.max(tenths[1:-1]))
     return {
         "checkpoint": flow.label,
         "scenes": len(flow.s),
@@ -125,12 +127,18 @@ def summary(flow: Paths) -> dict[str, Any]:
         "t_of_most": float(flow.t[mean.argmax()]),
         "first_tenth": _share(mean[flow.t < 0.1], mean),
         "last_tenth": _share(mean[flow.t >= 0.9], mean),
+        "ends_over_middle": ends / middle if middle > 0 else math.nan,
         "paths": len(flow.bends),
         "paths_share": len(flow.bends) / flow.elements,
         "paths_dropped": float(flow.dropped.mean()) if len(flow.dropped) else math.nan,
         "dropped_share": flow.dropped_share,
         "dropped_bend": flow.dropped_bend,
     }
+
+
+def _mean(part: np.ndarray) -> float:
+    """Mean; NaN of no steps, as where a path has fewer than ten."""
+    return float(part.mean()) if len(part) else math.nan
 
 
 def _share(part: np.ndarray, whole: np.ndarray) -> float:

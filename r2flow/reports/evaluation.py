@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from matplotlib.figure import Figure
 
@@ -16,6 +16,7 @@ from r2flow.reports.pages import STYLES, Page, blank_figure, plain, provenance
 from r2flow.reports.tables import print_table, shown, table
 
 FORMAT = "r2flow evaluation 1"
+Kind = Literal["judged", "floor", "control"]
 
 # Figures that the field's tables print scaled: heading and factor. The figure itself stays what it is.
 PRINTED = {
@@ -33,6 +34,7 @@ class Comparison:
     generated: ScanSet
     measured: Sequence[MetricResult]
     seconds: float
+    kind: Kind = "judged"
 
 
 def heading(metric: str, figure: str) -> tuple[str, float]:
@@ -49,16 +51,17 @@ def rows_of(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
             low, high = measured.intervals.get(name, (None, None))
             sizes = measured.protocol["sizes"]
             rows.append({
-                "comparison": comparison.name, "metric": measured.metric, "figure": name, "value": value, "low": low,
-                "high": high, "printed_as": said, "printed": value * factor, "real": sizes["real"],
-                "generated": sizes["generated"], "remarks": "; ".join(measured.remarks),
+                "comparison": comparison.name, "kind": comparison.kind, "metric": measured.metric, "figure": name,
+                "value": value, "low": low, "high": high, "printed_as": said, "printed": value * factor,
+                "real": sizes["real"], "generated": sizes["generated"], "remarks": "; ".join(measured.remarks),
             })  # fmt: skip
     return rows
 
 
 def print_comparisons(comparisons: Sequence[Comparison]) -> None:
-    """Print a line for each figure, a column for each comparison, and the remarks."""
-    columns, lines = _table(comparisons, "\n")
+    """Print one table, its protocol before it and the remarks after it."""
+    columns, lines = _table(comparisons)
+    print(_protocol(comparisons))
     print_table(lines, columns)
     for remark in _remarks(comparisons):
         print(f"  {remark}")
@@ -87,6 +90,7 @@ def evaluation_page(comparisons: Sequence[Comparison], command: str, device: str
         for p in protocols
     ]  # fmt: skip
     text = [
+        _protocol(comparisons),
         table(lines, columns),
         *([remarks] if remarks else []),
         "## Sets",
@@ -102,40 +106,57 @@ def evaluation_page(comparisons: Sequence[Comparison], command: str, device: str
                 {"evaluation": _figure(comparisons)}, command, seeds, device, more)  # fmt: skip
 
 
-def _table(comparisons: Sequence[Comparison], between: str = " ") -> tuple[list[str], list[list[str]]]:
-    """Headings and lines: figures down, comparisons across, numbers as the field prints them.
+def _protocol(comparisons: Sequence[Comparison]) -> str:
+    """The protocol of all figures, in a sentence."""
+    used = comparisons[0].measured[0].protocol
+    points = used["points"]
+    return (
+        f"Protocol {used['name']}: real points {points['real']}, generated points {points['generated']}; "
+        f"images {'x'.join(map(str, used['image']))}."
+    )
 
-    Args:
-        between: What stands between a figure and its interval, and between a comparison and its sizes.
-    """
-    columns = ["", *(f"{one.name}{between}({len(one.generated)} : {len(one.real)})" for one in comparisons)]
+
+def _table(comparisons: Sequence[Comparison]) -> tuple[list[str], list[list[str]]]:
+    """Headings and lines, numbers as the field prints them: comparisons or figures down, whichever are more."""
     cells: dict[str, dict[str, str]] = {}
     for row in rows_of(comparisons):
         factor = heading(row["metric"], row["figure"])[1]
         text = "none" if math.isnan(row["value"]) else f"{row['printed']:#.4g}"
         if row["low"] is not None and text != "none":
-            text += f"{between}[{row['low'] * factor:#.3g}, {row['high'] * factor:#.3g}]"
+            text += f" [{row['low'] * factor:#.3g}, {row['high'] * factor:#.3g}]"
         cells.setdefault(row["printed_as"], {})[row["comparison"]] = text
-    return columns, [[said, *(cells[said].get(one.name, "") for one in comparisons)] for said in cells]
+    sizes = [f"({len(one.generated)} : {len(one.real)})" for one in comparisons]
+    names = [one.name if one.kind == "judged" else f"{one.kind}: {one.name}" for one in comparisons]
+    if len(comparisons) >= len(cells):
+        lines = [
+            [name, size, *(own.get(one.name, "") for own in cells.values())]
+            for name, size, one in zip(names, sizes, comparisons, strict=True)
+        ]
+        return ["set", "its scans : real", *cells], lines
+    columns = ["", *(f"{name} {size}" for name, size in zip(names, sizes, strict=True))]
+    return columns, [[said, *(own.get(one.name, "") for one in comparisons)] for said, own in cells.items()]
 
 
 def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
-    """Each remark once, with the comparison and the metrics that it holds for."""
+    """Each remark once, with the metrics and the comparisons that it holds for."""
     said = []
     drawn = [m.protocol["interval"] for one in comparisons for m in one.measured if m.intervals]
     if drawn:
         draws = drawn[0]["bootstrap draws"]
         said.append(f"In brackets: intervals of {drawn[0]['level']:.0%}, from {draws} bootstrap draws.")
     if len({(len(one.real), len(one.generated)) for one in comparisons}) > 1:
-        said.append("Distances of fewer scans are larger: compare only columns of equal sizes.")
+        said.append("Distances of fewer scans are larger: compare only sets of equal sizes.")
+    found: dict[str, dict[str, list[str]]] = {}  # remark -> comparison -> metrics
     for one in comparisons:
-        found: dict[str, list[str]] = {}
         for measured in one.measured:
             for remark in measured.remarks:
-                found.setdefault(remark, []).append(measured.metric)
-        for remark, metrics in found.items():
-            obvious = len(metrics) == len(one.measured) or remark.startswith(tuple(metrics))
-            said.append(f"{one.name}: {remark}" if obvious else f"{one.name}, {', '.join(metrics)}: {remark}")
+                found.setdefault(remark, {}).setdefault(one.name, []).append(measured.metric)
+    for remark, where in found.items():
+        metrics = list(dict.fromkeys(name for names in where.values() for name in names))
+        about = [] if len(where) == len(comparisons) else [", ".join(where)]
+        if len(metrics) < len(comparisons[0].measured) and not remark.startswith(tuple(metrics)):
+            about.append(", ".join(metrics))
+        said.append(f"{'; '.join(about)}: {remark}" if about else remark)
     return said
 
 
@@ -147,6 +168,7 @@ def _plain_comparison(one: Comparison) -> dict[str, Any]:
     sets = {"real": one.real, "generated": one.generated}
     return {
         "comparison": one.name,
+        "kind": one.kind,
         **{whose: {"set": s.label, "scans": len(s), **s.about} for whose, s in sets.items()},
         "seconds": round(one.seconds, 2),
         "metrics": [

@@ -62,7 +62,7 @@ class Curve:
         return point_key(
             self.real, self.metrics, weights=weights_hash(flow), steps=steps, num=self.drawing.num,
             seed=self.drawing.seed, method=how.method, grid=how.grid, finish=how.finish, tolerance=how.tolerance,
-            device=self.device,
+            device=self.device, protocol=self.gathered.protocol.name,
         )  # fmt: skip
 
 
@@ -174,13 +174,18 @@ def speed_quality_page(
     printed = [{**row, **{n: row[n] * factor for n, (_, factor) in headings.items() if n in row}} for row in rows]
     sampled = (
         f"{drawing.num} scans of seed {drawing.seed} at every point, from the same noise, by "
-        f"{drawing.method or 'its own solver'}; measured against {len(curve.real)} scans of {curve.real.label}. "
+        f"{drawing.method or 'its own solver'}; measured against {len(curve.real)} scans of {curve.real.label}, "
+        f"under the protocol `{curve.gathered.protocol.name}`. "
         "Seconds are those of the network and its solver, the median over batches."
     )
     text = [sampled, table(printed, columns), *_remarks(rows)]
     more: dict[str, Sequence[Mapping[str, Any]]] = {
         "protocols": [
-            {**metric.protocol.asdict(), "real_chosen": curve.gathered.rules[name]}
+            {
+                **curve.gathered.protocol.describe(),
+                **metric.protocol.asdict(),
+                "real_chosen": curve.gathered.rules[name],
+            }
             for name, metric in curve.metrics.items()
         ],
         "other_points": [row for row in done if row["key"] not in keys],

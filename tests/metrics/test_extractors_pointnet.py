@@ -39,7 +39,7 @@ def test_a_dropped_ray_is_the_origin_in_units_of_80_m(network):
 
 
 def test_pointnet_s_features_are_of_each_scan_alone(network):
-    images = torch.rand(3, 2, *SMALL.shape) * 50 + 1
+    images = torch.rand(3, 1, *SMALL.shape) * 50 + 1
     images[1] = 0
     features = network.features(Scans(images, SMALL))
     assert features.shape == (3, network.dim) == (3, 1808)

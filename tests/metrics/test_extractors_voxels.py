@@ -52,7 +52,7 @@ def test_sectors_by_hand():
 @pytest.mark.parametrize("cls", [MinkowskiNet, SPVCNN])
 def test_the_sparse_networks_features_are_of_each_scan_alone(cls):
     network = cls.random(0)
-    images = torch.rand(3, 2, *SMALL.shape) * 50 + 1
+    images = torch.rand(3, 1, *SMALL.shape) * 50 + 1
     images[1] = 0
     features = network.features(Scans(images, SMALL))
     assert features.shape == (3, network.dim) == (3, 768)

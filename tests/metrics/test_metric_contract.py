@@ -14,7 +14,7 @@ from r2flow.metrics import METRICS
 from r2flow.metrics.base import SIDES
 from r2flow.metrics.features import extract
 from r2flow.metrics.scans import Scans
-from tests.metrics.conftest import one_of_each_class
+from tests.metrics.conftest import SMALL, one_of_each_class
 
 REAL, GENERATED = 12, 9
 pytestmark = pytest.mark.usefixtures("coarse")
@@ -212,6 +212,76 @@ def test_scans_without_reflectance_are_refused_where_it_is_needed(build, sets):
 
 def test_what_is_no_batch_of_scans_is_refused_in_one_line(build, sets):
     metric = build()
-    with pytest.raises(InputError, match=rf"^'{metric.name}' takes .*Scans\(images, sensor\), found Tensor\.$"):
+    with pytest.raises(InputError, match=rf"^'{metric.name}' takes .*Scans\(images, sensor\), .*without a sensor\.$"):
         metric.update(sets["real"].images, real=True)
+    with pytest.raises(InputError, match=r"found ndarray\.$"):
+        metric.update(sets["real"].images.numpy(), real=True)
     assert metric.given("real") == 0
+
+
+# What torchmetrics promises of every metric
+
+
+def told(metric, sets, size=4):
+    """Both sets as tensors, in batches that nobody numbers."""
+    for side, scans in sets.items():
+        for batch in scans.images.split(size):
+            metric.update(batch, real=side == "real")
+    return metric
+
+
+def test_images_are_given_as_tensors_in_batches_without_numbers(build, sets):
+    expected = give(build(), sets).compute()
+    metric = told(build(sensor=SMALL, keep=True), sets, size=5)
+    assert metric.compute() == expected
+    assert metric(sets["real"].images, real=True) == {}
+    metric.reset()
+    assert told(metric, sets).compute() == expected
+
+
+def test_merged_states_are_those_of_all_scans(build, sets):
+    expected = give(build(), sets).compute()
+    halves = [{s: part(x, numbers) for s, x in sets.items()} for numbers in (slice(0, 5), slice(5, None))]
+    parts = [told(build(sensor=SMALL, keep=True), half) for half in halves]
+    parts[1].persistent(True)
+    for incoming in (parts[1], parts[1].state_dict()):
+        metric = parts[0].clone()
+        metric.compute()  # what is computed before is not taken for what is there afterwards
+        metric.merge_state(incoming)
+        assert metric.compute() == pytest.approx(expected, rel=1e-10, abs=1e-13)
+    if parts[0].keeps:
+        with pytest.raises(InputError, match="keeps a row of each scan, and what is merged into it has none"):
+            parts[0].merge_state(parts[1].metric_state)
+
+
+def test_a_loaded_state_goes_on_where_the_saved_one_was(build, sets, tmp_path, recwarn):
+    expected = give(build(), sets).compute()
+    begun = build(sensor=SMALL, keep=True)
+    told(begun, {s: part(scans, slice(0, 7)) for s, scans in sets.items()})
+    middle = begun.compute()
+    begun.persistent(True)
+    torch.save(begun.state_dict(), tmp_path / "metric.pt")
+    saved = torch.load(tmp_path / "metric.pt", weights_only=True)
+    metric = build(sensor=SMALL, keep=True)
+    metric.load_state_dict(saved)
+    assert metric.compute() == middle
+    told(metric, {s: part(scans, slice(7, None)) for s, scans in sets.items()})
+    assert metric.compute() == pytest.approx(expected, rel=1e-10, abs=1e-13)
+    again = build(sensor=SMALL, keep=True)
+    again.load_state_dict(saved)  # which the first one has not changed
+    assert again.compute() == middle
+    fresh = build(keep=True)
+    fresh.load_real_state(begun.real_state())
+    fresh.compute()
+    assert not [one for one in recwarn if "before the ``update``" in str(one.message)]
+    if metric.keeps:
+        del saved["real_rows"]
+        with pytest.raises(RuntimeError, match="no 'real_rows'"):
+            build(keep=True).load_state_dict(saved)
+
+
+def test_moving_and_setting_a_dtype_change_no_figure(build, sets):
+    expected = give(build(), sets).compute()
+    metric = told(build(sensor=SMALL), sets).to("cpu").set_dtype(torch.float16).half()
+    metric.reset()
+    assert told(metric, sets).compute() == expected

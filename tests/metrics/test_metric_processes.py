@@ -8,6 +8,7 @@ import torch.distributed as dist
 import torch.multiprocessing as mp
 
 from r2flow.lidar.sensors import SENSORS
+from r2flow.metrics import METRICS
 from r2flow.metrics.bootstrap import bootstrap
 from r2flow.metrics.extractors import extractor_class
 from r2flow.metrics.frechet import FrechetDistance
@@ -28,8 +29,6 @@ def images(seed, n):
 
 def measure(rank, ranks, folder):
     """Figures, remarks and intervals of all metrics, of two generated sets one after the other."""
-    from r2flow.metrics import METRICS
-
     network = extractor_class("embedded").random()
     metrics = [METRICS[name](keep=True, folder=folder / name) for name in PLAIN]
     metrics += [FrechetDistance(network, keep=True, folder=folder), Manifold(network, folder=folder)]
@@ -46,6 +45,22 @@ def measure(rank, ranks, folder):
             give(metric, images(seed, 11), False, rank, ranks)
             intervals = {name: list(ends) for name, ends in bootstrap(metric, draws=5).items()}
             found.append([metric.compute(), metric.remarks(), intervals])
+    return found + on_their_own(network, rank, ranks)
+
+
+def on_their_own(network, rank, ranks):
+    """Figures of metrics without a common folder, of images that nobody numbers; twice, with more scans in between."""
+    metrics = [METRICS[name](sensor=SENSOR) for name in ("jsd", "mmd")]
+    metrics += [FrechetDistance(network, keep=True, sensor=SENSOR), Manifold(network, sensor=SENSOR)]
+    found = []
+    for metric in metrics:
+        for seed in (1, 4):
+            for real, scans in ((True, images(seed, 14)), (False, images(seed + 1, 11))):
+                for batch in scans.split(3)[rank::ranks]:
+                    metric.update(batch, real=real)
+            kept = len(metric.store("real")) if metric.keeps else 0
+            found.append([metric.compute(), metric.remarks(), {}])
+            assert not metric.keeps or len(metric.store("real")) == kept  # its own again
     return found
 
 

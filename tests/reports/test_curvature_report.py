@@ -14,6 +14,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.reports.curvature import (
+    Paths,
     curvature_page,
     curvature_rows,
     measure_paths,
@@ -157,3 +158,12 @@ def test_bad_input_is_one_line(r2flow, saved, tmp_path):  # noqa: F811
         assert words in err
         assert len([line for line in err.splitlines() if not line.startswith("WARNING")]) == 1
         assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize(("steps", "expected"), [(20, 4 / 5), (25, 4 / 5), (8, math.nan)])
+def test_the_ends_are_compared_with_the_most_curved_tenth_between(steps, expected):
+    t = np.arange(steps) / steps
+    s = np.select([t < 0.1, t >= 0.9, (t >= 0.4) & (t < 0.5)], [4.0, 6.0, 5.0], 1.0)[None]
+    none = np.zeros(0)
+    paths = Paths("by hand", t, s, np.ones(1), 1, none, none, none, 0.1, 0.1)
+    assert summary(paths)["ends_over_middle"] == pytest.approx(expected, nan_ok=True)

@@ -9,6 +9,7 @@ import yaml
 
 from r2flow.checkpoints import load_checkpoint, weights_hash
 from r2flow.errors import InputError
+from r2flow.evaluation.protocols import R2FLOW
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.reports.paper import cells
 from r2flow.reports.paper.figures import marginals, marginals_apart
@@ -125,6 +126,8 @@ def test_the_page_goes_on_where_it_stopped(r2flow, chains, tmp_path, monkeypatch
     assert {claim["verdict"] for claim in content["claims"]} <= {"holds", "does not hold", "cannot tell"}
     page = (tmp_path / "paper.md").read_text()
     assert "**FRD, FRID, FPD, FPVD, FSVD:** not computed: not asked for" in page
+    assert "are not comparable: its bins are those of an image of 64 x 1024." in page
+    assert [one["name"] for one in content["protocol"]] == ["r2flow"]
 
     monkeypatch.setattr(cells, "sampled_set", lambda *_: pytest.fail("a finished cell was measured again"))
     assert r2flow(*command)[0] == 0
@@ -164,9 +167,22 @@ def test_printed_and_own_figures_stand_in_one_line():
 def test_what_differs_is_said_and_nothing_else():
     paper = differences("KITTI-360", 81_106, 10_000, (64, 1024), [80_908_420], [2_560_000], {})
     assert len(paper) == 1
-    small = " ".join(differences("simulated", 51, 32, (32, 256), [2_000_000], [3600], {"frd": "no weights"}))
-    for words in ("32 generated against 51 real", "32 x 256", "2,000,000", "3,600", "FRD:** not computed: no weights"):
+    small = " ".join(
+        differences("simulated", 51, 32, (32, 256), [2_000_000], [3600], {"frd": "no weights"}, R2FLOW, "no points")
+    )
+    for words in (
+        "`r2flow`: real points on rays through bin centres",
+        "not comparable: no points.",
+        "32 generated against 51 real",
+        "32 x 256",
+        "2,000,000",
+        "3,600",
+        "FRD:** not computed: no weights",
+    ):
         assert words in small
+    for words in ("real points as measured", "generated points on rays through bin corners"):  # the paper's
+        assert words in small
+        assert words not in "".join(paper)
     assert same_architecture(125_246_466).frd == 134.22  # printed as 125.5 M
     assert same_architecture(2_000_000) is None
 

@@ -20,7 +20,8 @@ def found() -> dict[str, float]:
 @pytest.mark.parametrize("number", range(6))
 def test_each_of_the_paper_s_statements_holds(found: dict[str, float], number: int):
     claim = ordering.claims([found])[number]
-    assert claim["verdict"] == "holds", claim
+    assert claim["margins"][0] > 0, claim
+    assert claim["verdict"] == "cannot tell"  # from one seed
 
 
 def test_the_exact_velocity_carries_noise_to_the_data():

@@ -54,7 +54,7 @@ class CellSettings:
         """A cell's file, named by everything that it depends on."""
         key = point_key(
             self.real, self.metrics, weights=subject.weights, steps=steps, num=self.num, seed=SEED,
-            bootstrap=self.bootstrap, device=self.device,
+            bootstrap=self.bootstrap, device=self.device, protocol=self.gathered.protocol.name,
         )  # fmt: skip
         return self.folder / f"{key}.safetensors"
 

@@ -7,14 +7,16 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from r2flow.evaluation.protocols import PAPER, Rules
 from r2flow.evaluation.sets import ScanSet
 from r2flow.inversion import Interpolation
+from r2flow.metrics.base import Better
 from r2flow.reports.curvature import Paths, curvature_figure, curvature_text, summary, trajectories_figure
 from r2flow.reports.evaluation import heading
 from r2flow.reports.interpolation import interpolation_figure
 from r2flow.reports.pages import Page, picture
 from r2flow.reports.paper.cells import SEED, Cell
-from r2flow.reports.paper.claims import FAILS, HOLDS, UNKNOWN, Claim, claims
+from r2flow.reports.paper.claims import Claim, claims
 from r2flow.reports.paper.figures import birds_eye_figure, trade_off_figure
 from r2flow.reports.paper.subjects import PaperRun
 from r2flow.reports.paper.tables import (
@@ -27,6 +29,7 @@ from r2flow.reports.paper.tables import (
 )
 from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.speed_quality import BETWEEN
+from r2flow.reports.verdicts import FAILS, HOLDS, UNKNOWN
 
 
 @dataclass
@@ -49,20 +52,28 @@ class PaperResults:
     paths: dict[str, Paths] = field(default_factory=dict)
     architectures: list[dict[str, Any]] = field(default_factory=list)
     between: Interpolation | None = None
+    protocol: Rules = PAPER
+    why: str | None = None  # another one than the paper's
 
 
 def paper_page(
-    measured: PaperResults, metrics: Sequence[str], missing: Mapping[str, str], num: int, command: str, device: str
+    measured: PaperResults,
+    metrics: Mapping[str, Better],
+    primary: str,
+    missing: Mapping[str, str],
+    num: int,
+    command: str,
+    device: str,
 ) -> Page:
-    """The page, still to be written."""
+    """The page, still to be written; the primary one of the metrics judges."""
     rows = [cell.row for cell in measured.cells]
     headings = {name: heading(name, name)[0].partition(" x ")[0] for name in metrics}
     known = {one.label: one for one in measured.subjects}
     curved = [
-        {**summary(paths), "role": known[label].role, "family": known[label].family}
+        {**summary(paths), "role": known[label].role, "family": known[label].family, "kind": known[label].kind}
         for label, paths in measured.paths.items()
     ]
-    found = claims(rows, metrics, curved, measured.architectures)
+    found = claims(rows, metrics, primary, curved, measured.architectures)
     figures = figures_of(measured, rows, headings)
     roots = [one.config for one in measured.subjects if one.role == "1-RF"]
     scans = {str(config["data"]["name"]): config.get("scans", "") for config in roots}
@@ -70,15 +81,18 @@ def paper_page(
         "; ".join(f"{name} ({which})" if which else name for name, which in scans.items()),
         len(measured.real), num, measured.real.sensor.shape, [row["parameters"] for row in measured.architectures],
         [int(config["trainer"]["max_steps"]) * int(config["data"]["batch_size"]) for config in roots], missing,
+        measured.protocol, measured.why,
     )  # fmt: skip
-    side_by_side = beside(rows, metrics)
+    side_by_side = beside(rows, list(metrics))
     text = [
         f"{len(measured.subjects)} runs; {num} scans of each flow and number of Euler steps, all from the same noise, "
-        f"against {len(measured.real)} scans ({measured.real.label}).",
+        f"against {len(measured.real)} scans ({measured.real.label}), under the protocol `{measured.protocol.name}`.",
         "## The paper's claims, judged here",
         tally(found),
         claims_table(found),
-        "*Holds* and *does not hold* are decided by the intervals over seeds or, for one seed, over scans.",
+        f"`{primary}`, chosen before anything was measured (`--primary`), judges by Student's 95 % intervals over "
+        "training seeds; one seed gives no verdict. Where there is no difference, a claim gets a verdict either way in "
+        "at most 5 % of cases: each of them by itself, not all of them together.",
         "## What differs from the paper",
         "\n".join(f"- {part}" for part in parts),
         "## Table I: methods and metrics",
@@ -103,7 +117,7 @@ def paper_page(
     runs = [{"label": one.label, "role": one.role, "family": one.family, "seed": one.seed} for one in known.values()]
     more = {
         "claims": [vars(claim) for claim in found], "architectures": measured.architectures, "curvature": curved,
-        "runs": runs,
+        "runs": runs, "protocol": [measured.protocol.describe()],
     }  # fmt: skip
     title, seeds = "The paper's tables and figures", {"sampled scans": SEED}
     return Page("paper", title, text, rows, figures, command, seeds, device, more)

@@ -13,6 +13,7 @@ from r2flow import simulator
 from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
+from r2flow.evaluation.protocols import PAPER, R2FLOW, Rules
 from r2flow.evaluation.sets import ScanSet
 from r2flow.evaluation.statistics import Cache
 from r2flow.generators import Sampler
@@ -25,6 +26,7 @@ from r2flow.reports.paper.cells import SEED, CellSettings, counts_of, measure_ce
 from r2flow.reports.paper.figures import marginals_apart
 from r2flow.reports.paper.page import PaperResults, paper_page
 from r2flow.reports.paper.subjects import PaperRun
+from r2flow.reports.paper.tables import SIZE
 from r2flow.runs import read_config
 
 FRAMES = 6  # of figure 3, as in the paper: both ends' round trips and four between
@@ -53,20 +55,24 @@ def report(
     subjects: Sequence[PaperRun],
     out: Path,
     metrics: Mapping[str, ScanMetric],
+    primary: str,
     missing: Mapping[str, str],
     budget: Budget,
     work: Work,
     real: ScanSet | None = None,
     device: str = "cpu",
     command: str = "",
+    protocol: Rules | None = None,
 ) -> Page:
     """The page, still to be written; what is finished is kept in `out/cells`.
 
     Args:
         subjects: From `find_subjects`.
-        metrics: The distances by name, `jsd` among them.
+        metrics: By name, `jsd` among them.
+        primary: The one that judges the paper's claims.
         missing: The paper's metrics that are not measured, and why.
         real: The scans to compare with; those that the first 1-RF held out if left out.
+        protocol: The paper's where the real scans allow it, else ours, if left out.
 
     Raises:
         InputError: scans that cannot be read, or without the reflectance that a metric needs.
@@ -74,11 +80,13 @@ def report(
     first = next(one for one in subjects if one.role == "1-RF")
     real = real or held_out(first)
     check_reflectance(metrics, [real])
-    gathered = gather_real(metrics, real, work, Cache())
+    why = None if protocol else not_as_printed(real)
+    rules = protocol or (R2FLOW if why else PAPER)
+    gathered = gather_real(metrics, real, work, Cache(), rules)
     settings = CellSettings(real, metrics, gathered, budget.num, budget.bootstrap, work, out / "cells", device)
     metrics["jsd"].load_real_state(gathered.statistics["jsd"].states)
     ends = np.stack([real.source[index] for index in (len(real) // 4, 3 * len(real) // 4)])  # far apart in the set
-    measured = PaperResults(subjects, real, counts_of(metrics["jsd"], "real"), ends)
+    measured = PaperResults(subjects, real, counts_of(metrics["jsd"], "real"), ends, protocol=rules, why=why)
     costs: dict[str, dict[str, Any]] = {}
     for subject in subjects:
         flow = load_checkpoint(subject.run, device)
@@ -103,7 +111,15 @@ def report(
         if subject is first and budget.tolerance is not None and len(real) > 1:
             measured.between = _interpolate(flow, ends, Sampler("dopri5", tolerance=budget.tolerance), work)
         del flow
-    return paper_page(measured, list(metrics), missing, budget.num, command, device)
+    better = {name: metric.better for name, metric in metrics.items()}
+    return paper_page(measured, better, primary, missing, budget.num, command, device)
+
+
+def not_as_printed(real: ScanSet) -> str | None:
+    """Why scans cannot be compared as in the paper; None where they can."""
+    if real.sensor.shape != SIZE:
+        return f"its bins are those of an image of {SIZE[0]} x {SIZE[1]}"
+    return PAPER.lacking(real)
 
 
 def _interpolate(flow: Checkpoint, ends: np.ndarray, sampler: Sampler, work: Work) -> Interpolation:

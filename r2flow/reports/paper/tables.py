@@ -5,13 +5,13 @@ from dataclasses import asdict
 from statistics import fmean, stdev
 from typing import Any
 
+from r2flow.evaluation.protocols import PAPER, WORDS, Rules
 from r2flow.reports.paper.claims import Claim
-from r2flow.reports.paper.printed import COLUMNS, TABLE_I, TABLE_II, Architecture
+from r2flow.reports.paper.printed import COLUMNS, PAPER_KIND, TABLE_I, TABLE_II, Architecture
 from r2flow.reports.tables import Row, shown, table
 
 # The paper's settings.
 SCANS, REAL, IMAGES, SIZE = 10_000, 81_106, 2_560_000, (64, 1024)
-PAPER_KIND = "hdit with APE"  # the network of its chains
 
 
 def over_seeds(rows: Sequence[Row], metrics: Sequence[str]) -> list[dict[str, Any]]:
@@ -129,6 +129,8 @@ def differences(
     parameters: Sequence[int],
     images: Sequence[int],
     missing: Mapping[str, str],
+    protocol: Rules = PAPER,
+    why: str | None = None,
 ) -> list[str]:
     """The differences between our protocol and the paper's, a sentence each.
 
@@ -138,6 +140,7 @@ def differences(
         parameters: Of the 1-RFs' networks.
         images: That each 1-RF was trained on, repeats counted.
         missing: Metrics of the paper that were not computed, and why.
+        protocol, why: Under which the figures hold, and why not the paper's.
     """
     others = sorted({count for count in parameters if same_architecture(count) is None})
     least, most = min(images, default=IMAGES), max(images, default=IMAGES)
@@ -146,6 +149,11 @@ def differences(
         f"**Data:** {data}; the paper: KITTI-360, drives 3 4 5 6 7 9 10.": True,
         f"**Scans compared:** {generated:,} generated against {real:,} real ones; the paper: {SCANS:,} against "
         f"{REAL:,}. Distances between small sets come out larger.": (real, generated) != (REAL, SCANS),
+        f"**Protocol:** `{protocol.name}`: real points {WORDS[protocol.real]}, generated points "
+        f"{WORDS[protocol.generated]}; the paper: real points {WORDS[PAPER.real]}, generated points "
+        f"{WORDS[PAPER.generated]}. Its figures and these are not comparable{f': {why}' if why else ''}.": (
+            protocol is not PAPER
+        ),
         f"**Image:** {shape[0]} x {shape[1]}; the paper: {SIZE[0]} x {SIZE[1]}.": shape != SIZE,
         f"**Network:** {', '.join(f'{count:,}' for count in others)} parameters; the paper's HDiT: 80,908,420.": others,
         f"**Budget:** {seen} training images a 1-RF; the paper: {IMAGES:,}.": least < IMAGES,

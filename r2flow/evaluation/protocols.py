@@ -1,0 +1,106 @@
+"""Under which rules two sets of scans are compared: the paper's and ours, by name; figures of two are not comparable.
+
+They differ in where the points of a pixel lie, which decides bird's-eye histograms and all that a network sees of x, y
+and z; and in which real scans are compared where there are more than are needed. The mask, the histograms and the
+features are the same.
+"""
+
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from r2flow.data.layouts import KITTI_360_SPLIT, SourceKind
+from r2flow.data.sets import ScanSet, fixed_choice
+from r2flow.errors import InputError
+from r2flow.lidar.sensors import Convention
+
+Points = Literal["measured"] | Convention
+
+WORDS = {"measured": "as measured", "centre": "on rays through bin centres", "reference": "on rays through bin corners"}
+
+
+@dataclass(frozen=True)
+class Rules:
+    """One protocol.
+
+    Attributes:
+        real, generated: Where the point of a pixel lies: where it was measured, or on a ray through its bin's middle
+            ("centre") or upper left corner ("reference").
+        convention: How points of files become images where nobody says so; None for that of the model or the scans.
+        choose: Numbers of `most` scans of a set, rising.
+        chosen: How, in words.
+    """
+
+    name: str
+    real: Points
+    generated: Convention
+    convention: Convention | None
+    choose: Callable[[ScanSet, int], Sequence[int]]
+    chosen: str
+
+    def describe(self) -> dict[str, Any]:
+        """For a figure's protocol."""
+        return {"name": self.name, "points": {"real": WORDS[self.real], "generated": WORDS[self.generated]}}
+
+    def rays(self, real: bool) -> Convention:
+        """The rays on which points lie that were not measured."""
+        return self.real if real and self.real != "measured" else self.generated
+
+    def lacking(self, real: ScanSet) -> str | None:
+        """Why a set cannot be the real one; None where it can."""
+        if self.real != "measured" or real.source.measured:
+            return None
+        return f"{real.label} lacks the measured coordinates of its points: files of points alone hold them"
+
+    def check(self, real: ScanSet) -> None:
+        """Refuse a real set without what the protocol compares.
+
+        Raises:
+            InputError: it lacks measured coordinates.
+        """
+        lacks = self.lacking(real)
+        if lacks:
+            raise InputError(
+                f"{lacks}, and the protocol '{self.name}' compares them. Name such files (KITTI's .bin), or give "
+                "--protocol r2flow."
+            )
+
+
+def published_order(scans: ScanSet) -> list[int]:
+    """The numbers of a set as the published evaluation has them: KITTI-360's training drives before its test drives."""
+    last = {n for drive, held in scans.drives.items() if _KITTI_360.split_of(drive) == "test" for n in held}
+    if "kitti_360" not in str(scans.about.get("kind")):
+        return list(range(len(scans)))
+    return sorted(range(len(scans)), key=lambda number: number in last)
+
+
+def published_choice(scans: ScanSet, most: int) -> list[int]:
+    """`most` scans by the published draw, the first of Python's `random.Random(0).shuffle`, in rising order."""
+    order = published_order(scans)
+    random.Random(0).shuffle(order)  # shuffles whatever stands at each place
+    return sorted(order[:most])
+
+
+class _Kitti360(SourceKind):
+    splits = KITTI_360_SPLIT
+
+
+_KITTI_360 = _Kitti360()
+
+R2FLOW = Rules(
+    "r2flow", "centre", "centre", None, lambda scans, most: fixed_choice(len(scans), most), "fixed shuffle, seed 0"
+)
+PAPER = Rules("paper", "measured", "reference", "reference", published_choice, "Python's shuffle, seed 0")
+PROTOCOLS = {one.name: one for one in (R2FLOW, PAPER)}
+
+
+def named_rules(name: str) -> Rules:
+    """A protocol by its name.
+
+    Raises:
+        InputError: no such protocol.
+    """
+    if name not in PROTOCOLS:
+        raise InputError(f"--protocol must be one of {', '.join(PROTOCOLS)}; found {name!r}.")
+    return PROTOCOLS[name]

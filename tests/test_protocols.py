@@ -1,0 +1,166 @@
+"""The paper's protocol and ours, beside what is computed here by other means."""
+
+import json
+import math
+import random
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.data.opening import open_scans
+from r2flow.data.sources import Reading
+from r2flow.errors import InputError
+from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
+from r2flow.evaluation.protocols import PAPER, PROTOCOLS, R2FLOW, named_rules, published_choice
+from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.sensors import SENSORS
+from r2flow.metrics import METRICS
+from r2flow.reports.paper.report import not_as_printed
+from tests.data.conftest import kitti_360  # noqa: F401  a fixture
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.test_evaluation import SENSOR, folder, generated, images  # noqa: F401  a fixture
+
+READING = Reading(SENSOR, convention="reference")
+H, W = SENSOR.shape
+
+
+def angles(shift_down: np.ndarray | float, shift_right: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """Elevation and azimuth within each bin, both shifts from 0 (upper left corner) to 1, radians."""
+    h, w = np.indices((H, W))
+    elevation = np.deg2rad(3 - 28 * (h + shift_down) / H)
+    return elevation, math.pi - 2 * math.pi * (w + shift_right) / W
+
+
+def points(r: np.ndarray, elevation: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return np.moveaxis(r * np.stack(direction), 0, -1)[r > 0]
+
+
+def on_corners(r: np.ndarray) -> np.ndarray:
+    """The published points of an image, in float32: some lie on the border of two cells."""
+    h, w = torch.meshgrid(torch.arange(H) / H, torch.arange(W) / W, indexing="ij")
+    e, a = ((1 - h) * 28 - 25).deg2rad(), ((1 - w) * 360 - 180).deg2rad()
+    depth = torch.from_numpy(r)
+    xyz = torch.stack([depth * e.cos() * a.cos(), depth * e.cos() * a.sin(), depth * e.sin()], -1)
+    return xyz[depth > 0].double().numpy()
+
+
+def from_above(clouds: list[np.ndarray]) -> np.ndarray:
+    """Points of 3 m < r < 63 m in cells of 1.6 m, over all scans; the edges are the published ones, in float32."""
+    count, edges = np.zeros((100, 100)), torch.linspace(-80, 80, 101).double().numpy()
+    for xyz in clouds:
+        for x, y, z in xyz:
+            if 3 < math.sqrt(x * x + y * y + z * z) < 63:
+                count[(edges <= x).sum() - 1, (edges <= y).sum() - 1] += 1
+    return count
+
+
+def distance(a: np.ndarray, b: np.ndarray) -> float:
+    p, q = a.ravel() / a.sum(), b.ravel() / b.sum()
+    m = (p + q) / 2
+    entropy = [-(x[x > 0] * np.log(x[x > 0])).sum() for x in (p, q, m)]
+    return math.sqrt(entropy[2] - (entropy[0] + entropy[1]) / 2)
+
+
+@pytest.fixture
+def measured(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
+    """Scans of points anywhere in their bins, and the points."""
+    draw, clouds = np.random.default_rng(5), []
+    for number, image in enumerate(images(6, 1)):
+        xyz = points(image[0], *angles(*draw.uniform(0.02, 0.98, (2, H, W)))).astype(np.float32)
+        clouds.append(xyz)
+        write_points(tmp_path / "measured" / f"{number}.bin", xyz, np.full(len(xyz), 0.5, np.float32))
+    return tmp_path / "measured", clouds
+
+
+def figure(real: Path, judged: Path, rules, metric: str = "jsd") -> float:
+    metrics = {metric: METRICS[metric]()}
+    gathered = gather_real(metrics, open_scans(str(real), READING), Work(), protocol=rules)
+    (one,) = measure(metrics, gathered, open_scans(str(judged), READING), Work())
+    assert one.protocol["name"] == rules.name
+    return one.figures[metric]
+
+
+def test_real_points_are_the_measured_ones_and_generated_ones_bin_corners(measured, generated):  # noqa: F811
+    made = images(10, 2)[:, 0].astype(np.float64)
+    corners = from_above([on_corners(r) for r in images(10, 2)[:, 0]])
+    found = figure(measured[0], generated, PAPER)
+    assert found == pytest.approx(distance(from_above(measured[1]), corners), rel=1e-5)
+    centres = [from_above([points(r, *angles(0.5, 0.5)) for r in both]) for both in (images(6, 1)[:, 0], made)]
+    other = figure(measured[0], generated, R2FLOW)
+    assert other == pytest.approx(distance(*centres), rel=1e-3)  # ranges of the files are float32
+    assert abs(other / found - 1) > 0.02
+
+
+def test_the_paper_s_subset_is_its_own_draw_of_all_scans_with_test_drives_last(kitti_360, monkeypatch):  # noqa: F811
+    monkeypatch.setattr("r2flow.evaluation.measuring.REAL_SCANS", 5)
+    scans = open_scans(f"kitti_360:{kitti_360}", READING)
+    order = [name.split("/")[1][17:21] for name in scans.source.names]
+    assert order[:6] == ["0000"] * 3 + ["0002"] * 3
+    place = list(range(15))
+    random.Random(0).shuffle(place)
+    theirs = [*range(6, 15), *range(6)]  # drives 3, 4, 10, then 0, 2
+    expected = sorted(theirs[p] for p in place[:5])
+    assert published_choice(scans, 5) == expected
+    assert real_rule(METRICS["jsd"](), scans, PAPER) == (expected, "5 of 15, Python's shuffle, seed 0")
+    assert real_rule(METRICS["jsd"](), scans)[0] != expected
+    assert published_choice(open_scans("simulated:0", READING, num=15), 5) == sorted(place[:5])
+
+
+def test_scans_without_measured_points_are_refused_and_take_our_protocol_in_reports(generated, kitti_360):  # noqa: F811
+    image = open_scans(str(generated), READING)
+    with pytest.raises(InputError, match=r"lacks the measured coordinates .* 'paper' compares them"):
+        gather_real({"jsd": METRICS["jsd"]()}, image, Work(), protocol=PAPER)
+    assert "64 x 1024" in not_as_printed(image)
+    large = Reading(SENSORS["hdl64e"])
+    assert not_as_printed(open_scans(f"kitti_360:{kitti_360}", large)) is None
+    assert "simulated:0 lacks the measured" in not_as_printed(open_scans("simulated:0", large, num=2))
+    assert {name: named_rules(name).name for name in PROTOCOLS} == {"r2flow": "r2flow", "paper": "paper"}
+
+
+def test_several_sets_stand_in_one_table_with_floor_and_controls(
+    r2flow, measured, generated, tmp_path, monkeypatch  # noqa: F811
+):  # fmt: skip
+    monkeypatch.setattr("r2flow.metrics.lidm.FINE", 0.5)  # millions of cells take time
+    monkeypatch.setattr("r2flow.metrics.lidm.COARSE", 5)
+    monkeypatch.setenv("R2FLOW_CACHE", str(tmp_path / "cache"))
+    other = folder(tmp_path / "other", images(3, 7))
+    options = ("--metrics", "all", "--size", "8x64", "--workers", 0, "--json", tmp_path / "e.json")
+    code, said, warned = r2flow("evaluate", measured[0], generated, other, *options, "--protocol", "paper")
+    assert code == 0, warned
+    lines = said.splitlines()
+    assert lines[0].startswith("Protocol paper: real points as measured, generated points on rays through bin corners")
+    for words in ("generated (10 : 6)", "other (3 : 6)", "floor: real halves (3 : 3)", "control: noise (10 : 6)"):
+        assert words in lines[1]
+    assert len(lines) == len(set(lines))
+    assert sum("no full rank" in line for line in lines) == 1
+    assert sum("r2flow weights" in line for line in warned.splitlines()) == 1
+    content = json.loads((tmp_path / "e.json").read_text())["comparisons"]
+    assert {one["comparison"]: one["kind"] for one in content} == {
+        "generated": "judged", "other": "judged", "real halves": "floor", "generated, as many": "floor",
+        "other, as many": "floor", **dict.fromkeys(("noise", "flat ground", "mean scan", "shuffled pixels"), "control"),
+    }  # fmt: skip
+    assert {"jsd", "mmd_lidm", "beams", "kid_embedded"} <= {one["metric"] for one in content[0]["metrics"]}
+    (jsd,) = (one for one in content[0]["metrics"] if one["metric"] == "jsd")
+    assert jsd["figures"]["jsd"] == figure(measured[0], generated, PAPER)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda x: x[1].fill(255.0), "scan 000004.npy of .*generated: its reflectance goes up to 255"),
+        (lambda x: x.__imul__(1000), "scan 000004.npy of .*generated: its median range is .* millimetres"),
+    ],
+)
+def test_a_scan_of_another_scale_is_named_in_one_line(r2flow, measured, generated, tmp_path, change, said):  # noqa: F811
+    scan = np.load(generated / "000004.npy")
+    change(scan)
+    np.save(generated / "000004.npy", scan)
+    options = ("--metrics", "beams", "--size", "8x64", "--workers", 0, "--no-cache")
+    code, _, error = r2flow("evaluate", measured[0], generated, *options)
+    assert code == 2
+    (line,) = (line for line in error.splitlines() if not line.startswith("WARNING"))
+    assert re.search(said, line)
