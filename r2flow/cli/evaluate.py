@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-EMBEDDED = "frechet_embedded"
-DEFAULT = ("jsd", "mmd", EMBEDDED)
 ALL = "all"
 SAMPLED = 1000  # scans of a flow
 
@@ -41,7 +39,7 @@ class MeasureOptions:
     metrics: Annotated[
         str | None,
         typer.Option(
-            help="Names, separated by commas; jsd,mmd,frechet_embedded (or _range of it) if left out; "
+            help="Names, separated by commas; KID and Frechet of hand-made features, JSD, MMD if left out; "
             "all: whatever can be computed here."
         ),
     ] = None
@@ -413,11 +411,9 @@ def _build_those_possible(
     everything: bool, reflectance: bool, bootstrap: int, place: "Process"
 ) -> "dict[str, ScanMetric]":
     """The default metrics, or every one of the table; one warning says which of them cannot be computed here."""
-    from r2flow.metrics import METRICS
+    from r2flow.metrics import METRICS, default_metrics
 
-    names = [*METRICS] if everything else [*DEFAULT]
-    if not everything and not reflectance:
-        names = [f"{name}_range" if name == EMBEDDED else name for name in names]
+    names = METRICS if everything else default_metrics(reflectance)
     built: dict[str, ScanMetric] = {}
     left_out: dict[str, list[str]] = {}
     for name in names:
