@@ -130,6 +130,20 @@ backbones --channels 0
 backbones --repeats -1
 backbones --device nope
 backbones extra
+view # Missing
+view nowhere
+view scans -o out # ends in .html
+view scans -o file.txt/a.html
+view scans -o out.html --num 0
+view scans -o out.html --num 257
+view scans -o out.html --sensor nope
+view scans -o out.html --steps 1,2 # of a run, a checkpoint or a model
+view run -o out.html --steps 0
+view run -o out.html --steps 1,a
+view run -o out.html --times 1
+view run -o out.html --times 3 --steps 1,2 # one number of --steps
+view run scans -o out.html --times 3 --sequence # give one of them
+view empty -o out.html
 simulate # Missing
 simulate -o out --num 0 # --num
 simulate -o out --num -3

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-EMBEDDED = "frechet_embedded"
-DEFAULT = ("jsd", "mmd", EMBEDDED)
 ALL = "all"
 SAMPLED = 1000  # scans of a flow
 
@@ -41,7 +39,7 @@ class MeasureOptions:
     metrics: Annotated[
         str | None,
         typer.Option(
-            help="Names, separated by commas; jsd,mmd,frechet_embedded (or _range of it) if left out; "
+            help="Names, separated by commas; KID and Frechet of hand-made features, JSD, MMD if left out; "
             "all: whatever can be computed here."
         ),
     ] = None
@@ -227,6 +225,7 @@ def _compare(job: Job, judged: "dict[str, ScanSet]", measured: MeasureOptions, o
     from r2flow.evaluation.measuring import Gathered, gather_real, measure
     from r2flow.reports.evaluation import Comparison, Kind, evaluation_page, print_comparisons, write_json
     from r2flow.reports.pages import write_page
+    from r2flow.reports.view.panels import write_sets
 
     kinds: dict[Kind, dict[str, tuple[ScanSet, ScanSet]]]
     kinds = {"judged": {name: (job.truth, one) for name, one in judged.items()}}
@@ -261,6 +260,9 @@ def _compare(job: Job, judged: "dict[str, ScanSet]", measured: MeasureOptions, o
     if output.out is not None:
         for path in write_page(page, output.out):
             print(path)
+        print(
+            write_sets(output.out / "evaluation.html", {"real": job.truth, **judged}, title="Generated and real scans")
+        )
 
 
 def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOptions) -> "tuple[Drawing, list[int]]":
@@ -409,11 +411,9 @@ def _build_those_possible(
     everything: bool, reflectance: bool, bootstrap: int, place: "Process"
 ) -> "dict[str, ScanMetric]":
     """The default metrics, or every one of the table; one warning says which of them cannot be computed here."""
-    from r2flow.metrics import METRICS
+    from r2flow.metrics import METRICS, default_metrics
 
-    names = [*METRICS] if everything else [*DEFAULT]
-    if not everything and not reflectance:
-        names = [f"{name}_range" if name == EMBEDDED else name for name in names]
+    names = METRICS if everything else default_metrics(reflectance)
     built: dict[str, ScanMetric] = {}
     left_out: dict[str, list[str]] = {}
     for name in names:

@@ -114,6 +114,7 @@ def sample(
     region = part.region(loaded)
     write_samples(loaded, out, draw.num, draw.seed, sampler, formats, pictures, draw.batch_size, region, part.channels)
     seen = f", pictures in {out / 'samples.png'}" if pictures else ""
+    seen += f", in 3-D in {out / 'samples.html'}" if pictures and part.channels != "reflectance" else ""
     print(f"{draw.num} scans ({', '.join(formats)}) in {out}{seen}")
 
 

@@ -76,4 +76,5 @@ def interpolate(
     ends = real_scans(loaded, [first, last], how.reflectance_scale)
     sampler = solver.change(TIGHT.changed(tolerance=1e-4))
     written = write_page(interpolation(loaded, ends, frames, out, sampler, how.batch_size, command()), out)
-    print(f"{frames} scans in {out / 'frames'}; {', '.join(str(path) for path in written)}")
+    pages = ", ".join(map(str, [*written, out / "interpolation.html"]))
+    print(f"{frames} scans in {out / 'frames'}; {pages}")

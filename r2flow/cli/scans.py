@@ -1,7 +1,8 @@
 """Verbs for scans."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -21,6 +22,13 @@ from r2flow.cli.options import (
 )
 from r2flow.errors import InputError
 
+if TYPE_CHECKING:
+    from r2flow.reports.views import View
+
+PictureScale = Annotated[
+    float | None, typer.Option(min=1e-6, help="Value in the file that means full reflectance; guessed if left out.")
+]
+
 
 @app.command(epilog="Example: r2flow show scans/000000.ply velodyne/0000000100.bin --out views")
 def show(
@@ -29,25 +37,19 @@ def show(
     sensor: SensorChoice = None,
     size: SizeOption = None,
     projection: ProjectionOption = "spherical",
-    reflectance_scale: Annotated[
-        float | None, typer.Option(min=1e-6, help="Value in the file that means full reflectance; guessed if left out.")
-    ] = None,
+    reflectance_scale: PictureScale = None,
     columns: ColumnsOption = None,
     most: Annotated[int, typer.Option("--num", min=1, help="The most scans to draw of a folder.")] = 16,
     labels: Annotated[bool, typer.Option("--labels", help="Draw the classes of .label files, too.")] = False,
 ) -> None:
     """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each."""
     from r2flow.reports.pictures import save_figure, scan_figure
-    from r2flow.reports.views import label_view, views_of
+    from r2flow.reports.views import label_view
 
-    if projection == "unfolding" and sensor in (None, "hdl64e"):
-        sensor = "hdl64e_rings"  # rows are rings then, and these are not evenly spaced
-    chosen = None if sensor is None and size is None else build_sized(sensor or "hdl64e", size)
-    named = named_columns(columns)
-    views = [view for spec in scans for view in views_of(spec, chosen, projection, reflectance_scale, most, named)]
+    views = views_to_draw(scans, sensor, size, projection, reflectance_scale, columns, most)
     paths = [view.path for view in views]
     for view in views:
-        classes = label_view(view.path, view.scans.sensor, projection, named) if labels else None
+        classes = label_view(view) if labels else None
         figure = scan_figure(view.image, view.rays, view.path.name, classes)
         print(save_figure(figure, out / f"{unique_stem(view.path, paths)}.png"))
 
@@ -85,6 +87,25 @@ def project(
         np.save(file, image)
     returns = int((image[0] > 0).sum())
     print(f"{out}: {image.shape[1]} x {image.shape[2]}, {returns} returns ({returns / image[0].size:.1%})")
+
+
+def views_to_draw(
+    scans: Sequence[str],
+    sensor: str | None,
+    size: str | None,
+    projection: str,
+    reflectance_scale: float | None,
+    columns: str | None,
+    most: int,
+) -> "list[View]":
+    """The scans that are named, of each folder at most so many: `views_of`."""
+    from r2flow.reports.views import views_of
+
+    if projection == "unfolding" and sensor in (None, "hdl64e"):
+        sensor = "hdl64e_rings"  # rows are rings then, and these are not evenly spaced
+    chosen = None if sensor is None and size is None else build_sized(sensor or "hdl64e", size)
+    named = named_columns(columns)
+    return [view for spec in scans for view in views_of(spec, chosen, projection, reflectance_scale, most, named)]
 
 
 def unique_stem(path: Path, paths: list[Path]) -> str:

@@ -24,6 +24,7 @@ from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     simulate,
     train,
     unpack,
+    view,
     weights,
 )
 from r2flow.cli.app import app

@@ -35,7 +35,9 @@ def _lazily(where: str, *given: Any) -> Callable[..., ScanMetric]:
 METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     "metric",
     jsd=_lazily("jsd:JSD"),
+    jsd_extrapolated=_lazily("jsd:JSDExtrapolated"),
     mmd=_lazily("mmd:MMD"),
+    mmd_unbiased=_lazily("mmd:MMDUnbiased"),
     jsd_lidm=_lazily("lidm:JSDLiDM"),
     mmd_lidm=_lazily("lidm:MMDLiDM"),
     beams=_lazily("beams:BeamHistograms"),
@@ -52,3 +54,13 @@ def add_network(name: str) -> None:
 
 for _network in EXTRACTORS:
     add_network(_network)
+
+
+def default_metrics(reflectance: bool) -> tuple[str, ...]:
+    """What is measured where nobody names metrics: all of it without a download, the headline first.
+
+    The field's JSD and MMD stand beside what they would be without the bias of few scans, and KID, which has none,
+    beside the Frechet distance of the same features. Docs: metrics.md, "The headline".
+    """
+    features = "handcrafted" if reflectance else "handcrafted_range"
+    return (f"kid_{features}", f"frechet_{features}", "jsd", "jsd_extrapolated", "mmd", "mmd_unbiased")

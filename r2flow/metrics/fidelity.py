@@ -20,6 +20,7 @@ from r2flow.metrics.controls import CONTROLS, Control
 from r2flow.metrics.surfaces import bridged, drop_rate, normals
 
 GRADIENTS = np.concatenate([[0], np.geomspace(0.01, 80, 24)])  # metres
+STEPS, SECTORS = np.array([-20, -6, -2, -0.6, -0.2, -0.05, -0.02, 0.02, 0.05, 0.2, 0.6, 2, 6, 20]), 8  # metres
 RUNS = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 256, 512, 1025, 4097])  # pixels
 REFLECTANCES = np.linspace(0, 1.0001, 26)
 INCIDENCES = np.cos(np.linspace(np.pi / 2, 0, 11))  # cosines, in steps of 9 degrees
@@ -67,13 +68,23 @@ def gradient_elevation(images: np.ndarray, sensor: Sensor) -> np.ndarray:
     return _differences(images[:, 0, 1:], images[:, 0, :-1])
 
 
+def steps_by_sector(images: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """r(h, w + 1) - r(h, w) with its sign, in 13 bins, in each of 8 sectors of azimuth, (8, 13): left is not right."""
+    r = images[:, 0]
+    step, both = np.roll(r, -1, axis=-1) - r, (r > 0) & (np.roll(r, -1, axis=-1) > 0)
+    parts = np.array_split(np.arange(r.shape[-1]), SECTORS)
+    return np.stack([np.histogram(step[..., part][both[..., part]], STEPS)[0] for part in parts])
+
+
 def _differences(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.histogram(np.abs(a - b)[(a > 0) & (b > 0)], GRADIENTS)[0]
 
 
 def run_lengths(images: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Lengths of uninterrupted returns along the rows, weighted by length."""
+    """Lengths of uninterrupted returns along the rows, weighted by length; a run may pass the ring's first column."""
     returned = (images[:, 0] > 0).reshape(-1, images.shape[-1]).astype(np.int8)
+    begin = returned.argmin(1)[:, None]  # at a lost ray, where there is one
+    returned = np.take_along_axis(returned, (begin + np.arange(returned.shape[1])) % returned.shape[1], 1)
     edges = np.diff(np.pad(returned, ((0, 0), (1, 1))), axis=1)
     length = np.nonzero(edges < 0)[1] - np.nonzero(edges > 0)[1]
     return np.histogram(length, RUNS, weights=length)[0]
@@ -177,6 +188,7 @@ def mean_difference(a: np.ndarray, b: np.ndarray) -> float:
 PANEL: dict[str, Member] = {
     "gradient, azimuth": Member(gradient_azimuth, js_distance, "metres", GRADIENTS, log=True),
     "gradient, elevation": Member(gradient_elevation, js_distance, "metres", GRADIENTS, log=True),
+    "steps by sector": Member(steps_by_sector, js_distance),
     "run lengths": Member(run_lengths, js_distance, "pixels", RUNS, log=True),
     "changes per row": Member(changes_row, mean_difference, "row"),
     "drop rate by range": Member(drop_range, mean_difference, "metres", range_bins, log=True),

@@ -70,7 +70,7 @@ class Scans:
             InputError: the scans have none.
         """
         if not self.has_reflectance:
-            raise InputError("these scans have no reflectance; use a network of range alone, as embedded_range.")
+            raise InputError("these scans have no reflectance; use features of range alone, as handcrafted_range.")
         return self.images[:, 1:]
 
     @cached_property

@@ -19,7 +19,10 @@ FORMAT = "r2flow evaluation 1"
 Kind = Literal["judged", "floor", "control"]
 
 # Figures that the field's tables print scaled: heading and factor. The figure itself stays what it is.
-PRINTED = {"jsd": ("JSD x 10^2", 1e2), "mmd": ("MMD x 10^4", 1e4)}
+PRINTED = {
+    "jsd": ("JSD x 10^2", 1e2), "jsd_extrapolated": ("JSD x 10^2, extrapolated", 1e2),
+    "mmd": ("MMD x 10^4", 1e4), "mmd_unbiased": ("MMD x 10^4, unbiased", 1e4),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
+from r2flow.data.sources import spread
 from r2flow.errors import InputError
 from r2flow.generators import Sampler, as_flow
 from r2flow.inversion import TIGHT, interpolate_scans
@@ -25,6 +26,8 @@ from r2flow.reports.pictures import (
     draw_reflectance,
 )
 from r2flow.reports.tables import table
+from r2flow.reports.view import most_images
+from r2flow.reports.view.panels import Panel, write_panels
 
 MOST = 8  # frames in the figure, evenly chosen
 # In rows: the first two draw points, the others the image.
@@ -79,6 +82,11 @@ def interpolation(
         table(errors_of(checkpoint, found.ends, names, pair), ENDS),
         table(rows, BETWEEN),
     )
+    ends = [Panel(f"real: {name}", image[None], rays) for name, image in zip(names, pair.numpy(), strict=True)]
+    chosen = spread(len(images), most_images(images.shape) - 2)
+    said = [f"w = {weight:.2f}" for weight in found.weights[chosen].tolist()]
+    panels = [ends[0], Panel("between", images[chosen], rays), ends[1]]
+    write_panels(Path(out, "interpolation.html"), panels, said, "From scan to scan")
     figures = {"interpolation": interpolation_figure(pair.numpy(), images, found.weights.tolist(), rays, names)}
     device = str(checkpoint.generator.device)
     return Page("interpolation", "From scan to scan", text, rows, figures, command, device=device)

@@ -20,6 +20,7 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.region import Region
 from r2flow.lidar.scan_files import write_points
 from r2flow.progress import Bar, track
+from r2flow.reports.view import most_images, write_page
 from r2flow.sampling import batches, sample
 
 log = logging.getLogger(__name__)
@@ -46,7 +47,7 @@ def write_samples(
     region: Region | None = None,
     channels: str = "both",
 ) -> list[np.ndarray]:
-    """Draw scans and write each as `out/NNNNNN.FORMAT`, with a page and a contact sheet of the first ones.
+    """Draw scans and write each as `out/NNNNNN.FORMAT`, the first ones also as pictures and in 3-D (`samples.html`).
 
     Scan i of a seed is the same whatever `num` and `batch_size` are.
 
@@ -96,7 +97,11 @@ def write_samples(
     if parts and channels == "reflectance":
         draw_reflectances(parts[:8], out)
     elif parts:
-        draw_pages(parts, rays if region is None else region.crop(rays), out)
+        seen = rays if region is None else region.crop(rays)
+        draw_pages(parts, seen, out)
+        parts = parts[: most_images(seen.shape)]
+        captions = [f"sample {number}" for number in range(len(parts))]
+        write_page(out / "samples.html", parts, seen, captions, title=out.name)
     return shown
 
 

@@ -21,6 +21,7 @@ from r2flow.lidar.projection import image_to_points
 BACKGROUND, FOREGROUND = "#101418", "#d8dee4"
 VIEW = 50.0  # metres shown to each side in the bird's-eye view
 HEIGHTS = (-2.8, 3.0)  # metres over which height is coloured, sensor frame
+RANGES = (2.0, 80.0)  # metres over which range is coloured, on a logarithmic scale
 
 
 def scan_figure(image: np.ndarray, rays: Tensor, title: str = "", labels: np.ndarray | None = None) -> Figure:
@@ -99,7 +100,8 @@ def draw_range(axes: Any, image: np.ndarray, label: bool = True) -> None:
     """Range on a logarithmic colour scale, dropped rays black."""
     r = image[0]
     shown = np.ma.masked_where(r <= 0, np.log(np.maximum(r, 1e-3)))
-    axes.imshow(shown, cmap=_ranges(), vmin=np.log(2), vmax=np.log(80), aspect="auto", interpolation="nearest")
+    low, high = np.log(RANGES)
+    axes.imshow(shown, cmap=_ranges(), vmin=low, vmax=high, aspect="auto", interpolation="nearest")
     _strip(axes, "range" if label else "")
 
 
@@ -113,12 +115,9 @@ def draw_reflectance(axes: Any, image: np.ndarray, label: bool = True) -> None:
 def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
     """Semantic ids, (H, W), named where SemanticKITTI knows all of them, else by number; dropped rays black."""
     returned = image[0] > 0
-    found, counts = np.unique(labels[returned], return_counts=True)
-    named = all(int(one) in CLASSES for one in found)
     shown = np.zeros((*labels.shape, 3))
     entries: dict[str, Any] = {}
-    for one in found[np.argsort(-counts)]:
-        name, colour = CLASSES[int(one)] if named else (f"class {one}", _numbered_colour(int(one)))
+    for one, (name, colour) in class_colours(labels[returned]).items():
         shown[returned & (labels == one)] = to_rgb(colour)
         entries.setdefault(name, colour)
     axes.imshow(shown, aspect="auto", interpolation="nearest")
@@ -127,6 +126,17 @@ def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
     for name, colour in list(entries.items())[:14]:  # as many as the row is wide, the commonest first
         axes.text(x, 1.03, name, transform=axes.transAxes, color=colour, fontsize=8, va="bottom")
         x += 0.012 + 0.0052 * len(name)
+
+
+def class_colours(labels: np.ndarray, most: int | None = None) -> dict[int, tuple[str, str]]:
+    """Name and colour of each semantic id in (N,) labels, at most so many, the commonest first.
+
+    Where SemanticKITTI does not know all of them, they are named by number.
+    """
+    found, counts = np.unique(labels, return_counts=True)
+    named = all(int(one) in CLASSES for one in found)
+    ordered = [int(one) for one in found[np.argsort(-counts)][:most]]
+    return {one: CLASSES[one] if named else (f"class {one}", _numbered_colour(one)) for one in ordered}
 
 
 def _numbered_colour(number: int) -> str:
@@ -196,6 +206,12 @@ def dark_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), facecolor=BACKGROUND)
     FigureCanvasAgg(figure)
     return figure
+
+
+def colour_table(what: str) -> np.ndarray:
+    """The 256 colours of range, height or reflectance from their low to their high end, (256, 4) uint8."""
+    colours = _ranges() if what == "range" else _colours({"height": "turbo", "reflectance": "cividis"}[what])
+    return np.asarray(colours(np.arange(256), bytes=True))
 
 
 def _colours(name: str) -> Any:

@@ -61,6 +61,7 @@ def finish(run: str | Path, samples: Mapping[str, Any], seed: int, device: str, 
         f"""
 checkpoint    {path}
 pictures      {out / "samples.png"} and one page a scan beside it; during training: {run / "pictures"}
+in 3-D        {out / "samples.html"}, in a browser
 point clouds  {out / "000000.ply"} ...
 loss curve    {run / "loss.png"}; tensorboard --logdir {run / "tensorboard"}
 {what_next(run, out, "" if checkpoint.generator.sampler.fixed else " --steps 64", checkpoint.config)}""",

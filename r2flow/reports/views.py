@@ -9,10 +9,18 @@ import numpy as np
 from torch import Tensor
 
 from r2flow.data.opening import find_drives, open_scans, own_reading, parse, usual_reading
-from r2flow.data.options import FOLDER
+from r2flow.data.options import FOLDER, SIMULATED
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import range_image, read_labelled_scan, spread, warn_of_other_sensor
+from r2flow.data.sources import (
+    ScanFiles,
+    SimulatedScans,
+    range_image,
+    read_labelled_scan,
+    spread,
+    warn_of_other_sensor,
+)
 from r2flow.errors import InputError
+from r2flow.lidar.labels import labels_beside
 from r2flow.lidar.sensors import Sensor
 
 log = logging.getLogger(__name__)
@@ -33,6 +41,24 @@ class View(NamedTuple):
     def rays(self) -> Tensor:
         return self.scans.sensor.rays()
 
+    def labelled(self) -> tuple[np.ndarray, np.ndarray | None]:
+        """The image, and the semantic id of each pixel, (H, W), where a .label file or the simulator knows it."""
+        source = self.scans.source
+        if isinstance(source, SimulatedScans) and source.folder is None:
+            from r2flow.simulator import simulate
+
+            made = simulate(source.sensor, source.seed, source.scenes[self.number])
+            return made.image[: 1 + source.reflectance], made.labels
+        if not isinstance(source, ScanFiles):
+            return self.image, None
+        path, how = Path(source.paths[self.number]), source.reading
+        if labels_beside(path) is None or range_image(path) is not None:
+            return self.image, None
+        return read_labelled_scan(
+            path, how.sensor, projection=how.projection, convention=how.convention,
+            reflectance=bool(how.reflectance), reflectance_scale=how.reflectance_scale, columns=how.columns,
+        )  # fmt: skip
+
 
 def scans_of(path: Path, most: int) -> list[Path]:
     """The file itself, or at most `most` scans of a folder, evenly spread over it.
@@ -45,7 +71,13 @@ def scans_of(path: Path, most: int) -> list[Path]:
     if not path.is_dir():
         return [path]
     found = [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans]
+    _say_how_many(path, len(found), most)
     return [found[index] for index in spread(len(found), most)]
+
+
+def _say_how_many(what: str | Path, count: int, most: int) -> None:
+    if count > most:
+        log.warning("%s: %d of its %s scans are taken, evenly spread; --num takes more", what, most, f"{count:,}")
 
 
 def views_of(
@@ -79,17 +111,16 @@ def views_of(
         loose = scans_of(file or Path(options.folder), most)
         warn_of_other_sensor(loose, reading, spec)
         return [View(path, open_scans(path, reading, own_size=True), 0) for path in loose]
-    scans = open_scans(spec, reading).spread(most)
+    opened = open_scans(spec, reading)
+    if options.name != SIMULATED:  # which has as many as one likes
+        _say_how_many(spec, len(opened), most)
+    scans = opened.spread(most)
     return [View(Path(options.folder, name), scans, number) for number, name in enumerate(scans.source.names)]
 
 
-def label_view(
-    path: Path, sensor: Sensor, projection: str = "spherical", columns: tuple[str, ...] | None = None
-) -> np.ndarray | None:
+def label_view(view: View) -> np.ndarray | None:
     """The class of each pixel, (H, W); None, with a warning, where the scan has no labels."""
-    labels = None
-    if path.is_file() and range_image(path) is None:
-        _, labels = read_labelled_scan(path, sensor, projection=projection, reflectance=False, columns=columns)
+    _, labels = view.labelled()
     if labels is None:
-        log.warning("%s: no .label file lies beside it", path)
+        log.warning("%s: no .label file lies beside it", view.path)
     return labels

@@ -72,7 +72,7 @@ def test_the_network_of_range_alone_has_its_own_name_and_needs_no_reflectance(em
     np.testing.assert_array_equal(
         of_range.features(Scans(images, SENSOR)), of_range.features(Scans(images[:, :1], SENSOR))
     )
-    with pytest.raises(InputError, match="no reflectance; use .* embedded_range"):
+    with pytest.raises(InputError, match="no reflectance; use .* handcrafted_range"):
         embedded.features(Scans(images[:, :1], SENSOR))
 
 

@@ -7,7 +7,17 @@ import torch
 from r2flow.data.sources import Reading
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
-from r2flow.metrics.fidelity import PANEL, PER_PIXEL, controls, distances, nearest, panel
+from r2flow.metrics.fidelity import (
+    PANEL,
+    PER_PIXEL,
+    RUNS,
+    controls,
+    distances,
+    nearest,
+    panel,
+    run_lengths,
+    steps_by_sector,
+)
 from r2flow.reports.compare import read_fidelity
 from r2flow.reports.fidelity import compare_sets, load_scans, markdown
 from r2flow.reports.fidelity_page import fidelity_page
@@ -170,6 +180,25 @@ def test_a_copy_is_seen():
     assert nearest(training[3:5], training, SENSOR) == pytest.approx([0, 0], abs=1e-3)
     assert nearest(walls(3, 9), training, SENSOR).min() > 0.01
     assert nearest(training, training, SENSOR, leave_self=True).min() > 0.01
+
+
+def test_a_turn_changes_no_run_of_returns():
+    images = np.zeros((2, 1, 3, 40), np.float32)
+    images[0, 0, 0, 4:17], images[0, 0, 1, 30:], images[0, 0, 1, :5], images[1, 0, 2] = 9, 9, 9, 9
+    expected = np.histogram([13, 15, 40], RUNS, weights=[13, 15, 40])[0]
+    for by in (0, 7, 20):
+        np.testing.assert_array_equal(run_lengths(np.roll(images, by, -1), SENSOR), expected)
+
+
+def test_mirrored_scans_of_a_car_that_keeps_to_the_right_are_seen():
+    e, a = SENSOR.rays().numpy()
+    draw = np.random.default_rng(0)
+    away = np.where(np.sin(a) > 0, 9, 3)[None] * draw.uniform(0.9, 1.1, (60, 1, 1))  # walls to the left and right
+    images = (np.minimum(away / np.maximum(np.abs(np.sin(a)), 0.05), 60) / np.cos(e)).astype(np.float32)[:, None]
+    one, other = (steps_by_sector(half, SENSOR) for half in (images[:30], images[30:]))
+    mirrored = steps_by_sector(np.roll(images[30:, ..., ::-1], 1, axis=-1), SENSOR)  # about the first column
+    np.testing.assert_array_equal(mirrored, other[::-1, ::-1])  # sectors and signs change sides, nothing else
+    assert js_distance(one, mirrored) > 5 * js_distance(one, other)
 
 
 def test_range_alone_leaves_reflectance_out():

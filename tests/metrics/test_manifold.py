@@ -1,5 +1,7 @@
 """Precision, recall, density, coverage and the kernel distance of features."""
 
+from itertools import combinations, product
+
 import numpy as np
 import pytest
 import torch
@@ -94,19 +96,30 @@ def test_the_name_is_that_of_its_network():
     assert Manifold(Given()).protocol.metric == "manifold_given"
 
 
-@pytest.mark.parametrize("dead", [0, 4, 5, 8])
-def test_the_kernel_distance_does_not_depend_on_the_order_of_scans_whichever_channels_are_0(dead, monkeypatch):
-    monkeypatch.setattr(kid, "SUBSETS", 3)
-    monkeypatch.setattr(kid, "SUBSET_SIZE", 7)
-    real, generated = torch.randn(2, 20, 8)
-    real[:, :dead], generated[:, :dead] = 0, 0
-    values = []
-    for order in (slice(None), torch.randperm(20)):
-        metric = KernelDistance(Given())
-        metric.update(Rows(real[order]), real=True)
-        metric.update(Rows(generated), real=False)
-        values += metric.compute().values()
-    assert values[1] == pytest.approx(values[0], rel=1e-10, abs=1e-14)
+def kernel_distance(real, generated):
+    metric = KernelDistance(Given())
+    metric.update(Rows(real), real=True)
+    metric.update(Rows(generated), real=False)
+    return metric.compute()["kid_given"]
+
+
+def test_the_kernel_distance_of_two_gaussians_is_that_of_their_moments():
+    # k = 1 + 3 a b + 3 (a b)^2 + (a b)^3 on one feature, so that MMD^2 = sum of 3, 3, 1 times the squared differences
+    # of the first three moments: mu, mu^2 + s^2, mu^3 + 3 mu s^2. The samples are the quantiles of the Gaussians.
+    quantiles = torch.special.ndtri((torch.arange(4000, dtype=torch.float64) + 0.5) / 4000)[:, None]
+    moments = [np.array([m, m**2 + s**2, m**3 + 3 * m * s**2]) for m, s in ((0.5, 1.0), (0.0, 1.5))]
+    expected = float(np.array([3, 3, 1]) @ (moments[0] - moments[1]) ** 2)
+    found = kernel_distance(0.5 + quantiles, 1.5 * quantiles[::2])
+    assert found == pytest.approx(expected, rel=0.02)
+
+
+def test_the_kernel_distance_is_the_mean_over_all_subsets_in_blocks_of_any_size(monkeypatch):
+    real, generated = torch.randn(6, 3, dtype=torch.float64).float(), torch.randn(7, 3, dtype=torch.float64).float()
+    sides = [list(combinations(range(len(rows)), 3)) for rows in (real, generated)]
+    expected = np.mean([cubic_mmd(real[list(a)], generated[list(b)]) for a, b in product(*sides)])
+    for block in (2, 1000):
+        monkeypatch.setattr(kid, "BLOCK", block)
+        assert kernel_distance(real, generated) == pytest.approx(expected, rel=1e-9)
 
 
 def test_the_kernel_distance_is_the_reference_on_its_own_subsets(shared):

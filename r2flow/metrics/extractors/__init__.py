@@ -28,6 +28,8 @@ class Extractors(Registry["str | type[Extractor]"]):
 
 EXTRACTORS = Extractors(
     "extractor",
+    handcrafted="handcrafted:Handcrafted",
+    handcrafted_range="handcrafted:HandcraftedRange",
     embedded="embedded:Embedded",
     embedded_range="embedded:EmbeddedRange",
     rangenet53="rangenet:RangeNet53",

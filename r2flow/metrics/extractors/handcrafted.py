@@ -1,0 +1,278 @@
+"""Hand-made features of a scan: no training and no weights, for any sensor and image size.
+
+How neighbouring returns differ along rows and columns, where rays are lost, how ranges and reflectances spread: each
+statistic is a mean over the rays of half of the rows, so that turning the scan does not change it. Six of them are
+taken in sectors of azimuth as well, which do change: a scan that is turned or mirrored is another one.
+
+Which statistics, how many bands and sectors, and the scale were chosen by benchmarks/ranking.py on half of its kinds of
+damage; docs/metrics.md has what it found on the other half.
+"""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import ClassVar, NamedTuple, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from r2flow.metrics.extractors.base import Extractor, nan_where_empty
+from r2flow.metrics.scans import Scans
+
+BANDS, SECTORS = 2, 8  # of rows, of azimuth
+PIXELS = 2**16  # computed at once: what stays in a core's cache
+FINE = 0.005  # metres, or of full reflectance: much smaller steps count as this one
+SAME = 0.0025  # metres: neighbours that are equal but for the rounding of a file
+EDGE = 0.5  # metres between neighbours: another object
+RANGES = (0, 5, 10, 20, 40, torch.inf)  # metres
+REFLECTANCES = (0, 0.1, 0.25, 0.5, torch.inf)
+FEW = 0.01  # share of the rays of a cell; a statistic of fewer is drawn to its centre
+FAR_OUT = 5.0  # scales from the centre, from where on features grow as a logarithm
+
+
+class Scale(NamedTuple):
+    """A statistic is (x - centre) / spread as a feature: its mean and its deviation over simulated hdl64e scans."""
+
+    centre: float
+    spread: float
+
+
+SPREAD, BEAMS, SECTORED = ", spread", ", beams", ", sectors"
+SCALES = {
+    "returns": Scale(0.76, 0.029),
+    "row changes": Scale(0.026, 0.009),
+    "column changes": Scale(0.2, 0.019),
+    "single losses": Scale(0.0034, 0.0013),
+    "single returns": Scale(0.0018, 0.0011),
+    "log-range": Scale(3.3, 0.2),
+    "beyond 0 m": Scale(0.11, 0.055),
+    "beyond 5 m": Scale(0.36, 0.092),
+    "beyond 10 m": Scale(0.19, 0.063),
+    "beyond 20 m": Scale(0.077, 0.04),
+    "beyond 40 m": Scale(0.029, 0.023),
+    "row step": Scale(-5.0, 0.23),
+    "row edges": Scale(0.042, 0.011),
+    "row slant": Scale(0.0004, 0.0079),
+    "row equal": Scale(0.13, 0.025),
+    "row step of 8": Scale(-3.1, 0.41),
+    "row step of 64": Scale(-0.54, 0.55),
+    "row bend": Scale(-4.8, 0.25),
+    "row bend sign": Scale(0.022, 0.0048),
+    "row smooth": Scale(0.095, 0.067),
+    "column step": Scale(-2.6, 0.49),
+    "column edges": Scale(0.14, 0.06),
+    "column slant": Scale(-0.29, 0.069),
+    "column bend": Scale(-3.2, 0.37),
+    "column bend sign": Scale(0.018, 0.0093),
+    "rows agree": Scale(0.23, 0.062),
+    "diagonals": Scale(0.0043, 0.018),
+    "reflectance": Scale(0.27, 0.032),
+    "reflectance from 0": Scale(0.1, 0.041),
+    "reflectance from 0.1": Scale(0.2, 0.049),
+    "reflectance from 0.25": Scale(0.42, 0.073),
+    "reflectance from 0.5": Scale(0.041, 0.036),
+    "reflectance row step": Scale(-4.7, 0.14),
+    "reflectance row smooth": Scale(-0.24, 0.011),
+    "reflectance row bend": Scale(-3.9, 0.14),
+    "reflectance column step": Scale(-4.1, 0.13),
+    "reflectance at edges": Scale(0.16, 0.035),
+    "reflectance rows agree": Scale(0.012, 0.0061),
+    "reflectance with range": Scale(-0.19, 0.063),
+    "log-range, spread": Scale(0.54, 0.076),
+    "row step, spread": Scale(1.7, 0.15),
+    "row bend, spread": Scale(2.0, 0.16),
+    "column step, spread": Scale(1.8, 0.15),
+    "column bend, spread": Scale(1.9, 0.12),
+    "reflectance, spread": Scale(0.14, 0.019),
+    "returns, beams": Scale(0.16, 0.033),
+    "log-range, beams": Scale(0.076, 0.025),
+    "row step, beams": Scale(0.17, 0.061),
+    "reflectance, beams": Scale(0.065, 0.015),
+    "returns, sectors": Scale(0.76, 0.046),
+    "log-range, sectors": Scale(3.4, 0.29),
+    "beyond 0 m, sectors": Scale(0.11, 0.098),
+    "row edges, sectors": Scale(0.042, 0.018),
+    "row step, sectors": Scale(-4.9, 0.33),
+    "reflectance, sectors": Scale(0.26, 0.05),
+}
+
+
+class Statistic(NamedTuple):
+    """A number for every pixel, and the pixels whose mean is taken.
+
+    Attributes:
+        name: In `SCALES`.
+        values: (B, H, W).
+        where: 1 where the value counts, (B, H, W); None where it does for every ray.
+    """
+
+    name: str
+    values: Tensor
+    where: Tensor | None = None
+
+
+def statistics(r: Tensor, q: Tensor | None) -> Iterator[Statistic]:
+    """What is known of each pixel of ranges in metres and of reflectances, (B, H, W) each; 0 without a return."""
+    m = (r > 0).to(r)
+    right, left, lower = _right(m), _right(m, -1), _lower(m)
+    yield Statistic("returns", m)
+    yield Statistic("row changes", (m - right).abs())
+    yield Statistic("column changes", (m - lower).abs())
+    yield Statistic("single losses", (1 - m) * right * left)
+    yield Statistic("single returns", m * (1 - right) * (1 - left))
+    log_range = torch.log2(r + 1)
+    yield Statistic("log-range", log_range, m)
+    for low, high in pairwise(RANGES):
+        yield Statistic(f"beyond {low} m", ((r > low) & (r <= high)).to(r))
+
+    step, both = _right(r) - r, m * right
+    edge = (step.abs() > EDGE).to(r) * both
+    yield Statistic("row step", _size(step), both)
+    yield Statistic("row edges", edge)
+    yield Statistic("row slant", torch.tanh(step / EDGE), both)
+    yield Statistic("row equal", (step.abs() < SAME).to(r), both)
+    for far in (8, 64):
+        yield Statistic(f"row step of {far}", _size(_right(r, far) - r), m * _right(m, far))
+    before, three = _right(step, -1), both * left
+    yield Statistic("row bend", _size(step - before), three)
+    yield Statistic("row bend sign", torch.tanh((step - before) / 0.1), three)
+    yield Statistic("row smooth", _agreement(step, before), three)
+
+    down, two = _lower(r) - r, m * lower
+    yield Statistic("column step", _size(down), two)
+    yield Statistic("column edges", (down.abs() > EDGE).to(r) * two)
+    yield Statistic("column slant", torch.tanh(down / EDGE), two)
+    bend, whole = down - (r - _upper(r)), two * _upper(m)
+    yield Statistic("column bend", _size(bend), whole)
+    yield Statistic("column bend sign", torch.tanh(bend / EDGE), whole)
+    four = both * _lower(both)
+    yield Statistic("rows agree", _agreement(step, _lower(step)), four)
+    yield Statistic("diagonals", _size(_lower(_right(r)) - r) - _size(_right(r) - _lower(r)), four)
+
+    if q is None:
+        return
+    yield Statistic("reflectance", q, m)
+    for low, high in pairwise(REFLECTANCES):
+        yield Statistic(f"reflectance from {low}", ((q >= low) & (q < high)).to(r) * m)
+    step = _right(q) - q
+    before = _right(step, -1)
+    yield Statistic("reflectance row step", _size(step), both)
+    yield Statistic("reflectance row smooth", _agreement(step, before), three)
+    yield Statistic("reflectance row bend", _size(step - before), three)
+    yield Statistic("reflectance column step", _size(_lower(q) - q), two)
+    yield Statistic("reflectance at edges", step.abs(), edge)
+    yield Statistic("reflectance rows agree", _agreement(step, _lower(step)), four)
+    yield Statistic("reflectance with range", q * (log_range - 4), m)
+
+
+def _right(x: Tensor, by: int = 1) -> Tensor:
+    """The value of the pixel to the right; the ring closes."""
+    return x.roll(-by, -1)
+
+
+def _lower(x: Tensor) -> Tensor:
+    """The value of the pixel below; 0 under the last row."""
+    return F.pad(x[:, 1:], (0, 0, 0, 1))
+
+
+def _upper(x: Tensor) -> Tensor:
+    return F.pad(x[:, :-1], (0, 0, 1, 0))
+
+
+def _size(x: Tensor) -> Tensor:
+    return torch.log2(x.abs() + FINE)
+
+
+def _agreement(a: Tensor, b: Tensor) -> Tensor:
+    """2 a b / (a^2 + b^2): 1 for equal steps, -1 for opposite ones; 0 where one is none, or both are tiny."""
+    return 2 * a * b / (a * a + b * b + FINE**2)
+
+
+class Handcrafted(Extractor):
+    """Features of range and reflectance: means and spreads of `statistics` in 2 bands of rows, some in 8 sectors.
+
+    Beside its mean a statistic of `SPREADS` has its deviation within the band, and one of `BEAMS` how much the mean of
+    a row differs from that of the rows above and below, |x(h - 1) - 2 x(h) + x(h + 1)|, the mean over the band.
+    """
+
+    name = "handcrafted"
+    layer = f"means over {BANDS} bands of rows and {SECTORS} sectors of azimuth"
+    weights = "none"
+    needs_reflectance: ClassVar[bool] = True
+    table: Tensor  # centre and spread of every feature, (D, 2)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scales = {name: one for name, one in SCALES.items() if self.needs_reflectance or "reflectance" not in name}
+        cells = [SECTORS if name.endswith(SECTORED) else BANDS for name in self.scales]
+        self.dim = sum(cells)
+        table = torch.tensor([one for one, n in zip(self.scales.values(), cells, strict=True) for _ in range(n)])
+        self.register_buffer("table", table, persistent=False)
+
+    @classmethod
+    def trained(cls) -> Self:
+        """Itself: there is nothing to learn."""
+        return cls()
+
+    @torch.no_grad()
+    def features(self, scans: Scans) -> Tensor:
+        """(B, D), float32, D = `dim`; a row of NaN for a scan without a single return."""
+        h, w = scans.sensor.shape
+        parts = scans.images.split(max(PIXELS // (h * w), 1))
+        rows = (
+            torch.cat([self._features(part) for part in parts]) if len(scans) else scans.images.new_zeros(0, self.dim)
+        )
+        return nan_where_empty(rows, scans)
+
+    def _features(self, images: Tensor) -> Tensor:
+        h, w = images.shape[2:]
+        every = [images.new_full((len(images), n), of) for n, of in ((h, w), (w, h))]
+        counted: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+        found: dict[str, tuple[Tensor, Tensor]] = {}
+        for name, x, where in statistics(images[:, 0], images[:, 1] if self.needs_reflectance else None):
+            if where is None:
+                (in_rows, in_columns), held = every, x
+            else:  # kept beside its sums, so that no other one has its id
+                _, in_rows, in_columns = counted.setdefault(id(where), (where, where.sum(-1), where.sum(-2)))
+                held = x * where
+            in_row = held.sum(-1)
+            found[name] = mean, share = _cells(in_row, in_rows, BANDS, w)
+            if name + SPREAD in self.scales:
+                square, _ = _cells(torch.linalg.vecdot(held, x), in_rows, BANDS, w)
+                found[name + SPREAD] = (square - mean**2).clamp(min=0).sqrt(), share
+            if name + BEAMS in self.scales:
+                found[name + BEAMS] = _unevenness(in_row, in_rows)
+            if name + SECTORED in self.scales:
+                found[name + SECTORED] = _cells(held.sum(-2), in_columns, SECTORS, h)
+        values, shares = (torch.cat([found[name][k] for name in self.scales], 1) for k in (0, 1))
+        centre, spread = self.table.T
+        x = (values - centre) / spread * (shares / (shares + FEW))
+        return FAR_OUT * torch.asinh(x / FAR_OUT)
+
+
+class HandcraftedRange(Handcrafted):
+    """The same of range alone, for scans without reflectance: another distance."""
+
+    name = "handcrafted_range"
+    needs_reflectance = False
+
+
+def _cells(total: Tensor, count: Tensor, cells: int, rays: int) -> tuple[Tensor, Tensor]:
+    """Means over equal parts of rows or columns, (B, cells), and the share of their rays that counted.
+
+    Args:
+        total: Sums of each row or column, (B, n).
+        count: How many were added up, (B, n).
+        cells: Parts of n; they overlap where n is smaller or no multiple.
+        rays: The most that a row or column can count.
+    """
+    n = F.adaptive_avg_pool1d(count, cells)
+    return F.adaptive_avg_pool1d(total, cells) / n.clamp(min=1e-6), n / rays
+
+
+def _unevenness(total: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+    """|x(h - 1) - 2 x(h) + x(h + 1)| of the rows' means x, as `_cells`; of rows where all three have one."""
+    mean, there = total / count.clamp(min=1), (count > 0).to(total)
+    known = F.pad(there[:, 2:] * there[:, 1:-1] * there[:, :-2], (1, 1))
+    apart = F.pad((mean[:, 2:] - 2 * mean[:, 1:-1] + mean[:, :-2]).abs(), (1, 1))
+    return _cells(apart * known, known, BANDS, 1)

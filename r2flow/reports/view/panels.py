@@ -1,0 +1,142 @@
+"""What a page of `r2flow.reports.view` can show: scans of files and sets, samples of a generator, its way to them."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from r2flow.checkpoints import Checkpoint
+from r2flow.data.sets import ScanSet
+from r2flow.errors import InputError
+from r2flow.generators import as_flow
+from r2flow.noise import Draws
+from r2flow.reports.outputs import ScanBar, warn_unsolved
+from r2flow.reports.view import write_page
+from r2flow.reports.views import View
+from r2flow.sampling import sample
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One scan of a page, or several in the slider's turn.
+
+    Attributes:
+        images: (T, 2 or 1, H, W).
+        rays: (2, H, W).
+        labels: (T, H, W), or None.
+    """
+
+    caption: str
+    images: np.ndarray
+    rays: Tensor
+    labels: np.ndarray | None = None
+
+
+def write_panels(path: str | Path, panels: Sequence[Panel], frames: Sequence[str] = (), title: str = "r2flow") -> Path:
+    """Write the page of some panels."""
+    images, rays = [panel.images for panel in panels], [panel.rays for panel in panels]
+    captions, labels = [panel.caption for panel in panels], [panel.labels for panel in panels]
+    return write_page(path, images, rays, captions, frames=frames, labels=labels, title=title)
+
+
+def scan_panels(views: Sequence[View]) -> list[Panel]:
+    """A panel for each scan, named by its file; by its folder too, where two files have one name."""
+    shared = Counter(view.path.name for view in views)
+    panels = []
+    for view in views:
+        image, labels = view.labelled()
+        caption = view.path.name if shared[view.path.name] == 1 else f"{view.path.parent.name}/{view.path.name}"
+        panels.append(Panel(caption, image[None], view.rays, None if labels is None else labels[None]))
+    return panels
+
+
+def in_turn(panels: Sequence[Panel], caption: str) -> tuple[Panel, list[str]]:
+    """Panels as one, each a frame, and what the slider says.
+
+    Raises:
+        InputError: they differ in size or rays, or some have reflectance or labels and some not.
+    """
+    first = panels[0]
+    for panel in panels:
+        alike = panel.images.shape == first.images.shape and (panel.labels is None) == (first.labels is None)
+        if not alike or not torch.equal(panel.rays, first.rays):
+            raise InputError(f"{panel.caption} and {first.caption} differ in size, sensor, reflectance or labels: "
+                             "they cannot be frames of one sequence; leave --sequence out.")  # fmt: skip
+    labels = None if first.labels is None else np.concatenate([p.labels for p in panels if p.labels is not None])
+    images = np.concatenate([panel.images for panel in panels])
+    return Panel(caption, images, first.rays, labels), [panel.caption for panel in panels]
+
+
+def sample_panels(flow: Checkpoint, label: str, num: int, seed: int = 0, steps: Sequence[int] = ()) -> list[Panel]:
+    """Scans 0 to num - 1 of a seed, a panel each; with `steps`, a panel for each number of steps, a scan each frame.
+
+    Raises:
+        InputError: numbers of steps that the generator cannot take.
+    """
+    own = flow.generator.sampler
+    samplers = [own.changed(steps=count) for count in steps] or [own]
+    for one in samplers:
+        flow.generator.check_sampler(one)
+    drawn = []
+    evaluations = num * sum(flow.generator.evaluations_of(one) for one in samplers)
+    with ScanBar("sampling", num * len(samplers), evaluations) as bar:
+        for one in samplers:
+            images = []
+            for made in sample(flow, num, seed, sampler=one, progress=bar.evaluated):
+                warn_unsolved(made.converged, made.first)
+                images.append(made.images.nan_to_num(0.0).numpy())
+            drawn.append(np.concatenate(images))
+            bar.finished(num * len(drawn))
+    rays = flow.sensor.rays()
+    if steps:
+        said = [f"{label}, {count} step{'s' * (count > 1)}" for count in steps]
+        return [Panel(caption, images, rays) for caption, images in zip(said, drawn, strict=True)]
+    return [Panel(f"{label}, sample {number}", image[None], rays) for number, image in enumerate(drawn[0])]
+
+
+def way_panels(
+    flow: Checkpoint, label: str, num: int, seed: int = 0, steps: int | None = None, times: int = 9
+) -> tuple[list[Panel], list[str]]:
+    """x_t of scans 0 to num - 1 of a seed at `times` times from t = 0 to 1, decoded, and what the slider says.
+
+    Between two times the flow's own solver takes its share of the steps, at least one.
+
+    Raises:
+        InputError: a generator without an ODE, or fewer than two times.
+    """
+    if times < 2:
+        raise InputError(f"a way has two ends: --times must be at least 2, found {times}.")
+    solved = as_flow(flow.generator, "x_t")
+    how = solved.sampler.changed(steps=steps)
+    share = how.changed(steps=math.ceil(how.steps / (times - 1)), grid="uniform", finish=0.0)
+    solved.check_sampler(share)
+    x = Draws(seed, range(num)).start(solved.noise_shape)
+    at = [i / (times - 1) for i in range(times)]
+    decoded = [flow.encoding.decode(x)]
+    with ScanBar("solving", times - 1, (times - 1) * solved.evaluations_of(share)) as bar:
+        for t_0, t_1 in pairwise(at):
+            x = solved.solve(x, t_0, t_1, sampler=share, progress=bar.evaluated).x
+            decoded.append(flow.encoding.decode(x.cpu()))
+            bar.finished(len(decoded) - 1)
+    images = torch.stack(decoded, 1).nan_to_num(0.0).numpy()
+    rays = flow.sensor.rays()
+    panels = [Panel(f"{label}, sample {number}", image, rays) for number, image in enumerate(images)]
+    return panels, [f"t = {t:.3g}" for t in at]
+
+
+def write_sets(path: str | Path, sets: Mapping[str, ScanSet], num: int = 4, title: str = "r2flow") -> Path:
+    """A panel for each set, a slider through `num` scans of each, evenly spread."""
+    panels = []
+    for name, scans in sets.items():
+        some = scans.spread(num)
+        if not len(some):
+            continue
+        images = some.source.batch(range(len(some))).nan_to_num(0.0).numpy()
+        panels.append(Panel(f"{name}: {scans.label}", images, scans.sensor.rays()))
+    return write_panels(path, panels, title=title)

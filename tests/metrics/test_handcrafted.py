@@ -1,0 +1,150 @@
+"""Hand-made features against their values on images that can be worked out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.lidar.sensors import SENSORS
+from r2flow.metrics import METRICS
+from r2flow.metrics.extractors import load_extractor
+from r2flow.metrics.extractors.handcrafted import (
+    BANDS,
+    EDGE,
+    FAR_OUT,
+    FEW,
+    FINE,
+    SCALES,
+    SECTORED,
+    SECTORS,
+)
+from r2flow.metrics.scans import Scans
+
+SENSOR = SENSORS["hdl64e"].resized(8, 64)
+BOTH, RANGE = load_extractor("handcrafted"), load_extractor("handcrafted_range")
+
+
+def scans(r, q=0.3, sensor=SENSOR):
+    r = torch.as_tensor(r, dtype=torch.float32).expand(1, 1, *sensor.shape)
+    return Scans(torch.cat([r, torch.as_tensor(q, dtype=torch.float32) * (r > 0)], 1), sensor)
+
+
+def random_scans(n=3, sensor=SENSOR, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    r = (3 + 30 * torch.rand(n, 1, *sensor.shape, generator=g)) * (torch.rand(n, 1, *sensor.shape, generator=g) < 0.8)
+    return Scans(torch.cat([r, torch.rand(r.shape, generator=g) * (r > 0)], 1), sensor)
+
+
+def by_name(rows, extractor=BOTH):
+    """Features (B, D) as {statistic: (B, cells)}."""
+    cells = [SECTORS if name.endswith(SECTORED) else BANDS for name in extractor.scales]
+    return dict(zip(extractor.scales, rows.split(cells, dim=1), strict=True))
+
+
+def statistics(some):
+    """Of a scan whose rays all returned: the features taken back to the statistics' own units."""
+    whole = FAR_OUT * (BOTH.features(some) / FAR_OUT).sinh() * (1 + FEW)
+    return {name: SCALES[name].centre + SCALES[name].spread * x[0].numpy() for name, x in by_name(whole).items()}
+
+
+def test_a_constant_image():
+    found = statistics(scans(7.0, 0.3))
+    expected = {
+        "returns": 1, "row changes": 0, "single losses": 0, "log-range": 3, "beyond 5 m": 1, "beyond 10 m": 0,
+        "row edges": 0, "row equal": 1, "row step": math.log2(FINE), "row step of 64": math.log2(FINE),
+        "row bend": math.log2(FINE), "row smooth": 0, "rows agree": 0, "row step, spread": 0, "log-range, spread": 0,
+        "log-range, beams": 0, "reflectance": 0.3, "reflectance, spread": 0, "reflectance from 0.25": 1,
+        "reflectance row step": math.log2(FINE), "log-range, sectors": 3, "reflectance, sectors": 0.3,
+    }  # fmt: skip
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[name], value, atol=2e-3 * max(1, 30 * SCALES[name].spread), err_msg=name)
+
+
+def test_one_wall_before_another_has_two_edges_in_every_row():
+    w = SENSOR.columns
+    near = torch.arange(w) < w // 2
+    found = statistics(scans(torch.where(near, 7.0, 15.0)))
+    expected = {
+        "row edges": 2 / w,
+        "row step": ((w - 2) * math.log2(FINE) + 2 * math.log2(8 + FINE)) / w,
+        "row slant": 0,  # one step of either sign
+        "log-range": (3 + 4) / 2,
+        "log-range, spread": 0.5,
+        "row equal": (w - 2) / w,
+    }
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[name], value, rtol=2e-3, atol=1e-3, err_msg=name)
+    np.testing.assert_allclose(found["log-range, sectors"], [3] * 4 + [4] * 4, atol=5e-3)
+    saw = statistics(scans(7 + 8.0 * (torch.arange(w) / w)))  # rises slowly, falls at once
+    steps = (w - 1) * math.tanh(8 / w / EDGE) - math.tanh(8 * (w - 1) / w / EDGE)
+    np.testing.assert_allclose(saw["row slant"], steps / w, rtol=5e-3)
+
+
+def test_a_turn_changes_the_sectors_alone_and_a_mirror_image_sides_and_signs():
+    some = random_scans()
+    own = by_name(BOTH.features(some))
+    turned = by_name(BOTH.features(Scans(some.images.roll(SENSOR.columns // SECTORS, -1), SENSOR)))
+    any_turn = by_name(BOTH.features(Scans(some.images.roll(5, -1), SENSOR)))
+    mirrored = by_name(BOTH.features(Scans(some.images.flip(-1), SENSOR)))
+    signed = {"row slant", "diagonals"}
+    for name, x in own.items():
+        if name.endswith(SECTORED):
+            torch.testing.assert_close(turned[name], x.roll(1, -1), atol=1e-4, rtol=0)
+            assert (any_turn[name] - x).abs().max() > 0.01
+        else:
+            torch.testing.assert_close(turned[name], x, atol=1e-4, rtol=0)
+            torch.testing.assert_close(any_turn[name], x, atol=1e-4, rtol=0)
+        alike = name not in signed and not name.endswith(SECTORED)
+        assert torch.allclose(mirrored[name], x, atol=1e-4) == alike, name
+    slant = [FAR_OUT * (s["row slant"] / FAR_OUT).sinh() + SCALES["row slant"].centre / SCALES["row slant"].spread
+             / (1 + FEW) for s in (own, mirrored)]  # fmt: skip
+    torch.testing.assert_close(slant[0], -slant[1], atol=0.01, rtol=0)
+
+
+@pytest.mark.parametrize("shape", [(16, 100), (3, 5), (40, 2048)])
+@pytest.mark.parametrize("sensor", ["vlp16", "os1_64"])
+def test_any_sensor_and_size_with_and_without_reflectance(sensor, shape):
+    resized = SENSORS[sensor].resized(*shape)
+    some = random_scans(2, resized)
+    assert BOTH.features(some).shape == (2, BOTH.dim)
+    assert BOTH.features(some).isfinite().all()
+    of_range = RANGE.features(Scans(some.images[:, :1], resized))
+    assert of_range.shape == (2, RANGE.dim)
+    same = {name: x for name, x in by_name(BOTH.features(some)).items() if "reflectance" not in name}
+    torch.testing.assert_close(of_range, torch.cat(list(same.values()), 1))
+
+
+def test_empty_scans_and_values_that_are_no_numbers_leave_their_neighbours_alone():
+    some = random_scans(4).images
+    alone = BOTH.features(Scans(some[3:], SENSOR))
+    some[0] = 0
+    some[1, 0, 2] = torch.nan  # a range that is no number is no return
+    some[2, 1, some[2, 0] > 0] = torch.nan
+    found = BOTH.features(Scans(some, SENSOR))
+    assert found.isfinite().all(1).tolist() == [False, True, False, True]
+    torch.testing.assert_close(found[3:], alone)
+    assert BOTH.features(Scans(some[:0], SENSOR)).shape == (0, BOTH.dim)
+
+
+def test_a_scan_of_one_return_and_the_same_scan_among_many_have_features():
+    one = torch.zeros(*SENSOR.shape)
+    one[3, 7] = 12.0
+    assert BOTH.features(scans(one)).isfinite().all()
+    many = random_scans(40, SENSORS["hdl64e"].resized(64, 256))  # more than are computed at once
+    torch.testing.assert_close(BOTH.features(many)[17:18], BOTH.features(Scans(many.images[17:18], many.sensor)))
+
+
+@pytest.mark.parametrize("name", ["kid_handcrafted", "frechet_handcrafted"])
+def test_the_distances_of_walls_grow_with_their_roughness(name):
+    g = torch.Generator().manual_seed(0)
+    away = 8 + 4 * torch.rand(2, 16, 1, 1, 1, generator=g)
+    noise = torch.randn(16, 1, *SENSOR.shape, generator=g)
+    found = []
+    for sigma in (0.0, 0.03, 0.3):
+        metric = METRICS[name]()
+        for real, r in ((True, away[0].expand_as(noise)), (False, away[1] + sigma * noise)):
+            metric.update(Scans(torch.cat([r, torch.full_like(r, 0.3)], 1), SENSOR), real=real)
+        found += metric.compute().values()
+    assert list(metric.compute()) == [name]
+    assert found[0] < found[1] < found[2]

@@ -1,0 +1,216 @@
+"""The page of `r2flow view` without a browser: what it holds, and what it refuses."""
+
+import base64
+import hashlib
+import json
+import zlib
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.errors import InputError
+from r2flow.lidar.labels import CLASSES
+from r2flow.lidar.sensors import SENSORS
+from r2flow.reports.view import MOST, page
+from r2flow.simulator import simulate
+from tests.test_checkpoints import saved  # noqa: F401  a fixture
+from tests.test_cli import r2flow, scan  # noqa: F401  fixtures
+
+SENSOR = SENSORS["hdl64e"].resized(8, 32)
+RAYS = SENSOR.rays()
+ATTACK = "</script><img src=x onerror=alert(1)><!-- <script>&\"' $title ${data}"
+
+
+class Parsed(HTMLParser):
+    """Elements of a page, and the text within scripts and styles, as a browser cuts it."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict]] = []
+        self.texts: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        self.texts.append("")
+
+    def handle_endtag(self, tag):
+        self.handle_starttag(f"/{tag}", [])
+
+    def handle_data(self, data):
+        if self.texts:
+            self.texts[-1] += data
+
+    def all(self, tag: str) -> list[tuple[dict, str]]:
+        found = zip(self.elements, self.texts, strict=True)
+        return [(attributes, text) for (name, attributes), text in found if name == tag]
+
+    @property
+    def data(self) -> dict:
+        (text,) = (text for attributes, text in self.all("script") if attributes.get("id") == "data")
+        return json.loads(text)
+
+
+def images(count: int, channels: int = 2, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    r = rng.uniform(1.45, 80, (count, 1, *SENSOR.shape)) * (rng.random((count, 1, *SENSOR.shape)) < 0.8)
+    return np.concatenate([r, rng.random(r.shape) * (r > 0)], 1)[:, :channels].astype(np.float32)
+
+
+def unpacked(data: dict, number: int, frame: int = 0) -> list[np.ndarray]:
+    """Range in metres, reflectance and class number of one image, by the format's description alone."""
+    one = data["scans"][number]
+    rays = data["rays"][one["rays"]]
+    shape = rays["rows"], rays["columns"]
+    raw = np.frombuffer(zlib.decompress(base64.b64decode(one["frames"][frame])), np.uint8)
+    high, low, *others = raw.reshape(-1, *shape).astype(np.int64)
+    codes = np.cumsum(256 * high + low, axis=1) % 65536
+    return [codes * data["metres"], *others]
+
+
+@pytest.mark.parametrize("farthest", [80.0, 900.0], ids=["80 m", "900 m"])
+def test_what_is_unpacked_is_the_scan(farthest):
+    given = images(2)
+    given[1, 0, 3, 5] = farthest
+    data = Parsed(page(given, RAYS)).data
+    for number, image in enumerate(given):
+        r, reflectance = unpacked(data, number)
+        assert np.abs(r - image[0]).max() <= max(0.002, farthest / 65535 / 2) + 1e-5
+        assert ((r == 0) == (image[0] == 0)).all()
+        assert np.abs(reflectance / 255 - image[1]).max() <= 0.5 / 255 + 1e-6
+    (rays,) = data["rays"]
+    e, a = np.meshgrid(rays["elevations"], rays["azimuths"], indexing="ij")
+    np.testing.assert_allclose(np.stack([e, a]), RAYS.numpy(), atol=2e-7)
+
+
+def test_rays_of_no_grid_are_kept_pixel_by_pixel():
+    bent = RAYS.clone()
+    bent[1] += 0.01 * torch.arange(8.0)[:, None]
+    (rays,) = Parsed(page(images(1), bent)).data["rays"]
+    kept = np.frombuffer(base64.b64decode(rays["pixels"]), "<f4").reshape(2, 8, 32)
+    np.testing.assert_array_equal(kept, bent.numpy())
+
+
+def test_values_that_are_no_numbers_are_no_returns():
+    image = images(1)[0]
+    image[0, 0, :3] = np.nan, np.inf, -1
+    r, _ = unpacked(Parsed(page([image], RAYS)).data, 0)
+    assert (r[0, :3] == 0).all()
+
+
+def test_labels_have_their_names_and_colours():
+    ids = np.full(SENSOR.shape, 40)
+    ids[:2], ids[7] = 10, 0
+    data = Parsed(page(images(2, 1), RAYS, labels=[ids, None])).data
+    assert [one["labels"] for one in data["scans"]] == [True, False]
+    assert data["shown"] == {"reflectance": False, "label": True}
+    _, numbers = unpacked(data, 0)
+    assert data["classes"][numbers[0, 0]] == list(CLASSES[10])
+    assert data["classes"][numbers[4, 0]] == list(CLASSES[40])
+    assert data["classes"][numbers[7, 0]][0] == "no class"
+
+
+def test_a_usual_scan_takes_about_130_kb():
+    made = simulate(SENSORS["hdl64e"], 0, 0)
+    empty, one = (len(page([image], SENSORS["hdl64e"].rays())) for image in (0 * made.image, made.image))
+    assert one - empty < 140_000
+    assert empty < 70_000
+
+
+def test_no_text_is_read_as_html():
+    text = page(images(1)[None], RAYS, [ATTACK], frames=[ATTACK], labels=[np.full(SENSOR.shape, 600)], title=ATTACK)
+    parsed = Parsed(text)
+    assert [attributes.get("type") for attributes, _ in parsed.all("script")] == ["application/json", "module"]
+    assert not parsed.all("img")
+    assert parsed.data["scans"][0]["caption"] == parsed.data["frames"][0] == ATTACK
+    assert [said for _, said in parsed.all("title")] == [said.strip() for _, said in parsed.all("h1")] == [ATTACK]
+
+
+def test_the_page_allows_its_own_script_alone_and_loads_nothing():
+    text = page(images(1), RAYS)
+    parsed = Parsed(text)
+    (policy,) = (a["content"] for a, _ in parsed.all("meta") if "http-equiv" in a)
+    rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+    script = next(said for attributes, said in parsed.all("script") if attributes["type"] == "module")
+    (style,) = (said for _, said in parsed.all("style"))
+    for rule, said in (("script-src", script), ("style-src", style)):
+        assert rules[rule] == f"'sha256-{base64.b64encode(hashlib.sha256(said.encode()).digest()).decode()}'"
+    assert rules["default-src"] == "'none'"
+    assert "http://" not in text.replace("http-equiv", "")
+    assert "https://" not in text
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (lambda: page([], RAYS), "found 0 images"),
+        (lambda: page([np.broadcast_to(np.float32(0), (MOST // 256 + 1, 1, 8, 32))], RAYS), "found 65537 images"),
+        (lambda: page(images(2), [RAYS]), "1 rays"),
+        (lambda: page(images(2), RAYS, ["one"]), "1 captions"),
+        (lambda: page(images(1), SENSORS["hdl64e"].rays()), "need rays of as many pixels"),
+        (lambda: page(np.zeros((1, 3, 8, 32)), RAYS), "found (3, 8, 32)"),
+        (lambda: page(images(1), RAYS, labels=[np.zeros((4, 4), int)]), "labels of (4, 4)"),
+    ],
+)
+def test_what_does_not_fit_is_refused(given, said):
+    with pytest.raises(InputError, match=said.replace("(", r"\(").replace(")", r"\)")):
+        given()
+
+
+class TestTheVerb:
+    def test_shows_files_and_says_how_many_of_a_folder(self, r2flow, scan, tmp_path):  # noqa: F811
+        many = tmp_path / "many"
+        many.mkdir()
+        for number, image in enumerate(images(5)):
+            np.save(many / f"{number}{ATTACK.replace('/', '')}.npy", image)
+        code, said, warned = r2flow("view", scan, many, "--num", 3, "--out", tmp_path / "a.html")
+        assert (code, said) == (0, f"{tmp_path / 'a.html'}\n")
+        assert "3 of its 5 scans" in warned
+        data = Parsed((tmp_path / "a.html").read_text()).data
+        assert [one["caption"][:1] for one in data["scans"]] == ["g", "0", "2", "4"]
+        r, _ = unpacked(data, 0)
+        e = SENSORS["hdl64e"].rays()[0].numpy()
+        np.testing.assert_allclose(r[40:60], (-1.73 / np.sin(e))[40:60], atol=0.003)
+
+    def test_a_sequence_is_one_scan_with_frames(self, r2flow, tmp_path):  # noqa: F811
+        for name, image in zip("ab", images(2), strict=True):
+            np.save(tmp_path / f"{name}.npy", image)
+        assert r2flow("view", tmp_path, "--sequence", "--out", tmp_path / "a.html")[0] == 0
+        data = Parsed((tmp_path / "a.html").read_text()).data
+        assert [len(one["frames"]) for one in data["scans"]] == [2]
+        assert data["frames"] == ["a.npy", "b.npy"]
+
+    def test_draws_a_model_at_several_steps_from_the_same_noise(self, r2flow, saved, tmp_path):  # noqa: F811
+        import r2flow as package
+
+        assert r2flow("view", saved[0], "--num", 2, "--steps", "1,3", "--out", tmp_path / "a.html")[0] == 0
+        data = Parsed((tmp_path / "a.html").read_text()).data
+        assert [one["caption"].rpartition(", ")[2] for one in data["scans"]] == ["1 step", "3 steps"]
+        expected = package.load(saved[0]).sample(2, steps=3)
+        for frame in range(2):
+            assert np.abs(unpacked(data, 1, frame)[0] - expected[frame, 0].numpy()).max() < 0.0021
+
+    def test_goes_from_noise_to_scan(self, r2flow, saved, tmp_path):  # noqa: F811
+        import r2flow as package
+        from r2flow.noise import Draws
+
+        assert r2flow("view", saved[0], "--num", 1, "--times", 3, "--out", tmp_path / "a.html")[0] == 0
+        data = Parsed((tmp_path / "a.html").read_text()).data
+        assert data["frames"] == ["t = 0", "t = 0.5", "t = 1"]
+        flow = package.load(saved[0])
+        noise = flow.encoding.decode(Draws(0, [0]).start(flow.generator.noise_shape))
+        assert np.abs(unpacked(data, 0, 0)[0] - noise[0, 0].numpy()).max() < 0.0021
+
+    @pytest.mark.parametrize("screen", [True, False])
+    def test_opens_a_browser_where_there_is_a_screen(self, r2flow, tmp_path, monkeypatch, screen):  # noqa: F811
+        opened = []
+        np.save(tmp_path / "a.npy", images(1)[0])
+        monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url))
+        monkeypatch.setattr("sys.platform", "linux")
+        monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+        monkeypatch.setenv("DISPLAY", ":0") if screen else monkeypatch.delenv("DISPLAY", raising=False)
+        code, said, _ = r2flow("view", tmp_path / "a.npy")
+        assert code == 0
+        assert opened == ([f"file://{said.strip()}"] if screen else [])

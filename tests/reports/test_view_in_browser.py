@@ -1,0 +1,288 @@
+"""The page of `r2flow view` in headless Chromium, its pixels read back. `pytest -m browser`."""
+
+import math
+import re
+import shutil
+from io import BytesIO
+
+import numpy as np
+import pytest
+from matplotlib import colormaps
+
+from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.sensors import SENSORS
+from r2flow.reports.view import page
+from tests.reports.test_view import ATTACK
+
+pytestmark = pytest.mark.browser
+
+SENSOR = SENSORS["hdl64e"].resized(16, 64)
+RAYS = SENSOR.rays()
+PIXELS = {(4, 30): 22.0, (6, 35): 14.0, (9, 28): 9.0, (3, 40): 31.0, (12, 33): 5.0}  # (row, column): range
+DESKTOP, PHONE = {"width": 1200, "height": 800}, {"width": 390, "height": 844}
+
+
+def lone(scale: float = 1.0) -> np.ndarray:
+    image = np.zeros((2, *SENSOR.shape), np.float32)
+    for (row, column), r in PIXELS.items():
+        image[:, row, column] = scale * r, 0.5
+    return image
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install r2flow[browser]")
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+    if found is None:
+        pytest.skip("no chromium is installed")
+    arguments = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with playwright.sync_playwright() as running:
+        browser = running.chromium.launch(executable_path=found, args=arguments)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def opened(chromium, tmp_path):
+    """Opens the page of some arguments; no error of its own, no request but for itself."""
+    contexts, errors, requests = [], [], []
+
+    def open(*arguments, size=DESKTOP, scheme="dark", touch=False, **options):
+        path = tmp_path / "page.html"
+        path.write_text(page(*arguments, **options), encoding="utf-8")
+        contexts.append(chromium.new_context(viewport=size, color_scheme=scheme, has_touch=touch))
+        shown = contexts[-1].new_page()
+        shown.on("pageerror", lambda error: errors.append(str(error)))
+        shown.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        shown.on("request", lambda request: requests.append(request.url))
+        shown.on("dialog", lambda dialog: errors.append(f"dialog {dialog.message}"))
+        shown.goto(path.as_uri(), timeout=120_000)
+        shown.wait_for_selector("html[data-ready]", state="attached", timeout=120_000)
+        settle(shown)
+        return shown
+
+    yield open
+    for context in contexts:
+        context.close()
+    assert errors == []
+    assert all(url.startswith(("file:", "data:", "blob:")) for url in requests)
+
+
+def settle(shown) -> None:
+    """Until what was asked for is drawn: two frames after the last movement has rested."""
+    shown.wait_for_timeout(400)
+    shown.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+def screen(shown) -> np.ndarray:
+    from PIL import Image
+
+    return np.asarray(Image.open(BytesIO(shown.screenshot())).convert("RGB")).astype(int)
+
+
+def camera_of(shown) -> dict:
+    return shown.evaluate("() => ({...window.view.camera})")
+
+
+def projected(point: np.ndarray, camera: dict, box: dict) -> np.ndarray:
+    """Where a pinhole camera sees a point on the screen: 50 degrees upwards, more where the view is narrow."""
+    yaw, pitch = camera["yaw"], camera["pitch"]
+    ahead = -np.array([math.cos(pitch) * math.cos(yaw), math.cos(pitch) * math.sin(yaw), math.sin(pitch)])
+    eye = np.array(camera["target"]) - camera["distance"] * ahead
+    right = np.cross(ahead, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, ahead)
+    tangent = math.tan(math.radians(25)) * max(1, 1.2 * box["height"] / box["width"])
+    focal = box["height"] / 2 / tangent
+    seen = np.asarray(point) - eye
+    x, y = focal * (seen @ right) / (seen @ ahead), focal * (seen @ up) / (seen @ ahead)
+    return np.array([box["x"] + box["width"] / 2 + x, box["y"] + box["height"] / 2 - y])
+
+
+def points_of(image: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
+    """The point of each of `PIXELS`, each alone through the project's own unprojection."""
+    found = {}
+    for place in PIXELS:
+        one = np.zeros_like(image)
+        one[:, *place] = image[:, *place]
+        found[place] = image_to_points(one, RAYS)[0][0]
+    return found
+
+
+def colour_of_range(r: float) -> np.ndarray:
+    """As the pictures of the project have it: turbo from 0.93 (2 m) down to 0.1 (80 m), by the logarithm."""
+    share = int(np.clip(math.log(r / 2) / math.log(40) * 256, 0, 255)) / 255
+    return 255 * np.array(colormaps["turbo"](0.9 - 0.83 * share)[:3])
+
+
+@pytest.mark.parametrize("keys", [[], ["ArrowLeft"] * 4 + ["ArrowUp"] * 2, ["t"]], ids=["first", "turned", "above"])
+def test_points_are_drawn_where_the_camera_sees_them_in_the_colour_of_their_range(opened, keys):
+    shown = opened([lone()], RAYS)
+    for key in keys:
+        shown.keyboard.press(key)
+    settle(shown)
+    pixels, camera, box = screen(shown), camera_of(shown), shown.locator(".points").bounding_box()
+    drawn = 0
+    for place, point in points_of(lone()).items():
+        x, y = projected(point, camera, box)
+        if not (box["x"] + 40 < x < box["x"] + box["width"] - 40 and box["y"] + 40 < y < box["y"] + box["height"] - 40):
+            continue
+        drawn += 1
+        at = pixels[round(y - 0.5), round(x - 0.5)]
+        assert np.abs(at - colour_of_range(PIXELS[place])).max() <= 4, (place, at)
+        around = pixels[round(y) - 30 : round(y) + 30 : 59, round(x)]  # 30 pixels above and below: the background
+        assert (around.max(axis=1) < 45).all()
+    assert drawn >= 3
+
+
+def test_the_image_below_is_the_range_image(opened):
+    image = np.random.default_rng(0).uniform(2, 80, (1, *SENSOR.shape)).astype(np.float32)
+    image[0, :, ::3] = 0
+    shown = opened([image], RAYS)
+    box, pixels = shown.locator(".image").bounding_box(), screen(shown)
+    for row in range(16):
+        for column in range(64):
+            x = box["x"] + (column + 0.5) / 64 * box["width"]
+            y = box["y"] + 1 + (row + 0.5) / 16 * (box["height"] - 1)
+            r = image[0, row, column]
+            expected = colour_of_range(r) if r else np.zeros(3)
+            assert np.abs(pixels[int(y), int(x)] - expected).max() <= 4, (row, column)
+
+
+def test_mouse_and_keys_move_the_camera(opened):
+    shown = opened([lone()], RAYS)
+    first, box = camera_of(shown), shown.locator(".points").bounding_box()
+    x, y = box["x"] + 300, box["y"] + 200
+    shown.mouse.move(x, y)
+    shown.mouse.down()
+    shown.mouse.move(x + 50, y + 20)
+    shown.mouse.up()
+    turned = camera_of(shown)
+    assert turned["yaw"] == pytest.approx(first["yaw"] - 0.4)
+    assert turned["pitch"] == pytest.approx(first["pitch"] + 0.16)
+    shown.mouse.move(x, y)
+    shown.mouse.down(button="right")
+    shown.mouse.move(x + 50, y)
+    shown.mouse.up(button="right")
+    moved = camera_of(shown)
+    point = np.array(moved["target"])
+    # What was in the middle has followed the mouse.
+    middle = projected(np.array(turned["target"]), moved, box) - [
+        box["x"] + box["width"] / 2,
+        box["y"] + box["height"] / 2,
+    ]
+    assert middle == pytest.approx([50, 0], abs=0.5)
+    assert np.linalg.norm(point - turned["target"]) > 0.5
+    shown.mouse.wheel(0, -100)
+    shown.wait_for_function("distance => window.view.camera.distance < distance", arg=moved["distance"])
+    shown.keyboard.press("r")
+    assert camera_of(shown) == first
+
+
+def test_two_fingers_zoom_and_one_finger_turns(opened):
+    shown = opened([lone()], RAYS, size=PHONE, touch=True)
+    first, box = camera_of(shown), shown.locator(".points").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    hand = shown.context.new_cdp_session(shown)
+
+    def touch(kind, *fingers):
+        points = [{"x": x + dx, "y": y, "id": number} for number, dx in enumerate(fingers)]
+        hand.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    touch("touchStart", -40, 40)
+    for reach in (50, 60, 70, 80):
+        touch("touchMove", -reach, reach)
+    touch("touchEnd")
+    pinched = camera_of(shown)
+    assert pinched["distance"] == pytest.approx(first["distance"] / 2, rel=0.05)
+    touch("touchStart", 0)
+    for reach in (10, 20, 30):
+        touch("touchMove", reach)
+    touch("touchEnd")
+    assert camera_of(shown)["yaw"] == pytest.approx(pinched["yaw"] - 0.24, abs=0.01)
+
+
+def test_the_cursor_finds_the_point_and_back(opened):
+    shown = opened([lone(), lone(0.8)], RAYS, ["a", "b"])
+    first, second = shown.locator(".points").all()
+    strip = shown.locator(".image").first.bounding_box()
+    for (row, column), r in PIXELS.items():
+        shown.mouse.move(
+            strip["x"] + (column + 0.5) / 64 * strip["width"], strip["y"] + (row + 0.5) / 16 * strip["height"]
+        )
+        assert shown.locator("#readout").inner_text().startswith(f"row {row}, column {column} · {r:.2f} m")
+        for tile, image in ((first, lone()), (second, lone(0.8))):
+            box, mark = tile.bounding_box(), tile.locator(".mark").bounding_box()
+            at = projected(points_of(image)[row, column], camera_of(shown), box)
+            assert [mark["x"] + 9, mark["y"] + 9] == pytest.approx(at, abs=1.0)
+        shown.mouse.move(*projected(points_of(lone())[row, column], camera_of(shown), first.bounding_box()))
+        assert shown.locator("#readout").inner_text().startswith(f"row {row}, column {column} ·")
+    shown.mouse.move(strip["x"] + 3, strip["y"] + strip["height"] / 2)
+    assert "no return" in shown.locator("#readout").inner_text()
+
+
+def test_a_tap_finds_a_point(opened):
+    shown = opened([lone()], RAYS, size=PHONE, touch=True)
+    at = projected(points_of(lone())[6, 35], camera_of(shown), shown.locator(".points").bounding_box())
+    shown.touchscreen.tap(*at)
+    assert shown.locator("#readout").inner_text().startswith("row 6, column 35 · 14.00 m")
+
+
+def test_the_slider_goes_through_the_frames(opened):
+    shown = opened([np.stack([lone(), lone(0.5)]), lone()], RAYS, ["two", "one"], frames=["t = 0", "t = 1"])
+    strips = [one.bounding_box() for one in shown.locator(".image").all()]
+    assert shown.locator("#frame-name").inner_text() == "t = 0"
+    shown.keyboard.press(".")
+    shown.wait_for_function("() => document.getElementById('frame-name').textContent === 't = 1'")
+    for strip, r in zip(strips, (7.0, 14.0), strict=True):
+        shown.mouse.move(strip["x"] + 35.5 / 64 * strip["width"], strip["y"] + 6.5 / 16 * strip["height"])
+        assert f"column 35 · {r:.2f} m" in shown.locator("#readout").inner_text()
+
+
+def test_only_what_is_there_can_be_coloured(opened):
+    shown = opened([lone()[:1]], RAYS)
+    assert shown.locator("#modes button").all_inner_texts() == ["range", "height"]
+    assert shown.locator("#player").is_hidden()
+    shown = opened([lone()], RAYS, labels=[np.full(SENSOR.shape, 40)])
+    shown.get_by_role("button", name="label", exact=True).click()
+    assert shown.locator("#legend").inner_text().strip() == "road"
+    settle(shown)
+    box, point = shown.locator(".points").bounding_box(), points_of(lone())[6, 35]
+    x, y = projected(point, camera_of(shown), box)
+    assert np.abs(screen(shown)[round(y - 0.5), round(x - 0.5)] - [0x9A, 0x86, 0xC9]).max() <= 4
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_the_page_is_dark_or_light_as_the_system_is_and_on_request(opened, scheme):
+    shown = opened([lone()], RAYS, scheme=scheme)
+    before = screen(shown)[60, 600].mean()
+    shown.keyboard.press("d")
+    settle(shown)
+    after = screen(shown)[60, 600].mean()
+    assert (before < 60 and after > 200) if scheme == "dark" else (before > 200 and after < 60)
+
+
+def test_names_are_text(opened):
+    shown = opened([np.stack([lone()] * 2)], RAYS, [ATTACK], frames=[ATTACK] * 2, title=ATTACK)
+    assert shown.locator("figcaption span").inner_text() == re.sub(" +", " ", ATTACK)
+    assert shown.title() == ATTACK
+    assert shown.locator("img").count() == 0
+
+
+@pytest.mark.parametrize(("size", "count"), [(DESKTOP, 16), (PHONE, 6)])
+def test_everything_fits_and_the_rest_is_turned_to(opened, size, count):
+    shown = opened([lone()] * 20, RAYS, size=size)
+    boxes = [one.bounding_box() for one in shown.locator("figure, button:visible").all()]
+    for box in boxes:
+        assert box["x"] >= 0
+        assert box["y"] >= 0
+        assert box["x"] + box["width"] <= size["width"]
+        assert box["y"] + box["height"] <= size["height"]
+    seen = shown.locator("figure").count()
+    assert count <= seen <= 16
+    shown.locator("#next").click()
+    assert shown.locator("figcaption span").first.inner_text() == str(seen)
+    shown.locator("figcaption button").first.click()
+    assert shown.locator("figure").count() == 1
+    shown.keyboard.press("Escape")
+    assert shown.locator("figure").count() > 1
