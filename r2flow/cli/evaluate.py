@@ -247,7 +247,7 @@ def _compare(job: Job, judged: "dict[str, ScanSet]", measured: MeasureOptions, o
         found.append(Comparison(name, real, other, results, time.monotonic() - start, kind))
     if job.work.rank > 0:
         return
-    seeds = {"subsets": 0}
+    seeds: dict[str, int] = {}
     if any(one.about["kind"] == "sampled" for one in judged.values()):
         seeds["sampled scans"] = job.sampling.seed
     if measured.bootstrap:

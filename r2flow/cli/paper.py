@@ -49,7 +49,7 @@ def paper(
         str | None, typer.Option(help="paper or r2flow; the paper's where the real scans allow it if left out.")
     ] = None,
     primary: Annotated[
-        str | None, typer.Option(help="The metric that judges the claims; frd, else frechet_embedded if left out.")
+        str | None, typer.Option(help="The metric that judges the claims; frd, else frechet_handcrafted if left out.")
     ] = None,
 ) -> None:
     """The paper's tables I and II and figures 3, 5, 6, 7, 8 from runs, its printed numbers and claims beside ours.
