@@ -64,7 +64,7 @@ def pairs(
     first: Annotated[
         int | None, typer.Option(min=0, help="Index of the first pair; behind the flow's own pairs if left out.")
     ] = None,
-    knots: Annotated[int, typer.Option(min=0, help="Inner states to keep of each path, for a flow map.")] = 0,
+    knots: Annotated[int | None, typer.Option(min=1, help="Inner states to keep of each path, for a flow map.")] = None,
 ) -> None:
     """Draw reflow pairs from a flow: what is missing or damaged, as one of any number of processes.
 

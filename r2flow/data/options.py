@@ -90,7 +90,7 @@ class PairOptions:
     shard_mib: float = 256.0
     seed: int = 0  # of the noise; not the run's: runs of several seeds can share one set of pairs
     first: int | None = None  # index of the first pair; None: behind the pairs that the flow itself was trained on
-    knots: int = 0  # inner states of each path to keep with its pair, for stage=flow_map
+    knots: int | None = None  # inner states of each path to keep with its pair, for stage=flow_map
     parent: str | None = None  # hash of the flow; the run fills it in
 
     def recipe(self, shape: tuple[int, int, int], noise_shape: tuple[int, ...] | None = None) -> PairRecipe:
@@ -114,12 +114,12 @@ class PairOptions:
         named_grid(grid)
         if self.knots:
             check_knots(self.method, self.steps, self.knots)
-        size = self.batch_size * 2 * math.prod(shape) * (1 + self.knots)
+        size = self.batch_size * 2 * math.prod(shape) * (1 + (self.knots or 0))
         shard_batches = max(round(self.shard_mib * 2**20 / size), 1)
         tolerance = float(self.tolerance)  # 1 and 1.0 are one recipe
         return PairRecipe(
             self.parent or "", shape, self.seed, first, self.method, self.steps, tolerance, self.batch_size,
-            shard_batches, None if noise_shape == shape else noise_shape, grid, self.knots,
+            shard_batches, None if noise_shape == shape else noise_shape, grid, self.knots or 0,
         )  # fmt: skip
 
 

@@ -60,8 +60,8 @@ class View(NamedTuple):
         )  # fmt: skip
 
 
-def scans_of(path: Path, most: int) -> list[Path]:
-    """The file itself, or at most `most` scans of a folder, evenly spread over it.
+def scans_of(path: Path, most: int, say: bool = False) -> list[Path]:
+    """The file itself, or at most `most` scans of a folder, evenly spread over it; `say` so where there are more.
 
     Raises:
         InputError: nothing is there, or a folder without scans.
@@ -71,7 +71,8 @@ def scans_of(path: Path, most: int) -> list[Path]:
     if not path.is_dir():
         return [path]
     found = [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans]
-    _say_how_many(path, len(found), most)
+    if say:
+        _say_how_many(path, len(found), most)
     return [found[index] for index in spread(len(found), most)]
 
 
@@ -108,7 +109,7 @@ def views_of(
         reflectance_scale = sensor.reflectance_scale
     reading = replace(reading, sensor=sensor, reflectance_scale=reflectance_scale, on_bad_scan="error", columns=columns)
     if own is None and options.name == FOLDER:
-        loose = scans_of(file or Path(options.folder), most)
+        loose = scans_of(file or Path(options.folder), most, say=True)
         warn_of_other_sensor(loose, reading, spec)
         return [View(path, open_scans(path, reading, own_size=True), 0) for path in loose]
     opened = open_scans(spec, reading)
