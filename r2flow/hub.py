@@ -31,7 +31,9 @@ scans = HubFlow.from_pretrained("{{ repo_id | default('FOLDER', true) }}").sampl
 """
 
 
-class HubFlow(ModelHubMixin, library_name="r2flow", tags=["lidar", "rectified-flow"], model_card_template=CARD):
+class HubFlow(  # type: ignore[call-arg, unused-ignore]  # where the extra is not installed
+    ModelHubMixin, library_name="r2flow", tags=["lidar", "rectified-flow"], model_card_template=CARD
+):
     """A trained generator with `save_pretrained(folder)`, `from_pretrained(folder or name)`, `push_to_hub(name)`.
 
     Args:
