@@ -134,8 +134,16 @@ def test_samplers_that_jumps_do_not_have_are_refused(grown, sampler, said):
 
 
 def test_renoising_needs_draws(grown):
+    noise = torch.zeros(1, *grown.noise_shape)
     with pytest.raises(InputError, match="give draws"):
-        grown.generate(torch.zeros(1, *grown.noise_shape), sampler=Sampler("renoise", 2))
+        grown.generate(noise, sampler=Sampler("renoise", 2))
+
+
+@pytest.mark.parametrize("method", ["jump", "renoise", "euler"])
+def test_a_condition_that_it_has_not_learned_is_refused(grown, method):
+    noise = torch.zeros(1, *grown.noise_shape)
+    with pytest.raises(InputError, match="condition"):
+        grown.generate(noise, {"image": noise}, sampler=Sampler(method, 2), draws=Draws(0, [0]))
 
 
 # ---- the stage

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.labels import labels_beside, read_labels
-from r2flow.lidar.projection import Convention, Projection, project_indices, project_measured
+from r2flow.lidar.projection import Convention, Projection, image_of, project_indices
 from r2flow.lidar.recognition import other_sensor
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
 from r2flow.lidar.scan_files.points import FARTHEST
@@ -132,12 +132,29 @@ class ScanSource(ABC):
         return {}
 
 
-def read_scan(path: str | Path, sensor: Sensor, *options: Any, **more: Any) -> np.ndarray:
-    """One scan file as a range image, (2 or 1, H, W): the first part of `read_measured_scan`, with its arguments."""
-    return read_measured_scan(path, sensor, *options, **more)[0]
+class Projected(NamedTuple):
+    """A scan file, and which of its points each pixel has kept.
+
+    Attributes:
+        image: (2 or 1, H, W).
+        points: All of the file.
+        pixels, chosen: The pixels that keep one, h W + w, and the index of that point, (M,) each.
+    """
+
+    image: np.ndarray
+    points: Points
+    pixels: np.ndarray
+    chosen: np.ndarray
+
+    def spread(self, values: np.ndarray) -> np.ndarray:
+        """Values of the kept points, (M, ...), at their pixels, (H, W, ...); 0 elsewhere."""
+        shape = self.image.shape[1:]
+        found = np.zeros((math.prod(shape), *values.shape[1:]), values.dtype)
+        found[self.pixels] = values
+        return found.reshape(*shape, *values.shape[1:])
 
 
-def read_measured_scan(
+def read_scan(
     path: str | Path,
     sensor: Sensor,
     projection: Projection = "spherical",
@@ -145,14 +162,29 @@ def read_measured_scan(
     reflectance: bool = True,
     reflectance_scale: float | None = 1.0,
     columns: Sequence[str] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """One scan file as a range image, (2, H, W), without `reflectance` (1, H, W), and its pixels' points, (3, H, W).
-
-    The options are those of `Reading`.
+) -> np.ndarray:
+    """One scan file as a range image, (2, H, W); without `reflectance`, (1, H, W). The options are those of `Reading`.
 
     Raises:
         InputError: the file cannot be read, no point of it lies in the sensor's view and range (`NoPointsError`), or it
             has no reflectance, or one beyond the scale, where it is needed.
+    """
+    return read_projected(path, sensor, projection, convention, reflectance, reflectance_scale, columns).image
+
+
+def read_projected(
+    path: str | Path,
+    sensor: Sensor,
+    projection: Projection = "spherical",
+    convention: Convention = "centre",
+    reflectance: bool = True,
+    reflectance_scale: float | None = 1.0,
+    columns: Sequence[str] | None = None,
+) -> Projected:
+    """`read_scan` with the points behind its image.
+
+    Raises:
+        InputError: as `read_scan`.
     """
     points = read_points(path, columns)
     if points.dropped:
@@ -161,7 +193,8 @@ def read_measured_scan(
             path, points.dropped, FARTHEST,
         )  # fmt: skip
     scaled = _scaled_reflectance(path, points, reflectance_scale) if reflectance else None
-    image, xyz = project_measured(points.xyz, scaled, sensor, projection, convention, points.ring)
+    pixels, chosen, kept = project_indices(points.xyz, sensor, projection, convention, points.ring)
+    image = image_of(sensor, pixels, kept, None if scaled is None else scaled[chosen])
     if not image[0].any():
         r = np.linalg.norm(points.xyz, axis=1)
         raise NoPointsError(
@@ -169,7 +202,7 @@ def read_measured_scan(
             f"view of sensor '{sensor.name}' (ranges found: {r.min():.3g}-{r.max():.3g} m). "
             "Are its units metres and its sensor the configured one?"
         )
-    return (image if reflectance else image[:1]), xyz
+    return Projected(image if reflectance else image[:1], points, pixels, chosen)
 
 
 def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tuple[np.ndarray, np.ndarray | None]:
@@ -180,16 +213,12 @@ def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tupl
     Raises:
         InputError: what `read_scan` refuses, or labels that are damaged or of another scan.
     """
-    image = read_scan(path, sensor, **options)
+    found = read_projected(path, sensor, **options)
     file = labels_beside(path)
     if file is None:
-        return image, None
-    points = read_points(path, options.get("columns"))
-    projection, convention = options.get("projection", "spherical"), options.get("convention", "centre")
-    pixels, chosen, _ = project_indices(points.xyz, sensor, projection, convention, points.ring)
-    labels = np.zeros(math.prod(sensor.shape), dtype=np.uint16)
-    labels[pixels] = read_labels(file, path, points)[chosen]
-    return image, labels.reshape(sensor.shape)
+        return found.image, None
+    labels = read_labels(file, path, found.points)[found.chosen].astype(np.uint16)
+    return found.image, found.spread(labels)
 
 
 def _no_reflectance(path: str | Path) -> InputError:
@@ -240,7 +269,8 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     sensor, channels = reading.sensor, 1 + bool(reading.reflectance)
     image = range_image(path, sensor.shape)
     if image is None:
-        return read_points_image(path, reading)[0]
+        found = _projected(path, reading)
+        return _empty(reading) if found is None else found.image
     if len(image) < channels:
         raise _no_reflectance(path)
     image = image[:channels]
@@ -252,25 +282,31 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
 
 
 def read_points_image(path: Path, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
-    """A file of points as an image, (2 or 1, H, W), and its pixels' points, (3, H, W).
+    """A file of points as an image, (2 or 1, H, W), and its pixels' points in metres, (3, H, W) float32, 0 for none.
 
     Raises:
         InputError: as `read_image`.
     """
-    sensor = reading.sensor
-    how = (
-        reading.projection,
-        reading.convention,
-        bool(reading.reflectance),
-        reading.reflectance_scale,
-        reading.columns,
-    )
+    found = _projected(path, reading)
+    if found is None:
+        return _empty(reading), np.zeros((3, *reading.sensor.shape), np.float32)
+    xyz = found.spread(found.points.xyz[found.chosen].astype(np.float32))
+    return found.image, np.ascontiguousarray(np.moveaxis(xyz, -1, 0))
+
+
+def _projected(path: Path, reading: Reading) -> Projected | None:
+    """A file of points; None for one without a return where that may be."""
+    how = reading.projection, reading.convention, bool(reading.reflectance), reading.reflectance_scale, reading.columns
     try:
-        return read_measured_scan(path, sensor, *how)
+        return read_projected(path, reading.sensor, *how)
     except NoPointsError:
         if reading.on_bad_scan != "empty":
             raise
-        return tuple(np.zeros((n, *sensor.shape), np.float32) for n in (1 + bool(reading.reflectance), 3))  # type: ignore[return-value]
+        return None
+
+
+def _empty(reading: Reading) -> np.ndarray:
+    return np.zeros((1 + bool(reading.reflectance), *reading.sensor.shape), np.float32)
 
 
 def lacks_reflectance(

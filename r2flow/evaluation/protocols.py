@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from r2flow.data.layouts import KITTI_360_SPLIT, SourceKind
+from r2flow.data.opening import SOURCES
 from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Convention
@@ -69,9 +69,10 @@ class Rules:
 
 def published_order(scans: ScanSet) -> list[int]:
     """The numbers of a set as the published evaluation has them: KITTI-360's training drives before its test drives."""
-    last = {n for drive, held in scans.drives.items() if _KITTI_360.split_of(drive) == "test" for n in held}
     if "kitti_360" not in str(scans.about.get("kind")):
         return list(range(len(scans)))
+    known = SOURCES["kitti_360"]
+    last = {n for drive, held in scans.drives.items() if known.split_of(drive) == "test" for n in held}
     return sorted(range(len(scans)), key=lambda number: number in last)
 
 
@@ -81,12 +82,6 @@ def published_choice(scans: ScanSet, most: int) -> list[int]:
     random.Random(0).shuffle(order)  # shuffles whatever stands at each place
     return sorted(order[:most])
 
-
-class _Kitti360(SourceKind):
-    splits = KITTI_360_SPLIT
-
-
-_KITTI_360 = _Kitti360()
 
 R2FLOW = Rules(
     "r2flow", "centre", "centre", None, lambda scans, most: fixed_choice(len(scans), most), "fixed shuffle, seed 0"

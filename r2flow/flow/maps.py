@@ -196,9 +196,3 @@ def two_halves(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor)
 OBJECTIVES: Registry[Objective] = Registry(
     "objective of a flow map", knots=along_knots, corrected=corrected, consistency=consistency, two_halves=two_halves
 )
-
-
-def residual(u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
-    """One jump less two half jumps, X_{t->s}(x) - X_{m->s}(X_{t->m}(x)), (B, ...): 0 for the map of a flow."""
-    middle = (t + s) / 2
-    return jump(u, t, x, s) - jump(u, middle, jump(u, t, x, middle), s)

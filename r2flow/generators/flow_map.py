@@ -1,7 +1,6 @@
 """A flow map: one network that jumps from any time to any other."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -55,15 +54,15 @@ class FlowMap(RectifiedFlow):
         t_1: float = 1.0,
         *,
         sampler: Sampler | None = None,
-        condition: Condition | None = None,
         progress: Progress = None,
         **options: Any,
     ) -> Solution:
         how = sampler or self.sampler
         if how.method != JUMP:
-            return super().solve(x, t_0, t_1, sampler=how, condition=condition, progress=progress, **options)
-        if options:
-            raise InputError(f"jumps have no {', '.join(options)}; give a solver, as --solver adams3.")
+            return super().solve(x, t_0, t_1, sampler=how, progress=progress, **options)
+        given = [name for name, value in options.items() if value is not None]
+        if given:
+            raise InputError(f"jumps have no {', '.join(given)}; leave that out, or give a solver, as --solver adams3.")
         end = self._jumps(x, self._times(how, t_0, t_1), None, progress)
         return Solution.build(end.x, end.evaluations.cpu().numpy(), how.steps, 0, False, end.converged.cpu().numpy())
 
@@ -79,8 +78,8 @@ class FlowMap(RectifiedFlow):
         how = sampler or self.sampler
         if how.method != RENOISE:
             return super().generate(noise, condition, sampler=how, draws=draws, progress=progress)
-        if draws is None:
-            raise InputError("renoise draws further noise: give draws.")
+        if draws is None or condition is not None:
+            raise InputError("renoise draws further noise and takes no condition: give draws alone.")
         with torch.no_grad():
             return self._jumps(noise, self._times(how, 0.0, 1.0), draws, progress)
 
@@ -115,4 +114,4 @@ class FlowMap(RectifiedFlow):
         return sampler.steps if sampler.method in (JUMP, RENOISE) else super().evaluations_of(sampler)
 
     def in_steps(self, steps: int) -> Sampler:
-        return replace(Sampler(JUMP), steps=steps)
+        return Sampler(JUMP, steps)

@@ -49,25 +49,17 @@ def project(
         InputError: an unknown projection or convention; or a scan that does not unfold into the
             sensor's rings.
     """
-    return project_measured(xyz, reflectance, sensor, projection, convention, ring)[0]
-
-
-def project_measured(
-    xyz: np.ndarray,
-    reflectance: np.ndarray | None,
-    sensor: Sensor,
-    projection: Projection = "spherical",
-    convention: Convention = "centre",
-    ring: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The range image of `project`, and the point that each pixel has kept, (3, H, W) float32 in metres, 0 for none."""
-    image = np.zeros((2, math.prod(sensor.shape)), dtype=np.float32)
-    points = np.zeros((3, math.prod(sensor.shape)), dtype=np.float32)
     hit, chosen, r = project_indices(xyz, sensor, projection, convention, ring)
-    image[0, hit], points[:, hit] = r, np.asarray(xyz, dtype=np.float32)[chosen].T
+    return image_of(sensor, hit, r, None if reflectance is None else reflectance[chosen])
+
+
+def image_of(sensor: Sensor, hit: np.ndarray, r: np.ndarray, reflectance: np.ndarray | None) -> np.ndarray:
+    """The range image, (2, H, W) float32, of pixels h W + w with their ranges in metres and reflectances, (M,) each."""
+    image = np.zeros((2, math.prod(sensor.shape)), dtype=np.float32)
+    image[0, hit] = r
     if reflectance is not None:
-        image[1, hit] = reflectance[chosen]
-    return image.reshape(2, *sensor.shape), points.reshape(3, *sensor.shape)
+        image[1, hit] = reflectance
+    return image.reshape(2, *sensor.shape)
 
 
 def project_indices(

@@ -285,6 +285,16 @@ def test_knots_that_a_method_does_not_have_are_refused(method, steps, said):
         solve(lambda t, x: x, torch.ones(1, 1), method=method, steps=steps, knots=-1 if method == "euler" else 3)
 
 
+def test_knots_take_no_finish_and_are_counted_on_the_times_that_are_given():
+    with pytest.raises(InputError, match="takes no finish"):
+        solve(lambda t, x: x, torch.ones(1, 1), steps=8, knots=3, finish=0.1)
+    times = torch.tensor([0.0, 0.1, 0.4, 0.7, 1.0])
+    found = solve(lambda t, x: torch.ones_like(x), torch.zeros(1, 1), knots=1, grid=times)
+    torch.testing.assert_close(found.knots, torch.full((1, 1, 1), 0.4))
+    with pytest.raises(InputError, match="4 steps have no 2 inner knots"):
+        solve(lambda t, x: x, torch.ones(1, 1), knots=2, grid=times)
+
+
 def test_a_scene_that_fails_between_two_knots_stays_failed():
     x_0 = torch.tensor([[0.5], [3.0]], dtype=torch.float64)  # dx/dt = x^2 reaches infinity at t = 1 / x_0
     found = solve(lambda t, x: x * x, x_0, method="dopri5", knots=3, max_evaluations=400)

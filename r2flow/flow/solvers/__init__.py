@@ -100,7 +100,7 @@ def solve(
         global_error: Estimate the error at t_1 by a second solution, with half the steps' lengths or a sixtieth of the
             tolerance (a tenth, where the budget ends before) and of `finish`; its evaluations are counted.
         knots: Inner states to keep, at `knot_times`, of a method of fixed steps on a named grid or of an adaptive one,
-            which is solved from each to the next.
+            which is solved from each to the next. Not with `finish`.
 
     Raises:
         InputError: an unknown method or grid, fewer than one step, a number out of its range, or steps that have no
@@ -114,7 +114,9 @@ def solve(
     times = build_grid(grid, t_0, t_1 - math.copysign(finish, t_1 - t_0) if finish else t_1, steps)
     run = _Run(method, t_0, t_1, times, Limits(tolerance, max_evaluations, max_step=max_step, finish=finish), progress)
     if knots:
-        check_knots(method, steps, knots)
+        check_knots(method, len(times) - 1, knots)
+        if finish:
+            raise InputError("a solution with knots takes no finish: its steps end at equal parts of the way.")
     solution = run.in_pieces(velocity, x, knots) if knots and adapts(method) else run.solve(velocity, x, knots)
     return _with_global_error(solution, run, velocity, x) if global_error else solution
 
@@ -150,9 +152,7 @@ class _Run(NamedTuple):
         ends = [*uniform(self.t_0, self.t_1, knots + 1).tolist()[1:-1], self.t_1]
         states, pieces, t = [x], [], self.t_0
         for end in ends:
-            finish = self.limits.finish if end == self.t_1 else 0.0
-            piece = self._replace(t_0=t, t_1=end, limits=self.limits._replace(finish=finish))
-            pieces.append(piece.solve(velocity, states[-1]))
+            pieces.append(self._replace(t_0=t, t_1=end).solve(velocity, states[-1]))
             states.append(pieces[-1].x)
             t = end
         sums = {name: sum(getattr(piece, name) for piece in pieces) for name in ("evaluations", "accepted", "rejected")}
