@@ -7,7 +7,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.models import MODELS, find_model
 from r2flow.plugins import made_with
-from r2flow.published import published_cfg, published_config, published_rings, published_step
+from r2flow.published import FORMATS, format_of, published_cfg
 from r2flow.registry import did_you_mean
 from r2flow.sampling import sample
 
@@ -135,17 +135,25 @@ def find_checkpoint(path: str | Path) -> Path:
 
 
 def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
-    """The dict in a checkpoint file. Only tensors and plain values are read: a file cannot run code.
+    """The dict in a checkpoint file of ours. Only tensors and plain values are read: a file cannot run code.
 
     Raises:
         InputError: not a checkpoint, a damaged one, or one that holds more than plain values.
     """
+    content = _read(path, map_location)
+    if not isinstance(content, dict):
+        raise InputError(_not_a_checkpoint(path))
+    return _renamed(content)
+
+
+def _read(path: str | Path, map_location: Any = "cpu") -> Any:
+    """What a torch file holds, ours or a published one, which may be a list."""
     if not Path(path).is_file():  # a pipe would be waited for
         raise InputError(f"no checkpoint at {path}. Give a checkpoint file or a run folder.")
     _check_sums(path)
     try:
         with warnings.catch_warnings(action="ignore"):  # torch's, on bytes that are no checkpoint
-            content = torch.load(path, map_location=map_location, weights_only=True)
+            return torch.load(path, map_location=map_location, weights_only=True)
     except pickle.UnpicklingError as error:
         if "Unsupported global" in str(error) or "Unsupported class" in str(error):
             name = re.search(r"GLOBAL (\S+)", str(error))
@@ -159,9 +167,6 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
     except Exception:  # torch's reader raises nearly anything on bytes that are none of its own
         raise InputError(_not_a_checkpoint(path)) from None
-    if not isinstance(content, dict):
-        raise InputError(_not_a_checkpoint(path))
-    return _renamed(content)
 
 
 def _check_sums(path: str | Path) -> None:
@@ -217,24 +222,28 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
         InputError: nothing usable is there, or its weights do not fit its config.
     """
     path = find_checkpoint(path)
-    content = read_safetensors(path) if path.suffix == ".safetensors" else read_checkpoint(path)
+    content = read_safetensors(path) if path.suffix == ".safetensors" else _read(path)
     sampler: Mapping[str, Any] | None = None
-    if "cfg" in content and "weights" in content:
-        config = published_config(content["cfg"], path)
-        weights = {BACKBONE + name: value for name, value in content["weights"].items()}
-        step, kind = published_step(content), "published"
-    elif "config" in content and "state_dict" in content:
+    published = format_of(content)
+    if published is not None:
+        made = published.read(content, path, averaged)
+        config, weights, step, sampler, kind = made.config, made.weights, made.step, made.sampler, "published"
+    elif isinstance(content, dict) and "config" in content and "state_dict" in content:
+        content = _renamed(content)
         config, step, kind = dict(content["config"]), int(content.get("global_step", 0)), "r2flow"
         if "data" in config:
             config["data"] = upgraded(config["data"])
         state = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
         weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
         sampler = content.get("sampler") or _sampler_of_stage(config.get("stage") or {})
-    else:
+    elif isinstance(content, dict):
+        systems = ", ".join(one.system for one in FORMATS)
         raise InputError(
             f"{path} is a torch file but not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
-            f"(ours) nor 'cfg' and 'weights' (published); found {', '.join(map(repr, list(content)[:6]))}."
+            f"(ours) nor the layout of a published one ({systems}); found {', '.join(map(repr, list(content)[:6]))}."
         )
+    else:
+        raise InputError(_not_a_checkpoint(path))
     held = sum(value.numel() for value in weights.values())
     refused = (
         f"the weights in {path} do not fit its config: they are {held:,} numbers, and the config asks for far more."
@@ -244,9 +253,8 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     check_weights(generator, weights, path)
     generator.load_state_dict(weights)
     generator.sampler = Sampler.of(sampler or {})  # where none was written down, 32 Euler steps
-    if "published" in config and config["data"]["projection"] == "unfolding":
-        sensor = published_rings(generator.space.sensor, weights[BACKBONE + "coords"])
-        generator.space = replace(generator.space, sensor=sensor)
+    if published is not None and made.finish is not None:
+        made.finish(generator, config)
     accuracy = tuple(Budget.of(one) for one in content.get("accuracy") or ())
     return Checkpoint(generator.eval().requires_grad_(False).to(device), config, step, path, kind, accuracy)
 

@@ -1,4 +1,4 @@
-"""The published R2Flow checkpoints' configs in our terms."""
+"""The published R2Flow checkpoints: a dict of cfg, weights, optimizer, lr_scheduler and num_images."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,7 +10,9 @@ from torch import Tensor
 
 from r2flow.backbones import BACKBONES
 from r2flow.errors import InputError
+from r2flow.generators import Generator
 from r2flow.lidar.sensors import Sensor, build_sensor
+from r2flow.published.format import Format, Published
 from r2flow.registry import did_you_mean, options_of
 
 ARCHITECTURES = {
@@ -20,7 +22,18 @@ ARCHITECTURES = {
     "efficient_unet": "efficient_unet",
 }
 THEIR_POSITIONS = {"learnable": "learnable_embedding", "polar": "polar_coordinates", "none": None}
+BACKBONE = "backbone."  # of a flow's network in the generator
 UNSAID = {"patch": [1, 4], "window": [3, 9], "ring": True}
+
+
+def holds(content: Any) -> bool:
+    return isinstance(content, Mapping) and {"cfg", "weights"} <= content.keys() and "ema_weights" not in content
+
+
+def read(content: Any, path: Path, averaged: bool = True) -> Published:
+    """A published flow; the file holds its averaged weights alone."""
+    weights = {BACKBONE + name: value for name, value in content["weights"].items()}
+    return Published(published_config(content["cfg"], path), weights, _step(content), finish=_follow_rings)
 
 
 def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
@@ -128,13 +141,22 @@ def published_cfg(config: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def published_step(content: Mapping[str, Any]) -> int:
+def _step(content: Mapping[str, Any]) -> int:
     """Optimiser steps: the images that were seen over the batch size."""
     batch = content["cfg"].get("training", {}).get("batch_size", 1)
     return int(content.get("num_images", 0)) // max(int(batch), 1)
+
+
+def _follow_rings(generator: Generator, config: Mapping[str, Any]) -> None:
+    if config["data"]["projection"] == "unfolding":
+        sensor = published_rings(generator.space.sensor, generator.state_dict()[BACKBONE + "coords"])
+        generator.space = replace(generator.space, sensor=sensor)
 
 
 def published_rings(sensor: Sensor, coords: Tensor) -> Sensor:
     """The sensor with the ring elevations that an unfolding checkpoint carries in its `coords`, (1, 2, H, W)."""
     elevations = torch.rad2deg(coords[0, 0, :, 0].double())
     return replace(sensor, elevations=tuple(elevations.tolist()))
+
+
+FORMAT = Format("R2Flow", holds, read)
