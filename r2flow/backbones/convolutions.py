@@ -13,7 +13,7 @@ from r2flow.backbones.base import Backbone, CommonOptions, integers
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, position_name
 from r2flow.backbones.layers import ExactBuffers, ExactLinear, at_least_float32, zero_initialised
 from r2flow.errors import InputError
-from r2flow.registry import Count, Portion
+from r2flow.registry import Count, Portion, Positive
 
 GROUPS = 8
 EPS = 1e-6
@@ -75,12 +75,12 @@ class Resample(ExactBuffers):
 
 
 class GroupNorm(nn.GroupNorm):
-    """Group norm of 8 groups, computed in float32."""
+    """Group norm computed in float32."""
 
-    def __init__(self, channels: int, affine: bool = True) -> None:
-        if channels % GROUPS:
-            raise InputError(f"{channels} channels cannot be normed in {GROUPS} groups: make them a multiple of it.")
-        super().__init__(GROUPS, channels, eps=EPS, affine=affine)
+    def __init__(self, channels: int, groups: int = GROUPS, eps: float = EPS, affine: bool = True) -> None:
+        if channels % groups:
+            raise InputError(f"{channels} channels cannot be normed in {groups} groups: make them a multiple of it.")
+        super().__init__(groups, channels, eps=eps, affine=affine)
 
     def forward(self, x: Tensor) -> Tensor:
         wide = at_least_float32(x)
@@ -91,10 +91,10 @@ class GroupNorm(nn.GroupNorm):
 class AdaGroupNorm(nn.Module):
     """norm(x) (1 + scale) + shift, with (scale, shift) = W silu(c) + b of a condition c."""
 
-    def __init__(self, channels: int, condition_channels: int) -> None:
+    def __init__(self, channels: int, options: "BlockOptions") -> None:
         super().__init__()
-        self.norm = GroupNorm(channels, affine=False)
-        self.proj = nn.Sequential(nn.SiLU(), ExactLinear(condition_channels, 2 * channels))
+        self.norm = GroupNorm(channels, options.groups, options.eps, affine=False)
+        self.proj = nn.Sequential(nn.SiLU(), ExactLinear(options.condition_channels, 2 * channels))
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         scale, shift = self.proj(condition)[:, :, None, None].to(x.dtype).chunk(2, dim=1)
@@ -102,7 +102,7 @@ class AdaGroupNorm(nn.Module):
 
 
 class SinusoidalTime(nn.Module):
-    """sin(f_i t), then cos(f_i t), with f_i = 10^(-4 i / (C / 2 - 1)); t as it is, in [0, 1]."""
+    """sin(f_i t), then cos(f_i t), with f_i = 10^(-4 i / (C / 2 - 1)); t as it is, a flow's time or a log-SNR."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -129,11 +129,15 @@ class BlockOptions:
         condition_channels: Width of the time embedding.
         ring: Whether the columns are a full turn.
         dropout: Share of activations dropped in training.
+        groups: Of group norms.
+        eps: Added to their variance.
     """
 
     condition_channels: int
     ring: bool
     dropout: float
+    groups: int = GROUPS
+    eps: float = EPS
 
 
 class ResidualBlock(nn.Module):
@@ -144,9 +148,9 @@ class ResidualBlock(nn.Module):
     def __init__(self, channels: int, out_channels: int, options: BlockOptions) -> None:
         super().__init__()
         self.register_buffer("scale", torch.tensor(0.5**0.5))
-        self.norm1 = GroupNorm(channels)
+        self.norm1 = GroupNorm(channels, options.groups, options.eps)
         self.conv1 = RingConv2d(channels, out_channels, options.ring)
-        self.norm2 = AdaGroupNorm(out_channels, options.condition_channels)
+        self.norm2 = AdaGroupNorm(out_channels, options)
         self.dropout = nn.Dropout(options.dropout)
         self.conv2 = zero_convolution(RingConv2d(out_channels, out_channels, options.ring))
 
@@ -161,12 +165,12 @@ class SelfAttention(nn.Module):
 
     scale: Tensor
 
-    def __init__(self, channels: int, heads: int) -> None:
+    def __init__(self, channels: int, heads: int, options: BlockOptions) -> None:
         super().__init__()
         if channels % heads:
             raise InputError(f"{channels} channels cannot be shared by {heads} attention heads.")
         self.register_buffer("scale", torch.tensor(0.5**0.5))
-        self.norm = GroupNorm(channels)
+        self.norm = GroupNorm(channels, options.groups, options.eps)
         self.attn = nn.MultiheadAttention(channels, heads, batch_first=True)
         nn.init.zeros_(self.attn.out_proj.weight)
 
@@ -199,6 +203,8 @@ class UNet(Backbone):
         position: Features beside the image: "fourier_features", "polar", "spherical_harmonics" or "none".
         ring: Whether the columns are a full turn.
         dropout: Share of activations dropped in training.
+        groups: Of group norms; every width is a multiple of it.
+        eps: Added to their variance.
         common: See `Backbone`.
 
     Raises:
@@ -220,6 +226,8 @@ class UNet(Backbone):
         position: str | None = "fourier_features",
         ring: bool = True,
         dropout: Portion = 0.0,
+        groups: Count = GROUPS,
+        eps: Positive = EPS,
         **common: Unpack[CommonOptions],
     ) -> None:
         levels = max(len(channel_multiplier), 1)
@@ -235,7 +243,7 @@ class UNet(Backbone):
         self.time_embedding = time_embedding(base_channels, width)
         self.in_conv = RingConv2d(self.in_channels + extra, base_channels, ring)
         widths = [base_channels * multiplier for multiplier in multipliers]
-        self.build_levels(base_channels, widths, counts, num_heads, BlockOptions(width, ring, dropout))
+        self.build_levels(base_channels, widths, counts, num_heads, BlockOptions(width, ring, dropout, groups, eps))
         if self.second_time:
             self.interval_embedding = time_embedding(base_channels, width, bias=False)
             zero_initialised(cast(nn.Linear, self.interval_embedding[-1]))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -101,11 +101,20 @@ class Encoding:
         sensor: Its range limits say which ranges are returns.
         format: `logscale` (the paper's), `inverse`, `metric`, or `cartesian` (three channels).
         reflectance: Whether reflectance is a channel; without it a model is of range alone.
+        limits: `closed`: ranges of exactly the sensor's limits are returns. `open`, as R2DM has it: they are not, and
+            none is encoded that does not lie between them.
     """
 
-    def __init__(self, sensor: Sensor, format: str = "logscale", reflectance: bool = True) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        format: str = "logscale",
+        reflectance: bool = True,
+        limits: Literal["closed", "open"] = "closed",
+    ) -> None:
         self.sensor = sensor
         self.reflectance = reflectance
+        self.limits = limits
         self.format = FORMATS[format](sensor)
 
     @property
@@ -125,7 +134,10 @@ class Encoding:
         Raises:
             InputError: reflectance is a channel of the model and the image has none.
         """
-        y = self.format.forward(image[..., :1, :, :])
+        r = image[..., :1, :, :]
+        if self.limits == "open":
+            r = r * self._between(r)
+        y = self.format.forward(r)
         if self.reflectance:
             if image.shape[-3] < 2:
                 raise InputError(
@@ -137,13 +149,16 @@ class Encoding:
     def decode(self, x: Tensor) -> Tensor:
         """(..., channels, H, W) -> range in metres and reflectance, (..., 2 or 1, H, W).
 
-        A range outside [min_range, max_range] is a dropped ray, 0 in both; reflectance is clamped to [0, 1].
+        A range outside the limits is a dropped ray, 0 in both; reflectance is clamped to [0, 1].
         """
         y = (x + 1) / 2
         ranges = self.format.channels
         near, far = self.sensor.min_range, self.sensor.max_range
         r = self.format.inverse(y[..., :ranges, :, :])
-        returned = (r >= near * (1 - LIMIT_TOLERANCE)) & (r <= far * (1 + LIMIT_TOLERANCE))
+        if self.limits == "open":
+            returned = self._between(r)
+        else:
+            returned = (r >= near * (1 - LIMIT_TOLERANCE)) & (r <= far * (1 + LIMIT_TOLERANCE))
         zero = torch.zeros_like(r)
         image = torch.where(returned, r.clamp(near, far), zero)
         if self.reflectance:
@@ -151,8 +166,11 @@ class Encoding:
             image = torch.cat([image, torch.where(returned, reflectance, zero)], dim=-3)
         return image
 
+    def _between(self, r: Tensor) -> Tensor:
+        return (r > self.sensor.min_range) & (r < self.sensor.max_range)
+
 
 def build_encoding(options: Mapping[str, Any], sensor: Sensor) -> Encoding:
-    """The encoding a config describes: `format` and `reflectance`."""
+    """The encoding a config describes: `format`, `reflectance` and `limits`."""
     check_options("encoding", Encoding, options, given=1)
     return Encoding(sensor, **options)
