@@ -10,6 +10,7 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
 from r2flow.errors import InputError
+from r2flow.flow.times import golden_sequence
 from r2flow.generators import Generator
 from r2flow.noise import seed_torch
 from r2flow.registry import Count, Natural, NonNegative, Portion
@@ -135,6 +136,25 @@ class Stage(L.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["config"] = self.config
         checkpoint["sampler"] = self.generator.sampler.asdict()
+
+
+class SingleLoss(Stage):
+    """A stage with one loss of a batch. A subclass gives `regression_loss`."""
+
+    def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
+        """The mean loss at the times that the stage makes of uniform draws u in [0, 1), (B,)."""
+        raise NotImplementedError
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        loss = self.regression_loss(batch, batch["u"])
+        self.log("train/loss", loss, prog_bar=True, sync_dist=True)
+        return loss
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        # A low-discrepancy sequence over [0, 1) instead of random times: a steadier figure from few scans.
+        u = golden_sequence(batch["k"])
+        loss = self.regression_loss(batch, u)
+        self.log("val/loss", loss, prog_bar=True, batch_size=len(batch["x_1"]), sync_dist=True)
 
 
 def learning_rate_factor(step: int, warmup: int, total: int) -> float:
