@@ -9,14 +9,16 @@ from r2flow.errors import InputError
 from r2flow.generators.base import Condition, Generated, Generator, Sampler
 from r2flow.generators.budgets import Budget, levels
 from r2flow.generators.conditional import ConditionalFlow, Regression, condition_of
+from r2flow.generators.diffusion import Diffusion
 from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
 from r2flow.generators.flow_map import FlowMap
 from r2flow.lidar.space import build_space
 from r2flow.registry import Registry
 
 __all__ = [
-    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "Field", "Flow", "FlowMap", "Generated",
-    "Generator", "RectifiedFlow", "Regression", "Sampler", "as_flow", "build_generator", "condition_of", "levels",
+    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "Diffusion", "Field", "Flow", "FlowMap",
+    "Generated", "Generator", "RectifiedFlow", "Regression", "Sampler", "as_flow", "build_generator", "condition_of",
+    "levels",
 ]  # fmt: skip
 
 GENERATORS: Registry[type[Generator]] = Registry(
@@ -25,6 +27,7 @@ GENERATORS: Registry[type[Generator]] = Registry(
     flow_map=FlowMap,
     conditional_flow=ConditionalFlow,
     regression=Regression,
+    diffusion=Diffusion,
 )
 
 
