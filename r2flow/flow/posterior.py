@@ -206,7 +206,7 @@ def ot_ode(
     return x
 
 
-def mmps(u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, noise: Noise, products: int = 1) -> Tensor:
+def mmps(u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, noise: Noise, products: int = 2) -> Tensor:
     """The flow's own covariance in the place of r^2 (Rozet et al. 2024, moment matching posterior sampling).
 
     Cov(x_1 | x_t) = C = ((1 - t)^2 / t) J, the second-order Tweedie formula, so that
@@ -295,7 +295,7 @@ METHODS: Registry[Method] = Registry(
     flowdps=Method(flowdps, lambda n: n, draws=True),
     pnp=Method(pnp, lambda n, repeats: n * repeats, (5,), draws=True),
     ot_ode=Method(ot_ode, lambda n, start: 2 * n, (0.2,)),
-    mmps=Method(mmps, lambda n, products: n * (1 + products), (1,)),
+    mmps=Method(mmps, lambda n, products: n * (1 + products), (2,)),
 )
 
 
