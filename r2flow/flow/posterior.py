@@ -252,8 +252,6 @@ def _conjugate_gradients(multiply: Callable[[Tensor], tuple[Tensor, Tensor]], r:
     p, rr, found = r, _dot(r, r), torch.zeros(())
     enough = torch.finfo(r.dtype).eps ** 2 * rr
     for _ in range(steps):
-        if not (rr > enough).any():
-            break
         moved, q = multiply(p)
         curvature = _dot(p, q)
         step = torch.where((rr > enough) & (curvature > 0), rr / curvature, 0)

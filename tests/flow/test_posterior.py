@@ -164,7 +164,7 @@ def test_ot_ode_converges_to_the_posterior_mean_with_order_1_where_x_1_is_white(
     prior, case = white(), Case(torch.ones(WIDTH), 0.3, blur=True)
     y = case.measure(prior.sample(1, draws(4)), draws(5))
     exact, errors = prior.posterior(case.matrix, y[0], 0.3), []
-    for steps in (20, 40, 80):
+    for steps in (10, 20, 40):
         zeros = torch.zeros(1, WIDTH).double()
         found = sample_posterior(velocity_of(prior), zeros, case.measurement(y), f"ot_ode:{1 / steps}", times(steps))
         errors.append(float((found - exact.means).norm()))
