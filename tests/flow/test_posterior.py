@@ -55,7 +55,7 @@ def test_the_dense_gaussian_moves_with_its_velocity():
 def test_a_mixture_s_velocity_is_the_regression_of_x_1_minus_x_0():
     """E[(x_1 - x_0 - v) f(x_t)] = 0 for any f, by samples."""
     prior = Correlated(randn(2, 3), torch.stack([torch.eye(3).double(), 0.2 + torch.eye(3).double()]))
-    x_1, x_0 = prior.sample(200_000, draws(1)), randn(200_000, 3, seed=2)
+    x_1, x_0 = prior.sample(50_000, draws(1)), randn(50_000, 3, seed=2)
     t = torch.tensor(0.6, dtype=torch.float64)
     x = t * x_1 + (1 - t) * x_0
     rest = x_1 - x_0 - prior(t, x)
@@ -103,7 +103,7 @@ def test_the_pull_is_the_gradient_of_the_measurement_s_log_density(sigma, blur):
 
 def test_replaced_values_have_the_law_of_the_flow_s_own_state():
     """y = x_1 + sigma n: what is replaced is t x_1 with noise of a standard deviation of 1 - t."""
-    x_1, sigma, many = 0.7, 0.5, 200_000
+    x_1, sigma, many = 0.7, 0.5, 50_000
     y = x_1 + sigma * randn(many, 1)
     measured = Measurement(y, torch.ones_like(y), torch.tensor(sigma).double())
     for t in (0.2, 0.6, 0.66):  # 1 / (1 + sigma) = 2 / 3
