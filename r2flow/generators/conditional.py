@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -10,6 +11,7 @@ from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.generators.flow import RectifiedFlow
+from r2flow.lidar.interpolation import guess
 from r2flow.lidar.known import Ray
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
@@ -21,8 +23,8 @@ LAST = 1e-5  # of the time: where a known ray's velocity stops to grow
 def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
     """What is known of scans, as generators take it: `image`, `known` and `doubtful`, each (B, C, H, W) in model space.
 
-    `known` is 1 where a value was measured and `doubtful` where it was measured but is not trusted; `image` is 0 where
-    neither holds.
+    `known` is 1 where a value was measured and `doubtful` where it was measured but is not trusted; where neither
+    holds, `image` has a guess (`r2flow.lidar.interpolation.guess`), and 0 where nothing at all was measured.
 
     Args:
         images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W); 0 without a return. Of a scan without
@@ -42,12 +44,16 @@ def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
         raise InputError("a ray with a return must have a range above 0, an empty one the range 0.")
     encoding = space.encoding
     silent = encoding.reflectance and images.shape[1] == 1
-    image = encoding.encode(torch.cat([images, torch.zeros_like(images)], 1) if silent else images)
+    seen = state != Ray.UNKNOWN
+    guesses = np.stack([guess(x, m) for x, m in zip(images.cpu().numpy(), seen.cpu().numpy(), strict=True)])
+    filled = torch.where(seen[:, None], images, torch.from_numpy(guesses).to(images))
+    image = encoding.encode(torch.cat([filled, torch.zeros_like(filled)], 1) if silent else filled)
+    image = image * seen.flatten(1).any(1)[:, None, None, None]
     said = torch.ones_like(image)
     if silent:
         said[:, -1] = (~returned).to(said)
-    measured, trusted = (state != Ray.UNKNOWN)[:, None] * said, (state != Ray.DOUBTFUL)[:, None]
-    return {IMAGE: image * measured, KNOWN: measured * trusted, DOUBTFUL: measured * ~trusted}
+    measured, trusted = seen[:, None] * said, (state != Ray.DOUBTFUL)[:, None]
+    return {IMAGE: image, KNOWN: measured * trusted, DOUBTFUL: measured * ~trusted}
 
 
 def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -126,7 +132,9 @@ class Regression(ConditionalFlow):
         """x_1, (B, C, H, W), of the shape and type of `like`."""
         image, known, doubtful = parts_of(condition, like)
         t = torch.ones(len(like), device=like.device)
-        found: Tensor = self.backbone(t, torch.cat([torch.zeros_like(image), image, known, doubtful], dim=1))
+        told = (known + doubtful).flatten(1).any(1)[:, None, None, None]
+        begun = torch.where(told, image, -1.0)  # tokens of zeros have no finite gradient in a norm
+        found: Tensor = self.backbone(t, torch.cat([begun, image, known, doubtful], dim=1))
         return torch.where(known > 0, image, found)
 
     @torch.no_grad()
