@@ -107,8 +107,8 @@ def points_through(points: Points, fired: Fired, target: Sensor, reflectance: np
     if not (row >= 0).any():
         edges = target.row_edges
         raise InputError(
-            f"the scan's beams look from {seen.max():+.1f} to {seen.min():+.1f} degrees, and none of them into the view "
-            f"of sensor '{target.name}', {edges[0]:+.1f} to {edges[-1]:+.1f} degrees."
+            f"the scan's beams look from {seen.max():+.1f} to {seen.min():+.1f} degrees, none of them into the view of "
+            f"sensor '{target.name}', {edges[0]:+.1f} to {edges[-1]:+.1f} degrees."
         )
     lost = [(r, _without_return(azimuth[some], fired.steps)) for r, some in zip(row, by_beam, strict=True) if r >= 0]
     empty = np.zeros(target.shape, dtype=bool)

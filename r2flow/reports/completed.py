@@ -1,6 +1,7 @@
 """Completed scans as files and pictures."""
 
 import json
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,22 +20,16 @@ from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.generators import Sampler
 from r2flow.lidar.known import Mask, Ray
-from r2flow.lidar.projection import image_to_points, unproject
+from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.transfer import Partial
+from r2flow.metrics.completion import errors
 from r2flow.reports.outputs import ScanBar, keep_note, warn_unsolved
-from r2flow.reports.pictures import (
-    BACKGROUND,
-    FOREGROUND,
-    dark_figure,
-    draw_birds_eye,
-    draw_perspective,
-    draw_range,
-    draw_reflectance,
-    draw_values,
-    save_figure,
-)
-from r2flow.reports.view import most_images, write_page
+from r2flow.reports.pictures import completed_figure, save_figure
+from r2flow.reports.view import write_page
+
+log = logging.getLogger(__name__)
 
 WRITTEN = (".bin", ".pcd", ".ply", ".npy")  # formats that answers are written in; others become .ply
 SHOWN = 4  # answers on a page
@@ -57,23 +52,6 @@ class Job:
     batch_size: int = 1
 
 
-@dataclass(frozen=True)
-class Error:
-    """Distance of answers from the rays of a scan that a mask has hidden, the mean over the answers.
-
-    Attributes:
-        rays: Hidden rays of the scan.
-        mae: Mean absolute error of the range in metres over them, 0 m standing for no return.
-        both: The same over those that have a return in the scan and in the answer; NaN without any.
-        wrong: Share of the hidden rays that have a return in the scan or in the answer alone.
-    """
-
-    rays: int
-    mae: float
-    both: float
-    wrong: float
-
-
 def write_completed(
     checkpoint: Checkpoint,
     scans: Sequence[PartialScan],
@@ -81,7 +59,7 @@ def write_completed(
     job: Job,
     sampler: Sampler,
     about: Mapping[str, Any],
-) -> dict[str, Error | None]:
+) -> dict[str, dict[str, float] | None]:
     """Complete scans and write their answers, the spread between these, a picture and a page in 3-D of each.
 
     A scan whose files are all there is finished and passed over. Its picture is written last.
@@ -90,7 +68,8 @@ def write_completed(
         about: What else decides the answers, as plain values, by which a folder is told from another.
 
     Returns:
-        The scans that were completed now, by name, with their errors where a mask has hidden some of their rays.
+        The scans that were completed now, by name, with the mean `errors` of their answers where a mask has hidden
+        some of their rays, else None.
 
     Raises:
         InputError: a folder that holds other answers, or a scan that cannot be completed.
@@ -104,7 +83,8 @@ def write_completed(
         for path in answer_files(checkpoint, scan, out, job.num):
             if path.resolve() in inputs:
                 raise InputError(f"{path} is one of the scans and would be replaced; give another --out.")
-    found: dict[str, Error | None] = {}
+    found: dict[str, dict[str, float] | None] = {}
+    known = []
     batches = math.ceil(job.num / job.batch_size) * checkpoint.generator.evaluations_of(sampler)
     with ScanBar("completing", len(left), len(left) * batches) as bar:
         for number, scan in left:
@@ -116,11 +96,17 @@ def write_completed(
                 batch_size=job.batch_size, first=number, progress=bar.evaluated,
             )  # fmt: skip
             if not found:  # the first answer shows that the settings can be used
-                keep_note(checkpoint, out, **{**sampler.asdict(), "seed": job.seed}, **{"completion": settings})
+                keep_note(checkpoint, out, job.seed, {"completion": settings}, **sampler.asdict())
             warn_unsolved(made.converged)
             _write(checkpoint, scan, out, given, made, job, whole if job.mask else None)
-            found[scan.name] = hidden_error(whole, given, made.images) if job.mask else None
+            found[scan.name] = hidden_errors(whole, given, made, checkpoint.sensor) if job.mask else None
+            known += [] if made.evaluations.any() else [scan.name]
             bar.finished(len(found))
+    if known:
+        log.warning(
+            "%s: everything is known, so it came back as it was given; --mask hides a part, --keep blend mends it",
+            known[0] if len(known) == 1 else f"{len(known)} scans",
+        )  # fmt: skip
     return found
 
 
@@ -132,7 +118,7 @@ def masked(scan: Partial, mask: Mask | None, number: int, seed: int, name: str) 
     """
     if mask is None:
         return scan
-    kept = torch.from_numpy(mask(scan.state.shape, noise.generator(seed, "condition", number))).numpy()  # type: ignore[arg-type]
+    kept = torch.from_numpy(mask(scan.state.shape, noise.generator(seed, "condition", number))).numpy()
     measured = scan.state != Ray.UNKNOWN
     for wrong, what in ((not (measured & kept).any(), "nothing"), (not (measured & ~kept).any(), "everything")):
         if wrong:
@@ -142,16 +128,13 @@ def masked(scan: Partial, mask: Mask | None, number: int, seed: int, name: str) 
     return Partial(scan.image * kept, state, xyz, scan.outside)
 
 
-def hidden_error(whole: Partial, given: Partial, answers: torch.Tensor) -> Error:
-    """How far answers, (num, 2 or 1, H, W), are from what a mask has hidden of a scan."""
-    hidden = (whole.state != Ray.UNKNOWN) & (given.state == Ray.UNKNOWN)
-    truth, found = whole.image[0][hidden].astype(np.float64), answers[:, 0].numpy()[:, hidden].astype(np.float64)
-    apart = np.abs(found - truth)
-    both = (found > 0) & (truth > 0)
-    return Error(
-        int(hidden.sum()), float(apart.mean()), float(apart[both].mean()) if both.any() else math.nan,
-        float(((found > 0) != (truth > 0)).mean()),
-    )  # fmt: skip
+def hidden_errors(whole: Partial, given: Partial, made: Completed, sensor: Sensor) -> dict[str, float]:
+    """How far answers are from what a mask has hidden of a scan: means over the answers of `errors`."""
+    measured = whole.state != Ray.UNKNOWN
+    hidden = measured & (given.state == Ray.UNKNOWN)
+    # What no scan has measured, nobody knows: there an answer is neither right nor wrong.
+    each = [errors(whole.image, image * measured, hidden, sensor) for image in made.images.numpy()]
+    return {name: float(np.mean([one[name] for one in each])) for name in each[0]}
 
 
 def answer_ending(checkpoint: Checkpoint, scan: PartialScan) -> str:
@@ -186,7 +169,9 @@ def _refuse_others(out: Path, settings: Mapping[str, Any]) -> None:
     wrong = next((key for key in ours if there.get(key) != ours[key]), None)
     if wrong is not None:
         found, asked = (json.dumps(one) for one in (there.get(wrong), ours[wrong]))
-        raise InputError(f"{out} holds scans that were completed with {wrong} {found}, not {asked}; give another --out.")
+        raise InputError(
+            f"{out} holds scans that were completed with {wrong} {found}, not {asked}; give another --out."
+        )
 
 
 def _write(
@@ -198,37 +183,26 @@ def _write(
     job: Job,
     truth: Partial | None,
 ) -> None:
-    rays = checkpoint.sensor.rays()
-    kept = given.xyz if job.keep == "exact" else None
-    for path, image in zip(answer_files(checkpoint, scan, out, job.num), made.images.numpy(), strict=True):
-        if path.suffix == ".npy" and scan.path is None or path.suffix == ".npy" and given.xyz is None:
+    rays, answers = checkpoint.sensor.rays(), made.images.numpy()
+    measured = None
+    if given.xyz is not None and job.keep == "exact":
+        measured = given.xyz * (given.state == Ray.RETURN)
+    for path, image in zip(answer_files(checkpoint, scan, out, job.num), answers, strict=True):
+        if path.suffix == ".npy" and given.xyz is None:  # of a range image
             with atomic_write(path) as file:
                 np.save(file, image)
         else:
-            write_points(path, *_cloud(image, rays, given, kept))
+            xyz, reflectance = image_to_points(image, rays, measured)
+            write_points(path, xyz, reflectance if len(image) > 1 else None)
     if job.num > 1:
-        deviation, returned = made.spread.numpy()
         with atomic_write(out / f"{scan.name}.spread.npz") as file:
-            np.savez_compressed(file, deviation=deviation, returned=returned)
-    rows = [("what is known", given.image), ("an answer", made.images[0].numpy())]
-    rows += [("another answer", made.images[1].numpy())] if job.num > 1 else []
-    rows += [("the whole scan", truth.image)] if truth else []
-    more = [(f"answer {number}", image) for number, image in enumerate(made.images[:SHOWN].numpy())]
-    seen = [rows[0], *more, *rows[-1:]] if truth else [rows[0], *more]
-    seen = seen[: most_images(rays.shape)]
-    stem = _picture(scan, out)
-    captions, images = [f"{scan.name}: {said}" for said, _ in seen], [image for _, image in seen]
-    write_page(stem.with_suffix(".html"), images, rays, captions, title=scan.name)
-    save_figure(completed_figure(rows, given.state, made if job.num > 1 else None, rays, scan.name), stem)
-
-
-def _cloud(
-    image: np.ndarray, rays: torch.Tensor, given: Partial, kept: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points of an answer: measured ones where they were, the others along the middles of the pixels."""
-    xyz = unproject(torch.from_numpy(image[None, :1]), rays)[0].numpy()
-    if kept is not None:
-        xyz = np.where(given.state == Ray.RETURN, kept, xyz)
-    returned = image[0] > 0
-    points = np.ascontiguousarray(xyz[:, returned].T)
-    return points, np.ascontiguousarray(image[1][returned]) if len(image) > 1 else None
+            np.savez_compressed(file, **dict(zip(("deviation", "returned"), made.spread.numpy(), strict=True)))
+    rows = [("what is known", given.image), *((f"answer {number}", image) for number, image in enumerate(answers))]
+    rows = rows[: 1 + SHOWN] + ([("the whole scan", truth.image)] if truth else [])
+    picture = _picture(scan, out)
+    write_page(
+        picture.with_suffix(".html"), [image for _, image in rows], rays, [name for name, _ in rows], title=scan.name
+    )
+    drawn = [row for row in rows if row[0] not in ("answer 2", "answer 3")]
+    spread = made.spread.numpy() if job.num > 1 else None
+    save_figure(completed_figure(drawn, given.state == Ray.UNKNOWN, rays, scan.name, spread), picture)
