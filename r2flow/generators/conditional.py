@@ -1,12 +1,13 @@
 """Generators that are told a part of the scan: rays that are known, and rays that were measured but are not trusted."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from r2flow.backbones import Backbone
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
@@ -106,16 +107,28 @@ class ConditionalFlow(RectifiedFlow):
         image, known, _ = parts_of(condition, made.x)
         return Generated(torch.where(known > 0, image, made.x), made.evaluations, made.converged)
 
-    def start_from(self, parent: Generator) -> None:
-        """Take over a flow's weights; those of what it was never told begin at zero and change nothing at first."""
-        own, theirs = self.state_dict(), dict(parent.state_dict())
-        channels, more = self.space.shape[0], self.condition_channels
-        for name, value in theirs.items():
-            wanted = own[name].shape if name in own else value.shape
-            if value.ndim > 1 and wanted != value.shape and wanted == (len(value), value.shape[1] + more, *wanted[2:]):
-                unseen = value.new_zeros(len(value), more, *value.shape[2:])
-                theirs[name] = torch.cat([value[:, :channels], unseen, value[:, channels:]], dim=1)
-        self._take_flow(parent, theirs)
+    def untold(self) -> RectifiedFlow:
+        flow = RectifiedFlow.__new__(RectifiedFlow)
+        nn.Module.__init__(flow)
+        flow.space, flow.noise_shape, flow.sampler = self.space, self.noise_shape, self.sampler
+        flow.backbone = cast(Backbone, _Untold(self.backbone, self.condition_channels))
+        return flow.train(self.training)
+
+
+class _Untold(nn.Module):
+    """v(t, x) of a network with further input channels, of which nothing is known."""
+
+    second_time = False
+
+    def __init__(self, backbone: Backbone, channels: int) -> None:
+        super().__init__()
+        self.backbone, self.channels = backbone, channels
+        self.in_channels, self.coords, self.unit = backbone.in_channels - channels, backbone.coords, backbone.unit
+
+    def forward(self, t: Tensor, x: Tensor) -> Tensor:
+        unknown = x.new_zeros(x.shape[0], self.channels, x.shape[2], x.shape[3])
+        v: Tensor = self.backbone(t, torch.cat([x, unknown], dim=1))
+        return v
 
 
 class Regression(ConditionalFlow):

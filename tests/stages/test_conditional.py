@@ -208,3 +208,18 @@ def test_the_twin_has_one_way_to_be_run_and_ignores_the_noise(scans):
     assert one.evaluations.tolist() == [1, 1, 1]
     with pytest.raises(InputError, match="one way only"):
         generator.check_sampler(Sampler("euler", 4))
+
+
+def test_told_nothing_it_is_a_plain_flow(flow):
+    x, t, x_0 = torch.randn(2, 2, 8, 32), torch.tensor([0.2, 0.7]), Draws(0, range(2)).start((2, 8, 32))
+    plain = flow.untold()
+    assert torch.equal(plain.velocity(t, x), flow.velocity(t, x))
+    assert torch.equal(plain.generate(x_0).x, flow.generate(x_0).x)
+
+
+def test_a_plain_flow_that_starts_from_it_forgets_the_condition(flow):
+    plain = built("rectified_flow")
+    plain.start_from(flow)
+    x, t = torch.randn(2, 2, 8, 32), torch.tensor([0.2, 0.7])
+    with torch.no_grad():
+        assert torch.allclose(plain.velocity(t, x), flow.velocity(t, x), atol=1e-6)
