@@ -53,6 +53,7 @@ class AnswerOptions:
         int | None, typer.Option("--scans", min=1, help="The most scans of each folder, evenly spread; all.")
     ] = None
     batch_size: Annotated[int, typer.Option(min=1, help="Answers at once.")] = 1
+    pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture and a page in 3-D.")] = 8
     device: DeviceOption = "auto"
 
 
@@ -71,7 +72,7 @@ def complete(
 ) -> None:
     """Complete scans: from fewer beams to more, from a part to the whole, from a bad measurement to a good one.
 
-    Each scan becomes files of its own format, a picture and a page in 3-D. The same command goes on where it stopped.
+    Answers are files of the scan's own format. The same command goes on where it stopped.
     """
     from dataclasses import replace
 
@@ -105,7 +106,7 @@ def complete(
     if not loaded.encoding.reflectance:
         print("the model is of range alone: answers have no reflectance")
     keep = "blend" if known.doubtful else known.keep
-    job = Job(answers.num, answers.seed, keep, mask, answers.batch_size)
+    job = Job(answers.num, answers.seed, keep, mask, answers.batch_size, answers.pictures)
     about = {"mask": known.mask, "from": known.source}
     found = write_completed(loaded, scans, out, job, sampler, about)
     there = len(scans) - len(found)

@@ -43,12 +43,14 @@ class PartialScan:
         ending: Of its file; `.npy` of an image.
         read: What is known of it.
         path: Its file; None where it has none of its own.
+        image: Whether it is a range image, as its answers are then, or points.
     """
 
     name: str
     ending: str
     read: Callable[[], Partial]
     path: Path | None = None
+    image: bool = True
 
 
 def open_partial(
@@ -129,7 +131,9 @@ def _files(
     elif source and not _same_image(source, target):
         said.append(_described(spec, np.asarray(source.elevations), source, target))
     return [
-        PartialScan(_name(path, folder), _ending(path), partial(read if path in images else by_points, path), path)
+        PartialScan(_name(path, folder), _ending(path), partial(read, path), path)
+        if path in images
+        else PartialScan(_name(path, folder), _ending(path), partial(by_points, path), path, image=False)
         for path in paths
     ]
 

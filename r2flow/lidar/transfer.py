@@ -157,7 +157,7 @@ def points_of_same(
     image = image_of(target, hit, r, None if reflectance is None else reflectance[chosen])
     state = np.where(image[0] > 0, int(Ray.RETURN), int(Ray.EMPTY)).astype(np.uint8)
     returned = points.xyz[:, :2].any(axis=1)
-    state[:, _blind(_azimuth(points.xyz[returned]), target.shape[1], 0.0)] = Ray.UNKNOWN
+    state[:, _blind(_azimuth(points.xyz[returned]), target.shape[1], 3 * 360 / target.shape[1])] = Ray.UNKNOWN
     return Partial(image if reflectance is not None else image[:1], state, _spread(target, hit, points.xyz[chosen]))
 
 

@@ -43,6 +43,7 @@ class Job:
         num: Answers to each scan.
         keep: As in `r2flow.completion.complete`.
         mask: Of the measured rays of each scan those that are kept; None for all.
+        pictures: How many scans get a picture and a page in 3-D.
     """
 
     num: int = 1
@@ -50,6 +51,7 @@ class Job:
     keep: str = "exact"
     mask: Mask | None = None
     batch_size: int = 1
+    pictures: int = 8
 
 
 def write_completed(
@@ -60,9 +62,9 @@ def write_completed(
     sampler: Sampler,
     about: Mapping[str, Any],
 ) -> dict[str, dict[str, float] | None]:
-    """Complete scans and write their answers, the spread between these, a picture and a page in 3-D of each.
+    """Complete scans and write their answers, the spread between these, pictures and pages in 3-D.
 
-    A scan whose files are all there is finished and passed over. Its picture is written last.
+    A scan whose answers are all there is finished and passed over: they are written last.
 
     Args:
         about: What else decides the answers, as plain values, by which a folder is told from another.
@@ -77,7 +79,11 @@ def write_completed(
     asked = {"num": job.num, "seed": job.seed, "keep": job.keep, "weights": weights_hash(checkpoint), **about}
     settings = {**asked, "sampler": sampler.asdict()}
     _refuse_others(out, settings)
-    left = [(number, scan) for number, scan in enumerate(scans) if not _picture(scan, out).is_file()]
+    left = [
+        (number, scan)
+        for number, scan in enumerate(scans)
+        if not all(path.is_file() for path in answer_files(checkpoint, scan, out, job.num))
+    ]
     inputs = {scan.path.resolve() for scan in scans if scan.path}
     for _, scan in left:
         for path in answer_files(checkpoint, scan, out, job.num):
@@ -98,7 +104,9 @@ def write_completed(
             if not found:  # the first answer shows that the settings can be used
                 keep_note(checkpoint, out, job.seed, {"completion": settings}, **sampler.asdict())
             warn_unsolved(made.converged)
-            _write(checkpoint, scan, out, given, made, job, whole if job.mask else None)
+            if number < job.pictures:
+                _draw(checkpoint, scan, out, given, made, whole if job.mask else None)
+            _write(checkpoint, scan, out, given, made, job)
             found[scan.name] = hidden_errors(whole, given, made, checkpoint.sensor) if job.mask else None
             known += [] if made.evaluations.any() else [scan.name]
             bar.finished(len(found))
@@ -151,10 +159,6 @@ def answer_files(checkpoint: Checkpoint, scan: PartialScan, out: Path, num: int)
     return [out / f"{scan.name}{number}{ending}" for number in numbers]
 
 
-def _picture(scan: PartialScan, out: Path) -> Path:
-    return out / f"{scan.name}.png"
-
-
 def _refuse_others(out: Path, settings: Mapping[str, Any]) -> None:
     note = out / SAMPLES
     if not note.exists():
@@ -174,35 +178,33 @@ def _refuse_others(out: Path, settings: Mapping[str, Any]) -> None:
         )
 
 
-def _write(
-    checkpoint: Checkpoint,
-    scan: PartialScan,
-    out: Path,
-    given: Partial,
-    made: Completed,
-    job: Job,
-    truth: Partial | None,
-) -> None:
-    rays, answers = checkpoint.sensor.rays(), made.images.numpy()
-    measured = None
-    if given.xyz is not None and job.keep == "exact":
-        measured = given.xyz * (given.state == Ray.RETURN)
-    for path, image in zip(answer_files(checkpoint, scan, out, job.num), answers, strict=True):
-        if path.suffix == ".npy" and given.xyz is None:  # of a range image
-            with atomic_write(path) as file:
-                np.save(file, image)
-        else:
-            xyz, reflectance = image_to_points(image, rays, measured)
-            write_points(path, xyz, reflectance if len(image) > 1 else None)
+def _write(checkpoint: Checkpoint, scan: PartialScan, out: Path, given: Partial, made: Completed, job: Job) -> None:
     if job.num > 1:
         with atomic_write(out / f"{scan.name}.spread.npz") as file:
             np.savez_compressed(file, **dict(zip(("deviation", "returned"), made.spread.numpy(), strict=True)))
-    rows = [("what is known", given.image), *((f"answer {number}", image) for number, image in enumerate(answers))]
-    rows = rows[: 1 + SHOWN] + ([("the whole scan", truth.image)] if truth else [])
-    picture = _picture(scan, out)
-    write_page(
-        picture.with_suffix(".html"), [image for _, image in rows], rays, [name for name, _ in rows], title=scan.name
-    )
-    drawn = [row for row in rows if row[0] not in ("answer 2", "answer 3")]
-    spread = made.spread.numpy() if job.num > 1 else None
-    save_figure(completed_figure(drawn, given.state == Ray.UNKNOWN, rays, scan.name, spread), picture)
+    measured = None
+    if given.xyz is not None and job.keep == "exact":
+        measured = given.xyz * (given.state == Ray.RETURN)
+    for path, image in zip(answer_files(checkpoint, scan, out, job.num), made.images.numpy(), strict=True):
+        if scan.image:
+            with atomic_write(path) as file:
+                np.save(file, image)
+        else:
+            xyz, reflectance = image_to_points(image, checkpoint.sensor.rays(), measured)
+            write_points(path, xyz, reflectance if len(image) > 1 else None)
+
+
+def _draw(
+    checkpoint: Checkpoint, scan: PartialScan, out: Path, given: Partial, made: Completed, truth: Partial | None
+) -> None:
+    """`NAME.png` with two answers, `NAME.html` with more."""
+    rays, answers = checkpoint.sensor.rays(), made.images.numpy()
+    known = [("what is known", given.image)]
+    whole = [("the whole scan", truth.image)] if truth else []
+    rows = [(f"answer {number}", image) for number, image in enumerate(answers[:SHOWN])]
+    named = [*known, *rows, *whole]
+    page = out / f"{scan.name}.html"
+    write_page(page, [image for _, image in named], rays, [name for name, _ in named], title=scan.name)
+    spread = made.spread.numpy() if len(answers) > 1 else None
+    figure = completed_figure([*known, *rows[:2], *whole], given.state == Ray.UNKNOWN, rays, scan.name, spread)
+    save_figure(figure, out / f"{scan.name}.png")
