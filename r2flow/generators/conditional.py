@@ -1,19 +1,24 @@
 """Generators that are told a part of the scan: rays that are known, and rays that were measured but are not trusted."""
 
 from collections.abc import Mapping
-from typing import Any, cast
+from copy import deepcopy
+from itertools import pairwise
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones import Backbone
+from r2flow.backbones.convolutions import RingConv2d, zero_convolution
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.generators.flow import RectifiedFlow
 from r2flow.lidar.interpolation import guess
 from r2flow.lidar.known import Ray
+from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 
@@ -73,24 +78,65 @@ def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor, Te
     return image, known, doubtful
 
 
+class Trust(nn.Module):
+    """How far the guess of a condition holds, pixel by pixel: 3 x 3 convolutions on the condition.
+
+    Args:
+        channels: C of the image.
+        width: Of the hidden layers.
+    """
+
+    FINEST = 1e-3  # of sigma in model space, 0.2 % of a range on the paper's logarithmic scale
+
+    def __init__(self, channels: int, width: int = 24) -> None:
+        super().__init__()
+        sizes = [3 * channels, width, width, width]
+        self.layers = nn.ModuleList([RingConv2d(before, after, ring=True) for before, after in pairwise(sizes)])
+        self.answer = zero_convolution(RingConv2d(width, 2 * channels, ring=True))
+
+    def forward(self, told: Tensor) -> tuple[Tensor, Tensor]:
+        """`image`, `known` and `doubtful`, (B, 3 C, H, W), to weights in (0, 1) and sigma, (B, C, H, W) each."""
+        h = told
+        for layer in self.layers:
+            h = F.silu(layer(h))
+        weight, spread = self.answer(h).float().chunk(2, dim=1)
+        return weight.sigmoid(), (spread - 2.5).exp() + self.FINEST
+
+
 class ConditionalFlow(RectifiedFlow):
     """v(t, x | y) of a network that also sees what is known, y: one model for any mask, none and all included.
 
-    A known value has the exact velocity of its straight line, (y - x) / (1 - t), and arrives as it was given. The
-    condition is that of `condition_of`; None draws a scan of which nothing is known.
+    A known value has the exact velocity of its straight line, (y - x) / (1 - t), and arrives as it was given. Elsewhere
+    the network's velocity is mixed with that of N(g, sigma^2) about the guess g of the condition,
+
+        v = (1 - w) F(t, x, y) + w [g + skip(t, sigma) (x - t g)],
+
+    `skip` that of `r2flow.backbones.base.precondition`; w and sigma by `Trust`. So where interpolation holds, the model
+    need not learn it again. The condition is that of `condition_of`; None draws a scan of which nothing is known, by F
+    alone.
     """
+
+    trusts: ClassVar[bool] = True
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         self.condition_channels = 3 * space.shape[0]
         super().__init__(space, backbone)
+        if self.trusts:
+            self.trust = Trust(space.shape[0])
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         image, known, doubtful = parts_of(condition, x)
         v: Tensor = self.backbone(t, torch.cat([x, image, known, doubtful], dim=1))
         if condition is None:
             return v
-        left = expand_time(1 - torch.as_tensor(t, device=x.device), x).clamp(min=LAST)
-        return torch.where(known > 0, ((image - x) / left).to(v), v)
+        weight, sigma = self.trust(torch.cat([image, known, doubtful], dim=1))
+        weight = weight * (known + doubtful).flatten(1).any(1)[:, None, None, None]
+        t = expand_time(torch.as_tensor(t, device=x.device, dtype=torch.float32), x)
+        left = 1 - t
+        skip = (t * sigma.square() - left) / ((t * sigma).square() + left.square())
+        about = image + skip * (x - t * image)
+        mixed = v + weight * (about - v)
+        return torch.where(known > 0, (image - x) / left.clamp(min=LAST), mixed).to(v)
 
     def generate(
         self,
@@ -106,6 +152,15 @@ class ConditionalFlow(RectifiedFlow):
             return made
         image, known, _ = parts_of(condition, made.x)
         return Generated(torch.where(known > 0, image, made.x), made.evaluations, made.converged)
+
+    def part(self, region: Region) -> RectifiedFlow:
+        part = super().part(region)
+        if self.trusts and part is not self:
+            part.trust = deepcopy(self.trust)
+            for layer in part.trust.modules():
+                if isinstance(layer, RingConv2d) and region.width < region.shape[1]:
+                    layer.open_ring()
+        return part
 
     def untold(self) -> RectifiedFlow:
         flow = RectifiedFlow.__new__(RectifiedFlow)
@@ -136,6 +191,8 @@ class Regression(ConditionalFlow):
 
     Learned by absolute error it is the median of each value; it draws nothing.
     """
+
+    trusts = False
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space, backbone)

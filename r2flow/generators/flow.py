@@ -138,8 +138,10 @@ class RectifiedFlow(Flow):
         theirs = {
             name: _with_inputs(value, own[name].shape, self.space.shape[0], more) if name in own else value
             for name, value in parent.state_dict().items()
+            if name in own or name.startswith("backbone.")
         }
-        new = {name: own[name] for name in (f"backbone.{name}" for name in self.backbone.second_time_names())}
+        new = {name: value for name, value in own.items() if not name.startswith("backbone.")}
+        new |= {name: own[name] for name in (f"backbone.{name}" for name in self.backbone.second_time_names())}
         if not torch.equal(self.space.rays, parent.space.rays):
             theirs = {**theirs, "backbone.coords": own["backbone.coords"]}
             sized = [name for name, value in theirs.items() if name in own and value.shape != own[name].shape]
