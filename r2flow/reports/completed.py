@@ -79,21 +79,18 @@ def write_completed(
     asked = {"num": job.num, "seed": job.seed, "keep": job.keep, "weights": weights_hash(checkpoint), **about}
     settings = {**asked, "sampler": sampler.asdict()}
     _refuse_others(out, settings)
-    left = [
-        (number, scan)
-        for number, scan in enumerate(scans)
-        if not all(path.is_file() for path in answer_files(checkpoint, scan, out, job.num))
-    ]
+    files = [answer_files(checkpoint, scan, out, job.num) for scan in scans]
     inputs = {scan.path.resolve() for scan in scans if scan.path}
-    for _, scan in left:
-        for path in answer_files(checkpoint, scan, out, job.num):
-            if path.resolve() in inputs:
-                raise InputError(f"{path} is one of the scans and would be replaced; give another --out.")
+    replaced = [path for paths in files for path in paths if path.resolve() in inputs]
+    if replaced:
+        raise InputError(f"{replaced[0]} is one of the scans and would be replaced; give another --out.")
+    left = [number for number, paths in enumerate(files) if not all(path.is_file() for path in paths)]
     found: dict[str, dict[str, float] | None] = {}
     known = []
     batches = math.ceil(job.num / job.batch_size) * checkpoint.generator.evaluations_of(sampler)
     with ScanBar("completing", len(left), len(left) * batches) as bar:
-        for number, scan in left:
+        for number in left:
+            scan = scans[number]
             whole = scan.read()
             given = masked(whole, job.mask, number, job.seed, scan.name)
             images, state = torch.from_numpy(given.image)[None], torch.from_numpy(given.state)[None]
@@ -106,7 +103,7 @@ def write_completed(
             warn_unsolved(made.converged)
             if number < job.pictures:
                 _draw(checkpoint, scan, out, given, made, whole if job.mask else None)
-            _write(checkpoint, scan, out, given, made, job)
+            _write(checkpoint, scan, out, files[number], given, made, job.keep)
             found[scan.name] = hidden_errors(whole, given, made, checkpoint.sensor) if job.mask else None
             known += [] if made.evaluations.any() else [scan.name]
             bar.finished(len(found))
@@ -178,14 +175,23 @@ def _refuse_others(out: Path, settings: Mapping[str, Any]) -> None:
         )
 
 
-def _write(checkpoint: Checkpoint, scan: PartialScan, out: Path, given: Partial, made: Completed, job: Job) -> None:
-    if job.num > 1:
+def _write(
+    checkpoint: Checkpoint,
+    scan: PartialScan,
+    out: Path,
+    files: Sequence[Path],
+    given: Partial,
+    made: Completed,
+    keep: str,
+) -> None:
+    if len(files) > 1:
+        deviation, returned = made.spread.numpy()
         with atomic_write(out / f"{scan.name}.spread.npz") as file:
-            np.savez_compressed(file, **dict(zip(("deviation", "returned"), made.spread.numpy(), strict=True)))
+            np.savez_compressed(file, deviation=deviation, returned=returned)
     measured = None
-    if given.xyz is not None and job.keep == "exact":
+    if given.xyz is not None and keep == "exact":
         measured = given.xyz * (given.state == Ray.RETURN)
-    for path, image in zip(answer_files(checkpoint, scan, out, job.num), made.images.numpy(), strict=True):
+    for path, image in zip(files, made.images.numpy(), strict=True):
         if scan.image:
             with atomic_write(path) as file:
                 np.save(file, image)
