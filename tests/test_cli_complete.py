@@ -90,7 +90,10 @@ def test_a_sparser_sensor_is_found_and_its_points_come_back(r2flow, run, tmp_pat
         *COMPLETE, tmp_path / "in", "-c", run, "--to", "hdl64e", "--num", 2, "--out", tmp_path / "out"
     )
     assert code == 0
-    assert "16 beams from +15.1 to -14.9 degrees; 6 of the 8 rows of hdl64e are measured, 7 beams look past" in said
+    assert (
+        "vlp16 with 16 beams from +15.1 to -14.9 degrees; 6 of the 8 rows of hdl64e are measured, 7 beams look past"
+        in said
+    )
     answers = [read_points(tmp_path / "out" / f"room_{a}.pcd") for a in range(2)]
     for answer in answers:
         same = {tuple(p) for p in answer.xyz} & {tuple(p) for p in xyz.astype(np.float32)}

@@ -119,17 +119,18 @@ def _files(
     by_points = read
     if points := [path for path in paths if path not in images]:
         some = [read_points(points[number], reading.columns) for number in spread(len(points), LOOKED_AT)]
-        own = _same_view(source, target) if source else other_sensor(some, target) is None
-        if own:
+        doubt = None if source else other_sensor(some, target)
+        if _same_view(source, target) if source else doubt is None:
             full = scale or (1.0 if noted else usual_scale(spec, source or target))
             by_points = partial(_read_same, reading=reading, scale=full)
         else:
             fired, strength = _firing(spec, some, source), reflectance_of(some)
             full = scale or (source and source.reflectance_scale) or (strength.scale if strength else 1.0)
             by_points = partial(_read_other, reading=reading, fired=fired, scale=full, strict=scale is not None)
-            said.append(_described(spec, fired.elevations, source, target, some))
+            name = source.name if source else (doubt and doubt.name) or "a sensor"
+            said.append(_described(spec, fired.elevations, name, target))
     elif source and not _same_image(source, target):
-        said.append(_described(spec, np.asarray(source.elevations), source, target))
+        said.append(_described(spec, np.asarray(source.elevations), source.name, target))
     return [
         PartialScan(_name(path, folder), _ending(path), partial(read, path), path)
         if path in images
@@ -146,7 +147,7 @@ def _images(spec: str, reading: Reading, source: Sensor | None, most: int | None
     opened = open_scans(spec, how, num=(most or FEW) if simulated else None)
     scans = opened.spread(most or len(opened)).source
     if not _same_image(how.sensor, target):
-        said.append(_described(spec, np.asarray(how.sensor.elevations), how.sensor, target))
+        said.append(_described(spec, np.asarray(how.sensor.elevations), how.sensor.name, target))
     kind = spec.replace(":", "-") if simulated else Path(spec).name
     return [
         PartialScan(f"{kind}-{number:06d}", ".npy", partial(_read_set, scans, number, how.sensor, target))
@@ -161,16 +162,13 @@ def _firing(spec: str, some: list[Points], source: Sensor | None) -> Fired:
         raise InputError(f"{spec}: the sensor of the scans is not known, name it by --from: {error}") from None
 
 
-def _described(
-    spec: str, elevations: np.ndarray, source: Sensor | None, target: Sensor, some: Sequence[Points] = ()
-) -> str:
+def _described(spec: str, elevations: np.ndarray, name: str, target: Sensor) -> str:
     """In a line: the sensor, how many rows it measures, what is left out.
 
     Raises:
         InputError: no beam looks into the model's view.
     """
     rows = rows_of(elevations, target)
-    name = "a sensor" if source is None else source.name
     beams = f"{name} with {len(elevations)} beams from {elevations[0]:+.1f} to {elevations[-1]:+.1f} degrees"
     if not (rows >= 0).any():
         edges = target.row_edges
