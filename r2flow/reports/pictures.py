@@ -116,7 +116,7 @@ def completed_figure(
     if spread is not None:
         shown = (
             ("deviation of the range, 0 to 5 m", spread[0], 5.0),
-            ("share of answers with a return", spread[1], 1.0),
+            ("share of answers with a return, 0 to 1", spread[1], 1.0),
         )
         for (name, values, most), place in zip(shown, (grid[-1, 0], grid[-1, 1:]), strict=True):
             axes = figure.add_subplot(place)
