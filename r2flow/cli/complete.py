@@ -94,10 +94,9 @@ def complete(
     source = None if known.source is None else build_sized(known.source, None)
     loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(answers.device))
     _check_target(loaded, known.target)
-    usual = completing(loaded.generator)
-    sampler = completing(loaded.generator, solver.change(usual))
     reading = replace(reading_of_flow(loaded), columns=named_columns(known.columns))
     scans, said = open_partial(what, reading, source, known.reflectance_scale, answers.scans)
+    sampler = completing(loaded.generator, solver.change(completing(loaded.generator)))
     for line in said:
         print(line)
     for ending in sorted({scan.ending for scan in scans if answer_ending(loaded, scan) != scan.ending}):
