@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.solvers import check_method
+from r2flow.flow.posterior import completes
 from r2flow.generators import Condition, ConditionalFlow, Flow, Generator, Sampler, condition_of
 from r2flow.generators.base import Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
@@ -152,7 +152,8 @@ def _answers(
     progress: Progress,
 ) -> Iterator[Completed]:
     told = [_told(condition, i) for i in range(len(images))]
-    plain = _sampling(generator, how)
+    # A method that reads the condition has nothing to do without one.
+    plain = generator.sampler if completes(how.method) else how
     pairs = ((i, a) for i in range(len(images)) for a in range(num))
     done: list[Samples] = []
     for said, group in groupby(pairs, key=lambda pair: told[pair[0]]):
@@ -173,15 +174,6 @@ def _answers(
             while len(done) >= num:
                 yield _together(done[:num])
                 done = done[num:]
-
-
-def _sampling(generator: Generator, how: Sampler) -> Sampler:
-    """How a scan is drawn of which nothing is known: the same way, but where its method needs something known."""
-    try:
-        check_method(how.method)
-    except InputError:
-        return generator.sampler
-    return how
 
 
 ALL, SOME, NOTHING = "all", "some", "nothing"

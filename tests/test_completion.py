@@ -151,7 +151,6 @@ def test_without_states_a_ray_without_a_return_is_not_measured():
 
 
 def test_a_flow_that_was_not_trained_to_complete_does_so_too():
-    pytest.importorskip("r2flow.flow.posterior")
     checkpoint, images = network("rectified_flow"), scans()
     state = halved(images)
     for found, image, of in zip(complete(checkpoint, images, state, num=2), images, state, strict=True):
