@@ -134,7 +134,6 @@ def complete(
         state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.UNKNOWN)).to(torch.uint8)
     state = state.cpu()
     if keep == "blend":
-        condition_of(generator.space, images, state)  # before rays lose what contradicts it
         state = torch.where(state == Ray.UNKNOWN, state, torch.tensor(int(Ray.DOUBTFUL), dtype=state.dtype))
     condition = condition_of(generator.space, images, state)
     yield from _answers(generator, how, images, state, condition, num, seed, batch_size, first, progress)
