@@ -12,9 +12,8 @@ from r2flow.diffusion.objectives import PREDICTIONS
 from r2flow.diffusion.sampling import DDPM, eta_of, walk
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution
-from r2flow.flow.solvers.grids import build_grid
 from r2flow.generators.base import Condition, Generated, Progress, Sampler
-from r2flow.generators.flow import NetworkFlow
+from r2flow.generators.flow import UNTOLD, NetworkFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import Positive
@@ -70,7 +69,7 @@ class Diffusion(NetworkFlow):
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         if condition is not None:
-            raise InputError("this diffusion was trained without a condition and cannot take one.")
+            raise InputError(UNTOLD)
         log_snr = log_snr_of(torch.as_tensor(t, device=x.device).clamp(*self._ends))
         alpha, sigma = alpha_sigma(for_images(log_snr, x))
         z = (alpha + sigma) * x
@@ -100,7 +99,7 @@ class Diffusion(NetworkFlow):
         if eta is None:
             return super().generate(noise, condition, sampler=how, draws=draws, progress=progress)
         if condition is not None:
-            raise InputError("this diffusion was trained without a condition and cannot take one.")
+            raise InputError(UNTOLD)
         if eta and draws is None:
             raise InputError(f"{how.method} draws further noise: give draws.")
         z, steps = noise.to(self.device), count(1)
@@ -118,8 +117,7 @@ class Diffusion(NetworkFlow):
 
     def _log_snrs(self, how: Sampler) -> Tensor:
         """Of the sampler's grid, whose times run from noise to data, (N + 1,) float64."""
-        grid = how.grid if isinstance(how.grid, str) else torch.tensor(how.grid, dtype=torch.float64)
-        log_snrs: Tensor = self.schedule(1 - build_grid(grid, 0.0, 1.0, how.steps))
+        log_snrs: Tensor = self.schedule(1 - self._times(how))
         return log_snrs
 
     def check_sampler(self, sampler: Sampler) -> None:

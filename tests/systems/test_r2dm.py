@@ -413,6 +413,18 @@ def test_a_diffusion_is_the_flow_of_its_own_data(exact):
 
 
 @torch.no_grad()
+def test_a_scan_is_completed_with_a_diffusion_as_with_any_flow(exact):
+    noise, draws = Draws(0, [0]).start(exact.noise_shape), Draws(0, [0])
+    image = torch.full_like(noise, 0.25)
+    known = torch.zeros_like(noise)
+    known[..., ::2] = 1
+    condition = {"image": image * known, "known": known, "doubtful": torch.zeros_like(known)}
+    found = exact.generate(noise, condition, sampler=Sampler("replace", 32), draws=draws).x
+    torch.testing.assert_close(found * known, image * known, rtol=0, atol=0)
+    torch.testing.assert_close(found[..., 1::2], (exact.mean + exact.std * noise)[..., 1::2], rtol=0, atol=0.1)
+
+
+@torch.no_grad()
 def test_ancestral_scans_have_the_spread_that_their_steps_leave(exact):
     """Each step is affine in z, and its variance that of Ho et al. 2020, eq. 7, with the expected data in it."""
     draws, steps = Draws(0, range(16)), 32
@@ -474,7 +486,7 @@ def test_what_a_diffusion_cannot_do_is_said(exact):
         exact.generate(noise)
     with pytest.raises(InputError, match="goes from noise to data alone"):
         exact.solve(noise)
-    with pytest.raises(InputError, match="without a condition"):
+    with pytest.raises(InputError, match="trained without a condition"):
         exact.generate(noise, {"image": noise}, draws=Draws(0, [0]))
     with pytest.raises(InputError, match="highest to lowest"):
         Cosine(3, 3)
