@@ -11,12 +11,13 @@ from r2flow.generators.budgets import Budget, levels
 from r2flow.generators.conditional import ConditionalFlow, Regression, condition_of
 from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
 from r2flow.generators.flow_map import FlowMap
+from r2flow.generators.gan import DustyV1, DustyV2, Gan, VanillaGan
 from r2flow.lidar.space import build_space
 from r2flow.registry import Registry
 
 __all__ = [
-    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "Field", "Flow", "FlowMap", "Generated",
-    "Generator", "RectifiedFlow", "Regression", "Sampler", "as_flow", "build_generator", "condition_of", "levels",
+    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "DustyV1", "DustyV2", "Field", "Flow", "FlowMap",
+    "Gan", "Generated", "Generator", "RectifiedFlow", "Regression", "Sampler", "VanillaGan", "as_flow", "build_generator", "condition_of", "levels",
 ]  # fmt: skip
 
 GENERATORS: Registry[type[Generator]] = Registry(
@@ -25,6 +26,9 @@ GENERATORS: Registry[type[Generator]] = Registry(
     flow_map=FlowMap,
     conditional_flow=ConditionalFlow,
     regression=Regression,
+    vanilla_gan=VanillaGan,
+    dusty1=DustyV1,
+    dusty2=DustyV2,
 )
 
 

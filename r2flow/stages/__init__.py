@@ -10,6 +10,7 @@ from r2flow.registry import Registry, check_options
 from r2flow.stages.base import Stage
 from r2flow.stages.conditional import Conditional, Regress
 from r2flow.stages.flow_map import LearnFlowMap
+from r2flow.stages.gan import LearnGan
 from r2flow.stages.rectify import Rectify
 from r2flow.stages.reflow import Distill, Reflow
 
@@ -21,6 +22,7 @@ STAGES: Registry[type[Stage]] = Registry(
     flow_map=LearnFlowMap,
     conditional=Conditional,
     regress=Regress,
+    gan=LearnGan,
 )
 
 
