@@ -1,16 +1,24 @@
 """Generators that are told a part of the scan: rays that are known, and rays that were measured but are not trusted."""
 
 from collections.abc import Mapping
-from typing import Any
+from copy import deepcopy
+from itertools import pairwise
+from typing import Any, ClassVar, cast
 
+import numpy as np
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from torch import Tensor, nn
 
+from r2flow.backbones import Backbone
+from r2flow.backbones.convolutions import RingConv2d, zero_convolution
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.generators.flow import RectifiedFlow
+from r2flow.lidar.interpolation import guess
 from r2flow.lidar.known import Ray
+from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 
@@ -21,8 +29,8 @@ LAST = 1e-5  # of the time: where a known ray's velocity stops to grow
 def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
     """What is known of scans, as generators take it: `image`, `known` and `doubtful`, each (B, C, H, W) in model space.
 
-    `known` is 1 where a value was measured and `doubtful` where it was measured but is not trusted; `image` is 0 where
-    neither holds.
+    `known` is 1 where a value was measured and `doubtful` where it was measured but is not trusted; where neither
+    holds, `image` has a guess (`r2flow.lidar.interpolation.guess`), and 0 where nothing at all was measured.
 
     Args:
         images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W); 0 without a return. Of a scan without
@@ -42,12 +50,16 @@ def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
         raise InputError("a ray with a return must have a range above 0, an empty one the range 0.")
     encoding = space.encoding
     silent = encoding.reflectance and images.shape[1] == 1
-    image = encoding.encode(torch.cat([images, torch.zeros_like(images)], 1) if silent else images)
+    seen = state != Ray.UNKNOWN
+    guesses = np.stack([guess(x, m) for x, m in zip(images.cpu().numpy(), seen.cpu().numpy(), strict=True)])
+    filled = torch.where(seen[:, None], images, torch.from_numpy(guesses).to(images))
+    image = encoding.encode(torch.cat([filled, torch.zeros_like(filled)], 1) if silent else filled)
+    image = image * seen.flatten(1).any(1)[:, None, None, None]
     said = torch.ones_like(image)
     if silent:
         said[:, -1] = (~returned).to(said)
-    measured, trusted = (state != Ray.UNKNOWN)[:, None] * said, (state != Ray.DOUBTFUL)[:, None]
-    return {IMAGE: image * measured, KNOWN: measured * trusted, DOUBTFUL: measured * ~trusted}
+    measured, trusted = seen[:, None] * said, (state != Ray.DOUBTFUL)[:, None]
+    return {IMAGE: image, KNOWN: measured * trusted, DOUBTFUL: measured * ~trusted}
 
 
 def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -66,24 +78,65 @@ def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor, Te
     return image, known, doubtful
 
 
+class Trust(nn.Module):
+    """How far the guess of a condition holds, pixel by pixel: 3 x 3 convolutions on the condition.
+
+    Args:
+        channels: C of the image.
+        width: Of the hidden layers.
+    """
+
+    FINEST = 1e-3  # of sigma in model space, 0.2 % of a range on the paper's logarithmic scale
+
+    def __init__(self, channels: int, width: int = 24) -> None:
+        super().__init__()
+        sizes = [3 * channels, width, width, width]
+        self.layers = nn.ModuleList([RingConv2d(before, after, ring=True) for before, after in pairwise(sizes)])
+        self.answer = zero_convolution(RingConv2d(width, 2 * channels, ring=True))
+
+    def forward(self, told: Tensor) -> tuple[Tensor, Tensor]:
+        """`image`, `known` and `doubtful`, (B, 3 C, H, W), to weights in (0, 1) and sigma, (B, C, H, W) each."""
+        h = told
+        for layer in self.layers:
+            h = F.silu(layer(h))
+        weight, spread = self.answer(h).float().chunk(2, dim=1)
+        return weight.sigmoid(), (spread - 2.5).exp() + self.FINEST
+
+
 class ConditionalFlow(RectifiedFlow):
     """v(t, x | y) of a network that also sees what is known, y: one model for any mask, none and all included.
 
-    A known value has the exact velocity of its straight line, (y - x) / (1 - t), and arrives as it was given. The
-    condition is that of `condition_of`; None draws a scan of which nothing is known.
+    A known value has the exact velocity of its straight line, (y - x) / (1 - t), and arrives as it was given. Elsewhere
+    the network's velocity is mixed with that of N(g, sigma^2) about the guess g of the condition,
+
+        v = (1 - w) F(t, x, y) + w [g + skip(t, sigma) (x - t g)],
+
+    `skip` that of `r2flow.backbones.base.precondition`; w and sigma by `Trust`. So where interpolation holds, the model
+    need not learn it again. The condition is that of `condition_of`; None draws a scan of which nothing is known, by F
+    alone.
     """
+
+    trusts: ClassVar[bool] = True
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         self.condition_channels = 3 * space.shape[0]
         super().__init__(space, backbone)
+        if self.trusts:
+            self.trust = Trust(space.shape[0])
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         image, known, doubtful = parts_of(condition, x)
         v: Tensor = self.backbone(t, torch.cat([x, image, known, doubtful], dim=1))
         if condition is None:
             return v
-        left = expand_time(1 - torch.as_tensor(t, device=x.device), x).clamp(min=LAST)
-        return torch.where(known > 0, ((image - x) / left).to(v), v)
+        weight, sigma = self.trust(torch.cat([image, known, doubtful], dim=1))
+        weight = weight * (known + doubtful).flatten(1).any(1)[:, None, None, None]
+        t = expand_time(torch.as_tensor(t, device=x.device, dtype=torch.float32), x)
+        left = 1 - t
+        skip = (t * sigma.square() - left) / ((t * sigma).square() + left.square())
+        about = image + skip * (x - t * image)
+        mixed = v + weight * (about - v)
+        return torch.where(known > 0, (image - x) / left.clamp(min=LAST), mixed).to(v)
 
     def generate(
         self,
@@ -100,16 +153,37 @@ class ConditionalFlow(RectifiedFlow):
         image, known, _ = parts_of(condition, made.x)
         return Generated(torch.where(known > 0, image, made.x), made.evaluations, made.converged)
 
-    def start_from(self, parent: Generator) -> None:
-        """Take over a flow's weights; those of what it was never told begin at zero and change nothing at first."""
-        own, theirs = self.state_dict(), dict(parent.state_dict())
-        channels, more = self.space.shape[0], self.condition_channels
-        for name, value in theirs.items():
-            wanted = own[name].shape if name in own else value.shape
-            if value.ndim > 1 and wanted != value.shape and wanted == (len(value), value.shape[1] + more, *wanted[2:]):
-                unseen = value.new_zeros(len(value), more, *value.shape[2:])
-                theirs[name] = torch.cat([value[:, :channels], unseen, value[:, channels:]], dim=1)
-        self._take_flow(parent, theirs)
+    def part(self, region: Region) -> RectifiedFlow:
+        part = super().part(region)
+        if self.trusts and part is not self:
+            part.trust = deepcopy(self.trust)
+            for layer in part.trust.modules():
+                if isinstance(layer, RingConv2d) and region.width < region.shape[1]:
+                    layer.open_ring()
+        return part
+
+    def untold(self) -> RectifiedFlow:
+        flow = RectifiedFlow.__new__(RectifiedFlow)
+        nn.Module.__init__(flow)
+        flow.space, flow.noise_shape, flow.sampler = self.space, self.noise_shape, self.sampler
+        flow.backbone = cast(Backbone, _Untold(self.backbone, self.condition_channels))
+        return flow.train(self.training)
+
+
+class _Untold(nn.Module):
+    """v(t, x) of a network with further input channels, of which nothing is known."""
+
+    second_time = False
+
+    def __init__(self, backbone: Backbone, channels: int) -> None:
+        super().__init__()
+        self.backbone, self.channels = backbone, channels
+        self.in_channels, self.coords, self.unit = backbone.in_channels - channels, backbone.coords, backbone.unit
+
+    def forward(self, t: Tensor, x: Tensor) -> Tensor:
+        unknown = x.new_zeros(x.shape[0], self.channels, x.shape[2], x.shape[3])
+        v: Tensor = self.backbone(t, torch.cat([x, unknown], dim=1))
+        return v
 
 
 class Regression(ConditionalFlow):
@@ -117,6 +191,8 @@ class Regression(ConditionalFlow):
 
     Learned by absolute error it is the median of each value; it draws nothing.
     """
+
+    trusts = False
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space, backbone)
@@ -126,7 +202,9 @@ class Regression(ConditionalFlow):
         """x_1, (B, C, H, W), of the shape and type of `like`."""
         image, known, doubtful = parts_of(condition, like)
         t = torch.ones(len(like), device=like.device)
-        found: Tensor = self.backbone(t, torch.cat([torch.zeros_like(image), image, known, doubtful], dim=1))
+        told = (known + doubtful).flatten(1).any(1)[:, None, None, None]
+        begun = torch.where(told, image, -1.0)  # tokens of zeros have no finite gradient in a norm
+        found: Tensor = self.backbone(t, torch.cat([begun, image, known, doubtful], dim=1))
         return torch.where(known > 0, image, found)
 
     @torch.no_grad()
