@@ -1,6 +1,8 @@
 """Convolutional GANs (Radford et al. 2016): the vanilla GAN and DUSty v1 (Nakashima and Kurazume
 2021, in the form that DUSty v2's authors compare with)."""
 
+from itertools import pairwise
+
 from torch import Tensor, nn
 
 from r2flow.backbones.equalised import (
@@ -99,7 +101,7 @@ class Generator(LatentGenerator):
             Projection(latent, widths[0], first),
             *(
                 nn.Sequential(*_doubling(wide, narrow, ring, False), BiasedLeakyReLU(narrow))
-                for wide, narrow in zip(widths, widths[1:], strict=False)
+                for wide, narrow in pairwise(widths)
             ),
             Heads(widths[-1], outputs(channels, drops), ring, tanh),
         )
@@ -137,7 +139,7 @@ class Discriminator(nn.Sequential):
                     Equalised(nn.Conv2d(narrow, wide, 4, stride=2, bias=False)),
                     BiasedLeakyReLU(wide),
                 )
-                for narrow, wide in zip(widths, widths[1:], strict=False)
+                for narrow, wide in pairwise(widths)
             ),
             Equalised(nn.Conv2d(widths[-1], 1, last), exact=True),
         )

@@ -3,9 +3,9 @@ scene priors of 3D LiDAR data"): every pixel is made from its own angles, by a c
 """
 
 import math
+from itertools import pairwise
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.adversarial.processes import averaged
@@ -180,7 +180,7 @@ class Synthesis(nn.Module):
         shapes = [(shape[0] >> i, shape[1] >> i) for i in reversed(range(doublings + 1))]
         self.layers = nn.ModuleList(
             Level(narrow, wide, made, code, size, ring)
-            for narrow, wide, size in zip(widths, widths[1:], shapes, strict=False)
+            for (narrow, wide), size in zip(pairwise(widths), shapes, strict=True)
         )
         self.tanh = tanh
 
@@ -253,12 +253,10 @@ class Generator(LatentGenerator):
             PixelNorm(),
             *(
                 nn.Sequential(Equalised(nn.Linear(before, after), math.sqrt(2), 0.01, exact=True), nn.LeakyReLU(0.2))
-                for before, after in zip(widths, widths[1:], strict=False)
+                for before, after in pairwise(widths)
             ),
         )
-        synthesis = Synthesis(
-            shape, outputs(channels, True), code, base_channels, max_channels, doublings, tanh, ring
-        )
+        synthesis = Synthesis(shape, outputs(channels, True), code, base_channels, max_channels, doublings, tanh, ring)
         super().__init__(latent, code, mapping, synthesis, RayDrop(dropped, temperature), 2 * (doublings + 1))
 
     def synthesise(self, w: Tensor, angle: Tensor | None, shift: Tensor | None) -> dict[str, Tensor]:
@@ -350,7 +348,7 @@ class Discriminator(nn.Module):
             *[BlurBoth(ring)] * blur,
             nn.Sequential(Equalised(first)),
             BiasedLeakyReLU(widths[0]),
-            *(ResidualBlock(narrow, wide, ring) for narrow, wide in zip(widths, widths[1:], strict=False)),
+            *(ResidualBlock(narrow, wide, ring) for narrow, wide in pairwise(widths)),
         )
         last = widths[-1]
         left = (shape[0] >> halvings) * (shape[1] >> halvings)

@@ -17,7 +17,8 @@ from r2flow.registry import Registry
 
 __all__ = [
     "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "DustyV1", "DustyV2", "Field", "Flow", "FlowMap",
-    "Gan", "Generated", "Generator", "RectifiedFlow", "Regression", "Sampler", "VanillaGan", "as_flow", "build_generator", "condition_of", "levels",
+    "Gan", "Generated", "Generator", "RectifiedFlow", "Regression", "Sampler", "VanillaGan", "as_flow",
+    "build_generator", "condition_of", "levels",
 ]  # fmt: skip
 
 GENERATORS: Registry[type[Generator]] = Registry(

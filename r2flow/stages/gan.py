@@ -14,7 +14,7 @@ from r2flow.backbones import dcgan, style_gan
 from r2flow.errors import InputError
 from r2flow.generators import DustyV2, Gan, Generator
 from r2flow.noise import generator as stream
-from r2flow.registry import Count, Natural, NonNegative, Portion, Registry, check_options
+from r2flow.registry import Count, NonNegative, Portion, Registry, check_options
 from r2flow.stages.base import Batch, Stage
 
 DISCRIMINATORS: Registry[type[nn.Module]] = Registry(
@@ -94,7 +94,7 @@ class LearnGan(Stage):
         if not isinstance(generator, Gan):
             raise InputError(
                 f"stage=gan learns a GAN, which a {type(generator).__name__} is not: give experiment=vanilla_gan, "
-                "dusty1 or dusty2, or +generator.name=dusty2."
+                "dusty1 or dusty2, or generator=dusty2."
             )
         super().__init__(generator, learning_rate, betas, warmup_images=0, batch_size=batch_size, seed=seed)
         self.automatic_optimization = False

@@ -218,7 +218,7 @@ def test_rules_of_training(cases: Any):
         rate, betas = rules.lazy_adam(0.002, (0.0, 0.99), every)
         assert rate == pytest.approx(case["adam"][who]["lr"], rel=1e-12)
         assert betas == pytest.approx(case["adam"][who]["betas"], rel=1e-12)
-    assert 1.0 * 16 / 2 == case["r1_weight"]
+    assert case["r1_weight"] == 1.0 * 16 / 2
     dropout, warmup = case["warmup_dropout"], rules.Warmup()
     left = [warmup.dropout * warmup.left(images) for images in dropout["images"]]
     assert left == pytest.approx(dropout["ratio"], abs=1e-12)
@@ -402,7 +402,10 @@ def test_a_file_that_would_run_code_beside_its_config_is_refused(shared: Path, t
     ("change", "said"),
     [
         (lambda cfg: cfg["model"]["generator"].update(arch="stylegan"), "lacks or garbles 'stylegan'"),
-        (lambda cfg: cfg["model"]["generator"]["synthesis_kwargs"].update(use_noise=True), "lacks or garbles use_noise"),
+        (
+            lambda cfg: cfg["model"]["generator"]["synthesis_kwargs"].update(use_noise=True),
+            "lacks or garbles use_noise",
+        ),
         (lambda cfg: cfg["dataset"].pop("min_depth"), "lacks or garbles 'min_depth'"),
         (lambda cfg: cfg["dataset"].update(max_depth=1.0), "needs 0 < min_range < max_range"),
         (
@@ -440,7 +443,7 @@ def tiny(system: str, *more: str) -> dict[str, Any]:
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_scan_i_of_a_gan_is_a_function_of_its_number(system: str):
     generator = build_generator(tiny(system)).eval()
-    three = [drawn.images for drawn in sample(generator, 3, seed=5, batch_size=3)][0]
+    three = next(sample(generator, 3, seed=5, batch_size=3)).images
     two = torch.cat([drawn.images for drawn in sample(generator, 2, seed=5)])
     torch.testing.assert_close(three[:2], two, rtol=1e-4, atol=1e-4)
     assert not torch.allclose(three[0], three[1])
