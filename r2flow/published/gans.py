@@ -72,7 +72,7 @@ def _generator(model: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """The name of our generator and its options."""
     name, mapping, synthesis = GENERATORS[str(model["arch"])], model["mapping_kwargs"], model["synthesis_kwargs"]
     out = _outputs(synthesis)
-    common = {
+    common: dict[str, Any] = {
         "latent": int(mapping["in_ch"]),
         "base_channels": int(synthesis["ch_base"]),
         "max_channels": int(synthesis["ch_max"]),
