@@ -79,7 +79,7 @@ def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor, Te
 
 
 class Trust(nn.Module):
-    """How far the guess of a condition holds, pixel by pixel: 3 x 3 convolutions on the condition.
+    """How far the guess of a condition holds, value by value: 3 x 3 convolutions on the condition.
 
     Args:
         channels: C of the image.
@@ -87,6 +87,7 @@ class Trust(nn.Module):
     """
 
     FINEST = 1e-3  # of sigma in model space, 0.2 % of a range on the paper's logarithmic scale
+    BROAD = 0.5  # standard deviation in model space of what is no guess
 
     def __init__(self, channels: int, width: int = 24) -> None:
         super().__init__()
@@ -95,25 +96,27 @@ class Trust(nn.Module):
         self.answer = zero_convolution(RingConv2d(width, 2 * channels, ring=True))
 
     def forward(self, told: Tensor) -> tuple[Tensor, Tensor]:
-        """`image`, `known` and `doubtful`, (B, 3 C, H, W), to weights in (0, 1) and sigma, (B, C, H, W) each."""
+        """`image`, `known` and `doubtful`, (B, 3 C, H, W), to logit p and sigma, (B, C, H, W) each."""
         h = told
         for layer in self.layers:
             h = F.silu(layer(h))
-        weight, spread = self.answer(h).float().chunk(2, dim=1)
-        return weight.sigmoid(), (spread - 2.5).exp() + self.FINEST
+        logit, spread = self.answer(h).float().chunk(2, dim=1)
+        return logit, (spread - 4).exp() + self.FINEST
 
 
 class ConditionalFlow(RectifiedFlow):
     """v(t, x | y) of a network that also sees what is known, y: one model for any mask, none and all included.
 
     A known value has the exact velocity of its straight line, (y - x) / (1 - t), and arrives as it was given. Elsewhere
-    the network's velocity is mixed with that of N(g, sigma^2) about the guess g of the condition,
+    x_1 is held to be, with probability p, near the guess g of the condition, N(g, sigma^2), and else what the network
+    says: by Bayes' rule for x_t, whose variance is V_s = (t s)^2 + (1 - t)^2 about t g or 0,
 
-        v = (1 - w) F(t, x, y) + w [g + skip(t, sigma) (x - t g)],
+        v = r [g + skip(t, sigma) (x - t g)] + (1 - r) network(t, x, y),
+        logit r = logit p + log N(x; t g, V_sigma) - log N(x; 0, V_b),    b = 0.5,
 
-    `skip` that of `r2flow.backbones.base.precondition`; w and sigma by `Trust`. So where interpolation holds, the model
-    need not learn it again. The condition is that of `condition_of`; None draws a scan of which nothing is known, by F
-    alone.
+    `skip` that of `r2flow.backbones.base.precondition`; p and sigma by `Trust`. So where interpolation holds, the model
+    need not learn it again, and where it does not, x_t soon tells. The condition is that of `condition_of`; None draws
+    a scan of which nothing is known, by the network alone.
     """
 
     trusts: ClassVar[bool] = True
@@ -129,13 +132,14 @@ class ConditionalFlow(RectifiedFlow):
         v: Tensor = self.backbone(t, torch.cat([x, image, known, doubtful], dim=1))
         if condition is None:
             return v
-        weight, sigma = self.trust(torch.cat([image, known, doubtful], dim=1))
-        weight = weight * (known + doubtful).flatten(1).any(1)[:, None, None, None]
+        logit, sigma = self.trust(torch.cat([image, known, doubtful], dim=1))
         t = expand_time(torch.as_tensor(t, device=x.device, dtype=torch.float32), x)
-        left = 1 - t
-        skip = (t * sigma.square() - left) / ((t * sigma).square() + left.square())
-        about = image + skip * (x - t * image)
-        mixed = v + weight * (about - v)
+        left, off = 1 - t, x - t * image
+        narrow, broad = ((t * std).square() + left.square() for std in (sigma, Trust.BROAD))
+        near = logit - (narrow.log() - broad.log() + off.square() / narrow - x.square() / broad) / 2
+        told = (known + doubtful).flatten(1).any(1)[:, None, None, None]
+        about = image + (t * sigma.square() - left) / narrow * off
+        mixed = v + near.sigmoid() * told * (about - v)
         return torch.where(known > 0, (image - x) / left.clamp(min=LAST), mixed).to(v)
 
     def generate(

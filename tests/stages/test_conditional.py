@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.stats import norm
 
 from r2flow import noise
 from r2flow.errors import InputError
@@ -116,12 +117,15 @@ def test_it_starts_as_the_flow_that_it_starts_from(backbone, scans):
     with torch.no_grad():
         expected, unknown = parent.velocity(t, x), told["known"] == 0
         assert torch.allclose(child.velocity(t, x), expected, atol=1e-6)
-        weight, sigma = child.trust(torch.cat([told[name] for name in ("image", "known", "doubtful")], dim=1))
-        about = torch.empty_like(x)
-        for index in np.ndindex(*x.shape):  # the exact velocity of a Gaussian about the guess, value by value
-            problem = Gaussian(mean=float(told["image"][index]), std=float(sigma[index]))
-            about[index] = problem(t[index[0]].double(), x[index].double())
-        mixed = (1 - weight) * expected + weight * about
+        logit, sigma = child.trust(torch.cat([told[name] for name in ("image", "known", "doubtful")], dim=1))
+        mixed = torch.empty_like(x)
+        for index in np.ndindex(*x.shape):  # value by value: a Gaussian about the guess, or what the network says
+            guess, std, p = float(told["image"][index]), float(sigma[index]), float(logit[index].sigmoid())
+            at, value, v = float(t[index[0]]), float(x[index]), float(expected[index])
+            about = float(Gaussian(mean=guess, std=std)(t[index[0]].double(), x[index].double()))
+            near = p * norm.pdf(value, at * guess, math.hypot(at * std, 1 - at))
+            far = (1 - p) * norm.pdf(value, 0, math.hypot(at * 0.5, 1 - at))
+            mixed[index] = (near * about + far * v) / (near + far)
         assert torch.allclose(child.velocity(t, x, told)[unknown], mixed[unknown], atol=1e-4)
         exact = ((told["image"] - x) / (1 - t[:, None, None, None]))[~unknown]
         assert torch.allclose(child.velocity(t, x, told)[~unknown], exact, rtol=1e-4)
