@@ -35,7 +35,7 @@ class RingConv2d(nn.Conv2d):
 
 
 class Resample(ExactBuffers):
-    """Twice or half the resolution by a separable filter, circular in azimuth, zeros beyond the other edges.
+    """Twice or half the resolution by a separable filter, circular in azimuth, zeros or repeats beyond other edges.
 
     Down: every second value of the filtered image. Up: the filtered image of the pixels among zeros, the filter
     doubled so that its sum over either phase is 1.
@@ -44,26 +44,31 @@ class Resample(ExactBuffers):
         window: Filter taps, normalised to sum 1; an even number.
         up: Whether to double rather than halve.
         ring: Whether the columns are a ring.
+        repeat: Whether the pixels at the other edges are repeated beyond them.
     """
 
     kernel: Tensor
 
-    def __init__(self, window: Sequence[float], up: bool, ring: bool) -> None:
+    def __init__(self, window: Sequence[float], up: bool, ring: bool, repeat: bool = False) -> None:
         super().__init__()
         taps = torch.tensor(window, dtype=torch.float32)
         self.register_buffer("kernel", taps / taps.sum() * (2 if up else 1))
-        self.up, self.ring = up, ring
+        self.up, self.ring, self.repeat = up, ring, repeat
         self.margin = len(window) // 2 - 1  # taps that reach beyond a pixel's own pair
 
     def forward(self, x: Tensor) -> Tensor:
         channels, margin = x.shape[1], self.margin
-        if self.ring and margin:
-            x = F.pad(x, (margin, margin, 0, 0), mode="circular")
+        rows, columns = self.repeat, self.ring or self.repeat  # whether they are padded here
+        if columns and margin:
+            x = F.pad(x, (margin, margin, 0, 0), mode="circular" if self.ring else "replicate")
+        if rows and margin:
+            x = F.pad(x, (0, 0, margin, margin), mode="replicate")
         kernel = torch.outer(self.kernel, self.kernel).to(x.dtype).expand(channels, 1, -1, -1)
         if self.up:
-            crop = (margin, 3 * margin if self.ring else margin)
+            crop = (3 * margin if rows else margin, 3 * margin if columns else margin)
             return F.conv_transpose2d(x, kernel, stride=2, padding=crop, groups=channels)
-        return F.conv2d(x, kernel, stride=2, padding=(margin, 0 if self.ring else margin), groups=channels)
+        zeros = (0 if rows else margin, 0 if columns else margin)
+        return F.conv2d(x, kernel, stride=2, padding=zeros, groups=channels)
 
     def open_ring(self) -> None:
         """Zeros beyond the left and right edges too, from now on."""

@@ -12,13 +12,14 @@ from r2flow.generators.conditional import ConditionalFlow, Regression, condition
 from r2flow.generators.diffusion import Diffusion
 from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
 from r2flow.generators.flow_map import FlowMap
+from r2flow.generators.gan import DustyV1, DustyV2, Gan, VanillaGan
 from r2flow.lidar.space import build_space
 from r2flow.registry import Registry
 
 __all__ = [
-    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "Diffusion", "Field", "Flow", "FlowMap",
-    "Generated", "Generator", "RectifiedFlow", "Regression", "Sampler", "as_flow", "build_generator", "condition_of",
-    "levels",
+    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "Diffusion", "DustyV1", "DustyV2", "Field", "Flow",
+    "FlowMap", "Gan", "Generated", "Generator", "RectifiedFlow", "Regression", "Sampler", "VanillaGan", "as_flow",
+    "build_generator", "condition_of", "levels",
 ]  # fmt: skip
 
 GENERATORS: Registry[type[Generator]] = Registry(
@@ -28,6 +29,9 @@ GENERATORS: Registry[type[Generator]] = Registry(
     conditional_flow=ConditionalFlow,
     regression=Regression,
     diffusion=Diffusion,
+    vanilla_gan=VanillaGan,
+    dusty1=DustyV1,
+    dusty2=DustyV2,
 )
 
 

@@ -11,6 +11,7 @@ from r2flow.stages.base import Stage
 from r2flow.stages.conditional import Conditional, Regress
 from r2flow.stages.diffusion import LearnDiffusion
 from r2flow.stages.flow_map import LearnFlowMap
+from r2flow.stages.gan import LearnGan
 from r2flow.stages.rectify import Rectify
 from r2flow.stages.reflow import Distill, Reflow
 
@@ -23,6 +24,7 @@ STAGES: Registry[type[Stage]] = Registry(
     conditional=Conditional,
     regress=Regress,
     diffusion=LearnDiffusion,
+    gan=LearnGan,
 )
 
 

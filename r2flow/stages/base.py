@@ -2,13 +2,16 @@
 
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 from typing import Any, ClassVar
 
 import lightning as L
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
 
+from r2flow.adversarial.processes import averaged
 from r2flow.errors import InputError
 from r2flow.flow.times import golden_sequence
 from r2flow.generators import Generator
@@ -125,7 +128,13 @@ class Stage(L.LightningModule):
         Gradients of the loss by other optimisers' parameters are left; they are cleared before their own step.
         """
         optimizer.zero_grad()
-        self.manual_backward(loss)
+        model = self.trainer.strategy.model
+        # DDP waits for gradients of all parameters in every backward pass, and a loss has those of some.
+        with model.no_sync() if isinstance(model, DistributedDataParallel) else nullcontext():
+            self.manual_backward(loss)
+        for parameter in (p for group in optimizer.param_groups for p in group["params"]):
+            if parameter.grad is not None:
+                parameter.grad = averaged(parameter.grad)
         self.clip_gradients(optimizer.optimizer, self.gradient_clip_val)
         optimizer.step()
         schedules = self.lr_schedulers() or []
