@@ -23,7 +23,7 @@ from r2flow.sampling import HasGenerator, Samples, draw
 
 KEEP = ("exact", "blend")
 ANSWER = 2**32  # noise numbers from one answer to the next: answer 0 of scan i has the noise of sample i
-UNTRAINED = Sampler("flowdps", 32)  # of a flow that was not trained to complete
+UNTRAINED = Sampler("mmps", 10, grid="power:1.5")  # of a flow that was not trained to complete; docs/completion.md
 
 
 @dataclass(frozen=True)
