@@ -10,15 +10,18 @@ from r2flow.generators.base import Condition, Generated, Generator, Sampler
 from r2flow.generators.budgets import Budget, levels
 from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
 from r2flow.generators.flow_map import FlowMap
+from r2flow.generators.score import ScoreModel
 from r2flow.lidar.space import build_space
 from r2flow.registry import Registry
 
 __all__ = [
     "GENERATORS", "USUAL", "Budget", "Condition", "Field", "Flow", "FlowMap", "Generated", "Generator", "RectifiedFlow",
-    "Sampler", "as_flow", "build_generator", "levels",
+    "Sampler", "ScoreModel", "as_flow", "build_generator", "levels",
 ]  # fmt: skip
 
-GENERATORS: Registry[type[Generator]] = Registry("generator", rectified_flow=RectifiedFlow, flow_map=FlowMap)
+GENERATORS: Registry[type[Generator]] = Registry(
+    "generator", rectified_flow=RectifiedFlow, flow_map=FlowMap, score=ScoreModel
+)
 
 
 def build_generator(config: Mapping[str, Any]) -> Generator:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -41,6 +41,25 @@ class LogScale:
 
     def inverse(self, y: Tensor) -> Tensor:
         return torch.exp2(y * self.scale) - 1
+
+
+class ShiftedLog:
+    """log2(r + 1.0001) / scale, clipped to [0, 1], with scale = log2(r_max + 1) rounded up to hundredths.
+
+    LiDARGen's (r_max 63 m, scale 6) and LiDM's (56 m, 5.84). A ray without return is log2(1.0001) / scale and not
+    quite 0; the way back, 2^(scale y) - 1, leaves the 0.1 mm in.
+    """
+
+    channels = 1
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.scale = math.ceil(100 * math.log2(sensor.max_range + 1) - 1e-9) / 100
+
+    def forward(self, r: Tensor) -> Tensor:
+        return (torch.log2(r.clamp(min=0) + 1e-4 + 1) / self.scale).clamp(0, 1)
+
+    def inverse(self, y: Tensor) -> Tensor:
+        return torch.exp2(y.clamp(0, 1) * self.scale) - 1
 
 
 class Inverse:
@@ -90,7 +109,12 @@ class Cartesian:
 
 
 FORMATS: Registry[Callable[[Sensor], RangeFormat]] = Registry(
-    "range format", logscale=LogScale, inverse=Inverse, metric=Metric, cartesian=Cartesian
+    "range format",
+    logscale=LogScale,
+    shifted_log=ShiftedLog,
+    inverse=Inverse,
+    metric=Metric,
+    cartesian=Cartesian,
 )
 
 
@@ -99,13 +123,23 @@ class Encoding:
 
     Args:
         sensor: Its range limits say which ranges are returns.
-        format: `logscale` (the paper's), `inverse`, `metric`, or `cartesian` (three channels).
+        format: `logscale` (the paper's), `shifted_log` (LiDARGen's and LiDM's), `inverse`, `metric`, or `cartesian`
+            (three channels).
         reflectance: Whether reflectance is a channel; without it a model is of range alone.
+        limits: `closed`: ranges of exactly the sensor's limits are returns. `open`, as R2DM has it: they are not, and
+            none is encoded that does not lie between them.
     """
 
-    def __init__(self, sensor: Sensor, format: str = "logscale", reflectance: bool = True) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        format: str = "logscale",
+        reflectance: bool = True,
+        limits: Literal["closed", "open"] = "closed",
+    ) -> None:
         self.sensor = sensor
         self.reflectance = reflectance
+        self.limits = limits
         self.format = FORMATS[format](sensor)
 
     @property
@@ -120,12 +154,15 @@ class Encoding:
     def encode(self, image: Tensor) -> Tensor:
         """(..., 2 or 1, H, W) in metres and reflectance of [0, 1] -> (..., channels, H, W).
 
-        A dropped ray, range 0, becomes exactly -1 (the origin, 0, under `cartesian`).
+        A dropped ray, range 0, becomes exactly -1 (the origin, 0, under `cartesian`; nearly -1 under `shifted_log`).
 
         Raises:
             InputError: reflectance is a channel of the model and the image has none.
         """
-        y = self.format.forward(image[..., :1, :, :])
+        r = image[..., :1, :, :]
+        if self.limits == "open":
+            r = r * self._between(r)
+        y = self.format.forward(r)
         if self.reflectance:
             if image.shape[-3] < 2:
                 raise InputError(
@@ -137,13 +174,16 @@ class Encoding:
     def decode(self, x: Tensor) -> Tensor:
         """(..., channels, H, W) -> range in metres and reflectance, (..., 2 or 1, H, W).
 
-        A range outside [min_range, max_range] is a dropped ray, 0 in both; reflectance is clamped to [0, 1].
+        A range outside the limits is a dropped ray, 0 in both; reflectance is clamped to [0, 1].
         """
         y = (x + 1) / 2
         ranges = self.format.channels
         near, far = self.sensor.min_range, self.sensor.max_range
         r = self.format.inverse(y[..., :ranges, :, :])
-        returned = (r >= near * (1 - LIMIT_TOLERANCE)) & (r <= far * (1 + LIMIT_TOLERANCE))
+        if self.limits == "open":
+            returned = self._between(r)
+        else:
+            returned = (r >= near * (1 - LIMIT_TOLERANCE)) & (r <= far * (1 + LIMIT_TOLERANCE))
         zero = torch.zeros_like(r)
         image = torch.where(returned, r.clamp(near, far), zero)
         if self.reflectance:
@@ -151,8 +191,11 @@ class Encoding:
             image = torch.cat([image, torch.where(returned, reflectance, zero)], dim=-3)
         return image
 
+    def _between(self, r: Tensor) -> Tensor:
+        return (r > self.sensor.min_range) & (r < self.sensor.max_range)
+
 
 def build_encoding(options: Mapping[str, Any], sensor: Sensor) -> Encoding:
-    """The encoding a config describes: `format` and `reflectance`."""
+    """The encoding a config describes: `format`, `reflectance` and `limits`."""
     check_options("encoding", Encoding, options, given=1)
     return Encoding(sensor, **options)

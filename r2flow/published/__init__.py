@@ -2,13 +2,13 @@
 
 from typing import Any
 
-from r2flow.published import flows
+from r2flow.published import flows, lidargen
 from r2flow.published.flows import published_cfg
 from r2flow.published.format import Format, Published
 
 __all__ = ["FORMATS", "Format", "Published", "format_of", "published_cfg"]
 
-FORMATS: tuple[Format, ...] = (flows.FORMAT,)
+FORMATS: tuple[Format, ...] = (flows.FORMAT, lidargen.FORMAT)
 
 
 def format_of(content: Any) -> Format | None:

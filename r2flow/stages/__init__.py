@@ -11,9 +11,10 @@ from r2flow.stages.base import Stage
 from r2flow.stages.flow_map import LearnFlowMap
 from r2flow.stages.rectify import Rectify
 from r2flow.stages.reflow import Distill, Reflow
+from r2flow.stages.score import MatchScore
 
 STAGES: Registry[type[Stage]] = Registry(
-    "stage", rectify=Rectify, reflow=Reflow, distill=Distill, flow_map=LearnFlowMap
+    "stage", rectify=Rectify, reflow=Reflow, distill=Distill, flow_map=LearnFlowMap, score_matching=MatchScore
 )
 
 
