@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
+from r2flow.completion import complete
 from r2flow.config import learned
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
@@ -85,6 +86,16 @@ class Checkpoint:
             how: Options of `r2flow.sampling.sample`: steps, method, batch_size, region, ...
         """
         return torch.cat([drawn.images for drawn in sample(self, num, seed, **how)])
+
+    def complete(self, images: Tensor, state: Tensor | None = None, num: int = 1, seed: int = 0, **how: Any) -> Tensor:
+        """Scans completed from what is known of them, (B, num, 2 or 1, H, W), as `sample` gives them.
+
+        Args:
+            images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W).
+            state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); see `r2flow.completion.complete`.
+            how: Options of `r2flow.completion.complete`: keep, steps, batch_size, ...
+        """
+        return torch.stack([found.images for found in complete(self, images, state, num, seed, **how)])
 
     def points(self, images: Tensor) -> list[np.ndarray]:
         """The returns of each range image, (N, 4): x, y, z in metres and reflectance; see `ModelSpace.points`."""

@@ -11,9 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import at_least_float32
-from r2flow.diffusion.langevin import noise_levels
 from r2flow.errors import InputError
-from r2flow.registry import Count, Positive
+from r2flow.registry import Count
 
 
 def torus_convolution(channels: int, out_channels: int, dilation: int = 1, bias: bool = True) -> nn.Conv2d:
@@ -150,29 +149,16 @@ class RefineNet(nn.Module):
     Four levels, of which the second alone halves the image; the third and the fourth see further by dilation.
 
     Args:
+        sigmas: Noise levels, (L,).
         channels: Of the image.
         width: Of the first level; the others are twice as wide.
-        sigma_first: Largest noise level.
-        sigma_last: Smallest one.
-        levels: How many there are.
-        spacing: `geometric` or `uniform`.
     """
 
     sigmas: Tensor
 
-    def __init__(
-        self,
-        channels: Count = 2,
-        width: Count = 128,
-        sigma_first: Positive = 50.0,
-        sigma_last: Positive = 0.01,
-        levels: Count = 232,
-        spacing: str = "geometric",
-    ) -> None:
+    def __init__(self, sigmas: Tensor, channels: Count = 2, width: Count = 128) -> None:
         super().__init__()
-        if sigma_last > sigma_first:
-            raise InputError(f"noise levels fall from sigma_first={sigma_first:g} and cannot reach {sigma_last:g}.")
-        self.register_buffer("sigmas", noise_levels(sigma_first, sigma_last, levels, spacing))
+        self.register_buffer("sigmas", sigmas)
         wide = 2 * width
         self.begin_conv = nn.Conv2d(channels + 2, width, 3, padding=1)
         self.normalizer = InstanceNormPlus(width)

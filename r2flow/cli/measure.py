@@ -8,7 +8,15 @@ import typer
 
 from r2flow.cli.app import report
 from r2flow.cli.groups import ReadingOptions, grouped
-from r2flow.cli.options import SETS, choose_reading
+from r2flow.cli.options import (
+    SETS,
+    CheckpointOption,
+    DeviceOption,
+    OutOption,
+    ScaleChoice,
+    choose_device,
+    choose_reading,
+)
 
 
 @report.command(epilog="Example: r2flow report fidelity kitti360/test runs/real/samples --train raw --out reports")
@@ -50,3 +58,55 @@ def fidelity(
         print(text)
     else:
         finish(fidelity_page(result, statistics, truth, judged, chosen, name, command()), out, [text])
+
+
+@report.command(epilog="Example: r2flow report completion kitti360/test -c street --num 15 --out reports")
+@grouped
+def completion(
+    real: Annotated[str, typer.Argument(help=f"Scans, of which a part is hidden: {SETS}.")],
+    checkpoint: CheckpointOption = Path("street"),
+    also: Annotated[list[str] | None, typer.Option(help="More models, one each time.")] = None,
+    tasks: Annotated[
+        str | None, typer.Option(help="What is known, by masks with a space between them; the usual five if left out.")
+    ] = None,
+    solvers: Annotated[str | None, typer.Option(help="Ways to run the first model, as flowdps,repaint.")] = None,
+    steps: Annotated[str | None, typer.Option(help="Numbers of steps of the first model, as 8,16,64.")] = None,
+    num: Annotated[int, typer.Option(min=1, help="The most scans of a set, evenly spread over it.")] = 16,
+    answers: Annotated[int, typer.Option(min=1, help="Answers to each scan; 19 give intervals of 90 %.")] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Of the noise. What is hidden of a scan does not depend on it.")] = 0,
+    batch_size: Annotated[int, typer.Option(min=1, help="Answers at once.")] = 4,
+    reflectance_scale: ScaleChoice = None,
+    device: DeviceOption = "auto",
+    out: OutOption = Path("reports"),
+) -> None:
+    """Hide a part of scans and complete them, by models and by plain interpolation: errors against evaluations."""
+    import numpy as np
+
+    from r2flow.checkpoints import load_checkpoint
+    from r2flow.cli.output import command, finish
+    from r2flow.progress import Bar
+    from r2flow.reports.completion import TASKS, completion_page, completion_rows, hidden_by, pictured, ways_of
+    from r2flow.reports.inversion import real_scans
+    from r2flow.reports.pages import prepare_folder
+
+    first = load_checkpoint(checkpoint, choose_device(device))
+    counts = [int(one) for one in steps.split(",")] if steps else []
+    ways = ways_of(first, Path(checkpoint).stem, solvers.split(",") if solvers else [], counts)
+    for other in also or []:
+        ways += ways_of(load_checkpoint(other, choose_device(device)), Path(other).stem)
+    named = tasks.split() if tasks else list(TASKS)
+    for task in named:
+        hidden_by(task, first.sensor.shape, 0)
+    scans = real_scans(first, [real], reflectance_scale, num)
+    truths = [np.asarray(scan.image) for scan in scans]
+    prepare_folder(out)
+    rows, shown = [], []
+    total = sum(way.checkpoint.generator.evaluations_of(way.sampler) for way in ways) * len(named)
+    with Bar("completing", -(-len(truths) * answers // batch_size) * total, "evaluations") as advance:
+        for row, images in completion_rows(truths, first.sensor, ways, named, answers, seed, batch_size, advance):
+            rows.append(row)
+            shown.append((row, images[0]))
+    figure = pictured(truths[0], shown, first.sensor)
+    about = f"{len(truths)} scans of {real}, {answers} answers to each."
+    page = completion_page(rows, figure, about, seed, command(), str(choose_device(device)))
+    finish(page, out, page.text[1:])

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.errors import InputError
 from r2flow.registry import Registry
 
 Score = Callable[[Tensor, Tensor], Tensor]
@@ -26,8 +27,10 @@ def noise_levels(first: float, last: float, levels: int, spacing: str = "geometr
     """sigma_0 = first > ... > sigma_{L-1} = last, (levels,) float32.
 
     Raises:
-        InputError: an unknown spacing.
+        InputError: an unknown spacing, or last above first.
     """
+    if last > first:
+        raise InputError(f"noise levels fall from {first:g} and cannot reach {last:g}.")
     return torch.from_numpy(SPACINGS[spacing](first, last, levels).astype(np.float32))
 
 

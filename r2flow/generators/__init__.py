@@ -8,6 +8,7 @@ import torch
 from r2flow.errors import InputError
 from r2flow.generators.base import Condition, Generated, Generator, Sampler
 from r2flow.generators.budgets import Budget, levels
+from r2flow.generators.conditional import ConditionalFlow, Regression, condition_of
 from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
 from r2flow.generators.flow_map import FlowMap
 from r2flow.generators.score import ScoreModel
@@ -15,12 +16,18 @@ from r2flow.lidar.space import build_space
 from r2flow.registry import Registry
 
 __all__ = [
-    "GENERATORS", "USUAL", "Budget", "Condition", "Field", "Flow", "FlowMap", "Generated", "Generator", "RectifiedFlow",
-    "Sampler", "ScoreModel", "as_flow", "build_generator", "levels",
+    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "Field", "Flow", "FlowMap", "Generated",
+    "Generator", "RectifiedFlow", "Regression", "Sampler", "ScoreModel", "as_flow", "build_generator",
+    "condition_of", "levels",
 ]  # fmt: skip
 
 GENERATORS: Registry[type[Generator]] = Registry(
-    "generator", rectified_flow=RectifiedFlow, flow_map=FlowMap, score=ScoreModel
+    "generator",
+    rectified_flow=RectifiedFlow,
+    flow_map=FlowMap,
+    conditional_flow=ConditionalFlow,
+    regression=Regression,
+    score=ScoreModel,
 )
 
 

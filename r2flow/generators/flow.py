@@ -107,7 +107,7 @@ class RectifiedFlow(Flow):
         backbone: Name and options, as in conf/backbone.
     """
 
-    condition_channels: ClassVar[int] = 0  # further input channels of the backbone, for a subclass with a condition
+    condition_channels: int = 0  # further input channels of the backbone, for a subclass with a condition
     second_time: ClassVar[bool] = False  # whether the backbone takes a second time, for a subclass that is a flow map
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
@@ -132,7 +132,10 @@ class RectifiedFlow(Flow):
         Raises:
             InputError: other weights; a network with weights for each place of the image, and another size.
         """
-        own, theirs = self.state_dict(), parent.state_dict()
+        self._take_flow(parent, parent.state_dict())
+
+    def _take_flow(self, parent: Generator, theirs: Mapping[str, Tensor]) -> None:
+        own = self.state_dict()
         new = {name: own[name] for name in (f"backbone.{name}" for name in self.backbone.second_time_names())}
         if not torch.equal(self.space.rays, parent.space.rays):
             theirs = {**theirs, "backbone.coords": own["backbone.coords"]}

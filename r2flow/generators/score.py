@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from r2flow.backbones.refinenet import RefineNet
-from r2flow.diffusion.langevin import annealed_langevin, toward
+from r2flow.diffusion.langevin import annealed_langevin, noise_levels, toward
 from r2flow.errors import InputError
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.lidar.space import ModelSpace
@@ -31,7 +31,11 @@ class ScoreModel(Generator):
         rate: Of `r2flow.diffusion.langevin.step_sizes`.
         denoise: Whether the last level's noise is taken off at the end.
         pull: Strength of the pull to known pixels, a step.
-        width, sigma_first, sigma_last, levels, spacing: The network's, see `RefineNet`.
+        width: The network's, see `RefineNet`.
+        sigma_first, sigma_last, levels, spacing: The noise levels, see `r2flow.diffusion.langevin.noise_levels`.
+
+    Raises:
+        InputError: an odd height or width, noise levels that rise, an unknown spacing.
     """
 
     def __init__(
@@ -53,7 +57,7 @@ class ScoreModel(Generator):
         channels, rows, columns = space.shape
         if rows % 2 or columns % 2:
             raise InputError(f"RefineNet halves the image: its height and width must be even, found {rows}x{columns}.")
-        self.network = RefineNet(channels, width, sigma_first, sigma_last, levels, spacing)
+        self.network = RefineNet(noise_levels(sigma_first, sigma_last, levels, spacing), channels, width)
 
     @torch.no_grad()
     def generate(

@@ -8,13 +8,21 @@ from r2flow.errors import InputError
 from r2flow.generators import Generator, Sampler
 from r2flow.registry import Registry, check_options
 from r2flow.stages.base import Stage
+from r2flow.stages.conditional import Conditional, Regress
 from r2flow.stages.flow_map import LearnFlowMap
 from r2flow.stages.rectify import Rectify
 from r2flow.stages.reflow import Distill, Reflow
 from r2flow.stages.score import MatchScore
 
 STAGES: Registry[type[Stage]] = Registry(
-    "stage", rectify=Rectify, reflow=Reflow, distill=Distill, flow_map=LearnFlowMap, score_matching=MatchScore
+    "stage",
+    rectify=Rectify,
+    reflow=Reflow,
+    distill=Distill,
+    flow_map=LearnFlowMap,
+    conditional=Conditional,
+    regress=Regress,
+    score_matching=MatchScore,
 )
 
 

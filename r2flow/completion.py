@@ -1,0 +1,234 @@
+"""Scans completed from what is known of them: answer a of scan i is a function of (seed, i, a), whatever the batch.
+
+for found in complete(checkpoint, images, state, num=8):
+    found.images, found.spread
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.generators import Condition, ConditionalFlow, Flow, Generator, Sampler, condition_of
+from r2flow.generators.base import Progress
+from r2flow.lidar.encoding import LIMIT_TOLERANCE
+from r2flow.lidar.known import Ray
+from r2flow.lidar.sensors import Sensor
+from r2flow.sampling import HasGenerator, Samples, draw
+
+KEEP = ("exact", "blend")
+ANSWER = 2**32  # noise numbers from one answer to the next: answer 0 of scan i has the noise of sample i
+UNTRAINED = Sampler("flowdps", 32)  # of a flow that was not trained to complete
+
+
+@dataclass(frozen=True)
+class Completed:
+    """The answers to one scan.
+
+    Attributes:
+        images: Range in metres and, of a model that has it, reflectance, (num, 2 or 1, H, W), on the CPU; 0 without a
+            return.
+        evaluations: Network evaluations of each, (num,).
+        converged: Whether each is a scan of the generator, (num,) bool.
+        seconds: Of the generation of all of them; of a batch with other scans their share.
+    """
+
+    images: Tensor
+    evaluations: Tensor
+    converged: Tensor
+    seconds: float
+
+    @property
+    def spread(self) -> Tensor:
+        """How far the answers are apart: see `spread_of`."""
+        return spread_of(self.images)
+
+
+def spread_of(images: Tensor) -> Tensor:
+    """Of several answers to a scan, ray by ray: standard deviation of the range and share with a return, (2, H, W).
+
+    Args:
+        images: (num, 2 or 1, H, W), 0 without a return.
+
+    Returns:
+        The standard deviation is in metres, over the answers that have a return there, with num - 1 below the fraction
+        line; 0 where fewer than two have one.
+    """
+    r = images[:, 0].double()
+    returned = r > 0
+    count = returned.sum(0)
+    mean = r.sum(0) / count.clamp(min=1)
+    squares = ((r - mean).square() * returned).sum(0)
+    return torch.stack([(squares / (count - 1).clamp(min=1)).sqrt(), returned.double().mean(0)]).float()
+
+
+def completing(generator: Generator, sampler: Sampler | None = None, **changes: Any) -> Sampler:
+    """How a generator completes scans: a trained one by its own sampler, another flow by `UNTRAINED`; with changes.
+
+    Raises:
+        InputError: it cannot complete scans, or not so.
+    """
+    if not isinstance(generator, Flow) or generator.noise_shape != generator.space.shape:
+        raise InputError(
+            f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images, best one that "
+            "was trained with stage=conditional."
+        )
+    usual = generator.sampler if isinstance(generator, ConditionalFlow) else UNTRAINED
+    how = (sampler or usual).changed(**changes)
+    generator.check_sampler(how)
+    return how
+
+
+def complete(
+    source: HasGenerator | Generator,
+    images: Tensor,
+    state: Tensor | None = None,
+    num: int = 1,
+    seed: int = 0,
+    *,
+    keep: str = "exact",
+    sampler: Sampler | None = None,
+    batch_size: int = 1,
+    first: int = 0,
+    progress: Progress = None,
+    **changes: Any,
+) -> Iterator[Completed]:
+    """Complete scans of which a part is known, scan by scan.
+
+    A scan of which everything is known costs no evaluation. One of which nothing is known is drawn as
+    `r2flow.sampling.sample` draws it: answer 0 of scan i is sample i of the seed.
+
+    Args:
+        source: A checkpoint or its generator.
+        images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W), 0 without a return. A model with
+            reflectance completes that of a scan without; a model of range alone leaves reflectance out.
+        state: `r2flow.lidar.known.Ray` of each ray, (B, H, W). If left out, a ray without a return counts as not
+            measured.
+        num: Answers to each scan.
+        keep: `exact`: known rays come back as they were given, to the bit. `blend`: all measured rays are taken as
+            doubtful, so that the model may mend them.
+        sampler: How the generator is run; if left out, that of `completing`.
+        batch_size: Answers at once. It does not change a fixed-step result beyond rounding.
+        first: Number of the first scan.
+        progress: Called after every network evaluation of a batch.
+        changes: Single settings of the sampler: steps, method, tolerance, grid.
+
+    Raises:
+        InputError: a generator that cannot complete, images or states that do not fit it, values that are no ranges of
+            its sensor, num or batch_size below 1.
+    """
+    generator = source if isinstance(source, Generator) else source.generator
+    how = completing(generator, sampler, **changes)
+    if num < 1 or batch_size < 1:
+        raise InputError(f"needs at least one answer and a batch of at least one; found {num} and {batch_size}.")
+    if keep not in KEEP:
+        raise InputError(f"keep must be {' or '.join(KEEP)}, found {keep!r}.")
+    _check_values(generator.space.sensor, images)
+    images = images.detach().float().cpu()
+    if state is None:
+        state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.UNKNOWN)).to(torch.uint8)
+    state = state.cpu()
+    if keep == "blend":
+        condition_of(generator.space, images, state)  # before rays lose what contradicts it
+        state = torch.where(state == Ray.UNKNOWN, state, torch.tensor(int(Ray.DOUBTFUL), dtype=state.dtype))
+    condition = condition_of(generator.space, images, state)
+    yield from _answers(generator, how, images, state, condition, num, seed, batch_size, first, progress)
+
+
+def _answers(
+    generator: Generator,
+    how: Sampler,
+    images: Tensor,
+    state: Tensor,
+    condition: Condition,
+    num: int,
+    seed: int,
+    batch_size: int,
+    first: int,
+    progress: Progress,
+) -> Iterator[Completed]:
+    told = [_told(condition, i) for i in range(len(images))]
+    # A method that reads the condition has nothing to do without one.
+    plain = how if isinstance(generator, ConditionalFlow) or how.method != UNTRAINED.method else generator.sampler
+    pairs = ((i, a) for i in range(len(images)) for a in range(num))
+    done: list[Samples] = []
+    for said, group in groupby(pairs, key=lambda pair: told[pair[0]]):
+        waiting = list(group)
+        for start in range(0, len(waiting), batch_size):
+            batch = waiting[start : start + batch_size]
+            rows = [i for i, _ in batch]
+            numbers = [first + i + a * ANSWER for i, a in batch]
+            if said == ALL:
+                found = _given(generator, images[rows])
+            elif said == NOTHING:
+                found = draw(generator, numbers, seed, plain, progress=progress)
+            else:
+                known = {name: value[rows] for name, value in condition.items()}
+                found = draw(generator, numbers, seed, how, known, progress=progress)
+            pasted = _pasted(found.images, images[rows], state[rows])
+            done += _one_by_one(replace(found, images=pasted))
+            while len(done) >= num:
+                yield _together(done[:num])
+                done = done[num:]
+
+
+ALL, SOME, NOTHING = "all", "some", "nothing"
+
+
+def _told(condition: Condition, i: int) -> str:
+    """How much a generator is told of scan i."""
+    known, doubtful = condition["known"][i], condition["doubtful"][i]
+    if bool((known > 0).all()):
+        return ALL
+    return SOME if bool((known > 0).any()) or bool((doubtful > 0).any()) else NOTHING
+
+
+def _check_values(sensor: Sensor, images: Tensor) -> None:
+    if images.ndim != 4 or not len(images):
+        raise InputError(f"the images to complete must be (B, 2 or 1, H, W) with B of at least 1, found "
+                         f"{tuple(images.shape)}.")  # fmt: skip
+    if not bool(images.isfinite().all()):
+        raise InputError("the images to complete hold NaN or infinite values; a ray without a return has the range 0.")
+    r = images[:, 0]
+    near, far = sensor.min_range * (1 - LIMIT_TOLERANCE), sensor.max_range * (1 + LIMIT_TOLERANCE)
+    wrong = (r != 0) & ((r < near) | (r > far))
+    if bool(wrong.any()):
+        raise InputError(
+            f"a range of {float(r[wrong][0]):g} m is none of sensor '{sensor.name}', {sensor.min_range:g} to "
+            f"{sensor.max_range:g} m; give 0 and the state of a ray that was not measured."
+        )
+
+
+def _given(generator: Generator, images: Tensor) -> Samples:
+    """Scans of which everything is known."""
+    channels = 1 + generator.space.encoding.reflectance
+    none = torch.zeros(len(images), dtype=torch.int64)
+    return Samples(images[:, :channels], 0, none, none == 0, 0.0)
+
+
+def _pasted(found: Tensor, images: Tensor, state: Tensor) -> Tensor:
+    """Decoded scans with what was given where a ray is known."""
+    known = ((state == Ray.RETURN) | (state == Ray.EMPTY))[:, None]
+    channels = min(found.shape[1], images.shape[1])
+    pasted = torch.cat([torch.where(known, images[:, :channels], found[:, :channels]), found[:, channels:]], 1)
+    return pasted * (pasted[:, :1] > 0)
+
+
+def _one_by_one(made: Samples) -> list[Samples]:
+    share = made.seconds / len(made.images)
+    evaluations, converged = made.evaluations.cpu(), made.converged.cpu()
+    return [
+        Samples(made.images[b : b + 1], made.first, evaluations[b : b + 1], converged[b : b + 1], share)
+        for b in range(len(made.images))
+    ]
+
+
+def _together(answers: list[Samples]) -> Completed:
+    images, evaluations, converged = (
+        torch.cat([getattr(one, name) for one in answers]) for name in ("images", "evaluations", "converged")
+    )
+    return Completed(images, evaluations, converged, sum(one.seconds for one in answers))

@@ -1,0 +1,154 @@
+"""What is known of a scan: a state of each ray, and masks that say which rays are measured.
+
+state = ray_states(images, parse_mask("rows:4")(images.shape[-2:], rng))
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.lidar.region import region
+from r2flow.registry import Registry, did_you_mean
+
+
+class Ray(IntEnum):
+    """What is known of a ray. "Nothing came back" is a measurement too, and never the same as "not measured"."""
+
+    UNKNOWN = 0  # not measured
+    RETURN = 1  # measured, with a return
+    EMPTY = 2  # measured, and nothing came back
+    DOUBTFUL = 3  # measured, with or without a return, but not trusted
+
+
+def ray_states(images: Tensor, measured: Tensor | None = None) -> Tensor:
+    """The state of each ray, (B, H, W) uint8, of range images whose measured rays are known.
+
+    Args:
+        images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W); 0 without a return.
+        measured: Which rays are, (H, W) or (B, H, W) bool; None for all.
+    """
+    returned = images[:, 0] > 0
+    state = torch.full(returned.shape, int(Ray.EMPTY), dtype=torch.uint8, device=images.device)
+    state[returned] = int(Ray.RETURN)
+    if measured is not None:
+        state[~measured.to(images.device).expand_as(returned)] = int(Ray.UNKNOWN)
+    return state
+
+
+Mask = Callable[[tuple[int, int], np.random.Generator], np.ndarray]  # (H, W) and draws to measured rays, (H, W) bool
+
+
+def every_row(step: float, first: float = 0) -> Mask:
+    """Rows first, first + step, first + 2 step, ...: a sensor with fewer beams."""
+    if step < 1 or step % 1 or first < 0 or first % 1:
+        raise InputError(f"rows:STEP,FIRST are whole numbers, STEP of at least 1, found {step:g} and {first:g}.")
+
+    def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
+        if first >= shape[0]:
+            raise InputError(f"the mask begins at row {first:g}, and the image has rows 0 to {shape[0] - 1}.")
+        rows = (np.arange(shape[0]) - int(first)) % int(step) == 0
+        return np.repeat((rows & (np.arange(shape[0]) >= first % step))[:, None], shape[1], axis=1)
+
+    return mask
+
+
+def random_rows(share: float) -> Mask:
+    """A random share of the rows."""
+    _check_share("random", share)
+    return lambda shape, draws: np.repeat(_chosen(shape[0], share, draws)[:, None], shape[1], axis=1)
+
+
+def random_points(share: float) -> Mask:
+    """A random share of the rays."""
+    _check_share("points", share)
+    return lambda shape, draws: _chosen(math.prod(shape), share, draws).reshape(shape)
+
+
+def without_sector(first: float, last: float) -> Mask:
+    """All rays but those of a sector, from azimuth `first` counter-clockwise to `last`, in degrees."""
+
+    def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
+        measured = np.ones(shape, dtype=bool)
+        measured[:, region(shape, sector=(first, last)).columns.numpy()] = False
+        return measured
+
+    return mask
+
+
+MASKS: Registry[Callable[..., Mask]] = Registry(
+    "mask", rows=every_row, random=random_rows, points=random_points, sector=without_sector
+)
+FORMS = "rows:4, rows:4,FIRST, random:0.5, points:0.1, sector:-30,30 or a .npy of (H, W)"
+
+
+def parse_mask(text: str) -> Mask:
+    """A mask by its text: `NAME:NUMBERS` of `MASKS`, a .npy file, or several joined by +, which must all measure a ray.
+
+    Raises:
+        InputError: no such mask, numbers that it does not take, or a file that is no mask.
+    """
+    parts = [_one_mask(part.strip()) for part in text.split("+")]
+    return lambda shape, draws: np.logical_and.reduce([part(shape, draws) for part in parts])
+
+
+def _one_mask(text: str) -> Mask:
+    if text.endswith(".npy"):
+        return _from_file(Path(text))
+    name, _, numbers = text.partition(":")
+    if name not in MASKS:
+        raise InputError(f"no mask {text!r}: give {FORMS}.{did_you_mean(name, dict(MASKS.items()))}")
+    try:
+        return MASKS[name](*[float(number) for number in numbers.split(",")])
+    except (ValueError, TypeError):
+        raise InputError(f"the mask {text!r} does not say its numbers: give {FORMS}.") from None
+
+
+def _from_file(path: Path) -> Mask:
+    try:
+        held = np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"the mask {path} cannot be read: {error}.") from None
+    if not isinstance(held, np.ndarray) or held.ndim != 2 or not (held.dtype == bool or np.isin(held, (0, 1)).all()):
+        raise InputError(f"the mask {path} must be an array (H, W) of true where a ray is measured, or of 0 and 1.")
+
+    def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
+        if held.shape != tuple(shape):
+            raise InputError(f"the mask {path} is of {held.shape[0]} x {held.shape[1]}, the scans are of "
+                             f"{shape[0]} x {shape[1]} rays.")  # fmt: skip
+        return held.astype(bool)
+
+    return mask
+
+
+def _check_share(name: str, share: float) -> None:
+    if not 0 <= share <= 1:
+        raise InputError(f"{name}:SHARE is the share that is measured, from 0 to 1, found {share:g}.")
+
+
+def _chosen(count: int, share: float, draws: np.random.Generator) -> np.ndarray:
+    chosen = np.zeros(count, dtype=bool)
+    chosen[draws.permutation(count)[: round(share * count)]] = True
+    return chosen
+
+
+def nearest_filled(image: np.ndarray, known: Sequence[bool] | np.ndarray) -> np.ndarray:
+    """An image (C, H, W) whose unknown rays have the value of the nearest known one in their row, the ring closed.
+
+    A row without any stays as it is.
+    """
+    filled, columns = image.copy(), image.shape[-1]
+    at = np.arange(columns)
+    for row, measured in enumerate(np.asarray(known)):
+        places = np.flatnonzero(measured)
+        if 0 < len(places) < columns:
+            around = np.concatenate([places - columns, places, places + columns])
+            right = np.searchsorted(around, at)
+            nearest = np.where(at - around[right - 1] <= around[right] - at, around[right - 1], around[right])
+            filled[:, row] = image[:, row, nearest % columns]
+    return filled

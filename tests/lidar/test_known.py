@@ -1,0 +1,152 @@
+"""States of rays, masks, faults and interpolation."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.errors import InputError
+from r2flow.lidar.faults import FAULTS
+from r2flow.lidar.interpolation import OPPONENTS, guess, interpolated
+from r2flow.lidar.known import Ray, nearest_filled, parse_mask, ray_states
+from r2flow.lidar.sensors import SENSORS
+
+SENSOR = SENSORS["hdl64e"].resized(16, 64)
+SHAPE = SENSOR.shape
+
+
+def draws(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def test_a_ray_is_never_empty_because_it_was_not_measured():
+    images = torch.zeros(1, 2, 2, 2)
+    images[0, 0, 0, 0] = 5.0
+    measured = torch.tensor([[True, True], [False, True]])
+    assert ray_states(images, measured).tolist() == [[[Ray.RETURN, Ray.EMPTY], [Ray.UNKNOWN, Ray.EMPTY]]]
+    assert ray_states(images).tolist() == [[[Ray.RETURN, Ray.EMPTY], [Ray.EMPTY, Ray.EMPTY]]]
+
+
+def test_masks_measure_what_they_say():
+    assert np.flatnonzero(parse_mask("rows:4")(SHAPE, draws()).all(1)).tolist() == [0, 4, 8, 12]
+    assert np.flatnonzero(parse_mask("rows:4,2")(SHAPE, draws()).any(1)).tolist() == [2, 6, 10, 14]
+    rows = parse_mask("random:0.5")(SHAPE, draws())
+    assert rows.all(1).sum() == 8
+    assert rows.any(1).sum() == 8
+    assert parse_mask("points:0.1")(SHAPE, draws()).sum() == round(0.1 * math.prod(SHAPE))
+    sector = parse_mask("sector:-45,45")(SHAPE, draws())
+    assert np.flatnonzero(~sector.any(0)).tolist() == list(range(24, 40))  # the quarter ahead of 64 columns
+    both = parse_mask("rows:4+sector:-45,45")(SHAPE, draws())
+    assert both.sum() == 4 * 48
+
+
+def test_random_masks_differ_between_scans_and_are_drawn_again_alike():
+    mask = parse_mask("points:0.5")
+    assert (mask(SHAPE, draws(1)) == mask(SHAPE, draws(1))).all()
+    assert (mask(SHAPE, draws(1)) != mask(SHAPE, draws(2))).any()
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["row:4", "rows:0", "rows:1.5", "rows:two", "rows", "random:1.5", "points:-1", "sector:5", "sector:5,5", "no.npy"],
+)
+def test_what_is_no_mask_is_one_line(text):
+    with pytest.raises(InputError) as caught:
+        parse_mask(text)(SHAPE, draws())
+    assert "\n" not in str(caught.value)
+
+
+def test_a_mask_from_a_file_has_the_size_of_the_scans(tmp_path):
+    np.save(tmp_path / "mask.npy", np.eye(16, 64, dtype=np.uint8))
+    assert (parse_mask(str(tmp_path / "mask.npy"))(SHAPE, draws()) == np.eye(16, 64, dtype=bool)).all()
+    with pytest.raises(InputError, match="16 x 64"):
+        parse_mask(str(tmp_path / "mask.npy"))((8, 64), draws())
+    np.save(tmp_path / "other.npy", np.full((16, 64), 0.5))
+    with pytest.raises(InputError, match="true where a ray is measured"):
+        parse_mask(str(tmp_path / "other.npy"))
+
+
+def ground() -> np.ndarray:
+    """A plane 1.73 m below the sensor: r = 1.73 / sin(-e); every ray above -4 degrees looks into the sky."""
+    elevation = np.deg2rad(np.asarray(SENSOR.elevations))
+    r = np.where(elevation < np.deg2rad(-4), 1.73 / np.sin(-elevation).clip(1e-3), 0)
+    image = np.zeros((2, *SHAPE), dtype=np.float32)
+    image[0], image[1] = r[:, None], (r > 0)[:, None] * 0.25
+    return image
+
+
+@pytest.mark.parametrize("name", OPPONENTS)
+def test_interpolation_keeps_what_is_measured_and_fills_the_rest(name):
+    image = ground()
+    measured = parse_mask("points:0.3")(SHAPE, draws())
+    found = interpolated(np.where(measured, image, 7), measured, *OPPONENTS[name])
+    assert (found[:, measured] == image[:, measured]).all()
+    assert ((found[0] > 0) == (image[0] > 0)).mean() > 0.9
+    assert np.allclose(found[1][found[0] > 0], 0.25)
+
+
+def test_the_inverse_of_range_is_nearly_linear_on_the_ground():
+    image = ground()
+    measured = parse_mask("rows:2")(SHAPE, draws())
+    hidden = ~measured & (image[0] > 0)
+    hidden[: np.flatnonzero(measured.any(1) & (image[0] > 0).all(1))[0]] = False  # above the first known ground
+    hidden[15] = False  # beyond the last known row
+    # 1 / r = sin(-e) / h: the mean of two neighbours' is cos(step) of it, so that the range is 1 / cos(step) too long.
+    step = np.deg2rad(28 / 16)
+    direct, inverse = (interpolated(image, measured, "linear", way)[0] for way in (False, True))
+    assert inverse[hidden] == pytest.approx(image[0][hidden] / np.cos(step), rel=1e-5)
+    assert np.abs(inverse - image[0])[hidden].max() < 0.05 * np.abs(direct - image[0])[hidden].max()
+
+
+@pytest.mark.parametrize("mask", ["rows:4", "rows:3,2", "random:0.3", "points:0.1", "points:0.005", "sector:150,-150"])
+def test_the_guess_is_the_linear_interpolation_of_the_inverse(mask):
+    random = draws(3)
+    image = np.stack([random.uniform(2, 80, SHAPE), random.random(SHAPE)]).astype(np.float32)
+    image[:, random.random(SHAPE) < 0.3] = 0
+    measured = parse_mask(mask)(SHAPE, draws(4))
+    expected = interpolated(image, measured, "linear", inverse=True)
+    assert np.allclose(guess(image, measured), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_nothing_is_guessed_from_nothing():
+    assert not guess(ground(), np.zeros(SHAPE, dtype=bool)).any()
+
+
+def test_a_row_is_filled_from_its_nearest_neighbours_around_the_ring():
+    image = np.arange(8, dtype=np.float32)[None, None]
+    known = np.array([[False, True, False, False, False, False, True, False]])
+    assert nearest_filled(image, known)[0, 0].tolist() == [1, 1, 1, 1, 6, 6, 6, 6]
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faults_make_possible_scans(name):
+    image = ground()
+    found = FAULTS[name](image, SENSOR, 1.0, draws())
+    assert found.shape == image.shape
+    assert found.dtype == np.float32
+    r = found[0][found[0] > 0]
+    assert r.min() >= SENSOR.min_range
+    assert r.max() <= SENSOR.max_range
+    assert found[1].min() >= 0
+    assert found[1].max() <= 1
+    if name not in ("clean",):
+        assert (found != image).any()
+
+
+def test_faults_have_the_rates_that_they_say():
+    image = np.repeat(np.repeat(ground()[:, 10:11], 16, axis=1), 16, axis=2)  # one range everywhere
+    for name, most in (("rain", 0.1), ("crosstalk", 0.05), ("lost", 0.5)):
+        changed = (FAULTS[name](image, SENSOR, 1.0, draws())[0] != image[0]).mean()
+        spread = 4 * math.sqrt(most * (1 - most) / image[0].size)
+        # a drop behind the surface is not seen: P(1.45 + Exp(5) > r) of them are lost
+        seen = 1 - math.exp(-(image[0, 0, 0] - 1.45) / 5) if name == "rain" else 1
+        assert abs(changed - most * seen) < spread, name
+    noisy = FAULTS["noise"](image, SENSOR, 1.0, draws())[0] - image[0]
+    assert abs(noisy.std() - 0.5) < 0.5 * 4 / math.sqrt(2 * noisy.size)
+
+
+def test_a_clean_scan_has_lost_nothing_where_its_row_has_a_return():
+    image = ground()
+    image[:, 10, ::3] = 0
+    assert (FAULTS["clean"](image, SENSOR, 0.0, draws()) == ground()).all()

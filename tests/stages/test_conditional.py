@@ -1,0 +1,210 @@
+"""Flows that are told a part of the scan."""
+
+import math
+
+import pytest
+import torch
+
+from r2flow import noise
+from r2flow.errors import InputError
+from r2flow.generators import ConditionalFlow, Regression, Sampler, build_generator, condition_of
+from r2flow.lidar.known import Ray, parse_mask, ray_states
+from r2flow.noise import Draws
+from r2flow.stages.conditional import Conditional, Regress, Tasks
+
+CONFIG = {
+    "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
+    "encoding": {"format": "logscale", "reflectance": True},
+    "backbone": {
+        "name": "hdit", "base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16,
+        "position": "none", "detail": [1, 8],
+    },
+}  # fmt: skip
+
+
+def built(name: str, **backbone):
+    torch.manual_seed(1)
+    found = build_generator({**CONFIG, "backbone": CONFIG["backbone"] | backbone, "generator": {"name": name}})
+    with torch.no_grad():
+        for weight in found.parameters():
+            if not weight.any():
+                weight.normal_(std=0.05)
+    return found.eval()
+
+
+@pytest.fixture(scope="module")
+def flow() -> ConditionalFlow:
+    return built("conditional_flow")
+
+
+@pytest.fixture(scope="module")
+def scans() -> torch.Tensor:
+    draw = torch.Generator().manual_seed(3)
+    images = torch.stack([2 + 70 * torch.rand(3, 8, 32, generator=draw), torch.rand(3, 8, 32, generator=draw)], 1)
+    return images * (torch.rand(3, 1, 8, 32, generator=draw) > 0.2)
+
+
+def measured(images: torch.Tensor, text: str = "rows:4") -> torch.Tensor:
+    mask = torch.from_numpy(parse_mask(text)(images.shape[-2:], noise.generator(0, "condition", 0)))
+    return ray_states(images, mask)
+
+
+def test_known_values_are_encoded_and_the_rest_is_a_guess(flow, scans):
+    state = measured(scans)
+    told = condition_of(flow.space, scans, state)
+    known = (state != Ray.UNKNOWN)[:, None].expand_as(scans)
+    assert torch.equal(told["known"] > 0, known)
+    assert not told["doubtful"].any()
+    assert torch.equal(told["image"][known], flow.space.encoding.encode(scans)[known])
+    other = scans.clone()
+    other[~known] = 33.0 / 80  # what lies where nobody measured is not read
+    other[:, 0] = torch.where(state == Ray.UNKNOWN, torch.tensor(9.0), other[:, 0])
+    assert torch.equal(condition_of(flow.space, other, state)["image"], told["image"])
+
+
+def test_a_scan_without_reflectance_knows_that_of_its_empty_rays_alone(flow, scans):
+    told = condition_of(flow.space, scans[:, :1], measured(scans, "rows:1"))
+    assert told["known"][:, 0].all()
+    assert torch.equal(told["known"][:, 1] > 0, scans[:, 0] == 0)
+
+
+def test_states_that_contradict_the_image_are_refused(flow, scans):
+    for state in (Ray.RETURN, Ray.EMPTY):
+        with pytest.raises(InputError, match="a ray with a return must have a range"):
+            condition_of(flow.space, scans, torch.full((3, 8, 32), int(state), dtype=torch.uint8))
+    with pytest.raises(InputError, match=r"\(B, 2 or 1, 8, 32\)"):
+        condition_of(flow.space, scans[..., :16], measured(scans[..., :16]))
+
+
+@pytest.mark.parametrize("steps", [1, 3, 16])
+def test_known_values_arrive_as_given_and_on_their_line(flow, scans, steps):
+    told = condition_of(flow.space, scans, measured(scans))
+    draws = Draws(0, range(3))
+    x_0, known = draws.start((2, 8, 32)), told["known"] > 0
+    made = flow.generate(x_0, told, sampler=Sampler("euler", steps))
+    assert torch.equal(made.x[known], told["image"][known])
+    # half-way the known values are on the straight line between noise and scan
+    half = flow.solve(x_0, 0.0, 0.5, sampler=Sampler("euler", steps), condition=told).x
+    assert torch.allclose(half[known], ((x_0 + told["image"]) / 2)[known], atol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["dopri5", "heun2", "rk4", "adams3"])
+def test_solvers_that_look_at_the_end_find_no_infinity_there(flow, scans, method):
+    told = condition_of(flow.space, scans, measured(scans))
+    made = flow.generate(Draws(0, range(3)).start((2, 8, 32)), told, sampler=Sampler(method, 4, 1e-3))
+    assert made.x.isfinite().all()
+    assert made.converged.all()
+
+
+def test_a_rolled_scan_has_rolled_answers(flow, scans):
+    x_0 = Draws(0, range(3)).start((2, 8, 32))
+    told = condition_of(flow.space, scans, measured(scans, "rows:2+sector:10,80"))
+    turned = {name: value.roll(8, -1) for name, value in told.items()}
+    plain = flow.generate(x_0, told, sampler=Sampler("euler", 2)).x
+    rolled = flow.generate(x_0.roll(8, -1), turned, sampler=Sampler("euler", 2)).x
+    assert torch.allclose(rolled, plain.roll(8, -1), atol=1e-4)
+
+
+@pytest.mark.parametrize("backbone", [{}, {"detail": None}])
+def test_it_starts_as_the_flow_that_it_starts_from(backbone, scans):
+    parent, child = built("rectified_flow", **backbone), built("conditional_flow", **backbone)
+    child.start_from(parent)
+    x, t = torch.randn(3, 2, 8, 32), torch.tensor([0.1, 0.5, 0.9])
+    told = condition_of(child.space, scans, measured(scans))
+    with torch.no_grad():
+        expected, unknown = parent.velocity(t, x), told["known"] == 0
+        assert torch.allclose(child.velocity(t, x), expected, atol=1e-6)
+        assert torch.allclose(child.velocity(t, x, told)[unknown], expected[unknown], atol=1e-6)
+        exact = ((told["image"] - x) / (1 - t[:, None, None, None]))[~unknown]
+        assert torch.allclose(child.velocity(t, x, told)[~unknown], exact, rtol=1e-4)
+
+
+def test_a_u_net_too_starts_as_the_flow_that_it_starts_from(scans):
+    tiny = {
+        "name": "efficient_unet", "base_channels": 8, "channel_multiplier": [1, 2], "num_residual_blocks": 1,
+        "num_heads": 2,
+    }  # fmt: skip
+    config = {**CONFIG, "backbone": tiny}
+    parent, child = (
+        build_generator({**config, "generator": {"name": n}}) for n in ("rectified_flow", "conditional_flow")
+    )
+    with torch.no_grad():
+        parent.backbone.out_conv.weight.normal_()
+        child.start_from(parent)
+        x, t = torch.randn(3, 2, 8, 32), torch.tensor(0.5)
+        assert torch.allclose(child.velocity(t, x), parent.velocity(t, x), atol=1e-5)
+
+
+def stage_of(kind, generator, **tasks):
+    stage = kind(generator, tasks=tasks, warmup_images=0)
+    stage.log = lambda *args, **kwargs: None
+    return stage
+
+
+def batch_of(scans: torch.Tensor, space, first: int = 0) -> dict[str, torch.Tensor]:
+    x_1 = space.encoding.encode(scans)
+    return {"x_1": x_1, "x_0": torch.randn_like(x_1), "u": torch.rand(3), "k": torch.arange(first, first + 3)}
+
+
+def test_what_is_known_depends_on_the_image_s_number_alone(flow, scans):
+    stage = stage_of(Conditional, flow)
+    batch = batch_of(scans, flow.space)
+    whole = stage.condition(batch)
+    alone = stage.condition({name: value[1:2] for name, value in batch.items()})
+    for name in whole:
+        assert torch.equal(whole[name][1:2], alone[name])
+    assert any(not torch.equal(whole[name], stage.condition(batch_of(scans, flow.space, 3))[name]) for name in whole)
+
+
+def test_tasks_have_the_shares_that_they_say(flow, scans):
+    tasks, count = Tasks(nothing=0.3, faulty=0.2, silent=0.25), 600
+    x_1 = flow.space.encoding.encode(scans)
+    told = [tasks(flow.space, x_1[0], noise.generator(0, "condition", k)) for k in range(count)]
+    nothing = sum(not (one["known"].any() or one["doubtful"].any()) for one in told) / count
+    faulty = sum(bool(one["doubtful"].any()) for one in told) / count
+    assert abs(nothing - 0.3) < 4 * math.sqrt(0.3 * 0.7 / count)
+    assert abs(faulty - 0.7 * 0.2) < 4 * math.sqrt(0.14 * 0.86 / count)
+    returned = scans[0, 0] > 0
+    silent = [
+        one for one in told
+        if one["known"][0, 0][returned].any() and not one["known"][0, 1][returned].any()
+    ]  # fmt: skip
+    assert abs(len(silent) / count - 0.25 * 0.56) < 4 * math.sqrt(0.14 * 0.86 / count)
+
+
+def test_nothing_is_learned_of_what_is_known(flow, scans):
+    stage = stage_of(Conditional, flow)
+    batch = batch_of(scans, flow.space)
+    state = ray_states(scans)
+    stage.condition = lambda _: condition_of(flow.space, scans, state)  # type: ignore[method-assign]
+    assert stage.regression_loss(batch, torch.tensor([0.0, 0.5, 0.99])) < 1e-6
+
+
+def test_the_twin_learns_medians():
+    """Of values that are 0.5 in two scans of three and 1.0 in one, mean absolute error wants 0.5."""
+    generator = built("regression")
+    stage = stage_of(Regress, generator, nothing=0.0, faulty=0.0, silent=0.0)
+    x_1 = torch.full((3, 2, 8, 32), 0.5)
+    x_1[2] = 1.0
+    batch = {"x_1": x_1, "x_0": torch.zeros_like(x_1), "u": torch.rand(3), "k": torch.arange(3)}
+    stage.condition = lambda _: None  # type: ignore[method-assign]
+    optimizer = torch.optim.Adam(generator.parameters(), lr=3e-3)
+    for step in range(120):
+        for group in optimizer.param_groups:
+            group["lr"] = 3e-3 * (1 - step / 120)
+        optimizer.zero_grad()
+        stage.training_step(batch, 0).backward()
+        optimizer.step()
+    found = generator.generate(torch.zeros(1, 2, 8, 32)).x
+    assert found.mean() == pytest.approx(0.5, abs=0.05)
+
+
+def test_the_twin_has_one_way_to_be_run_and_ignores_the_noise(scans):
+    generator = built("regression")
+    assert isinstance(generator, Regression)
+    told = condition_of(generator.space, scans, measured(scans))
+    one, other = (generator.generate(torch.full((3, 2, 8, 32), value), told) for value in (0.0, 1.0))
+    assert torch.equal(one.x, other.x)
+    assert one.evaluations.tolist() == [1, 1, 1]
+    with pytest.raises(InputError, match="one way only"):
+        generator.check_sampler(Sampler("euler", 4))

@@ -1,0 +1,190 @@
+"""Networks with random weights: what is claimed here holds whatever they have learned."""
+
+import math
+
+import pytest
+import torch
+
+from r2flow.checkpoints import Checkpoint
+from r2flow.completion import ANSWER, complete, completing, spread_of
+from r2flow.errors import InputError
+from r2flow.generators import Generator, Sampler, build_generator
+from r2flow.lidar.known import Ray, parse_mask, ray_states
+from r2flow.noise import Draws, generator
+from tests.test_checkpoints import CONFIG
+
+SHAPE = 8, 64
+
+
+def network(name: str = "conditional_flow", reflectance: bool = True, **backbone) -> Checkpoint:
+    config = {
+        **CONFIG,
+        "generator": {"name": name},
+        "encoding": {"format": "logscale", "reflectance": reflectance},
+        "backbone": {**CONFIG["backbone"], "position": "none", "ring": True, **backbone},
+    }
+    torch.manual_seed(4)
+    made = build_generator(config).eval().requires_grad_(False)
+    for parameter in made.parameters():
+        parameter.copy_(0.2 * torch.randn_like(parameter))
+    made.sampler = made.sampler if name == "regression" else Sampler("euler", 3)
+    return Checkpoint(made, config)
+
+
+def scans(count: int = 2) -> torch.Tensor:
+    """Walls with holes, (B, 2, 8, 64)."""
+    draws = torch.Generator().manual_seed(7)
+    r = 3 + 60 * torch.rand(count, 1, *SHAPE, generator=draws)
+    r = r * (torch.rand(r.shape, generator=draws) > 0.2)
+    return torch.cat([r, torch.rand(r.shape, generator=draws) * (r > 0)], 1)
+
+
+def halved(images: torch.Tensor) -> torch.Tensor:
+    """The states where every second row is measured."""
+    measured = parse_mask("rows:2")(SHAPE, generator(0, "condition", 0))
+    return ray_states(images, torch.from_numpy(measured))
+
+
+@pytest.mark.parametrize("batch_size", [1, 4])
+def test_known_rays_come_back_to_the_bit(batch_size):
+    images = scans()
+    state = halved(images)
+    found = network().complete(images, state, num=3, batch_size=batch_size)
+    assert found.shape == (2, 3, 2, *SHAPE)
+    known = (state != Ray.UNKNOWN)[:, None, None].expand_as(found)
+    assert torch.equal(found[known], images[:, None].expand_as(found)[known])
+    assert not torch.equal(found[:, 0], found[:, 1])  # the rest is drawn
+
+
+def test_a_scan_of_which_everything_is_known_comes_back_without_an_evaluation():
+    images = scans()
+    for found, image in zip(complete(network(), images, ray_states(images), num=2), images, strict=True):
+        assert torch.equal(found.images, image.expand(2, -1, -1, -1))
+        assert found.evaluations.tolist() == [0, 0]
+        assert found.converged.all()
+        assert not found.spread[0].any()
+
+
+def test_a_scan_of_which_nothing_is_known_is_the_sample_of_its_number():
+    checkpoint = network()
+    nothing = torch.zeros(3, 2, *SHAPE)
+    state = torch.zeros(3, *SHAPE, dtype=torch.uint8)
+    found = checkpoint.complete(nothing, state, num=2, seed=5)
+    assert torch.equal(found[:, 0], checkpoint.sample(3, seed=5))
+    (later,) = complete(checkpoint, nothing[:1], state[:1], num=1, seed=5, first=2)
+    assert torch.equal(later.images, found[2, :1])
+
+
+def test_an_answer_depends_on_seed_scan_and_its_number_alone():
+    images = scans(3)
+    state = halved(images)
+    checkpoint = network()
+    whole = checkpoint.complete(images, state, num=3, seed=1)
+    batched = checkpoint.complete(images, state, num=3, seed=1, batch_size=4)
+    torch.testing.assert_close(batched, whole, rtol=1e-4, atol=1e-4)
+    (alone,) = complete(checkpoint, images[2:], state[2:], num=1, seed=1, first=2)
+    assert torch.equal(alone.images[0], whole[2, 0])
+    assert not torch.equal(whole[:, 0], checkpoint.complete(images, state, seed=2)[:, 0])
+
+
+def test_answers_never_share_their_noise():
+    starts = Draws(0, [0, 1, ANSWER, ANSWER + 1]).start((4,))
+    assert len(torch.unique(starts, dim=0)) == 4
+
+
+def test_scans_that_are_known_in_part_wholly_and_not_at_all_go_together():
+    images = scans(3)
+    state = halved(images)
+    state[1] = ray_states(images)[1]
+    state[2] = Ray.UNKNOWN
+    checkpoint = network()
+    found = list(complete(checkpoint, images, state, num=2, batch_size=4))
+    assert [one.evaluations.tolist() for one in found] == [[3, 3], [0, 0], [3, 3]]
+    assert torch.equal(found[1].images[0], images[1])
+    for i, one in enumerate(found):
+        (alone,) = complete(checkpoint, images[i : i + 1], state[i : i + 1], num=2, first=i)
+        torch.testing.assert_close(one.images, alone.images, rtol=1e-4, atol=1e-4)
+
+
+def test_reflectance_that_was_not_given_is_completed():
+    images = scans()
+    state = ray_states(images)
+    found = network().complete(images[:, :1], state)[:, 0]
+    assert torch.equal(found[:, 0], images[:, 0])
+    returned = images[:, 0] > 0
+    assert not found[:, 1][~returned].any()
+    assert found[:, 1][returned].std() > 0
+
+
+def test_a_model_of_range_alone_leaves_reflectance_out():
+    images = scans()
+    found = network(reflectance=False).complete(images, halved(images), num=2)
+    assert found.shape == (2, 2, 1, *SHAPE)
+    assert torch.equal(found[:, 0, :, ::2], images[:, :1, ::2])
+    everything = network(reflectance=False).complete(images, ray_states(images))
+    assert torch.equal(everything[:, 0], images[:, :1])
+
+
+def test_turned_scans_give_turned_answers_without_a_position():
+    images = scans()
+    state = halved(images)
+    checkpoint = network("regression")
+    found = checkpoint.complete(images, state)
+    turned = checkpoint.complete(images.roll(16, -1), state.roll(16, -1))
+    torch.testing.assert_close(turned, found.roll(16, -1), rtol=1e-3, atol=1e-3)
+
+
+def test_blended_rays_may_be_mended():
+    images = scans()
+    state = halved(images)
+    mended = network().complete(images, state, keep="blend")
+    measured = state == Ray.RETURN
+    assert not torch.equal(mended[:, 0, 0][measured], images[:, 0][measured])
+    doubtful = torch.where(state == Ray.UNKNOWN, state, int(Ray.DOUBTFUL))
+    assert torch.equal(mended, network().complete(images, doubtful))
+
+
+def test_without_states_a_ray_without_a_return_is_not_measured():
+    images = scans()
+    state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.UNKNOWN))
+    assert torch.equal(network().complete(images), network().complete(images, state))
+
+
+def test_spread_is_over_the_answers_with_a_return():
+    images = torch.tensor([[3.0, 5.0, 0.0], [5.0, 0.0, 0.0], [7.0, 0.0, 0.0]]).view(3, 1, 1, 3)
+    deviation, share = spread_of(images)
+    assert deviation.tolist() == [[2.0, 0.0, 0.0]]  # of 3, 5, 7: sqrt((4 + 0 + 4) / 2)
+    torch.testing.assert_close(share, torch.tensor([[1, 1 / 3, 0]]))
+
+
+class Noise(Generator):
+    """No flow."""
+
+    def __init__(self) -> None:
+        super().__init__(network().generator.space, (4,))
+
+
+def test_a_generator_that_cannot_complete_is_refused():
+    with pytest.raises(InputError, match="a Noise cannot complete a scan: that needs a flow of range images"):
+        completing(Noise())
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"images": torch.zeros(1, 2, 8, 32)}, r"must be \(B, 2 or 1, 8, 64\)"),
+        ({"images": torch.zeros(2, 8, 64)}, r"must be \(B, 2 or 1, H, W\)"),
+        ({"images": torch.full((1, 2, 8, 64), math.nan)}, "hold NaN"),
+        ({"images": torch.full((1, 2, 8, 64), 0.5)}, "a range of 0.5 m is none of sensor 'hdl64e', 1.45 to 80 m"),
+        ({"state": torch.zeros(1, 8, 32)}, "states of the rays must be"),
+        ({"state": torch.full((1, 8, 64), int(Ray.RETURN))}, "a ray with a return must have a range above 0"),
+        ({"keep": "all"}, "keep must be exact or blend"),
+        ({"num": 0}, "at least one answer"),
+        ({"steps": 0}, "at least 1 step"),
+    ],
+)
+def test_what_fits_nothing_is_refused(changed, message):
+    images = torch.zeros(1, 2, *SHAPE)
+    given = {"images": images, "state": torch.zeros(1, *SHAPE, dtype=torch.uint8), **changed}
+    with pytest.raises(InputError, match=message):
+        list(complete(network(), **given))
