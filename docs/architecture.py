@@ -26,7 +26,7 @@ ROOMS = {
     "simulator": (8, 1, ("simulator",), "street scenes, ray-cast"),
     "generators": (8, 2, ("generators",), "noise in, scan out"),
     "lidar": (9, 0, ("lidar",), "sensors, range images, files"),
-    "flow": (9, 1, ("flow", "diffusion"), "path, times, losses, solvers"),
+    "flow": (9, 1, ("flow", "diffusion", "adversarial"), "path, times, losses, solvers"),
     "backbones": (9, 2, ("backbones",), "networks v(t, x)"),
 }
 # What all rooms stand on; lines to it would cover the others.

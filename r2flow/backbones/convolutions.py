@@ -75,12 +75,12 @@ class Resample(ExactBuffers):
 
 
 class GroupNorm(nn.GroupNorm):
-    """Group norm of 8 groups, computed in float32."""
+    """Group norm computed in float32."""
 
-    def __init__(self, channels: int, affine: bool = True) -> None:
-        if channels % GROUPS:
-            raise InputError(f"{channels} channels cannot be normed in {GROUPS} groups: make them a multiple of it.")
-        super().__init__(GROUPS, channels, eps=EPS, affine=affine)
+    def __init__(self, channels: int, groups: int = GROUPS, eps: float = EPS, affine: bool = True) -> None:
+        if channels % groups:
+            raise InputError(f"{channels} channels cannot be normed in {groups} groups: make them a multiple of it.")
+        super().__init__(groups, channels, eps=eps, affine=affine)
 
     def forward(self, x: Tensor) -> Tensor:
         wide = at_least_float32(x)

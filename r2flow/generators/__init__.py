@@ -11,14 +11,15 @@ from r2flow.generators.budgets import Budget, levels
 from r2flow.generators.conditional import ConditionalFlow, Regression, condition_of
 from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
 from r2flow.generators.flow_map import FlowMap
+from r2flow.generators.latent import LatentDiffusion, VQAutoencoder
 from r2flow.generators.score import ScoreModel
 from r2flow.lidar.space import build_space
 from r2flow.registry import Registry
 
 __all__ = [
     "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "Field", "Flow", "FlowMap", "Generated",
-    "Generator", "RectifiedFlow", "Regression", "Sampler", "ScoreModel", "as_flow", "build_generator",
-    "condition_of", "levels",
+    "Generator", "LatentDiffusion", "RectifiedFlow", "Regression", "Sampler", "ScoreModel", "VQAutoencoder", "as_flow",
+    "build_generator", "condition_of", "levels",
 ]  # fmt: skip
 
 GENERATORS: Registry[type[Generator]] = Registry(
@@ -28,6 +29,8 @@ GENERATORS: Registry[type[Generator]] = Registry(
     conditional_flow=ConditionalFlow,
     regression=Regression,
     score=ScoreModel,
+    vq_autoencoder=VQAutoencoder,
+    latent_diffusion=LatentDiffusion,
 )
 
 

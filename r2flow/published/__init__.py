@@ -2,13 +2,13 @@
 
 from typing import Any
 
-from r2flow.published import flows, lidargen
+from r2flow.published import flows, lidargen, lidm
 from r2flow.published.flows import published_cfg
 from r2flow.published.format import Format, Published
 
 __all__ = ["FORMATS", "Format", "Published", "format_of", "published_cfg"]
 
-FORMATS: tuple[Format, ...] = (flows.FORMAT, lidargen.FORMAT)
+FORMATS: tuple[Format, ...] = (flows.FORMAT, lidargen.FORMAT, lidm.DIFFUSION, lidm.FIRST_STAGE)
 
 
 def format_of(content: Any) -> Format | None:

@@ -10,6 +10,7 @@ from r2flow.registry import Registry, check_options
 from r2flow.stages.base import Stage
 from r2flow.stages.conditional import Conditional, Regress
 from r2flow.stages.flow_map import LearnFlowMap
+from r2flow.stages.latent import LearnAutoencoder, LearnLatentDiffusion
 from r2flow.stages.rectify import Rectify
 from r2flow.stages.reflow import Distill, Reflow
 from r2flow.stages.score import MatchScore
@@ -23,6 +24,8 @@ STAGES: Registry[type[Stage]] = Registry(
     conditional=Conditional,
     regress=Regress,
     score_matching=MatchScore,
+    autoencoder=LearnAutoencoder,
+    latent_diffusion=LearnLatentDiffusion,
 )
 
 

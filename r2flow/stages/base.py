@@ -45,6 +45,7 @@ class Stage(L.LightningModule):
 
     generator_name: ClassVar[str | None] = None  # what it trains; None: the parent's, or a rectified flow
     needs_pairs: ClassVar[bool] = False  # whether a batch's x_0 and x_1 belong together
+    needs_parent: ClassVar[bool] = False  # whether it starts from another run, also where it learns from scans
     anneals: ClassVar[bool] = True  # whether the learning rate falls to 0 at the run's last step
 
     def __init__(
