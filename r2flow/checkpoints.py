@@ -67,7 +67,7 @@ class Checkpoint:
         """
         if not isinstance(self.generator, RectifiedFlow):
             raise InputError(f"{self.path} holds a {type(self.generator).__name__}, which has no network v(t, x).")
-        return self.generator.backbone
+        return self.generator.untold().backbone
 
     @property
     def sensor(self) -> Sensor:

@@ -161,7 +161,7 @@ def export(checkpoint: Checkpoint, path: str | Path, sampler: Sampler | None = N
     write = FORMATS[path.suffix.removeprefix(".")]
     if not isinstance(flow, RectifiedFlow):
         raise InputError(f"only flows can be exported, and {checkpoint.path} holds a {type(flow).__name__}.")
-    how = sampler or flow.sampler
+    flow, how = flow.untold(), sampler or flow.sampler
     steps = None if network else tableau(flow, how)
     notes = _notes(checkpoint, how, steps)
     with _quiet():

@@ -67,7 +67,7 @@ def completion(
     checkpoint: CheckpointOption = Path("street"),
     also: Annotated[list[str] | None, typer.Option(help="More models, one each time.")] = None,
     tasks: Annotated[
-        str | None, typer.Option(help="What is known, by masks with a space between them; the usual five if left out.")
+        str | None, typer.Option(help="Masks (rows:4) and faults (rain), a space between them; five masks if left out.")
     ] = None,
     solvers: Annotated[str | None, typer.Option(help="Ways to run the first model, as flowdps,repaint.")] = None,
     steps: Annotated[str | None, typer.Option(help="Numbers of steps of the first model, as 8,16,64.")] = None,
@@ -85,7 +85,7 @@ def completion(
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.output import command, finish
     from r2flow.progress import Bar
-    from r2flow.reports.completion import TASKS, completion_page, completion_rows, hidden_by, pictured, ways_of
+    from r2flow.reports.completion import TASKS, completion_page, completion_rows, given_by, pictured, ways_of
     from r2flow.reports.inversion import real_scans
     from r2flow.reports.pages import prepare_folder
 
@@ -96,7 +96,7 @@ def completion(
         ways += ways_of(load_checkpoint(other, choose_device(device)), Path(other).stem)
     named = tasks.split() if tasks else list(TASKS)
     for task in named:
-        hidden_by(task, first.sensor.shape, 0)
+        given_by(task, np.zeros((2, *first.sensor.shape), dtype=np.float32), first.sensor, 0)
     scans = real_scans(first, [real], reflectance_scale, num)
     truths = [np.asarray(scan.image) for scan in scans]
     prepare_folder(out)

@@ -1,18 +1,24 @@
 """Generators that are told a part of the scan: rays that are known, and rays that were measured but are not trusted."""
 
 from collections.abc import Mapping
-from typing import Any
+from copy import deepcopy
+from itertools import pairwise
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from torch import Tensor, nn
 
+from r2flow.backbones import Backbone
+from r2flow.backbones.convolutions import RingConv2d, zero_convolution
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.generators.flow import RectifiedFlow
 from r2flow.lidar.interpolation import guess
 from r2flow.lidar.known import Ray
+from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 
@@ -72,24 +78,69 @@ def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor, Te
     return image, known, doubtful
 
 
+class Trust(nn.Module):
+    """How far the guess of a condition holds, value by value: 3 x 3 convolutions on the condition.
+
+    Args:
+        channels: C of the image.
+        width: Of the hidden layers.
+    """
+
+    FINEST = 1e-3  # of sigma in model space, 0.2 % of a range on the paper's logarithmic scale
+    BROAD = 0.5  # standard deviation in model space of what is no guess
+
+    def __init__(self, channels: int, width: int = 24) -> None:
+        super().__init__()
+        sizes = [3 * channels, width, width, width]
+        self.layers = nn.ModuleList([RingConv2d(before, after, ring=True) for before, after in pairwise(sizes)])
+        self.answer = zero_convolution(RingConv2d(width, 2 * channels, ring=True))
+
+    def forward(self, told: Tensor) -> tuple[Tensor, Tensor]:
+        """`image`, `known` and `doubtful`, (B, 3 C, H, W), to logit p and sigma, (B, C, H, W) each."""
+        h = told
+        for layer in self.layers:
+            h = F.silu(layer(h))
+        logit, spread = self.answer(h).float().chunk(2, dim=1)
+        return logit, (spread - 4).exp() + self.FINEST
+
+
 class ConditionalFlow(RectifiedFlow):
     """v(t, x | y) of a network that also sees what is known, y: one model for any mask, none and all included.
 
-    A known value has the exact velocity of its straight line, (y - x) / (1 - t), and arrives as it was given. The
-    condition is that of `condition_of`; None draws a scan of which nothing is known.
+    A known value has the exact velocity of its straight line, (y - x) / (1 - t), and arrives as it was given. Elsewhere
+    x_1 is held to be, with probability p, near the guess g of the condition, N(g, sigma^2), and else what the network
+    says: by Bayes' rule for x_t, whose variance is V_s = (t s)^2 + (1 - t)^2 about t g or 0,
+
+        v = r [g + skip(t, sigma) (x - t g)] + (1 - r) network(t, x, y),
+        logit r = logit p + log N(x; t g, V_sigma) - log N(x; 0, V_b),    b = 0.5,
+
+    `skip` that of `r2flow.backbones.base.precondition`; p and sigma by `Trust`. So where interpolation holds, the model
+    need not learn it again, and where it does not, x_t soon tells. The condition is that of `condition_of`; None draws
+    a scan of which nothing is known, by the network alone.
     """
+
+    trusts: ClassVar[bool] = True
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         self.condition_channels = 3 * space.shape[0]
         super().__init__(space, backbone)
+        if self.trusts:
+            self.trust = Trust(space.shape[0])
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         image, known, doubtful = parts_of(condition, x)
         v: Tensor = self.backbone(t, torch.cat([x, image, known, doubtful], dim=1))
         if condition is None:
             return v
-        left = expand_time(1 - torch.as_tensor(t, device=x.device), x).clamp(min=LAST)
-        return torch.where(known > 0, ((image - x) / left).to(v), v)
+        logit, sigma = self.trust(torch.cat([image, known, doubtful], dim=1))
+        t = expand_time(torch.as_tensor(t, device=x.device, dtype=torch.float32), x)
+        left, off = 1 - t, x - t * image
+        narrow, broad = ((t * std).square() + left.square() for std in (sigma, Trust.BROAD))
+        near = logit - (narrow.log() - broad.log() + off.square() / narrow - x.square() / broad) / 2
+        told = (known + doubtful).flatten(1).any(1)[:, None, None, None]
+        about = image + (t * sigma.square() - left) / narrow * off
+        mixed = v + near.sigmoid() * told * (about - v)
+        return torch.where(known > 0, (image - x) / left.clamp(min=LAST), mixed).to(v)
 
     def generate(
         self,
@@ -106,16 +157,37 @@ class ConditionalFlow(RectifiedFlow):
         image, known, _ = parts_of(condition, made.x)
         return Generated(torch.where(known > 0, image, made.x), made.evaluations, made.converged)
 
-    def start_from(self, parent: Generator) -> None:
-        """Take over a flow's weights; those of what it was never told begin at zero and change nothing at first."""
-        own, theirs = self.state_dict(), dict(parent.state_dict())
-        channels, more = self.space.shape[0], self.condition_channels
-        for name, value in theirs.items():
-            wanted = own[name].shape if name in own else value.shape
-            if value.ndim > 1 and wanted != value.shape and wanted == (len(value), value.shape[1] + more, *wanted[2:]):
-                unseen = value.new_zeros(len(value), more, *value.shape[2:])
-                theirs[name] = torch.cat([value[:, :channels], unseen, value[:, channels:]], dim=1)
-        self._take_flow(parent, theirs)
+    def part(self, region: Region) -> RectifiedFlow:
+        part = super().part(region)
+        if self.trusts and part is not self:
+            part.trust = deepcopy(self.trust)
+            for layer in part.trust.modules():
+                if isinstance(layer, RingConv2d) and region.width < region.shape[1]:
+                    layer.open_ring()
+        return part
+
+    def untold(self) -> RectifiedFlow:
+        flow = RectifiedFlow.__new__(RectifiedFlow)
+        nn.Module.__init__(flow)
+        flow.space, flow.noise_shape, flow.sampler = self.space, self.noise_shape, self.sampler
+        flow.backbone = cast(Backbone, _Untold(self.backbone, self.condition_channels))
+        return flow.train(self.training)
+
+
+class _Untold(nn.Module):
+    """v(t, x) of a network with further input channels, of which nothing is known."""
+
+    second_time = False
+
+    def __init__(self, backbone: Backbone, channels: int) -> None:
+        super().__init__()
+        self.backbone, self.channels = backbone, channels
+        self.in_channels, self.coords, self.unit = backbone.in_channels - channels, backbone.coords, backbone.unit
+
+    def forward(self, t: Tensor, x: Tensor) -> Tensor:
+        unknown = x.new_zeros(x.shape[0], self.channels, x.shape[2], x.shape[3])
+        v: Tensor = self.backbone(t, torch.cat([x, unknown], dim=1))
+        return v
 
 
 class Regression(ConditionalFlow):
@@ -123,6 +195,8 @@ class Regression(ConditionalFlow):
 
     Learned by absolute error it is the median of each value; it draws nothing.
     """
+
+    trusts = False
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space, backbone)

@@ -125,18 +125,23 @@ class RectifiedFlow(Flow):
         return v
 
     def start_from(self, parent: Generator) -> None:
-        """Take over a flow's weights; what a second time adds keeps its own, which change nothing at first.
+        """Take over a flow's weights; what a second time or a condition adds changes nothing at first.
 
-        A flow that looks elsewhere, as through another sensor, keeps its own rays.
+        A condition of the other flow is forgotten. A flow that looks elsewhere, as through another sensor, keeps its
+        own rays.
 
         Raises:
             InputError: other weights; a network with weights for each place of the image, and another size.
         """
-        self._take_flow(parent, parent.state_dict())
-
-    def _take_flow(self, parent: Generator, theirs: Mapping[str, Tensor]) -> None:
         own = self.state_dict()
-        new = {name: own[name] for name in (f"backbone.{name}" for name in self.backbone.second_time_names())}
+        more = self.condition_channels - getattr(parent, "condition_channels", 0)
+        theirs = {
+            name: _with_inputs(value, own[name].shape, self.space.shape[0], more) if name in own else value
+            for name, value in parent.state_dict().items()
+            if name in own or name.startswith("backbone.")
+        }
+        new = {name: value for name, value in own.items() if not name.startswith("backbone.")}
+        new |= {name: own[name] for name in (f"backbone.{name}" for name in self.backbone.second_time_names())}
         if not torch.equal(self.space.rays, parent.space.rays):
             theirs = {**theirs, "backbone.coords": own["backbone.coords"]}
             sized = [name for name, value in theirs.items() if name in own and value.shape != own[name].shape]
@@ -147,6 +152,10 @@ class RectifiedFlow(Flow):
                     "leave sensor out, or start from one that was trained with backbone.position=none."
                 )
         self._take(parent, {**new, **theirs})
+
+    def untold(self) -> "RectifiedFlow":
+        """The flow of scans of which nothing is known: itself, where it takes no condition."""
+        return self
 
     @property
     def unit(self) -> tuple[int, int]:
@@ -163,6 +172,17 @@ class RectifiedFlow(Flow):
         part = copy(self)
         part._modules = {"backbone": self.backbone.cropped(region.rows, region.columns)}
         return part
+
+
+def _with_inputs(weights: Tensor, wanted: tuple[int, ...], channels: int, more: int) -> Tensor:
+    """Weights on an image's channels, and features behind them, with `more` zeros between these, or as many taken out.
+
+    Other weights, which the wanted shape tells, stay as they are.
+    """
+    if not more or weights.shape == wanted or len(wanted) < 2 or weights.shape[1] + more != wanted[1]:
+        return weights
+    own, rest = weights[:, :channels], weights[:, channels + max(-more, 0) :]
+    return torch.cat([own, weights.new_zeros(len(weights), max(more, 0), *weights.shape[2:]), rest], dim=1)
 
 
 class Field(Flow):

@@ -184,7 +184,7 @@ def cost(config: Mapping[str, Any], repeats: int, device: str) -> dict[str, Any]
     generator = build_generator(config)
     if not isinstance(generator, RectifiedFlow):
         return {"parameters": count_parameters(generator)}
-    model = generator.backbone.eval()
+    model = generator.untold().backbone.eval()
     found: dict[str, Any] = {"parameters": count_parameters(model), "gmac": count_macs(model) / 1e9}
     shape = (1, *generator.space.shape)
     found["latency_ms"] = latency(model.to(device), shape, repeats, device) if repeats else None

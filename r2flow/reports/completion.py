@@ -2,20 +2,22 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from r2flow import noise
 from r2flow.checkpoints import Checkpoint
 from r2flow.completion import complete, completing
 from r2flow.errors import InputError
-from r2flow.generators import Sampler
+from r2flow.generators import Regression, Sampler
 from r2flow.generators.base import Progress
+from r2flow.lidar.faults import FAULTS
 from r2flow.lidar.interpolation import OPPONENTS, interpolated
-from r2flow.lidar.known import parse_mask, ray_states
+from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.completion import UNITS, errors, spread_errors
@@ -24,6 +26,7 @@ from r2flow.reports.pages import Page
 from r2flow.reports.pictures import dark_figure, draw_perspective, draw_range
 from r2flow.reports.tables import table
 
+AS_IT_IS = "as it is"
 TASKS = ("rows:4", "rows:2", "random:0.5", "points:0.1", "sector:-11.25,11.25")
 SHOWN = {
     "method": "method", "evaluations": "evaluations", "seconds": "seconds", **UNITS, "panel": "panel",
@@ -60,12 +63,47 @@ def ways_of(checkpoint: Checkpoint, name: str, solvers: Sequence[str] = (), step
     return ways
 
 
-def hidden_by(task: str, shape: tuple[int, int], number: int) -> np.ndarray:
-    """The rays that a task hides of scan `number`, (H, W) bool: a function of both alone."""
-    hidden = ~parse_mask(task)(shape, noise.generator(0, "condition", number))
-    if not hidden.any() or hidden.all():
-        raise InputError(f"the task {task!r} hides {'every' if hidden.all() else 'no'} ray; give one that leaves some.")
-    return hidden
+class Given(NamedTuple):
+    """What a task gives of a scan.
+
+    Attributes:
+        image: Range in metres and reflectance, (2 or 1, H, W).
+        state: `r2flow.lidar.known.Ray` of each ray, (H, W).
+        asked: The rays that are to be found, (H, W) bool: hidden ones, or all that are not trusted.
+    """
+
+    image: np.ndarray
+    state: Tensor
+    asked: np.ndarray
+
+
+def given_by(task: str, truth: np.ndarray, sensor: Sensor, number: int) -> Given:
+    """What a task gives of scan `number`, a function of both alone: rays that a mask leaves, or a faulty measurement.
+
+    Raises:
+        InputError: no such task, or one that hides nothing or all.
+    """
+    draws = noise.generator(0, "condition", number)
+    if task in FAULTS:
+        image = np.ascontiguousarray(FAULTS[task](truth, sensor, 0.5, draws))
+        return Given(image, torch.full(image.shape[1:], int(Ray.DOUBTFUL), dtype=torch.uint8), image[0] >= 0)
+    measured = parse_mask(task)(sensor.shape, draws)
+    if measured.all() or not measured.any():
+        what = "no" if measured.all() else "every"
+        raise InputError(
+            f"the task {task!r} hides {what} ray; give one that leaves some, or one of {', '.join(FAULTS)}."
+        )
+    state = ray_states(torch.from_numpy(truth)[None], torch.from_numpy(measured))[0]
+    return Given(truth * measured, state, ~measured)
+
+
+def opponents(given: Given, faulty: bool) -> Iterator[tuple[str, np.ndarray]]:
+    """What needs no model: interpolations; of a faulty measurement, itself."""
+    if faulty:
+        yield AS_IT_IS, given.image
+        return
+    for name, (rule, inverse) in OPPONENTS.items():
+        yield name, interpolated(given.image, ~given.asked, rule, inverse)
 
 
 def completion_rows(
@@ -87,35 +125,29 @@ def completion_rows(
     """
     whole = panel(np.stack(truths), sensor)
     for task in tasks:
-        hidden = [hidden_by(task, sensor.shape, i) for i in range(len(truths))]
-        for name, (rule, inverse) in OPPONENTS.items():
-            found = [interpolated(x, ~h, rule, inverse)[None] for x, h in zip(truths, hidden, strict=True)]
-            row = _row(task, name, truths, found, hidden, sensor, whole)
+        given = [given_by(task, x, sensor, i) for i, x in enumerate(truths)]
+        asked = [one.asked for one in given]
+        plain: dict[str, list[np.ndarray]] = {}
+        for one in given:
+            for name, image in opponents(one, task in FAULTS):
+                plain.setdefault(name, []).append(image[None])
+        for name, found in plain.items():
+            row = _row(task, name, truths, found, asked, sensor, whole)
             yield {**row, "evaluations": 0, "seconds": float("nan")}, [images[0] for images in found]
         for way in ways:
-            found, seconds, evaluations = _answers(way, truths, hidden, answers, seed, batch_size, progress)
-            row = _row(task, way.name, truths, found, hidden, sensor, whole)
+            found, seconds, evaluations = _answers(way, given, answers, seed, batch_size, progress)
+            row = _row(task, way.name, truths, found, asked, sensor, whole)
             yield {**row, "evaluations": evaluations, "seconds": seconds}, [images[0] for images in found]
 
 
 def _answers(
-    way: Way,
-    truths: Sequence[np.ndarray],
-    hidden: Sequence[np.ndarray],
-    answers: int,
-    seed: int,
-    batch_size: int,
-    progress: Progress,
+    way: Way, given: Sequence[Given], answers: int, seed: int, batch_size: int, progress: Progress
 ) -> tuple[list[np.ndarray], float, float]:
-    images = torch.from_numpy(np.stack(truths))
-    state = ray_states(images, ~torch.from_numpy(np.stack(hidden)))
-    one = way.checkpoint.generator.evaluations_of(way.sampler) == 1 and way.sampler.fixed
-    made = list(
-        complete(
-            way.checkpoint, images, state, 1 if one else answers, seed, sampler=way.sampler, batch_size=batch_size,
-            progress=progress,
-        )
-    )  # fmt: skip
+    images = torch.from_numpy(np.stack([one.image for one in given]))
+    state = torch.stack([one.state for one in given])
+    alike = isinstance(way.checkpoint.generator, Regression)
+    options: dict[str, Any] = {"sampler": way.sampler, "batch_size": batch_size, "progress": progress}
+    made = list(complete(way.checkpoint, images, state, 1 if alike else answers, seed, **options))
     count = sum(len(each.images) for each in made)
     evaluations = sum(float(each.evaluations.sum()) for each in made) / count
     return [each.images.numpy() for each in made], sum(each.seconds for each in made) / count, evaluations
@@ -181,8 +213,8 @@ def pictured(truth: np.ndarray, shown: Sequence[tuple[Mapping[str, Any], np.ndar
     """Of one scan and the first task: what is measured, each interpolation's and model's answer, the truth."""
     task = shown[0][0]["task"]
     chosen = [(row["method"], image) for row, image in shown if row["task"] == task]
-    kept = [one for one in chosen if one[0] not in OPPONENTS or one[0] in ("nearest", "linear, 1/r")]
-    panels = [(f"measured, {task}", truth * ~hidden_by(task, sensor.shape, 0)), *kept, ("truth", truth)]
+    kept = [one for one in chosen if one[0] not in (*OPPONENTS, AS_IT_IS) or one[0] in ("nearest", "linear, 1/r")]
+    panels = [(f"measured, {task}", given_by(task, truth, sensor, 0).image), *kept, ("truth", truth)]
     figure = dark_figure(15, 2.3 * len(panels))
     grid = figure.add_gridspec(
         len(panels), 2, width_ratios=[2.2, 1.3], hspace=0.14, wspace=0.03, left=0.01, right=0.99, top=0.985, bottom=0.01

@@ -2,11 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.stats import norm
 
 from r2flow import noise
 from r2flow.errors import InputError
+from r2flow.flow.problems import Gaussian
 from r2flow.generators import ConditionalFlow, Regression, Sampler, build_generator, condition_of
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.noise import Draws
@@ -114,7 +117,16 @@ def test_it_starts_as_the_flow_that_it_starts_from(backbone, scans):
     with torch.no_grad():
         expected, unknown = parent.velocity(t, x), told["known"] == 0
         assert torch.allclose(child.velocity(t, x), expected, atol=1e-6)
-        assert torch.allclose(child.velocity(t, x, told)[unknown], expected[unknown], atol=1e-6)
+        logit, sigma = child.trust(torch.cat([told[name] for name in ("image", "known", "doubtful")], dim=1))
+        mixed = torch.empty_like(x)
+        for index in np.ndindex(*x.shape):  # value by value: a Gaussian about the guess, or what the network says
+            guess, std, p = float(told["image"][index]), float(sigma[index]), float(logit[index].sigmoid())
+            at, value, v = float(t[index[0]]), float(x[index]), float(expected[index])
+            about = float(Gaussian(mean=guess, std=std)(t[index[0]].double(), x[index].double()))
+            near = p * norm.pdf(value, at * guess, math.hypot(at * std, 1 - at))
+            far = (1 - p) * norm.pdf(value, 0, math.hypot(at * 0.5, 1 - at))
+            mixed[index] = (near * about + far * v) / (near + far)
+        assert torch.allclose(child.velocity(t, x, told)[unknown], mixed[unknown], atol=1e-4)
         exact = ((told["image"] - x) / (1 - t[:, None, None, None]))[~unknown]
         assert torch.allclose(child.velocity(t, x, told)[~unknown], exact, rtol=1e-4)
 
@@ -208,3 +220,18 @@ def test_the_twin_has_one_way_to_be_run_and_ignores_the_noise(scans):
     assert one.evaluations.tolist() == [1, 1, 1]
     with pytest.raises(InputError, match="one way only"):
         generator.check_sampler(Sampler("euler", 4))
+
+
+def test_told_nothing_it_is_a_plain_flow(flow):
+    x, t, x_0 = torch.randn(2, 2, 8, 32), torch.tensor([0.2, 0.7]), Draws(0, range(2)).start((2, 8, 32))
+    plain = flow.untold()
+    assert torch.equal(plain.velocity(t, x), flow.velocity(t, x))
+    assert torch.equal(plain.generate(x_0).x, flow.generate(x_0).x)
+
+
+def test_a_plain_flow_that_starts_from_it_forgets_the_condition(flow):
+    plain = built("rectified_flow")
+    plain.start_from(flow)
+    x, t = torch.randn(2, 2, 8, 32), torch.tensor([0.2, 0.7])
+    with torch.no_grad():
+        assert torch.allclose(plain.velocity(t, x), flow.velocity(t, x), atol=1e-6)
