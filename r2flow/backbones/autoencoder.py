@@ -79,8 +79,9 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         normed = self.norm(x)
-        q, k, v = (layer(normed).flatten(2).mT for layer in (self.q, self.k, self.v))
-        attended = F.scaled_dot_product_attention(q, k, v).mT.unflatten(2, x.shape[2:])
+        # with a dimension of heads and contiguous, as the fast kernels want them
+        q, k, v = (layer(normed).flatten(2).mT[:, None].contiguous() for layer in (self.q, self.k, self.v))
+        attended = F.scaled_dot_product_attention(q, k, v)[:, 0].mT.unflatten(2, x.shape[2:])
         return x + self.proj_out(attended)
 
 

@@ -67,7 +67,8 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         flat = self.norm(x).flatten(2)
-        q, k, v = self.qkv(flat).unflatten(1, (self.heads, 3, -1)).mT.unbind(2)
+        # contiguous: the fast kernels want the channels of a head side by side
+        q, k, v = (part.contiguous() for part in self.qkv(flat).unflatten(1, (self.heads, 3, -1)).mT.unbind(2))
         attended = F.scaled_dot_product_attention(q, k, v).mT.flatten(1, 2)
         return x + self.proj_out(attended).view(x.shape)
 
