@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
+from r2flow.flow.posterior import completes
 from r2flow.generators import Condition, ConditionalFlow, Flow, Generator, Sampler, condition_of
 from r2flow.generators.base import Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
@@ -133,7 +134,6 @@ def complete(
         state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.UNKNOWN)).to(torch.uint8)
     state = state.cpu()
     if keep == "blend":
-        condition_of(generator.space, images, state)  # before rays lose what contradicts it
         state = torch.where(state == Ray.UNKNOWN, state, torch.tensor(int(Ray.DOUBTFUL), dtype=state.dtype))
     condition = condition_of(generator.space, images, state)
     yield from _answers(generator, how, images, state, condition, num, seed, batch_size, first, progress)
@@ -153,7 +153,7 @@ def _answers(
 ) -> Iterator[Completed]:
     told = [_told(condition, i) for i in range(len(images))]
     # A method that reads the condition has nothing to do without one.
-    plain = how if isinstance(generator, ConditionalFlow) or how.method != UNTRAINED.method else generator.sampler
+    plain = generator.sampler if completes(how.method) else how
     pairs = ((i, a) for i in range(len(images)) for a in range(num))
     done: list[Samples] = []
     for said, group in groupby(pairs, key=lambda pair: told[pair[0]]):

@@ -150,6 +150,17 @@ def test_without_states_a_ray_without_a_return_is_not_measured():
     assert torch.equal(network().complete(images), network().complete(images, state))
 
 
+def test_a_flow_that_was_not_trained_to_complete_does_so_too():
+    checkpoint, images = network("rectified_flow"), scans()
+    state = halved(images)
+    for found, image, of in zip(complete(checkpoint, images, state, num=2), images, state, strict=True):
+        known = (of != Ray.UNKNOWN).expand(2, 2, -1, -1)
+        assert torch.equal(found.images[known], image.expand(2, -1, -1, -1)[known])
+        assert found.evaluations.tolist() == [32, 32]
+    nothing = torch.zeros_like(state)
+    assert torch.equal(checkpoint.complete(images, nothing)[:, 0], checkpoint.sample(2))
+
+
 def test_spread_is_over_the_answers_with_a_return():
     images = torch.tensor([[3.0, 5.0, 0.0], [5.0, 0.0, 0.0], [7.0, 0.0, 0.0]]).view(3, 1, 1, 3)
     deviation, share = spread_of(images)

@@ -130,6 +130,17 @@ backbones --channels 0
 backbones --repeats -1
 backbones --device nope
 backbones extra
+complete # Missing
+complete nowhere -o out
+complete empty -o out
+complete bad.bin -o out
+complete scans/000000.bin -c bad.ckpt -o out
+complete scans/000000.bin -c run -o out --num 0
+complete scans/000000.bin -c run -o out --mask nope # no mask
+complete scans/000000.bin -c run -o out --from nope
+complete scans/000000.bin -c run -o out --to os1_64
+complete scans/000000.bin -c run -o out --solver nope
+complete scans/000000.bin -c run -o file.txt --mask rows:2 --solver euler
 view # Missing
 view nowhere
 view scans -o out # ends in .html

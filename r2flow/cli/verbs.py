@@ -11,6 +11,7 @@ from r2flow import __version__
 from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     accuracy,
     compare,
+    complete,
     evaluate,
     export,
     flows,

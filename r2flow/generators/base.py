@@ -19,7 +19,25 @@ Condition = Mapping[str, Tensor]
 
 Progress = Callable[[], None] | None
 
+IMAGE, KNOWN, DOUBTFUL = "image", "known", "doubtful"  # the names of what is known of a part of a scan
+
 WHOLE_ONLY = "a {} makes whole images and no part of one; leave the region out."
+
+
+def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`image`, `known` and `doubtful` of a condition, as `x` is in type and place; zeros where nothing is known.
+
+    Raises:
+        InputError: a condition of other names or shapes.
+    """
+    if condition is None:
+        return (torch.zeros_like(x),) * 3
+    if condition.keys() != {IMAGE, KNOWN, DOUBTFUL}:
+        raise InputError(f"this generator is told '{IMAGE}', '{KNOWN}' and '{DOUBTFUL}', found {', '.join(condition)}.")
+    image, known, doubtful = (condition[name].to(x) for name in (IMAGE, KNOWN, DOUBTFUL))
+    if image.shape != x.shape or known.shape != x.shape or doubtful.shape != x.shape:
+        raise InputError(f"what is known must be {tuple(x.shape)} as the scans are, found {tuple(image.shape)}.")
+    return image, known, doubtful
 
 
 @dataclass(frozen=True)
@@ -27,7 +45,8 @@ class Sampler:
     """How a generator is run; saved with it.
 
     Attributes:
-        method: A solver's name for a flow (`r2flow.flow.solvers`); other families have names of their own.
+        method: A solver's name for a flow (`r2flow.flow.solvers`), or what completes a scan with it
+            (`r2flow.flow.posterior`); other families have names of their own.
         steps: Steps from noise to data, of a method of fixed steps.
         tolerance: Absolute and relative tolerance of an adaptive method.
         grid: Where fixed steps fall: a name (`r2flow.flow.solvers.named_grid`), or the times themselves.
@@ -36,6 +55,9 @@ class Sampler:
         levels: Numbers of steps to try on a scan one after the other, instead of `steps` (`r2flow.generators.budgets`).
         limits: For each of them but the last one the largest correction of a scan that needs no more steps.
         fixed: Whether the generator was trained for this number of steps and is worse at any other.
+        doubt: Standard deviation, in model space, of the error of a doubtful value, for a method of
+            `r2flow.flow.posterior`. Model space is 2 wide: false returns are further off than a tenth of that, the
+            noise of a ranging sensor is far less.
     """
 
     method: str = "euler"
@@ -46,6 +68,7 @@ class Sampler:
     levels: tuple[int, ...] = ()
     limits: tuple[float, ...] = ()
     fixed: bool = False
+    doubt: Positive = 0.2
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> Self:

@@ -14,7 +14,17 @@ from r2flow.backbones import Backbone
 from r2flow.backbones.convolutions import RingConv2d, zero_convolution
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
+from r2flow.generators.base import (
+    DOUBTFUL,
+    IMAGE,
+    KNOWN,
+    Condition,
+    Generated,
+    Generator,
+    Progress,
+    Sampler,
+    parts_of,
+)
 from r2flow.generators.flow import RectifiedFlow
 from r2flow.lidar.interpolation import guess
 from r2flow.lidar.known import Ray
@@ -22,7 +32,6 @@ from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 
-IMAGE, KNOWN, DOUBTFUL = "image", "known", "doubtful"
 LAST = 1e-5  # of the time: where a known ray's velocity stops to grow
 
 
@@ -60,22 +69,6 @@ def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
         said[:, -1] = (~returned).to(said)
     measured, trusted = seen[:, None] * said, (state != Ray.DOUBTFUL)[:, None]
     return {IMAGE: image, KNOWN: measured * trusted, DOUBTFUL: measured * ~trusted}
-
-
-def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`image`, `known` and `doubtful` of a condition, as `x` is in type and place; zeros where nothing is known.
-
-    Raises:
-        InputError: a condition of other names or shapes.
-    """
-    if condition is None:
-        return (torch.zeros_like(x),) * 3
-    if condition.keys() != {IMAGE, KNOWN, DOUBTFUL}:
-        raise InputError(f"this generator is told '{IMAGE}', '{KNOWN}' and '{DOUBTFUL}', found {', '.join(condition)}.")
-    image, known, doubtful = (condition[name].to(x) for name in (IMAGE, KNOWN, DOUBTFUL))
-    if image.shape != x.shape or known.shape != x.shape or doubtful.shape != x.shape:
-        raise InputError(f"what is known must be {tuple(x.shape)} as the scans are, found {tuple(image.shape)}.")
-    return image, known, doubtful
 
 
 class Trust(nn.Module):

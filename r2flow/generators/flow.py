@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from r2flow.backbones import build_backbone
 from r2flow.errors import InputError
+from r2flow.flow.posterior import METHODS, Measurement, completes, parse_method, sample_posterior
 from r2flow.flow.solvers import (
     Solution,
     Velocity,
@@ -20,12 +21,13 @@ from r2flow.flow.solvers import (
     solve,
 )
 from r2flow.flow.solvers.grids import build_grid
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
+from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, parts_of
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 
 USUAL = Sampler("adams3", 16, grid="power:1.5", finish=1 / 32)  # of a new flow: docs/results.md
+UNTOLD = f"this flow was trained without a condition; a scan is completed with it by --solver {', '.join(METHODS)}."
 
 
 class Flow(Generator):
@@ -34,6 +36,10 @@ class Flow(Generator):
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         """v(t, x), (B, C, H, W), at times t of shape () or (B,)."""
         raise NotImplementedError
+
+    def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+        """u(t, x, s), what is known at time t of the mean velocity from t to s: v(t, x), but for a flow map."""
+        return self.velocity(t, x)
 
     def field(self, condition: Condition | None = None) -> Velocity:
         """v(t, x) under a condition, as solvers take it."""
@@ -75,13 +81,71 @@ class Flow(Generator):
         progress: Progress = None,
     ) -> Generated:
         how = sampler or self.sampler
+        if completes(how.method):
+            if condition is None:
+                raise InputError(f"{how.method} completes a scan of which a part is known; give what is known.")
+            noise = noise.to(self.device)
+            image, known, doubtful = parts_of(condition, noise)
+            measured = Measurement(image, (known + doubtful > 0).to(noise), how.doubt * doubtful)
+            return self.given(noise, measured, sampler=how, draws=draws, progress=progress)
         options: dict[str, Any] = {}
         if how.finish and how.steps > 1:
             how, options = replace(how, steps=how.steps - 1), {"finish": how.finish}
         end = self.solve(noise, sampler=how, condition=condition, progress=progress, **options)
         return Generated(end.x, end.evaluations, end.converged)
 
+    @torch.no_grad()
+    def given(
+        self,
+        noise: Tensor,
+        measured: Measurement,
+        *,
+        sampler: Sampler,
+        draws: Draws | None = None,
+        progress: Progress = None,
+    ) -> Generated:
+        """x_1 given a measurement, by a method of `r2flow.flow.posterior`; of a known scan, the scan for nothing.
+
+        Args:
+            noise: (B, *noise_shape).
+            measured: Of each scan; a mask or any other linear measurement.
+
+        Raises:
+            InputError: a method that the table does not have, or one that the measurement or the draws do not suit.
+        """
+        x_0 = noise.to(self.device)
+        x_0 = x_0 if x_0.dtype == torch.float64 else x_0.float()
+        left = (~measured.known).flatten(1).any(1).nonzero()[:, 0]
+        evaluations = torch.zeros(len(x_0), dtype=torch.int64, device=x_0.device)
+        x = measured.y.to(x_0)
+        if len(left):
+
+            def u(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+                found = self.mean_velocity(t, x, s).to(x)
+                if progress is not None:
+                    progress()
+                    if found.requires_grad:
+                        found.register_hook(lambda _: progress())  # each product with the Jacobian
+                return found
+
+            further = None if draws is None else lambda j: draws.step(self.noise_shape, j).to(x_0)[left]
+            times = self._times(sampler)
+            made = sample_posterior(u, x_0[left], measured.select(left), sampler.method, times, further)
+            x = made if len(left) == len(x_0) else x.index_copy(0, left, made)
+            evaluations[left] = parse_method(sampler.method).evaluations(len(times) - 1)
+        return Generated(x, evaluations, x.isfinite().flatten(1).all(1))
+
+    def _times(self, sampler: Sampler, t_0: float = 0.0, t_1: float = 1.0) -> Tensor:
+        grid = sampler.grid if isinstance(sampler.grid, str) else torch.tensor(sampler.grid, dtype=torch.float64)
+        return build_grid(grid, t_0, t_1, sampler.steps)
+
     def check_sampler(self, sampler: Sampler) -> None:
+        if completes(sampler.method):
+            parse_method(sampler.method)
+            if sampler.levels or sampler.finish:
+                raise InputError(f"{sampler.method} has neither levels nor a finish; leave them out.")
+            self._times(sampler)
+            return
         check_method(sampler.method)
         check_tolerance(sampler.tolerance)
         grid, method = sampler.grid, fixed_step(sampler.method)
@@ -95,6 +159,8 @@ class Flow(Generator):
         return Sampler("euler", steps)
 
     def evaluations_of(self, sampler: Sampler) -> int:
+        if completes(sampler.method):
+            return parse_method(sampler.method).evaluations(sampler.steps)
         method = fixed_step(sampler.method)
         return 0 if method is None or sampler.levels else method.cost(sampler.steps)
 
@@ -120,7 +186,7 @@ class RectifiedFlow(Flow):
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         if condition is not None:
-            raise InputError("this flow was trained without a condition and cannot take one.")
+            raise InputError(UNTOLD)
         v: Tensor = self.backbone(t, x)
         return v
 
@@ -204,6 +270,8 @@ class Field(Flow):
         return self.function(t, x)
 
     def field(self, condition: Condition | None = None) -> Velocity:
+        if condition is not None:
+            raise InputError(UNTOLD)
         return self.function
 
     @property

@@ -11,9 +11,8 @@ from r2flow.errors import InputError
 from r2flow.flow.maps import jump
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers import Solution
-from r2flow.flow.solvers.grids import build_grid
 from r2flow.generators.base import Condition, Generated, Progress, Sampler
-from r2flow.generators.flow import RectifiedFlow
+from r2flow.generators.flow import UNTOLD, RectifiedFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 
@@ -76,16 +75,14 @@ class FlowMap(RectifiedFlow):
         progress: Progress = None,
     ) -> Generated:
         how = sampler or self.sampler
+        if condition is not None and how.method in (JUMP, RENOISE):
+            raise InputError(UNTOLD)
         if how.method != RENOISE:
             return super().generate(noise, condition, sampler=how, draws=draws, progress=progress)
-        if draws is None or condition is not None:
-            raise InputError("renoise draws further noise and takes no condition: give draws alone.")
+        if draws is None:
+            raise InputError("renoise draws further noise: give draws.")
         with torch.no_grad():
             return self._jumps(noise, self._times(how, 0.0, 1.0), draws, progress)
-
-    def _times(self, how: Sampler, t_0: float, t_1: float) -> Tensor:
-        grid = how.grid if isinstance(how.grid, str) else torch.tensor(how.grid, dtype=torch.float64)
-        return build_grid(grid, t_0, t_1, how.steps)
 
     def _jumps(self, x: Tensor, times: Tensor, draws: Draws | None, progress: Progress) -> Generated:
         x = x.to(self.device)

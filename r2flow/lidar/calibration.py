@@ -109,7 +109,7 @@ def estimate_sensor(scans: Sequence[Points]) -> Estimate:
         float((r < 1).mean()),
         height,
         ground_share,
-        _reflectance(scans),
+        reflectance_of(scans),
         len(scans),
         len(r),
     )
@@ -164,8 +164,8 @@ def _height(xyz: np.ndarray) -> tuple[float | None, float]:
     return (float(height), float(share)) if height > 0.1 and share > 0.03 else (None, float(share))
 
 
-def _reflectance(scans: Sequence[Points]) -> Reflectance | None:
-    """None where a file has no reflectance, or only one value."""
+def reflectance_of(scans: Sequence[Points]) -> Reflectance | None:
+    """The reflectance values of scans; None where a file has none, or only one value."""
     if any(scan.reflectance is None for scan in scans):
         return None
     values = np.unique(np.concatenate([scan.reflectance for scan in scans]))

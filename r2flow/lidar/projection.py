@@ -171,18 +171,23 @@ def unproject(r: Tensor, rays: Tensor) -> Tensor:
     return r * direction
 
 
-def image_to_points(image: np.ndarray, rays: Tensor) -> tuple[np.ndarray, np.ndarray]:
+def image_to_points(
+    image: np.ndarray, rays: Tensor, measured: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """The returns of one image as a cloud, in firing order: ring after ring from the top, azimuth rising from 0.
 
     Args:
         image: Range in metres and reflectance, (2, H, W); reflectance may be missing, (1, H, W).
         rays: (2, H, W) radians.
+        measured: Points of the pixels in metres, (3, H, W), to be taken where they are not the origin.
 
     Returns:
         Points in metres, (N, 3), and reflectance, (N,), float32; N is the number of returns.
     """
     r = torch.from_numpy(np.ascontiguousarray(image[:1]))[None]
     xyz = unproject(r, rays)[0].numpy()
+    if measured is not None:
+        xyz = np.where(measured.any(axis=0), measured, xyz)
     reflectance = image[1] if len(image) > 1 else np.zeros_like(image[0])
     columns = image.shape[-1]
     # Azimuth falls with w from +180 degrees: read backwards from the middle, it rises from 0.

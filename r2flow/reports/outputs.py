@@ -112,13 +112,16 @@ def warn_unsolved(converged: Tensor, first: int = 0) -> None:
         log.warning("not solved, so no scans of this flow: %s; try another solver.", ", ".join(lost))
 
 
-def keep_note(checkpoint: Checkpoint, out: Path, seed: int, **sampler: Any) -> None:
-    """Write beside samples what they are, so that readers know their size and sensor."""
+def keep_note(
+    checkpoint: Checkpoint, out: Path, seed: int, more: Mapping[str, Any] | None = None, **sampler: Any
+) -> None:
+    """Write beside samples what they are and `more`, so that readers know their size and sensor."""
     about = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
     about |= {"min_range": checkpoint.sensor.min_range, "max_range": checkpoint.sensor.max_range}
     reading, step = reading_of_flow(checkpoint), checkpoint.step
     # Points lie on rays through the middles of the bins, whatever rays the model was told.
-    write_samples_note(out, reading, encoding=about, seed=seed, sampler=sampler, step=step, rays="centre")
+    write_samples_note(out, reading, encoding=about, seed=seed, sampler=sampler, step=step, rays="centre",
+                       **(more or {}))  # fmt: skip
 
 
 def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str) -> None:

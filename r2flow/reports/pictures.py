@@ -78,6 +78,54 @@ def contact_sheet(images: Sequence[np.ndarray], rays: Tensor, titles: Sequence[s
     return figure
 
 
+def completed_figure(
+    rows: Sequence[tuple[str, np.ndarray]],
+    unknown: np.ndarray,
+    rays: Tensor,
+    title: str = "",
+    spread: np.ndarray | None = None,
+) -> Figure:
+    """What is known of a scan above its answers, and the spread between these.
+
+    Args:
+        rows: Name and image, (2 or 1, H, W), of each; the first one is what is known.
+        unknown: Rays of it that were not measured, (H, W) bool; drawn in grey.
+        spread: Standard deviation of the range in metres and share of answers with a return, (2, H, W).
+    """
+    heights = [2.4] * len(rows) + [1.3] * (spread is not None)
+    figure = dark_figure(15, sum(heights) + 0.35)
+    grid = figure.add_gridspec(
+        len(heights), 3, width_ratios=[2.6, 0.9, 1.3], height_ratios=heights, hspace=0.16, wspace=0.03,
+        left=0.01, right=0.99, top=1 - 0.5 / sum(heights), bottom=0.01,
+    )  # fmt: skip
+    grey = np.where(unknown[..., None], np.array([0.45, 0.45, 0.45, 1.0]), 0.0)
+    for row, (name, image) in enumerate(rows):
+        strips = grid[row, 0].subgridspec(len(image), 1, hspace=0.2)
+        axes = figure.add_subplot(strips[0])
+        draw_range(axes, image, label=False)
+        axes.set_title(f"{name}: range", color=FOREGROUND, fontsize=8, loc="left", pad=3)
+        drawn = [axes]
+        if len(image) > 1:
+            drawn.append(figure.add_subplot(strips[1]))
+            draw_reflectance(drawn[-1], image)
+        for one in drawn if row == 0 else ():
+            one.imshow(grey, aspect="auto", interpolation="nearest")
+        xyz, _ = image_to_points(image, rays)
+        draw_birds_eye(figure.add_subplot(grid[row, 1]), xyz, label=row == 0)
+        draw_perspective(figure.add_subplot(grid[row, 2]), xyz, label=row == 0)
+    if spread is not None:
+        shown = (
+            ("deviation of the range, 0 to 5 m", spread[0], 5.0),
+            ("share of answers with a return, 0 to 1", spread[1], 1.0),
+        )
+        for (name, values, most), place in zip(shown, (grid[-1, 0], grid[-1, 1:]), strict=True):
+            axes = figure.add_subplot(place)
+            axes.imshow(values, cmap="magma", vmin=0, vmax=most, aspect="auto", interpolation="nearest")
+            _strip(axes, name)
+    figure.suptitle(title, color=FOREGROUND, fontsize=11, x=0.01, ha="left", y=0.995)
+    return figure
+
+
 def loss_figure(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
     """Loss against optimiser step; each curve is (steps, values), a long noisy one also smoothed."""
     figure = Figure(figsize=(8, 4.5), layout="constrained")

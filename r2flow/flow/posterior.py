@@ -1,0 +1,356 @@
+"""Samples given a measurement, by a flow that was trained without one.
+
+The measurement is y = A x_1 + sigma n, n ~ N(0, 1) (`Measurement`). A method of `METHODS` takes the states x_t of a
+flow from noise at t = 0 to x_1 at t = 1 and pulls them towards it. All use the flow's estimates of both ends,
+
+    x_1hat = x_t + (1 - t) u,        x_0hat = x_t - t u,        x_t = t x_1hat + (1 - t) x_0hat,
+
+with u = v(t, x_t), where x_1hat is the mean E[x_1 | x_t]. With a flow map, `replace`, `repaint` and `pnp` jump, to the
+next time or to the end of the path itself; the others need that mean and take the map's velocity u(x, t, t). No method
+is exact for every flow: docs/completion.md has how far each is from the posterior where that is known.
+
+    x_1 = sample_posterior(u, x_0, measured, "mmps", times, noise)
+"""
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.flow.maps import MeanVelocity, jump
+from r2flow.registry import Registry
+
+Linear = Callable[[Tensor], Tensor]
+Noise = Callable[[int], Tensor]  # N(0, 1) of the j-th draw, j = 1, 2, ..., in the state's shape
+
+EARLIEST = 0.1  # time before which `mmps` takes the flow's Jacobian of this time: at t = 0 it is divided by 0
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """y = A x_1 + sigma n of each scan, n ~ N(0, 1).
+
+    A is a mask, unless `forward` is given.
+
+    Attributes:
+        y: Measured values, (B, ...); any where nothing was measured.
+        mask: 1 where a value was measured, 0 elsewhere, as y.
+        sigma: Standard deviation of each measured value's error, as y or (): 0 where it is known.
+        forward: A x for a linear A, (B, ...) to the shape of y, each scan for itself.
+        adjoint: A^T y, back again.
+    """
+
+    y: Tensor
+    mask: Tensor
+    sigma: Tensor
+    forward: Linear | None = None
+    adjoint: Linear | None = None
+
+    @property
+    def known(self) -> Tensor:
+        """Which values of x_1 are known, as y, bool."""
+        known = (self.mask > 0) & (self.sigma == 0)
+        return known if self.forward is None else torch.zeros_like(known)
+
+    def select(self, scans: Tensor) -> "Measurement":
+        """That of some of the scans, indices (N,)."""
+        sigma = self.sigma[scans] if self.sigma.ndim else self.sigma
+        return Measurement(self.y[scans], self.mask[scans], sigma, self.forward, self.adjoint)
+
+    def apply(self, x: Tensor) -> Tensor:
+        """A x."""
+        return self.mask * (x if self.forward is None else self.forward(x))
+
+    def transposed(self, d: Tensor) -> Tensor:
+        """A^T d."""
+        return self.mask * d if self.adjoint is None else self.adjoint(self.mask * d)
+
+    def residual(self, x: Tensor) -> Tensor:
+        """y - A x, 0 where nothing was measured."""
+        return self.mask * self.y - self.apply(x)
+
+    def pull(self, x: Tensor, variance: Tensor) -> Tensor:
+        """A^T (r^2 A A^T + sigma^2)^-1 (y - A x): the gradient of log p(y | x_1hat = x) where x_1 ~ N(x_1hat, r^2).
+
+        Args:
+            x: x_1hat, (B, ...).
+            variance: r^2 > 0, ().
+        """
+        residual = self.residual(x)
+        if self.forward is None:
+            return residual / torch.where(self.mask > 0, variance + self.sigma**2, 1)
+
+        def multiply(p: Tensor) -> tuple[Tensor, Tensor]:
+            back = self.transposed(p)
+            return back, variance * self.apply(back) + self.sigma**2 * p
+
+        return _conjugate_gradients(multiply, residual, 50)
+
+    def corrected(self, x: Tensor, variance: Tensor) -> Tensor:
+        """x + r^2 `pull`: the mean of x_1 ~ N(x, r^2) given y. A known value is y."""
+        return self.exact(x + variance * self.pull(x, variance))
+
+    def exact(self, x: Tensor) -> Tensor:
+        """x with the known values as they were given."""
+        return torch.where(self.known, self.y, x)
+
+    def on_path(self, t: Tensor, x: Tensor, e: Tensor) -> Tensor:
+        """x_t with its measured values replaced by t y + sqrt((1 - t)^2 - (t sigma)^2) e.
+
+        That is x_t = t x_1 + (1 - t) x_0 in law: the measurement's own error is a part of the noise. It is all of it
+        at t = 1 / (1 + sigma); later, y is noisier than x_t and nothing is replaced.
+        """
+        left = (1 - t) ** 2 - (t * self.sigma) ** 2
+        return torch.where((self.mask > 0) & (left >= 0), t * self.y + left.clamp(min=0).sqrt() * e, x)
+
+
+def _variance(t: Tensor) -> Tensor:
+    """Var(x_1 | x_t) = (1 - t)^2 / ((1 - t)^2 + t^2) if x_1 ~ N(0, 1), what methods without a Jacobian assume."""
+    return (1 - t) ** 2 / ((1 - t) ** 2 + t**2)
+
+
+def replace(u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, noise: Noise) -> Tensor:
+    """Euler steps, after each of which the measured values lie on the line from this scan's own noise to y.
+
+    x_t' = M (t' y + (1 - t') x_0) + (1 - M) (x_t + (t' - t) u). What is not measured learns of y only through the
+    network. One evaluation a step, no noise.
+    """
+    x_0 = x
+    for t, s in pairwise(times):
+        x = measured.on_path(s, jump(u, t, x, s), x_0)
+    return x
+
+
+def replace_fresh(u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, noise: Noise) -> Tensor:
+    """`replace` with other noise at each step (Song et al. 2021, score-based generative modeling, app. I.2).
+
+    One evaluation a step.
+    """
+    for j, (t, s) in enumerate(pairwise(times), start=1):
+        x = measured.on_path(s, jump(u, t, x, s), noise(j))
+    return x
+
+
+def repaint(
+    u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, noise: Noise, repeats: int = 4, length: int = 1
+) -> Tensor:
+    """`replace_fresh` that takes every `length` steps `repeats` times (Lugmayr et al. 2022, RePaint, algorithm 1).
+
+    Before it takes them again it goes back from t' to t by new noise, x_t = (t / t') x_t' + sqrt((1 - t)^2 -
+    (t / t')^2 (1 - t')^2) e, which leaves the law of the flow's x_t as it is. The first steps are taken once: at t = 0
+    nothing of x_t' is left. Evaluations: N + (repeats - 1) (N - length) for N steps.
+    """
+    j = 0
+    for first in range(0, len(times) - 1, length):
+        part = times[first : first + length + 1]
+        for again in range(repeats if first else 1):
+            if again:
+                j, share = j + 1, part[0] / part[-1]
+                left = (1 - part[0]) ** 2 - share**2 * (1 - part[-1]) ** 2
+                x = share * x + left.sqrt() * noise(j)
+            for t, s in pairwise(part):
+                j += 1
+                x = measured.on_path(s, jump(u, t, x, s), noise(j))
+    return x
+
+
+def flowdps(u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, noise: Noise) -> Tensor:
+    """Both ends apart: the measurement corrects x_1hat, new noise enters x_0hat (Kim et al. 2025, FlowDPS, alg. 1).
+
+    x_1' = t x_1hat + (1 - t) x_1y with x_1y = `corrected` x_1hat, then
+    x_t' = t' x_1' + (1 - t') (sqrt(1 - t') x_0hat + sqrt(t') e). The paper takes three gradient steps to x_1y, this
+    is where they lead. One evaluation a step.
+    """
+    for j, (t, s) in enumerate(pairwise(times), start=1):
+        v = u(t, x, t)
+        x_1, x_0 = x + (1 - t) * v, x - t * v
+        x_1 = t * x_1 + (1 - t) * measured.corrected(x_1, _variance(t))
+        x = s * x_1 + (1 - s) * ((1 - s).sqrt() * x_0 + s.sqrt() * noise(j))
+    return x
+
+
+def pnp(u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, noise: Noise, repeats: int = 5) -> Tensor:
+    """The flow as a denoiser in a descent on |A x - y|^2 / 2 (Martin et al. 2025, PnP-Flow, algorithm 3).
+
+    z = x - (1 - t)^a A^T (A x - y), then x = mean of D_t(t z + (1 - t) e) over `repeats` draws of e, with
+    D_t(x) = x + (1 - t) u and a = 1/2. It looks for one good x_1 and does not sample; sigma does not enter.
+    `repeats` evaluations a step.
+    """
+    for j, t in enumerate(times[:-1]):
+        z = x + (1 - t).sqrt() * measured.transposed(measured.residual(x))
+        found = [t * z + (1 - t) * noise(j * repeats + k) for k in range(1, repeats + 1)]
+        x = sum((jump(u, t, y, torch.ones_like(t)) for y in found), torch.zeros_like(x)) / repeats
+    return x
+
+
+def ot_ode(
+    u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, noise: Noise, start: float = 0.2
+) -> Tensor:
+    """The flow with the gradient of log p(y | x_t) (Pokle et al. 2024, training-free linear image inverses via flows).
+
+    v' = u + ((1 - t) / t) J^T h with J = d x_1hat / d x_t, h = A^T (r^2 A A^T + sigma^2)^-1 (y - A x_1hat) and
+    r^2 = (1 - t)^2 / ((1 - t)^2 + t^2), as in PiGDM (Song et al. 2023). With the exact v and x_1 ~ N(m, 1) this is the
+    posterior's own velocity. Euler steps go from `start` on, where x = start A^T y + (1 - start) x_0.
+    One evaluation a step and one vector-Jacobian product, which counts as another.
+    """
+    x = start * measured.transposed(measured.y) + (1 - start) * x
+    for t, s in pairwise(start + (1 - start) * times):
+        x_1, product = _linearised(u, t, x)
+        h = measured.pull(x_1, _variance(t))
+        x = x + (s - t) * ((x_1 - x) / (1 - t) + (1 - t) / t * product(h))
+    return x
+
+
+def mmps(u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, noise: Noise, products: int = 2) -> Tensor:
+    """The flow's own covariance in the place of r^2 (Rozet et al. 2024, moment matching posterior sampling).
+
+    Cov(x_1 | x_t) = C = ((1 - t)^2 / t) J, the second-order Tweedie formula, so that
+    E[x_1 | x_t, y] = x_1hat + C A^T (A C A^T + sigma^2)^-1 (y - A x_1hat), which is exact where x_1 is Gaussian given
+    x_t. The linear system is solved by `products` steps of conjugate gradients, each one product with J; where C is
+    not positive in a direction, as a network's may be, they end. The velocity to that mean is followed by the
+    Adams-Bashforth method of order 2, the last step by Euler's rule. Known values move straight to y.
+    Evaluations: 1 + `products` a step, a vector-Jacobian product counting as one.
+    """
+    former: tuple[Tensor, Tensor] | None = None
+    for t, s in pairwise(times):
+        at = t.clamp(min=EARLIEST)
+        x_1, product = _linearised(u, at, x * ((1 - at) / (1 - t)))
+
+        def multiply(p: Tensor, product: Linear = product, scale: Tensor = (1 - at) ** 2 / at) -> tuple[Tensor, Tensor]:
+            moved = scale * product(measured.transposed(p))
+            return moved, measured.apply(moved) + measured.sigma**2 * p
+
+        x_1 = measured.exact(x_1 + _conjugate_gradients(multiply, measured.residual(x_1), products))
+        v, step = (x_1 - x) / (1 - t), s - t
+        slope = v if former is None or s == times[-1] else v + step / (2 * former[1]) * (v - former[0])
+        former, x = (v, step), x + step * slope
+    return x
+
+
+def _linearised(u: MeanVelocity, t: Tensor, x: Tensor) -> tuple[Tensor, Linear]:
+    """x_1hat at x_t and the product J^T z with J = d x_1hat / d x_t."""
+    with torch.enable_grad():
+        at = x.detach().requires_grad_()
+        x_1 = at + (1 - t) * u(t, at, t)
+
+    def product(z: Tensor) -> Tensor:
+        return torch.autograd.grad(x_1, at, z, retain_graph=True)[0]
+
+    return x_1.detach(), product
+
+
+def _conjugate_gradients(multiply: Callable[[Tensor], tuple[Tensor, Tensor]], r: Tensor, steps: int) -> Tensor:
+    """B S^-1 r for a positive S, each scan for itself, with `multiply(p)` = (B p, S p).
+
+    A scan ends where its residual is 0 to rounding, or in a direction in which S is not positive.
+    """
+    p, rr, found = r, _dot(r, r), torch.zeros(())
+    enough = torch.finfo(r.dtype).eps ** 2 * rr
+    for _ in range(steps):
+        moved, q = multiply(p)
+        curvature = _dot(p, q)
+        step = torch.where((rr > enough) & (curvature > 0), rr / curvature, 0)
+        found, r = found + step * moved, r - step * q
+        former, rr = rr, _dot(r, r)
+        p = r + torch.where(step > 0, rr / former, 0) * p
+    return found
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Sum of a b over each scan, (B, 1, ...)."""
+    return (a * b).flatten(1).sum(1).view(-1, *(1,) * (a.ndim - 1))
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to sample given a measurement.
+
+    Attributes:
+        run: `run(u, x_0, measured, times, noise, *numbers)` to x_1.
+        evaluations: Network evaluations of a number of steps and the numbers.
+        numbers: Defaults of what may follow the name, as in `repaint:10,2`.
+        draws: Whether it draws noise on the way.
+        masks: Whether it takes masks alone, and no other linear A.
+    """
+
+    run: Callable[..., Tensor]
+    evaluations: Callable[..., int]
+    numbers: tuple[int | float, ...] = ()
+    draws: bool = False
+    masks: bool = False
+
+
+METHODS: Registry[Method] = Registry(
+    "method of completion",
+    replace=Method(replace, lambda n: n, masks=True),
+    replace_fresh=Method(replace_fresh, lambda n: n, draws=True, masks=True),
+    repaint=Method(repaint, lambda n, repeats, length: n + (repeats - 1) * max(n - length, 0), (4, 1), True, True),
+    flowdps=Method(flowdps, lambda n: n, draws=True),
+    pnp=Method(pnp, lambda n, repeats: n * repeats, (5,), draws=True),
+    ot_ode=Method(ot_ode, lambda n, start: 2 * n, (0.2,)),
+    mmps=Method(mmps, lambda n, products: n * (1 + products), (2,)),
+)
+
+
+class Chosen(NamedTuple):
+    """A method with its numbers."""
+
+    name: str
+    method: Method
+    numbers: tuple[int | float, ...]
+
+    def evaluations(self, steps: int) -> int:
+        """Network evaluations of a scan, a vector-Jacobian product counting as one."""
+        return self.method.evaluations(steps, *self.numbers)
+
+
+def completes(text: str) -> bool:
+    """Whether a sampler's method is one of `METHODS`."""
+    return text.partition(":")[0] in METHODS
+
+
+def parse_method(text: str) -> Chosen:
+    """A method by its text, `NAME` or `NAME:NUMBER,...`: whole numbers of at least 1, and a start in (0, 1).
+
+    Raises:
+        InputError: no such method, or numbers that it does not take.
+    """
+    name, _, given = text.partition(":")
+    method, numbers = METHODS[name], []
+    words = given.split(",") if given else []
+    with contextlib.suppress(ValueError):
+        numbers = [type(default)(word) for default, word in zip(method.numbers, words, strict=False)]
+    right = len(numbers) == len(words) and all(n >= 1 if isinstance(n, int) else 0 < n < 1 for n in numbers)
+    if not right:
+        usual = ":" + ",".join(map(str, method.numbers)) if method.numbers else " without numbers"
+        raise InputError(f"the method {text!r} does not say its numbers: give {name}{usual}.")
+    return Chosen(name, method, (*numbers, *method.numbers[len(numbers) :]))
+
+
+def sample_posterior(
+    u: MeanVelocity, x_0: Tensor, measured: Measurement, method: str, times: Tensor, noise: Noise | None = None
+) -> Tensor:
+    """x_1 given y, (B, ...); known values as they were given.
+
+    Args:
+        u: Mean velocity u(t, x, s) of the flow, at times of shape (): v(t, x) of one that knows no other.
+        x_0: Noise, (B, ...).
+        method: A name of `METHODS`, with its numbers or without.
+        times: Rising from 0 to 1, (N + 1,).
+        noise: Further noise; not needed by a method that draws none.
+
+    Raises:
+        InputError: no such method, one that needs noise or a mask and has none.
+    """
+    chosen = parse_method(method)
+    if chosen.method.masks and measured.forward is not None:
+        others = ", ".join(name for name, one in METHODS.items() if not one.masks)
+        raise InputError(f"{chosen.name} is for masks alone; for another measurement give {others}.")
+    if chosen.method.draws and noise is None:
+        raise InputError(f"{chosen.name} draws further noise: give draws.")
+    return measured.exact(chosen.method.run(u, x_0, measured, times.to(x_0), noise, *chosen.numbers))

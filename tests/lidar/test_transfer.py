@@ -1,0 +1,170 @@
+"""Rays of one sensor against a wall whose range is known, as another sensor's image."""
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from r2flow.errors import InputError
+from r2flow.lidar.known import Ray
+from r2flow.lidar.projection import project
+from r2flow.lidar.scan_files import Points
+from r2flow.lidar.sensors import SENSORS, Sensor
+from r2flow.lidar.transfer import (
+    Fired,
+    firing_of,
+    image_of_same,
+    image_through,
+    points_of_same,
+    points_through,
+    rows_of,
+)
+
+TARGET = SENSORS["hdl64e"].resized(32, 256)
+VLP16 = SENSORS["vlp16"]
+BEAMS = tuple(e + 0.1 for e in VLP16.elevations)  # none of which looks along an edge of the rows
+RADIUS = 10.0  # of the wall, a cylinder around the sensor
+
+
+def fired(elevations=BEAMS, steps: float = 1800) -> Fired:
+    return Fired(np.asarray(elevations), steps)
+
+
+def wall(firing: Fired, lost=None, radius: float = RADIUS) -> Points:
+    """The returns of every ray, but for those that `lost`, (beams, steps) bool, holds."""
+    e = np.deg2rad(firing.elevations)[:, None]
+    a = (2 * math.pi * (np.arange(round(firing.steps)) + 0.37) / firing.steps - math.pi)[None]
+    e, a = np.broadcast_arrays(e, a)
+    xyz = np.stack([radius * np.cos(a), radius * np.sin(a), radius * np.tan(e)], -1)
+    kept = np.ones(a.shape, bool) if lost is None else ~lost
+    return Points(xyz[kept].astype(np.float32))
+
+
+def rows_with_beams(elevations, target: Sensor) -> set[int]:
+    """By the definition of a bin, one beam and one row at a time."""
+    edges = target.row_edges
+    return {h for h, e in itertools.product(range(target.shape[0]), elevations) if edges[h] >= e > edges[h + 1]}
+
+
+@pytest.mark.parametrize("target", [TARGET, SENSORS["hdl64e"], SENSORS["vlp32c"]], ids=lambda s: s.name)
+@pytest.mark.parametrize("source", list(SENSORS))
+def test_the_rows_are_measured_that_a_beam_looks_into(source, target):
+    beams = SENSORS[source].elevations
+    seen = points_through(wall(fired(beams)), fired(beams), target)
+    expected = rows_with_beams(beams, target)
+    measured = np.flatnonzero((seen.state != Ray.UNKNOWN).any(axis=1))
+    # float32 coordinates may put a beam that looks along an edge to either side of it
+    edge = {h + d for h in range(len(target.row_edges)) for d in (-1, 0)
+            if np.abs(np.asarray(beams) - target.row_edges[h]).min() < 1e-4}  # fmt: skip
+    assert set(measured.tolist()) ^ expected <= edge
+    found = rows_of(np.asarray(beams), target)
+    assert set(found[found >= 0].tolist()) == expected
+
+
+def test_a_measured_row_has_the_range_of_its_beam_in_every_column():
+    seen = points_through(wall(fired()), fired(), TARGET)
+    for e, row in zip(BEAMS, rows_of(np.asarray(BEAMS), TARGET), strict=True):
+        if row >= 0:
+            np.testing.assert_allclose(seen.image[0, row], RADIUS / math.cos(math.radians(e)), rtol=1e-5)
+            assert (seen.state[row] == Ray.RETURN).all()
+    assert seen.image.shape[0] == 1
+    np.testing.assert_allclose(np.linalg.norm(seen.xyz, axis=0), seen.image[0], rtol=1e-6)
+
+
+def test_a_ray_that_did_not_come_back_is_empty_and_one_that_was_not_fired_is_unknown():
+    steps = 128  # half as many as the image has columns
+    firing = fired(steps=steps)
+    lost = np.zeros((16, steps), bool)
+    lost[:, 40:44] = True
+    lost[5, 60] = True
+    lost[8] = True  # a beam without any return
+    seen = points_through(wall(firing, lost), firing, TARGET)
+    column = np.floor((1 - (2 * math.pi * (np.arange(steps) + 0.37) / steps - math.pi) / math.pi) / 2 * 256).astype(int)
+    rows = rows_of(firing.elevations, TARGET)
+    hit = np.zeros(256, bool)
+    hit[column] = True
+    for beam, row in enumerate(rows):
+        if row < 0:
+            continue
+        if beam == 8:  # where its rays went is not known exactly, but that they did not come back is
+            assert (seen.state[row] != Ray.RETURN).all()
+            assert (seen.state[row] == Ray.EMPTY).mean() > 0.4
+            continue
+        expected = np.where(hit, int(Ray.RETURN), int(Ray.UNKNOWN))
+        expected[column[lost[beam]]] = Ray.EMPTY
+        expected[np.isin(np.arange(256), column[40:44])] = Ray.UNKNOWN  # 11 degrees in which no beam returned
+        assert (seen.state[row] == expected).all()
+
+
+def test_where_empty_rays_are_kept_a_sector_without_returns_was_measured():
+    firing = fired()
+    lost = np.zeros((16, 1800), bool)
+    lost[:, 300:400] = True  # 20 degrees
+    some = wall(firing, lost)
+    cut = points_through(some, firing, TARGET).state
+    kept = points_through(Points(np.vstack([some.xyz, np.zeros((1600, 3), np.float32)])), firing, TARGET).state
+    rows = (cut == Ray.RETURN).any(axis=1)
+    assert 12 <= (cut[rows] == Ray.UNKNOWN).all(axis=0).sum() <= 15
+    assert (kept[rows] != Ray.UNKNOWN).all()
+
+
+def test_what_is_too_near_hides_and_what_is_too_far_does_not_come_back():
+    firing = fired()
+    near, far = (points_through(wall(firing, radius=radius), firing, TARGET) for radius in (0.8, 90.0))
+    measured = sorted(rows_with_beams(BEAMS, TARGET))
+    assert (near.state == Ray.UNKNOWN).all()
+    assert (far.state[measured] == Ray.EMPTY).all()
+    assert not near.image.any()
+    assert not far.image.any()
+
+
+def test_the_share_of_the_returns_outside_the_view_is_told():
+    beams = (10.0, 8.0, 1.0, -1.0, -3.0)
+    assert points_through(wall(fired(beams)), fired(beams), TARGET).outside == pytest.approx(2 / 5)
+
+
+def test_a_sensor_that_looks_elsewhere_is_refused():
+    beams = (30.0, 20.0, 10.0, 5.0)
+    with pytest.raises(InputError, match="none of them into the view of sensor 'hdl64e'"):
+        points_through(wall(fired(beams)), fired(beams), TARGET)
+    with pytest.raises(InputError, match="no beam of sensor 'mine' looks into"):
+        image_through(np.ones((1, 4, 64), np.float32), Sensor("mine", beams, 64), TARGET)
+
+
+@pytest.mark.parametrize("named", [replace(VLP16, elevations=BEAMS), None])
+def test_beams_and_steps_are_found(named):
+    found = firing_of([wall(fired())], named)
+    np.testing.assert_allclose(found.elevations, BEAMS, atol=1e-3)
+    assert found.steps == pytest.approx(1800, rel=1e-3)
+
+
+def test_an_image_of_another_sensor_says_its_empty_rays():
+    source = replace(VLP16, elevations=BEAMS, columns=512)
+    image = project(wall(fired()).xyz, None, source)[:1]
+    image[:, :, 100:104] = 0
+    seen = image_through(image, source, TARGET)
+    inside = sorted(rows_with_beams(source.elevations, TARGET))
+    assert (seen.state[inside, 50:52] == Ray.EMPTY).all()
+    others = np.delete(seen.state[inside], [50, 51], axis=1)
+    assert (others == Ray.RETURN).all()
+    assert (np.delete(seen.state, inside, axis=0) == Ray.UNKNOWN).all()
+
+
+def test_a_scan_of_the_same_sensor_is_measured_everywhere_but_where_it_was_cut():
+    firing = fired(TARGET.elevations, 2000)
+    lost = np.zeros((32, 2000), bool)
+    lost[:, 1000:] = True  # azimuth 0 to 180
+    lost[3, 100:130] = True
+    seen = points_of_same(wall(firing, lost), TARGET)
+    assert (seen.state[:, 1:126] == Ray.UNKNOWN).all()
+    assert (seen.state[3] == Ray.EMPTY).sum() >= 3
+    assert (np.delete(seen.state, 3, axis=0)[:, 130:] == Ray.RETURN).all()
+
+
+def test_a_range_image_says_all_its_rays():
+    image = np.array([[[5.0, 0.0, 0.7, 90.0]], [[0.5, 0.0, 0.2, 1.3]]], np.float32)
+    seen = image_of_same(image, TARGET)
+    assert seen.state.tolist() == [[Ray.RETURN, Ray.EMPTY, Ray.UNKNOWN, Ray.EMPTY]]
+    assert seen.image.tolist() == [[[5.0, 0, 0, 0]], [[0.5, 0, 0, 0]]]

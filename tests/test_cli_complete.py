@@ -1,0 +1,241 @@
+"""r2flow complete: as a user types it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r2flow.data.opening import open_scans
+from r2flow.lidar.known import parse_mask
+from r2flow.lidar.projection import image_to_points, project
+from r2flow.lidar.scan_files import read_points, write_points
+from r2flow.lidar.sensors import SENSORS
+from r2flow.noise import generator
+from r2flow.stages.checkpointing import AtomicCheckpointIO
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+from tests.test_completion import network, scans
+
+SENSOR = SENSORS["hdl64e"].resized(8, 64)
+VLP16 = SENSORS["vlp16"]
+COMPLETE = "complete", "--pictures", "0"
+
+
+def write_run(path: Path, **options) -> Path:
+    """A run folder with a conditional flow of random weights, 8 x 64."""
+    made = network(**options)
+    content = {
+        "state_dict": {f"generator.{name}": value for name, value in made.generator.state_dict().items()},
+        "config": {**made.config, "stage": {"name": "conditional"}}, "global_step": 7,
+        "sampler": made.generator.sampler.asdict(),
+    }  # fmt: skip
+    AtomicCheckpointIO().save_checkpoint(content, path / "checkpoints" / "step-00000007.ckpt")
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("complete") / "run")
+
+
+def full_scan(path: Path, number: int = 0) -> np.ndarray:
+    """A scan of the model's own sensor, as a file of the path's format; its image."""
+    image = scans(2)[number].numpy()
+    if path.suffix == ".npy":
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, image)
+    else:
+        write_points(path, *image_to_points(image, SENSOR.rays()))
+    return image
+
+
+def sparse_scan(path: Path, steps: int = 900) -> np.ndarray:
+    """A VLP-16's scan of a round room without reflectance; its points."""
+    e = np.deg2rad(np.asarray(VLP16.elevations) + 0.1)[None]
+    a = np.linspace(-np.pi, np.pi, steps, endpoint=False)[:, None]
+    e, a = np.broadcast_arrays(e, a)
+    xyz = np.stack([9 * np.cos(a), 9 * np.sin(a), 9 * np.tan(e)], -1).reshape(-1, 3)
+    write_points(path, xyz)
+    return xyz
+
+
+@pytest.mark.parametrize("ending", [".bin", ".npy"])
+def test_a_masked_scan_is_completed_in_its_own_format(r2flow, run, tmp_path, ending):  # noqa: F811
+    image = full_scan(tmp_path / f"one{ending}")
+    code, said, error = r2flow(
+        "complete", tmp_path / f"one{ending}", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out"
+    )
+    assert (code, error) == (0, "")
+    assert "MAE" in said
+    found = tmp_path / "out" / f"one{ending}"
+    if ending == ".npy":
+        answer = np.load(found)
+        assert np.array_equal(answer[:, ::2], image[:, ::2])
+        assert (answer[0, 1::2] > 0).any()
+    else:
+        given, answered = (read_points(path) for path in (tmp_path / f"one{ending}", found))
+        rows = {tuple(row) for row in np.column_stack([answered.xyz, answered.reflectance])}
+        kept = project(given.xyz, given.reflectance, SENSOR)[0][::2]
+        ranges = np.linalg.norm(given.xyz, axis=1)
+        measured = given.xyz[np.isin(ranges.astype(np.float32), kept[kept > 0])]
+        assert len(measured) > 100
+        assert {tuple(p) for p in measured} <= {row[:3] for row in rows}  # to the bit
+    assert (tmp_path / "out" / "one.png").stat().st_size > 10_000
+    assert "what is known" in (tmp_path / "out" / "one.html").read_text()
+
+
+def test_a_sparser_sensor_is_found_and_its_points_come_back(r2flow, run, tmp_path):  # noqa: F811
+    xyz = sparse_scan(tmp_path / "in" / "room.pcd")
+    code, said, _ = r2flow(
+        *COMPLETE, tmp_path / "in", "-c", run, "--to", "hdl64e", "--num", 2, "--out", tmp_path / "out"
+    )
+    assert code == 0
+    assert (
+        "vlp16 with 16 beams from +15.1 to -14.9 degrees; 6 of the 8 rows of hdl64e are measured, 7 beams look past"
+        in said
+    )
+    answers = [read_points(tmp_path / "out" / f"room_{a}.pcd") for a in range(2)]
+    for answer in answers:
+        same = {tuple(p) for p in answer.xyz} & {tuple(p) for p in xyz.astype(np.float32)}
+        assert len(same) == 6 * 64  # of each measured pixel one of the points
+        assert answer.reflectance.std() > 0  # the model's
+    assert not np.array_equal(answers[0].xyz, answers[1].xyz)
+    with np.load(tmp_path / "out" / "room.spread.npz") as spread:
+        assert spread["deviation"].shape == spread["returned"].shape == (8, 64)
+        assert ((spread["deviation"] == 0) & (spread["returned"] == 1)).sum() >= 6 * 64
+    named = r2flow(*COMPLETE, tmp_path / "in", "-c", run, "--from", "vlp16", "--num", 2, "--out", tmp_path / "named")
+    assert "vlp16 with 16 beams" in named[1]
+
+
+def test_answers_are_read_as_samples_are(r2flow, run, tmp_path):  # noqa: F811
+    full_scan(tmp_path / "one.npy")
+    r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--num", 2, "--out", tmp_path / "out")
+    assert len(open_scans(tmp_path / "out")) == 2  # neither pictures nor spread
+
+
+def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(r2flow, run, tmp_path):  # noqa: F811
+    for number, name in enumerate(("one.npy", "two.npy")):
+        full_scan(tmp_path / "in" / name, number)
+    asked = [*COMPLETE, tmp_path / "in", "-c", run, "--mask", "points:0.3", "--seed", 3, "--out", tmp_path / "out"]
+    assert "2 scans completed" in r2flow(*asked)[1]
+    first = {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.npy")}
+    (tmp_path / "out" / "two.npy").unlink()
+    stamp = (tmp_path / "out" / "one.npy").stat().st_mtime_ns
+    assert "1 scans completed" in (said := r2flow(*asked)[1])
+    assert "1 were there already" in said
+    assert (tmp_path / "out" / "one.npy").stat().st_mtime_ns == stamp
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.npy")} == first
+    code, _, error = r2flow(*asked[:-1], tmp_path / "out", "--num", 3)
+    assert code == 2
+    assert "holds scans that were completed with num 1, not 3; give another --out" in error
+    kept = parse_mask("points:0.3")((8, 64), generator(3, "condition", 1))
+    image, answer = np.load(tmp_path / "in" / "two.npy"), np.load(tmp_path / "out" / "two.npy")
+    assert np.array_equal(image[:, kept], answer[:, kept])
+
+
+def test_doubtful_scans_are_mended(r2flow, run, tmp_path):  # noqa: F811
+    image = full_scan(tmp_path / "one.npy")
+    assert r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--doubtful", "--out", tmp_path / "a")[0] == 0
+    assert r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--keep", "blend", "--out", tmp_path / "b")[0] == 0
+    mended = np.load(tmp_path / "a" / "one.npy")
+    assert np.array_equal(mended, np.load(tmp_path / "b" / "one.npy"))
+    assert not np.array_equal(mended, image)
+
+
+def test_a_scan_of_which_everything_is_known_comes_back_and_says_so(r2flow, run, tmp_path):  # noqa: F811
+    image = full_scan(tmp_path / "one.npy")
+    code, _, error = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--out", tmp_path / "out")
+    assert code == 0
+    assert np.array_equal(np.load(tmp_path / "out" / "one.npy"), image)
+    assert "one: everything is known, so it came back as it was given" in error
+
+
+def test_simulated_scans_are_seen_through_another_sensor(r2flow, run, tmp_path):  # noqa: F811
+    code, said, _ = r2flow(
+        *COMPLETE, "simulated:3", "-c", run, "--from", "vlp16", "--scans", 1, "--steps", 1, "--out", tmp_path / "out"
+    )
+    assert code == 0
+    assert "simulated:3: vlp16 with 16 beams" in said
+    assert np.load(tmp_path / "out" / "simulated-3-000000.npy").shape == (2, 8, 64)
+
+
+def test_a_model_of_range_alone_leaves_reflectance_out(r2flow, tmp_path):  # noqa: F811
+    path = write_run(tmp_path / "run", reflectance=False)
+    full_scan(tmp_path / "one.bin")
+    code, said, _ = r2flow(*COMPLETE, tmp_path / "one.bin", "-c", path, "--mask", "rows:2", "--out", tmp_path / "out")
+    assert code == 0
+    assert "the model is of range alone: answers have no reflectance" in said
+    assert read_points(tmp_path / "out" / "one.ply").reflectance is None
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--mask", "points:0"], "one: the mask keeps nothing that was measured"),
+        (["--mask", "points:1"], "one: the mask keeps everything that was measured"),
+        (["--mask", "row:4"], "no mask 'row:4'"),
+        (["--mask", "{folder}/mask.npy"], "is of 4 x 4, the scans are of 8 x 64 rays"),
+        (["--to", "vlp16"], "--to vlp16: the model makes images of hdl64e, 8x64"),
+        (["--keep", "all"], "--keep must be exact or blend, found 'all'"),
+        (["--from", "vlp16"], "is a range image of 8x64, those of the model are 8x64: --from vlp16 has 16 rows"),
+        (["--solver", "dopri6"], "dopri6"),
+        (["--out", "{folder}"], "is one of the scans and would be replaced"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(r2flow, run, tmp_path, options, message):  # noqa: F811
+    full_scan(tmp_path / "one.npy")
+    np.save(tmp_path / "mask.npy", np.ones((4, 4), bool))
+    given = [option.format(folder=tmp_path) for option in options]
+    out = [] if "--out" in given else ["--out", tmp_path / "out"]
+    code, _, error = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, *out, *given)
+    assert code == 2
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        (
+            lambda path: np.save(path, np.ones((2, 4, 64), np.float32)),
+            "is a range image of 4x64, those of the model are",
+        ),
+        (lambda path: np.save(path, np.full((2, 8, 64), np.nan, np.float32)), "holds NaN or infinite values"),
+        (lambda path: path.write_bytes(b""), "is empty"),
+        (lambda path: None, "does not exist"),
+    ],
+)
+def test_scans_that_cannot_be_completed_are_one_line(r2flow, run, tmp_path, made, message):  # noqa: F811
+    made(tmp_path / "one.npy")
+    code, _, error = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--out", tmp_path / "out")
+    assert code == 2
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_other_samples_is_not_written_into(r2flow, run, tmp_path):  # noqa: F811
+    full_scan(tmp_path / "one.npy")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "scans.json").write_text(json.dumps({"seed": 0}))
+    code, _, error = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out")
+    assert code == 2
+    assert "holds other scans than completed ones" in error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scan", "beams"),
+    [
+        ("vlp16/000200.pcd", "16 beams"),
+        ("nuscenes_hdl32e/n015-2018-07-24-11-22-45+0800__LIDAR_TOP__1532402927647951.pcd.bin", "32 beams"),
+        ("rellis_os1_64/000104.bin", "64 beams"),
+        ("rellis_vlp32c/vel000104.bin", "32 beams"),
+    ],
+)
+def test_real_scans_of_other_sensors_are_completed(r2flow, shared, run, tmp_path, scan, beams):  # noqa: F811
+    code, said, _ = r2flow(*COMPLETE, shared / "real" / "other_sensors" / scan, "-c", run, "--out", tmp_path / "out")
+    assert code == 0
+    assert beams in said
+    assert "1 scans completed" in said
