@@ -35,6 +35,8 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import project, unproject
 from r2flow.lidar.sensors import build_sensor
 from r2flow.noise import Draws
+from r2flow.published.lidm import _autoencoder, _unet
+from r2flow.registry import options_of
 from r2flow.stages.latent import returns
 
 SMALL_AUTOENCODER = {"width": 32, "multipliers": [1, 1], "strides": [[2, 2]], "blocks": 1, "codes": 16}
@@ -68,7 +70,7 @@ def within(state: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tenso
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def diffusion(shared: Path) -> dict[str, Any]:
     case = load_case(shared, "lidm_diffusion.pt")
     case["unet"], case["autoencoder"] = (
@@ -131,12 +133,10 @@ def test_unet_and_gradients_are_the_published(shared: Path):
 def test_the_full_networks_have_the_published_names_and_shapes(shared: Path):
     with torch.device("meta"):
         autoencoder, unet = Autoencoder(), LatentUNet((8, 16, 128))
-        positioned = LatentUNet((8, 16, 128), position="learnable")
-    parts = autoencoder.encoder, autoencoder.decoder, autoencoder, unet, positioned
-    encoder, decoder, whole, diffusion, with_position = (sum(p.numel() for p in part.parameters()) for part in parts)
+    parts = autoencoder.encoder, autoencoder.decoder, autoencoder, unet
+    encoder, decoder, whole, diffusion = (sum(p.numel() for p in part.parameters()) for part in parts)
     assert (encoder, decoder, whole - encoder - decoder) == (6_343_368, 8_595_777, 131_216)
     assert diffusion == 257_751_560
-    assert with_position - diffusion == 256 * 16 * 128 == 524_288
     known = json.loads((shared / "oracle_baselines" / "state_dict_keys.json").read_text())["lidm"]
     for prefix, model in (("first_stage_model.", autoencoder), ("model.diffusion_model.", unet)):
         assert {name: list(value.shape) for name, value in model.state_dict().items()} == within(
@@ -351,6 +351,33 @@ def test_a_published_diffusion_without_its_config_has_the_published_size(shared:
     assert loaded.config["generator"]["unet"]["head_channels"] == 32
     assert loaded.config["generator"]["unet"]["multipliers"] == [1, 1]
     assert loaded.config["generator"]["beta_last"] == 0.0195
+
+
+def lists(value: Any) -> Any:
+    return [lists(one) for one in value] if isinstance(value, tuple) else value
+
+
+OPTIONS = [
+    ({}, {}),
+    (
+        {"multipliers": (1, 1, 2), "strides": ((1, 2), (1, 2)), "blocks": 3, "attention": (1,), "mask": True},
+        {"multipliers": (1, 2, 3), "blocks": 1, "attention": (2,), "width": 64},
+    ),
+]
+
+
+@pytest.mark.parametrize(("first", "second"), OPTIONS, ids=["published", "other"])
+def test_options_are_read_off_the_names_and_shapes_of_weights(first: dict[str, Any], second: dict[str, Any]):
+    with torch.device("meta"):
+        autoencoder, unet = Autoencoder(1, **first), LatentUNet((8, 16, 128), **second)
+    usual = options_of(Autoencoder, given=1), options_of(LatentUNet, given=1)
+    for read, model, given, known in (
+        (_autoencoder, autoencoder, {**first, "legacy": True}, usual[0]),
+        (_unet, unet, second, usual[1]),
+    ):
+        found = read(model.state_dict())
+        for name, value in found.items():
+            assert value == lists({**known, **given}[name]), name
 
 
 def test_a_published_config_that_contradicts_is_one_line(published: tuple[Path, dict[str, Any]]):
