@@ -10,7 +10,7 @@ from r2flow.checkpoints import FOLDER
 from r2flow.registry import Count, Registry, check_options
 
 from .curvature import Curvature
-from .ema import EMA
+from .ema import EMA, HalfLifeEMA
 from .guard import Guard
 from .loggers import LOGGERS, build_loggers, log_config, log_figures
 from .pictures import SamplePictures
@@ -74,6 +74,7 @@ CALLBACKS = Registry(
     "callback",
     reflow_pairs=Entry(ReflowPairs, lambda config: (config["stage"].get("init"),)),
     ema=Entry(EMA),
+    half_life_ema=Entry(HalfLifeEMA, lambda config: (config["data"]["batch_size"],)),
     pictures=Entry(
         SamplePictures,
         lambda config: (Path(config["run_dir"], "pictures"), config["seed"]),
@@ -91,6 +92,7 @@ __all__ = [
     "LOGGERS",
     "Curvature",
     "Guard",
+    "HalfLifeEMA",
     "Progress",
     "ReflowPairs",
     "SamplePictures",

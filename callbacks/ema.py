@@ -9,7 +9,8 @@ import torch
 from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 
-from r2flow.registry import Count, Natural, Portion, Registry
+from r2flow.adversarial.rules import half_life_decay
+from r2flow.registry import Count, Natural, Portion, Positive, Registry
 
 
 def ema_decay(step: int, warmup: int, highest: float = 0.995, power: float = 2 / 3) -> float:
@@ -60,9 +61,12 @@ class EMA(WeightAveraging):
         self._step = 0
         self._raw: list[Tensor] = []
 
+    def _decay(self) -> float:
+        """After step `_step`, counted from 0."""
+        return self._decay_at(self._step, self.warmup_steps or 0, self.decay)
+
     def _average(self, average: Tensor, weight: Tensor, updates: Any) -> Tensor:
-        decay = self._decay_at(self._step, self.warmup_steps or 0, self.decay)
-        return average + (1 - decay) * (weight - average)
+        return average + (1 - self._decay()) * (weight - average)
 
     def should_update(self, step_idx: int | None = None, epoch_idx: int | None = None) -> bool:
         if step_idx is None:
@@ -105,6 +109,24 @@ class EMA(WeightAveraging):
             yield
         finally:
             self.on_validation_epoch_end(trainer, pl_module)
+
+
+class HalfLifeEMA(EMA):
+    """The average of a GAN's generator: half of it is from the last `half_life` images, or from a share `rampup` of
+    those seen, where these are fewer (`r2flow.adversarial.rules.half_life_decay`); every step, buffers copied.
+
+    Args:
+        batch_size: Images a step.
+        half_life: Images.
+        rampup: Share of the images seen.
+    """
+
+    def __init__(self, batch_size: int, half_life: Positive = 10_000.0, rampup: Positive = 0.05) -> None:
+        super().__init__(every=1, warmup_steps=0)
+        self.batch_size, self.half_life, self.rampup = batch_size, half_life, rampup
+
+    def _decay(self) -> float:
+        return half_life_decay(self._step, self.batch_size, self.half_life, self.rampup)
 
 
 @contextmanager

@@ -26,14 +26,14 @@ ROOMS = {
     "simulator": (8, 1, ("simulator",), "street scenes, ray-cast"),
     "generators": (8, 2, ("generators",), "noise in, scan out"),
     "lidar": (9, 0, ("lidar",), "sensors, range images, files"),
-    "flow": (9, 1, ("flow", "diffusion", "adversarial"), "path, times, losses, solvers"),
+    "flow": (10, 1, ("flow", "diffusion", "adversarial"), "path, times, losses, solvers"),
     "backbones": (9, 2, ("backbones",), "networks v(t, x)"),
 }
 # What all rooms stand on; lines to it would cover the others.
 GROUND = ("config", "plugins", "registry", "models", "noise", "files", "hashing", "progress", "signals", "errors")
 
 WIDE, HIGH, ACROSS, DOWN, EDGE = 206, 52, 232, 88, 26  # size of a room, from one to the next, margin
-SIZE = (2 * EDGE + 2 * ACROSS + WIDE, 2 * EDGE + 10 * DOWN + HIGH - 18)
+SIZE = (2 * EDGE + 2 * ACROSS + WIDE, 2 * EDGE + 11 * DOWN + HIGH - 18)
 
 
 def imports() -> dict[str, set[str]]:

@@ -28,6 +28,7 @@ from r2flow.lidar.sensors import Sensor
 from r2flow.models import MODELS, find_model
 from r2flow.plugins import made_with
 from r2flow.published import FORMATS, format_of, published_cfg
+from r2flow.published.plain import inert, plain
 from r2flow.registry import did_you_mean
 from r2flow.sampling import sample
 
@@ -163,8 +164,8 @@ def _read(path: str | Path, map_location: Any = "cpu") -> Any:
         raise InputError(f"no checkpoint at {path}. Give a checkpoint file or a run folder.")
     _check_sums(path)
     try:
-        with warnings.catch_warnings(action="ignore"):  # torch's, on bytes that are no checkpoint
-            return torch.load(path, map_location=map_location, weights_only=True)
+        with warnings.catch_warnings(action="ignore"), inert():  # warnings of torch's, on bytes that are no checkpoint
+            content = torch.load(path, map_location=map_location, weights_only=True)
     except pickle.UnpicklingError as error:
         if "Unsupported global" in str(error) or "Unsupported class" in str(error):
             name = re.search(r"GLOBAL (\S+)", str(error))
@@ -178,6 +179,7 @@ def _read(path: str | Path, map_location: Any = "cpu") -> Any:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
     except Exception:  # torch's reader raises nearly anything on bytes that are none of its own
         raise InputError(_not_a_checkpoint(path)) from None
+    return {key: plain(value) for key, value in content.items()} if isinstance(content, dict) else content
 
 
 def _check_sums(path: str | Path) -> None:

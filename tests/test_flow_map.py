@@ -14,6 +14,7 @@ from r2flow.flow.maps import OBJECTIVES
 from r2flow.flow.path import interpolate
 from r2flow.flow.problems import Gaussian
 from r2flow.generators import Field, FlowMap, RectifiedFlow, Sampler, build_generator
+from r2flow.lidar.region import Region
 from r2flow.noise import Draws
 from r2flow.stages import build_stage
 from r2flow.stages.flow_map import LearnFlowMap, paths_of
@@ -106,6 +107,14 @@ def test_renoised_samples_of_an_exact_map_have_the_data_s_distribution(exact):
     between = 0.5 * draws.step(exact.noise_shape, 1) + 0.5 * (0.7 + 0.25 * x_0)
     expected = 0.7 + 0.25 / (0.25 + 0.25 * 0.25**2) ** 0.5 * (between - 0.5 * 0.7)
     torch.testing.assert_close(twice, expected, rtol=0, atol=1e-5)
+
+
+def test_a_part_is_renoised_with_the_noise_of_the_whole(exact):
+    region, draws, sampler = Region((8, 32), 0, 8, 8, 16), Draws(5, [0]), Sampler("renoise", 3)
+    x_0 = draws.start(exact.noise_shape)
+    whole = exact.generate(x_0, sampler=sampler, draws=draws)
+    part = exact.part(region).generate(region.crop(x_0), sampler=sampler, draws=draws)
+    torch.testing.assert_close(part.x, region.crop(whole.x), rtol=0, atol=1e-6)
 
 
 def test_it_can_also_be_solved_as_the_flow_that_it_is(grown):

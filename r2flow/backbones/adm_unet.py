@@ -55,7 +55,7 @@ class ADMUNet(UNet):
                     step.append(ADMBlock(width, width, options, double))
                 self.up_blocks.append(step)
         head = zero_convolution(RingConv2d(width, self.out_channels, options.ring))
-        self.out_conv = nn.Sequential(GroupNorm(width), nn.SiLU(), head)
+        self.out_conv = nn.Sequential(GroupNorm(width, options.groups, options.eps), nn.SiLU(), head)
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         condition = self.condition(self.time_embedding, t, s)
@@ -95,7 +95,7 @@ class ADMBlock(ResidualBlock):
         super().__init__(channels, out_channels, options)
         self.resample = resample or nn.Identity()
         self.skip_conv = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
-        self.self_attn_block = nn.Identity() if heads is None else SelfAttention(out_channels, heads)
+        self.self_attn_block = nn.Identity() if heads is None else SelfAttention(out_channels, heads, options)
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         residual = self.residual(self.resample(self.norm1(x)), condition)

@@ -13,7 +13,7 @@ from r2flow.backbones.base import Backbone, CommonOptions, integers
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, position_name
 from r2flow.backbones.layers import ExactBuffers, ExactLinear, at_least_float32, zero_initialised
 from r2flow.errors import InputError
-from r2flow.registry import Count, Portion
+from r2flow.registry import Count, Portion, Positive
 
 GROUPS = 8
 EPS = 1e-6
@@ -35,7 +35,7 @@ class RingConv2d(nn.Conv2d):
 
 
 class Resample(ExactBuffers):
-    """Twice or half the resolution by a separable filter, circular in azimuth, zeros beyond the other edges.
+    """Twice or half the resolution by a separable filter, circular in azimuth, zeros or repeats beyond other edges.
 
     Down: every second value of the filtered image. Up: the filtered image of the pixels among zeros, the filter
     doubled so that its sum over either phase is 1.
@@ -44,26 +44,31 @@ class Resample(ExactBuffers):
         window: Filter taps, normalised to sum 1; an even number.
         up: Whether to double rather than halve.
         ring: Whether the columns are a ring.
+        repeat: Whether the pixels at the other edges are repeated beyond them.
     """
 
     kernel: Tensor
 
-    def __init__(self, window: Sequence[float], up: bool, ring: bool) -> None:
+    def __init__(self, window: Sequence[float], up: bool, ring: bool, repeat: bool = False) -> None:
         super().__init__()
         taps = torch.tensor(window, dtype=torch.float32)
         self.register_buffer("kernel", taps / taps.sum() * (2 if up else 1))
-        self.up, self.ring = up, ring
+        self.up, self.ring, self.repeat = up, ring, repeat
         self.margin = len(window) // 2 - 1  # taps that reach beyond a pixel's own pair
 
     def forward(self, x: Tensor) -> Tensor:
         channels, margin = x.shape[1], self.margin
-        if self.ring and margin:
-            x = F.pad(x, (margin, margin, 0, 0), mode="circular")
+        rows, columns = self.repeat, self.ring or self.repeat  # whether they are padded here
+        if columns and margin:
+            x = F.pad(x, (margin, margin, 0, 0), mode="circular" if self.ring else "replicate")
+        if rows and margin:
+            x = F.pad(x, (0, 0, margin, margin), mode="replicate")
         kernel = torch.outer(self.kernel, self.kernel).to(x.dtype).expand(channels, 1, -1, -1)
         if self.up:
-            crop = (margin, 3 * margin if self.ring else margin)
+            crop = (3 * margin if rows else margin, 3 * margin if columns else margin)
             return F.conv_transpose2d(x, kernel, stride=2, padding=crop, groups=channels)
-        return F.conv2d(x, kernel, stride=2, padding=(margin, 0 if self.ring else margin), groups=channels)
+        zeros = (0 if rows else margin, 0 if columns else margin)
+        return F.conv2d(x, kernel, stride=2, padding=zeros, groups=channels)
 
     def open_ring(self) -> None:
         """Zeros beyond the left and right edges too, from now on."""
@@ -91,10 +96,10 @@ class GroupNorm(nn.GroupNorm):
 class AdaGroupNorm(nn.Module):
     """norm(x) (1 + scale) + shift, with (scale, shift) = W silu(c) + b of a condition c."""
 
-    def __init__(self, channels: int, condition_channels: int) -> None:
+    def __init__(self, channels: int, options: "BlockOptions") -> None:
         super().__init__()
-        self.norm = GroupNorm(channels, affine=False)
-        self.proj = nn.Sequential(nn.SiLU(), ExactLinear(condition_channels, 2 * channels))
+        self.norm = GroupNorm(channels, options.groups, options.eps, affine=False)
+        self.proj = nn.Sequential(nn.SiLU(), ExactLinear(options.condition_channels, 2 * channels))
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         scale, shift = self.proj(condition)[:, :, None, None].to(x.dtype).chunk(2, dim=1)
@@ -102,7 +107,7 @@ class AdaGroupNorm(nn.Module):
 
 
 class SinusoidalTime(nn.Module):
-    """sin(f_i t), then cos(f_i t), with f_i = 10^(-4 i / (C / 2 - 1)); t as it is, in [0, 1]."""
+    """sin(f_i t), then cos(f_i t), with f_i = 10^(-4 i / (C / 2 - 1)); t as it is, a flow's time or a log-SNR."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -129,11 +134,15 @@ class BlockOptions:
         condition_channels: Width of the time embedding.
         ring: Whether the columns are a full turn.
         dropout: Share of activations dropped in training.
+        groups: Of group norms.
+        eps: Added to their variance.
     """
 
     condition_channels: int
     ring: bool
     dropout: float
+    groups: int = GROUPS
+    eps: float = EPS
 
 
 class ResidualBlock(nn.Module):
@@ -144,9 +153,9 @@ class ResidualBlock(nn.Module):
     def __init__(self, channels: int, out_channels: int, options: BlockOptions) -> None:
         super().__init__()
         self.register_buffer("scale", torch.tensor(0.5**0.5))
-        self.norm1 = GroupNorm(channels)
+        self.norm1 = GroupNorm(channels, options.groups, options.eps)
         self.conv1 = RingConv2d(channels, out_channels, options.ring)
-        self.norm2 = AdaGroupNorm(out_channels, options.condition_channels)
+        self.norm2 = AdaGroupNorm(out_channels, options)
         self.dropout = nn.Dropout(options.dropout)
         self.conv2 = zero_convolution(RingConv2d(out_channels, out_channels, options.ring))
 
@@ -161,12 +170,12 @@ class SelfAttention(nn.Module):
 
     scale: Tensor
 
-    def __init__(self, channels: int, heads: int) -> None:
+    def __init__(self, channels: int, heads: int, options: BlockOptions) -> None:
         super().__init__()
         if channels % heads:
             raise InputError(f"{channels} channels cannot be shared by {heads} attention heads.")
         self.register_buffer("scale", torch.tensor(0.5**0.5))
-        self.norm = GroupNorm(channels)
+        self.norm = GroupNorm(channels, options.groups, options.eps)
         self.attn = nn.MultiheadAttention(channels, heads, batch_first=True)
         nn.init.zeros_(self.attn.out_proj.weight)
 
@@ -199,6 +208,8 @@ class UNet(Backbone):
         position: Features beside the image: "fourier_features", "polar", "spherical_harmonics" or "none".
         ring: Whether the columns are a full turn.
         dropout: Share of activations dropped in training.
+        groups: Of group norms; every width is a multiple of it.
+        eps: Added to their variance.
         common: See `Backbone`.
 
     Raises:
@@ -220,6 +231,8 @@ class UNet(Backbone):
         position: str | None = "fourier_features",
         ring: bool = True,
         dropout: Portion = 0.0,
+        groups: Count = GROUPS,
+        eps: Positive = EPS,
         **common: Unpack[CommonOptions],
     ) -> None:
         levels = max(len(channel_multiplier), 1)
@@ -235,7 +248,7 @@ class UNet(Backbone):
         self.time_embedding = time_embedding(base_channels, width)
         self.in_conv = RingConv2d(self.in_channels + extra, base_channels, ring)
         widths = [base_channels * multiplier for multiplier in multipliers]
-        self.build_levels(base_channels, widths, counts, num_heads, BlockOptions(width, ring, dropout))
+        self.build_levels(base_channels, widths, counts, num_heads, BlockOptions(width, ring, dropout, groups, eps))
         if self.second_time:
             self.interval_embedding = time_embedding(base_channels, width, bias=False)
             zero_initialised(cast(nn.Linear, self.interval_embedding[-1]))

@@ -82,7 +82,7 @@ class Level(nn.Module):
         inputs = [channels, *[out_channels] * (count - 1)]
         self.residual_blocks = nn.ModuleList([SkippedBlock(width, out_channels, options) for width in inputs])
         if heads is not None:
-            self.self_attn_block = SelfAttention(out_channels, heads)
+            self.self_attn_block = SelfAttention(out_channels, heads, options)
         if up:
             convolve = RingConv2d(out_channels, out_channels, options.ring)
             self.upsample = nn.Sequential(Resample(FILTER, up=True, ring=options.ring), convolve)

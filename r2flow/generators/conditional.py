@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from copy import deepcopy
 from itertools import pairwise
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 import torch
@@ -150,7 +150,7 @@ class ConditionalFlow(RectifiedFlow):
         image, known, _ = parts_of(condition, made.x)
         return Generated(torch.where(known > 0, image, made.x), made.evaluations, made.converged)
 
-    def part(self, region: Region) -> RectifiedFlow:
+    def part(self, region: Region) -> Self:
         part = super().part(region)
         if self.trusts and part is not self:
             part.trust = deepcopy(self.trust)

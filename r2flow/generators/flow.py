@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -165,30 +165,34 @@ class Flow(Generator):
         return 0 if method is None or sampler.levels else method.cost(sampler.steps)
 
 
-class RectifiedFlow(Flow):
-    """v(t, x) by a backbone: 1-RF, k-RF and k-TD alike, which differ in how they are learned and in their sampler.
+class NetworkFlow(Flow):
+    """A flow whose velocity follows from a backbone. A subclass says how.
 
     Args:
         space: The images it makes.
         backbone: Name and options, as in conf/backbone.
+
+    Attributes:
+        answer: What its network tells.
+        region: The part of the image that it makes; None for all of it.
     """
 
+    answer: str = "v(t, x)"
+    region: Region | None = None
     condition_channels: int = 0  # further input channels of the backbone, for a subclass with a condition
     second_time: ClassVar[bool] = False  # whether the backbone takes a second time, for a subclass that is a flow map
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space)
-        self.sampler = USUAL
         channels = space.shape[0]
         self.backbone = build_backbone(
             backbone, space.rays, channels + self.condition_channels, channels, self.second_time
         )
 
-    def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
-        if condition is not None:
-            raise InputError(UNTOLD)
-        v: Tensor = self.backbone(t, x)
-        return v
+    def further_noise(self, draws: Draws, j: int) -> Tensor:
+        """The noise of step j, for the part of the image that is made."""
+        noise = draws.step(self.noise_shape, j)
+        return noise if self.region is None else self.region.crop(noise)
 
     def start_from(self, parent: Generator) -> None:
         """Take over a flow's weights; what a second time or a condition adds changes nothing at first.
@@ -197,8 +201,12 @@ class RectifiedFlow(Flow):
         own rays.
 
         Raises:
-            InputError: other weights; a network with weights for each place of the image, and another size.
+            InputError: other weights; a network that tells something else; one with weights for each place of the
+                image, and another size.
         """
+        theirs_tell = getattr(parent, "answer", self.answer)
+        if theirs_tell != self.answer:
+            raise InputError(f"the network to start from tells {theirs_tell}, and this one learns {self.answer}.")
         own = self.state_dict()
         more = self.condition_channels - getattr(parent, "condition_channels", 0)
         theirs = {
@@ -219,10 +227,6 @@ class RectifiedFlow(Flow):
                 )
         self._take(parent, {**new, **theirs})
 
-    def untold(self) -> "RectifiedFlow":
-        """The flow of scans of which nothing is known: itself, where it takes no condition."""
-        return self
-
     @property
     def unit(self) -> tuple[int, int]:
         return self.backbone.unit
@@ -231,13 +235,37 @@ class RectifiedFlow(Flow):
     def learns_directions(self) -> bool:
         return self.backbone.learns_directions
 
-    def part(self, region: Region) -> "RectifiedFlow":
+    def part(self, region: Region) -> Self:
         """The flow on a region alone: its network does not see the rest of the image."""
         if region.share == 1:
             return self
         part = copy(self)
         part._modules = {"backbone": self.backbone.cropped(region.rows, region.columns)}
+        part.region = region
         return part
+
+
+class RectifiedFlow(NetworkFlow):
+    """v(t, x) by a backbone: 1-RF, k-RF and k-TD alike, which differ in how they are learned and in their sampler.
+
+    Args:
+        space: The images it makes.
+        backbone: Name and options, as in conf/backbone.
+    """
+
+    def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
+        super().__init__(space, backbone)
+        self.sampler = USUAL
+
+    def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
+        if condition is not None:
+            raise InputError(UNTOLD)
+        v: Tensor = self.backbone(t, x)
+        return v
+
+    def untold(self) -> "RectifiedFlow":
+        """The flow of scans of which nothing is known: itself, where it takes no condition."""
+        return self
 
 
 def _with_inputs(weights: Tensor, wanted: tuple[int, ...], channels: int, more: int) -> Tensor:

@@ -92,7 +92,7 @@ class FlowMap(RectifiedFlow):
             else:
                 following = jump(self.mean_velocity, t, x, times[-1].to(x))
                 if n < len(times) - 1:
-                    following = (1 - s) * draws.step(self.noise_shape, n).to(x) + s * following
+                    following = (1 - s) * self.further_noise(draws, n).to(x) + s * following
             alive = following.isfinite().flatten(1).all(1)
             x = following if bool(alive.all()) else torch.where(expand_time(alive, x), following, x)
             if progress is not None:

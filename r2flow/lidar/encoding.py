@@ -77,6 +77,23 @@ class Inverse:
         return torch.where(y > 0, self.min_range / y.clamp(min=1e-12), 0.0)
 
 
+class InverseDepth(Inverse):
+    """r_min / r within the range limits and 0 beyond them, both ways and without tolerance, as DUSty has it."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        super().__init__(sensor)
+        self.max_range = sensor.max_range
+
+    def forward(self, r: Tensor) -> Tensor:
+        held = (r >= self.min_range) & (r <= self.max_range)
+        return torch.where(held, super().forward(r), 0.0)
+
+    def inverse(self, y: Tensor) -> Tensor:
+        inverse = y / self.min_range
+        held = (inverse >= 1 / self.max_range) & (inverse <= 1 / self.min_range)
+        return torch.where(held, super().inverse(y), 0.0)
+
+
 class Metric:
     """r / r_max."""
 
@@ -113,6 +130,7 @@ FORMATS: Registry[Callable[[Sensor], RangeFormat]] = Registry(
     logscale=LogScale,
     shifted_log=ShiftedLog,
     inverse=Inverse,
+    inverse_depth=InverseDepth,
     metric=Metric,
     cartesian=Cartesian,
 )
@@ -123,8 +141,8 @@ class Encoding:
 
     Args:
         sensor: Its range limits say which ranges are returns.
-        format: `logscale` (the paper's), `shifted_log` (LiDARGen's and LiDM's), `inverse`, `metric`, or `cartesian`
-            (three channels).
+        format: `logscale` (the paper's), `shifted_log` (LiDARGen's and LiDM's), `inverse`, `inverse_depth` (DUSty's),
+            `metric`, or `cartesian` (three channels).
         reflectance: Whether reflectance is a channel; without it a model is of range alone.
         limits: `closed`: ranges of exactly the sensor's limits are returns. `open`, as R2DM has it: they are not, and
             none is encoded that does not lie between them.

@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from r2flow.errors import InputError
@@ -169,6 +170,26 @@ def unproject(r: Tensor, rays: Tensor) -> Tensor:
     e, a = rays.to(r)
     direction = torch.stack([e.cos() * a.cos(), e.cos() * a.sin(), e.sin()])
     return r * direction
+
+
+def resized_rays(rays: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Rays for images of another shape: the angle of the linearly interpolated sines and cosines.
+
+    Angles themselves cannot be interpolated where azimuth jumps from -pi to pi. Columns are a ring, the edge rows are
+    repeated.
+
+    Args:
+        rays: Elevation and azimuth in radians, (2, H, W).
+        shape: Rows and columns (H', W').
+
+    Returns:
+        (2, H', W').
+    """
+    parts = torch.cat([rays.sin(), rays.cos()])[None]
+    thrice = torch.cat([parts, parts, parts], dim=3)
+    resized = F.interpolate(thrice, size=(shape[0], 3 * shape[1]), mode="bilinear", align_corners=False)
+    sines, cosines = resized[0, :, :, shape[1] : 2 * shape[1]].split(2)
+    return torch.atan2(sines, cosines)
 
 
 def image_to_points(

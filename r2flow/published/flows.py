@@ -33,7 +33,7 @@ def holds(content: Any) -> bool:
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
     """A published flow; the file holds its averaged weights alone."""
     weights = {BACKBONE + name: value for name, value in content["weights"].items()}
-    return Published(published_config(content["cfg"], path), weights, _step(content), finish=_follow_rings)
+    return Published(published_config(content["cfg"], path), weights, _step(content), finish=follow_rings)
 
 
 def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
@@ -55,7 +55,7 @@ def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
                 "rays": "reference",
             },
             "encoding": {"format": data["data_format"], "reflectance": bool(data["train_reflectance"])},
-            "backbone": _backbone(model, path),
+            "backbone": backbone_of(model, path),
             "data": {
                 "name": data["dataset"],
                 "projection": str(data["projection"]).split("-")[0],
@@ -69,7 +69,12 @@ def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: the published config lacks or garbles {error}.") from None
 
 
-def _backbone(model: Mapping[str, Any], path: Path) -> dict[str, Any]:
+def backbone_of(model: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Our backbone's options of a published config's `model`.
+
+    Raises:
+        InputError: an unknown architecture.
+    """
     architecture = str(model["architecture"])
     if architecture not in ARCHITECTURES:
         raise InputError(
@@ -91,6 +96,8 @@ def _backbone(model: Mapping[str, Any], path: Path) -> dict[str, Any]:
         **common,
         "num_residual_blocks": blocks if isinstance(blocks, int) else list(blocks),
         "channel_multiplier": list(model["channel_multiplier"]),
+        "groups": model.get("gn_num_groups", 8),
+        "eps": model.get("gn_eps", 1e-6),
         "num_heads": heads if isinstance(heads, int) else list(heads)[-1],
     }
 
@@ -134,8 +141,8 @@ def published_cfg(config: Mapping[str, Any]) -> dict[str, Any]:
             "attn_num_heads": backbone["num_heads"],
             "coords_encoding": THEIR_POSITIONS.get(position, position),
             "dropout": backbone["dropout"],
-            "gn_num_groups": 8,
-            "gn_eps": 1e-6,
+            "gn_num_groups": backbone.get("groups", 8),
+            "gn_eps": backbone.get("eps", 1e-6),
         },
         "training": {"batch_size": config["data"].get("batch_size", 8)},
     }
@@ -147,7 +154,8 @@ def _step(content: Mapping[str, Any]) -> int:
     return int(content.get("num_images", 0)) // max(int(batch), 1)
 
 
-def _follow_rings(generator: Generator, config: Mapping[str, Any]) -> None:
+def follow_rings(generator: Generator, config: Mapping[str, Any]) -> None:
+    """Let the sensor of unfolded scans look along the rings that the weights carry."""
     if config["data"]["projection"] == "unfolding":
         sensor = published_rings(generator.space.sensor, generator.state_dict()[BACKBONE + "coords"])
         generator.space = replace(generator.space, sensor=sensor)

@@ -9,7 +9,9 @@ from r2flow.generators import Generator, Sampler
 from r2flow.registry import Registry, check_options
 from r2flow.stages.base import Stage
 from r2flow.stages.conditional import Conditional, Regress
+from r2flow.stages.diffusion import LearnDiffusion
 from r2flow.stages.flow_map import LearnFlowMap
+from r2flow.stages.gan import LearnGan
 from r2flow.stages.latent import LearnAutoencoder, LearnLatentDiffusion
 from r2flow.stages.rectify import Rectify
 from r2flow.stages.reflow import Distill, Reflow
@@ -23,6 +25,8 @@ STAGES: Registry[type[Stage]] = Registry(
     flow_map=LearnFlowMap,
     conditional=Conditional,
     regress=Regress,
+    diffusion=LearnDiffusion,
+    gan=LearnGan,
     score_matching=MatchScore,
     autoencoder=LearnAutoencoder,
     latent_diffusion=LearnLatentDiffusion,

@@ -2,14 +2,18 @@
 
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 from typing import Any, ClassVar
 
 import lightning as L
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
 
+from r2flow.adversarial.processes import averaged
 from r2flow.errors import InputError
+from r2flow.flow.times import golden_sequence
 from r2flow.generators import Generator
 from r2flow.noise import seed_torch
 from r2flow.registry import Count, Natural, NonNegative, Portion
@@ -128,7 +132,13 @@ class Stage(L.LightningModule):
         Gradients of the loss by other optimisers' parameters are left; they are cleared before their own step.
         """
         optimizer.zero_grad()
-        self.manual_backward(loss)
+        model = self.trainer.strategy.model
+        # DDP waits for gradients of all parameters in every backward pass, and a loss has those of some.
+        with model.no_sync() if isinstance(model, DistributedDataParallel) else nullcontext():
+            self.manual_backward(loss)
+        for parameter in (p for group in optimizer.param_groups for p in group["params"]):
+            if parameter.grad is not None:
+                parameter.grad = averaged(parameter.grad)
         self.clip_gradients(optimizer.optimizer, self.gradient_clip_val)
         optimizer.step()
         schedules = self.lr_schedulers() or []
@@ -139,6 +149,25 @@ class Stage(L.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["config"] = self.config
         checkpoint["sampler"] = self.generator.sampler.asdict()
+
+
+class SingleLoss(Stage):
+    """A stage with one loss of a batch. A subclass gives `regression_loss`."""
+
+    def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
+        """The mean loss at the times that the stage makes of uniform draws u in [0, 1), (B,)."""
+        raise NotImplementedError
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        loss = self.regression_loss(batch, batch["u"])
+        self.log("train/loss", loss, prog_bar=True, sync_dist=True)
+        return loss
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        # A low-discrepancy sequence over [0, 1) instead of random times: a steadier figure from few scans.
+        u = golden_sequence(batch["k"])
+        loss = self.regression_loss(batch, u)
+        self.log("val/loss", loss, prog_bar=True, batch_size=len(batch["x_1"]), sync_dist=True)
 
 
 def learning_rate_factor(step: int, warmup: int, total: int) -> float:

@@ -10,11 +10,10 @@ from r2flow.adversarial.hinge import adaptive_weight, adversarial_factor, hinge_
 from r2flow.backbones.patch_discriminator import PatchDiscriminator
 from r2flow.diffusion.ddim import noise_loss
 from r2flow.errors import InputError
-from r2flow.flow.times import golden_sequence
 from r2flow.generators import Generator, LatentDiffusion, VQAutoencoder
 from r2flow.lidar.encoding import Encoding
 from r2flow.registry import Natural, NonNegative, check_options
-from r2flow.stages.base import Batch, Stage
+from r2flow.stages.base import Batch, SingleLoss, Stage
 
 LEAST = 1 / 255  # metres: what is nearer is no return
 
@@ -112,7 +111,7 @@ class LearnAutoencoder(Stage):
         self.log("val/loss", loss, prog_bar=True, batch_size=len(x), sync_dist=True)
 
 
-class LearnLatentDiffusion(Stage):
+class LearnLatentDiffusion(SingleLoss):
     """Mean squared error of the noise in a trained autoencoder's latents, at steps drawn uniformly.
 
     Args:
@@ -134,7 +133,7 @@ class LearnLatentDiffusion(Stage):
         assert isinstance(self.generator, LatentDiffusion)
         return self.optimizers_for(self.generator.unet.parameters())
 
-    def loss(self, batch: Batch, u: Tensor) -> Tensor:
+    def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         """Mean over images at the steps that u in [0, 1) falls on, (B,)."""
         diffusion = self.generator
         assert isinstance(diffusion, LatentDiffusion)
@@ -142,12 +141,3 @@ class LearnLatentDiffusion(Stage):
             z = diffusion.first_stage_model.eval().encode(batch["x_1"])
         t = (u * len(diffusion.alpha_bar)).to(torch.int64)
         return noise_loss(diffusion.unet, z, t, batch["x_0"], diffusion.alpha_bar).mean()
-
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        loss = self.loss(batch, batch["u"])
-        self.log("train/loss", loss, prog_bar=True, sync_dist=True)
-        return loss
-
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        loss = self.loss(batch, golden_sequence(batch["k"]))
-        self.log("val/loss", loss, prog_bar=True, batch_size=len(batch["x_1"]), sync_dist=True)

@@ -8,12 +8,12 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.flow.losses import LOSSES
 from r2flow.flow.path import interpolate
-from r2flow.flow.times import TIMES, golden_sequence
+from r2flow.flow.times import TIMES
 from r2flow.generators import Condition, Flow, Generator
-from r2flow.stages.base import Batch, Stage
+from r2flow.stages.base import Batch, SingleLoss
 
 
-class Rectify(Stage):
+class Rectify(SingleLoss):
     """1-RF: regress v(t, x_t) onto x_1 - x_0 for independent x_0 ~ N(0, I) and x_1 a scan (paper, eq. 2).
 
     Args:
@@ -46,14 +46,3 @@ class Rectify(Stage):
         x_t, u_t = interpolate(x_0, x_1, t)
         v: Tensor = self.generator.velocity(t, x_t, self.condition(batch))  # type: ignore[operator]
         return self.loss(v, u_t).mean()
-
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        loss = self.regression_loss(batch, batch["u"])
-        self.log("train/loss", loss, prog_bar=True, sync_dist=True)
-        return loss
-
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        # A low-discrepancy sequence over [0, 1) instead of random times: a steadier figure from few scans.
-        u = golden_sequence(batch["k"])
-        loss = self.regression_loss(batch, u)
-        self.log("val/loss", loss, prog_bar=True, batch_size=len(batch["x_1"]), sync_dist=True)

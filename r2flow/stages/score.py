@@ -7,13 +7,12 @@ from torch import Tensor
 
 from r2flow.diffusion.langevin import score_loss
 from r2flow.errors import InputError
-from r2flow.flow.times import golden_sequence
 from r2flow.generators import Generator, ScoreModel
 from r2flow.registry import NonNegative
-from r2flow.stages.base import Batch, Stage
+from r2flow.stages.base import Batch, SingleLoss
 
 
-class MatchScore(Stage):
+class MatchScore(SingleLoss):
     """Denoising score matching at all noise levels alike (`r2flow.diffusion.langevin.score_loss`).
 
     Args:
@@ -31,19 +30,10 @@ class MatchScore(Stage):
             raise InputError(f"this stage learns a score, which a {type(generator).__name__} does not have.")
         self.power = power
 
-    def loss(self, batch: Batch, u: Tensor) -> Tensor:
+    def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         """Mean over images at the noise levels that u in [0, 1) falls on, (B,)."""
         assert isinstance(self.generator, ScoreModel)
         network = self.generator.network
         labels = (u * len(network.sigmas)).to(torch.int64)
         x = (batch["x_1"] + 1) / 2
         return score_loss(network, x, batch["x_0"], labels, network.sigmas, self.power).mean()
-
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        loss = self.loss(batch, batch["u"])
-        self.log("train/loss", loss, prog_bar=True, sync_dist=True)
-        return loss
-
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        loss = self.loss(batch, golden_sequence(batch["k"]))
-        self.log("val/loss", loss, prog_bar=True, batch_size=len(batch["x_1"]), sync_dist=True)

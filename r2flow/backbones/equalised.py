@@ -1,0 +1,212 @@
+"""What the GANs' networks are made of: layers of equalised learning rate, edges, filters, and latent codes."""
+
+import math
+from collections.abc import Sequence
+from typing import cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from r2flow.adversarial.masks import logistic, straight_through_mask
+from r2flow.adversarial.processes import averaged
+from r2flow.backbones.layers import ExactBuffers, at_least_float32
+from r2flow.errors import InputError
+
+IMAGE, LOGIT, MASK, ORIGINAL, CODE = "image", "raydrop_logit", "raydrop_mask", "image_orig", "w"
+
+
+class Equalised(nn.Module):
+    """gain rate f(x / sqrt n) with weights of N(0, 1 / rate^2), zero biases and n = the elements of weight[0].
+
+    Adam then learns all layers at one speed, `rate` times that of others (Karras et al. 2018, section 4.1). n is the
+    fan-in but for a transposed convolution, where the published weights were trained with out_channels k k.
+
+    Args:
+        module: f, a linear layer or a convolution; its bias is scaled too.
+        exact: Compute in float32 whatever autocast does.
+    """
+
+    def __init__(self, module: nn.Module, gain: float = 1.0, rate: float = 1.0, exact: bool = False) -> None:
+        super().__init__()
+        self.module, self.gain, self.exact = module, gain * rate, exact
+        weight, bias = cast(Tensor, module.weight), cast(Tensor | None, module.bias)
+        self.scale = 1 / math.sqrt(weight[0].numel())
+        nn.init.normal_(weight, 0, 1 / rate)
+        if bias is not None:
+            nn.init.zeros_(bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not self.exact:
+            return self.module(x * self.scale) * self.gain
+        kind = x.device.type if x.device.type != "meta" else "cpu"
+        with torch.autocast(kind, enabled=False):
+            return self.module(at_least_float32(x) * self.scale) * self.gain
+
+
+class BiasedLeakyReLU(nn.Module):
+    """sqrt(2) max(x + b, 0.2 (x + b)) with a bias for each channel."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.bias = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        bias = self.bias.to(x.dtype).view(-1, *[1] * (x.ndim - 2))
+        return F.leaky_relu(x + bias, 0.2) * math.sqrt(2)
+
+
+class Pad(nn.Module):
+    """One pixel more at each edge: circular in azimuth where the image is a ring, else as `edge` says."""
+
+    def __init__(self, ring: bool, edge: str) -> None:
+        super().__init__()
+        self.columns, self.rows = "circular" if ring else edge, edge
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.pad(F.pad(x, (1, 1, 0, 0), mode=self.columns), (0, 0, 1, 1), mode=self.rows)
+
+
+class Filter(ExactBuffers):
+    """An image of the same size by a separable filter, circular in azimuth, the edge rows repeated.
+
+    Args:
+        window: Filter taps, normalised to sum 1; of an even number, one more reaches to the left and up.
+        axes: "h" (elevation), "w" (azimuth) or "hw".
+    """
+
+    kernel: Tensor
+
+    def __init__(self, window: Sequence[float], ring: bool, axes: str = "hw") -> None:
+        super().__init__()
+        taps = torch.tensor(window, dtype=torch.float32)
+        self.register_buffer("kernel", taps / taps.sum())
+        self.columns, self.axes = "circular" if ring else "replicate", axes
+
+    def forward(self, x: Tensor) -> Tensor:
+        size, channels = len(self.kernel), x.shape[1]
+        before, after = size // 2, (size - 1) // 2
+        kernel = self.kernel.to(x.dtype).expand(channels, 1, 1, -1)
+        if "w" in self.axes:
+            x = F.conv2d(F.pad(x, (before, after, 0, 0), mode=self.columns), kernel, groups=channels)
+        if "h" in self.axes:
+            x = F.conv2d(F.pad(x, (0, 0, before, after), mode="replicate"), kernel.mT, groups=channels)
+        return x
+
+
+class BlurBoth(nn.Module):
+    """The image blurred in elevation and, as further channels, blurred in azimuth (Kaneko and Harada 2020, NR-GAN)."""
+
+    def __init__(self, ring: bool) -> None:
+        super().__init__()
+        self.blur_v, self.blur_h = Filter((1, 2, 1), ring, "h"), Filter((1, 2, 1), ring, "w")
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.cat([self.blur_v(x), self.blur_h(x)], dim=1)
+
+
+class RayDrop(nn.Module):
+    """The image where a drawn mask keeps a ray, `dropped` elsewhere (Nakashima and Kurazume 2021, section III-B)."""
+
+    raydrop_const: Tensor
+
+    def __init__(self, dropped: float, temperature: float) -> None:
+        super().__init__()
+        self.temperature = temperature
+        self.register_buffer("raydrop_const", torch.tensor(float(dropped)))
+
+    def forward(self, made: dict[str, Tensor], uniform: Tensor) -> dict[str, Tensor]:
+        mask = straight_through_mask(made[LOGIT], logistic(uniform), self.temperature)
+        return {**made, ORIGINAL: made[IMAGE], MASK: mask, IMAGE: made[IMAGE].lerp(self.raydrop_const, 1 - mask)}
+
+
+class LatentGenerator(nn.Module):
+    """z to an image: a mapping to a code w, a synthesis and, where rays are dropped, a measurement.
+
+    Parameters carry the published weights' names.
+
+    Args:
+        latent: Width of z.
+        code: Width of w.
+        mapping: z (B, latent) to w (B, code).
+        synthesis: w to outputs by name, (B, ., H, W) float32; see `synthesise`.
+        measurement: What draws the mask; None where no ray is dropped.
+        num_styles: Layers that take w.
+    """
+
+    w_avg: Tensor
+    decay = 0.995  # of the mean code
+
+    def __init__(
+        self,
+        latent: int,
+        code: int,
+        mapping: nn.Module,
+        synthesis: nn.Module,
+        measurement: RayDrop | None,
+        num_styles: int = 1,
+    ) -> None:
+        super().__init__()
+        self.latent, self.num_styles = latent, num_styles
+        self.register_buffer("w_avg", torch.zeros(1, code))
+        self.mapping_network, self.synthesis_network, self.measurement_model = mapping, synthesis, measurement
+
+    def synthesise(self, w: Tensor, angle: Tensor | None, shift: Tensor | None) -> dict[str, Tensor]:
+        """`image` and, where rays are dropped, `raydrop_logit`, (B, ., H, W) float32."""
+        made: dict[str, Tensor] = self.synthesis_network(w)
+        return made
+
+    def forward(
+        self,
+        z: Tensor,
+        angle: Tensor | None = None,
+        *,
+        truncation: float = 1.0,
+        uniform: Tensor | None = None,
+        shift: Tensor | None = None,
+    ) -> dict[str, Tensor]:
+        """The image and what it was made of.
+
+        In training mode the mean code follows w; else w is moved towards it.
+
+        Args:
+            z: (B, latent), standard normal.
+            angle: Elevation and azimuth of every pixel, (1 or B, 2, H, W), for a synthesis that asks for them.
+            truncation: psi of w <- w_avg + psi (w - w_avg), outside training (Karras et al. 2019, section B).
+            uniform: u in [0, 1) of the mask's noise, (B, 1, H, W).
+            shift: Random turn of each scan's azimuth, as a share of a full one, (B,), for a synthesis with angles.
+
+        Returns:
+            `image` (B, C, H, W) and `w` (B, layers, code); where rays are dropped also `image_orig`, `raydrop_logit`
+            and `raydrop_mask`.
+
+        Raises:
+            InputError: no noise for a mask that needs it.
+        """
+        w: Tensor = self.mapping_network(z)
+        if self.training:
+            self.w_avg.lerp_(averaged(w.detach().mean(0, keepdim=True)).to(self.w_avg), 1 - self.decay)
+        elif truncation != 1:
+            w = self.w_avg.lerp(w, truncation)
+        made = {**self.synthesise(w, angle, shift), CODE: w[:, None].expand(-1, self.num_styles, -1)}
+        if self.measurement_model is None:
+            return made
+        if uniform is None:
+            raise InputError("this generator draws a mask: give the uniform numbers of its noise.")
+        dropped: dict[str, Tensor] = self.measurement_model(made, uniform)
+        return dropped
+
+
+def outputs(channels: int, drops: bool) -> dict[str, int]:
+    """Channels of what a synthesis makes, by name."""
+    return {IMAGE: channels, LOGIT: 1} if drops else {IMAGE: channels}
+
+
+def check_shape(what: str, shape: tuple[int, int], unit: int) -> None:
+    """Refuse an image that cannot be halved so often.
+
+    Raises:
+        InputError: rows or columns that are no multiple of `unit`.
+    """
+    if shape[0] % unit or shape[1] % unit:
+        raise InputError(f"{what} needs rows and columns that are multiples of {unit}, found {shape[0]} x {shape[1]}.")

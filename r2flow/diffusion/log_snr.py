@@ -1,0 +1,119 @@
+"""Log-SNR schedules: how the noise grows with time t in [0, 1], from data at t = 0 to noise at t = 1.
+
+They compute in the precision of t.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.registry import Positive, Registry
+
+LogSNR = Callable[[Tensor], Tensor]
+
+
+class Cosine:
+    """lambda(t) = -2 ln tan(a + t (b - a)), a = atan e^(-highest / 2), b = atan e^(-lowest / 2).
+
+    alpha_t is the cosine and sigma_t the sine of that angle (Nichol and Dhariwal 2021; Hoogeboom et al. 2023, "Simple
+    diffusion", eq. 4, with the ends cut off).
+
+    Args:
+        lowest: lambda(1).
+        highest: lambda(0).
+
+    Raises:
+        InputError: lowest is not below highest.
+    """
+
+    def __init__(self, lowest: float = -15.0, highest: float = 15.0) -> None:
+        if lowest >= highest:
+            raise InputError(f"a log-SNR schedule falls from highest to lowest; found {highest:g} and {lowest:g}.")
+        self.start, self.end = (math.atan(math.exp(-one / 2)) for one in (highest, lowest))
+
+    def __call__(self, t: Tensor) -> Tensor:
+        return -2 * torch.tan(self.start + t * (self.end - self.start)).log()
+
+
+class Linear:
+    """lambda(t) = -ln(e^(1e-4 + 10 t^2) - 1): beta grows linearly in time (Ho et al. 2020, in continuous time)."""
+
+    def __call__(self, t: Tensor) -> Tensor:
+        return -(1e-4 + 10 * t.square()).expm1().log()
+
+
+class CosineShifted:
+    """lambda(t) = cosine + 2 ln(noise_d / image_d): more noise for larger images (Hoogeboom et al. 2023, eq. 5).
+
+    Args:
+        image_d: Side of the images.
+        noise_d: Side at which images would be as noisy under the cosine schedule.
+        ends: `lowest` and `highest` of `Cosine`, before the shift.
+    """
+
+    def __init__(self, image_d: Positive, noise_d: Positive, lowest: float = -15.0, highest: float = 15.0) -> None:
+        self.cosine, self.shift = Cosine(lowest, highest), 2 * math.log(noise_d / image_d)
+
+    def __call__(self, t: Tensor) -> Tensor:
+        return self.cosine(t) + self.shift
+
+
+class CosineInterpolated:
+    """lambda(t) = t shifted(noise_d_low) + (1 - t) shifted(noise_d_high) (Hoogeboom et al. 2023, eq. 6).
+
+    Args:
+        image_d: Side of the images.
+        noise_d_low: `noise_d` of `CosineShifted` towards t = 1.
+        noise_d_high: The same towards t = 0.
+        ends: `lowest` and `highest` of `Cosine`, before the shift.
+    """
+
+    def __init__(
+        self,
+        image_d: Positive,
+        noise_d_low: Positive,
+        noise_d_high: Positive,
+        lowest: float = -15.0,
+        highest: float = 15.0,
+    ) -> None:
+        self.low = CosineShifted(image_d, noise_d_low, lowest, highest)
+        self.high = CosineShifted(image_d, noise_d_high, lowest, highest)
+
+    def __call__(self, t: Tensor) -> Tensor:
+        return t * self.low(t) + (1 - t) * self.high(t)
+
+
+SCHEDULES: Registry[Callable[..., LogSNR]] = Registry(
+    "log-SNR schedule",
+    cosine=Cosine,
+    linear=Linear,
+    cosine_shifted=CosineShifted,
+    cosine_interpolated=CosineInterpolated,
+)
+
+
+def alpha_sigma(log_snr: Tensor) -> tuple[Tensor, Tensor]:
+    """alpha = sqrt(sigmoid(lambda)) and sigma = sqrt(sigmoid(-lambda)), in the shape of lambda."""
+    return log_snr.sigmoid().sqrt(), (-log_snr).sigmoid().sqrt()
+
+
+def for_images(log_snr: Tensor, z: Tensor) -> Tensor:
+    """lambda of shape () or (B,), in a shape and type that multiplies z, (B, ...)."""
+    log_snr = log_snr.to(z)
+    return log_snr.reshape(-1, *(1,) * (z.ndim - 1)) if log_snr.ndim else log_snr
+
+
+def straight_time(log_snr: Tensor) -> Tensor:
+    """alpha / (alpha + sigma) = sigmoid(lambda / 2): the time at which a straight line from noise to data is as noisy.
+
+    z_t = (alpha + sigma) [s x + (1 - s) eps] with this s, so a diffusion's states, rescaled, are those of a flow.
+    """
+    return torch.sigmoid(log_snr / 2)
+
+
+def log_snr_of(s: Tensor) -> Tensor:
+    """2 ln(s / (1 - s)): lambda of the straight line's time s, the inverse of `straight_time`."""
+    return 2 * torch.logit(s)

@@ -1,0 +1,88 @@
+"""What a network of a diffusion predicts, and the loss by which it learns that."""
+
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from r2flow.diffusion.log_snr import alpha_sigma, for_images
+from r2flow.registry import Registry
+
+Coefficients = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+class Prediction:
+    """A prediction y = p x + q eps, from which x and eps follow, because z = alpha x + sigma eps is known.
+
+        x = (sigma y - q z) / d,    eps = (p z - alpha y) / d,    d = p sigma - q alpha
+
+    Its error is |p - q alpha / sigma| times that of x.
+
+    Args:
+        coefficients: p and q from alpha and sigma.
+    """
+
+    def __init__(self, coefficients: Coefficients) -> None:
+        self.coefficients = coefficients
+
+    def target(self, x: Tensor, eps: Tensor, log_snr: Tensor) -> Tensor:
+        """y of data and noise, (B, ...), at log-SNRs () or (B,)."""
+        p, q = self.coefficients(*alpha_sigma(for_images(log_snr, x)))
+        return p * x + q * eps
+
+    def split(self, z: Tensor, y: Tensor, log_snr: Tensor) -> tuple[Tensor, Tensor]:
+        """x and eps, (B, ...) each, of a state and what was predicted there."""
+        alpha, sigma = alpha_sigma(for_images(log_snr, z))
+        p, q = self.coefficients(alpha, sigma)
+        d = p * sigma - q * alpha
+        return (sigma * y - q * z) / d, (p * z - alpha * y) / d
+
+    def weight(self, log_snr: Tensor, min_snr: float | None = 5.0) -> Tensor:
+        """min(SNR, gamma) over the squared factor between the errors of y and x, in the shape of log_snr.
+
+        The loss of y is then min(SNR, gamma) times that of x, whatever y is (Hang et al. 2023, "Efficient diffusion
+        training via min-SNR weighting strategy").
+
+        Args:
+            min_snr: gamma; None for the SNR itself.
+        """
+        alpha, sigma = alpha_sigma(log_snr)
+        p, q = self.coefficients(alpha, sigma)
+        snr = log_snr.exp()
+        weight = snr if min_snr is None else snr.clamp(max=min_snr)
+        return weight / (p - q * alpha / sigma).square()
+
+
+PREDICTIONS: Registry[Prediction] = Registry(
+    "prediction",
+    eps=Prediction(lambda alpha, sigma: (torch.zeros_like(alpha), torch.ones_like(alpha))),
+    v=Prediction(lambda alpha, sigma: (-sigma, alpha)),  # Salimans and Ho 2022, appendix D
+    x=Prediction(lambda alpha, sigma: (torch.ones_like(alpha), torch.zeros_like(alpha))),
+)
+
+Error = Callable[[Tensor, Tensor], Tensor]  # of each element
+
+ERRORS: Registry[Error] = Registry(
+    "error of an element",
+    l2=lambda y, target: F.mse_loss(y, target, reduction="none"),
+    l1=lambda y, target: F.l1_loss(y, target, reduction="none"),
+    huber=lambda y, target: F.smooth_l1_loss(y, target, reduction="none"),
+)
+
+
+def mean_errors(errors: Tensor, mask: Tensor | None = None) -> Tensor:
+    """The mean of each sample's elements, (B, ...) to (B,), of those where a mask of 0 and 1 is 1; 0 if none is."""
+    if mask is None:
+        return errors.flatten(1).mean(1)
+    return (errors * mask).flatten(1).sum(1) / mask.expand_as(errors).flatten(1).sum(1).clamp(min=1)
+
+
+def weighted_mean(errors: Tensor, weights: Tensor, paired: bool = True) -> Tensor:
+    """The mean of weight times error, (B,) each.
+
+    Args:
+        paired: False for the mean of the errors times the mean of the weights, as the published code of R2DM has it: a
+            sample's weight is then that of the whole batch, and of its own only where B = 1.
+    """
+    return (errors * weights).mean() if paired else errors.mean() * weights.mean()

@@ -1,0 +1,53 @@
+"""A diffusion, learned on noised scans."""
+
+from typing import Any
+
+from torch import Tensor
+
+from r2flow.diffusion.objectives import ERRORS, mean_errors, weighted_mean
+from r2flow.diffusion.sampling import noised
+from r2flow.errors import InputError
+from r2flow.generators import Diffusion, Generator
+from r2flow.registry import Positive
+from r2flow.stages.base import Batch, SingleLoss
+
+
+class LearnDiffusion(SingleLoss):
+    """Regress y(z_t, lambda_t) onto what the generator predicts, at t ~ Uniform[0, 1] (Kingma et al. 2021).
+
+    Args:
+        generator: A diffusion.
+        loss: Name in `r2flow.diffusion.objectives.ERRORS`.
+        min_snr: gamma of the weight min(SNR, gamma) on the error of the expected data; None for the SNR itself, which
+            is equal weights of the noise's error.
+        paired: Whether a sample's error has its own weight; False as published, see
+            `r2flow.diffusion.objectives.weighted_mean`.
+        options: Those of `Stage`.
+
+    Raises:
+        InputError: another generator, or an unknown loss.
+    """
+
+    generator_name = "diffusion"
+
+    def __init__(
+        self,
+        generator: Generator,
+        loss: str = "l2",
+        min_snr: Positive | None = 5.0,
+        paired: bool = True,
+        **options: Any,
+    ) -> None:
+        super().__init__(generator, **options)
+        if not isinstance(generator, Diffusion):
+            raise InputError(f"this stage learns a diffusion, which a {type(generator).__name__} is not.")
+        self.error, self.min_snr, self.paired = ERRORS[loss], min_snr, paired
+
+    def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
+        """The weighted mean error at t = u, where t = 0 is data and t = 1 noise."""
+        diffusion, x, eps = self.generator, batch["x_1"], batch["x_0"]
+        assert isinstance(diffusion, Diffusion)
+        log_snr = diffusion.schedule(u)
+        y = diffusion.predict(noised(x, log_snr, eps), log_snr)
+        errors = mean_errors(self.error(y.float(), diffusion.prediction.target(x, eps, log_snr)))
+        return weighted_mean(errors, diffusion.prediction.weight(log_snr, self.min_snr), self.paired)

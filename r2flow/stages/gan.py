@@ -1,0 +1,167 @@
+"""A GAN: a generator and a discriminator that learn from each other."""
+
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from r2flow.adversarial.augment import AdaptiveAugment
+from r2flow.adversarial.losses import discriminator_loss, generator_loss, r1
+from r2flow.adversarial.rules import Warmup, lazy_adam
+from r2flow.backbones import dcgan, style_gan
+from r2flow.errors import InputError
+from r2flow.generators import DustyV2, Gan, Generator
+from r2flow.noise import generator as stream
+from r2flow.registry import Count, NonNegative, Portion, Registry, check_options
+from r2flow.stages.base import Batch, Stage
+
+DISCRIMINATORS: Registry[type[nn.Module]] = Registry(
+    "discriminator", dcgan=dcgan.Discriminator, style_gan=style_gan.Discriminator
+)
+
+
+class Part(IntEnum):
+    """The parts of a step, each with draws of its own for every image."""
+
+    GENERATOR = 1
+    FAKE = 2
+    REAL = 3
+    PENALTY = 4
+
+
+class BatchDraws:
+    """Random numbers of each image in one part of a step: a function of (seed, number of the image, part).
+
+    Args:
+        seed: Run seed.
+        batch: With `k`, the images' numbers, (B,), and `x_1`, on whose device the numbers come.
+        part: Which part of the step.
+    """
+
+    def __init__(self, seed: int, batch: Batch, part: Part) -> None:
+        self.streams = [stream(seed, "training", int(k), part) for k in batch["k"]]
+        self.device = batch["x_1"].device
+
+    def uniform(self, shape: tuple[int, ...]) -> Tensor:
+        """In [0, 1), (B, *shape)."""
+        rows = [torch.from_numpy(one.random(shape, dtype="float32")) for one in self.streams]
+        return torch.stack(rows).to(self.device)
+
+    def normal(self, shape: tuple[int, ...]) -> Tensor:
+        """N(0, 1), (B, *shape)."""
+        rows = [torch.from_numpy(one.standard_normal(shape, dtype="float32")) for one in self.streams]
+        return torch.stack(rows).to(self.device)
+
+
+class LearnGan(Stage):
+    """G and D in turn: a step of G, one of D on fresh G(z) and the scans, and every `r1_every` steps one of R1.
+
+    All that D sees is warmed up (`r2flow.adversarial.rules.Warmup`) and augmented (`AdaptiveAugment`). Both learn by
+    Adam at a constant rate (`lazy_adam` for D). The loss is the non-saturating one; R1's weight is
+    r1 r1_every / 2, which makes up for the steps without it. The recipe is DUSty v2's.
+
+    Args:
+        generator: A GAN's.
+        discriminator: Name and options, as `{name: style_gan, base_channels: 32}`.
+        learning_rate: Of both.
+        betas: Adam's.
+        r1: gamma of R1; 0 for none.
+        r1_every: Steps between two of R1.
+        warmup: Options of `Warmup`.
+        augment: Options of `AdaptiveAugment`; None for no augmentation.
+        batch_size: Images a step.
+        seed: Run seed.
+
+    Raises:
+        InputError: a generator that is no GAN's, an unknown discriminator or option.
+    """
+
+    def __init__(
+        self,
+        generator: Generator,
+        discriminator: Mapping[str, Any] | None = None,
+        learning_rate: NonNegative = 2e-3,
+        betas: tuple[Portion, Portion] = (0.0, 0.99),
+        r1: NonNegative = 1.0,
+        r1_every: Count = 16,
+        warmup: Mapping[str, Any] | None = None,
+        augment: Mapping[str, Any] | None = None,
+        batch_size: Count = 32,
+        seed: int = 0,
+    ) -> None:
+        if not isinstance(generator, Gan):
+            raise InputError(
+                f"stage=gan learns a GAN, which a {type(generator).__name__} is not: give experiment=vanilla_gan, "
+                "dusty1 or dusty2, or generator=dusty2."
+            )
+        super().__init__(generator, learning_rate, betas, warmup_images=0, batch_size=batch_size, seed=seed)
+        self.automatic_optimization = False
+        self.batch_size, self.r1, self.r1_every = batch_size, r1, r1_every
+        channels, h, w = generator.space.shape
+        self.discriminator: nn.Module = DISCRIMINATORS.build(discriminator or {"name": "dcgan"}, (h, w), channels)
+        check_options("stage.warmup", Warmup, warmup or {})
+        self.warmup = Warmup(**(warmup or {}))
+        check_options("stage.augment", AdaptiveAugment, augment or {})
+        self.augment = None if augment is None else AdaptiveAugment(**augment)
+
+    def configure_optimizers(self) -> Any:
+        betas = self.betas[0], self.betas[1]
+        rate, lazy_betas = lazy_adam(self.learning_rate, betas, self.r1_every if self.r1 else 0)
+        return [
+            torch.optim.Adam(self.generator.parameters(), self.learning_rate, betas),
+            torch.optim.Adam(self.discriminator.parameters(), rate, lazy_betas),
+        ]
+
+    def training_step(self, batch: Batch, batch_idx: int) -> None:
+        assert isinstance(self.generator, Gan)
+        step, (for_generator, for_discriminator) = self.global_step, self.own_optimizers()
+        images, real = step * self.batch_size, batch["x_1"]
+
+        draws = BatchDraws(self.seed, batch, Part.GENERATOR)
+        self.discriminator.requires_grad_(False)
+        loss = generator_loss(self.discriminator(self.shown(self.make(batch["x_0"], draws), images, draws)))
+        self.take_step(for_generator, loss)
+        self.discriminator.requires_grad_(True)
+
+        draws = BatchDraws(self.seed, batch, Part.FAKE)
+        with torch.no_grad():
+            made = self.make(draws.normal(self.generator.noise_shape), draws)
+            fake = self.shown(made, images, draws)
+            seen = self.shown(real, images, BatchDraws(self.seed, batch, Part.REAL))
+        of_real, of_fake = self.discriminator(seen), self.discriminator(fake)
+        wrong = discriminator_loss(of_real, of_fake)
+        self.take_step(for_discriminator, wrong)
+        if self.augment is not None:
+            self.augment.count(of_real)
+
+        if self.r1 and step % self.r1_every == 0:
+            penalty = self.penalty(real, images, BatchDraws(self.seed, batch, Part.PENALTY))
+            self.take_step(for_discriminator, self.r1 * self.r1_every / 2 * penalty)
+            self.log("train/r1", penalty, sync_dist=True)
+        if self.augment is not None and self.augment.every and step % self.augment.every == 0:
+            self.augment.move()
+            self.log("train/augmented", self.augment.p)
+        self.log("train/loss", loss, prog_bar=True, sync_dist=True)
+        self.log("train/discriminator", wrong, prog_bar=True, sync_dist=True)
+
+    def make(self, z: Tensor, draws: BatchDraws) -> Tensor:
+        """G(z), (B, C, H, W), with the mask and the turn that are drawn."""
+        assert isinstance(self.generator, Gan)
+        rows, columns = self.generator.space.shape[1:]
+        uniform = draws.uniform((1, rows, columns)) if self.generator.drops else None
+        shift = draws.uniform((1,))[:, 0] if isinstance(self.generator, DustyV2) else None
+        return self.generator.made(z, uniform, shift)["image"]
+
+    def shown(self, x: Tensor, images: int, draws: BatchDraws) -> Tensor:
+        """x as D sees it after so many images of the run."""
+        uniform = draws.uniform(tuple(x.shape[1:])) if self.warmup.left(images) else None
+        x = self.warmup(x, images, uniform)
+        return x if self.augment is None else self.augment(x, self.augment.draw(draws))
+
+    def penalty(self, real: Tensor, images: int, draws: BatchDraws) -> Tensor:
+        """R1 by the scans themselves, through warm-up and augmentation; float32 whatever autocast does."""
+        with torch.autocast(real.device.type, enabled=False):
+            x = real.detach().requires_grad_()
+            return r1(self.discriminator(self.shown(x, images, draws)), x)

@@ -1,0 +1,559 @@
+"""The vanilla GAN, DUSty v1 and DUSty v2: networks, losses, rules, augmentation, data, published files and training."""
+
+import copy
+import functools
+import json
+import math
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from r2flow.adversarial import rules
+from r2flow.adversarial.augment import TRANSFORMATIONS, AdaptiveAugment, Draw, affine, colour, coloured, transformed
+from r2flow.adversarial.losses import discriminator_loss, generator_loss, r1
+from r2flow.adversarial.masks import logistic, straight_through_mask
+from r2flow.backbones import dcgan, style_gan
+from r2flow.callbacks import HalfLifeEMA
+from r2flow.checkpoints import load_checkpoint, read_checkpoint
+from r2flow.errors import InputError
+from r2flow.generators import DustyV1, Sampler, build_generator
+from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.projection import resized_rays, unproject
+from r2flow.lidar.sensors import SENSORS
+from r2flow.noise import Draws
+from r2flow.published.plain import inert
+from r2flow.sampling import sample
+from r2flow.stages import build_stage
+from r2flow.training import build, compose, fit
+from tests.conftest import ROOT
+
+NETWORKS = [
+    "vanilla_g_32x64", "dusty1_g_32x64", "dusty1_g_32x64_2ch", "dusty2_g_32x64_eval", "dusty2_g_32x64_train",
+]  # fmt: skip
+PUBLISHED = ["vanilla", "dusty1", "dusty2"]
+SYSTEMS = ["vanilla_gan", "dusty1", "dusty2"]
+
+
+@pytest.fixture(scope="session")
+def cases(shared: Path) -> Callable[[str], dict[str, Any]]:
+    def load(name: str) -> dict[str, Any]:
+        path = shared / "oracle_baselines" / name
+        if not path.exists():
+            pytest.skip(f"the reference case {name} is not here")
+        case: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        return case
+
+    return load
+
+
+def relative(found: Tensor, expected: Tensor) -> float:
+    """The largest difference over the largest expected value."""
+    return float(((found - expected).abs().max() / expected.abs().max()).detach())
+
+
+def generator_of(cfg: Mapping[str, Any]) -> nn.Module:
+    """The network of a published `cfg.model.generator`."""
+    synthesis, mapping = cfg["synthesis_kwargs"], cfg["mapping_kwargs"]
+    out = {one["name"]: one for one in synthesis["out_ch"]}
+    common = {
+        "shape": tuple(synthesis["resolution"]), "channels": out["image"]["ch"], "latent": mapping["in_ch"],
+        "base_channels": synthesis["ch_base"], "max_channels": synthesis["ch_max"],
+    }  # fmt: skip
+    if cfg["arch"] == "dusty_v2":
+        return style_gan.Generator(**common, depth=mapping["depth"], doublings=len(synthesis["layers"]))
+    return dcgan.Generator(**common, drops="raydrop_logit" in out)
+
+
+def discriminator_of(cfg: Mapping[str, Any]) -> nn.Module:
+    layer = cfg["layer_kwargs"]
+    common = {
+        "shape": tuple(layer["resolution"]), "channels": layer["in_ch"],
+        "base_channels": layer["ch_base"], "max_channels": layer["ch_max"],
+    }  # fmt: skip
+    return (style_gan if cfg["arch"] == "dusty_v2" else dcgan).Discriminator(**common)
+
+
+def assert_gradient_norms(network: nn.Module, expected: Mapping[str, float | None]) -> None:
+    for name, parameter in network.named_parameters():
+        norm = 0.0 if parameter.grad is None else float(parameter.grad.norm())
+        assert norm == pytest.approx(expected[name] or 0.0, rel=1e-3, abs=1e-9), name
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_generator_is_the_published_one(cases: Any, name: str):
+    case, tolerance = cases(f"{name}.pt"), 1e-4 if "dusty2" in name else 2e-5
+    network = generator_of(case["cfg"]).train(case["mode"] == "train")
+    assert list(network.state_dict()) == list(case["state_dict"])
+    network.load_state_dict(case["state_dict"])
+    given = case["inputs"]
+    z = given["z"].clone().requires_grad_()
+    made = network(z, given.get("angle"), uniform=given.get("uniform"), shift=given.get("shift_fraction"))
+    for key, expected in case["outputs"].items():
+        assert relative(made[key], expected) < tolerance, key
+    if "uniform" in given:
+        assert torch.equal(made["raydrop_mask"], case["outputs"]["raydrop_mask"])
+        torch.testing.assert_close(logistic(given["uniform"]), given["logistic_noise"], rtol=1e-5, atol=1e-6)
+    sum((made[key] * weight).sum() for key, weight in case["grad_w"].items()).backward()
+    assert relative(z.grad, case["grad_inputs"]["z"]) < 1e-3
+    assert_gradient_norms(network, case["grad_param_norms"])
+    after = network.state_dict()
+    for key, expected in case.get("buffers_after", {}).items():
+        torch.testing.assert_close(after[key], expected, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["vanilla_d_32x64", "dusty2_d_64x64"])
+def test_a_discriminator_is_the_published_one_with_its_penalty(cases: Any, name: str):
+    case, tolerance = cases(f"{name}.pt"), 1e-4 if "dusty2" in name else 2e-5
+    network = discriminator_of(case["cfg"])
+    assert list(network.state_dict()) == list(case["state_dict"])
+    network.load_state_dict(case["state_dict"])
+    x = case["inputs"]["x"].clone().requires_grad_()
+    scores = network(x)
+    assert relative(scores, case["outputs"]["score"]) < tolerance
+    (scores * case["grad_w"]["score"]).sum().backward()
+    assert relative(x.grad, case["grad_inputs"]["x"]) < 1e-3
+    assert_gradient_norms(network, case["grad_param_norms"])
+
+    expected = case["r1"]
+    network.zero_grad()
+    x = case["inputs"]["x"].clone().requires_grad_()
+    scores = network(x)
+    (slope,) = torch.autograd.grad(scores.sum(), x, retain_graph=True)
+    penalty = r1(scores, x)
+    penalty.backward()
+    assert relative(slope, expected["grad_x_of_score_sum"]) < 1e-4
+    assert penalty.item() == pytest.approx(expected["penalty"], rel=1e-4)
+    torch.testing.assert_close(x.grad, expected["grad_x_of_penalty"], rtol=1e-3, atol=1e-7)
+    assert_gradient_norms(network, expected["grad_param_norms"])
+
+
+NARROW, WIDE = (64, 512), (64, 1024)
+FULL = {
+    "vanilla_G": (dcgan.Generator, (NARROW,), 36_308_929),
+    "vanilla_D": (dcgan.Discriminator, (NARROW,), 2_821_057),
+    "dusty_v1_G": (dcgan.Generator, (NARROW, 1, True), 36_309_954),
+    "dusty_v1_D": (dcgan.Discriminator, (NARROW,), 2_821_057),
+    "dusty_v2_G": (style_gan.Generator, (NARROW,), 4_367_594),
+    "dusty_v2_D": (style_gan.Discriminator, (NARROW,), 38_445_569),
+    "vanilla_G_64x1024_2ch": (dcgan.Generator, (WIDE, 2), 69_864_386),
+    "vanilla_D_64x1024_2ch": (dcgan.Discriminator, (WIDE, 2), 2_888_641),
+    "dusty_v1_G_64x1024_2ch": (dcgan.Generator, (WIDE, 2, True), 69_865_411),
+    "dusty_v1_D_64x1024_2ch": (dcgan.Discriminator, (WIDE, 2), 2_888_641),
+    "dusty_v2_G_64x1024_2ch": (style_gan.Generator, (WIDE, 2), 4_368_591),
+    "dusty_v2_D_64x1024_2ch": (style_gan.Discriminator, (WIDE, 2), 72_000_065),
+}
+
+
+@pytest.mark.parametrize("name", FULL)
+def test_full_size_networks_have_the_published_names_shapes_and_count(shared: Path, name: str):
+    build, arguments, count = FULL[name]
+    with torch.device("meta"):
+        network = build(*arguments)
+    assert sum(p.numel() for p in network.parameters()) == count
+    said = json.loads((shared / "oracle_baselines" / "state_dict_keys.json").read_text())[name]
+    assert said["parameters"] == count
+    assert {key: list(value.shape) for key, value in network.state_dict().items()} == said["names"]
+
+
+def test_an_image_that_cannot_be_halved_so_often_is_refused():
+    with pytest.raises(InputError, match="multiples of 16, found 40 x 512"):
+        dcgan.Generator((40, 512))
+    with pytest.raises(InputError, match="4 doublings, too many for 16 x 64"):
+        dcgan.Generator((16, 64))
+
+
+@pytest.mark.parametrize("networks", [dcgan, style_gan])
+def test_codes_masks_and_scores_stay_float32_in_half_precision(networks: Any):
+    small: dict[str, Any] = {"shape": (32, 64), "base_channels": 4}
+    drops = {"drops": True} if networks is dcgan else {}
+    generator, discriminator = networks.Generator(latent=8, **small, **drops), networks.Discriminator(**small)
+    with torch.autocast("cpu", torch.bfloat16):
+        made = generator(torch.randn(2, 8), torch.randn(1, 2, 32, 64), uniform=torch.rand(2, 1, 32, 64))
+        scores = discriminator(made["image"])
+    assert {value.dtype for value in (*made.values(), scores)} == {torch.float32}
+
+
+def test_a_turn_by_whole_columns_is_a_roll():
+    x = torch.randn(2, 1, 3, 8)
+    expected = torch.stack([x[0].roll(-2, 2), x[1].roll(-5, 2)])
+    torch.testing.assert_close(style_gan.turned_back(x, torch.tensor([2 / 8, 5 / 8])), expected)
+
+
+def test_losses_and_their_gradients(cases: Any):
+    case = cases("gan_losses.pt")
+    for name, loss in (("nsgan_G", lambda real, fake: generator_loss(fake)), ("nsgan_D", discriminator_loss)):
+        expected = case["cases"][name]
+        real, fake = (case[key].clone().requires_grad_() for key in ("y_real", "y_fake"))
+        found = loss(real, fake)
+        found.backward()
+        assert found.item() == pytest.approx(expected["loss"], rel=1e-6)
+        for tensor, key in ((real, "grad_y_real"), (fake, "grad_y_fake")):
+            if expected[key] is None:
+                assert tensor.grad is None
+            else:
+                torch.testing.assert_close(tensor.grad, expected[key], rtol=1e-6, atol=1e-8)
+
+
+def test_r1_of_a_linear_score_is_its_slope_squared():
+    x = torch.randn(3, 1, 2, 4, requires_grad=True)
+    assert r1(x.sum((1, 2, 3)) * 2, x).item() == pytest.approx(4 * 8)
+
+
+def test_a_mask_is_drawn_with_its_probability_and_has_the_relaxed_gradient():
+    logit = torch.full((200_000,), math.log(3.0), requires_grad=True)
+    noise = logistic(torch.rand(200_000))
+    mask = straight_through_mask(logit, noise, 0.5)
+    assert set(mask.tolist()) == {0.0, 1.0}
+    assert mask.mean().item() == pytest.approx(0.75, abs=4 * (0.75 * 0.25 / 200_000) ** 0.5)
+    mask.sum().backward()
+    soft = torch.sigmoid((logit + noise) / 0.5).detach()
+    torch.testing.assert_close(logit.grad, soft * (1 - soft) / 0.5)
+
+
+def test_rules_of_training(cases: Any):
+    case = cases("gan_training_rules.pt")
+    ema = case["ema_decay"]
+    found = [
+        rules.half_life_decay(step, ema["batch_size"], 1000 * ema["ema_kimg"], ema["rampup"])
+        for step in ema["iteration"]
+    ]
+    torch.testing.assert_close(torch.tensor(found, dtype=torch.float64), ema["decay"], rtol=1e-6, atol=0)
+    for who, every in (("generator", 0), ("discriminator", 16)):
+        rate, betas = rules.lazy_adam(0.002, (0.0, 0.99), every)
+        assert rate == pytest.approx(case["adam"][who]["lr"], rel=1e-12)
+        assert betas == pytest.approx(case["adam"][who]["betas"], rel=1e-12)
+    assert case["r1_weight"] == 1.0 * 16 / 2
+    dropout, warmup = case["warmup_dropout"], rules.Warmup()
+    left = [warmup.dropout * warmup.left(images) for images in dropout["images"]]
+    assert left == pytest.approx(dropout["ratio"], abs=1e-12)
+    applied = case["warmup_dropout_apply"]
+    uniform = torch.where(applied["keep"] > 0, 0.1, 0.9)  # of which a share of 0.5 is dropped
+    assert torch.equal(warmup(applied["x"], 0, uniform), applied["y"])
+    blur = case["warmup_blur"]
+    assert relative(rules.blurred(blur["x"], blur["sigma"]), blur["y"]) < 1e-6
+    assert torch.equal(rules.Warmup(images=100, blur=1.7)(blur["x"], 100, None), blur["x"])
+
+
+def test_the_average_follows_the_published_trace(cases: Any, monkeypatch: pytest.MonkeyPatch):
+    trace = cases("gan_training_rules.pt")["ema_trace"]
+    callback = HalfLifeEMA(batch_size=32)
+    monkeypatch.setattr(callback, "_decay", lambda: trace["decay"])
+    average = trace["start"]
+    for online, expected in zip(trace["online"], trace["ema"], strict=True):
+        average = callback._average(average, online, None)
+        torch.testing.assert_close(average, expected, rtol=1e-6, atol=1e-7)
+    monkeypatch.undo()
+    callback._step = 6250
+    assert callback._decay() == pytest.approx(0.5 ** (32 / 10_000))
+
+
+def test_p_of_ada_follows_the_published_trace(cases: Any):
+    case = cases("gan_training_rules.pt")["ada_p"]
+    augment = AdaptiveAugment(case["p_target"], case["kimg"], highest=case["p_max"], every=case["every"])
+    signs, found = [], []
+    for step, scores in enumerate(case["preds"]):
+        augment.count(scores)
+        if step % augment.every == 0:
+            signs.append(float(augment.move()))
+            found.append(float(augment.p))
+    assert signs == pytest.approx(case["rt"], rel=1e-6)
+    assert found == pytest.approx(case["p"], rel=1e-6)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_augmentation_is_the_published_one(cases: Any, number: int):
+    case = cases("ada_transforms.pt")["cases"][number]
+    names = [name for name in TRANSFORMATIONS if case["policy"].get(name)]
+    drawn = [tensor.float() for _, tensor in case["draws"]]
+    draws = {name: Draw(*pair) for name, pair in zip(names, zip(drawn[::2], drawn[1::2], strict=True), strict=True)}
+    x = case["x"].clone().requires_grad_()
+    maps, colours = affine(draws, *x.shape[-2:]), colour(draws)
+    assert relative(maps, case["affine"]) < 1e-4
+    assert relative(colours, case["colour"]) < 1e-4
+    y = coloured(transformed(x, maps), colours)
+    assert relative(y, case["y"]) < 1e-4
+    (y * case["grad_w"]).sum().backward()
+    assert relative(x.grad, case["grad_x"]) < 1e-4
+
+
+class Source:
+    """Draws of torch's own generator."""
+
+    def __init__(self, batch: int) -> None:
+        self.batch = batch
+
+    def uniform(self, shape: tuple[int, ...]) -> Tensor:
+        return torch.rand(self.batch, *shape)
+
+    def normal(self, shape: tuple[int, ...]) -> Tensor:
+        return torch.randn(self.batch, *shape)
+
+
+def test_augmentation_draws_the_published_distributions():
+    augment = AdaptiveAugment(initial=0.4)
+    draws = augment.draw(Source(20_000))
+    assert list(draws) == list(TRANSFORMATIONS)
+    for name, draw in draws.items():
+        assert draw.chosen.mean().item() == pytest.approx(0.4, abs=0.015), name
+    for name, mean, deviation in (
+        ("lr_flip", 0.5, 0.5), ("int_trans", 0.0, 0.25 / 12**0.5), ("frac_trans", 0.0, 0.125), ("brightness", 0.0, 0.2),
+        ("luma_flip", 0.5, 0.5), ("hue", 0.0, 2 * math.pi / 12**0.5),
+    ):  # fmt: skip
+        values = draws[name].value
+        assert values.mean().item() == pytest.approx(mean, abs=5 * deviation / len(values.flatten()) ** 0.5), name
+        assert values.std().item() == pytest.approx(deviation, rel=0.03), name
+    for name, octaves in (("iso_scale", 0.2), ("contrast", 0.5), ("saturation", 1.0)):
+        assert draws[name].value.log2().std().item() == pytest.approx(octaves, rel=0.03), name
+    assert draws["int_trans"].value.shape == draws["frac_trans"].value.shape == (2, 20_000)
+
+
+def test_augmentation_without_a_transformation_leaves_it_out_and_refuses_an_unknown_one():
+    augment = AdaptiveAugment(initial=0.9, policy=dict.fromkeys(TRANSFORMATIONS, 0))
+    x = torch.randn(2, 1, 8, 16)
+    assert relative(augment(x, augment.draw(Source(2))), x) < 0.05  # the filter alone, there and back
+    with pytest.raises(InputError, match="no augmentation named 'flip'"):
+        AdaptiveAugment(policy={"flip": 1})
+
+
+def test_whole_shifts_on_a_ring_are_rolls_where_the_filter_lets_all_pass():
+    x = torch.sin(torch.arange(64) * 2 * math.pi * 3 / 64).expand(1, 1, 8, 64)  # far below the filter's limit
+    maps = torch.eye(3)[None].clone()
+    maps[0, 0, 2] = 5.0
+    assert relative(transformed(x, maps), x.roll(5, 3)) < 1e-3
+
+
+def test_data_are_the_published_ones(cases: Any):
+    case = cases("dusty_data.pt")
+    sensor = SENSORS["hdl64e_rings"].resized(16, 64)
+    assert (sensor.min_range, sensor.max_range) == (case["min_depth"], case["max_depth"])
+    encoding = Encoding(sensor, "inverse_depth", reflectance=False)
+    torch.testing.assert_close(encoding.encode(case["metres"] * case["mask"]), case["model_space"], rtol=1e-5, atol=0)
+    torch.testing.assert_close(encoding.format.forward(case["metres"]), case["inv_depth_norm"], rtol=1e-5, atol=0)
+    metres = encoding.decode(case["sample"])
+    torch.testing.assert_close(metres, case["sample_metres"].abs(), rtol=1e-5, atol=0)
+    angle = resized_rays(case["raw_angles"].permute(2, 0, 1), (16, 64))
+    torch.testing.assert_close(angle[None], case["angle"], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(unproject(metres, angle), case["sample_points"], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+@pytest.mark.parametrize("averaged", [True, False])
+def test_a_published_file_is_a_generator(cases: Any, shared: Path, name: str, averaged: bool):
+    io = cases(f"{name}_published_io.pt")
+    checkpoint = load_checkpoint(shared / "oracle_baselines" / f"{name}_published.pth", averaged=averaged)
+    assert checkpoint.config["published"] == io["cfg"]
+    assert checkpoint.step == 1_000_000 // 32
+    network = checkpoint.generator.network
+    assert sum(p.numel() for p in network.parameters()) == io["num_parameters"]["G"]
+    made = checkpoint.generator.made(io["z"], io["uniform"], truncation=io["truncation_psi"])
+    assert (relative(made["image"], io["outputs"]["image"]) < 1e-4) == averaged
+    if averaged:
+        for key, expected in io["outputs"].items():
+            assert relative(made[key], expected) < 1e-4, key
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_a_published_file_holds_its_discriminator_by_our_names(cases: Any, shared: Path, name: str):
+    io = cases(f"{name}_published_io.pt")
+    network = discriminator_of(io["cfg"]["model"]["discriminator"])
+    with inert():
+        content = torch.load(shared / "oracle_baselines" / f"{name}_published.pth", weights_only=True)
+    network.load_state_dict(content["D"])
+    assert relative(network(io["x"]), io["score"]) < 1e-4
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_a_published_file_samples_whatever_the_batch(shared: Path, name: str):
+    checkpoint = load_checkpoint(shared / "oracle_baselines" / f"{name}_published.pth")
+    together = checkpoint.sample(3, seed=1, batch_size=3, method="truncate:0.7")
+    alone = checkpoint.sample(3, seed=1, method="truncate:0.7")
+    assert together.shape == (3, 1, 64, 64)
+    kept = together[together > 0]
+    assert kept.min() >= 1.45
+    assert kept.max() <= 80
+    assert ((together > 0) == (alone > 0)).float().mean() > 0.999  # a value at a limit may go either way
+    both = (together > 0) & (alone > 0)
+    assert relative(1 / together[both], 1 / alone[both]) < 1e-4
+
+
+def test_sensor_and_angles_of_a_published_file_are_its_own(shared: Path):
+    path = shared / "oracle_baselines" / "dusty2_published.pth"
+    checkpoint = load_checkpoint(path)
+    rays = checkpoint.sensor.rays()
+    torch.testing.assert_close(checkpoint.generator.angle[0], rays, rtol=0, atol=1e-4)
+    assert math.degrees(float(rays[0, 0, 0])) == pytest.approx(math.degrees(0.05), abs=1e-3)
+
+
+class Ran:
+    """What a pickle would call."""
+
+    def __reduce__(self) -> Any:
+        return exec, ("raise SystemExit('the file has run code')",)
+
+
+def test_a_file_that_would_run_code_beside_its_config_is_refused(shared: Path, tmp_path: Path):
+    content = torch.load(shared / "oracle_baselines" / "vanilla_published.pth", weights_only=False)
+    content["optim_G"] = Ran()
+    torch.save(content, tmp_path / "it.pth")
+    with pytest.raises(InputError, match=r"would run code when loaded \(exec\)"):
+        load_checkpoint(tmp_path / "it.pth")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda cfg: cfg["model"]["generator"].update(arch="stylegan"), "lacks or garbles 'stylegan'"),
+        (
+            lambda cfg: cfg["model"]["generator"]["synthesis_kwargs"].update(use_noise=True),
+            "lacks or garbles use_noise",
+        ),
+        (lambda cfg: cfg["dataset"].pop("min_depth"), "lacks or garbles 'min_depth'"),
+        (lambda cfg: cfg["dataset"].update(max_depth=1.0), "needs 0 < min_range < max_range"),
+        (
+            lambda cfg: cfg["model"]["generator"]["synthesis_kwargs"]["out_ch"][0].update(act="os.system"),
+            "lacks or garbles the activation 'os.system'",
+        ),
+    ],
+)
+def test_a_garbled_config_is_one_line(shared: Path, tmp_path: Path, change: Callable[[Any], Any], said: str):
+    content = torch.load(shared / "oracle_baselines" / "dusty2_published.pth", weights_only=False)
+    change(content["cfg"])
+    torch.save(content, tmp_path / "it.pth")
+    with pytest.raises(InputError) as error:
+        load_checkpoint(tmp_path / "it.pth")
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+TINY = [
+    "sensor.rows=16", "sensor.columns=32", "data.scenes=8", "data.batch_size=4", "generator.latent=8",
+    "generator.base_channels=4", "stage.discriminator.base_channels=4", "stage.r1_every=2", "stage.augment.every=2",
+    "stage.augment.initial=0.5", "stage.augment.kimg=0.1", "encoding.reflectance=true", "trainer.accelerator=cpu",
+]  # fmt: skip
+
+
+@functools.cache
+def composed(system: str) -> dict[str, Any]:
+    return compose([f"experiment={system}_small", *TINY])
+
+
+def tiny(system: str, *more: str) -> dict[str, Any]:
+    return compose([f"experiment={system}_small", *TINY, *more]) if more else copy.deepcopy(composed(system))
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_scan_i_of_a_gan_is_a_function_of_its_number(system: str):
+    generator = build_generator(tiny(system)).eval()
+    three = next(sample(generator, 3, seed=5, batch_size=3)).images
+    two = torch.cat([drawn.images for drawn in sample(generator, 2, seed=5)])
+    torch.testing.assert_close(three[:2], two, rtol=1e-4, atol=1e-4)
+    assert not torch.allclose(three[0], three[1])
+
+
+def test_truncation_by_0_is_refused_and_by_less_draws_codes_together():
+    generator = build_generator(tiny("dusty2")).eval()
+    z = torch.randn(16, 8)
+    generator.network.w_avg.copy_(torch.randn(1, 8))
+    whole, half = (generator.made(z, torch.rand(16, 1, 16, 32), truncation=psi)["w"] for psi in (1.0, 0.5))
+    torch.testing.assert_close(half, generator.network.w_avg + 0.5 * (whole - generator.network.w_avg))
+    for method in ("truncate:0", "truncate:2", "truncate:x", "truncate:nan", "euler"):
+        with pytest.raises(InputError):
+            generator.check_sampler(generator.sampler.changed(method=method))
+    generator.check_sampler(generator.sampler.changed(method="truncate:0.7"))
+    with pytest.raises(InputError, match="1 step"):
+        generator.check_sampler(generator.sampler.changed(steps=2))
+
+
+def test_a_generator_with_a_mask_needs_draws():
+    generator = build_generator(tiny("dusty1")).eval()
+    assert isinstance(generator, DustyV1)
+    noise = Draws(0, range(2)).start(generator.noise_shape)
+    with pytest.raises(InputError, match="draws"):
+        generator.generate(noise)
+    made = generator.generate(noise, draws=Draws(0, range(2)), sampler=Sampler("truncate:0.7", 1))
+    assert made.evaluations.tolist() == [1, 1]
+    assert float(made.x.abs().max()) <= 1
+
+
+def test_a_stage_of_another_generator_and_unknown_options_are_refused():
+    for wrong, said in (
+        ({"discriminator": {"name": "patch"}}, "no discriminator named 'patch'"),
+        ({"muon": 0.1}, "no option 'muon'"),
+        ({"r1_every": 0}, "r1_every must be a whole number of at least 1"),
+        ({"warmup": {"dropout": 2}}, r"dropout must be a finite number in \[0, 1\)"),
+    ):
+        config = tiny("dusty2")
+        config["stage"].update(wrong)
+        with pytest.raises(InputError, match=said):
+            build_stage(config, build_generator(config))
+    flow = {**tiny("dusty2"), "generator": None}
+    with pytest.raises(InputError, match="learns a GAN"):
+        build_stage(flow, build_generator(flow))
+
+
+RUN = [
+    "trainer.val_check_interval=4", "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false",
+    "callbacks.checkpoint.every=2", "callbacks.pictures=null", "samples.num=0", "loggers=[csv]",
+]  # fmt: skip
+
+
+def trained(run: Path, system: str, *more: str) -> dict[str, Any]:
+    result = fit(build(tiny(system, *RUN, f"run_dir={run}", *more)))
+    assert result.finished
+    return read_checkpoint(result.checkpoint)
+
+
+def assert_equal(a: Any, b: Any) -> None:
+    """Bit-equal, whatever is nested in what."""
+    if isinstance(a, Tensor):
+        assert torch.equal(a, b)
+    elif isinstance(a, Mapping):
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_equal(a[key], b[key])
+    elif isinstance(a, list | tuple):
+        for one, other in zip(a, b, strict=True):
+            assert_equal(one, other)
+    else:
+        assert a == b
+
+
+@pytest.mark.parametrize("system", [pytest.param(s, marks=pytest.mark.slow) for s in SYSTEMS])
+def test_a_stopped_gan_ends_as_the_one_left_alone(tmp_path: Path, system: str):
+    whole = trained(tmp_path / "run", system, "trainer.max_steps=5")
+    stopped = Path(shutil.copytree(tmp_path / "run", tmp_path / "stopped"))
+    (stopped / "checkpoints" / "step-00000005.ckpt").unlink()  # as if killed after step 4
+    resumed = trained(stopped, system, "trainer.max_steps=5")
+    # R1's turns are steps 0, 2 and 4, and p moves in the same ones: both in what was done again.
+    for part in ("state_dict", "current_model_state", "optimizer_states"):
+        assert_equal(whole[part], resumed[part])
+    assert float(whole["current_model_state"]["augment.p"]) != 0.5
+    steps = [{int(s["step"]) for s in one["state"].values()} for one in whole["optimizer_states"]]
+    assert steps[0] == {5}
+    assert steps[1] <= {8, 5}  # 5 and 3 of R1, which has no gradient by the last bias
+    assert 8 in steps[1]
+
+
+@pytest.mark.slow
+def test_two_processes_equal_one(tmp_path: Path):
+    runs = {}
+    for name, more in (("one", []), ("two", ["trainer.devices=2", "trainer.strategy=ddp"])):
+        options = [*TINY, *RUN, "trainer.max_steps=3", "data.batch_size=8", f"run_dir={tmp_path / name}", *more]
+        done = subprocess.run(
+            [sys.executable, str(ROOT / "train.py"), "experiment=dusty2_small", *options],
+            capture_output=True, text=True, timeout=300, check=False, cwd=tmp_path,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout + done.stderr
+        runs[name] = read_checkpoint(tmp_path / name / "checkpoints" / "step-00000003.ckpt")
+    one, two = runs["one"], runs["two"]
+    assert_equal(one["current_model_state"]["augment.p"], two["current_model_state"]["augment.p"])
+    for name, value in one["current_model_state"].items():
+        # Adam with beta_1 = 0 takes steps of the rate's size whatever the gradient's: 2e-3 a step.
+        torch.testing.assert_close(two["current_model_state"][name], value, rtol=0, atol=2e-4, msg=name)

@@ -1,0 +1,527 @@
+"""R2DM against the published implementation: network, schedules, objective, samplers, RePaint, data, checkpoint."""
+
+import json
+import re
+import shutil
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from published_cases import assert_near, assert_norms, load_case
+from torch import Tensor
+
+from r2flow.backbones import Backbone, build_backbone
+from r2flow.callbacks.ema import ema_decay
+from r2flow.checkpoints import checkpoints_of, load_checkpoint
+from r2flow.cli.verbs import app
+from r2flow.diffusion.discrete import BETAS, tables
+from r2flow.diffusion.log_snr import SCHEDULES, Cosine, alpha_sigma, log_snr_of, straight_time
+from r2flow.diffusion.objectives import ERRORS, PREDICTIONS, mean_errors, weighted_mean
+from r2flow.diffusion.sampling import eta_of, forward_step, noised, repaint, step, walk
+from r2flow.errors import InputError
+from r2flow.generators import Diffusion, Sampler, build_generator
+from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.projection import unproject
+from r2flow.lidar.region import Region
+from r2flow.lidar.sensors import SENSORS
+from r2flow.noise import Draws
+from r2flow.stages import build_stage
+from r2flow.stages.base import learning_rate_factor
+from r2flow.training import build, compose, fit
+
+CONFIG: dict[str, Any] = {
+    "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
+    "encoding": {"format": "logscale", "reflectance": True},
+    "backbone": {"name": "efficient_unet", "base_channels": 8, "channel_multiplier": [1, 2], "num_residual_blocks": 1},
+    "generator": {"name": "diffusion"},
+}
+
+
+def network(case: dict[str, Any]) -> Backbone:
+    cfg = case["cfg"]
+    options = {
+        "name": "efficient_unet",
+        "base_channels": cfg["base_channels"],
+        "channel_multiplier": cfg["channel_multiplier"],
+        "num_residual_blocks": cfg["num_residual_blocks"],
+        "num_heads": cfg["attn_num_heads"],
+        "time_channels": cfg["temb_channels"],
+        "position": cfg["coords_encoding"],
+        "groups": cfg["gn_num_groups"],
+        "eps": cfg["gn_eps"],
+        "ring": cfg["ring"],
+    }
+    model = build_backbone(options, torch.zeros(2, *cfg["resolution"]), cfg["in_channels"])
+    model.load_state_dict(case["state_dict"])
+    return model
+
+
+@pytest.mark.parametrize("name", ["r2dm_net_16x64_fourier", "r2dm_net_16x32_polar"])
+def test_the_network_and_its_gradients_are_the_published(shared, name):
+    case = load_case(shared, f"{name}.pt")
+    model = network(case)
+    x, t = (case["inputs"][key].clone().requires_grad_() for key in ("x", "t"))
+    output = model(t, x)
+    assert_near(output, case["outputs"]["output"], 2e-5)
+    (output * case["grad_w"]["output"]).sum().backward()
+    for key, value in (("x", x), ("t", t)):
+        assert_near(value.grad, case["grad_inputs"][key], 1e-3)
+    assert_norms(model, case["grad_param_norms"])
+    assert sum(p.numel() for p in model.parameters()) == case["num_parameters"]
+
+
+def test_the_full_network_has_the_published_names_and_31_099_650_parameters(shared):
+    expected = json.loads((shared / "oracle_baselines" / "state_dict_keys.json").read_text())["r2dm"]
+    config = compose(["experiment=r2dm", "encoding.reflectance=true"])
+    with torch.device("meta"):
+        generator = build_generator(config)
+    found = {name: list(value.shape) for name, value in generator.backbone.state_dict().items()}
+    names = {name.removeprefix("model."): shape for name, shape in expected["names"].items() if "_dummy" not in name}
+    assert found == names
+    assert sum(p.numel() for p in generator.parameters()) == expected["parameters"] == 31_099_650
+
+
+@pytest.mark.parametrize("name", SCHEDULES)
+def test_schedules_are_the_published(shared, name):
+    case = load_case(shared, "r2dm_schedules.pt")
+    log_snr = SCHEDULES[name](**case[name].get("kwargs", {}))(case["t"])
+    alpha, sigma = alpha_sigma(log_snr)
+    assert_near(log_snr, case[name]["log_snr"], 1e-6)
+    assert_near(alpha, case[name]["alpha"], 1e-5)
+    assert_near(sigma, case[name]["sigma"], 1e-5)
+
+
+def test_loss_weights_are_the_published(shared):
+    case = load_case(shared, "r2dm_schedules.pt")
+    log_snr = Cosine()(case["t"])
+    for name, theirs in (("eps", "eps"), ("v", "v"), ("x", "x_0")):
+        for kind, gamma in (("minsnr", 5.0), ("plain", None)):
+            expected = case["loss_weight_cosine"][f"{theirs}_{kind}"]
+            torch.testing.assert_close(PREDICTIONS[name].weight(log_snr, gamma), expected, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("name", BETAS)
+def test_tables_of_discrete_steps_are_the_published(shared, name):
+    expected = load_case(shared, "r2dm_schedules.pt")["discrete_40_steps"][name]
+    found = tables(BETAS[name](40))
+    for key in found._fields:
+        assert_near(getattr(found, key), expected[key], 1e-6)
+
+
+def test_learning_rate_and_average_are_the_published(shared):
+    case = load_case(shared, "r2dm_schedules.pt")
+    lr, ema = case["lr_factor"], case["ema"]
+    found = [learning_rate_factor(n, lr["warmup"], lr["total"]) for n in range(lr["total"] + 1)]
+    assert found == pytest.approx(lr["factor"].tolist(), abs=1e-6)
+    average = ema["online"][0]
+    for call, online in enumerate(ema["online"]):
+        if call % ema["update_every"] == 0:
+            average = torch.lerp(online, average, ema_decay(call, ema["update_after_step"], ema["beta"], ema["power"]))
+        assert_near(average, ema["ema"][call], 1e-6)
+
+
+@pytest.mark.parametrize("name", ["eps_l2", "eps_l2_masked"])
+@pytest.mark.parametrize("paired", [False, True])
+def test_the_loss_and_its_gradients_are_the_published_and_the_formula_s(shared, name, paired):
+    case = load_case(shared, "r2dm_objective.pt")
+    model, case = network(case), case["cases"][name]
+    given = case["inputs"]
+    x = given["x_0"].clone().requires_grad_()
+    prediction, log_snr = PREDICTIONS["eps"], Cosine()(given["t"])
+    z = noised(x, log_snr, given["noise"])
+    assert_near(z, case["x_t"], 1e-5)
+    y = model(log_snr, z)
+    assert_near(y, case["prediction"], 2e-5)
+    errors = mean_errors(ERRORS["l2"](y, prediction.target(x, given["noise"], log_snr)), given["loss_mask"])
+    weights = prediction.weight(log_snr, case["min_snr_gamma"])
+    assert_near(errors, case["per_sample"], 1e-5)
+    assert_near(weights, case["weight"], 1e-5)
+    loss = weighted_mean(errors, weights, paired)
+    assert loss.item() == pytest.approx(float(case["loss_paired" if paired else "loss"]), rel=1e-5)
+    loss.backward()
+    assert_norms(model, case["grad_param_norms_paired" if paired else "grad_param_norms"])
+    if not paired:
+        assert_near(x.grad, case["grad_x0"], 1e-3)
+
+
+def test_the_stage_s_loss_is_the_formula_s_or_on_demand_the_published(shared):
+    case = load_case(shared, "r2dm_objective.pt")
+    cfg, given = case["cfg"], case["cases"]["eps_l2"]
+    shape = dict(zip(("rows", "columns"), cfg["resolution"], strict=True))
+    config = {
+        **CONFIG,
+        "sensor": {"name": "hdl64e", **shape, "rays": "reference"},
+        "backbone": {
+            "name": "efficient_unet", "base_channels": cfg["base_channels"], "num_residual_blocks": 1,
+            "channel_multiplier": cfg["channel_multiplier"], "num_heads": cfg["attn_num_heads"],
+        },
+        "data": {"name": "simulated", "batch_size": 3}, "seed": 0,
+    }  # fmt: skip
+    batch = {"x_1": given["inputs"]["x_0"], "x_0": given["inputs"]["noise"]}
+    for paired, key in ((True, "loss_paired"), (False, "loss")):
+        stage = build_stage({**config, "stage": {"name": "diffusion", "paired": paired}}, build_generator(config))
+        stage.generator.backbone.load_state_dict(case["state_dict"])  # type: ignore[union-attr]
+        with torch.no_grad():
+            loss = stage.regression_loss(batch, given["inputs"]["t"])  # type: ignore[operator]
+        assert loss.item() == pytest.approx(float(given[key]), rel=1e-5)
+
+
+def clean(model: Backbone, clip: float | None = 1.0):
+    def denoise(z: Tensor, log_snr: Tensor) -> Tensor:
+        x, _ = PREDICTIONS["eps"].split(z, model(log_snr.float(), z), log_snr)
+        return x if clip is None else x.clamp(-clip, clip)
+
+    return denoise
+
+
+@torch.no_grad()
+def test_samplers_follow_the_published_trajectories(shared):
+    case = load_case(shared, "r2dm_sampling.pt")
+    model = network(case).eval()
+    for one in case["cases"].values():
+        eta = 1.0 if one["mode"] == "ddpm" else one["ddim_eta"]
+        start, *draws = one["noise"]
+        log_snrs = Cosine()(torch.linspace(1, 0, one["num_steps"] + 1, dtype=torch.float64)).float()
+        states = torch.stack([start, *walk(clean(model), start, log_snrs, eta, iter(draws).__next__)])
+        assert_near(states, one["trajectory"], 1e-3 if one["mode"] == "ddpm" else 2e-3)
+
+
+@torch.no_grad()
+def test_single_steps_down_and_up_are_the_published(shared):
+    case = load_case(shared, "r2dm_sampling.pt")
+    model, schedule = network(case).eval(), Cosine()
+    for name, one in case["steps"].items():
+        at_t, at_s = schedule(one["t"]), schedule(one["s"])
+        if name == "q_step":
+            assert_near(forward_step(one["x_s"], at_s, at_t, one["noise"]), one["x_t"], 1e-4)
+            continue
+        x = clean(model, None if "noclip" in name else 1.0)(one["x_t"], at_t)
+        found = step(one["x_t"], x, at_t, at_s, one.get("ddim_eta", 1.0), one["noise"])
+        assert_near(found, one["x_s"], 1e-3 if name == "ddim" else 1e-4)
+
+
+@torch.no_grad()
+def test_repaint_is_the_published(shared):
+    case = load_case(shared, "r2dm_repaint.pt")
+    model = network(case).eval()
+    for one in case["cases"].values():
+        start, *draws = one["noise"]
+        found = repaint(
+            clean(model), start, case["known"], case["mask"], Cosine(), one["num_steps"], iter(draws).__next__,
+            one["num_resample_steps"], one["jump_length"],
+        )  # fmt: skip
+        states = torch.stack([start, *found])
+        assert_near(states, one["trajectory"], 1e-3)
+        assert_near(states[-1], one["output"], 1e-3)
+
+
+def test_repaint_draws_as_often_as_its_steps_parts_and_repeats_say():
+    drawn = []
+
+    def noise() -> Tensor:
+        drawn.append(torch.zeros(1, 1, 2, 2))
+        return drawn[-1]
+
+    known = torch.ones(1, 1, 2, 2)
+    mask = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    states = list(repaint(lambda z, _: torch.zeros_like(z), known, known, mask, Cosine(), 3, noise, 2, 4))
+    assert len(states) == 2 + 2 + 1  # the last step is not repeated
+    assert len(drawn) == 5 * 4 * 2 + 2 * 4  # known pixels and ancestral step on the way down, one on the way up
+    torch.testing.assert_close(states[-1][0, 0], mask, rtol=0, atol=1e-6)
+    with pytest.raises(InputError, match="at least 1; found 3, 0, 1"):
+        next(repaint(lambda z, _: z, known, known, mask, Cosine(), 3, noise, repeats=0))
+
+
+FORMATS = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric"}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_metres_and_model_space_are_the_published(shared, name):
+    data = load_case(shared, "r2dm_data.pt")
+    case = data[f"{name}_1.45_80.0"]
+    sensor = SENSORS["hdl64e"].resized(16, 64)
+    encoding = Encoding(sensor, FORMATS[name], reflectance=False, limits="open")
+    assert_near(encoding.encode(case["metres"]), case["model_space"], 1e-5)
+    assert_near(encoding.decode(2 * case["normalised_in"] - 1), case["reverted"], 1e-5)
+    # A range next to a limit may leave it by the rounding of model space.
+    inside = (case["metres"] - 1.45).abs().minimum((case["metres"] - 80).abs()) > 1e-3
+    back = encoding.decode(case["model_space"])
+    assert_near(back * inside, case["round_trip"] * inside, 1e-5)
+    assert torch.equal((case["model_space"] > -1) & inside, (case["mask"] > 0) & inside)
+    points = unproject(case["metres"] * case["mask"], data["ray_angles"][0])
+    assert_near(points, case["xyz"], 1e-5)
+
+
+def test_rays_are_the_published(shared):
+    data, sensor = load_case(shared, "r2dm_data.pt"), SENSORS["hdl64e"]
+    assert_near(sensor.resized(16, 64).rays("reference"), data["ray_angles"][0], 1e-5)
+    assert_near(sensor.rays("reference").double().sum((1, 2)), data["ray_angles_64x1024_sums"], 1e-5)
+
+
+@pytest.mark.parametrize("averaged", [True, False])
+@torch.no_grad()
+def test_a_published_checkpoint_predicts_what_its_authors_did(shared, averaged):
+    expected = load_case(shared, "r2dm_published_io.pt")
+    found = load_checkpoint(shared / "oracle_baselines" / "r2dm_published.pth", averaged=averaged)
+    diffusion = found.generator
+    assert isinstance(diffusion, Diffusion)
+    output = diffusion.predict(expected["x"], expected["t"])
+    assert_near(output, expected["output_ema" if averaged else "output_weights"], 2e-5)
+    assert sum(p.numel() for p in diffusion.parameters()) == expected["parameters"]
+    assert (found.format, found.step, found.sensor.min_range, found.sensor.max_range) == ("published", 3, 1.45, 80.0)
+    assert found.encoding.limits == "open"
+    assert diffusion.sampler == Sampler("ddpm", 256)
+
+
+def r2flow(*words: Any) -> None:
+    app([str(word) for word in words], standalone_mode=False)
+
+
+def test_a_published_checkpoint_is_sampled_and_evaluated(shared, tmp_path):
+    path = shared / "oracle_baselines" / "r2dm_published.pth"
+    r2flow("sample", "-c", path, "--num", 2, "--steps", 2, "--format", "npy", "--pictures", 0, "-o", tmp_path / "scans")
+    images = [np.load(one) for one in sorted((tmp_path / "scans").glob("*.npy"))]
+    assert [image.shape for image in images] == [(2, 16, 64)] * 2
+    with torch.no_grad():
+        diffusion = load_checkpoint(path).generator
+        noise = Draws(0, [1]).start(diffusion.noise_shape)
+        made = diffusion.generate(noise, sampler=Sampler("ddpm", 2), draws=Draws(0, [1]))
+    np.testing.assert_allclose(images[1], diffusion.space.decode(made.x)[0], rtol=0, atol=1e-3)
+    few = ["--num", 2, "--real-num", 2, "--workers", 0, "--no-cache", "--metrics", "jsd"]
+    r2flow("evaluate", "simulated:7", "-c", path, *few, "--steps", "1,2", "-o", tmp_path)
+    rows = json.loads((tmp_path / "speed_quality.json").read_text())["rows"]
+    assert [row["steps"] for row in rows] == [1, 2]
+
+
+def damaged(path: Path, tmp_path: Path, change) -> Path:
+    content = torch.load(path, weights_only=True)
+    change(content["cfg"])
+    torch.save(content, tmp_path / "changed.pth")
+    return tmp_path / "changed.pth"
+
+
+def test_unfolded_scans_look_along_the_rings_of_the_weights(shared, tmp_path):
+    path = shared / "oracle_baselines" / "r2dm_published.pth"
+    changed = damaged(path, tmp_path, lambda cfg: cfg["data"].update(projection="unfolding-64"))
+    rings = torch.rad2deg(torch.load(path, weights_only=True)["ema_weights"]["model.coords"][0, 0, :, 0].double())
+    assert load_checkpoint(changed).sensor.elevations == pytest.approx(rings.tolist())
+
+
+CHANGES = {
+    "found 90.0 and 80.0 metres": lambda cfg: cfg["data"].update(min_depth=90.0),
+    "its diffusion is of discrete steps": lambda cfg: cfg["diffusion"].update(timestep_type="discrete"),
+    "it makes reflectance without range": lambda cfg: cfg["data"].update(train_depth=False),
+    "lacks or garbles 'data'": lambda cfg: cfg.pop("data"),
+    "lacks or garbles 'disparity'": lambda cfg: cfg["data"].update(depth_format="disparity"),
+    "no backbone for the published architecture 'refinenet'": lambda cfg: cfg["model"].update(architecture="refinenet"),
+    "no log-SNR schedule named 'sigmoid'": lambda cfg: cfg["diffusion"].update(noise_schedule="sigmoid"),
+}
+
+
+@pytest.mark.parametrize("said", CHANGES)
+def test_a_published_config_that_is_not_understood_is_one_line(shared, tmp_path, said):
+    path = damaged(shared / "oracle_baselines" / "r2dm_published.pth", tmp_path, CHANGES[said])
+    with pytest.raises(InputError, match=re.escape(said)) as refused:
+        load_checkpoint(path)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", PREDICTIONS)
+def test_data_and_noise_follow_from_every_prediction(name):
+    x, eps = torch.randn(2, 6, 2, 4, 4, dtype=torch.float64)
+    log_snr = torch.linspace(-8, 8, 6, dtype=torch.float64)
+    prediction = PREDICTIONS[name]
+    found = prediction.split(noised(x, log_snr, eps), prediction.target(x, eps, log_snr), log_snr)
+    torch.testing.assert_close(torch.stack(found), torch.stack([x, eps]), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", PREDICTIONS)
+def test_the_weight_turns_a_prediction_s_error_into_that_of_the_data(name):
+    log_snr = torch.linspace(-4, 4, 9, dtype=torch.float64)
+    prediction = PREDICTIONS[name]
+    x, z = torch.zeros(9, 1, dtype=torch.float64), torch.randn(9, 1, dtype=torch.float64)
+    alpha, sigma = (part[:, None] for part in alpha_sigma(log_snr))
+    wrong = x + 0.1
+    error = prediction.target(wrong, (z - alpha * wrong) / sigma, log_snr) - prediction.target(
+        x, (z - alpha * x) / sigma, log_snr
+    )
+    weighted = prediction.weight(log_snr, 5.0) * error.square()[:, 0]
+    torch.testing.assert_close(weighted, 0.01 * log_snr.exp().clamp(max=5.0))
+
+
+@pytest.mark.parametrize("eta", [0.0, 0.4, 1.0])
+def test_a_step_keeps_the_distribution_of_gaussian_data(eta):
+    """Data x = 0.3: z_t ~ N(0.3 alpha, sigma^2) at every t, whatever the share of new noise."""
+    x = torch.full((200_000,), 0.3, dtype=torch.float64)
+    here, there = torch.tensor(-2.0), torch.tensor(1.5)
+    draws = torch.randn(2, len(x), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    found = step(noised(x, here, draws[0]), x, here, there, eta, draws[1])
+    alpha, sigma = alpha_sigma(there)
+    assert found.mean().item() == pytest.approx(0.3 * alpha.item(), abs=4 * sigma.item() / len(x) ** 0.5)
+    assert found.std().item() == pytest.approx(sigma.item(), rel=1e-2)
+
+
+def test_forward_steps_add_up_to_the_noise_of_their_end():
+    zero, one = torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+    lambdas = [torch.tensor(value, dtype=torch.float64) for value in (4.0, 1.0, -3.0)]
+    (alpha, sigma), (last_alpha, last_sigma) = alpha_sigma(lambdas[0]), alpha_sigma(lambdas[-1])
+    signal, variance = alpha * one, sigma.square() * one
+    for here, there in pairwise(lambdas):
+        kept = forward_step(one, here, there, zero)
+        signal, variance = kept * signal, kept.square() * variance + forward_step(zero, here, there, one).square()
+    torch.testing.assert_close(signal, last_alpha * one)
+    torch.testing.assert_close(variance, last_sigma.square() * one)
+
+
+def test_names_of_samplers_say_eta():
+    assert [eta_of(name) for name in ("ddpm", "ddim", "ddim:0.25", "adams3")] == [1.0, 0.0, 0.25, None]
+    for name in ("ddim:2", "ddim:", "ddim:nan"):
+        with pytest.raises(InputError, match=r"must lie in \[0, 1\]"):
+            eta_of(name)
+
+
+class Exact(Diffusion):
+    """Of data ~ N(mean, std^2): E[eps | z] = sigma (z - alpha mean) / (alpha^2 std^2 + sigma^2)."""
+
+    mean, std = 0.2, 0.1
+
+    def predict(self, z: Tensor, log_snr: Tensor) -> Tensor:
+        alpha, sigma = (part.reshape(-1, 1, 1, 1) for part in alpha_sigma(log_snr.double().reshape(-1)))
+        return (sigma * (z - alpha * self.mean) / (alpha**2 * self.std**2 + sigma**2)).to(z)
+
+
+@pytest.fixture
+def exact() -> Exact:
+    made = build_generator(CONFIG)
+    made.__class__ = Exact
+    assert isinstance(made, Exact)
+    return made.eval()
+
+
+@torch.no_grad()
+def test_a_diffusion_is_the_flow_of_its_own_data(exact):
+    """The straight flow of N(m, s^2) carries x_0 to m + s x_0; the schedule ends where sigma is 6e-4."""
+    noise = Draws(0, [0]).start(exact.noise_shape)
+    for sampler in (Sampler("dopri5", tolerance=1e-7), Sampler("ddim", 1000)):
+        found = exact.generate(noise, sampler=sampler)
+        torch.testing.assert_close(found.x, exact.mean + exact.std * noise, rtol=0, atol=2e-3)
+    s = torch.tensor([0.1, 0.5, 0.9])
+    torch.testing.assert_close(straight_time(log_snr_of(s)), s)
+
+
+@torch.no_grad()
+def test_a_scan_is_completed_with_a_diffusion_as_with_any_flow(exact):
+    noise, draws = Draws(0, [0]).start(exact.noise_shape), Draws(0, [0])
+    image = torch.full_like(noise, 0.25)
+    known = torch.zeros_like(noise)
+    known[..., ::2] = 1
+    condition = {"image": image * known, "known": known, "doubtful": torch.zeros_like(known)}
+    found = exact.generate(noise, condition, sampler=Sampler("replace", 500), draws=draws).x
+    torch.testing.assert_close(found * known, image * known, rtol=0, atol=0)
+    torch.testing.assert_close(found[..., 1::2], (exact.mean + exact.std * noise)[..., 1::2], rtol=0, atol=0.01)
+
+
+@torch.no_grad()
+def test_ancestral_scans_have_the_spread_that_their_steps_leave(exact):
+    """Each step is affine in z, and its variance that of Ho et al. 2020, eq. 7, with the expected data in it."""
+    draws, steps = Draws(0, range(16)), 32
+    found = exact.generate(draws.start(exact.noise_shape), sampler=Sampler("ddpm", steps), draws=draws)
+    signal = Cosine()(torch.linspace(1, 0, steps + 1, dtype=torch.float64)).sigmoid().tolist()
+    mean, variance, m, v = 0.0, 1.0, exact.mean, exact.std**2
+    for here, there in pairwise(signal):
+        beta = 1 - here / there
+        of_x, of_z = there**0.5 * beta / (1 - here), (1 - beta) ** 0.5 * (1 - there) / (1 - here)
+        gain = here**0.5 * v / (here * v + 1 - here)  # E[x | z] = m + gain (z - sqrt(here) m)
+        mean = of_x * (m + gain * (mean - here**0.5 * m)) + of_z * mean
+        variance = (of_x * gain + of_z) ** 2 * variance + beta * (1 - there) / (1 - here)
+    assert found.x.mean().item() == pytest.approx(mean, abs=0.003)
+    assert found.x.std().item() == pytest.approx(variance**0.5, rel=0.03)
+    assert variance**0.5 < 0.8 * exact.std  # that of so few steps; more of them leave all of it
+
+
+@torch.no_grad()
+def test_evaluations_are_counted_and_scans_do_not_depend_on_their_batch(exact):
+    calls = []
+    sampler = Sampler("ddim:0.5", 5)
+    noise = Draws(0, [0, 1]).start(exact.noise_shape)
+    two = exact.generate(noise, sampler=sampler, draws=Draws(0, [0, 1]), progress=lambda: calls.append(1))
+    one = exact.generate(noise[1:], sampler=sampler, draws=Draws(0, [1]))
+    torch.testing.assert_close(one.x, two.x[1:], rtol=0, atol=1e-6)
+    assert len(calls) == exact.evaluations_of(sampler) == int(two.evaluations[0]) == 5
+    assert exact.evaluations_of(Sampler("heun2", 5)) == 10
+    assert exact.in_steps(8) == Sampler("ddpm", 8)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("method", ["ddpm", "euler"])
+def test_a_part_of_the_image_has_the_noise_of_the_whole(exact, method):
+    """The expected noise of a pixel is a function of that pixel here, and so is the scan."""
+    region, draws, sampler = Region((8, 32), 0, 8, 8, 16), Draws(0, [4]), Sampler(method, 3)
+    noise = draws.start(exact.noise_shape)
+    whole = exact.generate(noise, sampler=sampler, draws=draws)
+    part = exact.part(region).generate(region.crop(noise), sampler=sampler, draws=draws)
+    torch.testing.assert_close(part.x, region.crop(whole.x), rtol=0, atol=1e-6)
+
+
+REFUSED = {
+    "ddim:1.5": "must lie in",
+    "ddpm finish": "neither levels nor a finish",
+    "jump": "no solver named 'jump'",
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_sampler_that_a_diffusion_does_not_have_is_refused(exact, case):
+    method, _, finish = case.partition(" ")
+    with pytest.raises(InputError, match=REFUSED[case]):
+        exact.check_sampler(Sampler(method, 4, finish=0.1 if finish else 0.0))
+
+
+def test_what_a_diffusion_cannot_do_is_said(exact):
+    noise = torch.zeros(1, *exact.noise_shape)
+    with pytest.raises(InputError, match="ddpm draws further noise"):
+        exact.generate(noise)
+    with pytest.raises(InputError, match="goes from noise to data alone"):
+        exact.solve(noise)
+    with pytest.raises(InputError, match="trained without a condition"):
+        exact.generate(noise, {"image": noise}, draws=Draws(0, [0]))
+    with pytest.raises(InputError, match="highest to lowest"):
+        Cosine(3, 3)
+    flow = build_generator({**CONFIG, "generator": {"name": "rectified_flow"}})
+    stage = {"data": {"name": "simulated", "batch_size": 2}, "seed": 0, "stage": {"name": "diffusion"}}
+    with pytest.raises(InputError, match=r"tells v\(t, x\), and this one learns eps\(z, log-SNR\)"):
+        exact.start_from(flow)
+    with pytest.raises(InputError, match="learns a diffusion, which a RectifiedFlow is not"):
+        build_stage({**CONFIG, **stage}, flow)
+
+
+TINY = [
+    "experiment=r2dm_small", "sensor.rows=8", "sensor.columns=32", "backbone.base_channels=8", "backbone.dropout=0.1",
+    "backbone.channel_multiplier=[1,2]", "backbone.num_residual_blocks=1", "backbone.time_channels=16",
+    "data.scenes=12", "data.batch_size=4", "data.validation.scans=2", "trainer.accelerator=cpu", "trainer.max_steps=4",
+    "trainer.val_check_interval=2", "callbacks.checkpoint.every=2", "callbacks.pictures=null", "sampler.steps=2",
+    "samples.num=1", "loggers=[csv]",
+]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_bit_by_bit_and_is_sampled_as_its_config_says(tmp_path):
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    result = fit(build(compose([*TINY, f"run_dir={whole}"])))
+    assert {"train/loss", "val/loss"} <= result.metrics.keys()
+    shutil.copytree(whole, stopped)
+    checkpoints_of(stopped)[0].unlink()  # as if killed between steps 2 and 4
+    fit(build(compose([*TINY, f"run_dir={stopped}"])))
+    found = [torch.load(checkpoints_of(run)[0], weights_only=True) for run in (whole, stopped)]
+    assert found[0]["global_step"] == found[1]["global_step"] == 4
+    for key in ("state_dict", "current_model_state"):
+        assert all(torch.equal(value, found[1][key][name]) for name, value in found[0][key].items())
+    trained = load_checkpoint(whole).generator
+    assert isinstance(trained, Diffusion)
+    assert trained.sampler == Sampler("ddpm", 2)
+    image = np.load(whole / "samples" / "000000.npy")
+    assert image.shape == (2, 8, 32)
+    assert np.isfinite(image).all()
