@@ -1,6 +1,6 @@
 """The averaged weights, which are the model."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -10,7 +10,7 @@ from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 
 from r2flow.adversarial.rules import half_life_decay
-from r2flow.registry import Count, Natural, Portion, Positive
+from r2flow.registry import Count, Natural, Portion, Positive, Registry
 
 
 def ema_decay(step: int, warmup: int, highest: float = 0.995, power: float = 2 / 3) -> float:
@@ -22,28 +22,48 @@ def ema_decay(step: int, warmup: int, highest: float = 0.995, power: float = 2 /
     return 0.0 if n <= 0 else min(highest, 1 - (1 + n) ** -power)
 
 
+def constant_decay(step: int, warmup: int, highest: float) -> float:
+    """highest, and 0 during the warm-up: LiDARGen's."""
+    return 0.0 if step < warmup else highest
+
+
+def ratio_decay(step: int, warmup: int, highest: float) -> float:
+    """min(highest, (1 + n) / (10 + n)) with n the steps since the warm-up, this one too, and 0 during it: LiDM's."""
+    n = step + 1 - warmup
+    return 0.0 if n <= 0 else min(highest, (1 + n) / (10 + n))
+
+
+DECAYS: Registry[Callable[[int, int, float], float]] = Registry(
+    "decay of the average", power=ema_decay, constant=constant_decay, ratio=ratio_decay
+)
+
+
 class EMA(WeightAveraging):
     """Exponential moving average of the weights, in float32, for validation, pictures and the checkpoint.
 
-    Every `every` steps: average <- decay average + (1 - decay) weights, with the decay of `ema_decay`.
+    Every `every` steps: average <- decay average + (1 - decay) weights.
 
     Args:
         decay: Highest decay.
+        rule: How it is reached, a name in `DECAYS`; `ratio` and `constant` are meant for every=1.
         every: Steps between two updates.
         warmup_steps: Steps during which the average copies the weights; None takes the stage's
             learning-rate warm-up.
     """
 
-    def __init__(self, decay: Portion = 0.995, every: Count = 10, warmup_steps: Natural | None = None) -> None:
+    def __init__(
+        self, decay: Portion = 0.995, every: Count = 10, warmup_steps: Natural | None = None, rule: str = "power"
+    ) -> None:
         # Buffers are constants here (ray angles, frequencies): averaging them would only cost time.
         super().__init__(use_buffers=False, avg_fn=self._average)
         self.decay, self.every, self.warmup_steps = decay, every, warmup_steps
+        self._decay_at = DECAYS[rule]
         self._step = 0
         self._raw: list[Tensor] = []
 
     def _decay(self) -> float:
         """After step `_step`, counted from 0."""
-        return ema_decay(self._step, self.warmup_steps or 0, self.decay)
+        return self._decay_at(self._step, self.warmup_steps or 0, self.decay)
 
     def _average(self, average: Tensor, weight: Tensor, updates: Any) -> Tensor:
         return average + (1 - self._decay()) * (weight - average)

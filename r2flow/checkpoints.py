@@ -268,7 +268,8 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     generator.sampler = Sampler.of(sampler or {})  # where none was written down, 32 Euler steps
     if published is not None and made.finish is not None:
         made.finish(generator, config)
-    accuracy = tuple(Budget.of(one) for one in content.get("accuracy") or ())
+    measured = () if published is not None else content.get("accuracy") or ()
+    accuracy = tuple(Budget.of(one) for one in measured)
     return Checkpoint(generator.eval().requires_grad_(False).to(device), config, step, path, kind, accuracy)
 
 

@@ -11,8 +11,9 @@ from r2flow.data.options import PairOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.sources import AUTO
 from r2flow.errors import InputError
+from r2flow.generators import GENERATORS
 from r2flow.models import name_of
-from r2flow.registry import check_options
+from r2flow.registry import check_options, options_of
 from r2flow.stages import STAGES
 
 
@@ -68,6 +69,8 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     if parent is None:
         if _on_pairs(config):
             raise InputError(f"stage={config['stage']['name']} starts from a trained flow: give stage.init=RUN.")
+        if STAGES[config["stage"]["name"]].needs_parent:
+            raise InputError(f"stage={config['stage']['name']} starts from another run: give stage.init=RUN.")
         config["generator"] = generator_of(config, parent)
         return config
     keys = [key_of(one) for one in asked]
@@ -106,13 +109,17 @@ def _on_pairs(config: Mapping[str, Any]) -> bool:
 
 
 def generator_of(config: Mapping[str, Any], parent: Parent | None) -> dict[str, Any]:
-    """What a run trains: the config's `generator`, else its stage's, else its parent's with the options of that."""
+    """What a run trains: the config's `generator`, else its stage's, else its parent's; the last two with the parent's
+    options, as far as they have them."""
     own = config.get("generator")
     if own:
         return {"name": own} if isinstance(own, str) else dict(own)
     theirs = (parent and parent.config.get("generator")) or {"name": "rectified_flow"}
     own = STAGES[config["stage"]["name"]].generator_name
-    return dict(theirs) if own in (None, theirs["name"]) else {"name": own}
+    if own in (None, theirs["name"]):
+        return dict(theirs)
+    shared = options_of(GENERATORS[own], given=2)
+    return {"name": own, **{key: value for key, value in theirs.items() if key in shared}}
 
 
 def pairs_of(parent: Checkpoint | Parent, options: Mapping[str, Any], weights: str | None) -> dict[str, Any]:

@@ -13,12 +13,15 @@ from r2flow.generators.diffusion import Diffusion
 from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
 from r2flow.generators.flow_map import FlowMap
 from r2flow.generators.gan import DustyV1, DustyV2, Gan, VanillaGan
+from r2flow.generators.latent import LatentDiffusion, VQAutoencoder
+from r2flow.generators.score import ScoreModel
 from r2flow.lidar.space import build_space
 from r2flow.registry import Registry
 
 __all__ = [
     "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "Diffusion", "DustyV1", "DustyV2", "Field", "Flow",
-    "FlowMap", "Gan", "Generated", "Generator", "RectifiedFlow", "Regression", "Sampler", "VanillaGan", "as_flow",
+    "FlowMap", "Gan", "Generated", "Generator", "LatentDiffusion", "RectifiedFlow", "Regression", "Sampler",
+    "ScoreModel", "VQAutoencoder", "VanillaGan", "as_flow",
     "build_generator", "condition_of", "levels",
 ]  # fmt: skip
 
@@ -32,6 +35,9 @@ GENERATORS: Registry[type[Generator]] = Registry(
     vanilla_gan=VanillaGan,
     dusty1=DustyV1,
     dusty2=DustyV2,
+    score=ScoreModel,
+    vq_autoencoder=VQAutoencoder,
+    latent_diffusion=LatentDiffusion,
 )
 
 

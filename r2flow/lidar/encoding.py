@@ -43,6 +43,25 @@ class LogScale:
         return torch.exp2(y * self.scale) - 1
 
 
+class ShiftedLog:
+    """log2(r + 1.0001) / scale, clipped to [0, 1], with scale = log2(r_max + 1) rounded up to hundredths.
+
+    LiDARGen's (r_max 63 m, scale 6) and LiDM's (56 m, 5.84). A ray without return is log2(1.0001) / scale and not
+    quite 0; the way back, 2^(scale y) - 1, leaves the 0.1 mm in.
+    """
+
+    channels = 1
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.scale = math.ceil(100 * math.log2(sensor.max_range + 1) - 1e-9) / 100
+
+    def forward(self, r: Tensor) -> Tensor:
+        return (torch.log2(r.clamp(min=0) + 1e-4 + 1) / self.scale).clamp(0, 1)
+
+    def inverse(self, y: Tensor) -> Tensor:
+        return torch.exp2(y.clamp(0, 1) * self.scale) - 1
+
+
 class Inverse:
     """r_min / r, 0 where there is no return; float32 holds r to within r^2 / r_min 2^-26, 2 mm of 0.3 to 200 m."""
 
@@ -109,6 +128,7 @@ class Cartesian:
 FORMATS: Registry[Callable[[Sensor], RangeFormat]] = Registry(
     "range format",
     logscale=LogScale,
+    shifted_log=ShiftedLog,
     inverse=Inverse,
     inverse_depth=InverseDepth,
     metric=Metric,
@@ -121,7 +141,8 @@ class Encoding:
 
     Args:
         sensor: Its range limits say which ranges are returns.
-        format: `logscale` (the paper's), `inverse`, `inverse_depth`, `metric`, or `cartesian` (three channels).
+        format: `logscale` (the paper's), `shifted_log` (LiDARGen's and LiDM's), `inverse`, `inverse_depth` (DUSty's),
+            `metric`, or `cartesian` (three channels).
         reflectance: Whether reflectance is a channel; without it a model is of range alone.
         limits: `closed`: ranges of exactly the sensor's limits are returns. `open`, as R2DM has it: they are not, and
             none is encoded that does not lie between them.
@@ -151,7 +172,7 @@ class Encoding:
     def encode(self, image: Tensor) -> Tensor:
         """(..., 2 or 1, H, W) in metres and reflectance of [0, 1] -> (..., channels, H, W).
 
-        A dropped ray, range 0, becomes exactly -1 (the origin, 0, under `cartesian`).
+        A dropped ray, range 0, becomes exactly -1 (the origin, 0, under `cartesian`; nearly -1 under `shifted_log`).
 
         Raises:
             InputError: reflectance is a channel of the model and the image has none.

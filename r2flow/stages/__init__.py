@@ -12,8 +12,10 @@ from r2flow.stages.conditional import Conditional, Regress
 from r2flow.stages.diffusion import LearnDiffusion
 from r2flow.stages.flow_map import LearnFlowMap
 from r2flow.stages.gan import LearnGan
+from r2flow.stages.latent import LearnAutoencoder, LearnLatentDiffusion
 from r2flow.stages.rectify import Rectify
 from r2flow.stages.reflow import Distill, Reflow
+from r2flow.stages.score import MatchScore
 
 STAGES: Registry[type[Stage]] = Registry(
     "stage",
@@ -25,6 +27,9 @@ STAGES: Registry[type[Stage]] = Registry(
     regress=Regress,
     diffusion=LearnDiffusion,
     gan=LearnGan,
+    score_matching=MatchScore,
+    autoencoder=LearnAutoencoder,
+    latent_diffusion=LearnLatentDiffusion,
 )
 
 

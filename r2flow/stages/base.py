@@ -49,6 +49,8 @@ class Stage(L.LightningModule):
 
     generator_name: ClassVar[str | None] = None  # what it trains; None: the parent's, or a rectified flow
     needs_pairs: ClassVar[bool] = False  # whether a batch's x_0 and x_1 belong together
+    needs_parent: ClassVar[bool] = False  # whether it starts from another run, also where it learns from scans
+    anneals: ClassVar[bool] = True  # whether the learning rate falls to 0 at the run's last step
 
     def __init__(
         self,
@@ -106,9 +108,11 @@ class Stage(L.LightningModule):
         return torch.optim.AdamW(parameters, **options) if self.muon is None else Muon(parameters, self.muon, **options)
 
     def schedule_for(self, optimizer: torch.optim.Optimizer) -> torch.optim.lr_scheduler.LambdaLR:
-        """`learning_rate_factor` over the run."""
+        """`learning_rate_factor` over the run, or its warm-up alone where the rate does not fall."""
         total = max(int(self.trainer.max_steps), 1)
         warmup = min(self.warmup_steps, total)
+        if not self.anneals:
+            return torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: min(1.0, step / warmup) if warmup else 1.0)
         return torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: learning_rate_factor(step, warmup, total))
 
     def own_optimizers(self) -> list[LightningOptimizer]:

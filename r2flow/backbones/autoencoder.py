@@ -1,0 +1,306 @@
+"""LiDM's autoencoder: range images to a small map of codes and back (Ran et al. 2024, "Towards realistic scene
+generation with LiDAR diffusion models").
+
+Circular in azimuth, zeros beyond the top and bottom. Parameters carry the published weights' names.
+"""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from r2flow.backbones.base import integers
+from r2flow.backbones.convolutions import GroupNorm
+from r2flow.backbones.quantiser import Quantised, Quantiser
+from r2flow.errors import InputError
+from r2flow.registry import Count, NonNegative, Portion
+
+GROUPS = 32
+Size = tuple[int, int]
+Margins = tuple[int, int, int, int]  # left, right, top, bottom
+
+# Of a stride (rows, columns): kernel and margins on the way down, of the blocks of the decoder, and on the way up.
+DOWN: dict[Size, tuple[Size, Margins]] = {(1, 2): ((3, 3), (0, 1, 1, 1)), (2, 2): ((3, 3), (0, 1, 0, 1))}
+BLOCK: dict[Size, tuple[Size, Margins]] = {(1, 2): ((1, 4), (1, 2, 0, 0)), (2, 2): ((3, 3), (1, 1, 1, 1))}
+UP: dict[Size, tuple[Size, Margins]] = {(1, 2): ((1, 5), (2, 2, 0, 0)), (2, 2): ((3, 3), (1, 1, 1, 1))}
+SQUARE = BLOCK[2, 2]
+FLAT = BLOCK[1, 2]
+
+
+class CircularConv2d(nn.Conv2d):
+    """A convolution with margins of its own: circular on the left and right, zeros at the top and bottom."""
+
+    def __init__(
+        self,
+        channels: int,
+        out_channels: int,
+        kernel: Size = SQUARE[0],
+        margins: Margins = SQUARE[1],
+        stride: Size | int = 1,
+    ) -> None:
+        super().__init__(channels, out_channels, kernel, stride)
+        self.margins = margins
+
+    def forward(self, x: Tensor) -> Tensor:
+        left, right, top, bottom = self.margins
+        x = F.pad(x, (left, right, 0, 0), mode="circular") if left or right else x
+        return super().forward(F.pad(x, (0, 0, top, bottom)) if top or bottom else x)
+
+
+class ResidualBlock(nn.Module):
+    """shortcut(x) + conv silu norm conv silu norm (x)."""
+
+    def __init__(
+        self, channels: int, out_channels: int, shape: tuple[Size, Margins] = SQUARE, dropout: float = 0.0
+    ) -> None:
+        super().__init__()
+        self.norm1 = GroupNorm(channels, GROUPS)
+        self.conv1 = CircularConv2d(channels, out_channels, *shape)
+        self.norm2 = GroupNorm(out_channels, GROUPS)
+        self.dropout = nn.Dropout(dropout)
+        self.conv2 = CircularConv2d(out_channels, out_channels, *shape)
+        self.nin_shortcut = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = self.conv1(F.silu(self.norm1(x)))
+        return self.nin_shortcut(x) + self.conv2(self.dropout(F.silu(self.norm2(h))))
+
+
+class Attention(nn.Module):
+    """x + attention(norm x) among all pixels, with one head."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = GroupNorm(channels, GROUPS)
+        self.q, self.k, self.v, self.proj_out = (nn.Conv2d(channels, channels, 1) for _ in range(4))
+
+    def forward(self, x: Tensor) -> Tensor:
+        normed = self.norm(x)
+        # with a dimension of heads and contiguous, as the fast kernels want them
+        q, k, v = (layer(normed).flatten(2).mT[:, None].contiguous() for layer in (self.q, self.k, self.v))
+        attended = F.scaled_dot_product_attention(q, k, v)[:, 0].mT.unflatten(2, x.shape[2:])
+        return x + self.proj_out(attended)
+
+
+class Middle(nn.Module):
+    """A residual block, attention and another one."""
+
+    def __init__(self, channels: int, dropout: float) -> None:
+        super().__init__()
+        self.block_1 = ResidualBlock(channels, channels, dropout=dropout)
+        self.attn_1 = Attention(channels)
+        self.block_2 = ResidualBlock(channels, channels, dropout=dropout)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.block_2(self.attn_1(self.block_1(x)))
+
+
+class Downsample(nn.Module):
+    """A convolution that takes every stride-th row and column."""
+
+    def __init__(self, channels: int, stride: Size) -> None:
+        super().__init__()
+        self.conv = CircularConv2d(channels, channels, *DOWN[stride], stride=stride)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.conv(x)
+
+
+class Upsample(nn.Module):
+    """Bilinear between the outermost pixels, which stay where they are, then a convolution."""
+
+    def __init__(self, channels: int, stride: Size) -> None:
+        super().__init__()
+        self.stride = stride
+        self.conv = CircularConv2d(channels, channels, *UP[stride])
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.conv(F.interpolate(x, scale_factor=self.stride, mode="bilinear", align_corners=True))
+
+
+class Level(nn.Module):
+    """Residual blocks of one resolution, each followed by attention where the level has it.
+
+    Attributes:
+        downsample, upsample: To the next level, where there is one.
+    """
+
+    def __init__(
+        self,
+        widths: Sequence[int],
+        shape: tuple[Size, Margins],
+        attends: bool,
+        dropout: float,
+        down: Size | None = None,
+        up: Size | None = None,
+    ) -> None:
+        super().__init__()
+        self.block = nn.ModuleList(ResidualBlock(*pair, shape, dropout) for pair in pairwise(widths))
+        self.attn = nn.ModuleList(Attention(width) for width in widths[1:] if attends)
+        if down is not None:
+            self.downsample = Downsample(widths[-1], down)
+        if up is not None:
+            self.upsample = Upsample(widths[-1], up)
+
+    def forward(self, x: Tensor) -> Tensor:
+        for index, block in enumerate(self.block):
+            x = block(x)
+            if len(self.attn):
+                x = self.attn[index](x)
+        for name in ("downsample", "upsample"):
+            x = getattr(self, name)(x) if hasattr(self, name) else x
+        return x
+
+
+class Encoder(nn.Module):
+    """Images (B, channels, H, W) to (B, out_channels, H / rows, W / columns), of all strides together."""
+
+    def __init__(
+        self,
+        channels: int,
+        out_channels: int,
+        widths: Sequence[int],
+        strides: Sequence[Size],
+        blocks: int,
+        attends: Sequence[int],
+        dropout: float,
+    ) -> None:
+        super().__init__()
+        self.conv_in = CircularConv2d(channels, widths[0])
+        before = [widths[0], *widths]
+        self.down = nn.ModuleList(
+            Level([before[i], *[width] * blocks], SQUARE, i in attends, dropout, down=stride)
+            for i, (width, stride) in enumerate(zip(widths, [*strides, None], strict=True))
+        )
+        self.mid = Middle(widths[-1], dropout)
+        self.norm_out = GroupNorm(widths[-1], GROUPS)
+        self.conv_out = CircularConv2d(widths[-1], out_channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.conv_in(x)
+        for level in self.down:
+            x = level(x)
+        return self.conv_out(F.silu(self.norm_out(self.mid(x))))
+
+
+class Decoder(nn.Module):
+    """The way back, with one more block a level; a level that widens columns alone looks along rows alone."""
+
+    def __init__(
+        self,
+        channels: int,
+        out_channels: int,
+        widths: Sequence[int],
+        strides: Sequence[Size],
+        blocks: int,
+        attends: Sequence[int],
+        dropout: float,
+    ) -> None:
+        super().__init__()
+        self.conv_in = CircularConv2d(channels, widths[-1])
+        self.mid = Middle(widths[-1], dropout)
+        deeper = [*widths[1:], widths[-1]]
+        self.up = nn.ModuleList(
+            Level(
+                [deeper[i], *[width] * (blocks + 1)],
+                FLAT if stride is None else BLOCK[stride],
+                i in attends,
+                dropout,
+                up=stride,
+            )
+            for i, (width, stride) in enumerate(zip(widths, [None, *strides], strict=True))
+        )
+        self.norm_out = GroupNorm(widths[0], GROUPS)
+        self.conv_out = CircularConv2d(widths[0], out_channels, *FLAT)
+
+    def forward(self, z: Tensor) -> Tensor:
+        x = self.mid(self.conv_in(z))
+        for level in reversed(self.up):
+            x = level(x)
+        return self.conv_out(F.silu(self.norm_out(x)))
+
+
+class Autoencoder(nn.Module):
+    """Images (B, C, H, W) to latents (B, code_channels, h, w), nearest codes, and back.
+
+    Args:
+        channels: C of the images.
+        width: Of the first level, a multiple of 32.
+        multipliers: Width of each level over `width`.
+        strides: Rows and columns that become one between each level and the next: [1, 2] or [2, 2].
+        blocks: Residual blocks of each level; the decoder has one more.
+        attention: Numbers of the levels that attend, beside the middle, which always does.
+        latent_channels: Between the encoder and the codes' projections.
+        code_channels: Of a code.
+        codes: How many there are.
+        beta: See `Quantiser`.
+        legacy: See `Quantiser`.
+        mask: Whether the decoder says, in one channel more, which rays return; where it is negative there is none.
+        dropout: Share of activations dropped in training.
+
+    Raises:
+        InputError: widths, strides or levels that do not go together.
+    """
+
+    def __init__(
+        self,
+        channels: Count = 1,
+        width: Count = 64,
+        multipliers: Sequence[int] = (1, 2, 2, 4),
+        strides: Sequence[Sequence[int]] = ((1, 2), (2, 2), (2, 2)),
+        blocks: Count = 2,
+        attention: Sequence[int] = (),
+        latent_channels: Count = 8,
+        code_channels: Count = 8,
+        codes: Count = 16384,
+        beta: NonNegative = 0.25,
+        legacy: bool = False,
+        mask: bool = False,
+        dropout: Portion = 0.0,
+    ) -> None:
+        super().__init__()
+        self.strides = [(int(rows), int(columns)) for rows, columns in strides]
+        unknown = [list(stride) for stride in self.strides if stride not in DOWN]
+        if unknown or len(multipliers) != len(self.strides) + 1:
+            raise InputError(
+                f"an autoencoder of {len(multipliers)} levels needs {len(multipliers) - 1} strides, each [1, 2] or "
+                f"[2, 2]; found {[list(stride) for stride in self.strides]}."
+            )
+        widths = [width * multiplier for multiplier in integers("multipliers", multipliers, len(multipliers))]
+        self.mask, self.code_channels = mask, code_channels
+        shared = widths, self.strides, blocks, attention, dropout
+        self.encoder = Encoder(channels, latent_channels, *shared)
+        self.decoder = Decoder(latent_channels, channels + mask, *shared)
+        self.quantize = Quantiser(codes, code_channels, beta, legacy)
+        self.quant_conv = nn.Conv2d(latent_channels, code_channels, 1)
+        self.post_quant_conv = nn.Conv2d(code_channels, latent_channels, 1)
+
+    def latent_shape(self, rows: int, columns: int) -> tuple[int, int, int]:
+        """(code_channels, h, w) of an image's latents.
+
+        Raises:
+            InputError: rows or columns that the strides do not divide.
+        """
+        high, wide = (math.prod(stride[axis] for stride in self.strides) for axis in (0, 1))
+        if rows % high or columns % wide:
+            raise InputError(
+                f"the autoencoder makes one latent of {high} x {wide} pixels, which do not divide {rows} x {columns}."
+            )
+        return self.code_channels, rows // high, columns // wide
+
+    def encode(self, x: Tensor) -> Tensor:
+        """Latents, not yet codes."""
+        return self.quant_conv(self.encoder(x))
+
+    def decode(self, z: Tensor, quantise: bool = True) -> Tensor:
+        """The image of latents, which become codes first; a ray that the mask drops is -1."""
+        image = self.decoder(self.post_quant_conv(self.quantize(z).codes if quantise else z))
+        return torch.where(image[:, -1:] < 0, -1.0, image[:, :-1]) if self.mask else image
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Quantised]:
+        """The reconstruction, with its mask in the last channel where there is one, and what the quantiser found."""
+        quantised = self.quantize(self.encode(x))
+        return self.decoder(self.post_quant_conv(quantised.codes)), quantised

@@ -1,0 +1,181 @@
+"""LiDM's U-Net on latents: the guided-diffusion network (Dhariwal and Nichol 2021) with convolutions that are circular
+in azimuth.
+
+Parameters carry the published weights' names.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from r2flow.backbones.autoencoder import CircularConv2d
+from r2flow.backbones.base import integers
+from r2flow.backbones.convolutions import GroupNorm, zero_convolution
+from r2flow.backbones.layers import ExactLinear, at_least_float32
+from r2flow.errors import InputError
+from r2flow.registry import Count, Portion
+
+GROUPS, EPS = 32, 1e-5
+POSITIONS = "none", "learnable"
+
+
+def norm(channels: int) -> GroupNorm:
+    return GroupNorm(channels, GROUPS, EPS)
+
+
+def cosines_and_sines(t: Tensor, channels: int) -> Tensor:
+    """cos(f_i t), then sin(f_i t), with f_i = 10^(-4 i / (C / 2)); t as it is, the number of a step, (B,)."""
+    half = channels // 2
+    frequencies = torch.exp(-math.log(1e4) / half * torch.arange(half, device=t.device, dtype=torch.float32))
+    phase = at_least_float32(t.to(torch.promote_types(t.dtype, torch.float32)))[:, None] * frequencies
+    return torch.cat([phase.cos(), phase.sin()], dim=1)
+
+
+class ResidualBlock(nn.Module):
+    """skip(x) + conv silu norm (conv silu norm (x) + W silu(c)), its last convolution zero at the start."""
+
+    def __init__(self, channels: int, out_channels: int, condition_channels: int, dropout: float) -> None:
+        super().__init__()
+        self.in_layers = nn.Sequential(norm(channels), nn.SiLU(), CircularConv2d(channels, out_channels))
+        self.emb_layers = nn.Sequential(nn.SiLU(), ExactLinear(condition_channels, out_channels))
+        last = zero_convolution(CircularConv2d(out_channels, out_channels))
+        self.out_layers = nn.Sequential(norm(out_channels), nn.SiLU(), nn.Dropout(dropout), last)
+        self.skip_connection = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
+
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+        h = self.in_layers(x)
+        h = self.out_layers(h + self.emb_layers(condition)[:, :, None, None].to(h.dtype))
+        return self.skip_connection(x) + h
+
+
+class Attention(nn.Module):
+    """x + attention(norm x) among all pixels; of each head the q, k and v lie side by side."""
+
+    def __init__(self, channels: int, head_channels: int) -> None:
+        super().__init__()
+        if channels % head_channels:
+            raise InputError(f"{channels} channels cannot be shared by heads of {head_channels}.")
+        self.heads = channels // head_channels
+        self.norm = norm(channels)
+        self.qkv = nn.Conv1d(channels, 3 * channels, 1)
+        self.proj_out = nn.Conv1d(channels, channels, 1)
+        nn.init.zeros_(self.proj_out.weight)
+        nn.init.zeros_(self.proj_out.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor) -> Tensor:
+        flat = self.norm(x).flatten(2)
+        # contiguous: the fast kernels want the channels of a head side by side
+        q, k, v = (part.contiguous() for part in self.qkv(flat).unflatten(1, (self.heads, 3, -1)).mT.unbind(2))
+        attended = F.scaled_dot_product_attention(q, k, v).mT.flatten(1, 2)
+        return x + self.proj_out(attended).view(x.shape)
+
+
+class Halve(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.op = CircularConv2d(channels, channels, stride=2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.op(x)
+
+
+class Double(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv = CircularConv2d(channels, channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.conv(F.interpolate(x, scale_factor=2, mode="nearest"))
+
+
+class Step(nn.Sequential):
+    """Layers one after the other, of which residual blocks are told the time."""
+
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:  # type: ignore[override]
+        for layer in self:
+            x = layer(x, condition) if isinstance(layer, ResidualBlock) else layer(x)
+        return x
+
+
+class LatentUNet(nn.Module):
+    """eps(z, t) for latents z at the steps t of a diffusion.
+
+    Args:
+        shape: Channels, rows and columns of the latents.
+        width: Of the first level.
+        multipliers: Width of each level over `width`.
+        blocks: Residual blocks of each level on the way down; one more on the way up.
+        attention: By how much the levels are reduced that attend; the middle always does.
+        head_channels: Of an attention head.
+        position: "learnable" adds a learned bias for each place after the first convolution, (width, rows, columns),
+            zero at the start: the paper's LiDM + APE. "none": LiDM.
+        dropout: Share of activations dropped in training.
+
+    Raises:
+        InputError: sizes, widths or heads that do not go together.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int, int],
+        width: Count = 256,
+        multipliers: Sequence[int] = (1, 2, 4),
+        blocks: Count = 2,
+        attention: Sequence[int] = (1, 2, 4),
+        head_channels: Count = 32,
+        position: str = "none",
+        dropout: Portion = 0.0,
+    ) -> None:
+        super().__init__()
+        channels, rows, columns = shape
+        widths = [width * multiplier for multiplier in integers("multipliers", multipliers, len(multipliers))]
+        coarsest = 2 ** (len(widths) - 1)
+        if rows % coarsest or columns % coarsest:
+            raise InputError(f"latents of {rows} x {columns} cannot be halved {len(widths) - 1} times.")
+        if position not in POSITIONS:
+            raise InputError(f"no position named {position!r}; known: {', '.join(POSITIONS)}.")
+        condition, self.width = 4 * width, width
+        self.time_embed = nn.Sequential(ExactLinear(width, condition), nn.SiLU(), ExactLinear(condition, condition))
+        self.position = nn.Parameter(torch.zeros(width, rows, columns)) if position == "learnable" else None
+
+        def block(before: int, after: int) -> ResidualBlock:
+            return ResidualBlock(before, after, condition, dropout)
+
+        here, skips = width, [width]
+        self.input_blocks = nn.ModuleList([Step(CircularConv2d(channels, width))])
+        for level, after in enumerate(widths):
+            for _ in range(blocks):
+                attends = [Attention(after, head_channels)] if 2**level in attention else []
+                self.input_blocks.append(Step(block(here, after), *attends))
+                here = after
+                skips.append(here)
+            if level < len(widths) - 1:
+                self.input_blocks.append(Step(Halve(here)))
+                skips.append(here)
+        self.middle_block = Step(block(here, here), Attention(here, head_channels), block(here, here))
+        self.output_blocks = nn.ModuleList()
+        for level in reversed(range(len(widths))):
+            for index in range(blocks + 1):
+                layers: list[nn.Module] = [block(here + skips.pop(), widths[level])]
+                here = widths[level]
+                layers += [Attention(here, head_channels)] if 2**level in attention else []
+                layers += [Double(here)] if level and index == blocks else []
+                self.output_blocks.append(Step(*layers))
+        self.out = nn.Sequential(norm(here), nn.SiLU(), zero_convolution(CircularConv2d(here, channels)))
+
+    def forward(self, z: Tensor, t: Tensor) -> Tensor:
+        """eps, of z's shape (B, channels, rows, columns), at the steps t, (B,)."""
+        condition = self.time_embed(cosines_and_sines(t, self.width))
+        h, skips = z, []
+        for index, step in enumerate(self.input_blocks):
+            h = step(h, condition)
+            if index == 0 and self.position is not None:
+                h = h + self.position
+            skips.append(h)
+        h = self.middle_block(h, condition)
+        for step in self.output_blocks:
+            h = step(torch.cat([h, skips.pop()], dim=1), condition)
+        return self.out(h)

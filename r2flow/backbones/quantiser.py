@@ -1,0 +1,65 @@
+"""A codebook: vectors become the nearest of some learned ones (van den Oord et al. 2017, "Neural discrete
+representation learning")."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+AT_ONCE = 4096  # vectors whose distances to all codes are held at a time
+
+
+class Quantised(NamedTuple):
+    """What a quantiser makes of z, (B, C, H, W).
+
+    Attributes:
+        codes: The nearest codes, (B, C, H, W), with the gradient of z (straight through).
+        loss: What draws codes and vectors to each other, ().
+        indices: Of the codes, (B H W,) int64.
+    """
+
+    codes: Tensor
+    loss: Tensor
+    indices: Tensor
+
+
+class Quantiser(nn.Module):
+    """q(z), the code e_k nearest to each vector z, and the loss
+
+        |q - sg z|^2 + beta |sg q - z|^2
+
+    in the mean over all numbers, with sg the value without its gradient (2017, eq. 3). The first term moves the codes,
+    the second, the commitment, the vectors.
+
+    Args:
+        codes: How many there are.
+        channels: Of each.
+        beta: Weight of the commitment.
+        legacy: Put beta on the first term instead, as the published code that LiDM's weights were trained with does.
+    """
+
+    def __init__(self, codes: int, channels: int, beta: float = 0.25, legacy: bool = False) -> None:
+        super().__init__()
+        self.beta, self.legacy = beta, legacy
+        self.embedding = nn.Embedding(codes, channels)
+        nn.init.uniform_(self.embedding.weight, -1 / codes, 1 / codes)
+
+    def forward(self, z: Tensor) -> Quantised:
+        vectors = z.movedim(1, -1)
+        indices = self.nearest(vectors.detach().flatten(0, -2))
+        q = self.embedding(indices).view(vectors.shape)
+        codebook, commitment = (q - vectors.detach()).square().mean(), (q.detach() - vectors).square().mean()
+        loss = self.beta * codebook + commitment if self.legacy else codebook + self.beta * commitment
+        through = vectors + (q - vectors).detach()
+        return Quantised(through.movedim(-1, 1), loss, indices)
+
+    @torch.no_grad()
+    def nearest(self, vectors: Tensor) -> Tensor:
+        """The index of the code nearest to each vector, (N, C) to (N,)."""
+        codes = self.embedding.weight
+        lengths = codes.square().sum(1)
+        parts = [
+            (part.square().sum(1, keepdim=True) + lengths - 2 * part @ codes.T).argmin(1)
+            for part in vectors.split(AT_ONCE)
+        ]
+        return torch.cat(parts)

@@ -1,0 +1,194 @@
+"""RefineNet of NCSNv2 as LiDARGen has it: the score of noised range images (Song and Ermon 2020; Zyrianov et al. 2022).
+
+Most convolutions are circular in azimuth and in elevation too, where an image is no ring: the published weights were
+trained so. Parameters carry their names.
+"""
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from r2flow.backbones.layers import at_least_float32
+from r2flow.errors import InputError
+from r2flow.registry import Count
+
+
+def torus_convolution(channels: int, out_channels: int, dilation: int = 1, bias: bool = True) -> nn.Conv2d:
+    """3 x 3, circular in both directions."""
+    return nn.Conv2d(
+        channels, out_channels, 3, padding=dilation, dilation=dilation, bias=bias, padding_mode="circular"
+    )  # fmt: skip
+
+
+class InstanceNormPlus(nn.Module):
+    """gamma (norm(x) + alpha m) + beta, with norm each channel's own and m the channels' means, standardised.
+
+    m has lost its own mean and is divided by its standard deviation over the channels (the unbiased one): what norm
+    takes away of the channels' means comes back (Song and Ermon 2019, appendix A).
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.alpha = nn.Parameter(1 + 0.02 * torch.randn(channels))
+        self.gamma = nn.Parameter(1 + 0.02 * torch.randn(channels))
+        self.beta = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        wide = at_least_float32(x)
+        means = wide.mean((2, 3), keepdim=True)
+        spread = (means.var(1, keepdim=True) + 1e-5).sqrt()
+        alpha, gamma, beta = (p[:, None, None] for p in (self.alpha, self.gamma, self.beta))
+        centred = (means - means.mean(1, keepdim=True)) / spread
+        return (gamma * (F.instance_norm(wide) + alpha * centred) + beta).to(x.dtype)
+
+
+class PooledConvolution(nn.Module):
+    """A convolution, zeros beyond the edges, then the mean of every 2 x 2 pixels."""
+
+    def __init__(self, channels: int, out_channels: int, size: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, out_channels, size, padding=size // 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.avg_pool2d(self.conv(x), 2)
+
+
+class ScoreBlock(nn.Module):
+    """shortcut(x) + conv elu norm conv elu norm (x).
+
+    Args:
+        changes: Whether the shortcut is learned. Without dilation the block then halves the image, with it not.
+        dilation: Of its 3 x 3 convolutions; 1 for none.
+    """
+
+    def __init__(self, channels: int, out_channels: int, changes: bool = False, dilation: int = 1) -> None:
+        super().__init__()
+        self.conv1 = torus_convolution(channels, channels if changes else out_channels, dilation)
+        self.normalize2 = InstanceNormPlus(channels if changes else out_channels)
+        self.normalize1 = InstanceNormPlus(channels)
+        self.shortcut: nn.Module = nn.Identity()
+        self.conv2: nn.Module
+        if changes and dilation == 1:
+            self.conv2 = PooledConvolution(channels, out_channels, 3)
+            self.shortcut = PooledConvolution(channels, out_channels, 1)
+        else:
+            self.conv2 = torus_convolution(out_channels, out_channels, dilation)
+            if changes:
+                self.shortcut = torus_convolution(channels, out_channels, dilation)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = self.conv1(F.elu(self.normalize1(x)))
+        return self.shortcut(x) + self.conv2(F.elu(self.normalize2(h)))
+
+
+class ResidualUnits(nn.Module):
+    """x <- x + conv elu conv elu (x), several times."""
+
+    def __init__(self, channels: int, count: int) -> None:
+        super().__init__()
+        self.names = [(f"{unit}_1_conv", f"{unit}_2_conv") for unit in range(1, count + 1)]
+        for pair in self.names:
+            for name in pair:
+                self.add_module(name, torus_convolution(channels, channels, bias=False))
+
+    def forward(self, x: Tensor) -> Tensor:
+        for first, second in self.names:
+            x = x + self.get_submodule(second)(F.elu(self.get_submodule(first)(F.elu(x))))
+        return x
+
+
+class Fusion(nn.Module):
+    """The sum of several maps, each by a convolution and then enlarged to one size."""
+
+    def __init__(self, channels: Sequence[int], out_channels: int) -> None:
+        super().__init__()
+        self.convs = nn.ModuleList(torus_convolution(width, out_channels) for width in channels)
+
+    def forward(self, maps: Sequence[Tensor]) -> Tensor:
+        size = maps[0].shape[2:]
+        every = [conv(x) for conv, x in zip(self.convs, maps, strict=True)]
+        return sum((F.interpolate(x, size, mode="bilinear", align_corners=True) for x in every[1:]), every[0])
+
+
+class PoolChain(nn.Module):
+    """x + p_1 + p_2 with p_i = conv maxpool p_{i-1}, p_0 = x = elu of the input."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.convs = nn.ModuleList(torus_convolution(channels, channels, bias=False) for _ in range(2))
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = path = F.elu(x)
+        for conv in self.convs:
+            path = conv(F.max_pool2d(path, 5, stride=1, padding=2))
+            x = x + path
+        return x
+
+
+class RefineBlock(nn.Module):
+    """Maps of several sizes become one of the first one's size (Lin et al. 2017, "RefineNet")."""
+
+    def __init__(self, channels: Sequence[int], out_channels: int, last: bool = False) -> None:
+        super().__init__()
+        self.adapt_convs = nn.ModuleList(ResidualUnits(width, 2) for width in channels)
+        if len(channels) > 1:
+            self.msf = Fusion(channels, out_channels)
+        self.crp = PoolChain(out_channels)
+        self.output_convs = ResidualUnits(out_channels, 3 if last else 1)
+
+    def forward(self, *maps: Tensor) -> Tensor:
+        adapted = [adapt(x) for adapt, x in zip(self.adapt_convs, maps, strict=True)]
+        return self.output_convs(self.crp(self.msf(adapted) if len(adapted) > 1 else adapted[0]))
+
+
+class RefineNet(nn.Module):
+    """s(x, i) = F(2 x - 1, column, row) / sigma_i for images x of [0, 1].
+
+    Four levels, of which the second alone halves the image; the third and the fourth see further by dilation.
+
+    Args:
+        sigmas: Noise levels, (L,).
+        channels: Of the image.
+        width: Of the first level; the others are twice as wide.
+    """
+
+    sigmas: Tensor
+
+    def __init__(self, sigmas: Tensor, channels: Count = 2, width: Count = 128) -> None:
+        super().__init__()
+        self.register_buffer("sigmas", sigmas)
+        wide = 2 * width
+        self.begin_conv = nn.Conv2d(channels + 2, width, 3, padding=1)
+        self.normalizer = InstanceNormPlus(width)
+        self.end_conv = nn.Conv2d(width, channels, 3, padding=1)
+        self.res1 = nn.Sequential(ScoreBlock(width, width), ScoreBlock(width, width))
+        self.res2 = nn.Sequential(ScoreBlock(width, wide, changes=True), ScoreBlock(wide, wide))
+        self.res3, self.res4 = (
+            nn.Sequential(ScoreBlock(wide, wide, True, dilation), ScoreBlock(wide, wide, dilation=dilation))
+            for dilation in (2, 4)
+        )
+        self.refine1 = RefineBlock([wide], wide)
+        self.refine2 = RefineBlock([wide, wide], wide)
+        self.refine3 = RefineBlock([wide, wide], width)
+        self.refine4 = RefineBlock([width, width], width, last=True)
+
+    def forward(self, x: Tensor, labels: Tensor) -> Tensor:
+        """The score of images (B, C, H, W) at the noise levels (B,) int64, of their shape; H and W are even.
+
+        Raises:
+            InputError: an odd height or width.
+        """
+        rows, columns = x.shape[2:]
+        if rows % 2 or columns % 2:
+            raise InputError(f"RefineNet halves the image: its height and width must be even, found {rows}x{columns}.")
+        column = torch.linspace(0, 1, columns, device=x.device, dtype=x.dtype).expand(len(x), 1, rows, -1)
+        row = torch.linspace(0, 1, rows, device=x.device, dtype=x.dtype)[:, None].expand(len(x), 1, -1, columns)
+        first = self.res1(self.begin_conv(torch.cat([2 * x - 1, column, row], 1)))
+        second = self.res2(first)
+        third = self.res3(second)
+        refined = self.refine2(third, self.refine1(self.res4(third)))
+        refined = self.refine4(first, self.refine3(second, refined))
+        score = self.end_conv(F.elu(self.normalizer(refined)))
+        return score / self.sigmas[labels][:, None, None, None]

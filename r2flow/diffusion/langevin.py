@@ -1,0 +1,109 @@
+"""Scores of noised data at a ladder of noise levels, and annealed Langevin dynamics down the ladder.
+
+Song and Ermon 2019, "Generative modeling by estimating gradients of the data distribution", and 2020, "Improved
+techniques for training score-based generative models". The score s(x, i) is the gradient by x of the log density of
+data plus noise of standard deviation sigma_i.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.registry import Registry
+
+Score = Callable[[Tensor, Tensor], Tensor]
+"""s(x, i): images (B, C, H, W) and the number of each one's noise level, (B,) int64, to (B, C, H, W)."""
+
+SPACINGS: Registry[Callable[[float, float, int], np.ndarray]] = Registry(
+    "spacing of noise levels", geometric=np.geomspace, uniform=np.linspace
+)
+
+
+def noise_levels(first: float, last: float, levels: int, spacing: str = "geometric") -> Tensor:
+    """sigma_0 = first > ... > sigma_{L-1} = last, (levels,) float32.
+
+    Raises:
+        InputError: an unknown spacing, or last above first.
+    """
+    if last > first:
+        raise InputError(f"noise levels fall from {first:g} and cannot reach {last:g}.")
+    return torch.from_numpy(SPACINGS[spacing](first, last, levels).astype(np.float32))
+
+
+def step_sizes(sigmas: Tensor, rate: float) -> Tensor:
+    """e_i = rate (sigma_i / sigma_{L-1})^2, (L,): every level then has the same signal to noise in a step."""
+    return rate * (sigmas / sigmas[-1]).square()
+
+
+def score_loss(score: Score, x: Tensor, noise: Tensor, labels: Tensor, sigmas: Tensor, power: float = 2.0) -> Tensor:
+    """Denoising score matching, sigma^power / 2 |s(x + sigma n, i) + n / sigma|^2 of each image, (B,).
+
+    With power 2 every level weighs the same (2019, eq. 6).
+
+    Args:
+        x: Images, (B, C, H, W).
+        noise: n, standard normal, of their shape.
+        labels: i, the noise level of each, (B,) int64.
+        sigmas: Of all levels, (L,).
+    """
+    sigma = sigmas[labels][:, None, None, None]
+    error = score(x + sigma * noise, labels) + noise / sigma
+    return error.square().flatten(1).sum(1) * sigmas[labels] ** power / 2
+
+
+def annealed_langevin(
+    score: Score,
+    x: Tensor,
+    sigmas: Tensor,
+    noise: Callable[[int], Tensor],
+    rate: float = 6.2e-6,
+    steps: int = 5,
+    denoise: bool = True,
+    pull: Callable[[Tensor], Tensor] | None = None,
+) -> Iterator[Tensor]:
+    """The states of annealed Langevin dynamics (2019, algorithm 1), after each evaluation of the score.
+
+    `steps` times at each level i, from the first to the last: x <- x + e_i s(x, i) + sqrt(2 e_i) z with e_i of
+    `step_sizes`. Then, where it is asked for, the noise that the last level leaves is taken off (2020, section 3.3):
+    x <- x + sigma_{L-1}^2 s(x, L-1).
+
+    Args:
+        x: Where it starts, (B, C, H, W).
+        sigmas: Of all levels, (L,).
+        noise: z of step k = 1, 2, ..., counted over all levels, of x's shape.
+        denoise: Whether the last noise is taken off.
+        pull: Added in every step, a function of the state before it: the gradient of a likelihood, as `toward`. The
+            last denoising adds that of the step before once more, and the state after it is pulled once again: so
+            LiDARGen completes scans.
+    """
+    number, sizes = 0, step_sizes(sigmas, rate).tolist()
+    pulled: Tensor | float = 0.0
+    for level, size in enumerate(sizes):
+        labels = torch.full((len(x),), level, device=x.device)
+        for _ in range(steps):
+            number += 1
+            if pull is not None:
+                pulled = pull(x)
+            x = x + size * score(x, labels) + math.sqrt(2 * size) * noise(number) + pulled
+            if number < len(sizes) * steps or denoise or pull is None:
+                yield x
+    if denoise:
+        x = x + sigmas[-1].square() * score(x, torch.full((len(x),), len(sizes) - 1, device=x.device)) + pulled
+    if pull is not None:
+        x = x + pull(x)
+    if denoise or pull is not None:
+        yield x
+
+
+def toward(image: Tensor, mask: Tensor, strength: float = 0.1) -> Callable[[Tensor], Tensor]:
+    """strength mask (image - x): pulls the known pixels to their values (Zyrianov et al. 2022, "Learning to generate
+    realistic LiDAR point clouds", eq. 8); their 4-beam scans know every 16th row."""
+
+    def pull(x: Tensor) -> Tensor:
+        return strength * mask * (image - x)
+
+    return pull

@@ -1,0 +1,136 @@
+"""Generators in a smaller space than the image's: LiDM's autoencoder, and the diffusion of its latents."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from r2flow.backbones.autoencoder import Autoencoder
+from r2flow.backbones.latent_unet import LatentUNet
+from r2flow.diffusion.ddim import ddim, ddim_walk, eta_of, square_root_linear, tables
+from r2flow.errors import InputError
+from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
+from r2flow.lidar.space import ModelSpace
+from r2flow.noise import Draws
+from r2flow.registry import Count, Positive, check_options
+
+
+def build_autoencoder(space: ModelSpace, options: Mapping[str, Any] | None) -> Autoencoder:
+    """The autoencoder of a config's `generator.autoencoder`, for the images of a space."""
+    check_options("generator.autoencoder", Autoencoder, options or {}, given=1)
+    return Autoencoder(space.shape[0], **(options or {}))
+
+
+class VQAutoencoder(Generator):
+    """An autoencoder by itself, on the way to a `LatentDiffusion`. It makes no scans of noise.
+
+    Args:
+        space: The images that it learns.
+        backbone: Not used.
+        autoencoder: Options of `r2flow.backbones.autoencoder.Autoencoder`.
+    """
+
+    def __init__(
+        self, space: ModelSpace, backbone: Mapping[str, Any], autoencoder: Mapping[str, Any] | None = None
+    ) -> None:
+        super().__init__(space)
+        self.first_stage_model = build_autoencoder(space, autoencoder)
+        self.noise_shape = self.first_stage_model.latent_shape(*space.shape[1:])
+
+    def generate(self, noise: Tensor, condition: Condition | None = None, **options: Any) -> Generated:
+        raise InputError(
+            "an autoencoder turns scans into latents and back and makes none of noise: give the checkpoint of a latent "
+            "diffusion, or train one with experiment=lidm stage.init=FILE."
+        )
+
+
+class LatentDiffusion(Generator):
+    """eps(z_t, t) by a U-Net on an autoencoder's latents, sampled by DDIM and decoded: LiDM (Ran et al. 2024).
+
+    Latents become codes when they are decoded, not before. The sampler `ddim:ETA` takes every (N // steps)-th of the
+    diffusion's N steps, `r2flow.diffusion.ddim.ddim_walk`.
+
+    Args:
+        space: The images it makes.
+        backbone: Not used.
+        autoencoder: Options of `r2flow.backbones.autoencoder.Autoencoder`.
+        unet: Options of `r2flow.backbones.latent_unet.LatentUNet`; `position: learnable` is LiDM + APE.
+        beta_first, beta_last: Of `r2flow.diffusion.ddim.square_root_linear`.
+        diffusion_steps: N.
+    """
+
+    alpha_bar: Tensor
+
+    def __init__(
+        self,
+        space: ModelSpace,
+        backbone: Mapping[str, Any],
+        autoencoder: Mapping[str, Any] | None = None,
+        unet: Mapping[str, Any] | None = None,
+        beta_first: Positive = 0.0015,
+        beta_last: Positive = 0.0195,
+        diffusion_steps: Count = 1000,
+    ) -> None:
+        super().__init__(space)
+        self.sampler = Sampler("ddim:1", 50)
+        self.first_stage_model = build_autoencoder(space, autoencoder)
+        self.noise_shape = shape = self.first_stage_model.latent_shape(*space.shape[1:])
+        check_options("generator.unet", LatentUNet, unet or {}, given=1)
+        self.model = nn.ModuleDict({"diffusion_model": LatentUNet(shape, **(unet or {}))})
+        with torch.device("cpu"):
+            beta = square_root_linear(beta_first, beta_last, diffusion_steps)
+        self.register_buffer("alpha_bar", tables(beta).alpha_bar.float(), persistent=False)
+
+    @property
+    def unet(self) -> LatentUNet:
+        """The network eps(z, t)."""
+        network = self.model["diffusion_model"]
+        assert isinstance(network, LatentUNet)
+        return network
+
+    @torch.no_grad()
+    def generate(
+        self,
+        noise: Tensor,
+        condition: Condition | None = None,
+        *,
+        sampler: Sampler | None = None,
+        draws: Draws | None = None,
+        progress: Progress = None,
+    ) -> Generated:
+        if condition is not None:
+            raise InputError("a latent diffusion was trained without a condition and cannot take one.")
+        how, z = sampler or self.sampler, noise.to(self.device)
+        eta = eta_of(how.method)
+        if eta and draws is None:
+            raise InputError(f"{how.method} draws noise in every step: give draws.")
+
+        def fresh(step: int) -> Tensor:
+            assert draws is not None
+            return draws.step(self.noise_shape, step).to(z)
+
+        walk = ddim_walk(self.alpha_bar.double(), how.steps, eta)
+        for state, _ in ddim(self.unet, z, walk, fresh):
+            z = state
+            if progress is not None:
+                progress()
+        return Generated.after(self.first_stage_model.decode(z), len(walk.times))
+
+    def check_sampler(self, sampler: Sampler) -> None:
+        eta = eta_of(sampler.method)
+        ddim_walk(self.alpha_bar, sampler.steps, eta)
+        if sampler != Sampler(sampler.method, sampler.steps, sampler.tolerance):
+            raise InputError("a latent diffusion's steps are its own: leave the time grid, finish and levels out.")
+
+    def evaluations_of(self, sampler: Sampler) -> int:
+        return len(ddim_walk(self.alpha_bar, sampler.steps, 0.0).times)
+
+    def start_from(self, parent: Generator) -> None:
+        """Take over an autoencoder's weights, or another latent diffusion's.
+
+        Raises:
+            InputError: the autoencoder is another one, or the parent is neither.
+        """
+        new = self.state_dict() if isinstance(parent, VQAutoencoder) else {}
+        self._take(parent, {**new, **parent.state_dict()})

@@ -1,0 +1,61 @@
+"""LiDARGen's published checkpoints: a list of weights, optimizer, epoch, step and averaged weights.
+
+The file says neither the size of its images nor their ranges: they are the published ones, 64 x 1024 and 0.5 to 63 m.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.published.format import Format, Published
+
+NETWORK = "network."  # in the generator
+WRAPPED = "module."  # by torch's DataParallel
+FIRST, LAST = "begin_conv.weight", "end_conv.weight"
+SENSOR = {"name": "hdl64e", "rows": 64, "columns": 1024, "min_range": 0.5, "max_range": 63.0}
+
+
+def holds(content: Any) -> bool:
+    return (
+        isinstance(content, list)
+        and len(content) in (4, 5)
+        and isinstance(content[0], Mapping)
+        and WRAPPED + FIRST in content[0]
+    )
+
+
+def read(content: Any, path: Path, averaged: bool = True) -> Published:
+    """A published score model; its averaged weights lack the buffers, and files without them have the raw ones."""
+    try:
+        raw: dict[str, Tensor] = {name.removeprefix(WRAPPED): value for name, value in content[0].items()}
+        average = {name.removeprefix(WRAPPED): value for name, value in dict(*content[4:]).items()}
+        sigmas, step = raw["sigmas"], int(content[3])
+        config = {
+            "sensor": dict(SENSOR),
+            "encoding": {"format": "shifted_log", "reflectance": len(raw[LAST]) > 1, "limits": "open"},
+            "backbone": {"name": "refinenet"},
+            "generator": {
+                "name": "score",
+                "width": len(raw[FIRST]),
+                "sigma_first": float(f"{sigmas[0]:.6g}"),
+                "sigma_last": float(f"{sigmas[-1]:.6g}"),
+                "levels": len(sigmas),
+            },
+            "data": {"name": "kitti_360", "projection": "spherical", "convention": "reference"},
+            "published": {"system": "LiDARGen"},
+        }
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise InputError(f"{path}: the published LiDARGen checkpoint lacks or garbles {error}.") from None
+    weights = {**raw, **average} if averaged else raw
+    return Published(
+        config,
+        {NETWORK + name: value for name, value in weights.items()},
+        step,
+        {"method": "langevin", "steps": 5},
+    )
+
+
+FORMAT = Format("LiDARGen", holds, read)

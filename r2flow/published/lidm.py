@@ -1,0 +1,184 @@
+"""LiDM's published checkpoints: Lightning's dict, whose state_dict holds a latent diffusion with its autoencoder, or an
+autoencoder alone.
+
+The files say neither the size of the images nor the width of attention heads. Both are in the `config.yaml` that is
+published with them: where that lies beside a file it is read, else they are 64 x 1024 and 32, as in all of them.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from torch import Tensor
+
+from r2flow.backbones.autoencoder import UP
+from r2flow.errors import InputError
+from r2flow.lidar.encoding import ShiftedLog
+from r2flow.lidar.sensors import build_sensor
+from r2flow.published.format import Format, Published
+
+UNET, AUTOENCODER, AVERAGE = "model.diffusion_model.", "first_stage_model.", "model_ema."
+FIRST, CODES = "encoder.conv_in.weight", "quantize.embedding.weight"
+STRIDES = {kernel: list(stride) for stride, (kernel, _) in UP.items()}
+SIZE, RANGES, VIEW, HEAD = (64, 1024), (1.0, 56.0), (3, -25), 32
+
+
+def _state(content: Any) -> Mapping[str, Tensor]:
+    state = content.get("state_dict") if isinstance(content, Mapping) else None
+    return state if isinstance(state, Mapping) else {}
+
+
+def holds_diffusion(content: Any) -> bool:
+    state = _state(content)
+    return UNET + "time_embed.0.weight" in state and AUTOENCODER + FIRST in state
+
+
+def holds_autoencoder(content: Any) -> bool:
+    return {FIRST, CODES} <= _state(content).keys()
+
+
+def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published:
+    """A published latent diffusion, with its averaged weights, whose names have lost their dots."""
+    state = _state(content)
+    params = _params(path)
+    try:
+        raw = {name: value for name, value in state.items() if name.startswith((UNET, AUTOENCODER))}
+        average = {name: state.get(_undotted(name), value) for name, value in raw.items()}
+        head = int(params.get("unet_config", {}).get("params", {}).get("num_head_channels", HEAD))
+        generator = {
+            "name": "latent_diffusion",
+            "autoencoder": _autoencoder(_within(raw, AUTOENCODER)),
+            "unet": {**_unet(_within(raw, UNET)), "head_channels": head},
+            "beta_first": float(f"{state['betas'][0]:.6g}"),
+            "beta_last": float(f"{state['betas'][-1]:.6g}"),
+            "diffusion_steps": len(state["betas"]),
+        }
+        config = _config(generator, path)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise _garbled(error, path) from None
+    weights = average if averaged else raw
+    return Published(config, dict(weights), _step(content), {"method": "ddim:1", "steps": 50})
+
+
+def read_autoencoder(content: Any, path: Path, averaged: bool = True) -> Published:
+    """A published autoencoder; its discriminator is left out."""
+    raw = {name: value for name, value in _state(content).items() if not name.startswith("loss.")}
+    try:
+        config = _config({"name": "vq_autoencoder", "autoencoder": _autoencoder(raw)}, path)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise _garbled(error, path) from None
+    return Published(config, {AUTOENCODER + name: value for name, value in raw.items()}, _step(content))
+
+
+def _garbled(error: Exception, path: Path) -> InputError:
+    if isinstance(error, InputError):
+        return error
+    return InputError(f"{path}: the published LiDM checkpoint lacks or garbles {error}.")
+
+
+def _undotted(name: str) -> str:
+    return AVERAGE + name.removeprefix("model.").replace(".", "")
+
+
+def _within(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+
+
+def _step(content: Mapping[str, Any]) -> int:
+    return int(content.get("global_step", 0))
+
+
+def _counted(names: Mapping[str, Tensor], form: str) -> int:
+    """How many of form.format(0), form.format(1), ... there are."""
+    count = 0
+    while form.format(count) in names:
+        count += 1
+    return count
+
+
+def _autoencoder(state: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Options of `Autoencoder` from the shapes of its weights."""
+    levels = _counted(state, "encoder.down.{}.block.0.conv1.weight")
+    width, channels = state[FIRST].shape[:2]
+    codes, code_channels = state[CODES].shape
+    up = [state[f"decoder.up.{level}.upsample.conv.weight"].shape[2:] for level in range(1, levels)]
+    return {
+        "width": width,
+        "multipliers": [len(state[f"encoder.down.{level}.block.0.conv1.weight"]) // width for level in range(levels)],
+        "strides": [STRIDES[rows, columns] for rows, columns in up],
+        "blocks": _counted(state, "encoder.down.0.block.{}.conv1.weight"),
+        "attention": [level for level in range(levels) if f"encoder.down.{level}.attn.0.q.weight" in state],
+        "latent_channels": len(state["encoder.conv_out.weight"]),
+        "code_channels": code_channels,
+        "codes": codes,
+        "legacy": True,
+        "mask": len(state["decoder.conv_out.weight"]) > channels,
+    }
+
+
+def _unet(state: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Options of `LatentUNet` from the names and shapes of its weights."""
+    width, block = len(state["input_blocks.0.0.weight"]), 1
+    multipliers, counts, attention = [], [0], set()
+    while any(name.startswith(f"input_blocks.{block}.") for name in state):
+        if f"input_blocks.{block}.0.op.weight" in state:
+            counts.append(0)
+        else:
+            counts[-1] += 1
+            if counts[-1] == 1:
+                multipliers.append(len(state[f"input_blocks.{block}.0.in_layers.2.weight"]) // width)
+            if f"input_blocks.{block}.1.qkv.weight" in state:
+                attention.add(2 ** (len(counts) - 1))
+        block += 1
+    return {"width": width, "multipliers": multipliers, "blocks": counts[0], "attention": sorted(attention)}
+
+
+def _beside(path: Path) -> Mapping[str, Any]:
+    """The published `config.yaml` beside a file; nothing where there is none."""
+    file = path.with_name("config.yaml")
+    if not file.is_file():
+        return {}
+    try:
+        found = yaml.safe_load(file.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f"{file}, beside {path.name}, cannot be read: {' '.join(str(error).split())}.") from None
+    return found if isinstance(found, Mapping) else {}
+
+
+def _params(path: Path) -> Mapping[str, Any]:
+    model = _beside(path).get("model")
+    params = model.get("params") if isinstance(model, Mapping) else None
+    return params if isinstance(params, Mapping) else {}
+
+
+def _config(generator: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The config of a file, with what its `config.yaml` says of the data.
+
+    Raises:
+        InputError: a field of view or a scale of the ranges that LiDM's published images do not have.
+    """
+    data = _beside(path).get("data") or {}
+    images = (data.get("params") or {}).get("dataset") or {}
+    rows, columns = (int(size) for size in images.get("size", SIZE))
+    nearest, farthest = (float(limit) for limit in images.get("depth_range", RANGES))
+    if tuple(images.get("fov", VIEW)) != VIEW:
+        raise InputError(f"{path}: LiDM's images see from 3 to -25 degrees, its config.yaml says {images['fov']}.")
+    logarithmic = bool(images.get("log_scale", True))
+    sensor = {"name": "hdl64e", "rows": rows, "columns": columns, "min_range": nearest, "max_range": farthest}
+    own = ShiftedLog(build_sensor(**sensor)).scale if logarithmic else farthest  # type: ignore[arg-type]
+    scale = float(images.get("depth_scale", own))
+    if abs(scale - own) > 1e-6:
+        raise InputError(f"{path}: ranges up to {farthest:g} m have the scale {own:g}, its config.yaml says {scale:g}.")
+    return {
+        "sensor": sensor,
+        "encoding": {"format": "shifted_log" if logarithmic else "metric", "reflectance": False, "limits": "open"},
+        "backbone": {"name": "latent_unet"},
+        "generator": generator,
+        "data": {"name": "kitti_360", "projection": "spherical", "convention": "reference"},
+        "published": {"system": "LiDM"},
+    }
+
+
+DIFFUSION = Format("LiDM", holds_diffusion, read_diffusion)
+FIRST_STAGE = Format("LiDM's autoencoder", holds_autoencoder, read_autoencoder)

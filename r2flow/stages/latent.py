@@ -1,0 +1,143 @@
+"""LiDM's two stages: an autoencoder that a discriminator sharpens, and the diffusion of its latents."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from r2flow.adversarial.hinge import adaptive_weight, adversarial_factor, hinge_loss, reconstruction_loss
+from r2flow.backbones.patch_discriminator import PatchDiscriminator
+from r2flow.diffusion.ddim import noise_loss
+from r2flow.errors import InputError
+from r2flow.generators import Generator, LatentDiffusion, VQAutoencoder
+from r2flow.lidar.encoding import Encoding
+from r2flow.registry import Natural, NonNegative, check_options
+from r2flow.stages.base import Batch, SingleLoss, Stage
+
+LEAST = 1 / 255  # metres: what is nearer is no return
+
+
+def returns(x: Tensor, encoding: Encoding) -> Tensor:
+    """1 where a ray of images in model space returns and -1 where it does not, (B, 1, H, W)."""
+    least = encoding.format.forward(torch.full((1, 1, 1), LEAST - 1e-4, device=x.device))
+    return torch.where(x[:, :1] < 2 * least - 1 + 1e-6, -1.0, 1.0)
+
+
+class LearnAutoencoder(Stage):
+    """Reconstruction, codebook and a patch discriminator: R + f w A + c Q for the autoencoder, f H for the latter.
+
+    R is the mean absolute error, A the discriminator's verdict, w `adaptive_weight`, Q the quantiser's loss, H the
+    hinge loss and f `adversarial_factor`, all of `r2flow.adversarial.hinge` (Esser et al. 2021).
+
+    Args:
+        generator: A `VQAutoencoder`.
+        discriminator: Options of `PatchDiscriminator`: width and layers.
+        adversarial_weight: In w.
+        adversarial_start: Step that f changes at.
+        inverted: Whether f is 1 up to that step and 0 after it, as in the published code, and not the other way round.
+        codebook_weight: c.
+        mask_factor: Weight of the mask's error, of an autoencoder with a mask.
+        options: Those of `Stage`. The learning rate does not fall.
+    """
+
+    generator_name = "vq_autoencoder"
+    anneals = False
+
+    def __init__(
+        self,
+        generator: Generator,
+        discriminator: Mapping[str, Any] | None = None,
+        adversarial_weight: NonNegative = 0.6,
+        adversarial_start: Natural = 1,
+        inverted: bool = False,
+        codebook_weight: NonNegative = 1.0,
+        mask_factor: NonNegative = 1.0,
+        **options: Any,
+    ) -> None:
+        super().__init__(generator, **options)
+        if not isinstance(generator, VQAutoencoder):
+            raise InputError(f"this stage learns an autoencoder, which a {type(generator).__name__} is not.")
+        self.automatic_optimization = False
+        check_options("stage.discriminator", PatchDiscriminator, discriminator or {}, given=1)
+        self.autoencoder = generator.first_stage_model
+        channels = generator.space.shape[0] + self.autoencoder.mask
+        self.discriminator = PatchDiscriminator(channels, **(discriminator or {}))
+        self.adversarial_weight, self.codebook_weight = adversarial_weight, codebook_weight
+        self.adversarial_start, self.inverted = adversarial_start, inverted
+        self.mask_factor = mask_factor
+
+    def configure_optimizers(self) -> Any:
+        return self.optimizers_for(self.autoencoder.parameters(), self.discriminator.parameters())
+
+    def mask_of(self, x: Tensor) -> Tensor | None:
+        """`returns` of images, for an autoencoder with a mask."""
+        return returns(x, self.generator.space.encoding) if self.autoencoder.mask else None
+
+    def over_processes(self, value: Tensor) -> Tensor:
+        """The mean of a value over all processes."""
+        if self.trainer.world_size == 1:
+            return value
+        gathered = self.all_gather(value)
+        assert isinstance(gathered, Tensor)
+        return gathered.mean(0)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> None:
+        for_autoencoder, for_discriminator = self.own_optimizers()
+        x = batch["x_1"]
+        mask = self.mask_of(x)
+        factor = adversarial_factor(self.global_step, self.adversarial_start, self.inverted)
+        made, quantised = self.autoencoder(x)
+        reconstruction = reconstruction_loss(x, made, mask, self.mask_factor)
+        loss = reconstruction + self.codebook_weight * quantised.loss
+        if factor:
+            adversarial = -self.discriminator(made).mean()
+            last = self.autoencoder.decoder.conv_out.weight
+            weight = adaptive_weight(
+                reconstruction, adversarial, last, self.adversarial_weight, self.over_processes
+            )  # fmt: skip
+            loss = loss + factor * weight * adversarial
+        self.take_step(for_autoencoder, loss)
+        real = x if mask is None else torch.cat([x, mask], 1)
+        judged = hinge_loss(self.discriminator(real), self.discriminator(made.detach()))
+        self.take_step(for_discriminator, factor * judged)
+        self.log("train/loss", reconstruction, prog_bar=True, sync_dist=True)
+        self.log("train/codebook", quantised.loss, sync_dist=True)
+        self.log("train/discriminator", judged, sync_dist=True)
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        x = batch["x_1"]
+        loss = reconstruction_loss(x, self.autoencoder(x)[0], self.mask_of(x), self.mask_factor)
+        self.log("val/loss", loss, prog_bar=True, batch_size=len(x), sync_dist=True)
+
+
+class LearnLatentDiffusion(SingleLoss):
+    """Mean squared error of the noise in a trained autoencoder's latents, at steps drawn uniformly.
+
+    Args:
+        generator: A `LatentDiffusion`, whose autoencoder stays as it is.
+        options: Those of `Stage`. The learning rate does not fall.
+    """
+
+    generator_name = "latent_diffusion"
+    needs_parent = True
+    anneals = False
+
+    def __init__(self, generator: Generator, **options: Any) -> None:
+        super().__init__(generator, **options)
+        if not isinstance(generator, LatentDiffusion):
+            raise InputError(f"this stage learns a diffusion of latents, which a {type(generator).__name__} has not.")
+        generator.first_stage_model.requires_grad_(False)
+
+    def configure_optimizers(self) -> Any:
+        assert isinstance(self.generator, LatentDiffusion)
+        return self.optimizers_for(self.generator.unet.parameters())
+
+    def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
+        """Mean over images at the steps that u in [0, 1) falls on, (B,)."""
+        diffusion = self.generator
+        assert isinstance(diffusion, LatentDiffusion)
+        with torch.no_grad():
+            z = diffusion.first_stage_model.eval().encode(batch["x_1"])
+        t = (u * len(diffusion.alpha_bar)).to(torch.int64)
+        return noise_loss(diffusion.unet, z, t, batch["x_0"], diffusion.alpha_bar).mean()

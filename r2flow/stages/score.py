@@ -1,0 +1,39 @@
+"""Score matching: a network learns the gradient of the log density of noised scans."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from r2flow.diffusion.langevin import score_loss
+from r2flow.errors import InputError
+from r2flow.generators import Generator, ScoreModel
+from r2flow.registry import NonNegative
+from r2flow.stages.base import Batch, SingleLoss
+
+
+class MatchScore(SingleLoss):
+    """Denoising score matching at all noise levels alike (`r2flow.diffusion.langevin.score_loss`).
+
+    Args:
+        generator: A `ScoreModel`.
+        power: Of sigma in the weight of each level.
+        options: Those of `Stage`. The learning rate does not fall.
+    """
+
+    generator_name = "score"
+    anneals = False
+
+    def __init__(self, generator: Generator, power: NonNegative = 2.0, **options: Any) -> None:
+        super().__init__(generator, **options)
+        if not isinstance(generator, ScoreModel):
+            raise InputError(f"this stage learns a score, which a {type(generator).__name__} does not have.")
+        self.power = power
+
+    def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
+        """Mean over images at the noise levels that u in [0, 1) falls on, (B,)."""
+        assert isinstance(self.generator, ScoreModel)
+        network = self.generator.network
+        labels = (u * len(network.sigmas)).to(torch.int64)
+        x = (batch["x_1"] + 1) / 2
+        return score_loss(network, x, batch["x_0"], labels, network.sigmas, self.power).mean()

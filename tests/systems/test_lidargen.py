@@ -1,0 +1,221 @@
+"""LiDARGen against its published code: network, objective, sampler, data and checkpoints."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from published_cases import assert_near, assert_norms, load_case
+
+from r2flow.backbones.refinenet import InstanceNormPlus, RefineNet
+from r2flow.callbacks.ema import DECAYS
+from r2flow.checkpoints import load_checkpoint
+from r2flow.diffusion.langevin import annealed_langevin, noise_levels, score_loss, step_sizes, toward
+from r2flow.errors import InputError
+from r2flow.generators import build_generator
+from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.projection import project_indices
+from r2flow.lidar.sensors import build_sensor
+from r2flow.noise import Draws
+
+TINY = {
+    "sensor": {"name": "hdl64e", "rows": 8, "columns": 16, "min_range": 0.5, "max_range": 63.0},
+    "encoding": {"format": "shifted_log", "limits": "open"},
+    "backbone": {"name": "refinenet"},
+    "generator": {"name": "score", "width": 4, "levels": 3},
+}
+
+
+def network_of(case: dict) -> RefineNet:
+    model = case["cfg"]["model"]
+    sigmas = noise_levels(model["sigma_begin"], model["sigma_end"], model["num_classes"], model["sigma_dist"])
+    network = RefineNet(sigmas, case["cfg"]["data"]["channels"], model["ngf"])
+    network.load_state_dict(case["state_dict"])
+    return network
+
+
+def test_output_and_gradients_are_the_published_network_s(shared: Path):
+    case = load_case(shared, "lidargen_net_16x64.pt")
+    network, x = network_of(case), case["inputs"]["x"].clone().requires_grad_()
+    output = network(x, case["inputs"]["y"])
+    assert_near(output, case["outputs"]["output"], 1e-4)
+    (output * case["grad_w"]["output"]).sum().backward()
+    assert_near(x.grad, case["grad_inputs"]["x"], 1e-3)
+    assert_norms(network, case["grad_param_norms"])
+
+
+def test_the_full_network_has_the_published_names_and_shapes(shared: Path):
+    with torch.device("meta"):
+        network = RefineNet(torch.empty(232))
+    assert sum(p.numel() for p in network.parameters()) == 29_694_082
+    known = json.loads((shared / "oracle_baselines" / "state_dict_keys.json").read_text())["lidargen"]
+    assert {name: list(value.shape) for name, value in network.state_dict().items()} == dict(known["names"])
+
+
+def test_instance_norm_plus_gives_channels_their_means_back():
+    torch.manual_seed(0)
+    norm, x = InstanceNormPlus(4), torch.randn(2, 4, 6, 8) + torch.arange(4.0)[None, :, None, None]
+    means = norm(x).mean((2, 3))  # what is left of each channel's mean: gamma alpha standardised + beta
+    for row, of in zip(means, x, strict=True):
+        own = of.mean((1, 2))
+        expected = norm.gamma * norm.alpha * (own - own.mean()) / (own.var() + 1e-5).sqrt() + norm.beta
+        torch.testing.assert_close(row, expected, rtol=0, atol=1e-5)
+
+
+def test_noise_levels_and_step_sizes_are_the_published(shared: Path):
+    case = load_case(shared, "lidargen_objective.pt")
+    sigmas = noise_levels(50, 0.01, 232)
+    assert_near(sigmas, case["sigmas_232"], 1e-6)
+    assert_near(step_sizes(sigmas, 6.2e-6), case["step_sizes_232"], 1e-6)
+    assert_near(noise_levels(50, 0.01, 232, "uniform"), case["sigmas_uniform"], 1e-6)
+
+
+@pytest.mark.parametrize("name", ["loss_power2", "loss_power1"])
+def test_loss_and_gradients_are_the_published(shared: Path, name: str):
+    case = load_case(shared, "lidargen_objective.pt")
+    network, own = network_of(case), case[name]
+    loss = score_loss(network, own["x"], own["noise"], own["labels"], own["sigmas"], own["anneal_power"])
+    assert_near(loss, own["per_sample"], 1e-5)
+    assert_near(loss.mean(), own["loss"], 1e-5)
+    loss.mean().backward()
+    assert_norms(network, own["grad_param_norms"])
+
+
+def test_the_score_of_a_gaussian_has_the_least_loss():
+    torch.manual_seed(0)
+    sigmas, labels = torch.tensor([2.0]), torch.zeros(20_000, dtype=torch.int64)
+    x, noise = (torch.randn(20_000, 1, 1, 1) for _ in range(2))
+    losses = [score_loss(lambda y, _, k=k: -y / k, x, noise, labels, sigmas).mean() for k in (4.5, 5.0, 5.5)]
+    assert losses[1] == min(losses)  # the noised data have variance 1 + 2^2
+    assert losses[1].item() == pytest.approx(0.5 * 1 / 5, rel=0.05)  # Var[x | x + 2 n] / (2 * 4) = (4 / 5) / 8
+
+
+def test_average_and_optimiser_are_the_published(shared: Path):
+    case = load_case(shared, "lidargen_objective.pt")
+    own, average = case["ema"], case["ema"]["ema"][0]
+    for step, (weights, expected) in enumerate(zip(own["online"][1:], own["ema"][1:], strict=True)):
+        average = average + (1 - DECAYS["constant"](step, 0, own["mu"])) * (weights - average)
+        assert_near(average, expected, 1e-6)
+
+
+def test_annealed_langevin_is_the_published(shared: Path):
+    case = load_case(shared, "lidargen_sampling.pt")
+    network, own = network_of(case), case["annealed"]
+    with torch.no_grad():
+        path = list(
+            annealed_langevin(
+                network, own["start"], own["sigmas"], lambda k: own["noise"][k - 1], own["step_lr"],
+                own["n_steps_each"], own["denoise"],
+            )
+        )  # fmt: skip
+    assert len(path) == 10 * 5 + 1
+    for level, expected in enumerate(own["after_each_level"]):
+        assert_near(path[5 * level + 4], expected, 1e-4)
+    assert_near(path[-1], own["output"], 1e-4)
+    assert_near(path[-1].clamp(0, 1), own["output_clamped"], 1e-4)
+
+
+def test_langevin_dynamics_draws_from_the_score_s_distribution():
+    torch.manual_seed(0)
+    sigmas = noise_levels(2.0, 0.1, 30)
+    start = torch.rand(4000, 1, 1, 1)
+
+    def score(x, labels):  # of N(3, 1) and the level's noise
+        return (3 - x) / (1 + sigmas[labels][:, None, None, None] ** 2)
+
+    *_, end = annealed_langevin(score, start, sigmas, lambda _: torch.randn_like(start), rate=1e-3, steps=20)
+    assert end.mean().item() == pytest.approx(3, abs=0.1)
+    assert end.std().item() == pytest.approx(1, abs=0.1)
+
+
+def test_known_pixels_pull_in_every_step_and_once_more_at_the_end():
+    # Without a score and without noise a known pixel's distance to its value shrinks by 1 - 0.1 in every step. The
+    # last denoising repeats the pull of the step before, 0.1 of the distance before it; then it shrinks once more.
+    x, image = torch.zeros(1, 1, 4, 2), torch.ones(1, 1, 4, 2)
+    mask = torch.zeros(1, 1, 4, 2)
+    mask[:, :, ::2] = 1
+    path = list(
+        annealed_langevin(
+            lambda x, _: torch.zeros_like(x), x, noise_levels(1, 0.1, 3), lambda _: torch.zeros(()), steps=2,
+            pull=toward(image, mask, 0.1),
+        )
+    )  # fmt: skip
+    assert len(path) == 7
+    assert (path[-1][:, :, 1::2] == 0).all()
+    known = 1 - path[-1][:, :, ::2]
+    expected = (0.9**6 - 0.1 * 0.9**5) * 0.9
+    torch.testing.assert_close(known, torch.full_like(known, expected))
+
+
+def test_ranges_and_intensities_are_encoded_and_decoded_as_published(shared: Path):
+    case = load_case(shared, "lidargen_data.pt")
+    encoding = Encoding(build_sensor("hdl64e", 16, 64, 0.5, 63.0), "shifted_log")
+    # The published code encodes ranges beyond the limits too; no image of ours has them, so limits stay closed here.
+    image = torch.stack([case["metres"], case["intensity"].clamp(0, 1)])
+    assert_near((encoding.encode(image) + 1) / 2, case["model_space"], 1e-6)
+    encoding = Encoding(encoding.sensor, "shifted_log", reflectance=False, limits="open")
+    decoded = encoding.decode(2 * case["model_space_in"][None] - 1)[0]
+    sure = (case["metres_back"] - 63).abs() > 1e-4
+    assert torch.equal((decoded > 0)[sure], case["valid"][sure])
+    assert_near(torch.where(case["valid"], decoded, 0), torch.where(case["valid"], case["metres_back"], 0), 1e-6)
+
+
+def test_points_fall_into_the_published_pixels(shared: Path):
+    case = load_case(shared, "lidargen_data.pt")
+    sensor = build_sensor("hdl64e", 16, 64, 1e-3, 1e3)  # the published projection knows no limits
+    points = case["points"].numpy()
+    hit, chosen, r = project_indices(points[:, :3], sensor, convention="reference")
+    index = np.full(16 * 64, -1)
+    index[hit] = chosen
+    assert np.array_equal(index.reshape(16, 64), case["proj_index"].numpy())
+    ranges = np.full(16 * 64, -1.0)
+    ranges[hit] = r
+    assert_near(torch.from_numpy(ranges).view(16, 64), case["proj_range"], 1e-6)
+
+
+@pytest.mark.parametrize("averaged", [True, False])
+def test_a_published_checkpoint_gives_its_scores(shared: Path, averaged: bool):
+    io = load_case(shared, "lidargen_published_io.pt")
+    loaded = load_checkpoint(shared / "oracle_baselines" / "lidargen_published.pth", averaged=averaged)
+    assert loaded.generator.space.shape == (2, 64, 1024)
+    with torch.no_grad():
+        output = loaded.generator.network(io["x"], io["y"])
+    assert_near(output, io["output_ema" if averaged else "output_weights"], 1e-4)
+    assert loaded.generator.evaluations_of(loaded.generator.sampler) == 10 * 5 + 1
+
+
+def test_a_garbled_checkpoint_is_one_line(tmp_path: Path):
+    path = tmp_path / "checkpoint.pth"
+    torch.save([{"module.begin_conv.weight": torch.zeros(4, 4, 3, 3)}, {}, 1, 2, {}], path)
+    with pytest.raises(InputError, match="lacks or garbles 'sigmas'"):
+        load_checkpoint(path)
+
+
+def test_a_scan_is_a_function_of_its_number_alone():
+    torch.manual_seed(0)
+    generator = build_generator(TINY)
+    shape = generator.noise_shape
+    three, one = Draws(0, [4, 5, 6]), Draws(0, [5])
+    many = generator.generate(three.start(shape), draws=three)
+    alone = generator.generate(one.start(shape), draws=one)
+    torch.testing.assert_close(many.x[1:2], alone.x, rtol=0, atol=1e-4)
+    assert many.x.abs().max() <= 1
+    assert many.evaluations.tolist() == [3 * 5 + 1] * 3
+
+
+def test_known_pixels_stay_near_their_values():
+    torch.manual_seed(0)
+    generator = build_generator(TINY)
+    draws, shape = Draws(0, [0]), generator.noise_shape
+    mask = torch.zeros(1, 1, 8, 16)
+    mask[:, :, ::4] = 1
+    made = generator.generate(draws.start(shape), {"image": torch.full((1, *shape), 0.5), "mask": mask}, draws=draws).x
+    known, unknown = (made[:, :, start::4] for start in (0, 2))
+    assert (known - 0.5).abs().mean() < (unknown - 0.5).abs().mean()
+
+
+def test_a_sampler_of_another_family_is_refused():
+    generator = build_generator(TINY)
+    with pytest.raises(InputError, match="sampled by langevin"):
+        generator.check_sampler(generator.sampler.changed(method="euler"))

@@ -1,0 +1,482 @@
+"""LiDM against its published code: autoencoder, quantiser, U-Net, diffusion, losses, data and checkpoints."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+import yaml
+from published_cases import assert_near, assert_norms, load_case
+
+from r2flow.adversarial.hinge import adaptive_weight, adversarial_factor, hinge_loss, reconstruction_loss
+from r2flow.backbones.autoencoder import Autoencoder
+from r2flow.backbones.latent_unet import LatentUNet
+from r2flow.backbones.patch_discriminator import PatchDiscriminator
+from r2flow.backbones.quantiser import Quantiser
+from r2flow.callbacks.ema import DECAYS
+from r2flow.checkpoints import load_checkpoint
+from r2flow.cli import main
+from r2flow.diffusion.ddim import (
+    Tables,
+    ancestral_step,
+    ddim,
+    ddim_walk,
+    noise_loss,
+    noised,
+    square_root_linear,
+    tables,
+)
+from r2flow.errors import InputError
+from r2flow.generators import LatentDiffusion, build_generator
+from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.projection import project, unproject
+from r2flow.lidar.sensors import build_sensor
+from r2flow.noise import Draws
+from r2flow.published.lidm import _autoencoder, _unet
+from r2flow.registry import options_of
+from r2flow.stages.latent import returns
+
+SMALL_AUTOENCODER = {"width": 32, "multipliers": [1, 1], "strides": [[2, 2]], "blocks": 1, "codes": 16}
+SMALL_UNET = {"width": 32, "multipliers": [1, 2], "blocks": 1, "attention": [2]}
+TINY: dict[str, Any] = {
+    "sensor": {"name": "hdl64e", "rows": 8, "columns": 32, "min_range": 1.0, "max_range": 56.0},
+    "encoding": {"format": "shifted_log", "reflectance": False, "limits": "open"},
+    "backbone": {"name": "latent_unet"},
+}
+DIFFUSION = {**TINY, "generator": {"name": "latent_diffusion", "autoencoder": SMALL_AUTOENCODER, "unet": SMALL_UNET}}
+AUTOENCODER = {**TINY, "generator": {"name": "vq_autoencoder", "autoencoder": SMALL_AUTOENCODER}}
+
+
+def autoencoder_of(cfg: dict[str, Any], legacy: bool = True) -> Autoencoder:
+    inner = cfg["ddconfig"]
+    return Autoencoder(
+        inner["in_channels"], inner["ch"], inner["ch_mult"], inner["strides"], inner["num_res_blocks"],
+        inner["attn_levels"], inner["z_channels"], cfg["embed_dim"], cfg["n_embed"], legacy=legacy,
+        mask=cfg["use_mask"],
+    )  # fmt: skip
+
+
+def unet_of(cfg: dict[str, Any]) -> LatentUNet:
+    return LatentUNet(
+        (cfg["in_channels"], *cfg["image_size"]), cfg["model_channels"], cfg["channel_mult"], cfg["num_res_blocks"],
+        cfg["attention_resolutions"], cfg["num_head_channels"],
+    )  # fmt: skip
+
+
+def within(state: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+
+
+@pytest.fixture(scope="module")
+def diffusion(shared: Path) -> dict[str, Any]:
+    case = load_case(shared, "lidm_diffusion.pt")
+    case["unet"], case["autoencoder"] = (
+        unet_of(case["unet_cfg"]),
+        autoencoder_of(case["cfg"]["first_stage_config"]["params"]),
+    )
+    case["unet"].load_state_dict(within(case["state_dict"], "model.diffusion_model."))
+    case["autoencoder"].load_state_dict(within(case["state_dict"], "first_stage_model."))
+    case["tables"] = tables(square_root_linear(0.0015, 0.0195, 1000))
+    return case
+
+
+def test_autoencoder_and_gradients_are_the_published(shared: Path):
+    case = load_case(shared, "lidm_ae_16x64.pt")
+    model = autoencoder_of(case["cfg"])
+    model.load_state_dict(case["state_dict"])
+    x, expected, weights = case["inputs"]["x"].clone().requires_grad_(), case["outputs"], case["grad_w"]
+    before, (made, quantised) = model.encode(x), model(x)
+    sure = case["index_margin"] > 1e-5
+    assert torch.equal(quantised.indices[sure], expected["indices"][sure])
+    found = {
+        "prequant": before, "quant": quantised.codes, "codebook_loss": quantised.loss, "reconstruction": made,
+        "interface_decoded": model.decode(before), "interface_decoded_unquantised": model.decode(before, False),
+    }  # fmt: skip
+    for name, value in found.items():
+        assert_near(value, expected[name], 5e-5)
+    sum((found[name] * weight).sum() for name, weight in weights.items()).backward()
+    assert_near(x.grad, case["grad_inputs"]["x"], 1e-3)
+    assert_norms(model, case["grad_param_norms"])
+
+
+@pytest.mark.parametrize("name", ["legacy", "corrected"])
+def test_quantiser_and_gradients_are_the_published(shared: Path, name: str):
+    case = load_case(shared, "lidm_vq.pt")
+    quantiser = Quantiser(*case["codebook"].shape, beta=case["beta"], legacy=name == "legacy")
+    quantiser.load_state_dict({"embedding.weight": case["codebook"]})
+    z, expected = case["z"].clone().requires_grad_(), case["cases"][name]
+    found = quantiser(z)
+    sure = case["index_margin"] > 1e-5
+    assert torch.equal(found.indices[sure], case["indices"][sure])
+    assert_near(found.codes, case["quant"], 1e-6)
+    assert_near(found.loss, expected["loss"], 1e-6)
+    (0.1 * (found.codes * case["grad_w"]).sum() + 3 * found.loss).backward()
+    assert_near(z.grad, expected["grad_z"], 1e-6)
+    assert_near(quantiser.embedding.weight.grad, expected["grad_codebook"], 1e-6)
+
+
+def test_unet_and_gradients_are_the_published(shared: Path):
+    case = load_case(shared, "lidm_unet_8x16.pt")
+    model = unet_of(case["cfg"])
+    model.load_state_dict(case["state_dict"])
+    x = case["inputs"]["x"].clone().requires_grad_()
+    output = model(x, case["inputs"]["t"])
+    assert_near(output, case["outputs"]["output"], 2e-5)
+    (output * case["grad_w"]["output"]).sum().backward()
+    assert_near(x.grad, case["grad_inputs"]["x"], 1e-3)
+    assert_norms(model, case["grad_param_norms"])
+
+
+def test_the_full_networks_have_the_published_names_and_shapes(shared: Path):
+    with torch.device("meta"):
+        autoencoder, unet = Autoencoder(), LatentUNet((8, 16, 128))
+    parts = autoencoder.encoder, autoencoder.decoder, autoencoder, unet
+    encoder, decoder, whole, diffusion = (sum(p.numel() for p in part.parameters()) for part in parts)
+    assert (encoder, decoder, whole - encoder - decoder) == (6_343_368, 8_595_777, 131_216)
+    assert diffusion == 257_751_560
+    known = json.loads((shared / "oracle_baselines" / "state_dict_keys.json").read_text())["lidm"]
+    for prefix, model in (("first_stage_model.", autoencoder), ("model.diffusion_model.", unet)):
+        assert {name: list(value.shape) for name, value in model.state_dict().items()} == within(
+            dict(known["names"]), prefix
+        )
+
+
+def test_a_learned_bias_is_added_after_the_first_convolution():
+    torch.manual_seed(0)
+    plain = LatentUNet((8, 4, 8), **SMALL_UNET)
+    torch.nn.init.normal_(plain.out[-1].weight)
+    positioned = LatentUNet((8, 4, 8), **SMALL_UNET, position="learnable")
+    positioned.load_state_dict({**plain.state_dict(), "position": torch.zeros(32, 4, 8)})
+    z, t = torch.randn(2, 8, 4, 8), torch.tensor([3, 500])
+    assert torch.equal(positioned(z, t), plain(z, t))
+    # A constant bias is that of the convolution itself.
+    with torch.no_grad():
+        positioned.position.copy_(torch.arange(32.0)[:, None, None].expand(32, 4, 8))
+        plain.input_blocks[0][0].bias += torch.arange(32.0)
+    torch.testing.assert_close(positioned(z, t), plain(z, t), rtol=0, atol=1e-4)
+
+
+def test_schedule_is_the_published(diffusion: dict[str, Any]):
+    found: Tables = diffusion["tables"]
+    a = found.alpha_bar
+    named = {
+        "betas": found.beta, "alphas_cumprod": a, "alphas_cumprod_prev": found.alpha_bar_prev,
+        "sqrt_alphas_cumprod": a.sqrt(), "sqrt_one_minus_alphas_cumprod": (1 - a).sqrt(),
+        "log_one_minus_alphas_cumprod": (1 - a).log(), "sqrt_recip_alphas_cumprod": (1 / a).sqrt(),
+        "sqrt_recipm1_alphas_cumprod": (1 / a - 1).sqrt(), "posterior_variance": found.variance,
+        "posterior_log_variance_clipped": found.log_variance, "posterior_mean_coef1": found.of_data,
+        "posterior_mean_coef2": found.of_state, "lvlb_weights": found.bound,
+    }  # fmt: skip
+    assert named.keys() == diffusion["schedule"].keys()
+    for name, value in named.items():
+        assert_near(value, diffusion["schedule"][name], 1e-5)
+
+
+def test_objective_and_gradients_are_the_published(diffusion: dict[str, Any]):
+    case, unet, of = diffusion["objective"], diffusion["unet"], diffusion["tables"]
+    x, t, eps = case["x_start"], case["t"], case["noise"]
+    assert_near(noised(x, t, eps, of.alpha_bar), case["x_t"], 1e-5)
+    loss = noise_loss(unet, x, t, eps, of.alpha_bar)
+    assert_near(loss, case["per_sample"], 1e-5)
+    assert_near(loss.mean(), case["loss"], 1e-5)
+    assert_near((of.bound[t] * loss).mean(), case["loss_vlb"], 1e-5)
+    loss.mean().backward()
+    assert_norms(unet, case["grad_param_norms"], prefix="diffusion_model.")
+
+
+def test_an_ancestral_step_is_the_published(diffusion: dict[str, Any]):
+    case = diffusion["objective"]["ancestral"]
+    with torch.no_grad():
+        found = ancestral_step(diffusion["unet"], case["x_t"], case["t"], case["noise"], diffusion["tables"])
+    assert_near(found, case["x_prev"], 1e-5)
+
+
+@pytest.mark.parametrize("name", ["ddim_10_eta0", "ddim_10_eta1"])
+def test_ddim_is_the_published(diffusion: dict[str, Any], name: str):
+    case, autoencoder = diffusion["cases"][name], diffusion["autoencoder"]
+    walk = ddim_walk(diffusion["tables"].alpha_bar, case["steps"], case["eta"])
+    with torch.no_grad():
+        path = list(ddim(diffusion["unet"], case["x_T"], walk, lambda k: case["noise"][k - 1]))
+        decoded = autoencoder.decode(path[-1][0]), autoencoder.decode(path[-1][0], False)
+    for k, (z, x) in enumerate(path):
+        assert_near(z, case["x_trajectory"][k + 1], 1e-4)
+        assert_near(x, case["pred_x0"][k], 1e-4)
+    assert_near(decoded[0], case["decoded"], 1e-4)
+    assert_near(decoded[1], case["decoded_unquantised"], 1e-4)
+
+
+@pytest.mark.parametrize("name", ["S50", "S30", "S7"])
+def test_subsets_of_steps_are_the_published(diffusion: dict[str, Any], name: str):
+    case, alpha_bar = diffusion["ddim_tables"][name], diffusion["tables"].alpha_bar
+    walk = ddim_walk(alpha_bar, int(name[1:]), 1.0)
+    assert torch.equal(walk.times.flip(0), case["timesteps"])
+    for found, expected in zip(walk[1:], ("alphas", "alphas_prev", "sigmas"), strict=True):
+        assert_near(found.flip(0), case[expected], 1e-5)
+
+
+def test_ddim_without_noise_keeps_a_known_gaussian():
+    # For data N(0, s^2) the best eps is sqrt(1 - a) z / (a s^2 + 1 - a); the deterministic way then scales each z by
+    # the ratio of standard deviations, up to the steps' error.
+    alpha_bar, s = tables(square_root_linear(0.0015, 0.0195, 1000)).alpha_bar, 0.5
+    z = torch.linspace(-2, 2, 9)[:, None]
+
+    def predict(z: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        a = alpha_bar[t].float()[:, None]
+        return (1 - a).sqrt() * z / (a * s**2 + 1 - a)
+
+    walk = ddim_walk(alpha_bar, 500, 0.0)
+    *_, (end, _) = ddim(predict, z, walk, lambda _: torch.zeros_like(z))
+    spread = [(a * s**2 + 1 - a) ** 0.5 for a in (walk.alpha[0].item(), walk.alpha_prev[-1].item())]
+    torch.testing.assert_close(end, z * spread[1] / spread[0], rtol=0.01, atol=1e-6)
+
+
+def test_what_is_held_is_put_in_before_each_step():
+    walk = ddim_walk(tables(square_root_linear(0.0015, 0.0195, 1000)).alpha_bar, 4, 0.0)
+    seen: list[int] = []
+
+    def hold(z: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        seen.append(int(t[0]))
+        return torch.full_like(z, 7.0)
+
+    states = [
+        z for z, _ in ddim(lambda z, t: torch.zeros_like(z), torch.zeros(1, 1), walk, lambda k: torch.zeros(1), hold)
+    ]
+    assert seen == walk.times.tolist()
+    for z, a, b in zip(states, walk.alpha.tolist(), walk.alpha_prev.tolist(), strict=True):
+        assert z.item() == pytest.approx(7 * (b / a) ** 0.5)
+
+
+def test_the_average_is_the_published(diffusion: dict[str, Any]):
+    case, average = diffusion["ema"], diffusion["ema"]["ema"][0]
+    for step, decay in enumerate(case["decay"]):
+        own = DECAYS["ratio"](step, 0, 0.9999)
+        assert own == pytest.approx(decay.item(), abs=1e-6)
+        average = average + (1 - own) * (case["online"][step + 1] - average)
+        assert_near(average, case["ema"][step + 1], 1e-5)
+
+
+@pytest.mark.parametrize("step", [0, 1, 2])
+def test_adversarial_losses_and_gradients_are_the_published(shared: Path, step: int):
+    case = load_case(shared, "lidm_ae_loss.pt")
+    cfg = case["cfg"]
+    model = PatchDiscriminator(cfg["disc_in_channels"], cfg["disc_ndf"], cfg["disc_num_layers"])
+    model.load_state_dict(case["discriminator"])
+    last, factor = case["last_layer"].clone().requires_grad_(), adversarial_factor(step, cfg["disc_start"], True)
+    made = F.conv2d(case["features"], last)
+    expected = case["cases"][f"step{step}_ae"]
+    reconstruction, adversarial = reconstruction_loss(case["inputs"], made), -model(made).mean()
+    weight = adaptive_weight(reconstruction, adversarial, last, cfg["disc_weight"])
+    assert_near(weight, expected["log"]["train/d_weight"], 1e-4)
+    assert_near(adversarial, expected["log"]["train/g_loss"], 1e-4)
+    loss = reconstruction + factor * weight * adversarial + cfg["codebook_weight"] * case["codebook_loss"]
+    assert_near(loss, expected["loss"], 1e-4)
+    loss.backward()
+    assert_near(last.grad, expected["grad_last_layer"], 1e-3)
+    assert_norms(model, expected["grad_disc_norms"])
+    model.load_state_dict(case["discriminator"])
+    model.zero_grad()
+    expected = case["cases"][f"step{step}_disc"]
+    loss = factor * hinge_loss(model(case["inputs"]), model(made.detach()))
+    assert loss.item() == pytest.approx(expected["loss"], rel=1e-4)
+    loss.backward()
+    assert_norms(model, expected["grad_disc_norms"])
+
+
+def test_the_discriminator_begins_at_its_step_and_ends_there_as_published():
+    assert [adversarial_factor(step, 2) for step in range(5)] == [0, 0, 1, 1, 1]
+    assert [adversarial_factor(step, 2, inverted=True) for step in range(5)] == [1, 1, 1, 0, 0]
+
+
+def test_ranges_and_masks_are_encoded_and_decoded_as_published(shared: Path):
+    case = load_case(shared, "lidm_data.pt")
+    nearest, farthest = case["depth_range"]
+    sensor = build_sensor("hdl64e", 16, 64, nearest, farthest)
+    encoding = Encoding(sensor, "shifted_log", reflectance=False)
+    assert encoding.format.scale == case["depth_scale"]
+    x = encoding.encode(case["metres"][None])
+    assert_near(x, case["model_space"], 1e-6)
+    assert torch.equal(returns(x[None], encoding)[0], case["mask"])
+    encoding = Encoding(sensor, "shifted_log", reflectance=False, limits="open")
+    decoded = encoding.decode(case["sample"][None])[0]
+    assert torch.equal(decoded > 0, case["sample_valid"])
+    assert_near(decoded, torch.where(case["sample_valid"], case["sample_metres"], 0), 1e-6)
+    points = unproject(decoded[None, None], sensor.rays("reference"))[0][:, case["sample_valid"]].T
+    assert_near(points, case["sample_points"], 1e-6)
+
+
+def test_points_fall_into_the_published_pixels(shared: Path):
+    case = load_case(shared, "lidm_data.pt")
+    nearest, farthest = case["depth_range"]
+    sensor = build_sensor("hdl64e", 16, 64, nearest, farthest)
+    points = case["points"].numpy()
+    # The published projection leaves out what is beyond the limits first: no such point hides another one.
+    kept = [nearest < (point**2).sum() ** 0.5 < farthest for point in points]
+    image = torch.from_numpy(project(points[kept], None, sensor, convention="reference"))[0]
+    assert_near(torch.where(image > 0, image, -1.0), case["proj_range"], 1e-6)
+
+
+@pytest.fixture
+def published(shared: Path, tmp_path: Path) -> tuple[Path, dict[str, Any]]:
+    """The published diffusion's file beside its config, as it is distributed."""
+    io = load_case(shared, "lidm_published_io.pt")
+    path = Path(shutil.copy(shared / "oracle_baselines" / "lidm_published.ckpt", tmp_path / "model.ckpt"))
+    images = {"size": [16, 32], "fov": [3, -25], "depth_range": [1.0, 56.0], "depth_scale": 5.84, "log_scale": True}
+    config = {"model": {"params": io["cfg"]}, "data": {"params": {"dataset": images}}}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+    return path, io
+
+
+@pytest.mark.parametrize("averaged", [True, False])
+def test_a_published_diffusion_gives_its_noise_and_images(published: tuple[Path, dict[str, Any]], averaged: bool):
+    path, io = published
+    loaded = load_checkpoint(path, averaged=averaged)
+    generator = loaded.generator
+    assert isinstance(generator, LatentDiffusion)
+    assert generator.space.shape == (1, 16, 32)
+    assert loaded.step == 1234
+    assert (generator.sampler.method, generator.sampler.steps) == ("ddim:1", 50)
+    with torch.no_grad():
+        noise = generator.unet(io["z"], io["t"])
+        assert_near(noise, io["output_ema" if averaged else "output_weights"], 5e-5)
+        assert_near(generator.first_stage_model.encode(io["x"]), io["latent"], 5e-5)
+        assert_near(generator.first_stage_model.decode(io["z"]), io["decoded"], 5e-5)
+
+
+def test_a_published_diffusion_without_its_config_has_the_published_size(shared: Path):
+    loaded = load_checkpoint(shared / "oracle_baselines" / "lidm_published.ckpt")
+    assert loaded.generator.space.shape == (1, 64, 1024)
+    assert loaded.config["generator"]["unet"]["head_channels"] == 32
+    assert loaded.config["generator"]["unet"]["multipliers"] == [1, 1]
+    assert loaded.config["generator"]["beta_last"] == 0.0195
+
+
+def lists(value: Any) -> Any:
+    return [lists(one) for one in value] if isinstance(value, tuple) else value
+
+
+OPTIONS = [
+    ({}, {}),
+    (
+        {"multipliers": (1, 1, 2), "strides": ((1, 2), (1, 2)), "blocks": 3, "attention": (1,), "mask": True},
+        {"multipliers": (1, 2, 3), "blocks": 1, "attention": (2,), "width": 64},
+    ),
+]
+
+
+@pytest.mark.parametrize(("first", "second"), OPTIONS, ids=["published", "other"])
+def test_options_are_read_off_the_names_and_shapes_of_weights(first: dict[str, Any], second: dict[str, Any]):
+    with torch.device("meta"):
+        autoencoder, unet = Autoencoder(1, **first), LatentUNet((8, 16, 128), **second)
+    usual = options_of(Autoencoder, given=1), options_of(LatentUNet, given=1)
+    for read, model, given, known in (
+        (_autoencoder, autoencoder, {**first, "legacy": True}, usual[0]),
+        (_unet, unet, second, usual[1]),
+    ):
+        found = read(model.state_dict())
+        for name, value in found.items():
+            assert value == lists({**known, **given}[name]), name
+
+
+def test_a_published_config_that_contradicts_is_one_line(published: tuple[Path, dict[str, Any]]):
+    path, _ = published
+    text = path.with_name("config.yaml").read_text()
+    for what, instead, said in (("5.84", "6.5", "have the scale 5.84"), ("- -25", "- -30", "see from 3 to -25")):
+        path.with_name("config.yaml").write_text(text.replace(what, instead))
+        with pytest.raises(InputError, match=said):
+            load_checkpoint(path)
+
+
+def test_a_published_autoencoder_gives_its_codes(shared: Path):
+    io = load_case(shared, "lidm_ae_published_io.pt")
+    model = load_checkpoint(shared / "oracle_baselines" / "lidm_ae_published.ckpt").generator.first_stage_model
+    with torch.no_grad():
+        made, quantised = model(io["x"])
+        assert_near(model.encode(io["x"]), io["prequant"], 5e-5)
+    assert_near(made, io["reconstruction"], 5e-5)
+    assert_near(quantised.loss, io["codebook_loss"], 5e-5)
+    assert (quantised.indices == io["indices"]).float().mean() > 0.99
+
+
+def test_an_autoencoder_where_scans_are_wanted_is_one_line(shared: Path, tmp_path: Path, monkeypatch, capsys):
+    path = shared / "oracle_baselines" / "lidm_ae_published.ckpt"
+    monkeypatch.setattr("sys.argv", ["r2flow", "sample", "-c", str(path), "-o", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as end:
+        main()
+    said = capsys.readouterr().err.splitlines()
+    assert end.value.code == 2
+    assert len(said) == 1
+    assert "makes none of noise" in said[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_latent_diffusion_starts_from_its_autoencoder_alone():
+    torch.manual_seed(0)
+    generator, parent = build_generator(DIFFUSION), build_generator(AUTOENCODER)
+    before = generator.unet.state_dict()
+    generator.start_from(parent)
+    own = generator.first_stage_model.state_dict()
+    assert all(torch.equal(own[name], value) for name, value in parent.first_stage_model.state_dict().items())
+    assert all(torch.equal(before[name], value) for name, value in generator.unet.state_dict().items())
+    other = {**AUTOENCODER["generator"], "autoencoder": {**SMALL_AUTOENCODER, "codes": 32}}
+    with pytest.raises(InputError, match="do not fit"):
+        generator.start_from(build_generator({**AUTOENCODER, "generator": other}))
+
+
+def test_a_scan_is_a_function_of_its_number_alone():
+    torch.manual_seed(0)
+    generator = build_generator(DIFFUSION).eval()
+    generator.sampler = generator.sampler.changed(steps=7)
+    shape = generator.noise_shape
+    three, one = Draws(0, [4, 5, 6]), Draws(0, [5])
+    many = generator.generate(three.start(shape), draws=three)
+    alone = generator.generate(one.start(shape), draws=one)
+    torch.testing.assert_close(many.x[1:2], alone.x, rtol=0, atol=1e-4)
+    assert many.x.shape == (3, 1, 8, 32)
+    assert many.evaluations.tolist() == [8] * 3  # 1000 // 7 = 142 goes 8 times into 1000
+    assert generator.evaluations_of(generator.sampler) == 8
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"method": "euler"}, "sampled by ddim:ETA"),
+        ({"method": "ddim:2"}, "sampled by ddim:ETA"),
+        ({"steps": 1000}, "in 1 to 999"),
+        ({"grid": "power:2"}, "steps are its own"),
+    ],
+)
+def test_a_sampler_that_a_latent_diffusion_does_not_have_is_refused(changes: dict[str, Any], said: str):
+    generator = build_generator(DIFFUSION)
+    with pytest.raises(InputError, match=said):
+        generator.check_sampler(generator.sampler.changed(**changes))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"autoencoder": {"strides": [[3, 3], [2, 2], [2, 2]]}}, r"each \[1, 2\] or \[2, 2\]"),
+        ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1, 2], [2, 2]]}}, "needs 1 strides"),
+        ({"autoencoder": {"multipliers": [1], "strides": []}, "unet": {"multipliers": [1] * 5}}, "cannot be halved 4"),
+        ({"unet": {"position": "polar"}, "autoencoder": SMALL_AUTOENCODER}, "no position named 'polar'"),
+        ({"unet": {"wdith": 3}, "autoencoder": SMALL_AUTOENCODER}, "generator.unet has no option 'wdith'"),
+    ],
+)
+def test_sizes_that_cannot_work_are_one_line(change: dict[str, Any], said: str):
+    with torch.device("meta"), pytest.raises(InputError, match=said):
+        build_generator({**TINY, "generator": {"name": "latent_diffusion", **change}})
+
+
+def test_a_masked_autoencoder_drops_what_its_mask_denies():
+    torch.manual_seed(0)
+    model = Autoencoder(1, **SMALL_AUTOENCODER, mask=True)
+    z = torch.randn(2, 8, 4, 16)
+    raw, decoded = model.decoder(model.post_quant_conv(z)), model.decode(z, quantise=False)
+    assert raw.shape == (2, 2, 8, 32)
+    assert (decoded[raw[:, 1:] < 0] == -1).all()
+    assert torch.equal(decoded[raw[:, 1:] >= 0], raw[:, :1][raw[:, 1:] >= 0])
+    x, mask = torch.rand(2, 1, 8, 32), torch.ones(2, 1, 8, 32)
+    expected = ((x - raw[:, :1]).abs().mean() + 0.5 * (1 - raw[:, 1:]).abs().mean()) / 2
+    torch.testing.assert_close(reconstruction_loss(x, raw, mask, 0.5), expected)
