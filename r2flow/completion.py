@@ -14,7 +14,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.posterior import completes
-from r2flow.generators import Condition, ConditionalFlow, Flow, Generator, Sampler, condition_of
+from r2flow.generators import Condition, Flow, Generator, Sampler, condition_of
 from r2flow.generators.base import Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
 from r2flow.lidar.known import Ray
@@ -68,17 +68,20 @@ def spread_of(images: Tensor) -> Tensor:
 
 
 def completing(generator: Generator, sampler: Sampler | None = None, **changes: Any) -> Sampler:
-    """How a generator completes scans: a trained one by its own sampler, another flow by `UNTRAINED`; with changes.
+    """How a generator completes scans: one that is told of them by its own sampler, another flow by `UNTRAINED`.
+
+    Args:
+        changes: Single settings of the sampler.
 
     Raises:
         InputError: it cannot complete scans, or not so.
     """
-    if not isinstance(generator, Flow) or generator.noise_shape != generator.space.shape:
+    if not (generator.told or isinstance(generator, Flow)) or generator.noise_shape != generator.space.shape:
         raise InputError(
             f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images, best one that "
             "was trained with stage=conditional."
         )
-    usual = generator.sampler if isinstance(generator, ConditionalFlow) else UNTRAINED
+    usual = generator.sampler if generator.told else UNTRAINED
     how = (sampler or usual).changed(**changes)
     generator.check_sampler(how)
     return how

@@ -69,7 +69,9 @@ def completion(
     tasks: Annotated[
         str | None, typer.Option(help="Masks (rows:4) and faults (rain), a space between them; five masks if left out.")
     ] = None,
-    solvers: Annotated[str | None, typer.Option(help="Ways to run the first model, as flowdps,repaint.")] = None,
+    solvers: Annotated[
+        str | None, typer.Option(help="Ways to run the first model, with or without steps: flowdps/32,mmps.")
+    ] = None,
     steps: Annotated[str | None, typer.Option(help="Numbers of steps of the first model, as 8,16,64.")] = None,
     num: Annotated[int, typer.Option(min=1, help="The most scans of a set, evenly spread over it.")] = 16,
     answers: Annotated[int, typer.Option(min=1, help="Answers to each scan; 19 give intervals of 90 %.")] = 8,

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -148,7 +148,10 @@ class Generator(nn.Module):
         space: The images it makes.
         noise_shape: What one scan is made of: (C, H, W) for a flow, (latent,) for a GAN.
         sampler: How it is run when nobody says otherwise.
+        told: Whether it takes a condition of `r2flow.generators.condition_of` by its own sampler.
     """
+
+    told: ClassVar[bool] = False
 
     def __init__(self, space: ModelSpace, noise_shape: tuple[int, ...] | None = None) -> None:
         super().__init__()

@@ -112,6 +112,7 @@ class ConditionalFlow(RectifiedFlow):
     a scan of which nothing is known, by the network alone.
     """
 
+    told = True
     trusts: ClassVar[bool] = True
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:

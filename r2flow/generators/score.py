@@ -9,7 +9,7 @@ from torch import Tensor
 from r2flow.backbones.refinenet import RefineNet
 from r2flow.diffusion.langevin import annealed_langevin, noise_levels, toward
 from r2flow.errors import InputError
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
+from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, parts_of
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import Count, Positive
@@ -22,8 +22,7 @@ class ScoreModel(Generator):
     clouds").
 
     It works in [0, 1] and starts from uniform noise, which is made of ours by the normal distribution function. Its
-    sampler's `steps` are those at each noise level. A condition of `image`, (B, C, H, W) in model space, and `mask`,
-    (B, 1 or C, H, W), 1 where the image is known, pulls the scan to the known pixels: densification.
+    sampler's `steps` are those at each noise level. A condition pulls the scan to what is known: densification.
 
     Args:
         space: The images it makes.
@@ -37,6 +36,8 @@ class ScoreModel(Generator):
     Raises:
         InputError: an odd height or width, noise levels that rise, an unknown spacing.
     """
+
+    told = True
 
     def __init__(
         self,
@@ -90,9 +91,8 @@ class ScoreModel(Generator):
     def _pulled(self, condition: Condition | None, x: Tensor) -> Callable[[Tensor], Tensor] | None:
         if condition is None:
             return None
-        if condition.keys() != {"image", "mask"}:
-            raise InputError(f"a score model is told 'image' and 'mask', found {', '.join(condition)}.")
-        return toward((condition["image"].to(x) + 1) / 2, condition["mask"].to(x), self.pull)
+        image, known, doubtful = parts_of(condition, x)
+        return toward((image + 1) / 2, known + doubtful, self.pull)
 
     def check_sampler(self, sampler: Sampler) -> None:
         plain = Sampler(LANGEVIN, sampler.steps)

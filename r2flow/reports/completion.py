@@ -52,13 +52,19 @@ class Way:
 def ways_of(checkpoint: Checkpoint, name: str, solvers: Sequence[str] = (), steps: Sequence[int] = ()) -> list[Way]:
     """A model by its usual way of completing, or by each of the solvers and numbers of steps that are named.
 
+    Args:
+        solvers: Each with a number of steps of its own behind a slash, or without: `flowdps/32`.
+
     Raises:
         InputError: a model that cannot complete, or not so.
     """
     ways = []
     for solver in solvers or (None,):
-        for count in steps or (None,):
-            how = completing(checkpoint.generator, method=solver, steps=count)
+        method, _, own = (solver or "").partition("/")
+        if own and not own.isdecimal():
+            raise InputError(f"a solver's steps are a whole number behind a slash, as flowdps/32; found {solver!r}.")
+        for count in (int(own),) if own else steps or (None,):
+            how = completing(checkpoint.generator, method=method or None, steps=count)
             ways.append(Way(f"{name}, {how.method} {how.steps}", checkpoint, how))
     return ways
 
