@@ -154,7 +154,7 @@ def test_the_global_error_is_estimated_and_its_cost_counted(method):
 @pytest.mark.parametrize("method", ["rk4", *ADAPTIVE, "torchdiffeq:dopri5"])
 @pytest.mark.parametrize(("problem", "finish"), [
     (Gaussian(std=1e-2), 1e-2), (Gaussian(std=1e-3), 1e-3), (Gaussian(std=1e-4), 1e-3), (RayDrop(), 1e-2),
-], ids=str)  # fmt: skip
+], ids=["gaussian-1e-2", "gaussian-1e-3", "gaussian-1e-4", "ray-drop"])  # fmt: skip
 def test_the_error_estimate_includes_the_finish(method, problem, finish):
     # At this tolerance the one Euler step at the end makes nearly all of the error.
     x_0 = torch.randn(3, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
