@@ -14,16 +14,17 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.posterior import completes
-from r2flow.generators import Condition, Flow, Generator, Sampler, condition_of
+from r2flow.generators import Condition, Flow, Generator, Regression, Sampler, condition_of
 from r2flow.generators.base import Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
 from r2flow.lidar.known import Ray
 from r2flow.lidar.sensors import Sensor
 from r2flow.sampling import HasGenerator, Samples, draw
 
-KEEP = ("exact", "blend")
+KEEP = ("exact", "blend", "mend")
+CONFIRMED = 0.2  # of its range: nearer an answer confirms a doubtful return; docs/completion.md
 ANSWER = 2**32  # noise numbers from one answer to the next: answer 0 of scan i has the noise of sample i
-UNTRAINED = Sampler("mmps", 10, grid="power:1.5")  # of a flow that was not trained to complete; docs/completion.md
+USUAL = Sampler("mmps", 10, grid="power:1.5")  # of flows; docs/completion.md has others
 
 
 @dataclass(frozen=True)
@@ -67,10 +68,11 @@ def spread_of(images: Tensor) -> Tensor:
     return torch.stack([(squares / (count - 1).clamp(min=1)).sqrt(), returned.double().mean(0)]).float()
 
 
-def completing(generator: Generator, sampler: Sampler | None = None, **changes: Any) -> Sampler:
-    """How a generator completes scans: one that is told of them by its own sampler, another flow by `UNTRAINED`.
+def completing(generator: Generator, sampler: Sampler | None = None, doubtful: bool = False, **changes: Any) -> Sampler:
+    """How a generator completes scans: a flow by `USUAL`, what is told of the scan otherwise by its own sampler.
 
     Args:
+        doubtful: Whether rays were measured that are not trusted: a flow that is told of them knows what goes wrong.
         changes: Single settings of the sampler.
 
     Raises:
@@ -81,7 +83,8 @@ def completing(generator: Generator, sampler: Sampler | None = None, **changes: 
             f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images, best one that "
             "was trained with stage=conditional."
         )
-    usual = generator.sampler if generator.told else UNTRAINED
+    own = generator.told and (doubtful or isinstance(generator, Regression) or not isinstance(generator, Flow))
+    usual = generator.sampler if own else USUAL
     how = (sampler or usual).changed(**changes)
     generator.check_sampler(how)
     return how
@@ -114,7 +117,8 @@ def complete(
             measured.
         num: Answers to each scan.
         keep: `exact`: known rays come back as they were given, to the bit. `blend`: all measured rays are taken as
-            doubtful, so that the model may mend them.
+            doubtful, and the model says what they are. `mend`: the same, but a doubtful return that the answer
+            confirms, within `CONFIRMED` of its range, stays as it was measured.
         sampler: How the generator is run; if left out, that of `completing`.
         batch_size: Answers at once. It does not change a fixed-step result beyond rounding.
         first: Number of the first scan.
@@ -126,20 +130,22 @@ def complete(
             its sensor, num or batch_size below 1.
     """
     generator = source if isinstance(source, Generator) else source.generator
-    how = completing(generator, sampler, **changes)
+    doubtful = keep != "exact" or (state is not None and bool((state == Ray.DOUBTFUL).any()))
+    how = completing(generator, sampler, doubtful, **changes)
     if num < 1 or batch_size < 1:
         raise InputError(f"needs at least one answer and a batch of at least one; found {num} and {batch_size}.")
     if keep not in KEEP:
-        raise InputError(f"keep must be {' or '.join(KEEP)}, found {keep!r}.")
+        raise InputError(f"keep must be {', '.join(KEEP[:-1])} or {KEEP[-1]}, found {keep!r}.")
     _check_values(generator.space.sensor, images)
     images = images.detach().float().cpu()
     if state is None:
         state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.UNKNOWN)).to(torch.uint8)
     state = state.cpu()
-    if keep == "blend":
+    if keep != "exact":
         state = torch.where(state == Ray.UNKNOWN, state, torch.tensor(int(Ray.DOUBTFUL), dtype=state.dtype))
     condition = condition_of(generator.space, images, state)
-    yield from _answers(generator, how, images, state, condition, num, seed, batch_size, first, progress)
+    mends = keep == "mend"
+    yield from _answers(generator, how, images, state, condition, num, seed, batch_size, first, progress, mends)
 
 
 def _answers(
@@ -153,6 +159,7 @@ def _answers(
     batch_size: int,
     first: int,
     progress: Progress,
+    mends: bool,
 ) -> Iterator[Completed]:
     told = [_told(condition, i) for i in range(len(images))]
     # A method that reads the condition has nothing to do without one.
@@ -172,7 +179,7 @@ def _answers(
             else:
                 known = {name: value[rows] for name, value in condition.items()}
                 found = draw(generator, numbers, seed, how, known, progress=progress)
-            pasted = _pasted(found.images, images[rows], state[rows])
+            pasted = _pasted(found.images, images[rows], state[rows], mends)
             done += _one_by_one(replace(found, images=pasted))
             while len(done) >= num:
                 yield _together(done[:num])
@@ -213,11 +220,14 @@ def _given(generator: Generator, images: Tensor) -> Samples:
     return Samples(images[:, :channels], 0, none, none == 0, 0.0)
 
 
-def _pasted(found: Tensor, images: Tensor, state: Tensor) -> Tensor:
-    """Decoded scans with what was given where a ray is known."""
-    known = ((state == Ray.RETURN) | (state == Ray.EMPTY))[:, None]
+def _pasted(found: Tensor, images: Tensor, state: Tensor, mends: bool) -> Tensor:
+    """Decoded scans with what was given where a ray is known, or confirmed."""
+    kept = (state == Ray.RETURN) | (state == Ray.EMPTY)
+    if mends:
+        r, s = images[:, 0], found[:, 0]
+        kept = kept | ((state == Ray.DOUBTFUL) & (r > 0) & (s > 0) & ((s - r).abs() <= CONFIRMED * r))
     channels = min(found.shape[1], images.shape[1])
-    pasted = torch.cat([torch.where(known, images[:, :channels], found[:, :channels]), found[:, channels:]], 1)
+    pasted = torch.cat([torch.where(kept[:, None], images[:, :channels], found[:, :channels]), found[:, channels:]], 1)
     return pasted * (pasted[:, :1] > 0)
 
 

@@ -133,12 +133,15 @@ def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(r2flow,
     assert np.array_equal(image[:, kept], answer[:, kept])
 
 
-def test_doubtful_scans_are_mended(r2flow, run, tmp_path):  # noqa: F811
+def test_a_mended_scan_keeps_what_the_answer_confirms(r2flow, run, tmp_path):  # noqa: F811
     image = full_scan(tmp_path / "one.npy")
-    assert r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--doubtful", "--out", tmp_path / "a")[0] == 0
-    assert r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--keep", "blend", "--out", tmp_path / "b")[0] == 0
-    mended = np.load(tmp_path / "a" / "one.npy")
-    assert np.array_equal(mended, np.load(tmp_path / "b" / "one.npy"))
+    for keep in ("mend", "blend"):
+        said = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--keep", keep, "--out", tmp_path / keep)
+        assert said[0] == 0
+    mended, blended = (np.load(tmp_path / keep / "one.npy") for keep in ("mend", "blend"))
+    r, s = image[0], blended[0]
+    confirmed = (r > 0) & (s > 0) & (np.abs(s - r) <= 0.2 * r)
+    assert np.array_equal(mended, np.where(confirmed, image, blended))
     assert not np.array_equal(mended, image)
 
 
@@ -176,7 +179,7 @@ def test_a_model_of_range_alone_leaves_reflectance_out(r2flow, tmp_path):  # noq
         (["--mask", "row:4"], "no mask 'row:4'"),
         (["--mask", "{folder}/mask.npy"], "is of 4 x 4, the scans are of 8 x 64 rays"),
         (["--to", "vlp16"], "--to vlp16: the model makes images of hdl64e, 8x64"),
-        (["--keep", "all"], "--keep must be exact or blend, found 'all'"),
+        (["--keep", "all"], "--keep must be exact, blend or mend, found 'all'"),
         (["--from", "vlp16"], "is a range image of 8x64, those of the model are 8x64: --from vlp16 has 16 rows"),
         (["--solver", "dopri6"], "dopri6"),
         (["--out", "{folder}"], "is one of the scans and would be replaced"),

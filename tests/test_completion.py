@@ -99,7 +99,7 @@ def test_scans_that_are_known_in_part_wholly_and_not_at_all_go_together():
     state[2] = Ray.UNKNOWN
     checkpoint = network()
     found = list(complete(checkpoint, images, state, num=2, batch_size=4))
-    assert [one.evaluations.tolist() for one in found] == [[3, 3], [0, 0], [3, 3]]
+    assert [one.evaluations.tolist() for one in found] == [[30, 30], [0, 0], [3, 3]]
     assert torch.equal(found[1].images[0], images[1])
     for i, one in enumerate(found):
         (alone,) = complete(checkpoint, images[i : i + 1], state[i : i + 1], num=2, first=i)
@@ -142,6 +142,16 @@ def test_blended_rays_may_be_mended():
     assert not torch.equal(mended[:, 0, 0][measured], images[:, 0][measured])
     doubtful = torch.where(state == Ray.UNKNOWN, state, int(Ray.DOUBTFUL))
     assert torch.equal(mended, network().complete(images, doubtful))
+
+
+def test_a_mended_ray_that_the_answer_confirms_stays_as_measured():
+    images = scans()
+    state = torch.full_like(images[:, 0], int(Ray.DOUBTFUL), dtype=torch.uint8)
+    blended, mended = (network().complete(images, state, keep=keep)[:, 0] for keep in ("blend", "mend"))
+    r, s = images[:, 0], blended[:, 0]
+    confirmed = (r > 0) & (s > 0) & ((s - r).abs() <= 0.2 * r)
+    assert confirmed.any()
+    assert torch.equal(mended, torch.where(confirmed[:, None], images, blended))
 
 
 def test_without_states_a_ray_without_a_return_is_not_measured():
@@ -189,7 +199,7 @@ def test_a_generator_that_cannot_complete_is_refused():
         ({"images": torch.full((1, 2, 8, 64), 0.5)}, "a range of 0.5 m is none of sensor 'hdl64e', 1.45 to 80 m"),
         ({"state": torch.zeros(1, 8, 32)}, "states of the rays must be"),
         ({"state": torch.full((1, 8, 64), int(Ray.RETURN))}, "a ray with a return must have a range above 0"),
-        ({"keep": "all"}, "keep must be exact or blend"),
+        ({"keep": "all"}, "keep must be exact, blend or mend"),
         ({"num": 0}, "at least one answer"),
         ({"steps": 0}, "at least 1 step"),
     ],

@@ -31,12 +31,12 @@ class KnownOptions:
         typer.Option(help="Keep a part of what was measured: rows:4, random:0.5, points:0.1, sector:-30,30, FILE.npy."),
     ] = None
     keep: Annotated[
-        str, typer.Option(help="exact: measured rays come back as they are. blend: the model may mend them.")
+        str,
+        typer.Option(
+            help="exact: measured rays come back as they are. mend: where the answer contradicts one, it is replaced. "
+            "blend: all are the answer's."
+        ),
     ] = "exact"
-    doubtful: Annotated[
-        bool,
-        typer.Option("--doubtful", help="Trust no measured ray, as --keep blend: mend noise, rain, lost returns."),
-    ] = False
     reflectance_scale: Annotated[
         float | None, typer.Option(min=1e-6, help="Value in the files that means full reflectance; found if left out.")
     ] = None
@@ -87,7 +87,7 @@ def complete(
     from r2flow.reports.completed import WRITTEN, Job, answer_ending, write_completed
 
     if known.keep not in KEEP:
-        raise InputError(f"--keep must be {' or '.join(KEEP)}, found {known.keep!r}.")
+        raise InputError(f"--keep must be {', '.join(KEEP[:-1])} or {KEEP[-1]}, found {known.keep!r}.")
     if checkpoint is None:
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
     mask = None if known.mask is None else parse_mask(known.mask)
@@ -96,7 +96,8 @@ def complete(
     _check_target(loaded, known.target)
     reading = replace(reading_of_flow(loaded), columns=named_columns(known.columns))
     scans, said = open_partial(what, reading, source, known.reflectance_scale, answers.scans)
-    sampler = completing(loaded.generator, solver.change(completing(loaded.generator)))
+    doubtful = known.keep != "exact"
+    sampler = completing(loaded.generator, solver.change(completing(loaded.generator, doubtful=doubtful)))
     for line in said:
         print(line)
     for ending in sorted({scan.ending for scan in scans if answer_ending(loaded, scan) != scan.ending}):
@@ -104,8 +105,7 @@ def complete(
         print(f"{ending} is {why}: answers are .ply ({', '.join(WRITTEN)} are written)")
     if not loaded.encoding.reflectance:
         print("the model is of range alone: answers have no reflectance")
-    keep = "blend" if known.doubtful else known.keep
-    job = Job(answers.num, answers.seed, keep, mask, answers.batch_size, answers.pictures)
+    job = Job(answers.num, answers.seed, known.keep, mask, answers.batch_size, answers.pictures)
     about = {"mask": known.mask, "from": known.source}
     found = write_completed(loaded, scans, out, job, sampler, about)
     there = len(scans) - len(found)

@@ -86,6 +86,7 @@ def completion(
 
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.output import command, finish
+    from r2flow.lidar.faults import FAULTS
     from r2flow.progress import Bar
     from r2flow.reports.completion import TASKS, completion_page, completion_rows, given_by, pictured, ways_of
     from r2flow.reports.inversion import real_scans
@@ -103,8 +104,8 @@ def completion(
     truths = [np.asarray(scan.image) for scan in scans]
     prepare_folder(out)
     rows, shown = [], []
-    total = sum(way.checkpoint.generator.evaluations_of(way.sampler) for way in ways) * len(named)
-    with Bar("completing", -(-len(truths) * answers // batch_size) * total, "evaluations") as advance:
+    cost = [way.checkpoint.generator.evaluations_of(way.sampler(task in FAULTS)) for way in ways for task in named]
+    with Bar("completing", -(-len(truths) * answers // batch_size) * sum(cost), "evaluations") as advance:
         for row, images in completion_rows(truths, first.sensor, ways, named, answers, seed, batch_size, advance):
             rows.append(row)
             shown.append((row, images[0]))

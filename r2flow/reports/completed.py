@@ -109,7 +109,7 @@ def write_completed(
             bar.finished(len(found))
     if known:
         log.warning(
-            "%s: everything is known, so it came back as it was given; --mask hides a part, --keep blend mends it",
+            "%s: everything is known, so it came back as it was given; --mask hides a part, --keep mend repairs it",
             known[0] if len(known) == 1 else f"{len(known)} scans",
         )  # fmt: skip
     return found

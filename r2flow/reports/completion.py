@@ -1,7 +1,7 @@
 """Scans of which a part is hidden, completed by models and by interpolation: how near to the truth, at what cost."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,14 +39,22 @@ class Way:
     """A model and how it is run.
 
     Attributes:
-        name: In tables.
+        model: Its name in tables.
         checkpoint: The model.
-        sampler: How it is run.
+        changes: Settings of its sampler that are not the usual ones.
     """
 
-    name: str
+    model: str
     checkpoint: Checkpoint
-    sampler: Sampler
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+    def sampler(self, faulty: bool = False) -> Sampler:
+        """How it is run, on faulty measurements or on a part of a scan."""
+        return completing(self.checkpoint.generator, doubtful=faulty, **self.changes)
+
+    def name(self, faulty: bool = False) -> str:
+        how = self.sampler(faulty)
+        return f"{self.model}, {how.method} {how.steps}"
 
 
 def ways_of(checkpoint: Checkpoint, name: str, solvers: Sequence[str] = (), steps: Sequence[int] = ()) -> list[Way]:
@@ -64,8 +72,9 @@ def ways_of(checkpoint: Checkpoint, name: str, solvers: Sequence[str] = (), step
         if own and not own.isdecimal():
             raise InputError(f"a solver's steps are a whole number behind a slash, as flowdps/32; found {solver!r}.")
         for count in (int(own),) if own else steps or (None,):
-            how = completing(checkpoint.generator, method=method or None, steps=count)
-            ways.append(Way(f"{name}, {how.method} {how.steps}", checkpoint, how))
+            named = {"method": method or None, "steps": count}
+            ways.append(Way(name, checkpoint, {key: value for key, value in named.items() if value is not None}))
+            ways[-1].sampler()
     return ways
 
 
@@ -142,7 +151,7 @@ def completion_rows(
             yield {**row, "evaluations": 0, "seconds": float("nan")}, [images[0] for images in found]
         for way in ways:
             found, seconds, evaluations = _answers(way, given, answers, seed, batch_size, progress)
-            row = _row(task, way.name, truths, found, asked, sensor, whole)
+            row = _row(task, way.name(task in FAULTS), truths, found, asked, sensor, whole)
             yield {**row, "evaluations": evaluations, "seconds": seconds}, [images[0] for images in found]
 
 
@@ -152,8 +161,10 @@ def _answers(
     images = torch.from_numpy(np.stack([one.image for one in given]))
     state = torch.stack([one.state for one in given])
     alike = isinstance(way.checkpoint.generator, Regression)
-    options: dict[str, Any] = {"sampler": way.sampler, "batch_size": batch_size, "progress": progress}
-    made = list(complete(way.checkpoint, images, state, 1 if alike else answers, seed, **options))
+    faulty = bool((state == Ray.DOUBTFUL).any())
+    options: dict[str, Any] = {"sampler": way.sampler(faulty), "batch_size": batch_size, "progress": progress}
+    keep = "mend" if faulty else "exact"
+    made = list(complete(way.checkpoint, images, state, 1 if alike else answers, seed, keep=keep, **options))
     count = sum(len(each.images) for each in made)
     evaluations = sum(float(each.evaluations.sum()) for each in made) / count
     return [each.images.numpy() for each in made], sum(each.seconds for each in made) / count, evaluations

@@ -41,7 +41,7 @@ def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(
         return Generated.after(encoding.encode(torch.cat([moved, stacked[:, 1:]], 1)), 7)
 
     monkeypatch.setattr(checkpoint.generator, "generate", answer)
-    ways = [Way("truth", checkpoint, checkpoint.generator.sampler)]
+    ways = [Way("truth", checkpoint, {"method": "euler", "steps": 7})]
     options = {"tasks": ["rows:4"], "answers": 1, "batch_size": 3}
     *plain, (row, _) = completion_rows(truths, sensor, ways, **options)
     assert [one["method"] for one, _ in plain] == list(OPPONENTS)
@@ -90,11 +90,11 @@ def test_a_task_that_is_none_is_one_line(checkpoint, truths, task):
 
 
 def test_a_model_is_run_by_every_solver_and_number_of_steps(checkpoint):
-    names = [way.name for way in ways_of(checkpoint, "street", ["euler", "midpoint"], [2, 4])]
+    names = [way.name() for way in ways_of(checkpoint, "street", ["euler", "midpoint"], [2, 4])]
     assert names == ["street, euler 2", "street, euler 4", "street, midpoint 2", "street, midpoint 4"]
-    assert [way.name for way in ways_of(checkpoint, "street")] == ["street, adams3 16"]
+    assert [way.name() for way in ways_of(checkpoint, "street")] == ["street, mmps 10"]
     own = ways_of(checkpoint, "street", ["euler/3", "midpoint"], [5])
-    assert [way.name for way in own] == ["street, euler 3", "street, midpoint 5"]
+    assert [way.name() for way in own] == ["street, euler 3", "street, midpoint 5"]
     with pytest.raises(InputError, match="behind a slash"):
         ways_of(checkpoint, "street", ["euler/x"])
 
@@ -104,12 +104,12 @@ def test_the_verb_writes_a_page_with_its_picture(checkpoint, tmp_path: Path, mon
     out = tmp_path / "out"
     monkeypatch.setattr("sys.argv", [
         "r2flow", "report", "completion", "simulated:3", "-c", str(tmp_path / "model.safetensors"), "--num", "2",
-        "--answers", "2", "--steps", "1", "--tasks", "rows:4 rain", "--out", str(out),
+        "--answers", "2", "--solvers", "euler/1", "--tasks", "rows:4 rain", "--out", str(out),
     ])  # fmt: skip
     with pytest.raises(SystemExit) as ended:
         main()
     assert not ended.value.code
     assert (out / "completion.png").stat().st_size > 10_000
     rows = json.loads((out / "completion.json").read_text())["rows"]
-    assert [row["method"] for row in rows] == [*OPPONENTS, "model, adams3 1", "as it is", "model, adams3 1"]
+    assert [row["method"] for row in rows] == [*OPPONENTS, "model, euler 1", "as it is", "model, euler 1"]
     assert "coverage" in (out / "completion.md").read_text()
