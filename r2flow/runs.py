@@ -68,7 +68,18 @@ def read_config(run: str | Path) -> dict[str, Any] | None:
     config = _read_yaml(path) if path.is_file() else next((one for one in kept if isinstance(one, dict)), None)
     if not config:
         return None
-    return {**config, "data": upgraded(config["data"])} if "data" in config else config
+    return _in_todays_keys(config)
+
+
+def _in_todays_keys(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A config with what its keys were before they could be chosen."""
+    found = dict(config)
+    if "data" in found:
+        found["data"] = upgraded(found["data"])
+    callbacks = found.get("callbacks")
+    if isinstance(callbacks, Mapping) and isinstance(callbacks.get("ema"), Mapping):
+        found["callbacks"] = {**callbacks, "ema": {"rule": "power", **callbacks["ema"]}}
+    return found
 
 
 MOST_ALIASES = 20  # a few lines of aliases of aliases stand for billions of values

@@ -49,6 +49,7 @@ def test_a_run_goes_on_from_its_checkpoint_bit_by_bit(trained: tuple[Family, Pat
     assert_bit_equal(run, stopped)
 
 
+@pytest.mark.slow
 def test_a_killed_gan_ends_as_the_one_left_alone(gan: Path, tmp_path: Path):
     run, held = tmp_path / "run", tmp_path / "held"
     options = hold_at(3, held)

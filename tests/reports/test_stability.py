@@ -8,6 +8,8 @@ from r2flow.flow.problems import PROBLEMS
 from r2flow.flow.solvers import SOLVERS, adapts
 from r2flow.reports.stability import cells, jet_probe, stability, stability_figure, stability_page, summary
 
+pytestmark = pytest.mark.slow  # every problem by every solver takes minutes on a busy machine
+
 
 @pytest.fixture(scope="module")
 def rows():

@@ -17,6 +17,7 @@ def found() -> dict[str, float]:
         return ordering.plane(seed=7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(6))
 def test_each_of_the_paper_s_statements_holds(found: dict[str, float], number: int):
     claim = ordering.claims([found])[number]

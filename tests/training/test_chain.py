@@ -132,6 +132,7 @@ def kill(process: subprocess.Popen[str], all_of_it: bool) -> None:
     process.communicate(timeout=100)
 
 
+@pytest.mark.slow
 def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(
     chained: tuple[Path, str], scans: Path, tmp_path: Path
 ):

@@ -115,6 +115,7 @@ def test_a_defect_on_one_device_is_skipped_and_ends_on_all(scans: Path, tmp_path
         assert torch.equal(value, states[1]["current_model_state"][name])
 
 
+@pytest.mark.slow
 def test_accumulated_batches_have_the_losses_of_the_whole(one: Path, scans: Path, tmp_path: Path):
     recorded(tmp_path, scans, tmp_path, "name=parts", *EXACT, "trainer.accumulate_grad_batches=2",
              "trainer.val_check_interval=20")  # fmt: skip

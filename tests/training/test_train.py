@@ -105,6 +105,7 @@ def test_a_run_told_to_stop_leaves_a_checkpoint_and_one_line(
     assert_bit_equal(alone[0], run)
 
 
+@pytest.mark.slow
 def test_a_run_told_to_stop_before_its_first_step_says_one_line(scans: Path, tmp_path: Path):
     command = tiny(scans, "name=early", *hold_at(0, tmp_path / "held"))
     code, said = stop_held(tmp_path / "held", signal.SIGINT, command)
