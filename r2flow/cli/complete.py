@@ -97,6 +97,8 @@ def complete(
     reading = replace(reading_of_flow(loaded), columns=named_columns(known.columns))
     scans, said = open_partial(what, reading, source, known.reflectance_scale, answers.scans)
     doubtful = known.keep != "exact"
+    if doubtful and not loaded.generator.told:
+        print("this model was not trained on faulty measurements and mends them badly: give one of stage=conditional")
     sampler = completing(loaded.generator, solver.change(completing(loaded.generator, doubtful=doubtful)))
     for line in said:
         print(line)

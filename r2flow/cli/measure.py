@@ -17,6 +17,7 @@ from r2flow.cli.options import (
     choose_device,
     choose_reading,
 )
+from r2flow.errors import InputError
 
 
 @report.command(epilog="Example: r2flow report fidelity kitti360/test runs/real/samples --train raw --out reports")
@@ -101,7 +102,9 @@ def completion(
     for task in named:
         given_by(task, np.zeros((2, *first.sensor.shape), dtype=np.float32), first.sensor, 0)
     scans = real_scans(first, [real], reflectance_scale, num)
-    truths = [np.asarray(scan.image) for scan in scans]
+    truths = [np.asarray(scan.image) for scan in scans if scan.image[0].any()]
+    if not truths:
+        raise InputError(f"{real}: no scan has a return, so there is nothing to hide.")
     prepare_folder(out)
     rows, shown = [], []
     cost = [way.checkpoint.generator.evaluations_of(way.sampler(task in FAULTS)) for way in ways for task in named]

@@ -37,7 +37,7 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes, learned from simulated scans",
-        "daa9a137dbba758e4a9663ecf2d855f7e5a966adae34092c2becb6cf64d108ee",
+        "ced1705675e7c9f315a83a96b039f368202ac02474a9e52e3fcfeafa765e6b05",
     ),
 )
 DEFAULT = "street"
