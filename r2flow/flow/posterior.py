@@ -300,7 +300,7 @@ METHODS: Registry[Method] = Registry(
 class Chosen(NamedTuple):
     """A method with its numbers."""
 
-    name: str
+    called: str
     method: Method
     numbers: tuple[int | float, ...]
 
@@ -350,7 +350,7 @@ def sample_posterior(
     chosen = parse_method(method)
     if chosen.method.masks and measured.forward is not None:
         others = ", ".join(name for name, one in METHODS.items() if not one.masks)
-        raise InputError(f"{chosen.name} is for masks alone; for another measurement give {others}.")
+        raise InputError(f"{chosen.called} is for masks alone; for another measurement give {others}.")
     if chosen.method.draws and noise is None:
-        raise InputError(f"{chosen.name} draws further noise: give draws.")
+        raise InputError(f"{chosen.called} draws further noise: give draws.")
     return measured.exact(chosen.method.run(u, x_0, measured, times.to(x_0), noise, *chosen.numbers))
