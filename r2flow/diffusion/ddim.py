@@ -154,19 +154,3 @@ def ddim(
         if sigma:
             z = z + sigma * noise(number)
         yield z, x
-
-
-def eta_of(method: str) -> float:
-    """eta of a sampler's name, `ddim:ETA`; `ddim` alone is 0.
-
-    Raises:
-        InputError: another name, or an eta outside [0, 1].
-    """
-    name, _, given = method.partition(":")
-    try:
-        eta = float(given or 0)
-    except ValueError:
-        eta = -1.0
-    if name != "ddim" or not 0 <= eta <= 1:
-        raise InputError(f"a latent diffusion is sampled by ddim:ETA with ETA in [0, 1], as ddim:1; found {method!r}.")
-    return eta

@@ -44,6 +44,15 @@ def pseudo_huber_elementwise(v_t: Tensor, u_t: Tensor) -> Tensor:
     return (r.square() / ((r.square() + c**2).sqrt() + c)).mean(1)
 
 
+def absolute(v_t: Tensor, u_t: Tensor) -> Tensor:
+    """mean_i |r_i|: its minimum is the median of each element."""
+    return (v_t.float() - u_t.float()).abs().flatten(1).mean(1)
+
+
 LOSSES: Registry[Loss] = Registry(
-    "loss", mse=mse, pseudo_huber=pseudo_huber, pseudo_huber_elementwise=pseudo_huber_elementwise
+    "loss",
+    mse=mse,
+    pseudo_huber=pseudo_huber,
+    pseudo_huber_elementwise=pseudo_huber_elementwise,
+    absolute=absolute,
 )

@@ -8,7 +8,8 @@ from torch import Tensor, nn
 
 from r2flow.backbones.autoencoder import Autoencoder
 from r2flow.backbones.latent_unet import LatentUNet
-from r2flow.diffusion.ddim import ddim, ddim_walk, eta_of, square_root_linear, tables
+from r2flow.diffusion.ddim import ddim, ddim_walk, square_root_linear, tables
+from r2flow.diffusion.sampling import DDPM, eta_of
 from r2flow.errors import InputError
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.lidar.space import ModelSpace
@@ -102,7 +103,7 @@ class LatentDiffusion(Generator):
         if condition is not None:
             raise InputError("a latent diffusion was trained without a condition and cannot take one.")
         how, z = sampler or self.sampler, noise.to(self.device)
-        eta = eta_of(how.method)
+        eta = _eta(how.method)
         if eta and draws is None:
             raise InputError(f"{how.method} draws noise in every step: give draws.")
 
@@ -118,8 +119,7 @@ class LatentDiffusion(Generator):
         return Generated.after(self.first_stage_model.decode(z), len(walk.times))
 
     def check_sampler(self, sampler: Sampler) -> None:
-        eta = eta_of(sampler.method)
-        ddim_walk(self.alpha_bar, sampler.steps, eta)
+        ddim_walk(self.alpha_bar, sampler.steps, _eta(sampler.method))
         if sampler != Sampler(sampler.method, sampler.steps, sampler.tolerance):
             raise InputError("a latent diffusion's steps are its own: leave the time grid, finish and levels out.")
 
@@ -134,3 +134,10 @@ class LatentDiffusion(Generator):
         """
         new = self.state_dict() if isinstance(parent, VQAutoencoder) else {}
         self._take(parent, {**new, **parent.state_dict()})
+
+
+def _eta(method: str) -> float:
+    eta = eta_of(method)
+    if eta is None or method == DDPM:
+        raise InputError(f"a latent diffusion is sampled by ddim:ETA with ETA in [0, 1], as ddim:1; found {method!r}.")
+    return eta

@@ -8,7 +8,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from r2flow.lidar.known import nearest_filled
 from r2flow.lidar.sensors import Sensor
 from r2flow.registry import Registry
 
@@ -48,6 +47,26 @@ def clean(image: np.ndarray, sensor: Sensor, strength: float, draws: np.random.G
 
 
 FAULTS: Registry[Fault] = Registry("fault", noise=noisy, rain=rain, crosstalk=crosstalk, lost=lost, clean=clean)
+
+
+def nearest_filled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """An image (C, H, W) whose unknown rays have the value of the nearest known one in their row, the ring closed.
+
+    A row without any stays as it is.
+
+    Args:
+        known: (H, W) bool.
+    """
+    filled, columns = image.copy(), image.shape[-1]
+    at = np.arange(columns)
+    for row, measured in enumerate(known):
+        places = np.flatnonzero(measured)
+        if 0 < len(places) < columns:
+            around = np.concatenate([places - columns, places, places + columns])
+            right = np.searchsorted(around, at)
+            nearest = np.where(at - around[right - 1] <= around[right] - at, around[right - 1], around[right])
+            filled[:, row] = image[:, row, nearest % columns]
+    return filled
 
 
 def _replaced(image: np.ndarray, where: np.ndarray, r: np.ndarray, reflectance: np.ndarray) -> np.ndarray:

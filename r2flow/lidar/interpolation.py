@@ -73,11 +73,7 @@ def interpolated(image: np.ndarray, measured: np.ndarray, rule: str, inverse: bo
         if len(known) and len(wanted):
             around = np.concatenate([known - columns, known, known + columns])
             filled[:, h, wanted] = _line(filled[:, h], around, wanted, fill, inverse, columns)
-    empty = ~done.any(1)
-    if empty.any() and done.any():  # rows beyond the known ones
-        rows = np.flatnonzero(~empty)
-        filled[:, empty] = filled[:, rows[np.abs(np.flatnonzero(empty)[:, None] - rows).argmin(1)]]
-    return filled
+    return _rows_beyond(filled, done)
 
 
 def guess(image: np.ndarray, measured: np.ndarray) -> np.ndarray:
@@ -85,6 +81,8 @@ def guess(image: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
     An image without any measured ray is 0.
     """
+    if measured.all() or not measured.any():
+        return image * measured
     filled, done = _along(image * measured, measured, 1)
     if done.all():
         return filled.astype(np.float32)
@@ -92,11 +90,16 @@ def guess(image: np.ndarray, measured: np.ndarray) -> np.ndarray:
     ring = np.concatenate([filled] * 3, axis=2), np.concatenate([done] * 3, axis=1)
     wide = _along(*ring, 2, extend=True)[0][..., columns : 2 * columns]
     filled = np.where(done, filled, wide)
+    return _rows_beyond(filled, done).astype(np.float32)
+
+
+def _rows_beyond(image: np.ndarray, done: np.ndarray) -> np.ndarray:
+    """The image with the nearest filled row in the place of each row of which nothing is known."""
     empty = ~done.any(1)
     if empty.any() and done.any():
         rows = np.flatnonzero(~empty)
-        filled[:, empty] = filled[:, rows[np.abs(np.flatnonzero(empty)[:, None] - rows).argmin(1)]]
-    return filled.astype(np.float32)
+        image[:, empty] = image[:, rows[np.abs(np.flatnonzero(empty)[:, None] - rows).argmin(1)]]
+    return image
 
 
 def _along(image: np.ndarray, known: np.ndarray, axis: int, extend: bool = False) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,7 @@ state = ray_states(images, parse_mask("rows:4")(images.shape[-2:], rng))
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from enum import IntEnum
 from pathlib import Path
 
@@ -52,8 +52,9 @@ def every_row(step: float, first: float = 0) -> Mask:
     def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
         if first >= shape[0]:
             raise InputError(f"the mask begins at row {first:g}, and the image has rows 0 to {shape[0] - 1}.")
-        rows = (np.arange(shape[0]) - int(first)) % int(step) == 0
-        return np.repeat((rows & (np.arange(shape[0]) >= first % step))[:, None], shape[1], axis=1)
+        measured = np.zeros(shape, dtype=bool)
+        measured[int(first) :: int(step)] = True
+        return measured
 
     return mask
 
@@ -135,20 +136,3 @@ def _chosen(count: int, share: float, draws: np.random.Generator) -> np.ndarray:
     chosen = np.zeros(count, dtype=bool)
     chosen[draws.permutation(count)[: round(share * count)]] = True
     return chosen
-
-
-def nearest_filled(image: np.ndarray, known: Sequence[bool] | np.ndarray) -> np.ndarray:
-    """An image (C, H, W) whose unknown rays have the value of the nearest known one in their row, the ring closed.
-
-    A row without any stays as it is.
-    """
-    filled, columns = image.copy(), image.shape[-1]
-    at = np.arange(columns)
-    for row, measured in enumerate(np.asarray(known)):
-        places = np.flatnonzero(measured)
-        if 0 < len(places) < columns:
-            around = np.concatenate([places - columns, places, places + columns])
-            right = np.searchsorted(around, at)
-            nearest = np.where(at - around[right - 1] <= around[right] - at, around[right - 1], around[right])
-            filled[:, row] = image[:, row, nearest % columns]
-    return filled

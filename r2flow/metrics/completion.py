@@ -22,7 +22,6 @@ UNITS: Mapping[str, str] = {
     "chamfer_m2": "Chamfer, squared (m^2)",
     "reflectance_mae": "reflectance MAE",
 }
-BETTER_UP = {"iou"}
 
 
 def errors(truth: np.ndarray, answer: np.ndarray, hidden: np.ndarray, sensor: Sensor) -> dict[str, float]:

@@ -18,12 +18,11 @@ from r2flow.generators.base import Progress
 from r2flow.lidar.faults import FAULTS
 from r2flow.lidar.interpolation import OPPONENTS, interpolated
 from r2flow.lidar.known import Ray, parse_mask, ray_states
-from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.completion import UNITS, errors, spread_errors
 from r2flow.metrics.fidelity import PANEL, distances, panel
 from r2flow.reports.pages import Page
-from r2flow.reports.pictures import dark_figure, draw_perspective, draw_range
+from r2flow.reports.pictures import completed_figure
 from r2flow.reports.tables import table
 
 AS_IT_IS = "as it is"
@@ -231,15 +230,6 @@ def pictured(truth: np.ndarray, shown: Sequence[tuple[Mapping[str, Any], np.ndar
     task = shown[0][0]["task"]
     chosen = [(row["method"], image) for row, image in shown if row["task"] == task]
     kept = [one for one in chosen if one[0] not in (*OPPONENTS, AS_IT_IS) or one[0] in ("nearest", "linear, 1/r")]
-    panels = [(f"measured, {task}", given_by(task, truth, sensor, 0).image), *kept, ("truth", truth)]
-    figure = dark_figure(15, 2.3 * len(panels))
-    grid = figure.add_gridspec(
-        len(panels), 2, width_ratios=[2.2, 1.3], hspace=0.14, wspace=0.03, left=0.01, right=0.99, top=0.985, bottom=0.01
-    )
-    for number, (name, image) in enumerate(panels):
-        axes = figure.add_subplot(grid[number, 0])
-        draw_range(axes, image, label=number == 0)
-        box = {"facecolor": "black", "alpha": 0.6, "linewidth": 0, "pad": 2}
-        axes.text(0.004, 0.94, name, transform=axes.transAxes, va="top", fontsize=9, color="white", bbox=box)
-        draw_perspective(figure.add_subplot(grid[number, 1]), image_to_points(image, sensor.rays())[0])
-    return figure
+    given = given_by(task, truth, sensor, 0)
+    rows = [(f"measured, {task}", given.image), *kept, ("truth", truth)]
+    return completed_figure(rows, (given.state == Ray.UNKNOWN).numpy(), sensor.rays())

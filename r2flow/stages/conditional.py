@@ -55,8 +55,9 @@ class Tasks:
     def _faulty(self, space: ModelSpace, images: Tensor, draws: np.random.Generator) -> tuple[Tensor, Tensor]:
         image = images[0].cpu().numpy()
         names = list(FAULTS)
-        first, second = (names[int(draws.integers(len(names)))] for _ in range(2))
-        for name in dict.fromkeys([first] if draws.random() < 0.5 or "clean" in (first, second) else [first, second]):
+        pair = {names[int(draws.integers(len(names)))]: None for _ in range(2)}  # in the order drawn
+        alone = draws.random() < 0.5 or "clean" in pair  # a scan without any loss has no other fault
+        for name in list(pair)[: 1 if alone else 2]:
             image = FAULTS[name](image, space.sensor, draws.random(), draws)
         changed = torch.from_numpy(np.ascontiguousarray(image))[None]
         return changed, torch.full_like(changed[:, 0], int(Ray.DOUBTFUL), dtype=torch.uint8)
@@ -114,11 +115,21 @@ class Conditional(Rectify):
 
 
 class Regress(Conditional):
-    """The median of what is not known: mean absolute error of one evaluation, with nothing drawn."""
+    """What is not known by one evaluation, with nothing drawn: of the absolute error, the median of each value."""
 
     generator_name = "regression"
 
+    def __init__(
+        self,
+        generator: Generator,
+        loss: str = "absolute",
+        tasks: Mapping[str, Any] | None = None,
+        **options: Any,
+    ) -> None:
+        if options.pop("time", None) is not None:
+            raise InputError("a regression has no times between noise and scan; leave stage.time out, or null.")
+        super().__init__(generator, loss, tasks=tasks, **options)
+
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         assert isinstance(self.generator, Regression)
-        found = self.generator.estimate(self.condition(batch), batch["x_1"])
-        return (found - batch["x_1"]).abs().mean()
+        return self.loss(self.generator.estimate(self.condition(batch), batch["x_1"]), batch["x_1"]).mean()

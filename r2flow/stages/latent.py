@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from r2flow.adversarial.hinge import adaptive_weight, adversarial_factor, hinge_loss, reconstruction_loss
+from r2flow.adversarial.processes import averaged
 from r2flow.backbones.patch_discriminator import PatchDiscriminator
 from r2flow.diffusion.ddim import noise_loss
 from r2flow.errors import InputError
@@ -74,14 +75,6 @@ class LearnAutoencoder(Stage):
         """`returns` of images, for an autoencoder with a mask."""
         return returns(x, self.generator.space.encoding) if self.autoencoder.mask else None
 
-    def over_processes(self, value: Tensor) -> Tensor:
-        """The mean of a value over all processes."""
-        if self.trainer.world_size == 1:
-            return value
-        gathered = self.all_gather(value)
-        assert isinstance(gathered, Tensor)
-        return gathered.mean(0)
-
     def training_step(self, batch: Batch, batch_idx: int) -> None:
         for_autoencoder, for_discriminator = self.own_optimizers()
         x = batch["x_1"]
@@ -93,9 +86,7 @@ class LearnAutoencoder(Stage):
         if factor:
             adversarial = -self.discriminator(made).mean()
             last = self.autoencoder.decoder.conv_out.weight
-            weight = adaptive_weight(
-                reconstruction, adversarial, last, self.adversarial_weight, self.over_processes
-            )  # fmt: skip
+            weight = adaptive_weight(reconstruction, adversarial, last, self.adversarial_weight, averaged)
             loss = loss + factor * weight * adversarial
         self.take_step(for_autoencoder, loss)
         real = x if mask is None else torch.cat([x, mask], 1)

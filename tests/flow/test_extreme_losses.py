@@ -14,6 +14,7 @@ EXPECTED = {
     "mse": lambda r: r**2,
     "pseudo_huber": lambda r: (math.sqrt(D * r**2 + C**2) - C) / math.sqrt(D),
     "pseudo_huber_elementwise": lambda r: math.sqrt(r**2 + C**2) - C,
+    "absolute": abs,
 }
 
 

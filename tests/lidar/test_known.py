@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.lidar.faults import FAULTS
+from r2flow.lidar.faults import FAULTS, nearest_filled
 from r2flow.lidar.interpolation import OPPONENTS, guess, interpolated
-from r2flow.lidar.known import Ray, nearest_filled, parse_mask, ray_states
+from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.lidar.sensors import SENSORS
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
@@ -31,6 +31,7 @@ def test_a_ray_is_never_empty_because_it_was_not_measured():
 def test_masks_measure_what_they_say():
     assert np.flatnonzero(parse_mask("rows:4")(SHAPE, draws()).all(1)).tolist() == [0, 4, 8, 12]
     assert np.flatnonzero(parse_mask("rows:4,2")(SHAPE, draws()).any(1)).tolist() == [2, 6, 10, 14]
+    assert np.flatnonzero(parse_mask("rows:4,6")(SHAPE, draws()).any(1)).tolist() == [6, 10, 14]
     rows = parse_mask("random:0.5")(SHAPE, draws())
     assert rows.all(1).sum() == 8
     assert rows.any(1).sum() == 8

@@ -211,6 +211,11 @@ def test_the_twin_learns_medians():
     assert found.mean() == pytest.approx(0.5, abs=0.05)
 
 
+def test_the_twin_has_no_times():
+    with pytest.raises(InputError, match="no times between noise and scan"):
+        Regress(built("regression"), time={"name": "uniform"})
+
+
 def test_the_twin_has_one_way_to_be_run_and_ignores_the_noise(scans):
     generator = built("regression")
     assert isinstance(generator, Regression)

@@ -443,7 +443,8 @@ def test_a_scan_is_a_function_of_its_number_alone():
     ("changes", "said"),
     [
         ({"method": "euler"}, "sampled by ddim:ETA"),
-        ({"method": "ddim:2"}, "sampled by ddim:ETA"),
+        ({"method": "ddim:2"}, "eta of ddim:ETA must lie in"),
+        ({"method": "ddpm"}, "sampled by ddim:ETA"),
         ({"steps": 1000}, "in 1 to 999"),
         ({"grid": "power:2"}, "steps are its own"),
     ],
