@@ -243,7 +243,7 @@ def scans_of(seed: int, first: int, num: int) -> np.ndarray:
     return np.stack([simulate(SENSOR, seed, k).image[:1] for k in range(first, first + num)])
 
 
-def study(out: Path, seeds: Sequence[int], seconds: float, num: int) -> None:
+def study(out: Path, seeds: Sequence[int], seconds: float, num: int, names: Sequence[str]) -> None:
     held = scans_of(HELD_OUT_SEED, 0, HELD_OUT + num)
     real = panel(held[:HELD_OUT], SENSOR)
     floor = distances(panel(held[HELD_OUT:], SENSOR), real)
@@ -256,7 +256,8 @@ def study(out: Path, seeds: Sequence[int], seconds: float, num: int) -> None:
                 lines = distances(panel(images, SENSOR), real)
                 beside[name] = {"lines": lines, "panel": float(np.mean(list(lines.values())))}
             write(note, beside)
-        for name, link in LINKS.items():
+        for name in names:
+            link = LINKS[name]
             took, folder = learn(out, seed, name, seconds), folder_of(out, seed, name)
             text = took["failed"] or "{steps} steps, {planned:.1f} s planned, {spent:.1f} spent".format(**took)
             note = folder.with_suffix(".json")
@@ -351,10 +352,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
     parser.add_argument("--seconds", type=float, default=SECONDS)
     parser.add_argument("--samples", type=int, default=SAMPLES)
+    parser.add_argument("--rows", nargs="+", default=list(LINKS), choices=LINKS)
     given = parser.parse_args()
     torch.set_num_threads(1)
     out = given.out.resolve()
-    study(out, given.seeds, given.seconds, given.samples)
+    study(out, given.seeds, given.seconds, given.samples, given.rows)
     report(out, given.seeds)
 
 
