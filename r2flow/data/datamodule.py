@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from r2flow import simulator
 from r2flow.data.augment import Augmentation
-from r2flow.data.loader import FlowDataset, Item, Order, Permutations, RunLoader, RunSampler, fixed_batches
+from r2flow.data.loader import FlowDataset, Further, Item, Order, Permutations, RunLoader, RunSampler, fixed_batches
 from r2flow.data.mixture import MixedOrder, Mixture, refuse_shared_scans
 from r2flow.data.opening import held_out_options, open_source, split_parts
 from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
@@ -41,6 +41,9 @@ class ScanDataModule(L.LightningDataModule):
     Args:
         keys: The keys of `r2flow.data.options.DataOptions`.
 
+    Attributes:
+        further: What the run's stage adds to each scan of a batch.
+
     Raises:
         InputError: an unknown key, or values that cannot be.
     """
@@ -59,6 +62,7 @@ class ScanDataModule(L.LightningDataModule):
         check_options("data.augment", Augmentation, augment)
         self.augment = Augmentation(**augment)
         self.validation = self.options.held
+        self.further: Further | None = None
         self.names: list[str] = []
         self.files: dict[str, str | Path] = {}  # that scans are read from; see `r2flow.data.contents`
         self.training_source: ScanSource | PairSource | None = None
@@ -207,7 +211,7 @@ class ScanDataModule(L.LightningDataModule):
         if isinstance(source, PairSource):
             return PairDataset(source, self.seed, purpose)
         augment = self.augment if purpose == "training" else None
-        return FlowDataset(source, self.encoding, self.seed, purpose, augment, self.noise_shape)
+        return FlowDataset(source, self.encoding, self.seed, purpose, augment, self.noise_shape, self.further)
 
     def val_dataloader(self) -> DataLoader[Item] | list[Any]:
         self._ready()

@@ -1,6 +1,6 @@
 """Batches that a run can leave and come back to."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,6 +14,7 @@ from r2flow.data.sources import ScanSource
 from r2flow.lidar.encoding import Encoding
 
 Item = dict[str, Tensor]
+Further = Callable[[Tensor, np.random.Generator], Item]  # of x_1, (C, H, W), and draws of the image's own
 
 
 class FlowDataset(Dataset[Item]):
@@ -24,8 +25,9 @@ class FlowDataset(Dataset[Item]):
     - x_1, (B, C, H, W): scans in model space, where t = 1;
     - x_0, (B, *noise_shape): standard normal noise, where t = 0;
     - u, (B,): uniform in [0, 1); the stage makes t of it;
-    - k, (B,): number of the image in the run. A stage that needs more draws or conditions for an image derives them
-      from (seed, purpose, k).
+    - k, (B,): number of the image in the run. A stage that needs more draws for an image derives them from
+      (seed, purpose, k);
+    - what `further` makes of the image: a stage's conditions. Those of validation are the same for every seed.
     """
 
     def __init__(
@@ -36,9 +38,11 @@ class FlowDataset(Dataset[Item]):
         purpose: str,
         augment: Augmentation | None = None,
         noise_shape: Sequence[int] | None = None,
+        further: Further | None = None,
     ) -> None:
         self.source, self.encoding, self.seed, self.purpose = source, encoding, seed, purpose
         self.augment, self.noise_shape = augment, tuple(noise_shape or encoding.shape)
+        self.further = further
 
     def __len__(self) -> int:
         return len(self.source)
@@ -53,7 +57,11 @@ class FlowDataset(Dataset[Item]):
             x_1 = self.encoding.encode(torch.from_numpy(image))
         else:
             x_1 = self.source.encoded(index, self.encoding)
-        return {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
+        item = {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
+        if self.further is None:
+            return item
+        seed = self.seed if self.purpose == "training" else 0
+        return item | self.further(x_1, noise.generator(seed, "condition", k))
 
 
 class Order(Protocol):

@@ -79,8 +79,8 @@ class Gan(Generator):
         known = sampler.method == DIRECT or sampler.method.startswith(TRUNCATE)
         if not known or replace(sampler, method=self.sampler.method) != self.sampler:
             raise InputError(
-                f"a {type(self).__name__} makes a scan in 1 step, by {DIRECT} or {TRUNCATE}PSI; "
-                f"found {sampler.method} with {sampler.steps}."
+                f"a {type(self).__name__} makes a scan in 1 step, by {DIRECT} or {TRUNCATE}PSI, without a tolerance or "
+                f"a time grid; found {sampler.method} in {sampler.steps}."
             )
         truncation_of(sampler)
 

@@ -89,7 +89,7 @@ def woods(b: SceneBuilder, x: float, y: float) -> None:
 
 
 def hedge(b: SceneBuilder, x: float, y: float, yaw: float, length: float, height: float) -> None:
-    """A trimmed hedge, in pieces of different height and depth."""
+    """A trimmed hedge, in pieces of different height and depth; open where it meets a carriageway."""
     albedo = b.albedo("leaves")
     c, s = math.cos(yaw), math.sin(yaw)
     pieces = max(1, round(length / 2.5))
@@ -101,7 +101,8 @@ def hedge(b: SceneBuilder, x: float, y: float, yaw: float, length: float, height
             px, py, yaw + b.draws.uniform(-0.03, 0.03), length / pieces + 0.1, b.draws.uniform(0.7, 1.1),
             ground - 0.3, ground + height * b.draws.uniform(0.9, 1.08),
         )  # fmt: skip
-        b.add(box, "vegetation", "leaves", albedo)
+        if b.ground.off_street(px, py) > 0:
+            b.add(box, "vegetation", "leaves", albedo)
 
 
 def fence(b: SceneBuilder, x: float, y: float, yaw: float, length: float) -> None:

@@ -1,11 +1,12 @@
 """What every stage has in common: a generator that learns, its optimiser, and what a checkpoint says of it."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from typing import Any, ClassVar
 
 import lightning as L
+import numpy as np
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
@@ -45,6 +46,7 @@ class Stage(L.LightningModule):
     Attributes:
         config: The run's, which goes into its checkpoints.
         gradient_clip_val: The run's, for a stage with manual optimisation, which clips for itself.
+        further: What a batch holds beside, made of x_1, (C, H, W), and draws of each image by the loader's workers.
     """
 
     generator_name: ClassVar[str | None] = None  # what it trains; None: the parent's, or a rectified flow
@@ -71,6 +73,7 @@ class Stage(L.LightningModule):
         self.seed = seed
         self.config: dict[str, Any] = {}
         self.gradient_clip_val: float | None = None
+        self.further: Callable[[Tensor, np.random.Generator], Batch] | None = None
 
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
         """Refuse a config's `data` that the stage of this name cannot learn from.

@@ -2,15 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow import noise
 from r2flow.errors import InputError
 from r2flow.generators import Condition, ConditionalFlow, Generator, Regression, condition_of
+from r2flow.generators.base import DOUBTFUL, IMAGE, KNOWN
 from r2flow.lidar.faults import FAULTS
 from r2flow.lidar.known import Ray, every_row, random_points, random_rows, ray_states, without_sector
 from r2flow.lidar.space import ModelSpace
@@ -37,8 +38,8 @@ class Tasks:
     faulty: Portion = 0.15
     silent: Portion = 0.1
 
-    def __call__(self, space: ModelSpace, x_1: Tensor, draws: np.random.Generator) -> Condition:
-        """The condition of one scan in model space, (C, H, W): tensors (1, C, H, W)."""
+    def __call__(self, space: ModelSpace, x_1: Tensor, draws: np.random.Generator) -> Batch:
+        """What is known of one scan of model space: `condition_of` without its first dimension."""
         which, silent = draws.random(2)
         images = space.decode(x_1[None].float())
         if silent < self.silent:
@@ -50,7 +51,7 @@ class Tasks:
         else:
             measured = _measured(space.sensor.shape, draws)
             state = ray_states(images, torch.from_numpy(measured))
-        return condition_of(space, images, state)
+        return {name: value[0] for name, value in condition_of(space, images, state).items()}
 
     def _faulty(self, space: ModelSpace, images: Tensor, draws: np.random.Generator) -> tuple[Tensor, Tensor]:
         image = images[0].cpu().numpy()
@@ -102,16 +103,10 @@ class Conditional(Rectify):
         if not isinstance(generator, ConditionalFlow):
             raise InputError(f"this stage learns from what is known, which a {type(generator).__name__} is not told.")
         check_options("stage.tasks", Tasks, tasks or {})
-        self.tasks = Tasks(**(tasks or {}))
+        self.further = partial(Tasks(**(tasks or {})), generator.space)
 
     def condition(self, batch: Batch) -> Condition:
-        """What is known of image k is a function of (seed, k), in validation of k alone."""
-        space, seed = self.generator.space, self.seed if self.training else 0
-        parts = [
-            self.tasks(space, x_1.cpu(), noise.generator(seed, "condition", int(k)))
-            for k, x_1 in zip(batch["k"], batch["x_1"], strict=True)
-        ]
-        return {name: torch.cat([part[name] for part in parts]).to(batch["x_1"]) for name in parts[0]}
+        return {name: batch[name] for name in (IMAGE, KNOWN, DOUBTFUL)}
 
 
 class Regress(Conditional):

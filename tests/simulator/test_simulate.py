@@ -12,6 +12,7 @@ from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.noise import generator
 from r2flow.simulator import draw_scene, simulate
+from r2flow.simulator.shapes import Boxes
 
 HDL64E = SENSORS["hdl64e"]
 SMALL = HDL64E.resized(32, 256)
@@ -21,6 +22,15 @@ SENSORS_SEEN = [*(sensor for _, sensor in SENSORS.items()), SMALL, build_sensor(
 @pytest.fixture(scope="module")
 def scans():
     return [simulate(HDL64E, seed=3, index=index) for index in range(40)]
+
+
+@pytest.mark.parametrize(("seed", "index"), [(77, 291), *((0, index) for index in range(24))])
+def test_no_hedge_stands_on_a_carriageway(seed, index):
+    # One across a junction once held the sensor: a scan without a return.
+    scene = draw_scene(generator(seed, "simulator", index))
+    for solid, surface in zip(scene.solids, scene.surfaces, strict=True):
+        for k in np.flatnonzero(surface.label == LABELS["vegetation"]) if isinstance(solid, Boxes) else ():
+            assert scene.ground.off_street(float(solid.x[k]), float(solid.y[k])) > 0
 
 
 def fingerprint(scan) -> int:

@@ -8,6 +8,8 @@ import torch
 from scipy.stats import norm
 
 from r2flow import noise
+from r2flow.data.loader import FlowDataset
+from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
 from r2flow.flow.problems import Gaussian
 from r2flow.generators import ConditionalFlow, Regression, Sampler, build_generator, condition_of
@@ -153,19 +155,28 @@ def stage_of(kind, generator, **tasks):
     return stage
 
 
-def batch_of(scans: torch.Tensor, space, first: int = 0) -> dict[str, torch.Tensor]:
+def batch_of(scans: torch.Tensor, space) -> dict[str, torch.Tensor]:
     x_1 = space.encoding.encode(scans)
-    return {"x_1": x_1, "x_0": torch.randn_like(x_1), "u": torch.rand(3), "k": torch.arange(first, first + 3)}
+    return {"x_1": x_1, "x_0": torch.randn_like(x_1), "u": torch.rand(3), "k": torch.arange(3)}
 
 
-def test_what_is_known_depends_on_the_image_s_number_alone(flow, scans):
-    stage = stage_of(Conditional, flow)
-    batch = batch_of(scans, flow.space)
-    whole = stage.condition(batch)
-    alone = stage.condition({name: value[1:2] for name, value in batch.items()})
-    for name in whole:
-        assert torch.equal(whole[name][1:2], alone[name])
-    assert any(not torch.equal(whole[name], stage.condition(batch_of(scans, flow.space, 3))[name]) for name in whole)
+@pytest.mark.parametrize(("purpose", "seeds_differ"), [("training", True), ("validation", False)])
+def test_what_is_known_is_a_function_of_seed_and_number_and_in_validation_of_the_number(
+    flow, scans, purpose, seeds_differ
+):
+    source = InMemory(scans.numpy(), ["a", "b", "c"])
+
+    def told(seed: int, k: int) -> dict[str, torch.Tensor]:
+        stage = stage_of(Conditional, flow)
+        item = FlowDataset(source, flow.space.encoding, seed, purpose, further=stage.further)[(k, 0)]
+        return stage.condition({name: value[None] for name, value in item.items()})
+
+    def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
+        return all(torch.equal(one[name], other[name]) for name in one)
+
+    assert same(told(1, 7), told(1, 7))
+    assert not all(same(told(1, 7), told(1, k)) for k in range(8, 14))
+    assert seeds_differ is not all(same(told(1, k), told(2, k)) for k in range(7, 14))
 
 
 def test_tasks_have_the_shares_that_they_say(flow, scans):
@@ -179,7 +190,7 @@ def test_tasks_have_the_shares_that_they_say(flow, scans):
     returned = scans[0, 0] > 0
     silent = [
         one for one in told
-        if one["known"][0, 0][returned].any() and not one["known"][0, 1][returned].any()
+        if one["known"][0][returned].any() and not one["known"][1][returned].any()
     ]  # fmt: skip
     assert abs(len(silent) / count - 0.25 * 0.56) < 4 * math.sqrt(0.14 * 0.86 / count)
 
