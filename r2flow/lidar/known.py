@@ -117,8 +117,8 @@ def _from_file(path: Path) -> Mask:
     held = read_numbers(path)
     if held.ndim != 2 or not (held.dtype == bool or (held.dtype.kind in "iuf" and np.isin(held, (0, 1)).all())):
         raise InputError(
-            f"the mask {path} must be an array (H, W) of true where a ray is measured, or of 0 and 1; found {held.dtype} "
-            f"of shape {held.shape}."
+            f"the mask {path} must be an array (H, W) of true where a ray is measured, or of 0 and 1; found "
+            f"{held.dtype} of shape {held.shape}."
         )
 
     def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
