@@ -245,6 +245,34 @@ def test_no_error_is_told_where_no_ray_returns_in_both(r2flow, run, tmp_path):  
     assert "of the rays return in one alone" in said
 
 
+def test_the_folder_of_the_scans_is_not_written_into(r2flow, run, tmp_path):  # noqa: F811
+    """There the note on the answers would be taken for one on the scans."""
+    sparse_scan(tmp_path / "in" / "room.pcd")
+    for what in (tmp_path / "in" / "room.pcd", tmp_path / "in", tmp_path):
+        out = tmp_path if what == tmp_path else tmp_path / "in"
+        code, _, error = r2flow(*COMPLETE, what, "-c", run, "--num", 2, "--out", out)
+        assert code == 2
+        assert f"{out} is the folder of the scans; answers need one of their own" in error
+    assert [path.name for path in (tmp_path / "in").iterdir()] == ["room.pcd"]
+
+
+def test_a_file_of_an_answer_s_name_is_no_answer(r2flow, run, tmp_path):  # noqa: F811
+    full_scan(tmp_path / "one.npy")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "one.npy").write_text("mine")
+    code, _, error = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out")
+    assert code == 2
+    assert "one.npy is there and no answer of this command; give another --out" in error
+    assert (tmp_path / "out" / "one.npy").read_text() == "mine"
+
+
+def test_answers_of_another_sampler_are_told_apart_by_its_setting(r2flow, run, tmp_path):  # noqa: F811
+    full_scan(tmp_path / "one.npy")
+    asked = [*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out", "--steps"]
+    assert r2flow(*asked, 1)[0] == 0
+    assert "completed with steps 1, not 2; give another --out" in r2flow(*asked, 2)[2]
+
+
 def test_a_folder_of_other_samples_is_not_written_into(r2flow, run, tmp_path):  # noqa: F811
     full_scan(tmp_path / "one.npy")
     (tmp_path / "out").mkdir()
