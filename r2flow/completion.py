@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,12 +19,16 @@ from r2flow.generators import Condition, Flow, Generator, Regression, Sampler, c
 from r2flow.generators.base import Progress
 from r2flow.generators.flow import UNTOLD
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
+from r2flow.lidar.interpolation import surfaces
 from r2flow.lidar.known import Ray
 from r2flow.lidar.sensors import Sensor
 from r2flow.sampling import HasGenerator, Samples, draw
 
 KEEP = ("exact", "blend", "mend")
 CONFIRMED = 0.2  # of its range: nearer an answer confirms a doubtful return; docs/completion.md
+ROUGH = 0.06  # of its range: how far the answers of a flow lie about a surface
+EXACT = 0.002  # of its range: no surface is known better
+SURE = 0.05  # of its range: a surface known better than that holds wherever an answer has the return
 ANSWER = 2**32  # noise numbers from one answer to the next: answer 0 of scan i has the noise of sample i
 USUAL = Sampler("mmps", 10, grid="power:1.5")  # of flows; docs/completion.md has others
 
@@ -104,6 +109,7 @@ def complete(
     sampler: Sampler | None = None,
     batch_size: int = 1,
     first: int = 0,
+    on_surfaces: bool | None = None,
     progress: Progress = None,
     **changes: Any,
 ) -> Iterator[Completed]:
@@ -125,6 +131,8 @@ def complete(
         sampler: How the generator is run; if left out, that of `completing`.
         batch_size: Answers at once. It does not change a fixed-step result beyond rounding.
         first: Number of the first scan.
+        on_surfaces: Whether returns of an answer are moved towards the surfaces that the known ones lie on (`settled`);
+            if left out, those of a flow that was trained without a condition.
         progress: Called after every network evaluation of a batch.
         changes: Single settings of the sampler: steps, method, tolerance, grid.
 
@@ -147,23 +155,44 @@ def complete(
     if keep != "exact":
         state = torch.where(state == Ray.UNKNOWN, state, torch.tensor(int(Ray.DOUBTFUL), dtype=state.dtype))
     condition = condition_of(generator.space, images, state)
-    mends = keep == "mend"
-    yield from _answers(generator, how, images, state, condition, num, seed, batch_size, first, progress, mends)
+    if on_surfaces is None:
+        on_surfaces = not generator.told
+    last = _Last(images, state, keep == "mend", on_surfaces)
+    yield from _answers(generator, how, last, condition, num, seed, batch_size, first, progress)
+
+
+def settled(r: Tensor, surface: Tensor, error: Tensor) -> Tensor:
+    """Ranges of an answer, moved towards the surfaces that the measured returns lie on.
+
+    Where the answer's log-range is log(surface) + d with |d| <= 3 s, s^2 = `ROUGH`^2 + error^2, it is taken for one of
+    N(log surface, s^2) and becomes log(surface) + d error / s, which has the variance that the surface leaves. Further
+    off it stays, unless the surface is known better than `SURE`: then the range is the surface's.
+
+    Args:
+        r: (..., H, W) in metres; 0, without a return, stays 0.
+        surface: Range in metres, (..., H, W), of `r2flow.lidar.interpolation.surfaces`.
+        error: Its error; infinite where there is none.
+    """
+    said = error.isfinite() & (r > 0)
+    error = torch.where(said, error, 1).clamp(min=EXACT)
+    d = torch.where(said, r / torch.where(said, surface, 1), 1).log()
+    s = (ROUGH**2 + error.square()).sqrt()
+    share = torch.where(d.abs() <= 3 * s, error / s, torch.where(error < SURE, 0, 1))
+    return torch.where(said, surface * (share * d).exp(), r).to(r)
 
 
 def _answers(
     generator: Generator,
     how: Sampler,
-    images: Tensor,
-    state: Tensor,
+    last: "_Last",
     condition: Condition,
     num: int,
     seed: int,
     batch_size: int,
     first: int,
     progress: Progress,
-    mends: bool,
 ) -> Iterator[Completed]:
+    images = last.images
     told = [_told(condition, i) for i in range(len(images))]
     # A method that reads the condition has nothing to do without one.
     plain = generator.sampler if completes(how.method) else how
@@ -182,8 +211,7 @@ def _answers(
             else:
                 known = {name: value[rows] for name, value in condition.items()}
                 found = draw(generator, numbers, seed, how, known, progress=progress)
-            pasted = _pasted(found.images, images[rows], state[rows], mends)
-            done += _one_by_one(replace(found, images=pasted))
+            done += _one_by_one(replace(found, images=last(found.images, rows)))
             while len(done) >= num:
                 yield _together(done[:num])
                 done = done[num:]
@@ -223,15 +251,30 @@ def _given(generator: Generator, images: Tensor) -> Samples:
     return Samples(images[:, :channels], 0, none, none == 0, 0.0)
 
 
-def _pasted(found: Tensor, images: Tensor, state: Tensor, mends: bool) -> Tensor:
-    """Decoded scans with what was given where a ray is known, or confirmed."""
-    kept = (state == Ray.RETURN) | (state == Ray.EMPTY)
-    if mends:
-        r, s = images[:, 0], found[:, 0]
-        kept = kept | ((state == Ray.DOUBTFUL) & (r > 0) & (s > 0) & ((s - r).abs() <= CONFIRMED * r))
-    channels = min(found.shape[1], images.shape[1])
-    pasted = torch.cat([torch.where(kept[:, None], images[:, :channels], found[:, :channels]), found[:, channels:]], 1)
-    return pasted * (pasted[:, :1] > 0)
+class _Last:
+    """The last of an answer's way: returns moved to surfaces, and what was given where a ray is known or confirmed."""
+
+    def __init__(self, images: Tensor, state: Tensor, mends: bool, on_surfaces: bool) -> None:
+        self.images, self.state, self.mends = images, state, mends
+        self.kept = (state == Ray.RETURN) | (state == Ray.EMPTY)
+        self.surface = self.error = torch.full_like(images[:, 0], torch.inf)
+        if on_surfaces:
+            found = [surfaces(r, known) for r, known in zip(images[:, 0].numpy(), self.kept.numpy(), strict=True)]
+            self.surface, self.error = (torch.from_numpy(np.stack(part)).float() for part in zip(*found, strict=True))
+
+    def __call__(self, found: Tensor, rows: list[int]) -> Tensor:
+        """Decoded scans (B, 2 or 1, H, W), answers to those of `rows`."""
+        images, kept = self.images[rows], self.kept[rows]
+        free = self.state[rows] == Ray.UNKNOWN
+        moved = settled(found[:, 0], self.surface[rows], torch.where(free, self.error[rows], torch.inf))
+        found = torch.cat([moved[:, None], found[:, 1:]], 1)
+        if self.mends:
+            r, s = images[:, 0], found[:, 0]
+            near = (r > 0) & (s > 0) & ((s - r).abs() <= CONFIRMED * r)
+            kept = kept | ((self.state[rows] == Ray.DOUBTFUL) & near)
+        channels = min(found.shape[1], images.shape[1])
+        pasted = torch.where(kept[:, None], images[:, :channels], found[:, :channels])
+        return torch.cat([pasted, found[:, channels:]], 1) * (pasted[:, :1] > 0)
 
 
 def _one_by_one(made: Samples) -> list[Samples]:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from r2flow.checkpoints import Checkpoint
-from r2flow.completion import ANSWER, complete, completing, spread_of
+from r2flow.completion import ANSWER, ROUGH, SURE, complete, completing, settled, spread_of
 from r2flow.errors import InputError
 from r2flow.generators import Generator, Sampler, build_generator
 from r2flow.lidar.known import Ray, parse_mask, ray_states
@@ -215,3 +215,41 @@ def test_what_fits_nothing_is_refused(changed, message):
     given = {"images": images, "state": torch.zeros(1, *SHAPE, dtype=torch.uint8), **changed}
     with pytest.raises(InputError, match=message):
         list(complete(network(), **given))
+
+
+def test_settled_answers_scatter_as_the_surface_leaves_it():
+    draws = torch.Generator().manual_seed(2)
+    surface, error = torch.tensor(20.0), torch.tensor(0.03)
+    around = surface * ((ROUGH**2 + 0.03**2) ** 0.5 * torch.randn(200_000, generator=draws).clamp(-3, 3)).exp()
+    logs = (settled(around, surface, error) / surface).log()
+    assert float(logs.std()) == pytest.approx(0.03, rel=0.02)  # three deviations of 200,000 draws are 0.5 %
+    assert float(logs.mean()) == pytest.approx(0, abs=3 * 0.03 / 200_000**0.5)
+
+
+def test_settled_answers_far_off_stay_unless_the_surface_is_sure():
+    r = torch.tensor([40.0, 40.0, 0.0, 21.0])
+    surface = torch.full((4,), 20.0)
+    error = torch.tensor([2 * SURE, SURE / 2, 0.001, torch.inf])
+    assert settled(r, surface, error).tolist() == [40, 20, 0, 21]
+
+
+def test_answers_of_a_flow_without_a_condition_are_moved_to_surfaces_and_no_others():
+    images = scans()
+    images[:, 0] = torch.where(images[:, 0] > 0, 7.0, 0)  # walls around the sensor
+    state = halved(images)
+    plain = network("rectified_flow")
+    how = {"num": 2, "sampler": Sampler("mmps:1", 2)}
+    by_default, without = plain.complete(images, state, **how), plain.complete(images, state, on_surfaces=False, **how)
+    known = (state != Ray.UNKNOWN)[:, None, None].expand_as(without)
+    assert torch.equal(by_default[known], without[known])
+    assert torch.equal(by_default[:, :, 0] > 0, without[:, :, 0] > 0)
+    assert torch.equal(by_default[:, :, 1], without[:, :, 1])
+    surrounded = torch.zeros(SHAPE, dtype=torch.bool)
+    surrounded[3:5:2] = True
+    inside = surrounded & (images[:, 0].roll(1, 1) > 0) & (images[:, 0].roll(-1, 1) > 0)
+    returned = inside[:, None] & (without[:, :, 0] > 0)
+    off, left = (one[:, :, 0][returned] - 7 for one in (without, by_default))
+    assert returned.any()
+    assert float(left.abs().mean()) < 0.5 * float(off.abs().mean())
+    told = network()
+    assert torch.equal(told.complete(images, state), told.complete(images, state, on_surfaces=False))

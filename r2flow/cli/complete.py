@@ -8,7 +8,16 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import SolverOptions, grouped
-from r2flow.cli.options import SETS, ColumnsOption, DeviceOption, OutOption, build_sized, choose_device, named_columns
+from r2flow.cli.options import (
+    SETS,
+    ColumnsOption,
+    DeviceOption,
+    OutOption,
+    SurfacesOption,
+    build_sized,
+    choose_device,
+    named_columns,
+)
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -37,6 +46,7 @@ class KnownOptions:
             "blend: all are the answer's."
         ),
     ] = "exact"
+    surfaces: SurfacesOption = None
     reflectance_scale: Annotated[
         float | None, typer.Option(min=1e-6, help="Value in the files that means full reflectance; found if left out.")
     ] = None
@@ -107,8 +117,9 @@ def complete(
         print(f"{ending} is {why}: answers are .ply ({', '.join(WRITTEN)} are written)")
     if not loaded.encoding.reflectance:
         print("the model is of range alone: answers have no reflectance")
-    job = Job(answers.num, answers.seed, known.keep, mask, answers.batch_size, answers.pictures)
-    about = {"mask": known.mask, "from": known.source}
+    surfaces = not loaded.generator.told if known.surfaces is None else known.surfaces
+    job = Job(answers.num, answers.seed, known.keep, mask, answers.batch_size, surfaces, answers.pictures)
+    about = {"mask": known.mask, "from": known.source, "surfaces": surfaces}
     found = write_completed(loaded, scans, out, job, sampler, about)
     there = len(scans) - len(found)
     print(f"{len(found)} scans completed in {out}" + (f", {there} were there already" if there else ""))

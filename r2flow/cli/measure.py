@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -14,6 +14,7 @@ from r2flow.cli.options import (
     DeviceOption,
     OutOption,
     ScaleChoice,
+    SurfacesOption,
     choose_device,
     choose_reading,
 )
@@ -78,6 +79,7 @@ def completion(
     answers: Annotated[int, typer.Option(min=1, help="Answers to each scan; 19 give intervals of 90 %.")] = 8,
     seed: Annotated[int, typer.Option(min=0, help="Of the noise. What is hidden of a scan does not depend on it.")] = 0,
     batch_size: Annotated[int, typer.Option(min=1, help="Answers at once.")] = 4,
+    surfaces: SurfacesOption = None,
     reflectance_scale: ScaleChoice = None,
     device: DeviceOption = "auto",
     out: OutOption = Path("reports"),
@@ -109,7 +111,8 @@ def completion(
     rows, shown = [], []
     cost = [way.checkpoint.generator.evaluations_of(way.sampler(task in FAULTS)) for way in ways for task in named]
     with Bar("completing", -(-len(truths) * answers // batch_size) * sum(cost), "evaluations") as advance:
-        for row, images in completion_rows(truths, first.sensor, ways, named, answers, seed, batch_size, advance):
+        options: dict[str, Any] = {"on_surfaces": surfaces, "progress": advance}
+        for row, images in completion_rows(truths, first.sensor, ways, named, answers, seed, batch_size, **options):
             rows.append(row)
             shown.append((row, images[0]))
     figure = pictured(truths[0], shown, first.sensor)

@@ -23,6 +23,13 @@ SensorOption = Annotated[str, typer.Option(help="Name of the sensor, or the YAML
 SizeOption = Annotated[str | None, typer.Option(help="Rows x columns, as 64x1024; the sensor's own if left out.")]
 ProjectionOption = Annotated[str, typer.Option(help="spherical or unfolding.")]
 ConventionOption = Annotated[str, typer.Option(help="centre, or reference for the published models'.")]
+SurfacesOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--surfaces/--no-surfaces",
+        help="Whether answers are moved to the surfaces that measured returns lie on; for models without a condition.",
+    ),
+]
 SETS = "a folder of scans, samples, a run, prepared shards, NAME:FOLDER, simulated:SEED"
 SensorChoice = Annotated[
     str | None, typer.Option(help="Name of the sensor; that of the flow or the scans, or hdl64e, if left out.")

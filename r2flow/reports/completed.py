@@ -43,6 +43,7 @@ class Job:
         num: Answers to each scan.
         keep: As in `r2flow.completion.complete`.
         mask: Of the measured rays of each scan those that are kept; None for all.
+        on_surfaces: As in `r2flow.completion.complete`.
         pictures: How many scans get a picture and a page in 3-D.
     """
 
@@ -51,6 +52,7 @@ class Job:
     keep: str = "exact"
     mask: Mask | None = None
     batch_size: int = 1
+    on_surfaces: bool | None = None
     pictures: int = 8
 
 
@@ -99,7 +101,7 @@ def write_completed(
             images, state = torch.from_numpy(given.image)[None], torch.from_numpy(given.state)[None]
             (made,) = complete(
                 checkpoint, images, state, job.num, job.seed, keep=job.keep, sampler=sampler,
-                batch_size=job.batch_size, first=number, progress=bar.evaluated,
+                batch_size=job.batch_size, first=number, on_surfaces=job.on_surfaces, progress=bar.evaluated,
             )  # fmt: skip
             if not found:  # the first answer shows that the settings can be used
                 keep_note(checkpoint, out, job.seed, {"completion": settings}, **sampler.asdict())

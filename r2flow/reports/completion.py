@@ -16,7 +16,7 @@ from r2flow.errors import InputError
 from r2flow.generators import Regression, Sampler
 from r2flow.generators.base import Progress
 from r2flow.lidar.faults import FAULTS
-from r2flow.lidar.interpolation import OPPONENTS, interpolated
+from r2flow.lidar.interpolation import OPPONENTS
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.completion import UNITS, errors, spread_errors
@@ -116,8 +116,8 @@ def opponents(given: Given, faulty: bool) -> Iterator[tuple[str, np.ndarray]]:
     if faulty:
         yield AS_IT_IS, given.image
         return
-    for name, (rule, inverse) in OPPONENTS.items():
-        yield name, interpolated(given.image, ~given.asked, rule, inverse)
+    for name, fill in OPPONENTS.items():
+        yield name, fill(given.image, ~given.asked)
 
 
 def completion_rows(
@@ -128,6 +128,7 @@ def completion_rows(
     answers: int = 8,
     seed: int = 0,
     batch_size: int = 4,
+    on_surfaces: bool | None = None,
     progress: Progress = None,
 ) -> Iterator[tuple[dict[str, Any], list[np.ndarray]]]:
     """A row for each task and method, means over scans and answers, and the first answer to each scan.
@@ -136,6 +137,7 @@ def completion_rows(
         truths: Range images, (2 or 1, H, W).
         answers: To each scan; interpolations have one.
         batch_size: Answers at once.
+        on_surfaces: As in `r2flow.completion.complete`.
     """
     whole = panel(np.stack(truths), sensor)
     for task in tasks:
@@ -149,19 +151,27 @@ def completion_rows(
             row = _row(task, name, truths, found, asked, sensor, whole)
             yield {**row, "evaluations": 0, "seconds": float("nan")}, [images[0] for images in found]
         for way in ways:
-            found, seconds, evaluations = _answers(way, given, answers, seed, batch_size, progress)
+            found, seconds, evaluations = _answers(way, given, answers, seed, batch_size, on_surfaces, progress)
             row = _row(task, way.name(task in FAULTS), truths, found, asked, sensor, whole)
             yield {**row, "evaluations": evaluations, "seconds": seconds}, [images[0] for images in found]
 
 
 def _answers(
-    way: Way, given: Sequence[Given], answers: int, seed: int, batch_size: int, progress: Progress
+    way: Way,
+    given: Sequence[Given],
+    answers: int,
+    seed: int,
+    batch_size: int,
+    on_surfaces: bool | None,
+    progress: Progress,
 ) -> tuple[list[np.ndarray], float, float]:
     images = torch.from_numpy(np.stack([one.image for one in given]))
     state = torch.stack([one.state for one in given])
     alike = isinstance(way.checkpoint.generator, Regression)
     faulty = bool((state == Ray.DOUBTFUL).any())
-    options: dict[str, Any] = {"sampler": way.sampler(faulty), "batch_size": batch_size, "progress": progress}
+    options: dict[str, Any] = {
+        "sampler": way.sampler(faulty), "batch_size": batch_size, "on_surfaces": on_surfaces, "progress": progress,
+    }  # fmt: skip
     keep = "mend" if faulty else "exact"
     made = list(complete(way.checkpoint, images, state, 1 if alike else answers, seed, keep=keep, **options))
     count = sum(len(each.images) for each in made)
