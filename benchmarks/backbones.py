@@ -6,6 +6,7 @@ r2flow/backbones/cost.py, three times as many for forward and backward. Medians,
 
 python benchmarks/backbones.py                                  # forward and backward, eager, the three base models
 python benchmarks/backbones.py --backbone hdit --mode compiled-bfloat16
+python benchmarks/backbones.py --experiment dusty2 --options data.batch_size=4  # a step of training, on simulated scans
 python benchmarks/backbones.py --device cuda --batch 1 8 64 --attention flex tiles natten --mode compiled-bfloat16
 """
 
@@ -13,16 +14,19 @@ import argparse
 import json
 import resource
 import statistics
+import tempfile
 import time
 from collections.abc import Callable
 from typing import Any
 
+import lightning as L
 import torch
 
 from r2flow.backbones import Backbone, build_backbone, configurations
 from r2flow.backbones.cost import RULE, count_macs, count_parameters
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import build_sensor
+from r2flow.training import build, compose, fit
 
 MODES = ("float32", "bfloat16", "compiled-float32", "compiled-bfloat16", "training-float32", "training-bfloat16")
 ORDER = {"cpu": 2048, "cuda": 8192}  # of the square matrices whose product sets the rate
@@ -93,10 +97,50 @@ def measured(model: Backbone, mode: str, batch: int, repeats: int, device: str) 
     }
 
 
+class Stopwatch(L.Callback):
+    """Processor seconds of each step."""
+
+    def __init__(self) -> None:
+        self.seconds: list[float] = []
+
+    def on_train_batch_start(self, *_: Any) -> None:
+        self.begin = time.process_time()
+
+    def on_train_batch_end(self, *_: Any) -> None:
+        self.seconds.append(time.process_time() - self.begin)
+
+
+def trained(experiment: str, repeats: int, more: list[str]) -> dict[str, Any]:
+    """Processor seconds of a step of an experiment as published but for its scans, and the process's peak memory.
+
+    The first step, which warms up, is left out. Give one thread, and one experiment a process: memory is its peak.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        options = [
+            f"experiment={experiment}", "data=simulated", "data.scenes=8", "data.workers=0", "data.drives=null",
+            "data.projection=spherical",
+            "data.convention=centre",
+            "trainer.accelerator=cpu", f"trainer.max_steps={repeats + 1}", f"trainer.val_check_interval={repeats + 1}",
+            "trainer.enable_progress_bar=false", "callbacks.pictures=null", "samples.num=0", f"run_dir={folder}/run",
+            *more,
+        ]  # fmt: skip
+        run, watch = build(compose(options)), Stopwatch()
+        run.trainer.callbacks.insert(0, watch)
+        fit(run)
+    steps = watch.seconds[1:]
+    return {
+        "experiment": experiment, "batch": run.config["data"]["batch_size"], "step_s": statistics.median(steps),
+        "least_s": min(steps), "most_s": max(steps),
+        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+    }  # fmt: skip
+
+
 def main() -> None:
     """Print the table, or the same as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backbone", nargs="+", default=["hdit", "efficient_unet", "adm_unet"])
+    parser.add_argument("--experiment", help="time a step of this experiment's training instead")
+    parser.add_argument("--options", nargs="*", default=[], help="and these config keys, as data.batch_size=4")
     parser.add_argument("--mode", nargs="+", choices=MODES, default=["float32", "bfloat16", "training-float32"])
     parser.add_argument("--attention", nargs="+", default=["auto"], help="hdit's attention backends")
     parser.add_argument("--batch", nargs="+", type=int, default=[1])
@@ -108,6 +152,9 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
+    if options.experiment:
+        print(json.dumps(trained(options.experiment, options.repeats, options.options)))
+        return
     found = []
     if not options.json:
         print(f"{RULE}\ntorch {torch.__version__}, {options.device}, {options.threads} threads")

@@ -138,6 +138,21 @@ def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):
     assert "--projection must be one of spherical, unfolding; found 'flat'" in said
 
 
+def test_a_curve_of_several_solvers_has_a_line_for_each_with_intervals(r2flow, saved, real, tmp_path):  # noqa: F811
+    code, _, err = r2flow(
+        "evaluate", real, "-c", saved[0], "--solver", "euler,heun2", "--steps", "1,2", "--metrics", "jsd", "--num", 4,
+        "--bootstrap", 8, "--workers", 0, "--out", tmp_path,
+    )  # fmt: skip
+    assert code == 0, err
+    rows = json.loads((tmp_path / "speed_quality.json").read_text())["rows"]
+    assert [(row["solver"], row["evaluations"]) for row in rows] == [
+        ("euler", 1), ("euler", 2), ("heun2", 2), ("heun2", 4),
+    ]  # fmt: skip
+    assert [row["flow"].partition(", ")[2] for row in rows] == ["euler", "euler", "heun2", "heun2"]
+    assert all(row["jsd/jsd low"] < row["jsd/jsd high"] for row in rows)
+    assert (tmp_path / "speed_quality.md").read_text().count(" to ") >= 4
+
+
 def test_a_curve_goes_on_where_it_stopped(r2flow, saved, real, tmp_path, monkeypatch):  # noqa: F811
     import r2flow.reports.speed_quality as speed_quality
 

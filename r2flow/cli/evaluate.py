@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -84,7 +85,10 @@ class SamplingOptions:
     steps: Annotated[
         str | None, typer.Option(help="Of the sampled flow, 32 or k of a k-TD if left out; of a curve, 1,2,4,...,256.")
     ] = None
-    solver: Annotated[str | None, typer.Option(help="Of the sampled flow: euler, heun2, rk4, dopri5, ...")] = None
+    solver: Annotated[
+        str | None,
+        typer.Option(help="Of the sampled flow: euler, heun2, dopri5, ...; of a curve, several as ddpm,adams3."),
+    ] = None
     tolerance: Annotated[float | None, typer.Option(help="Of an adaptive solver.")] = None
     seed: Annotated[int, typer.Option(min=0, help="Of sampled scans.")] = 0
 
@@ -164,12 +168,12 @@ def evaluate(
             truth, built, work_of(work.batch_size, work.workers, place.rank, place.ranks),
             None if measured.no_cache else Cache(), place.device, sampling, rules,
         )  # fmt: skip
-        drawing, steps = _curve_of(flows, scans.num or SAMPLED, sampling) if checkpoint else (None, [])
+        drawings, steps = _curve_of(flows, scans.num or SAMPLED, sampling) if checkpoint else ([], [])
         for folder in (output.out, output.json.parent if output.json else None):
             if folder is not None:
                 prepare_folder(folder)
-        if drawing and output.out:
-            _measure_curve(job, flows, drawing, steps, output.out)
+        if drawings and output.out:
+            _measure_curve(job, flows, drawings, steps, measured.bootstrap, output.out)
         else:
             _compare(job, judged, measured, output)
 
@@ -200,10 +204,8 @@ def _check_evaluation(
         raise InputError("a curve needs --out FOLDER, where its points are kept.")
     if not generated and not checkpoint and not (measured.floor or measured.controls):
         raise InputError("nothing to compare with: give GENERATED, --checkpoint RUN or --floor.")
-    if checkpoint and (measured.floor or measured.controls or measured.bootstrap or output.json):
-        raise InputError(
-            "--floor, --controls, --bootstrap and --json belong to a comparison; a curve writes its page to --out."
-        )
+    if checkpoint and (measured.floor or measured.controls or output.json):
+        raise InputError("--floor, --controls and --json belong to a comparison; a curve writes its page to --out.")
     if output.json is not None and output.json.is_dir():
         raise InputError(f"--json {output.json} is a folder; name a file to write to.")
     return rules
@@ -265,18 +267,22 @@ def _compare(job: Job, judged: "dict[str, ScanSet]", measured: MeasureOptions, o
         )
 
 
-def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOptions) -> "tuple[Drawing, list[int]]":
-    """What a curve draws, and its numbers of steps; what they cannot be is refused before anything is read."""
+def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOptions) -> "tuple[list[Drawing], list[int]]":
+    """What is drawn for each line of a curve, and the numbers of steps; what they cannot be is refused before anything
+    is read.
+    """
     from r2flow.reports.speed_quality import Drawing, steps_of
 
-    drawing, steps = Drawing(num, sampling.seed, sampling.solver, sampling.tolerance), _many(sampling.steps)
-    for label, flow in flows.items():
+    solvers: list[str | None] = [*dict.fromkeys(sampling.solver.split(","))] if sampling.solver else [None]
+    drawings = [Drawing(num, sampling.seed, solver, sampling.tolerance) for solver in solvers]
+    steps = _many(sampling.steps)
+    for (label, flow), drawing in product(flows.items(), drawings):
         steps_of(flow, label, steps, drawing)
-    return drawing, steps
+    return drawings, steps
 
 
 def _measure_curve(
-    job: Job, flows: "dict[str, Checkpoint]", drawing: "Drawing", steps: Sequence[int], out: Path
+    job: Job, flows: "dict[str, Checkpoint]", drawings: "list[Drawing]", steps: Sequence[int], bootstrap: int, out: Path
 ) -> None:
     from r2flow.cli.output import command, finish
     from r2flow.evaluation.measuring import gather_real
@@ -285,7 +291,7 @@ def _measure_curve(
 
     done = read_rows(out)
     gathered = gather_real(job.metrics, job.truth, job.work, job.cache, job.rules)
-    curve = Curve(job.truth, job.metrics, gathered, drawing, job.device)
+    curve = Curve(job.truth, job.metrics, gathered, drawings, job.device, bootstrap)
 
     def keep(rows: list[dict[str, Any]]) -> None:
         if job.work.rank == 0:

@@ -1,4 +1,4 @@
-"""`r2flow report paper`: the paper's tables and figures from run folders."""
+"""`r2flow report paper`: the paper's tables and figures from run folders and checkpoints."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,8 +22,8 @@ HEADLINE = "frechet_handcrafted"  # of equally many scans everywhere, so that it
 class BudgetOptions:
     """How much is measured."""
 
-    num: Annotated[int, typer.Option(min=2, help="Scans of each flow and number of steps; the paper: 10000.")] = 1000
-    steps: Annotated[str, typer.Option(help="Euler steps of flows that are not distilled.")] = (
+    num: Annotated[int, typer.Option(min=2, help="Scans of each, at each number of steps; the paper: 10000.")] = 1000
+    steps: Annotated[str, typer.Option(help="Of generators with any number of steps: Euler's of a flow.")] = (
         "1,2,4,8,16,32,64,128,256"
     )
     curved: Annotated[int, typer.Option(min=0, help="Scenes whose paths are followed for figure 8.")] = 4
@@ -32,10 +32,13 @@ class BudgetOptions:
     tolerance: Annotated[float, typer.Option(min=0, help="Of the inversion in figure 3; 0 leaves it out.")] = 1e-3
 
 
-@report.command(epilog="Example: r2flow report paper runs/r2flow runs/sweep --out paper")
+@report.command(epilog="Example: r2flow report paper runs/r2flow runs/r2dm lidargen.pth --out paper")
 @grouped
 def paper(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders, or folders of them: a chain's, a sweep's.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(help="Run folders, folders of them (a chain's, a sweep's), checkpoint files."),
+    ],
     out: OutOption,
     budget: BudgetOptions,
     work: WorkOptions,
@@ -54,6 +57,8 @@ def paper(
 ) -> None:
     """The paper's tables I and II and figures 3, 5, 6, 7, 8 from runs, its printed numbers and claims beside ours.
 
+    Takes the paper's flows and the systems that it compares them with (R2DM, LiDM, LiDARGen, the GANs).
+
     What is measured is kept in the folder: the same command again goes on where it stopped.
     """
     from r2flow.cli.evaluate import work_of
@@ -61,23 +66,23 @@ def paper(
     from r2flow.evaluation.protocols import named_rules
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.paper.claims import primary_of
-    from r2flow.reports.paper.report import Budget, report
+    from r2flow.reports.paper.report import Budget, first_of, report
     from r2flow.reports.paper.subjects import find_subjects
 
     rules = None if protocol is None else named_rules(protocol)
     where = choose_device(work.device)
-    euler = tuple(sorted(set(numbers("steps", budget.steps, int))))
-    amount = Budget(budget.num, euler, budget.curved, budget.repeats, budget.bootstrap, budget.tolerance or None)
+    counts = tuple(sorted(set(numbers("steps", budget.steps, int))))
+    amount = Budget(budget.num, counts, budget.curved, budget.repeats, budget.bootstrap, budget.tolerance or None)
     subjects = find_subjects(runs)
-    truth = None if real is None else real_set(real, split, subjects[0].run, protocol)
-    reflectance = bool(subjects[0].config["encoding"]["reflectance"])
+    truth = None if real is None else real_set(real, split, first_of(subjects).run, protocol)
+    reflectance = all(one.config["encoding"]["reflectance"] for one in subjects)
     chosen, missing = build_metrics(metrics.split(",") if metrics else None, amount.bootstrap > 0, reflectance, where)
     judging = primary_of(list(chosen), primary)
     prepare_folder(out)
-    print(f"{len(subjects)} runs: {', '.join(f'{one.label} ({one.role})' for one in subjects)}")
+    print(f"{len(subjects)} generators: {', '.join(f'{one.label} ({one.role})' for one in subjects)}")
     doing = work_of(work.batch_size, work.workers)
     page = report(subjects, out, chosen, judging, missing, amount, doing, truth, where, command(), rules)
-    finish(page, out, page.text[2:4])
+    finish(page, out, page.text[2:4] if any(one.role == "1-RF" for one in subjects) else page.text[4:5])
 
 
 def real_set(text: str, split: str | None, run: Path, protocol: str | None = None) -> "ScanSet":

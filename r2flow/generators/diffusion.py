@@ -124,7 +124,10 @@ class Diffusion(NetworkFlow):
 
     def check_sampler(self, sampler: Sampler) -> None:
         if eta_of(sampler.method) is None:
-            super().check_sampler(sampler)
+            try:
+                super().check_sampler(sampler)
+            except InputError as error:
+                raise InputError(f"a diffusion has ddpm, ddim:ETA and a flow's solvers: {error}") from None
             return
         if sampler.levels or sampler.finish:
             raise InputError(f"{sampler.method} has neither levels nor a finish; leave them out, or give a solver.")

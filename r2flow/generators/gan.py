@@ -79,8 +79,8 @@ class Gan(Generator):
         known = sampler.method == DIRECT or sampler.method.startswith(TRUNCATE)
         if not known or replace(sampler, method=self.sampler.method) != self.sampler:
             raise InputError(
-                f"a {type(self).__name__} makes a scan in 1 step, by {DIRECT} or {TRUNCATE}PSI; "
-                f"found {sampler.unlike(self.sampler)}."
+                f"a {type(self).__name__} makes a scan in 1 step, by {DIRECT} or {TRUNCATE}PSI, without a tolerance or "
+                f"a time grid; found {sampler.unlike(self.sampler)}."
             )
         truncation_of(sampler)
 

@@ -19,10 +19,11 @@ from r2flow.generators import Sampler
 from r2flow.metrics.base import ScanMetric
 from r2flow.reports.evaluation import heading
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
-from r2flow.reports.tables import table
+from r2flow.reports.tables import shown, table
 
 NAME = "speed_quality"
 BETWEEN = " | "  # remarks of a row
+ENDS = (" low", " high")  # of the names of an interval's ends
 AXES = (("evaluations", "network evaluations a scan"), ("seconds", "seconds a scan"))
 
 
@@ -47,21 +48,25 @@ class Curve:
     Attributes:
         real: The scans that it is measured against.
         gathered: Their statistics, for the metrics.
+        drawings: Each is a line of its own for each flow.
         device: What the network runs on, in words.
+        bootstrap: Resamples for 95 % intervals; 0 for none.
     """
 
     real: ScanSet
     metrics: Mapping[str, ScanMetric]
     gathered: Gathered
-    drawing: Drawing
+    drawings: Sequence[Drawing]
     device: str
+    bootstrap: int = 0
 
-    def key(self, flow: Checkpoint, steps: int) -> str:
+    def key(self, flow: Checkpoint, steps: int, drawing: Drawing) -> str:
         """Of a point; when it changes, the point is measured again."""
-        how = self.drawing.sampler(flow, steps)
+        how = drawing.sampler(flow, steps)
+        more = {"bootstrap": self.bootstrap} if self.bootstrap else {}
         return point_key(
-            self.real, self.metrics, weights=weights_hash(flow), steps=steps, num=self.drawing.num,
-            seed=self.drawing.seed, method=how.method, grid=how.grid, finish=how.finish, tolerance=how.tolerance,
+            self.real, self.metrics, **more, weights=weights_hash(flow), steps=steps, num=drawing.num,
+            seed=drawing.seed, method=how.method, grid=how.grid, finish=how.finish, tolerance=how.tolerance,
             device=self.device, protocol=self.gathered.protocol.name,
         )  # fmt: skip
 
@@ -92,7 +97,7 @@ def measure_curve(
     done: Sequence[Mapping[str, Any]] = (),
     arrived: Callable[[list[dict[str, Any]]], None] = lambda rows: None,
 ) -> list[dict[str, Any]]:
-    """A row for each generator and number of steps; rows that are done already are kept as they are.
+    """A row for each generator, way to draw and number of steps; rows that are done already are kept as they are.
 
     Seconds are of the network and its solver alone, the median over batches, so that neither the first batch's warm-up
     nor the metrics count.
@@ -104,33 +109,37 @@ def measure_curve(
     """
     known = {row["key"]: dict(row) for row in done}
     rows: list[dict[str, Any]] = []
-    for label, flow in flows.items():
-        for count in steps_of(flow, label, steps, curve.drawing):
-            key = curve.key(flow, count)
+    for (name, flow), drawing in product(flows.items(), curve.drawings):
+        label = f"{name}, {drawing.method}" if len(curve.drawings) > 1 else name
+        for count in steps_of(flow, label, steps, drawing):
+            key = curve.key(flow, count, drawing)
             if key in known:
                 rows.append({**known[key], "flow": label})
             else:
-                rows.append({**_point(curve, flow, label, count, work), "key": key})
+                rows.append({**_point(curve, flow, label, count, drawing, work), "key": key})
                 arrived(rows)
     return rows
 
 
-def _point(curve: Curve, flow: Checkpoint, label: str, steps: int, work: Work) -> dict[str, Any]:
-    own, how = flow.generator.sampler, curve.drawing.sampler(flow, steps)
-    drawn = sampled_set(flow, label, curve.drawing.num, how, curve.drawing.seed)
-    measured = measure(curve.metrics, curve.gathered, drawn, work)
+def _point(curve: Curve, flow: Checkpoint, label: str, steps: int, drawing: Drawing, work: Work) -> dict[str, Any]:
+    own, how = flow.generator.sampler, drawing.sampler(flow, steps)
+    drawn = sampled_set(flow, label, drawing.num, how, drawing.seed)
+    measured = measure(curve.metrics, curve.gathered, drawn, work, curve.bootstrap)
     assert isinstance(drawn.source, SampledScans)
     # A process without a batch has none; the first one, which writes the page, always has some.
     evaluations: Sequence[float] = drawn.source.evaluations or [math.nan]
     seconds = drawn.source.seconds or [math.nan]
     figures = {f"{m.metric}/{name}": value for m in measured for name, value in m.figures.items()}
+    for one in measured:
+        for name, ends in one.intervals.items():
+            figures |= {f"{one.metric}/{name}{end}": value for end, value in zip(ENDS, ends, strict=True)}
     remarks = dict.fromkeys(remark for m in measured for remark in m.remarks)
     return {
         "flow": label, "weights": weights_hash(flow), "steps": steps,
         "distilled_for": own.steps if own.fixed else None,
         "solver": how.method, "evaluations": statistics.fmean(evaluations),
         "seconds": statistics.median(seconds), "batch_size": work.batch_size,
-        "scans": curve.drawing.num, "seed": curve.drawing.seed, **figures, "remarks": BETWEEN.join(remarks),
+        "scans": drawing.num, "seed": drawing.seed, **figures, "remarks": BETWEEN.join(remarks),
     }  # fmt: skip
 
 
@@ -166,15 +175,19 @@ def speed_quality_page(
         done: Rows of earlier calls, which the JSON keeps although this call did not ask for them.
         figures: False while it is still being measured.
     """
-    drawing, keys = curve.drawing, {row["key"] for row in rows}
-    names = list(dict.fromkeys(name for row in rows for name in row if "/" in name))  # METRIC/FIGURE
+    drawing, keys = curve.drawings[0], {row["key"] for row in rows}
+    solvers = ", ".join(one.method or "its own solver" for one in curve.drawings)
+    # METRIC/FIGURE, without the ends of its interval
+    names = [n for n in dict.fromkeys(n for row in rows for n in row) if "/" in n and not n.endswith(ENDS)]
     headings = {name: heading(*name.split("/", 1)) for name in names}
     columns = {"flow": "flow", "steps": "steps", "evaluations": "evaluations", "seconds": "s a scan"}
     columns |= {name: said for name, (said, _) in headings.items()}
-    printed = [{**row, **{n: row[n] * factor for n, (_, factor) in headings.items() if n in row}} for row in rows]
+    printed = [
+        {**row, **{n: _shown(row, n, factor) for n, (_, factor) in headings.items() if n in row}} for row in rows
+    ]
     sampled = (
         f"{drawing.num} scans of seed {drawing.seed} at every point, from the same noise, by "
-        f"{drawing.method or 'its own solver'}; measured against {len(curve.real)} scans of {curve.real.label}, "
+        f"{solvers}; measured against {len(curve.real)} scans of {curve.real.label}, "
         f"under the protocol `{curve.gathered.protocol.name}`. "
         "Seconds are those of the network and its solver, the median over batches."
     )
@@ -193,6 +206,13 @@ def speed_quality_page(
     drawn = {NAME: _figure(rows, names)} if figures and names else {}
     seeds = {"sampled scans": drawing.seed}
     return Page(NAME, "Quality against speed", text, rows, drawn, command, seeds, curve.device, more)
+
+
+def _shown(row: Mapping[str, Any], name: str, factor: float) -> float | str:
+    """A figure as it is printed, with its interval where it has one."""
+    low, high = (row.get(f"{name}{end}") for end in ENDS)
+    value: float = row[name] * factor
+    return value if low is None or high is None else f"{shown(value)} ({shown(low * factor)} to {shown(high * factor)})"
 
 
 def _remarks(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -222,7 +242,10 @@ def _figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Figure:
         for number, flow in enumerate(flows):
             own = sorted((row for row in rows if row["flow"] == flow), key=lambda row: row[x])
             values = [row.get(name, math.nan) * factor for row in own]
-            axes.plot([row[x] for row in own], values, **STYLES[number % len(STYLES)], ms=5, lw=1.2, label=flow)
+            style = STYLES[number % len(STYLES)]
+            axes.plot([row[x] for row in own], values, **style, ms=5, lw=1.2, label=flow)
+            ends = [[row.get(f"{name}{end}", math.nan) * factor for row in own] for end in ENDS]
+            axes.vlines([row[x] for row in own], *ends, color=style["color"], lw=0.8)
         axes.set(xscale="log", xlabel=label, ylabel=said)
         values = [row[name] for row in rows if row.get(name, 0) > 0]
         if values and max(values) > 20 * min(values):

@@ -5,20 +5,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 from r2flow.checkpoints import load_checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.evaluation.protocols import R2FLOW
+from r2flow.generators import build_generator
+from r2flow.lineage import Parent
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.reports.paper import cells
 from r2flow.reports.paper.figures import marginals, marginals_apart
-from r2flow.reports.paper.page import remarks_of
+from r2flow.reports.paper.page import from_above, remarks_of
 from r2flow.reports.paper.report import held_out
 from r2flow.reports.paper.subjects import find_subjects
 from r2flow.reports.paper.tables import beside, differences, over_seeds, same_architecture
 from r2flow.reports.speed_quality import BETWEEN
 from r2flow.stages.checkpointing import AtomicCheckpointIO
+from r2flow.training import check, compose
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_sampling import network
 
@@ -96,7 +100,7 @@ def test_seeds_are_those_of_one_kind_of_network():
 
 
 def test_runs_without_a_first_flow_or_of_two_sensors_are_refused(chains, tmp_path):
-    with pytest.raises(InputError, match="no 1-RF among the runs"):
+    with pytest.raises(InputError, match="no 1-RF among the flows"):
         find_subjects([chains / "0" / "b"])
     other = make_run(tmp_path / "other", {"name": "rectify"})
     config = load_checkpoint(other).config
@@ -191,3 +195,93 @@ def test_a_remark_stays_whole_and_is_said_once():
     rows = [{"remarks": BETWEEN.join(["too few; compare with as many", "one is empty"])}, {"remarks": "one is empty"}]
     assert remarks_of(rows) == ["- too few; compare with as many\n- one is empty"]
     assert remarks_of([{"remarks": ""}, {}]) == []
+
+
+# Of each system a few thousand random weights: options, and the evaluations of a scan where it is asked for 1 and 2.
+SYSTEMS = {
+    "Vanilla GAN": (["experiment=vanilla_gan_small", "generator.base_channels=4"], {1}),
+    "DUSty v2": (["experiment=dusty2_small", "generator.base_channels=4"], {1}),
+    "LiDARGen": (["experiment=lidargen_small", "generator.width=4", "generator.levels=2"], {2 * 5 + 1}),
+    "LiDM, range": (["experiment=lidm_small"], {1, 2, 50}),
+    "LiDM + APE, range": (["experiment=lidm_ape_small"], {1, 2, 50}),
+    "R2DM": (
+        ["experiment=r2dm_small", "backbone.base_channels=8"],
+        {1, 2, 256},
+    ),
+}
+
+
+def make_system(folder: Path, options: list[str]) -> Path:
+    small = ["sensor.rows=16", "sensor.columns=64", "data.scenes=4", "data.validation.scans=2"]
+    small += ["trainer.accelerator=cpu", f"run_dir={folder}"]
+    latent = options[0].startswith("experiment=lidm")
+    parent = Parent(compose(["experiment=lidm_autoencoder_small", *small]), folder) if latent else None
+    config = check(compose([*options, *small]), parent=parent)
+    config["encoding"]["reflectance"] = not latent
+    torch.manual_seed(0)
+    generator = build_generator(config)
+    weights = {f"generator.{name}": value for name, value in generator.state_dict().items()}
+    sampler = generator.sampler.asdict()
+    content = {"state_dict": weights, "config": config, "global_step": 7, "sampler": sampler}
+    AtomicCheckpointIO().save_checkpoint(content, folder / "checkpoints" / "step-00000007.ckpt")
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    return folder
+
+
+@pytest.mark.slow
+def test_other_systems_stand_in_the_paper_s_order_with_their_own_evaluations(r2flow, tmp_path):  # noqa: F811
+    for number, (options, _) in enumerate(reversed(SYSTEMS.values())):
+        make_system(tmp_path / "runs" / str(number), options)
+    code, said, error = r2flow(*paper(tmp_path / "runs", tmp_path / "out", "--bootstrap", 0, "--workers", 0))
+    assert code == 0, error
+    content = json.loads((tmp_path / "out" / "paper.json").read_text())
+    found: dict[str, set[int]] = {}
+    for row in content["rows"]:
+        found.setdefault(row["role"], set()).add(row["steps"])
+    assert found == {role: evaluations for role, (_, evaluations) in SYSTEMS.items()}
+    assert list(found) == list(SYSTEMS)
+    assert content["claims"] == []  # which are about the paper's own flows
+    page = (tmp_path / "out" / "paper.md").read_text()
+    assert "**Ranges:** real scans 1.45 to 80 m; LiDARGen 0.5 to 63 m, LiDM, range 1 to 56 m" in page
+    assert "### The paper's figures beside ours" not in page  # under another protocol they are not comparable
+    assert (tmp_path / "out" / "figure_6.png").is_file()
+
+
+def test_figure_5_is_of_lidm_without_and_with_a_position_embedding():
+    def cell(role: str, steps: int, at: int) -> cells.Cell:
+        counts = np.zeros((100, 100))
+        counts[at, at] = 1
+        return cells.Cell({"role": role, "kind": "", "steps": steps}, counts, np.zeros((1, 1, 2, 2)))
+
+    made = [cell("LiDM, range", 1, 0), cell("LiDM, range", 50, 1), cell("LiDM, range", 50, 2), cell("R2DM", 256, 3)]
+    assert {name: np.argwhere(counts)[:, 0].tolist() for name, counts in from_above(made).items()} == {
+        "LiDM, range": [1, 2]
+    }
+    assert list(from_above(made[3:])) == ["R2DM"]
+
+
+def test_other_systems_stand_beside_their_printed_figures_at_the_nearest_evaluations():
+    rows = [
+        {"role": role, "kind": "", "steps": steps, "seconds": 1, "jsd": 0.05}
+        for role, steps in (("LiDARGen", 1161), ("LiDM + APE, range", 50), ("LiDM + APE, range", 143), ("R2DM", 1))
+    ]
+    lines = beside(rows, ["jsd"]).splitlines()[2:]
+    assert lines == [
+        "| LiDARGen | 1160 | 1161 | 4.04 | 5 |",
+        "| LiDM + APE, range | 50 | 50 | 4.5 | 5 |",
+        "| LiDM + APE, range | 200 | 143 | 4.3 | 5 |",
+        "| R2DM | 1 | 1 | 33.5 | 5 |",
+    ]
+
+
+def test_a_published_file_is_reported_on_and_an_autoencoder_left_out(r2flow, shared, tmp_path):  # noqa: F811
+    files = [shared / "oracle_baselines" / f"{name}_published.pth" for name in ("vanilla", "dusty1")]
+    if not files[0].exists():
+        pytest.skip("the reference checkpoints are not here")
+    code, _, error = r2flow(*paper(files[0], tmp_path, files[1], "--bootstrap", 0))
+    assert (code, error.count("\n")) == (2, 1)
+    assert "give --real SCANS" in error
+    found = find_subjects(files)
+    assert [one.role for one in found] == ["Vanilla GAN, range", "DUSty v1, range"]
+    with pytest.raises(InputError, match="autoencoder alone"):
+        find_subjects([files[0].with_name("lidm_ae_published.ckpt")])

@@ -1,4 +1,4 @@
-"""Every flow at every number of evaluations, measured once and kept, so that a stopped report goes on."""
+"""Every generator at every number of evaluations, measured once and kept, so that a stopped report goes on."""
 
 import json
 import statistics
@@ -20,16 +20,17 @@ from r2flow.reports.paper.subjects import PaperRun
 from r2flow.reports.speed_quality import BETWEEN
 from r2flow.sampling import sample
 
-SHOWN = 2  # scans of each flow that are drawn
-SEED = 0  # of their noise, the same for every flow
+SHOWN = 2  # scans of each generator that are drawn
+SEED = 0  # of their noise, the same for every generator
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One flow at one number of Euler steps.
+    """One generator in one number of steps: a flow's are Euler's.
 
-    The row has label, role, family, kind, seed, steps, seconds a scan, and each metric's first figure under its name
-    with its interval's `_low` and `_high`. Beside it: points of all scans from above, (100, 100), and the first scans.
+    The row has label, role, family, kind, seed, steps (evaluations of the network), seconds a scan, and each metric's
+    first figure under its name with its interval's `_low` and `_high`. Beside it: points of all scans from above,
+    (100, 100), and the first scans.
     """
 
     row: dict[str, Any]
@@ -60,11 +61,12 @@ class CellSettings:
 
 
 def measure_cells(settings: CellSettings, flow: Checkpoint, subject: PaperRun, steps: Sequence[int]) -> Iterator[Cell]:
-    """The cells of one flow, each kept when it is done.
+    """The cells of one generator, each kept when it is done.
 
-    A distilled flow is measured at its own number of steps only; it was trained for no other.
+    One that has a single number of steps, as a distilled flow, is measured there only; another system also at its own.
     """
-    for count in steps if subject.steps is None else [subject.steps]:
+    own = {flow.generator.sampler.steps} if subject.system else set()
+    for count in sorted({*steps, *own}) if subject.steps is None else [subject.steps]:
         path = settings.path(subject, count)
         cell = _read(path)
         if cell is None:
@@ -78,11 +80,14 @@ def measure_cells(settings: CellSettings, flow: Checkpoint, subject: PaperRun, s
 def _measure(settings: CellSettings, flow: Checkpoint, subject: PaperRun, steps: int) -> Cell:
     sampler = flow.generator.in_steps(steps)  # Euler for a flow, as in the paper
     drawn = sampled_set(flow, f"{subject.label}, {steps} steps", settings.num, sampler, SEED)
-    found = measure(settings.metrics, settings.gathered, drawn, settings.work, settings.bootstrap)
+    sees = flow.encoding.reflectance
+    metrics = {name: metric for name, metric in settings.metrics.items() if sees or not metric.needs_reflectance}
+    found = measure(metrics, settings.gathered, drawn, settings.work, settings.bootstrap)
     assert isinstance(drawn.source, SampledScans)
     row: dict[str, Any] = {
-        "label": subject.label, "role": subject.role, "family": subject.family, "seed": subject.seed, "steps": steps,
-        "scans": settings.num, "seconds": statistics.median(drawn.source.seconds),
+        "label": subject.label, "role": subject.role, "family": subject.family, "seed": subject.seed,
+        "steps": flow.generator.evaluations_of(sampler), "scans": settings.num,
+        "seconds": statistics.median(drawn.source.seconds),
     }  # fmt: skip
     for one in found:
         first = next(iter(one.figures))

@@ -21,14 +21,14 @@ def marginals_apart(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.mean([js_distance(x, y) for x, y in zip(marginals(a), marginals(b), strict=True)]))
 
 
-def birds_eye_figure(real: np.ndarray, flows: Mapping[str, np.ndarray]) -> Figure:
+def birds_eye_figure(real: np.ndarray, made: Mapping[str, np.ndarray]) -> Figure:
     """Figure 5: where points lie from above, (100, 100) each, with their marginals over the data's."""
-    names = [*flows, "held-out scans"]
+    names = [*made, "real scans"]
     figure = blank_figure(2.75 * len(names) + 0.5, 3.6)
     figure.set_layout_engine("none")
     outer = figure.add_gridspec(1, len(names), left=0.5 / figure.get_figwidth(), right=0.99, bottom=0.13, top=0.86)
     for place, name in enumerate(names):
-        counts = flows.get(name, real)
+        counts = made.get(name, real)
         grid = outer[place].subgridspec(2, 2, height_ratios=(1, 3.2), width_ratios=(3.2, 1), hspace=0.03, wspace=0.03)
         axes = figure.add_subplot(grid[1, 0])
         share = counts / max(counts.sum(), 1)
@@ -40,7 +40,7 @@ def birds_eye_figure(real: np.ndarray, flows: Mapping[str, np.ndarray]) -> Figur
         axes.tick_params(labelsize=7, labelleft=place == 0)
         above, beside = figure.add_subplot(grid[0, 0], sharex=axes), figure.add_subplot(grid[1, 1], sharey=axes)
         _draw_marginals(above, beside, counts, real)
-        distance = f"\nmarginals apart {marginals_apart(counts, real):.3f}" if name in flows else "\n"
+        distance = f"\nmarginals apart {marginals_apart(counts, real):.3f}" if name in made else "\n"
         above.set_title(f"{name}{distance}", fontsize=8)
     return figure
 
@@ -69,13 +69,13 @@ def trade_off_figure(rows: Sequence[Row], metrics: Mapping[str, str]) -> Figure:
     """
     figure = blank_figure(10, 3.1 * len(metrics) + 0.3)
     lines = list(dict.fromkeys((row["role"], row.get("kind", "")) for row in rows))
-    several = len({kind for _, kind in lines}) > 1
+    several = len({kind for _, kind in lines if kind}) > 1
     for place, (metric, heading) in enumerate(metrics.items()):
         for side, (work, label) in enumerate((("steps", "network evaluations"), ("seconds", "seconds a scan"))):
             axes = figure.add_subplot(len(metrics), 2, 2 * place + side + 1)
             for number, (role, kind) in enumerate(lines):
                 own = [row for row in rows if (row["role"], row.get("kind", "")) == (role, kind)]
-                _draw_line(axes, own, work, metric, f"{role}, {kind}" if several else role, number)
+                _draw_line(axes, own, work, metric, f"{role}, {kind}" if several and kind else role, number)
             axes.set_xscale("log", base=2 if work == "steps" else 10)
             axes.set_yscale("log")
             axes.set(xlabel=label, ylabel=heading if side == 0 else "")

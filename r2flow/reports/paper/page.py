@@ -39,8 +39,8 @@ class PaperResults:
     Attributes:
         birds_eye: Points of the real scans from above, (100, 100).
         ends: Two real scans, (2, 2 or 1, H, W), and between them figure 3's frames.
-        cells: Every flow at every number of steps.
-        paths: Of the flows that are not distilled, by label.
+        cells: Every generator at every number of steps.
+        paths: Of the paper's flows that are not distilled, by label.
         architectures: A row for each 1-RF.
     """
 
@@ -73,26 +73,24 @@ def paper_page(
         {**summary(paths), "role": known[label].role, "family": known[label].family, "kind": known[label].kind}
         for label, paths in measured.paths.items()
     ]
-    found = claims(rows, metrics, primary, curved, measured.architectures)
-    figures = figures_of(measured, rows, headings)
     roots = [one.config for one in measured.subjects if one.role == "1-RF"]
-    scans = {str(config["data"]["name"]): config.get("scans", "") for config in roots}
+    found = claims(rows, metrics, primary, curved, measured.architectures) if roots else []
+    figures = figures_of(measured, rows, headings)
+    learned = roots or [one.config for one in measured.subjects]
+    scans = {str(config["data"]["name"]): config.get("scans", "") for config in learned}
     parts = differences(
         "; ".join(f"{name} ({which})" if which else name for name, which in scans.items()),
         len(measured.real), num, measured.real.sensor.shape, [row["parameters"] for row in measured.architectures],
         [int(config["trainer"]["max_steps"]) * int(config["data"]["batch_size"]) for config in roots], missing,
         measured.protocol, measured.why,
     )  # fmt: skip
-    side_by_side = beside(rows, list(metrics))
+    parts += ranges_apart(measured)
+    # Under another protocol the figures would look comparable and are not.
+    side_by_side = beside(rows, list(metrics)) if measured.protocol is PAPER else ""
     text = [
-        f"{len(measured.subjects)} runs; {num} scans of each flow and number of Euler steps, all from the same noise, "
+        f"{len(measured.subjects)} generators; {num} scans of each and each number of steps (Euler's of a flow), "
         f"against {len(measured.real)} scans ({measured.real.label}), under the protocol `{measured.protocol.name}`.",
-        "## The paper's claims, judged here",
-        tally(found),
-        claims_table(found),
-        f"`{primary}`, chosen before anything was measured (`--primary`), judges by Student's 95 % intervals over "
-        "training seeds; one seed gives no verdict. Where there is no difference, a claim gets a verdict either way in "
-        "at most 5 % of cases: each of them by itself, not all of them together.",
+        *(claimed(found, primary) if found else []),
         "## What differs from the paper",
         "\n".join(f"- {part}" for part in parts),
         "## Table I: methods and metrics",
@@ -101,8 +99,7 @@ def paper_page(
         *(["### The paper's figures beside ours", side_by_side] if side_by_side else []),
         "### As the paper prints it",
         printed_table(),
-        "## Table II: velocity estimators",
-        architectures_table(measured.architectures, headings),
+        *(["## Table II: velocity estimators", architectures_table(measured.architectures, headings)] if roots else []),
     ]
     titles = {
         "figure_3": "## Figure 3: from scan to scan through the noise",
@@ -121,6 +118,31 @@ def paper_page(
     }  # fmt: skip
     title, seeds = "The paper's tables and figures", {"sampled scans": SEED}
     return Page("paper", title, text, rows, figures, command, seeds, device, more)
+
+
+def claimed(found: Sequence[Claim], primary: str) -> list[str]:
+    """The claims' section; the first paragraph after its heading sums it up."""
+    return [
+        "## The paper's claims, judged here",
+        tally(found),
+        claims_table(found),
+        f"`{primary}`, chosen before anything was measured (`--primary`), judges by Student's 95 % intervals over "
+        "training seeds; one seed gives no verdict. Where there is no difference, a claim gets a verdict either way in "
+        "at most 5 % of cases: each of them by itself, not all of them together.",
+    ]
+
+
+def ranges_apart(measured: PaperResults) -> list[str]:
+    """A sentence on generators whose scans reach less or more far than the real ones that they are compared with."""
+    real = measured.real.sensor
+    said = {
+        one.role: f"{one.role} {one.sensor.min_range:g} to {one.sensor.max_range:g} m"
+        for one in measured.subjects
+        if (one.sensor.min_range, one.sensor.max_range) != (real.min_range, real.max_range)
+    }
+    if not said:
+        return []
+    return [f"**Ranges:** real scans {real.min_range:g} to {real.max_range:g} m; {', '.join(said.values())}."]
 
 
 def remarks_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -157,22 +179,33 @@ def figures_of(
 
 
 def from_above(cells: Sequence[Cell]) -> dict[str, np.ndarray]:
-    """The bird's-eye histogram of every kind of 1-RF at the most evaluations, added up over its seeds."""
-    roots = [cell for cell in cells if cell.row["role"] == "1-RF"]
-    most = max(cell.row["steps"] for cell in roots)
+    """Bird's-eye histograms at the most evaluations, added up over seeds: of every kind of 1-RF and, as in the paper,
+    LiDM without and with APE; of all systems where there is none of these.
+    """
     added: dict[str, np.ndarray] = {}
-    for cell in roots:
-        if cell.row["steps"] == most:
-            added[cell.row["kind"]] = added.get(cell.row["kind"], 0) + cell.birds_eye
+    for only in (("1-RF", "LiDM"), ("",)):
+        for cell in cells:
+            role = cell.row["role"]
+            most = max(one.row["steps"] for one in cells if one.row["role"] == role)
+            if role.startswith(only) and cell.row["steps"] == most:
+                name = cell.row["kind"] or role
+                added[name] = added.get(name, 0) + cell.birds_eye
+        if added:
+            break
     return added
 
 
 def scans_figure(measured: PaperResults) -> Figure:
-    """Figure 7: a real scan, then the first scan of every flow of the first chain at the steps that table I has."""
-    chain = [cell for cell in measured.cells if cell.row["family"] == measured.cells[0].row["family"]]
-    most = max(cell.row["steps"] for cell in chain)
-    shown = [c for c in chain if c.row["steps"] in (1, most) or c.row["role"].endswith("TD")]
-    channels = min(measured.ends.shape[1], shown[0].images.shape[1])
+    """Figure 7: a real scan, then the first scan of each other system at its most evaluations, and of every flow of the
+    first chain at the steps that table I has.
+    """
+    systems = {one.role for one in measured.subjects if one.system}
+    best = {c.row["role"]: c for c in sorted(measured.cells, key=lambda c: c.row["steps"]) if c.row["role"] in systems}
+    flows = [cell for cell in measured.cells if cell.row["role"] not in systems]
+    chain = [cell for cell in flows if cell.row["family"] == flows[0].row["family"]]
+    most = max((cell.row["steps"] for cell in chain), default=0)
+    shown = [*best.values(), *(c for c in chain if c.row["steps"] in (1, most) or c.row["role"].endswith("TD"))]
+    channels = min(measured.ends.shape[1], *(cell.images.shape[1] for cell in shown))
     images = [measured.ends[0][:channels], *(cell.images[0][:channels] for cell in shown)]
     titles = ["real", *(f"{c.row['role']}, NFE = {c.row['steps']}" for c in shown)]
     return contact_sheet(images, measured.real.sensor.rays(), titles)

@@ -21,7 +21,7 @@ PAPER_KIND = "hdit with APE"  # the network of its chains
 
 
 class Printed(NamedTuple):
-    """A row of table I: the role is "1-RF", ... for the paper's own flows, None for others' methods.
+    """A row of table I: the role is "1-RF", ... for the paper's own flows, None for others, which their method names.
 
     The figures stand in the order of `COLUMNS`, with its factors; None where the paper has none.
     """

@@ -1,4 +1,4 @@
-"""Measure what the paper's tables and figures show, flow by flow, and write the page."""
+"""Measure what the paper's tables and figures show, generator by generator, and write the page."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -12,6 +12,7 @@ import torch
 from r2flow import simulator
 from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
+from r2flow.errors import InputError
 from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
 from r2flow.evaluation.protocols import PAPER, R2FLOW, Rules
 from r2flow.evaluation.sets import ScanSet
@@ -34,10 +35,10 @@ FRAMES = 6  # of figure 3, as in the paper: both ends' round trips and four betw
 
 @dataclass(frozen=True)
 class Budget:
-    """How much is measured: `num` scans of each flow and number of steps, intervals from `bootstrap` resamplings.
+    """How much is measured: `num` scans of each generator and number of steps, intervals from `bootstrap` resamplings.
 
     Attributes:
-        steps: Euler steps of the flows that are not distilled.
+        steps: Of the generators that can be run in any number of them.
         curved: Scenes whose paths are followed for figure 8; 0 leaves it out.
         repeats: Timed evaluations of each network for table II; 0 leaves latency out.
         tolerance: Of dopri5 in the inversion of figure 3; None leaves it out.
@@ -71,13 +72,13 @@ def report(
         metrics: By name, `jsd` among them.
         primary: The one that judges the paper's claims.
         missing: The paper's metrics that are not measured, and why.
-        real: The scans to compare with; those that the first 1-RF held out if left out.
+        real: The scans to compare with; those that `first_of` held out if left out.
         protocol: The paper's where the real scans allow it, else ours, if left out.
 
     Raises:
         InputError: scans that cannot be read, or without the reflectance that a metric needs.
     """
-    first = next(one for one in subjects if one.role == "1-RF")
+    first = first_of(subjects)
     real = real or held_out(first)
     check_reflectance(metrics, [real])
     why = None if protocol else not_as_printed(real)
@@ -91,7 +92,7 @@ def report(
     for subject in subjects:
         flow = load_checkpoint(subject.run, device)
         measured.cells += measure_cells(settings, flow, subject, budget.steps)
-        if budget.curved and subject.steps is None:
+        if budget.curved and subject.steps is None and not subject.system:
             most, label = max(budget.steps), subject.label
             with work.bar(f"following paths of {label}", 2 * most, "evaluations") as advance:
                 measured.paths[label] = measure_paths(
@@ -108,11 +109,18 @@ def report(
                 **{name: cell.row.get(name) for name in metrics},
                 "marginals": marginals_apart(cell.birds_eye, measured.birds_eye), **costs[network],
             })  # fmt: skip
-        if subject is first and budget.tolerance is not None and len(real) > 1:
+        if subject is first and not subject.system and budget.tolerance is not None and len(real) > 1:
             measured.between = _interpolate(flow, ends, Sampler("dopri5", tolerance=budget.tolerance), work)
         del flow
     better = {name: metric.better for name, metric in metrics.items()}
     return paper_page(measured, better, primary, missing, budget.num, command, device)
+
+
+def first_of(subjects: Sequence[PaperRun]) -> PaperRun:
+    """Whose scans the others are compared with: the first 1-RF's, else those of most channels and widest range."""
+    return max(
+        subjects, key=lambda one: (one.role == "1-RF", one.config["encoding"]["reflectance"], one.sensor.max_range)
+    )
 
 
 def not_as_printed(real: ScanSet) -> str | None:
@@ -129,7 +137,13 @@ def _interpolate(flow: Checkpoint, ends: np.ndarray, sampler: Sampler, work: Wor
 
 
 def held_out(subject: PaperRun) -> ScanSet:
-    """All scans that a run held out of its training."""
+    """All scans that a run held out of its training.
+
+    Raises:
+        InputError: a published file, which has none.
+    """
+    if "seed" not in subject.config:
+        raise InputError(f"{subject.run} does not come with scans that were held out; give --real SCANS.")
     config = read_config(subject.run) or subject.config  # the folder's own knows where the scans have moved
     flow = load_checkpoint(subject.run)
     data = {**config["data"], "validation": {**(config["data"].get("validation") or {}), "scans": 10**9}}

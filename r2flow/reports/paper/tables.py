@@ -1,12 +1,13 @@
 """The paper's tables I and II: ours, the printed ones and both side by side, and what differs in words."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from statistics import fmean, stdev
 from typing import Any
 
 from r2flow.evaluation.protocols import PAPER, WORDS, Rules
-from r2flow.reports.paper.claims import Claim
+from r2flow.reports.paper.claims import MANY, Claim
 from r2flow.reports.paper.printed import COLUMNS, PAPER_KIND, TABLE_I, TABLE_II, Architecture
 from r2flow.reports.tables import Row, shown, table
 
@@ -46,37 +47,41 @@ def _text(rows: Sequence[Row], metric: str) -> str:
 
 
 def ours(rows: Sequence[Row], metrics: Mapping[str, str]) -> str:
-    """Every flow at every number of evaluations."""
+    """Every generator at every number of evaluations."""
     headings = {
-        "role": "flow", "kind": "backbone", "steps": "evaluations", "n": "seeds", "seconds": "seconds a scan",
+        "role": "method", "kind": "backbone", "steps": "evaluations", "n": "seeds", "seconds": "seconds a scan",
     }  # fmt: skip
     figures = {f"{metric} text": heading for metric, heading in metrics.items()}
     return table(over_seeds(rows, list(metrics)), headings | figures)
 
 
 def beside(rows: Sequence[Row], metrics: Sequence[str]) -> str:
-    """Table I's flows, printed and ours, in the columns that both have; "" where they share none.
+    """Table I's rows, printed and ours, in the columns that both have; "" where they share none.
 
-    The paper's are of HDiT with APE: of several kinds of ours, that one.
+    The paper's flows are of HDiT with APE: of several kinds of ours, that one. Where the paper has many evaluations,
+    ours of the nearest number.
     """
     shared = [metric for metric in COLUMNS if metric in metrics]
-    rows = [row for row in rows if row.get("kind") == PAPER_KIND] or rows
-    mine = {(row["role"], row["steps"]): row for row in over_seeds(rows, shared)}
-    most = max((row["steps"] for row in rows), default=0)
+    if any(row.get("kind") == PAPER_KIND for row in rows):
+        rows = [row for row in rows if row.get("kind") in (PAPER_KIND, "")]
+    mine = over_seeds(rows, shared)
     lines = []
     for printed in TABLE_I:
-        # Our many evaluations may be fewer than the paper's 256.
-        own = mine.get((printed.role or "", most if printed.evaluations == 256 else printed.evaluations))
-        if own is None:
+        role, count = printed.role or printed.method, printed.evaluations
+        near = [
+            row for row in mine if row["role"] == role and (row["steps"] == count or min(row["steps"], count) >= MANY)
+        ]
+        if not near:
             continue
-        line: dict[str, Any] = {"role": printed.role, "printed": printed.evaluations, "own": own["steps"]}
+        own = min(near, key=lambda row: abs(math.log(row["steps"] / count)))
+        line: dict[str, Any] = {"role": role, "printed": count, "own": own["steps"]}
         for metric, figure in zip(COLUMNS, printed.figures, strict=True):
             value = own.get(metric)
             line |= {f"{metric} printed": figure, metric: None if value is None else value * COLUMNS[metric][1]}
         lines.append(line)
     if not lines or not shared:
         return ""
-    headings = {"role": "flow", "printed": "NFE, paper", "own": "NFE, ours"}
+    headings = {"role": "method", "printed": "NFE, paper", "own": "NFE, ours"}
     for metric in shared:
         headings |= {f"{metric} printed": f"{COLUMNS[metric][0]}, paper", metric: "ours"}
     return table(lines, headings)
