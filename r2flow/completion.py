@@ -17,6 +17,7 @@ from r2flow.errors import InputError
 from r2flow.flow.posterior import completes
 from r2flow.generators import Condition, Flow, Generator, Regression, Sampler, condition_of
 from r2flow.generators.base import Progress
+from r2flow.generators.flow import UNTOLD
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
 from r2flow.lidar.interpolation import surfaces
 from r2flow.lidar.known import Ray
@@ -92,6 +93,8 @@ def completing(generator: Generator, sampler: Sampler | None = None, doubtful: b
     usual = generator.sampler if own else USUAL
     how = (sampler or usual).changed(**changes)
     generator.check_sampler(how)
+    if not generator.told and not completes(how.method):
+        raise InputError(UNTOLD)
     return how
 
 

@@ -205,6 +205,11 @@ def test_what_cannot_be_done_is_one_line(r2flow, run, tmp_path, options, message
             "is a range image of 4x64, those of the model are",
         ),
         (lambda path: np.save(path, np.full((2, 8, 64), np.nan, np.float32)), "holds NaN or infinite values"),
+        (lambda path: np.save(path, -scans()[0].numpy()), "must hold ranges in metres, of 0 or more"),
+        (
+            lambda path: np.save(path, np.full((2, 8, 64), 3, np.float32)),
+            "reflectances of [0, 1]; found 3 to 3, 3 to 3. Divide",
+        ),
         (lambda path: path.write_bytes(b""), "is empty"),
         (lambda path: None, "does not exist"),
     ],
@@ -216,6 +221,56 @@ def test_scans_that_cannot_be_completed_are_one_line(r2flow, run, tmp_path, made
     assert message in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("sensor", [[], ["--from", "vlp32c"]])
+def test_points_of_which_none_is_in_view_are_one_line(r2flow, run, tmp_path, sensor):  # noqa: F811
+    xyz, reflectance = image_to_points(scans()[0].numpy(), SENSOR.rays())
+    write_points(tmp_path / "far.bin", 500 * xyz / np.linalg.norm(xyz, axis=1, keepdims=True), reflectance)
+    code, _, error = r2flow(*COMPLETE, tmp_path / "far.bin", "-c", run, *sensor, "--out", tmp_path / "out")
+    assert code == 2
+    assert "lies within 1.45-80 m" in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_error_is_told_where_no_ray_returns_in_both(r2flow, run, tmp_path):  # noqa: F811
+    np.save(tmp_path / "one.npy", np.zeros((2, 8, 64), np.float32))
+    code, said, error = r2flow(
+        *COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out"
+    )
+    assert (code, error) == (0, "")
+    assert "nan" not in said
+    assert "no hidden ray returns in both" in said
+    assert "of the rays return in one alone" in said
+
+
+def test_the_folder_of_the_scans_is_not_written_into(r2flow, run, tmp_path):  # noqa: F811
+    """There the note on the answers would be taken for one on the scans."""
+    sparse_scan(tmp_path / "in" / "room.pcd")
+    for what in (tmp_path / "in" / "room.pcd", tmp_path / "in", tmp_path):
+        out = tmp_path if what == tmp_path else tmp_path / "in"
+        code, _, error = r2flow(*COMPLETE, what, "-c", run, "--num", 2, "--out", out)
+        assert code == 2
+        assert f"{out} is the folder of the scans; answers need one of their own" in error
+    assert [path.name for path in (tmp_path / "in").iterdir()] == ["room.pcd"]
+
+
+def test_a_file_of_an_answer_s_name_is_no_answer(r2flow, run, tmp_path):  # noqa: F811
+    full_scan(tmp_path / "one.npy")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "one.npy").write_text("mine")
+    code, _, error = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out")
+    assert code == 2
+    assert "one.npy is there and no answer of this command; give another --out" in error
+    assert (tmp_path / "out" / "one.npy").read_text() == "mine"
+
+
+def test_answers_of_another_sampler_are_told_apart_by_its_setting(r2flow, run, tmp_path):  # noqa: F811
+    full_scan(tmp_path / "one.npy")
+    asked = [*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out", "--steps"]
+    assert r2flow(*asked, 1)[0] == 0
+    assert "completed with steps 1, not 2; give another --out" in r2flow(*asked, 2)[2]
 
 
 def test_a_folder_of_other_samples_is_not_written_into(r2flow, run, tmp_path):  # noqa: F811

@@ -190,6 +190,12 @@ def test_a_generator_that_cannot_complete_is_refused():
         completing(Noise())
 
 
+def test_a_flow_without_a_condition_says_what_completes_with_it():
+    with pytest.raises(InputError, match="a scan is completed with it by --solver replace, replace_fresh, repaint, "):
+        completing(network("rectified_flow").generator, method="euler")
+    assert completing(network().generator, method="euler").method == "euler"
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

@@ -134,7 +134,7 @@ def test_a_scan_that_leaves_the_numbers_is_flagged_and_keeps_its_last_state(exac
     [
         (Sampler("jump", 4, finish=0.1), "neither levels nor a finish"),
         (Sampler("jump", 4, grid=(0.0, 0.5)), "time grid"),
-        (Sampler("jumps", 4), "no solver named 'jumps'"),
+        (Sampler("jumps", 4), "no solver named 'jumps'; known: jump, renoise, ab2, "),
     ],
 )
 def test_samplers_that_jumps_do_not_have_are_refused(grown, sampler, said):

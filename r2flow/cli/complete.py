@@ -125,10 +125,12 @@ def complete(
     print(f"{len(found)} scans completed in {out}" + (f", {there} were there already" if there else ""))
     errors = [error for error in found.values() if error is not None]
     if errors:
-        mean = {name: float(np.nanmean([error[name] for error in errors])) for name in ("mae_m", "drop_wrong")}
+        off = [error["mae_m"] for error in errors if not np.isnan(error["mae_m"])]
+        apart = f"MAE {np.mean(off):.2f} m where both return" if off else "no hidden ray returns in both"
+        wrong = np.mean([error["drop_wrong"] for error in errors])
         print(
-            f"to the truth of {len(errors)} scans, on the rays that the mask hid: MAE {mean['mae_m']:.2f} m where both "
-            f"return; {mean['drop_wrong']:.1%} of the rays return in one alone"
+            f"to the truth of {len(errors)} scans, on the rays that the mask hid: {apart}; {wrong:.1%} of the rays "
+            "return in one alone"
         )
 
 

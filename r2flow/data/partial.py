@@ -14,11 +14,11 @@ import numpy as np
 
 from r2flow.data.opening import SAMPLES, SOURCES, open_scans, own_reading, parse, usual_scale
 from r2flow.data.options import PREPARED, SIMULATED
-from r2flow.data.sources import LOOKED_AT, Reading, ScanSource, spread
+from r2flow.data.sources import LOOKED_AT, Reading, ScanSource, nothing_in_view, spread
 from r2flow.errors import InputError
 from r2flow.lidar.calibration import reflectance_of
 from r2flow.lidar.recognition import other_sensor
-from r2flow.lidar.scan_files import SCAN_ENDINGS, Points, read_points, read_range_image
+from r2flow.lidar.scan_files import SCAN_ENDINGS, Points, read_numbers, read_points, read_range_image
 from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.transfer import (
     Fired,
@@ -184,21 +184,36 @@ def _described(spec: str, elevations: np.ndarray, name: str, target: Sensor) -> 
 def _read_same(path: Path, reading: Reading, scale: float) -> Partial:
     points = read_points(path, reading.columns)
     strength = _strength(path, points, scale, strict=True)
-    return points_of_same(points, reading.sensor, reading.projection, reading.convention, strength)
+    seen = points_of_same(points, reading.sensor, reading.projection, reading.convention, strength)
+    return _shown(path, points, reading.sensor, seen)
 
 
 def _read_other(path: Path, reading: Reading, fired: Fired, scale: float, strict: bool) -> Partial:
     points = read_points(path, reading.columns)
-    return points_through(points, fired, reading.sensor, _strength(path, points, scale, strict))
+    seen = points_through(points, fired, reading.sensor, _strength(path, points, scale, strict))
+    return _shown(path, points, reading.sensor, seen)
+
+
+def _shown(path: Path, points: Points, target: Sensor, seen: Partial) -> Partial:
+    if not seen.image[0].any():
+        raise nothing_in_view(path, points, target)
+    return seen
 
 
 def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
     image = read_range_image(path)
     assert image is not None
-    if not np.isfinite(np.load(path, allow_pickle=False)).all():
+    stored = read_numbers(path)
+    if not np.isfinite(stored).all():
         raise InputError(
             f"{path} holds NaN or infinite values: give 0 where nothing came back, and say by --mask FILE.npy what "
             "was not measured."
+        )
+    if stored.min() < 0 or stored[1:].max(initial=0) > 1:
+        found = ", ".join(f"{channel.min():g} to {channel.max():g}" for channel in stored)
+        raise InputError(
+            f"{path} must hold ranges in metres, of 0 or more, and reflectances of [0, 1]; found {found}. Divide the "
+            "reflectances by what means full reflectance."
         )
     found = "x".join(map(str, image.shape[1:]))
     if source is not None and image.shape[1] == source.shape[0]:

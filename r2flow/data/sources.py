@@ -196,13 +196,18 @@ def read_projected(
     pixels, chosen, kept = project_indices(points.xyz, sensor, projection, convention, points.ring)
     image = image_of(sensor, pixels, kept, None if scaled is None else scaled[chosen])
     if not image[0].any():
-        r = np.linalg.norm(points.xyz, axis=1)
-        raise NoPointsError(
-            f"{path}: none of its {len(r)} points lies within {sensor.min_range:g}-{sensor.max_range:g} m and the "
-            f"view of sensor '{sensor.name}' (ranges found: {r.min():.3g}-{r.max():.3g} m). "
-            "Are its units metres and its sensor the configured one?"
-        )
+        raise nothing_in_view(path, points, sensor)
     return Projected(image if reflectance else image[:1], points, pixels, chosen)
+
+
+def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPointsError:
+    """That a scan has no return that the sensor's image shows."""
+    r = np.linalg.norm(points.xyz, axis=1)
+    return NoPointsError(
+        f"{path}: none of its {len(r)} points lies within {sensor.min_range:g}-{sensor.max_range:g} m and the "
+        f"view of sensor '{sensor.name}' (ranges found: {r.min():.3g}-{r.max():.3g} m). "
+        "Are its units metres and its sensor the configured one?"
+    )
 
 
 def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tuple[np.ndarray, np.ndarray | None]:

@@ -328,7 +328,9 @@ def parse_method(text: str) -> Chosen:
     right = len(numbers) == len(words) and all(n >= 1 if isinstance(n, int) else 0 < n < 1 for n in numbers)
     if not right:
         usual = ":" + ",".join(map(str, method.numbers)) if method.numbers else " without numbers"
-        raise InputError(f"the method {text!r} does not say its numbers: give {name}{usual}.")
+        kinds = {int: " (whole numbers of at least 1)", float: " (a start in (0, 1))"}
+        takes = kinds[type(method.numbers[0])] if method.numbers else ""
+        raise InputError(f"the numbers of {text!r} are none that {name} takes{takes}: give {name}{usual}.")
     return Chosen(name, method, (*numbers, *method.numbers[len(numbers) :]))
 
 

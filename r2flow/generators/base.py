@@ -112,6 +112,11 @@ class Sampler:
             raise InputError(f"a sampler needs at least 1 step, found {found.steps}.")
         return found
 
+    def unlike(self, other: Self) -> str:
+        """What is another one's setting, in words: "steps 5, tolerance 0.1"."""
+        theirs = other.asdict()
+        return ", ".join(f"{key} {value}" for key, value in self.asdict().items() if value != theirs[key])
+
     def asdict(self) -> dict[str, Any]:
         """Plain values, as a config or a checkpoint holds them."""
         return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
@@ -192,7 +197,7 @@ class Generator(nn.Module):
         if sampler != own:
             raise InputError(
                 f"a {type(self).__name__} can be run in one way only, {own.method} with {own.steps} "
-                f"step{'s' * (own.steps > 1)}; found {sampler.method} with {sampler.steps}."
+                f"step{'s' * (own.steps > 1)}; found {sampler.unlike(own)}."
             )
 
     def evaluations_of(self, sampler: Sampler) -> int:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from r2flow.diffusion.log_snr import SCHEDULES, alpha_sigma, for_images, log_snr_of, straight_time
 from r2flow.diffusion.objectives import PREDICTIONS
-from r2flow.diffusion.sampling import DDPM, eta_of, walk
+from r2flow.diffusion.sampling import DDIM, DDPM, eta_of, walk
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution
 from r2flow.generators.base import Condition, Generated, Progress, Sampler
@@ -41,6 +41,8 @@ class Diffusion(NetworkFlow):
         schedule: Name and options of a log-SNR schedule in `r2flow.diffusion.log_snr.SCHEDULES`.
         clip: Expected data are clamped to [-clip, clip] whenever scans are made; null leaves them as they are.
     """
+
+    other_samplers = DDPM, f"{DDIM}:ETA"
 
     def __init__(
         self,

@@ -31,7 +31,9 @@ UNTOLD = f"this flow was trained without a condition; a scan is completed with i
 
 
 class Flow(Generator):
-    """A generator by an ODE. A subclass gives its velocity."""
+    """A generator by an ODE. A subclass gives its velocity, and names what it is sampled by beside solvers."""
+
+    other_samplers: ClassVar[tuple[str, ...]] = ()
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         """v(t, x), (B, C, H, W), at times t of shape () or (B,)."""
@@ -146,7 +148,7 @@ class Flow(Generator):
                 raise InputError(f"{sampler.method} has neither levels nor a finish; leave them out.")
             self._times(sampler)
             return
-        check_method(sampler.method)
+        check_method(sampler.method, self.other_samplers)
         check_tolerance(sampler.tolerance)
         grid, method = sampler.grid, fixed_step(sampler.method)
         build_grid(grid if isinstance(grid, str) else torch.tensor(grid), 0.0, 1.0, sampler.steps)

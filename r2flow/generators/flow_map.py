@@ -35,6 +35,7 @@ class FlowMap(RectifiedFlow):
     """
 
     second_time: ClassVar[bool] = True
+    other_samplers = JUMP, RENOISE
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space, backbone)

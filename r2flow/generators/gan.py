@@ -80,7 +80,7 @@ class Gan(Generator):
         if not known or replace(sampler, method=self.sampler.method) != self.sampler:
             raise InputError(
                 f"a {type(self).__name__} makes a scan in 1 step, by {DIRECT} or {TRUNCATE}PSI, without a tolerance or "
-                f"a time grid; found {sampler.method} in {sampler.steps}."
+                f"a time grid; found {sampler.unlike(self.sampler)}."
             )
         truncation_of(sampler)
 

@@ -98,8 +98,8 @@ class ScoreModel(Generator):
         plain = Sampler(LANGEVIN, sampler.steps)
         if sampler != plain:
             raise InputError(
-                "a score model is sampled by langevin, in steps at each noise level and without a time grid; found "
-                f"{sampler.method} on {sampler.grid}."
+                f"a score model is sampled by {LANGEVIN}, in steps at each noise level and without other settings; "
+                f"found {sampler.unlike(plain)}."
             )
 
     def evaluations_of(self, sampler: Sampler) -> int:

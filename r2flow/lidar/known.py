@@ -14,6 +14,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.lidar.region import region
+from r2flow.lidar.scan_files import read_numbers
 from r2flow.registry import Registry, did_you_mean
 
 
@@ -106,17 +107,19 @@ def _one_mask(text: str) -> Mask:
         raise InputError(f"no mask {text!r}: give {FORMS}.{did_you_mean(name, dict(MASKS.items()))}")
     try:
         return MASKS[name](*[float(number) for number in numbers.split(",")])
+    except InputError:
+        raise
     except (ValueError, TypeError):
         raise InputError(f"the mask {text!r} does not say its numbers: give {FORMS}.") from None
 
 
 def _from_file(path: Path) -> Mask:
-    try:
-        held = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise InputError(f"the mask {path} cannot be read: {error}.") from None
-    if not isinstance(held, np.ndarray) or held.ndim != 2 or not (held.dtype == bool or np.isin(held, (0, 1)).all()):
-        raise InputError(f"the mask {path} must be an array (H, W) of true where a ray is measured, or of 0 and 1.")
+    held = read_numbers(path)
+    if held.ndim != 2 or not (held.dtype == bool or (held.dtype.kind in "iuf" and np.isin(held, (0, 1)).all())):
+        raise InputError(
+            f"the mask {path} must be an array (H, W) of true where a ray is measured, or of 0 and 1; found "
+            f"{held.dtype} of shape {held.shape}."
+        )
 
     def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
         if held.shape != tuple(shape):

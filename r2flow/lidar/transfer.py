@@ -5,7 +5,7 @@ empty only where a ray was fired into it and did not come back.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from r2flow.lidar.calibration import steps_of_a_turn
 from r2flow.lidar.known import Ray
 from r2flow.lidar.projection import Convention, Projection, image_of, project_indices
 from r2flow.lidar.scan_files import Points
+from r2flow.lidar.scan_files.points import NEAREST
 from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.unfolding import elevations_of
 
@@ -152,10 +153,17 @@ def points_of_same(
     convention: Convention = "centre",
     reflectance: np.ndarray | None = None,
 ) -> Partial:
-    """What is known of a sensor's image by a scan of this sensor: all of it, but for a sector without any return."""
+    """What is known of a sensor's image by a scan of this sensor.
+
+    All of it, but for a sector without any return and for what is behind a return nearer than its nearest range.
+    """
     hit, chosen, r = project_indices(points.xyz, target, projection, convention, points.ring)
     image = image_of(target, hit, r, None if reflectance is None else reflectance[chosen])
     state = np.where(image[0] > 0, int(Ray.RETURN), int(Ray.EMPTY)).astype(np.uint8)
+    # A point at the origin is a ray without a return.
+    close = replace(target, min_range=min(NEAREST, target.min_range / 2), max_range=target.min_range)
+    near = project_indices(points.xyz, close, projection, convention, points.ring)[0]
+    state.ravel()[near[image[0].ravel()[near] == 0]] = Ray.UNKNOWN
     returned = points.xyz[:, :2].any(axis=1)
     state[:, _blind(_azimuth(points.xyz[returned]), target.shape[1], 3 * 360 / target.shape[1])] = Ray.UNKNOWN
     return Partial(image if reflectance is not None else image[:1], state, _spread(target, hit, points.xyz[chosen]))

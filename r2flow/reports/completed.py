@@ -80,12 +80,15 @@ def write_completed(
     """
     asked = {"num": job.num, "seed": job.seed, "keep": job.keep, "weights": weights_hash(checkpoint), **about}
     settings = {**asked, "sampler": sampler.asdict()}
-    _refuse_others(out, settings)
     files = [answer_files(checkpoint, scan, out, job.num) for scan in scans]
     inputs = {scan.path.resolve() for scan in scans if scan.path}
     replaced = [path for paths in files for path in paths if path.resolve() in inputs]
     if replaced:
         raise InputError(f"{replaced[0]} is one of the scans and would be replaced; give another --out.")
+    for scan in scans:
+        if scan.path and (out / scan.name).resolve().parent == scan.path.resolve().parent:
+            raise InputError(f"{out} is the folder of the scans; answers need one of their own: give another --out.")
+    _refuse_others(out, settings, [path for paths in files for path in paths])
     left = [number for number, paths in enumerate(files) if not all(path.is_file() for path in paths)]
     found: dict[str, dict[str, float] | None] = {}
     known = []
@@ -158,23 +161,31 @@ def answer_files(checkpoint: Checkpoint, scan: PartialScan, out: Path, num: int)
     return [out / f"{scan.name}{number}{ending}" for number in numbers]
 
 
-def _refuse_others(out: Path, settings: Mapping[str, Any]) -> None:
+def _refuse_others(out: Path, settings: Mapping[str, Any], files: Sequence[Path]) -> None:
     note = out / SAMPLES
-    if not note.exists():
+    if not note.exists():  # it is written before the first answer
+        if foreign := next((path for path in files if path.exists()), None):
+            raise InputError(f"{foreign} is there and no answer of this command; give another --out.")
         return
     try:
         there = json.loads(note.read_text(encoding="utf-8")).get("completion")
     except (ValueError, AttributeError):
         there = None
-    ours = json.loads(json.dumps(settings))
+    ours = _flat(json.loads(json.dumps(settings)))
     if there is None:
         raise InputError(f"{out} holds other scans than completed ones (its {SAMPLES} says so); give another --out.")
+    there = _flat(there)
     wrong = next((key for key in ours if there.get(key) != ours[key]), None)
     if wrong is not None:
         found, asked = (json.dumps(one) for one in (there.get(wrong), ours[wrong]))
         raise InputError(
             f"{out} holds scans that were completed with {wrong} {found}, not {asked}; give another --out."
         )
+
+
+def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of the sampler beside the others."""
+    return {key: value for key, value in settings.items() if key != "sampler"} | settings.get("sampler", {})
 
 
 def _write(

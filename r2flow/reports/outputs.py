@@ -70,6 +70,7 @@ def write_samples(
     sampler = sampler or generator.sampler
     formats = formats_of(checkpoint, channels) if formats is None else formats
     check_formats(checkpoint, formats, channels)
+    generator.check_sampler(sampler)
     out, rays = Path(out), checkpoint.sensor.rays()
     if {"ply", "bin"} & set(formats) and not torch.equal(generator.space.rays, rays):
         log.warning(

@@ -9,10 +9,10 @@ ERROR = 0.05  # at most so often a verdict is given, either way, where there is 
 
 
 def interval(values: Sequence[float], error: float = ERROR) -> tuple[float, float]:
-    """The mean's two-sided interval by Student's t at level 1 - error; all numbers for fewer than two values."""
+    """The mean's two-sided interval by Student's t at level 1 - error; all numbers for fewer than two values, or NaN."""
     from scipy.special import stdtrit  # quantiles of Student's t
 
-    if len(values) < 2:
+    if len(values) < 2 or any(math.isnan(value) for value in values):
         return -math.inf, math.inf
     half = float(stdtrit(len(values) - 1, 1 - error / 2)) * stdev(values) / math.sqrt(len(values))
     return fmean(values) - half, fmean(values) + half

@@ -132,7 +132,7 @@ CANNOT = {
     "report work-precision": (["-c", "RUN", "-o", "OUT"], "a work-precision report needs the velocity of a flow"),
     "calibrate": (["-c", "RUN"], "a time grid needs the velocity of a flow, which a ToyGenerator"),
     "convert": (["RUN", "OUT.pth"], "the published format cannot hold a ToyGenerator; convert to .safetensors"),
-    "pairs": (["-c", "RUN"], "a ToyGenerator can be run in one way only, direct with 1 step; found adams3"),
+    "pairs": (["-c", "RUN"], "a ToyGenerator can be run in one way only, direct with 1 step; found method adams3"),
     "sample": (["-c", "RUN", "--steps", "4", "-o", "OUT"], "a ToyGenerator can be run in one way only"),
 }  # fmt: skip
 

@@ -163,6 +163,22 @@ def test_a_scan_of_the_same_sensor_is_measured_everywhere_but_where_it_was_cut()
     assert (np.delete(seen.state, 3, axis=0)[:, 130:] == Ray.RETURN).all()
 
 
+def test_what_is_behind_a_near_return_of_the_same_sensor_was_not_measured():
+    near, away = 100, (30, 200)  # columns, of 0.5 m and of 10 m; the others came back empty
+    e = np.deg2rad(np.asarray(TARGET.elevations))[:, None]
+    a = np.pi * (1 - 2 * (np.array([near, *away]) + 0.5) / 256)[None]
+    rays = np.stack(np.broadcast_arrays(np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)), -1)
+    xyz = rays * np.array([0.5, 10, 10])[None, :, None]
+    every = np.pi * (1 - 2 * (np.arange(256) + 0.5) / 256)
+    ring = 10 * np.stack([np.cos(every), np.sin(every), np.full(256, np.tan(e[0, 0]))], -1)  # no sector is blind
+    points = np.concatenate([xyz[1:].reshape(-1, 3), ring, np.zeros((5, 3))]).astype(np.float32)
+    seen = points_of_same(Points(points), TARGET)
+    assert (seen.state[0] == Ray.RETURN).all()
+    assert (seen.state[1:, near] == Ray.UNKNOWN).all()
+    assert (seen.state[1:, list(away)] == Ray.RETURN).all()
+    assert (np.delete(seen.state[1:], [near, *away], axis=1) == Ray.EMPTY).all()
+
+
 def test_a_range_image_says_all_its_rays():
     image = np.array([[[5.0, 0.0, 0.7, 90.0]], [[0.5, 0.0, 0.2, 1.3]]], np.float32)
     seen = image_of_same(image, TARGET)

@@ -56,6 +56,10 @@ def test_the_interval_is_student_s():
     assert said in compare(rows, A, B, "jsd").said
 
 
+def test_a_margin_that_is_not_known_tells_nothing():
+    assert all_above_0([[math.nan, 3.0, 3.1]]) == any_above_0([[math.nan, 3.0, 3.1]]) == UNKNOWN
+
+
 def test_only_the_primary_metric_judges():
     rows = [{**row, "mmd": 1 / row["jsd"]} for seed in range(3) for row in (
         {"family": str(seed), "role": "2-RF", "steps": 1, "jsd": 0.1 + 0.01 * seed},

@@ -218,5 +218,7 @@ def test_known_pixels_stay_near_their_values():
 
 def test_a_sampler_of_another_family_is_refused():
     generator = build_generator(TINY)
-    with pytest.raises(InputError, match="sampled by langevin"):
+    with pytest.raises(InputError, match=r"sampled by langevin.*; found method euler\.$"):
         generator.check_sampler(generator.sampler.changed(method="euler"))
+    with pytest.raises(InputError, match=r"found tolerance 0\.1, grid power:2\.$"):
+        generator.check_sampler(generator.sampler.changed(tolerance=0.1, grid="power:2"))

@@ -28,6 +28,7 @@ from r2flow.lidar.projection import unproject
 from r2flow.lidar.region import Region
 from r2flow.lidar.sensors import SENSORS
 from r2flow.noise import Draws
+from r2flow.reports.outputs import write_samples
 from r2flow.stages import build_stage
 from r2flow.stages.base import learning_rate_factor
 from r2flow.training import build, compose, fit
@@ -296,6 +297,14 @@ def test_a_published_checkpoint_is_sampled_and_evaluated(shared, tmp_path):
     assert [row["steps"] for row in rows] == [1, 2]
 
 
+def test_a_sampler_is_refused_before_anything_is_said(shared, tmp_path, caplog):
+    loaded = load_checkpoint(shared / "oracle_baselines" / "r2dm_published.pth")
+    with pytest.raises(InputError, match="no solver named 'langevin'; known: ddpm, ddim:ETA"):
+        write_samples(loaded, tmp_path / "out", 1, 0, Sampler("langevin", 2))
+    assert not caplog.records
+    assert not (tmp_path / "out").exists()
+
+
 def damaged(path: Path, tmp_path: Path, change) -> Path:
     content = torch.load(path, weights_only=True)
     change(content["cfg"])
@@ -469,7 +478,7 @@ def test_a_part_of_the_image_has_the_noise_of_the_whole(exact, method):
 REFUSED = {
     "ddim:1.5": "must lie in",
     "ddpm finish": "neither levels nor a finish",
-    "jump": "no solver named 'jump'",
+    "jump": "no solver named 'jump'; known: ddpm, ddim:ETA, ab2, ",
 }
 
 

@@ -1,7 +1,7 @@
 """ODE solvers: dx/dt = v(t, x) from one end of the flow to the other."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ from r2flow.flow.solvers.grids import build_grid, extended, halved, named_grid, 
 from r2flow.flow.solvers.multistep import adams
 from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite
 from r2flow.flow.solvers.step_size import Limits
-from r2flow.registry import Registry
+from r2flow.registry import Registry, did_you_mean
 
 __all__ = [
     "LEAST_TOLERANCE", "SOLVERS", "TORCHDIFFEQ", "EmbeddedMethod", "FixedStep", "Solution", "Velocity", "adapts",
@@ -199,16 +199,20 @@ def _with_global_error(solution: Solution, run: _Run, velocity: Velocity, x: Ten
     return replace(solution, evaluations=evaluations, global_error=error, estimate_evaluations=extra)
 
 
-def check_method(method: str) -> None:
+def check_method(method: str, others: Iterable[str] = ()) -> None:
     """Check the name of a solver.
+
+    Args:
+        others: What may stand in its place here, to be named with the solvers.
 
     Raises:
         InputError: an unknown method.
     """
     if method.startswith(TORCHDIFFEQ):
         check_torchdiffeq(method.removeprefix(TORCHDIFFEQ))
-    else:
-        SOLVERS[method]
+    elif method not in SOLVERS:
+        known = [*others, *sorted(SOLVERS)]
+        raise InputError(f"no solver named {method!r}; known: {', '.join(known)}.{did_you_mean(method, known)}")
 
 
 def check_knots(method: str, steps: int, knots: int) -> None:

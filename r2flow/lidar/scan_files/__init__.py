@@ -15,7 +15,15 @@ import numpy as np
 
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, refuse_unreadable
-from r2flow.lidar.scan_files.arrays import Columns, named_already, read_image, read_kitti, read_npy, read_nuscenes
+from r2flow.lidar.scan_files.arrays import (
+    Columns,
+    named_already,
+    read_array,
+    read_image,
+    read_kitti,
+    read_npy,
+    read_nuscenes,
+)
 from r2flow.lidar.scan_files.fields import check_columns
 from r2flow.lidar.scan_files.pcd import read_pcd, write_pcd
 from r2flow.lidar.scan_files.ply import read_ply, write_ply
@@ -28,6 +36,7 @@ __all__ = [
     "SCAN_ENDINGS",
     "NoPointsError",
     "Points",
+    "read_numbers",
     "read_points",
     "read_range_image",
     "write_points",
@@ -135,6 +144,21 @@ def read_range_image(path: str | Path) -> np.ndarray | None:
     try:
         refuse_unreadable(path, LARGEST_FILE, "range image")
         return read_image(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
+
+
+def read_numbers(path: str | Path) -> np.ndarray:
+    """The array of numbers in a .npy, of any shape and type. Nothing is unpickled.
+
+    Raises:
+        InputError: the file is missing, no regular file, damaged, or holds objects.
+    """
+    path = Path(path)
+    try:
+        refuse_unreadable(path, LARGEST_FILE, ".npy file")
+        with path.open("rb") as file:
+            return read_array(path, file, None)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
 

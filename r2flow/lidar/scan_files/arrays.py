@@ -111,7 +111,7 @@ def read_array(path: Path, file: IO[bytes], size: int | None) -> np.ndarray:
     """
     shape, fortran_order, dtype = _npy_header(path, file)
     if dtype.hasobject:
-        raise InputError(f"{path} holds objects, not floats: points are float (N, 3) or (N, 4).")
+        raise InputError(f"{path} holds objects, not numbers; write it from an array of numbers.")
     return _npy_body(path, file, shape, fortran_order, dtype, size)
 
 

@@ -105,9 +105,11 @@ def find_subjects(folders: Sequence[Path]) -> list[PaperRun]:
             found[one.weights] = replace(one, role=role, family=parent.family if parent else one.weights)
         rest = [one for one in rest if one not in known]
     order = [*SYSTEMS, None]  # that of table I; the paper's own flows come last
-    subjects = sorted(
-        found.values(), key=lambda one: order.index(one.config["generator"]["name"] if one.system else None)
-    )
+
+    def place(one: PaperRun) -> tuple[int, bool]:
+        return order.index(one.config["generator"]["name"] if one.system else None), "+ APE" in one.role
+
+    subjects = sorted(found.values(), key=place)
     _check_comparable(subjects)
     return subjects
 
