@@ -37,7 +37,7 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes, learned from simulated scans",
-        "ced1705675e7c9f315a83a96b039f368202ac02474a9e52e3fcfeafa765e6b05",
+        "b41ab872e1494a4bac5a730330d66491bf58dcdb65e5e409d6510d5d8ca66f77",
     ),
 )
 DEFAULT = "street"
