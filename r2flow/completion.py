@@ -26,8 +26,9 @@ from r2flow.sampling import HasGenerator, Samples, draw
 
 KEEP = ("exact", "blend", "mend")
 CONFIRMED = 0.2  # of its range: nearer an answer confirms a doubtful return; docs/completion.md
-ROUGH = 0.06  # of its range: how far the answers of a flow lie about a surface
-EXACT = 0.002  # of its range: no surface is known better
+ROUGH = 0.03  # of its range: how far the answers of a flow lie about a surface
+EXACT = 0.004  # of its range: no surface is known better
+TAILS = 2  # so many times the error at the measured rays is that between them taken for; docs/completion.md
 SURE = 0.05  # of its range: a surface known better than that holds wherever an answer has the return
 ANSWER = 2**32  # noise numbers from one answer to the next: answer 0 of scan i has the noise of sample i
 USUAL = Sampler("mmps", 10, grid="power:1.5")  # of flows; docs/completion.md has others
@@ -164,9 +165,9 @@ def complete(
 def settled(r: Tensor, surface: Tensor, error: Tensor) -> Tensor:
     """Ranges of an answer, moved towards the surfaces that the measured returns lie on.
 
-    Where the answer's log-range is log(surface) + d with |d| <= 3 s, s^2 = `ROUGH`^2 + error^2, it is taken for one of
-    N(log surface, s^2) and becomes log(surface) + d error / s, which has the variance that the surface leaves. Further
-    off it stays, unless the surface is known better than `SURE`: then the range is the surface's.
+    Where the answer's log-range is log(surface) + d with |d| <= 3 s, s^2 = `ROUGH`^2 + e^2, e = `TAILS` error, it is
+    taken for one of N(log surface, s^2) and becomes log(surface) + d e / s, which has the variance that the surface
+    leaves. Further off it stays, unless the surface is known better than `SURE`: then the range is the surface's.
 
     Args:
         r: (..., H, W) in metres; 0, without a return, stays 0.
@@ -174,10 +175,10 @@ def settled(r: Tensor, surface: Tensor, error: Tensor) -> Tensor:
         error: Its error; infinite where there is none.
     """
     said = error.isfinite() & (r > 0)
-    error = torch.where(said, error, 1).clamp(min=EXACT)
+    e = torch.where(said, TAILS * error, 1).clamp(min=EXACT)
     d = torch.where(said, r / torch.where(said, surface, 1), 1).log()
-    s = (ROUGH**2 + error.square()).sqrt()
-    share = torch.where(d.abs() <= 3 * s, error / s, torch.where(error < SURE, 0, 1))
+    s = (ROUGH**2 + e.square()).sqrt()
+    share = torch.where(d.abs() <= 3 * s, e / s, torch.where(error < SURE, 0, 1))
     return torch.where(said, surface * (share * d).exp(), r).to(r)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from r2flow.checkpoints import Checkpoint
-from r2flow.completion import ANSWER, ROUGH, SURE, complete, completing, settled, spread_of
+from r2flow.completion import ANSWER, ROUGH, SURE, TAILS, complete, completing, settled, spread_of
 from r2flow.errors import InputError
 from r2flow.generators import Generator, Sampler, build_generator
 from r2flow.lidar.known import Ray, parse_mask, ray_states
@@ -220,10 +220,11 @@ def test_what_fits_nothing_is_refused(changed, message):
 def test_settled_answers_scatter_as_the_surface_leaves_it():
     draws = torch.Generator().manual_seed(2)
     surface, error = torch.tensor(20.0), torch.tensor(0.03)
-    around = surface * ((ROUGH**2 + 0.03**2) ** 0.5 * torch.randn(200_000, generator=draws).clamp(-3, 3)).exp()
+    left = TAILS * 0.03
+    around = surface * ((ROUGH**2 + left**2) ** 0.5 * torch.randn(200_000, generator=draws).clamp(-3, 3)).exp()
     logs = (settled(around, surface, error) / surface).log()
-    assert float(logs.std()) == pytest.approx(0.03, rel=0.02)  # three deviations of 200,000 draws are 0.5 %
-    assert float(logs.mean()) == pytest.approx(0, abs=3 * 0.03 / 200_000**0.5)
+    assert float(logs.std()) == pytest.approx(left, rel=0.02)  # three deviations of 200,000 draws are 0.5 %
+    assert float(logs.mean()) == pytest.approx(0, abs=3 * left / 200_000**0.5)
 
 
 def test_settled_answers_far_off_stay_unless_the_surface_is_sure():

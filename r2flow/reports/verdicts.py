@@ -9,7 +9,7 @@ ERROR = 0.05  # at most so often a verdict is given, either way, where there is 
 
 
 def interval(values: Sequence[float], error: float = ERROR) -> tuple[float, float]:
-    """The mean's two-sided interval by Student's t at level 1 - error; all numbers for fewer than two values, or NaN."""
+    """The mean's two-sided interval by Student's t at level 1 - error; all numbers for NaN or fewer than two values."""
     from scipy.special import stdtrit  # quantiles of Student's t
 
     if len(values) < 2 or any(math.isnan(value) for value in values):
