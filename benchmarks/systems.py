@@ -1,6 +1,6 @@
 """The paper's other systems and R2Flow's own, each trained for as many processor seconds on the same simulated scans.
 
-    python benchmarks/systems.py --out systems              # an hour and a half on one quiet core; resumes
+    python benchmarks/systems.py --out systems              # half an hour of one core; resumes
     python benchmarks/systems.py --out systems --seconds 5 --seeds 1 --samples 8    # whether it runs at all
 
 Rows, division, figures and verdicts were written down before the first run.
