@@ -167,7 +167,8 @@ def settled(r: Tensor, surface: Tensor, error: Tensor) -> Tensor:
 
     Where the answer's log-range is log(surface) + d with |d| <= 3 s, s^2 = `ROUGH`^2 + e^2, e = `TAILS` error, it is
     taken for one of N(log surface, s^2) and becomes log(surface) + d e / s, which has the variance that the surface
-    leaves. Further off it stays, unless the surface is known better than `SURE`: then the range is the surface's.
+    leaves. Further off it stays, unless the surface is known better than `SURE`: then the range is the surface's. No
+    published method: docs/completion.md has what it is worth.
 
     Args:
         r: (..., H, W) in metres; 0, without a return, stays 0.

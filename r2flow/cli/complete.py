@@ -117,9 +117,8 @@ def complete(
         print(f"{ending} is {why}: answers are .ply ({', '.join(WRITTEN)} are written)")
     if not loaded.encoding.reflectance:
         print("the model is of range alone: answers have no reflectance")
-    surfaces = not loaded.generator.told if known.surfaces is None else known.surfaces
-    job = Job(answers.num, answers.seed, known.keep, mask, answers.batch_size, surfaces, answers.pictures)
-    about = {"mask": known.mask, "from": known.source, "surfaces": surfaces}
+    job = Job(answers.num, answers.seed, known.keep, mask, answers.batch_size, known.surfaces, answers.pictures)
+    about = {"mask": known.mask, "from": known.source, "surfaces": known.surfaces}
     found = write_completed(loaded, scans, out, job, sampler, about)
     there = len(scans) - len(found)
     print(f"{len(found)} scans completed in {out}" + (f", {there} were there already" if there else ""))

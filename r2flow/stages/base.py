@@ -1,18 +1,18 @@
 """What every stage has in common: a generator that learns, its optimiser, and what a checkpoint says of it."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 from typing import Any, ClassVar
 
 import lightning as L
-import numpy as np
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from r2flow.adversarial.processes import averaged
+from r2flow.data.loader import Further
 from r2flow.errors import InputError
 from r2flow.flow.times import golden_sequence
 from r2flow.generators import Generator
@@ -73,7 +73,7 @@ class Stage(L.LightningModule):
         self.seed = seed
         self.config: dict[str, Any] = {}
         self.gradient_clip_val: float | None = None
-        self.further: Callable[[Tensor, np.random.Generator], Batch] | None = None
+        self.further: Further | None = None
 
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
         """Refuse a config's `data` that the stage of this name cannot learn from.
