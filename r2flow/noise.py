@@ -18,7 +18,7 @@ from r2flow.errors import InputError
 
 PURPOSES = (
     "training", "validation", "pairs", "evaluation", "simulator", "shuffle", "mixture", "augmentation", "dropout",
-    "weights", "condition",
+    "weights", "condition", "beside",
 )  # fmt: skip
 
 

@@ -6,7 +6,9 @@ import pytest
 import torch
 import yaml
 
-from r2flow.data.options import PairOptions
+from r2flow.data.datamodule import ScanDataModule
+from r2flow.data.loader import FlowDataset
+from r2flow.data.options import DataOptions, PairOptions
 from r2flow.data.pairs import PairDataset, PairSource, make_pairs
 from r2flow.data.shards import PairStore
 from r2flow.errors import InputError
@@ -231,6 +233,63 @@ def test_a_flow_map_learns_a_map_that_it_can_know(objective, monkeypatch):
         optimizer.step()
         losses.append(loss.item())
     assert sum(losses[-3:]) < 0.6 * sum(losses[:3])
+
+
+def test_with_scans_beside_the_pairs_velocities_are_those_of_the_scans_and_jumps_those_of_the_pairs(monkeypatch):
+    draws = torch.Generator().manual_seed(1)
+    noise, scan = torch.randn(2, 4, 2, 8, 32, generator=draws).unbind(0)
+    batch = batch_of(noise=noise, scan=scan)
+    learned = stage(objective="knots").eval()
+    t, s = torch.tensor([0.0, 0.3, 0.5, 1.0]), torch.tensor([1.0, 0.3, 0.75, 1.0])
+    learned.jumps = lambda u: (t, s)  # type: ignore[assignment]
+    asked: list[torch.Tensor] = []
+    aims: list[torch.Tensor] = []
+    monkeypatch.setattr(
+        learned.generator, "mean_velocity", lambda t, x, s: asked.append(x) or torch.zeros_like(x), raising=False
+    )
+    learned.loss = lambda found, target: aims.append(target) or found.flatten(1).mean(1)  # type: ignore[assignment]
+    learned.regression_loss(batch, batch["u"])
+    on_scans = (1 - t.view(4, 1, 1, 1)) * noise + t.view(4, 1, 1, 1) * scan
+    on_pairs = (1 - t.view(4, 1, 1, 1)) * batch["x_0"] + t.view(4, 1, 1, 1) * batch["x_1"]
+    for row, expected, slope in [(0, on_pairs, batch["x_1"] - batch["x_0"]), (1, on_scans, scan - noise),
+                                 (2, on_pairs, batch["x_1"] - batch["x_0"]), (3, on_scans, scan - noise)]:  # fmt: skip
+        torch.testing.assert_close(asked[0][row], expected[row])
+        torch.testing.assert_close(aims[0][row], slope[row])
+
+
+def test_scans_beside_pairs_are_for_objectives_on_the_parents_own_paths():
+    scans = {"name": "simulated", "scenes": 4}
+    assert stage({**DATA, "scans": scans}, objective="knots").objective is not None
+    with pytest.raises(InputError, match=r"leave data\.scans out, or give stage\.objective=knots"):
+        stage({**DATA, "scans": scans})
+    with pytest.raises(InputError, match=r"stage=reflow learns from pairs alone: leave data\.scans out"):
+        build_stage({"stage": {"name": "reflow"}, "data": {**DATA, "scans": scans}, "seed": 0}, parent())
+    with pytest.raises(InputError, match=r"data\.scans stand beside pairs, found data=simulated"):
+        DataOptions(scans=scans)
+    with pytest.raises(InputError, match=r"data\.scans needs the name of a data set"):
+        assert DataOptions(name="pairs", scans={"scenes": 4}).beside
+
+
+def test_a_batch_of_pairs_with_scans_beside_is_a_function_of_its_number(tmp_path: Path):
+    flow = flow_map()
+    keys = {"name": "pairs", "root": str(tmp_path), "batch_size": 4, "scans": {"name": "simulated", "scenes": 5}}
+    data = ScanDataModule(
+        flow.space.sensor, flow.space.encoding, 3, pairs={"num": 10, "steps": 1, "batch_size": 2, "parent": "a"}, **keys
+    )
+    make_pairs(data.pair_store, Field(lambda t, x: x, flow.noise_shape), 10)
+    data.setup()
+    data._ready()
+    assert data.fingerprint().startswith("10 pairs, ")
+    assert "; 5 of 5 scans, " in data.fingerprint()
+    held = [scan["x_1"] for scan in (FlowDataset(data.scans, data.encoding, 3, "beside")[0, i] for i in range(5))]
+    dataset = data._dataset(data.training_source, "training")
+    once, again = ([dataset[k, k % 9] for k in range(10)] for _ in range(2))
+    for first, second in zip(once, again, strict=True):
+        assert all(torch.equal(first[key], second[key]) for key in first)
+        assert not torch.equal(first["noise"], first["x_0"])
+    which = [next(i for i, scan in enumerate(held) if torch.equal(scan, item["scan"])) for item in once]
+    assert sorted(which[:5]) == sorted(which[5:]) == [0, 1, 2, 3, 4]  # every scan once, then every scan again
+    assert "scan" not in data._dataset(data.validation_source, "validation")[0, 0]
 
 
 def test_a_stage_of_jumps_says_what_it_lacks():

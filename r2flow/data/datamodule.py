@@ -68,6 +68,7 @@ class ScanDataModule(L.LightningDataModule):
         self.training_source: ScanSource | PairSource | None = None
         self.validation_source: ScanSource | PairSource | None = None
         self.pairs = self._pair_options() if self.options.name == PAIRS else None
+        self.scans: ScanSource | None = None  # beside pairs
 
     def _pair_options(self) -> PairOptions:
         options = self.options.pairs or {}
@@ -87,10 +88,14 @@ class ScanDataModule(L.LightningDataModule):
         return PairStore(self.options.folder, self.pairs.recipe(self.encoding.shape, self.noise_shape))
 
     def setup(self, stage: str | None = None) -> None:
-        if self.training_source is not None:
+        if self.training_source is not None or self.scans is not None:
             return
         if self.pairs is not None:
             _ = self.pair_store  # other pairs in its folder are refused now; missing ones are made later
+            if self.options.beside is not None:
+                source = self._open(self.options.beside)
+                self.names, self.files = list(source.names), dict(source.files())
+                self.scans = self._kept(source, "scans beside the pairs")
             return
         training, held = self.sources()
         self._order(training)  # weights that it refuses are refused before anything is read or written
@@ -152,12 +157,16 @@ class ScanDataModule(L.LightningDataModule):
     def fingerprint(self) -> str:
         """What is trained on, wherever it lies: a run goes on only with the same scans in the same order."""
         if self.pairs is not None:
-            return f"{self.pairs.num} pairs, {self.pair_store.recipe.digest}"
-        assert self.training_source is not None
+            pairs = f"{self.pairs.num} pairs, {self.pair_store.recipe.digest}"
+            return pairs if self.scans is None else f"{pairs}; {self._named(self.scans, [self.options.beside])}"
+        assert isinstance(self.training_source, ScanSource)
+        return self._named(self.training_source, self.parts)
+
+    def _named(self, taken: ScanSource, parts: Sequence[SourceOptions | None]) -> str:
         # Another revision of the simulator draws other scans of the same name.
-        revision = [f"simulator {simulator.REVISION}"] if any(p.name == SIMULATED for p in self.parts) else []
+        revision = [f"simulator {simulator.REVISION}"] if any(p and p.name == SIMULATED for p in parts) else []
         names = hashlib.sha256(os.fsencode("\n".join([*self.names, *revision]))).hexdigest()[:12]
-        return f"{len(self.training_source)} of {len(self.names)} scans, {names}"
+        return f"{len(taken)} of {len(self.names)} scans, {names}"
 
     def _kept(self, source: ScanSource, what: str) -> ScanSource:
         """The source in memory where all that is slow to get of it fits there, read with a progress bar."""
@@ -209,7 +218,10 @@ class ScanDataModule(L.LightningDataModule):
 
     def _dataset(self, source: ScanSource | PairSource, purpose: str) -> Dataset[Item]:
         if isinstance(source, PairSource):
-            return PairDataset(source, self.seed, purpose)
+            if self.scans is None or purpose != "training":
+                return PairDataset(source, self.seed, purpose)
+            scans = FlowDataset(self.scans, self.encoding, self.seed, "beside", None, self.noise_shape)
+            return PairDataset(source, self.seed, purpose, scans, Permutations(len(self.scans), self.seed))
         augment = self.augment if purpose == "training" else None
         return FlowDataset(source, self.encoding, self.seed, purpose, augment, self.noise_shape, self.further)
 

@@ -137,6 +137,7 @@ class DataOptions(SourceOptions):
     memory_gib: NonNegative = 2.0  # training scans are kept in memory where they fit into this, else read when needed
     validation: Mapping[str, Any] | None = None  # `ValidationOptions`
     pairs: Mapping[str, Any] | None = None  # `PairOptions`, where the data are pairs
+    scans: Mapping[str, Any] | None = None  # `SourceOptions` of scans beside pairs, for the velocities of a flow map
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -147,9 +148,23 @@ class DataOptions(SourceOptions):
             )
         if self.parts is not None and self.name != MIXED:
             raise InputError(f"data.parts are those of data=mixed, found data={self.name}; leave them out, or give it.")
+        if self.scans is not None and self.name != PAIRS:
+            raise InputError(
+                f"data.scans stand beside pairs, found data={self.name}; leave them out, or give data=pairs."
+            )
 
     @property
     def held(self) -> ValidationOptions:
         """`validation`, checked."""
         check_options("data.validation", ValidationOptions, self.validation or {})
         return ValidationOptions(**(self.validation or {}))
+
+    @property
+    def beside(self) -> SourceOptions | None:
+        """`scans`, checked."""
+        if self.scans is None:
+            return None
+        check_options("data.scans", SourceOptions, self.scans)
+        if self.scans.get("name") in (None, MIXED, PAIRS):
+            raise InputError(f"data.scans needs the name of a data set, found {self.scans.get('name')!r}.")
+        return SourceOptions(**self.scans)

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from r2flow import noise
-from r2flow.data.loader import Item
+from r2flow.data.loader import Item, Order
 from r2flow.data.shards import Block, PairRecipe, PairStore
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution, knot_times
@@ -182,11 +182,20 @@ class PairDataset(Dataset[Item]):
     """A pair as a training item, with the keys of `FlowDataset`; u is a function of (seed, purpose, k) alone.
 
     With knots there are two keys more: knots, (K, C, H, W), the inner states of the path, and times, (K + 2,), those of
-    x_0, the knots and x_1.
+    x_0, the knots and x_1. With scans beside the pairs two others: scan, (C, H, W), one of them in model space, and
+    noise, (*noise_shape), which does not belong to it.
     """
 
-    def __init__(self, source: PairSource, seed: int, purpose: str) -> None:
+    def __init__(
+        self,
+        source: PairSource,
+        seed: int,
+        purpose: str,
+        scans: Dataset[Item] | None = None,
+        order: Order | None = None,
+    ) -> None:
         self.source, self.seed, self.purpose = source, seed, purpose
+        self.scans, self.order = scans, order
         recipe = source.store.recipe
         self.times = knot_times(recipe.method, recipe.grid, recipe.knots).float() if recipe.knots else None
 
@@ -198,7 +207,12 @@ class PairDataset(Dataset[Item]):
         x_0, x_1 = self.source[index]
         u = torch.tensor(noise.generator(self.seed, self.purpose, k).random(dtype=np.float32))
         item = {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
-        return item if self.times is None else {**item, "knots": self.source.knots(index), "times": self.times}
+        if self.times is not None:
+            item |= {"knots": self.source.knots(index), "times": self.times}
+        if self.scans is not None and self.order is not None:
+            beside = self.scans[k, self.order[k]]
+            item |= {"scan": beside["x_1"], "noise": beside["x_0"]}
+        return item
 
 
 def default_folder(checkpoint: Path) -> Path:

@@ -5,16 +5,16 @@
 An objective gives the point x_t at which u is learned and what it shall be there. None needs forward-mode derivatives.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
-from r2flow.flow.times import UShaped
+from r2flow.flow.times import TIMES
 from r2flow.registry import Portion, Registry
 
 MeanVelocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # u(t, x, s), as a backbone of two times takes them
@@ -94,18 +94,19 @@ class JumpTimes:
     Args:
         steps: Numbers of steps; one that stands here twice is asked for twice as often.
         share: Of the jumps that these steps take.
-        diagonal: Share of the rest with s = t, at the times of `UShaped`, by which reflow learns its velocity.
+        diagonal: Share of the rest with s = t.
         backward: Share of the rest with s < t.
+        time: Density of the times of velocities, of `r2flow.flow.times.TIMES`; None: `u_shaped`, as in reflow.
     """
 
     steps: Sequence[int] = (1, 1, 1, 2, 4, 8)
     share: Portion = 0.55
     diagonal: Portion = 0.55
     backward: Portion = 0.0
-
-    velocities: ClassVar = UShaped()
+    time: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "velocities", TIMES.build(self.time or {"name": "u_shaped"}))
         if not self.steps or min(self.steps) < 1:
             raise InputError(f"the steps of a flow map's jumps must be numbers of at least 1, found {self.steps}.")
         if self.diagonal + self.backward > 1:
@@ -121,7 +122,7 @@ class JumpTimes:
         step = torch.minimum((b * count).floor(), count - 1)
         low, high = torch.minimum(a, b), torch.maximum(a, b)
         rest = (which - self.share) / (1 - self.share)
-        velocity = self.velocities(a)
+        velocity = self.velocities(a)  # type: ignore[attr-defined]
         low, high = (torch.where(rest < self.diagonal, velocity, time) for time in (low, high))
         turned = (rest >= self.diagonal) & (rest < self.diagonal + self.backward)
         low, high = torch.where(turned, high, low), torch.where(turned, low, high)

@@ -84,6 +84,8 @@ class Stage(L.LightningModule):
         on_pairs = data["name"] == "pairs"
         if self.needs_pairs and not on_pairs:
             raise InputError(f"stage={name} learns from pairs: give data=pairs, found {data['name']}.")
+        if data.get("scans") is not None:
+            raise InputError(f"stage={name} learns from pairs alone: leave data.scans out, or give stage=flow_map.")
         if on_pairs and not self.needs_pairs:
             raise InputError(f"stage={name} learns from scans, and data=pairs has none; give stage=reflow.")
 

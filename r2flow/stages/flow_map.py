@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, along_knots, corrected
+from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots, corrected
+from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import FlowMap, Generator
 from r2flow.registry import Positive, check_options
@@ -19,7 +20,8 @@ class LearnFlowMap(Reflow):
     """Flow map: regress u(x_t, t, s) onto what an objective of `r2flow.flow.maps` says.
 
     From a 1-RF or a 2-RF on its pairs, with the inner states of their paths (`data.pairs.knots`) for the objectives
-    `knots` and `corrected`; or on scans, where noise and scan are drawn independently.
+    `knots` and `corrected`; or on scans, where noise and scan are drawn independently. With scans beside the pairs
+    (`data.scans`) velocities, s = t, are learned from these, as by `Rectify`, and jumps from the pairs.
 
     Args:
         objective: Name in `r2flow.flow.maps.OBJECTIVES`.
@@ -56,6 +58,11 @@ class LearnFlowMap(Reflow):
                 f"stage.objective={self.objective_name} learns from inner states of paths: give data=pairs "
                 "data.pairs.knots=7, or stage.objective=consistency."
             )
+        if data.get("scans") is not None and self.objective not in (along_knots, corrected):
+            raise InputError(
+                f"stage.objective={self.objective_name} learns from straight lines between pairs, whose velocities are "
+                "not those of scans: leave data.scans out, or give stage.objective=knots."
+            )
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         assert isinstance(self.generator, FlowMap)
@@ -67,6 +74,10 @@ class LearnFlowMap(Reflow):
             aim = self.objective(self.generator.mean_velocity, paths, t, s, rho)
         else:  # one figure for all objectives
             aim = along_knots(self.generator.mean_velocity, paths, t, s, torch.ones_like(t))
+        if "scan" in batch:
+            x_t, v = interpolate(batch["noise"], batch["scan"], t)
+            velocity = expand_time(t == s, x_t)
+            aim = Aim(torch.where(velocity, x_t, aim.x_t), torch.where(velocity, v, aim.target))
         found = self.generator.mean_velocity(t, aim.x_t, s)
         return self.loss(found, aim.target).mean()
 
