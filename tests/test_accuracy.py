@@ -36,8 +36,33 @@ def test_a_calibration_measures_the_errors_of_its_sampler():
     for budget in checkpoint.accuracy[:5]:
         expected = error(replace(sampler, steps=budget.steps))
         torch.testing.assert_close(torch.tensor(budget.errors, dtype=torch.float64), expected, rtol=0.02, atol=1e-6)
-    worst = {grid: error(Sampler("adams3", 8, grid=grid)).max().item() for grid in GRIDS}
-    assert worst[sampler.grid] <= 1.02 * min(worst.values())
+    ends = {grid: checkpoint.generator.solve(x_0, sampler=Sampler("adams3", 8, grid=grid)).x for grid in GRIDS}
+    typical = {grid: (end - exact).abs().median().item() for grid, end in ends.items()}
+    assert typical[sampler.grid] <= 1.02 * min(typical.values())
+
+
+class FewStiffAtTheStart(GaussianFlow):
+    """v of a narrow Gaussian, which needs short steps near t = 1, but for one column that falls steeply at t = 0."""
+
+    def forward(self, t, x):
+        t = t.view(-1, 1, 1, 1) if t.ndim else t
+        v = (t * 0.02**2 - (1 - t)) / ((1 - t) ** 2 + (t * 0.02) ** 2) * x
+        return torch.cat([-40 * (-40 * t).exp() * (1 + 0 * x[..., :1]), v[..., 1:]], -1)
+
+
+def test_the_time_grid_is_that_of_most_rays_and_not_of_a_few():
+    checkpoint = calibrate(flow(FewStiffAtTheStart()), steps=16, num=2)
+    assert checkpoint.generator.sampler.grid.startswith("power:")
+    x_0 = Draws(0, range(2), "validation").start(checkpoint.generator.noise_shape)
+    exact = checkpoint.generator.solve(x_0.double(), sampler=Sampler("dopri5", tolerance=1e-8)).x
+
+    def mean_square(grid):
+        return float(
+            (checkpoint.generator.solve(x_0, sampler=Sampler("adams3", 16, grid=grid)).x - exact).square().mean()
+        )
+
+    # The few have the largest errors: by the mean square, the other way round would be best.
+    assert min(GRIDS, key=mean_square).startswith("power-start:")
 
 
 def test_the_correction_is_the_error_of_the_predictor_alone():
