@@ -109,13 +109,13 @@ def _on_pairs(config: Mapping[str, Any]) -> bool:
 
 
 def generator_of(config: Mapping[str, Any], parent: Parent | None) -> dict[str, Any]:
-    """What a run trains: the config's `generator`, else its stage's, else its parent's; the last two with the parent's
-    options, as far as they have them."""
+    """What a run trains: the config's `generator`, else its stage's, else its parent's, of a flow map its velocity; the
+    last three with the parent's options, as far as they have them."""
     own = config.get("generator")
     if own:
         return {"name": own} if isinstance(own, str) else dict(own)
     theirs = (parent and parent.config.get("generator")) or {"name": "rectified_flow"}
-    own = STAGES[config["stage"]["name"]].generator_name
+    own = STAGES[config["stage"]["name"]].generator_name or getattr(GENERATORS[theirs["name"]], "goes_on_as", None)
     if own in (None, theirs["name"]):
         return dict(theirs)
     shared = options_of(GENERATORS[own], given=2)

@@ -17,6 +17,7 @@ from r2flow.flow.path import interpolate
 from r2flow.flow.problems import Gaussian
 from r2flow.generators import Field, FlowMap, RectifiedFlow, Sampler, build_generator
 from r2flow.lidar.region import Region
+from r2flow.lineage import Parent, generator_of
 from r2flow.noise import Draws
 from r2flow.stages import build_stage
 from r2flow.stages.flow_map import LearnFlowMap, paths_of
@@ -80,6 +81,31 @@ def test_before_it_has_learned_jumps_are_its_parent_s_euler_steps(grown):
         assert jumped.evaluations.tolist() == [steps, steps]
     t = torch.tensor([0.3, 0.6])
     assert torch.equal(grown.velocity(t, x_0), parent().velocity(t, x_0))
+
+
+def test_a_flow_that_goes_on_from_a_map_has_its_velocity():
+    torch.manual_seed(2)
+    learned = flow_map()
+    with torch.no_grad():
+        for weight in learned.parameters():
+            weight.add_(0.05 * torch.randn_like(weight))
+    x, t = torch.randn(3, 2, 8, 32), torch.tensor([0.0, 0.3, 1.0])
+    told = build_generator({**CONFIG, "generator": {"name": "conditional_flow"}}).eval()
+    plain = build_generator(CONFIG).eval()
+    plain.start_from(learned)
+    assert torch.equal(plain.velocity(t, x), learned.velocity(t, x))
+    apart = learned.mean_velocity(t, x, torch.ones(3)) - plain.velocity(t, x)
+    assert apart[:2].abs().max().item() > 1e-4
+    told.start_from(learned)
+    torch.testing.assert_close(told.untold().velocity(t, x), learned.velocity(t, x), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(("stage", "made"), [("rectify", "rectified_flow"), ("reflow", "rectified_flow"),
+                                             ("distill", "rectified_flow"), ("flow_map", "flow_map"),
+                                             ("conditional", "conditional_flow")])  # fmt: skip
+def test_what_a_stage_makes_of_a_map(stage, made):
+    of_map = Parent({"generator": {"name": "flow_map"}}, Path("x"))
+    assert generator_of({"stage": {"name": stage}}, of_map) == {"name": made}
 
 
 @pytest.mark.parametrize(("steps", "grid"), [(1, "uniform"), (4, "power:2"), (3, (0.0, 0.2, 0.7, 1.0))])

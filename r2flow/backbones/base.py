@@ -132,13 +132,16 @@ class Backbone(ExactBuffers):
         raise NotImplementedError
 
     def condition(self, time_embedding: nn.Module, t: Tensor, s: Tensor | None) -> Tensor:
-        """time_embedding(t) + interval_embedding(s - t): what steers the network, (B or 1, K).
+        """time_embedding(t) + e(s - t) - e(0), e the `interval_embedding`: what steers the network, (B or 1, K).
 
-        The second term is zero when training begins: u(x, t, s) = v(t, x) for every s, bit by bit where t and s have
-        one shape.
+        The difference is zero when training begins, u(x, t, s) = v(t, x) for every s, bit by bit where t and s have one
+        shape; and always where s = t, so that without e the network is the one of u(x, t, t) = v(t, x).
         """
         c = time_embedding(t)
-        return c if s is None else c + self.interval_embedding(s - t)
+        if s is None:
+            return c
+        e = self.interval_embedding(torch.cat([s - t, (s - t)[:1] * 0]))
+        return c + (e[:-1] - e[-1:])
 
     def second_time_names(self) -> frozenset[str]:
         """Entries of the state_dict that a network of one time does not have.

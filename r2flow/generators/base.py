@@ -154,9 +154,11 @@ class Generator(nn.Module):
         noise_shape: What one scan is made of: (C, H, W) for a flow, (latent,) for a GAN.
         sampler: How it is run when nobody says otherwise.
         told: Whether it takes a condition of `r2flow.generators.condition_of` by its own sampler.
+        goes_on_as: The family that a stage for any flow makes of it; None for its own.
     """
 
     told: ClassVar[bool] = False
+    goes_on_as: ClassVar[str | None] = None
 
     def __init__(self, space: ModelSpace, noise_shape: tuple[int, ...] | None = None) -> None:
         super().__init__()

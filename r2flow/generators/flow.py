@@ -199,8 +199,8 @@ class NetworkFlow(Flow):
     def start_from(self, parent: Generator) -> None:
         """Take over a flow's weights; what a second time or a condition adds changes nothing at first.
 
-        A condition of the other flow is forgotten. A flow that looks elsewhere, as through another sensor, keeps its
-        own rays.
+        A condition of the other flow is forgotten, and of a flow map all but its velocity u(x, t, t). A flow that looks
+        elsewhere, as through another sensor, keeps its own rays.
 
         Raises:
             InputError: other weights; a network that tells something else; one with weights for each place of the
@@ -211,10 +211,11 @@ class NetworkFlow(Flow):
             raise InputError(f"the network to start from tells {theirs_tell}, and this one learns {self.answer}.")
         own = self.state_dict()
         more = self.condition_channels - getattr(parent, "condition_channels", 0)
+        apart = parent.backbone.second_time_names() if isinstance(parent, NetworkFlow) else frozenset[str]()
         theirs = {
             name: _with_inputs(value, own[name].shape, self.space.shape[0], more) if name in own else value
             for name, value in parent.state_dict().items()
-            if name in own or name.startswith("backbone.")
+            if name in own or (name.startswith("backbone.") and name.removeprefix("backbone.") not in apart)
         }
         new = {name: value for name, value in own.items() if not name.startswith("backbone.")}
         new |= {name: own[name] for name in (f"backbone.{name}" for name in self.backbone.second_time_names())}

@@ -35,6 +35,7 @@ class FlowMap(RectifiedFlow):
     """
 
     second_time: ClassVar[bool] = True
+    goes_on_as = "rectified_flow"  # where velocities alone are learned, the jumps would be those of another flow
     other_samplers = JUMP, RENOISE
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
