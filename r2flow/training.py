@@ -197,22 +197,26 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
     with made_with(parent.config if parent else {}, "the run that it starts from"):
         config = inherit(config, asked, parent)
     check_options("data", DataOptions, config["data"])
-    _refuse_unread(config["data"])
+    for key, scans in (("data", config["data"]), ("data.scans", config["data"].get("scans"))):
+        if scans is not None:
+            _refuse_unread(key, scans)
     return config
 
 
-def _refuse_unread(data: Mapping[str, Any]) -> None:
-    """Refuse what the set of scans would pass over in silence.
+def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
+    """Refuse what the set of scans under this key would pass over in silence.
 
     Raises:
         InputError: the options of files with simulated scans, or the other way round.
     """
-    simulated = data["name"] == SIMULATED
-    if not simulated and (data["name"] in (PAIRS, MIXED) or not isinstance(SOURCES[data["name"]], Layout | Prepared)):
+    simulated = data.get("name") == SIMULATED
+    if not simulated and (
+        data.get("name") in (None, PAIRS, MIXED) or not isinstance(SOURCES[data["name"]], Layout | Prepared)
+    ):
         return
     usual = SourceOptions()
     unread = {f.name for f in fields(usual)} - {"name", "root", "scenes"} if simulated else {"scenes"}
-    wrong = sorted(f"data.{key}" for key in unread if data.get(key, getattr(usual, key)) != getattr(usual, key))
+    wrong = sorted(f"{key}.{name}" for name in unread if data.get(name, getattr(usual, name)) != getattr(usual, name))
     if wrong:
         what = "simulated scans are no files" if simulated else "scans in files are no simulated scenes"
         raise InputError(f"{what}: leave {', '.join(wrong)} out.")

@@ -59,6 +59,8 @@ REFUSED = {
     "backbone.window=[2,9]": "odd sizes",
     "backbone.dropout=2": "dropout must be a finite number in [0, 1)",
     "data.split=train": "simulated scans are no files: leave data.split out",
+    "data.scans={name: simulated, split: train}": "simulated scans are no files: leave data.scans.split out",
+    "data.scans={name: simulated}": "data.scans stand beside pairs, found data=simulated",
     "data.drives=[1]": "leave data.drives out",
     "data.projection=unfolding": "leave data.projection out",
     "data.on_bad_scan=skip": "leave data.on_bad_scan out",
