@@ -103,7 +103,8 @@ def completed_figure(
         strips = grid[row, 0].subgridspec(len(image), 1, hspace=0.2)
         axes = figure.add_subplot(strips[0])
         draw_range(axes, image, label=False)
-        axes.set_title(f"{name}: range", color=FOREGROUND, fontsize=8, loc="left", pad=3)
+        legend = " (grey: not measured, black: measured without a return)" if row == 0 else ""
+        axes.set_title(f"{name}: range{legend}", color=FOREGROUND, fontsize=8, loc="left", pad=3)
         drawn = [axes]
         if len(image) > 1:
             drawn.append(figure.add_subplot(strips[1]))
