@@ -7,6 +7,7 @@ An objective gives the point x_t at which u is learned and what it shall be ther
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -106,13 +107,18 @@ class JumpTimes:
     time: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "velocities", TIMES.build(self.time or {"name": "u_shaped"}))
+        _ = self.velocities  # an unknown density is refused now
         if not self.steps or min(self.steps) < 1:
             raise InputError(f"the steps of a flow map's jumps must be numbers of at least 1, found {self.steps}.")
         if self.diagonal + self.backward > 1:
             raise InputError(
                 f"diagonal and backward are shares of one rest; found {self.diagonal} and {self.backward}."
             )
+
+    @cached_property
+    def velocities(self) -> Callable[[Tensor], Tensor]:
+        """The times of velocities, (B,), from uniform draws."""
+        return TIMES.build(self.time or {"name": "u_shaped"})
 
     def __call__(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """t and s, (B,) each, from uniform draws in [0, 1), (B, 3)."""
@@ -122,7 +128,7 @@ class JumpTimes:
         step = torch.minimum((b * count).floor(), count - 1)
         low, high = torch.minimum(a, b), torch.maximum(a, b)
         rest = (which - self.share) / (1 - self.share)
-        velocity = self.velocities(a)  # type: ignore[attr-defined]
+        velocity = self.velocities(a)
         low, high = (torch.where(rest < self.diagonal, velocity, time) for time in (low, high))
         turned = (rest >= self.diagonal) & (rest < self.diagonal + self.backward)
         low, high = torch.where(turned, high, low), torch.where(turned, low, high)
