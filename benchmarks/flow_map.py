@@ -412,18 +412,18 @@ def street(out: Path, names: list[str]) -> None:
 # ---- what else such a network allows
 
 
-def uses(folder: Path, first: Path) -> None:
+def uses(folder: str, first: str, num: int) -> None:
     """Of a trained map: fresh noise between jumps, the way back, the velocity on the diagonal, splitting by scan."""
     torch.set_num_threads(1)
-    held = np.stack([simulate(SENSOR, HELD_OUT_SEED, k).image for k in range(HELD_OUT)])
-    real = panel(held, SENSOR)
     model, parent = load_checkpoint(folder).generator, load_checkpoint(first).generator
     assert isinstance(model, FlowMap)
     assert isinstance(parent, Flow)
+    sensor = model.space.sensor
+    real = panel(np.stack([simulate(sensor, HELD_OUT_SEED, k).image for k in range(HELD_OUT)]), sensor)
 
     def mean_of(flow: Flow, how: Sampler) -> float:
-        images = torch.cat([drawn.images for drawn in sample(flow, SAMPLES, batch_size=16, sampler=how)]).numpy()
-        return float(np.mean(list(distances(panel(images, SENSOR), real).values())))
+        images = torch.cat([drawn.images for drawn in sample(flow, num, batch_size=16, sampler=how)]).numpy()
+        return float(np.mean(list(distances(panel(images, sensor), real).values())))
 
     rows = [[str(k), *(f"{mean_of(model, Sampler(how, k)):.4f}" for how in ("jump", "renoise"))] for k in (1, 2, 4, 8)]
     print(table(rows, ["evaluations", "jump", "renoise"]), flush=True)
@@ -435,13 +435,15 @@ def uses(folder: Path, first: Path) -> None:
         ["solved by adams3", "16", "64"],
     ), flush=True)  # fmt: skip
 
-    noise = Draws(1, range(SAMPLES)).start(model.noise_shape)
+    noise = Draws(1, range(num)).start(model.noise_shape)
     ends = torch.cat([parent.solve(part, sampler=exact).x for part in noise.split(16)])
     rows = []
     for k in (1, 2, 4, 8, 16):
-        back = torch.cat([model.solve(part, 1.0, 0.0, sampler=Sampler("jump", k)).x for part in ends[:ENDS].split(16)])
-        solved = [parent.solve(part, 1.0, 0.0, sampler=Sampler("adams3", k)).x for part in ends[:ENDS].split(16)]
-        rows.append([str(k), *(f"{rms(x, noise[:ENDS]).mean():.3f}" for x in (back, torch.cat(solved)))])
+        back = torch.cat(
+            [model.solve(part, 1.0, 0.0, sampler=Sampler("jump", k)).x for part in ends[: num // 4].split(16)]
+        )
+        solved = [parent.solve(part, 1.0, 0.0, sampler=Sampler("adams3", k)).x for part in ends[: num // 4].split(16)]
+        rows.append([str(k), *(f"{rms(x, noise[: num // 4]).mean():.3f}" for x in (back, torch.cat(solved)))])
     print(table(rows, ["evaluations back to the noise", "jumps", "adams3 of the 1-RF"]), flush=True)
 
     drawn = {k: torch.cat([model.generate(x, sampler=Sampler("jump", k)).x for x in noise.split(16)]) for k in COUNTS}
@@ -469,14 +471,15 @@ def main() -> None:
     parser.add_argument("part", choices=["plane", "scans", "street", "uses"])
     parser.add_argument("--out", type=Path, default=Path("flow_map"))
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
-    parser.add_argument("--of", type=Path, nargs=2, help="For `uses`: a trained map and its 1-RF.")
+    parser.add_argument("--of", nargs=2, help="For `uses`: a trained map and its 1-RF.")
+    parser.add_argument("--num", type=int, default=SAMPLES, help="For `uses`: samples.")
     parser.add_argument("--runs", nargs="+", default=[], choices=[*RUNS, *TRIED, *STREET_RUNS])
     given = parser.parse_args()
     if given.part == "plane":
         torch.set_num_threads(1)
         plane()
     elif given.part == "uses":
-        uses(*given.of)
+        uses(*given.of, given.num)
     elif given.part == "street":
         street(given.out, given.runs)
     else:
