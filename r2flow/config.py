@@ -62,6 +62,8 @@ RULES: dict[str, Key] = {
     "data.workers": FREE,
     "data.memory_gib": FREE,
     "data.pairs": Key(links="pairs"),
+    "data.scans": Key(links="pairs"),
+    "data.scans.root": Key(links="pairs", resume="free"),
     "callbacks.reflow_pairs": FREE,
     "callbacks.pictures": FREE,
     "callbacks.curvature": FREE,

@@ -147,7 +147,13 @@ def test_a_written_config_says_what_was_learned_and_no_folder():
         "run_dir": "/home/me/runs/a",
         "seed": 3,
         "stage": {"name": "rectify", "init": "/home/me/runs/b"},
-        "data": {"name": "mixed", "root": "/data", "workers": 4, "parts": [{"name": "folder", "root": "/data/a"}]},
+        "data": {
+            "name": "mixed",
+            "root": "/data",
+            "workers": 4,
+            "parts": [{"name": "folder", "root": "/data/a"}],
+            "scans": {"name": "simulated", "root": "/data/b"},
+        },
         "parent": {"path": "/home/me/runs/b", "step": 7},
         "samples": {"num": 4},
         "sampler": {},
@@ -155,13 +161,23 @@ def test_a_written_config_says_what_was_learned_and_no_folder():
     assert learned(config) == {
         "seed": 3,
         "stage": {"name": "rectify"},
-        "data": {"name": "mixed", "parts": [{"name": "folder"}]},
+        "data": {"name": "mixed", "parts": [{"name": "folder"}], "scans": {"name": "simulated"}},
         "parent": {"step": 7},
     }
 
 
 def test_pairs_of_a_model_lie_outside_the_package():
     assert default_folder(find_model("street")) == Path("runs/street-pairs")
+
+
+def test_the_files_of_the_release_are_the_models_that_they_are_named_after(tmp_path: Path, monkeypatch):
+    monkeypatch.setenv("R2FLOW_MODELS", str(tmp_path))
+    release = Path(__file__).parents[1] / "release"
+    for file in sorted(release.glob("*.safetensors")):
+        name = file.stem
+        assert MODELS[name].page == f"release/{file.name} in the source of r2flow"
+        assert add_model(name, file) == find_model(name)
+        assert card(describe(name)) in (release.parent / "docs" / "models" / f"{name}.md").read_text()
 
 
 @pytest.mark.parametrize("name", MODELS)
