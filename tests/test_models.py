@@ -173,7 +173,10 @@ def test_pairs_of_a_model_lie_outside_the_package():
 def test_the_files_of_the_release_are_the_models_that_they_are_named_after(tmp_path: Path, monkeypatch):
     monkeypatch.setenv("R2FLOW_MODELS", str(tmp_path))
     release = Path(__file__).parents[1] / "release"
-    for file in sorted(release.glob("*.safetensors")):
+    files = sorted(release.glob("*.safetensors"))
+    if not files:
+        pytest.skip("this copy of the source has no release files")
+    for file in files:
         name = file.stem
         assert MODELS[name].page == f"release/{file.name} in the source of r2flow"
         assert add_model(name, file) == find_model(name)

@@ -158,13 +158,15 @@ class ScanDataModule(L.LightningDataModule):
         """What is trained on, wherever it lies: a run goes on only with the same scans in the same order."""
         if self.pairs is not None:
             pairs = f"{self.pairs.num} pairs, {self.pair_store.recipe.digest}"
-            return pairs if self.scans is None else f"{pairs}; {self._named(self.scans, [self.options.beside])}"
+            beside = self.options.beside
+            return f"{pairs}; {self._named(self.scans, [beside])}" if self.scans is not None and beside else pairs
         assert isinstance(self.training_source, ScanSource)
         return self._named(self.training_source, self.parts)
 
-    def _named(self, taken: ScanSource, parts: Sequence[SourceOptions | None]) -> str:
+    def _named(self, taken: ScanSource, parts: Sequence[SourceOptions]) -> str:
+        """How many of the run's scans are taken, and a hash of their names."""
         # Another revision of the simulator draws other scans of the same name.
-        revision = [f"simulator {simulator.REVISION}"] if any(p and p.name == SIMULATED for p in parts) else []
+        revision = [f"simulator {simulator.REVISION}"] if any(p.name == SIMULATED for p in parts) else []
         names = hashlib.sha256(os.fsencode("\n".join([*self.names, *revision]))).hexdigest()[:12]
         return f"{len(taken)} of {len(self.names)} scans, {names}"
 
