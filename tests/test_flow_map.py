@@ -330,6 +330,14 @@ def test_a_stage_of_jumps_says_what_it_lacks():
     assert stage({"name": "simulated", "batch_size": 4}).objective is not None
 
 
+def test_a_map_is_drawn_on_the_grid_that_it_learned():
+    found = stage(jumps={"grid": "power:3"}).generator
+    assert (found.sampler.method, found.sampler.grid) == ("jump", "power:3")
+    assert found.in_steps(2) == Sampler("jump", 2, grid="power:3")
+    found.sampler = Sampler("adams3", 16, grid="power:1.5")
+    assert found.in_steps(2) == Sampler("jump", 2)
+
+
 def test_the_stage_s_options_are_those_of_its_config():
     text = (Path(__file__).parent.parent / "conf/stage/flow_map.yaml").read_text(encoding="utf-8")
     options = {key: value for key, value in yaml.safe_load(text).items() if key not in ("defaults", "init")}

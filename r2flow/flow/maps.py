@@ -5,6 +5,7 @@
 An objective gives the point x_t at which u is learned and what it shall be there. None needs forward-mode derivatives.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,9 +13,11 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
+from r2flow.flow.solvers.grids import build_grid
 from r2flow.flow.times import TIMES
 from r2flow.registry import Portion, Registry
 
@@ -90,10 +93,11 @@ class Paths:
 
 @dataclass(frozen=True)
 class JumpTimes:
-    """Which jumps (t, s) are learned: those of some numbers of equal steps, velocities (s = t), and any others.
+    """Which jumps (t, s) are learned: those of some numbers of steps, velocities (s = t), and any others.
 
     Args:
         steps: Numbers of steps; one that stands here twice is asked for twice as often.
+        grid: Where these steps fall, of `r2flow.flow.solvers.grids.named_grid`.
         share: Of the jumps that these steps take.
         diagonal: Share of the rest with s = t.
         backward: Share of the rest with s < t.
@@ -101,15 +105,16 @@ class JumpTimes:
     """
 
     steps: Sequence[int] = (1, 1, 1, 2, 4, 8)
+    grid: str = "uniform"
     share: Portion = 0.55
     diagonal: Portion = 0.55
     backward: Portion = 0.0
     time: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        _ = self.velocities  # an unknown density is refused now
         if not self.steps or min(self.steps) < 1:
             raise InputError(f"the steps of a flow map's jumps must be numbers of at least 1, found {self.steps}.")
+        _ = self.velocities, self.times  # an unknown density or grid is refused now
         if self.diagonal + self.backward > 1:
             raise InputError(
                 f"diagonal and backward are shares of one rest; found {self.diagonal} and {self.backward}."
@@ -120,12 +125,18 @@ class JumpTimes:
         """The times of velocities, (B,), from uniform draws."""
         return TIMES.build(self.time or {"name": "u_shaped"})
 
+    @cached_property
+    def times(self) -> Tensor:
+        """Where the steps of each number begin and end, (len(steps), max(steps) + 1) float64; NaN behind the last."""
+        rows = [build_grid(self.grid, 0.0, 1.0, count) for count in self.steps]
+        return pad_sequence(rows, batch_first=True, padding_value=math.nan)
+
     def __call__(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """t and s, (B,) each, from uniform draws in [0, 1), (B, 3)."""
         which, a, b = u.unbind(1)
-        count = torch.tensor(tuple(self.steps), device=u.device)
-        count = count[(a * len(self.steps)).long().clamp(max=len(self.steps) - 1)]
-        step = torch.minimum((b * count).floor(), count - 1)
+        times, counts = self.times.to(u), torch.tensor(tuple(self.steps), device=u.device)
+        row = (a * len(counts)).long().clamp(max=len(counts) - 1)
+        step = torch.minimum((b * counts[row]).long(), counts[row] - 1)
         low, high = torch.minimum(a, b), torch.maximum(a, b)
         rest = (which - self.share) / (1 - self.share)
         velocity = self.velocities(a)
@@ -133,7 +144,7 @@ class JumpTimes:
         turned = (rest >= self.diagonal) & (rest < self.diagonal + self.backward)
         low, high = torch.where(turned, high, low), torch.where(turned, low, high)
         given = which < self.share
-        return torch.where(given, step / count, low), torch.where(given, (step + 1) / count, high)
+        return torch.where(given, times[row, step], low), torch.where(given, times[row, step + 1], high)
 
 
 class Aim(NamedTuple):

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from r2flow.flow.solvers.grids import build_grid
 from r2flow.registry import Count, Portion, Positive, Registry
 
 GOLDEN = -7046029254386353131  # (sqrt(5) - 1) / 2 of 2^64, as a signed integer
@@ -71,14 +72,14 @@ class Late:
 
 
 class Discrete:
-    """t uniform on {0, 1/k, ..., (k-1)/k}, the times at which k Euler steps begin (timestep distillation)."""
+    """t uniform on the times at which k Euler steps begin, {0, 1/k, ..., (k-1)/k} on a uniform grid (k-TD)."""
 
-    def __init__(self, k: Count) -> None:
-        self.k = k
+    def __init__(self, k: Count, grid: str = "uniform") -> None:
+        self.k, self.times = k, build_grid(grid, 0.0, 1.0, k)
 
     def __call__(self, u: Tensor) -> Tensor:
         # u just below 1 times k can round up to k in float32.
-        return torch.floor(u * self.k).clamp(max=self.k - 1) / self.k
+        return self.times.to(u)[(u * self.k).long().clamp(max=self.k - 1)]
 
 
 def golden_sequence(k: Tensor) -> Tensor:

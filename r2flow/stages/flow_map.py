@@ -11,6 +11,8 @@ from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots, cor
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import FlowMap, Generator
+from r2flow.generators.base import Sampler
+from r2flow.generators.flow_map import JUMP
 from r2flow.registry import Positive, check_options
 from r2flow.stages.base import Batch
 from r2flow.stages.reflow import Reflow
@@ -50,6 +52,7 @@ class LearnFlowMap(Reflow):
         self.objective, self.objective_name, self.rho = OBJECTIVES[objective], objective, rho
         check_options("stage.jumps", JumpTimes, jumps or {})
         self.jumps = JumpTimes(**(jumps or {}))
+        generator.sampler = Sampler(JUMP, 4, grid=self.jumps.grid)
 
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
         knots = data["name"] == "pairs" and (data.get("pairs") or {}).get("knots")

@@ -29,12 +29,20 @@ class Distill(Reflow):
 
     Args:
         steps: k, the steps that the flow is to be sampled with.
+        grid: Where they fall: uniform as in the paper, or another of `r2flow.flow.solvers.grids.named_grid`.
     """
 
-    def __init__(self, generator: Generator, steps: Count = 1, loss: str = "pseudo_huber", **options: Any) -> None:
+    def __init__(
+        self,
+        generator: Generator,
+        steps: Count = 1,
+        loss: str = "pseudo_huber",
+        grid: str = "uniform",
+        **options: Any,
+    ) -> None:
         if options.pop("time", None) is not None:
             raise InputError(
                 f"a distilled flow trains at the {steps} times that its steps visit; leave stage.time out."
             )
-        super().__init__(generator, loss, {"name": "discrete", "k": steps}, **options)
-        generator.sampler = Sampler("euler", steps, fixed=True)
+        super().__init__(generator, loss, {"name": "discrete", "k": steps, "grid": grid}, **options)
+        generator.sampler = Sampler("euler", steps, grid=grid, fixed=True)

@@ -84,7 +84,20 @@ def test_the_last_draw_below_one_is_still_a_jump():
         assert 0 <= float(t) <= float(s) <= 1
 
 
-@pytest.mark.parametrize("options", [{"steps": ()}, {"steps": (0, 1)}, {"diagonal": 0.6, "backward": 0.6}])
+def test_jumps_fall_on_the_grid_that_they_are_drawn_with():
+    u = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0))
+    t, s = JumpTimes(steps=(1, 2, 3), grid="power:3", share=1.0)(u)
+    expected = {(1 - (1 - i / k) ** 3, 1 - (1 - (i + 1) / k) ** 3) for k in (1, 2, 3) for i in range(k)}
+    found = set(zip(t.tolist(), s.tolist(), strict=True))
+    assert len(found) == len(expected) == 6
+    for pair in expected:
+        assert min(abs(a - pair[0]) + abs(b - pair[1]) for a, b in found) < 1e-6
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"steps": ()}, {"grid": "power:0.5"}, {"grid": "cubic"}, {"steps": (0, 1)}, {"diagonal": 0.6, "backward": 0.6}],
+)
 def test_jump_times_that_cannot_be_are_refused(options):
     with pytest.raises(InputError, match="found"):
         JumpTimes(**options)

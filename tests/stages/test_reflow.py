@@ -43,8 +43,8 @@ def test_a_distilled_flow_is_right_at_its_own_number_of_steps(k: int):
     torch.testing.assert_close(end, M + S * X_0, rtol=0, atol=0.02)
 
 
-@pytest.mark.parametrize("k", [1, 2, 4])
-def test_distillation_trains_at_the_times_of_its_steps_alone(k: int):
+@pytest.mark.parametrize(("k", "grid"), [(1, "uniform"), (2, "uniform"), (4, "uniform"), (4, "power:2")])
+def test_distillation_trains_at_the_times_of_its_steps_alone(k: int, grid: str):
     seen = set()
 
     class Spy(Affine):
@@ -52,10 +52,11 @@ def test_distillation_trains_at_the_times_of_its_steps_alone(k: int):
             seen.update(t.tolist())
             return super().forward(t, x)
 
-    stage = Distill(affine(Spy()), steps=k)
+    stage = Distill(affine(Spy()), steps=k, grid=grid)
     stage.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
     stage.training_step(pairs(0), 0)
-    assert seen == {i / k for i in range(k)}
+    assert seen == ({i / k for i in range(k)} if grid == "uniform" else {0, 7 / 16, 12 / 16, 15 / 16})
+    assert (stage.generator.sampler.steps, stage.generator.sampler.grid) == (k, grid)
 
 
 def test_the_paper_s_loss_and_times_are_the_defaults():
