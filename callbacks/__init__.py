@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 
 from r2flow.checkpoints import FOLDER
+from r2flow.lineage import drawn_by
 from r2flow.registry import Count, Registry, check_options
 
 from .curvature import Curvature
@@ -72,7 +73,7 @@ def keep_checkpoints(folder: Path, every: Count = 100) -> list[Callback]:
 # In the order in which they act.
 CALLBACKS = Registry(
     "callback",
-    reflow_pairs=Entry(ReflowPairs, lambda config: (config["stage"].get("init"),)),
+    reflow_pairs=Entry(ReflowPairs, lambda config: (drawn_by(config),)),
     ema=Entry(EMA),
     half_life_ema=Entry(HalfLifeEMA, lambda config: (config["data"]["batch_size"],)),
     pictures=Entry(

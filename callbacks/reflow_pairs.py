@@ -11,18 +11,18 @@ class ReflowPairs(L.Callback):
     """When a run begins, makes the pairs that its data name and that are missing or damaged, over all its devices.
 
     Args:
-        init: The flow that draws them (`stage.init`); None where the run starts from no other.
+        of: The flow that draws them (`data.pairs.of`, else `stage.init`); None where the run starts from no other.
     """
 
-    def __init__(self, init: str | None) -> None:
-        self.init = init
+    def __init__(self, of: str | None) -> None:
+        self.of = of
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         data = trainer.datamodule  # type: ignore[attr-defined]
-        if not isinstance(data, ScanDataModule) or data.pairs is None or self.init is None:
+        if not isinstance(data, ScanDataModule) or data.pairs is None or self.of is None:
             return
         store, num = data.pair_store, data.pairs.num
-        device, flow = trainer.strategy.root_device, load_checkpoint(self.init)
+        device, flow = trainer.strategy.root_device, load_checkpoint(self.of)
         made = make_and_tell(store, flow, num, trainer.global_rank, trainer.world_size, device)
         # Another device is given up only after several times what a batch has taken here.
         patience = max(120.0, 5 * store.recipe.batch_size * made.seconds / max(made.pairs, 1))

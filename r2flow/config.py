@@ -62,6 +62,7 @@ RULES: dict[str, Key] = {
     "data.workers": FREE,
     "data.memory_gib": FREE,
     "data.pairs": Key(links="pairs"),
+    "data.pairs.of": Key(links="pairs", resume="free"),  # data.pairs.parent says which
     "data.scans": Key(links="pairs"),
     "data.scans.root": Key(links="pairs", resume="free"),
     "callbacks.reflow_pairs": FREE,

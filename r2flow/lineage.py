@@ -57,7 +57,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     """The config of a run, completed by what its parent says.
 
     Encoding and backbone are the parent's, and so is the sensor unless another is asked for; pairs are those of its
-    averaged weights, in its folder, and of its sensor.
+    averaged weights, in its folder, and of its sensor, or those of another flow (`data.pairs.of`).
 
     Args:
         asked: What the command line gave, as `backbone=hdit` or `backbone.depths=[1]`.
@@ -91,9 +91,29 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     config["parent"] = {"path": str(parent.path), "weights": parent.weights, "step": parent.step, "stage": stage}
     data = config["data"]
     if data["name"] == "pairs":
-        data["root"] = data["root"] or str(default_folder(parent.path))
-        data["pairs"] = pairs_of(parent, data["pairs"] or {}, parent.weights)
+        drawer = _drawer(config, parent)
+        data["root"] = data["root"] or str(default_folder(drawer.path))
+        data["pairs"] = pairs_of(drawer, data["pairs"] or {}, drawer.weights)
     return config
+
+
+def drawn_by(config: Mapping[str, Any]) -> str | None:
+    """The flow that draws a run's pairs: `data.pairs.of`, else the one that it starts from."""
+    return (config["data"].get("pairs") or {}).get("of") or config["stage"].get("init")
+
+
+def _drawer(config: Mapping[str, Any], parent: Parent) -> Parent:
+    of = (config["data"].get("pairs") or {}).get("of")
+    found = find_parent({"stage": {"init": of}})
+    if found is None:
+        return parent
+    for group in ("sensor", "encoding"):
+        if found[0].config.get(group) != config[group]:
+            raise InputError(
+                f"data.pairs.of={of} has another {group} than {parent.path}, which this run starts from; its pairs are "
+                "other images. Leave it out, or start from a flow of the same."
+            )
+    return found[0]
 
 
 def inherited(key: str, config: Mapping[str, Any]) -> str:

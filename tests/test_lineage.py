@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from r2flow.checkpoints import load_checkpoint
+from r2flow.checkpoints import load_checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
-from r2flow.lineage import find_parent, inherit
+from r2flow.lineage import drawn_by, find_parent, inherit
 from r2flow.stages import build_stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 
@@ -83,6 +83,30 @@ def test_pairs_are_images_of_the_parents_sensor(parent: Path):
     assert completed(config, [])["sensor"]["rows"] == 8
     with pytest.raises(InputError, match="sensor.rows is 16 here, but 8 in"):
         completed(config, ["sensor.rows=16"])
+
+
+def test_pairs_can_be_those_of_another_flow(parent: Path, tmp_path: Path):
+    def written(name: str, rows: int) -> Path:
+        config = sized(CONFIG, rows, 64)
+        state = {"state_dict": build_stage(config, build_generator(config)).state_dict(), "config": config}
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        AtomicCheckpointIO().save_checkpoint({**state, "global_step": 7}, tmp_path / name)
+        return tmp_path / name
+
+    def on_pairs_of(flow: Path | None) -> dict:
+        data = {"name": "pairs", "root": None, "pairs": {"of": flow and str(flow)}}
+        return completed({**child(parent, False), "data": data, "stage": {"name": "reflow", "init": str(parent)}}, [])
+
+    other = written("other/flow.ckpt", 8)
+    config = on_pairs_of(other)
+    assert config["data"]["pairs"]["parent"] == weights_hash(load_checkpoint(other)) != config["parent"]["weights"]
+    assert Path(config["data"]["root"]).parent == other.parent
+    assert drawn_by(config) == str(other)
+    own = on_pairs_of(None)
+    assert own["data"]["pairs"]["parent"] == own["parent"]["weights"]
+    assert drawn_by(own) == str(parent)
+    with pytest.raises(InputError, match=r"data\.pairs\.of=.*taller\.ckpt has another sensor than .*parent\.ckpt"):
+        on_pairs_of(written("taller.ckpt", 16))
 
 
 @pytest.mark.parametrize("position", ["none", "polar", "spherical_harmonics"])

@@ -91,6 +91,7 @@ class PairOptions:
     seed: int = 0  # of the noise; not the run's: runs of several seeds can share one set of pairs
     first: int | None = None  # index of the first pair; None: behind the pairs that the flow itself was trained on
     knots: int | None = None  # inner states of each path to keep with its pair, for stage=flow_map
+    of: str | None = None  # the flow that draws them; None: that of stage.init
     parent: str | None = None  # hash of the flow; the run fills it in
 
     def recipe(self, shape: tuple[int, int, int], noise_shape: tuple[int, ...] | None = None) -> PairRecipe:
