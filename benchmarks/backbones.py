@@ -6,6 +6,7 @@ r2flow/backbones/cost.py, three times as many for forward and backward. Medians,
 
 python benchmarks/backbones.py                                  # forward and backward, eager, the three base models
 python benchmarks/backbones.py --backbone hdit --mode compiled-bfloat16
+python benchmarks/backbones.py --backbone hdit --mode float32 bfloat16 --threads 1 --profile  # and where the time goes
 python benchmarks/backbones.py --experiment dusty2 --options data.batch_size=4  # a step of training, on simulated scans
 python benchmarks/backbones.py --device cuda --batch 1 8 64 --attention flex tiles natten --mode compiled-bfloat16
 """
@@ -54,8 +55,13 @@ def built(config: str, rows: int, columns: int, attention: str, device: str) -> 
     return model.to(device)
 
 
-def measured(model: Backbone, mode: str, batch: int, repeats: int, device: str) -> dict[str, float]:
-    """Median milliseconds of one call and median share of the matrix product's rate timed beside it."""
+def measured(
+    model: Backbone, mode: str, batch: int, repeats: int, device: str, profile: bool = False
+) -> dict[str, Any]:
+    """Median milliseconds of one call and median share of the matrix product's rate timed beside it.
+
+    With `profile` the share of its time of each operation too, by torch's profiler, of one more call.
+    """
     kind, _, name = mode.rpartition("-")
     dtype = getattr(torch, name)
     x = torch.randn(batch, 2, *model.coords.shape[2:], device=device)
@@ -84,6 +90,12 @@ def measured(model: Backbone, mode: str, batch: int, repeats: int, device: str) 
             after = seconds(product, device)
             rate = 2 * 2 * ORDER[device] ** 3 / (before + after)
             shares.append(operations / times[-1] / rate)
+        spent: dict[str, float] = {}
+        if profile:
+            with torch.profiler.profile() as seen:
+                work()
+            column = "self_device_time_total" if device == "cuda" else "self_cpu_time_total"
+            spent = {one.key: getattr(one, column) for one in seen.key_averages()}
     if device == "cuda":
         memory = torch.cuda.max_memory_allocated() / 2**30
         torch.cuda.reset_peak_memory_stats()
@@ -94,6 +106,7 @@ def measured(model: Backbone, mode: str, batch: int, repeats: int, device: str) 
         "share": statistics.median(shares),
         "first_call_s": first,
         "peak_gib": memory,
+        "operations": {key: time / sum(spent.values()) for key, time in spent.items()},
     }
 
 
@@ -149,6 +162,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--device", choices=list(ORDER), default="cpu")
+    parser.add_argument("--profile", action="store_true", help="and where the time goes, by operation")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -166,13 +180,16 @@ def main() -> None:
                 for batch in options.batch:
                     row = {"name": config, "mode": mode, "attention": attention, "batch": batch}
                     try:
-                        row |= measured(model.train("training" in mode), mode, batch, options.repeats, options.device)
+                        model.train("training" in mode)
+                        row |= measured(model, mode, batch, options.repeats, options.device, options.profile)
                     except InputError as error:
                         row["error"] = str(error)
                     row |= {"parameters": count_parameters(model), "gmac": count_macs(model) / 1e9}
                     found.append(row)
                     if not options.json:
                         print(line(row), flush=True)
+                        spent = sorted(row.get("operations", {}).items(), key=lambda one: -one[1])
+                        print("".join(f"    {share:6.1%}  {name}\n" for name, share in spent[:12]), end="", flush=True)
     if options.json:
         print(json.dumps(found, indent=2))
 

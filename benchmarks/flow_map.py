@@ -57,6 +57,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -469,7 +470,10 @@ def uses(folder: str, first: str, num: int) -> None:
         images = torch.cat([drawn.images for drawn in sample(flow, num, batch_size=16, sampler=how)]).numpy()
         return float(np.mean(list(distances(panel(images, sensor), real).values())))
 
-    rows = [[str(k), *(f"{panel_of(model, Sampler(how, k)):.4f}" for how in ("jump", "renoise"))] for k in (1, 2, 4, 8)]
+    rows = []
+    for k in (1, 2, 4, 8):
+        ways = [replace(model.in_steps(k), method=how) for how in ("jump", "renoise")]
+        rows.append([str(k), *(f"{panel_of(model, way):.4f}" for way in ways)])
     print(table(rows, ["evaluations", "jump", "renoise"]), flush=True)
 
     exact = Sampler("adams3", 64, grid="power:1.75")
@@ -484,13 +488,13 @@ def uses(folder: str, first: str, num: int) -> None:
     rows = []
     for k in (1, 2, 4, 8, 16):
         back = torch.cat(
-            [model.solve(part, 1.0, 0.0, sampler=Sampler("jump", k)).x for part in ends[: num // 4].split(16)]
+            [model.solve(part, 1.0, 0.0, sampler=model.in_steps(k)).x for part in ends[: num // 4].split(16)]
         )
         solved = [parent.solve(part, 1.0, 0.0, sampler=Sampler("adams3", k)).x for part in ends[: num // 4].split(16)]
         rows.append([str(k), *(f"{rms(x, noise[: num // 4]).mean():.3f}" for x in (back, torch.cat(solved)))])
     print(table(rows, ["evaluations back to the noise", "jumps", "adams3 of the 1-RF"]), flush=True)
 
-    drawn = {k: torch.cat([model.generate(x, sampler=Sampler("jump", k)).x for x in noise.split(16)]) for k in COUNTS}
+    drawn = {k: torch.cat([model.generate(x, sampler=model.in_steps(k)).x for x in noise.split(16)]) for k in COUNTS}
     errors = {k: rms(x, ends) for k, x in drawn.items()}
     rows = []
     for low in (1, 2, 4):
