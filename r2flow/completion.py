@@ -250,7 +250,8 @@ def _given(generator: Generator, images: Tensor) -> Samples:
     """Scans of which everything is known."""
     channels = 1 + generator.space.encoding.reflectance
     none = torch.zeros(len(images), dtype=torch.int64)
-    return Samples(images[:, :channels], 0, none, none == 0, 0.0)
+    lacking = images.new_zeros(len(images), max(channels - images.shape[1], 0), *images.shape[2:])
+    return Samples(torch.cat([images[:, :channels], lacking], 1), 0, none, none == 0, 0.0)
 
 
 class _Last:

@@ -79,6 +79,11 @@ def _in_todays_keys(config: Mapping[str, Any]) -> dict[str, Any]:
     callbacks = found.get("callbacks")
     if isinstance(callbacks, Mapping) and isinstance(callbacks.get("ema"), Mapping):
         found["callbacks"] = {**callbacks, "ema": {"rule": "power", **callbacks["ema"]}}
+    stage = found.get("stage")
+    if isinstance(stage, Mapping) and stage.get("name") == "distill":
+        found["stage"] = {"grid": "uniform", **stage}
+    if isinstance(stage, Mapping) and isinstance(stage.get("jumps"), Mapping):
+        found["stage"] = {**stage, "jumps": {"grid": "uniform", **stage["jumps"]}}
     return found
 
 

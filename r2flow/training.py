@@ -242,6 +242,8 @@ def _assembled(config: dict[str, Any], generator: Generator, parent: Parent | No
 def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
     options = dict(config["trainer"])
     check_options("trainer", L.Trainer, options)
+    if options["accelerator"] == "auto" and not torch.cuda.is_available():
+        options["accelerator"] = "cpu"  # Lightning would take Apple's GPU, which has no float64
     if not stage.automatic_optimization:  # Lightning leaves these two to the stage
         if options["accumulate_grad_batches"] != 1:
             name = config["stage"]["name"]
@@ -263,6 +265,11 @@ def check_trainer(options: Mapping[str, Any]) -> None:
         InputError: a value out of its range, an accelerator that is not there, a precision that a CPU does not have.
     """
     check_options("trainer", TrainerRanges, {f.name: options.get(f.name) for f in fields(TrainerRanges)})
+    if str(options["precision"]) in ("16-true", "bf16-true"):
+        raise InputError(
+            f"trainer.precision={options['precision']} rounds the times of a flow to three digits; use "
+            f"{options['precision'].replace('true', 'mixed')}."
+        )
     gpu = torch.cuda.is_available()
     if options["accelerator"] in ("gpu", "cuda") and not gpu:
         raise InputError("trainer.accelerator=gpu, but torch sees no GPU here; use trainer=cpu.")

@@ -45,6 +45,16 @@ def halved(images: torch.Tensor) -> torch.Tensor:
     return ray_states(images, torch.from_numpy(measured))
 
 
+def test_a_scan_without_a_return_is_one_of_a_batch_without_reflectance():
+    images = scans()[:, :1]
+    images[0] = 0
+    state = halved(images)
+    state[0] = int(Ray.EMPTY)
+    found = network().complete(images, state, steps=2)
+    assert found.shape == (2, 1, 2, *SHAPE)
+    assert not found[0].any()
+
+
 @pytest.mark.parametrize("batch_size", [1, 4])
 def test_known_rays_come_back_to_the_bit(batch_size):
     images = scans()

@@ -41,6 +41,23 @@ def test_the_same_config_goes_on_from_the_newest_whole_checkpoint(tmp_path: Path
     assert open_run(tmp_path, CONFIG) == older
 
 
+@pytest.mark.parametrize(
+    ("then", "now"),
+    [
+        ({"name": "distill", "steps": 2}, {"name": "distill", "steps": 2, "grid": "uniform"}),
+        (
+            {"name": "flow_map", "jumps": {"share": 0.5}},
+            {"name": "flow_map", "jumps": {"share": 0.5, "grid": "uniform"}},
+        ),
+    ],
+)
+def test_a_run_from_before_steps_had_a_grid_goes_on(tmp_path: Path, then: dict, now: dict):
+    write_config(tmp_path, {**CONFIG, "stage": then})
+    kept = read_config(tmp_path)
+    assert kept is not None
+    assert contradictions(kept, {**CONFIG, "stage": now}) == []
+
+
 def test_where_it_computes_may_change_and_what_may_not(tmp_path: Path):
     assert contradictions(CONFIG, changed(trainer__devices=4, data__root="moved")) == []
     assert contradictions(CONFIG, changed(seed=1)) == ["seed=0 there, 1 here"]

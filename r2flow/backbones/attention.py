@@ -94,6 +94,7 @@ def _dense(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tens
     return (weights @ v).transpose(1, 2).unflatten(1, (rows.size, columns.size))
 
 
+GRAPHS = 64  # that torch.compile may make of flex_attention; its own limit of 8 is passed by three levels
 TILE = (4, 8)  # queries, whose keys are 6 x 16: smaller tiles copy more keys, larger ones compute more masked products
 
 
@@ -159,7 +160,10 @@ def _tile_sees(axis: _Axis, tile: int, keys: Tensor) -> Tensor:
 def _compiled_flex() -> Callable[..., Tensor]:
     from torch.nn.attention.flex_attention import flex_attention
 
-    return torch.compile(flex_attention, dynamic=False)
+    # A graph for each level, type and mode; past the limit the form that keeps all scores would run.
+    config = torch._dynamo.config
+    config.recompile_limit = max(GRAPHS, config.recompile_limit)
+    return torch.compile(flex_attention)
 
 
 @functools.lru_cache(maxsize=64)
@@ -175,7 +179,9 @@ def _flex_mask(rows: _Axis, columns: _Axis, device: torch.device):  # type: igno
 
     tokens = rows.size * columns.size
     with torch.inference_mode(False):
-        return create_block_mask(sees, None, None, tokens, tokens, device=str(device))
+        # Compiled it never holds all pairs of tokens at once: 17 bytes each, 4.6 GB at 64 x 1024.
+        create = torch.compile(create_block_mask) if device.type == "cuda" else create_block_mask
+        return create(sees, None, None, tokens, tokens, device=str(device))
 
 
 def _flex(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:

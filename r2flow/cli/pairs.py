@@ -64,6 +64,9 @@ def pairs(
     first: Annotated[
         int | None, typer.Option(min=0, help="Index of the first pair; behind the flow's own pairs if left out.")
     ] = None,
+    grid: Annotated[
+        str | None, typer.Option(help="Where fixed steps fall; the solver's usual grid if left out.")
+    ] = None,
     knots: Annotated[int | None, typer.Option(min=1, help="Inner states to keep of each path, for a flow map.")] = None,
 ) -> None:
     """Draw reflow pairs from a flow: what is missing or damaged, as one of any number of processes.
@@ -86,7 +89,7 @@ def pairs(
     options = {
         **{key: value for key, value in asked.items() if value is not None},
         "num": num, "batch_size": batch_size, "shard_mib": shard_mib, "seed": seed, "first": first,
-        "knots": knots,
+        "knots": knots, "grid": grid,
     }  # fmt: skip
     recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(
         flow.encoding.shape, flow.generator.noise_shape

@@ -281,6 +281,12 @@ def open_prepared(
 # The sets of scans that a run's `data` names
 
 
+def _check_split(what: str, given: Mapping[str, Any]) -> None:
+    known = ", ".join(SOURCES[given["name"]].splits)
+    if known and "split" not in given:
+        raise InputError(f"{what}: {given['name']} has a standard split: give split, one of {known}, or null for all.")
+
+
 def split_parts(options: DataOptions) -> list[PartOptions]:
     """The sets of scans to train on; none of pairs. What a part does not say is the run's, but for root, split, drives.
 
@@ -289,6 +295,8 @@ def split_parts(options: DataOptions) -> list[PartOptions]:
             which nobody said whether its test drives are meant too.
     """
     if options.name == PAIRS:
+        if options.beside is not None:
+            _check_split("data.scans", options.scans or {})
         return []
     if options.name != MIXED:
         return [PartOptions(**options.common)]
@@ -303,11 +311,7 @@ def split_parts(options: DataOptions) -> list[PartOptions]:
         check_options(what, PartOptions, part)
         if "name" not in part or part["name"] in (MIXED, PAIRS):
             raise InputError(f"{what} needs the name of a data set, found {part.get('name')!r}.")
-        known = ", ".join(SOURCES[part["name"]].splits)
-        if known and "split" not in part:
-            raise InputError(
-                f"{what}: {part['name']} has a standard split: give split, one of {known}, or null for all."
-            )
+        _check_split(what, part)
         made.append(PartOptions(**{**options.common, "root": None, "split": None, "drives": None, **part}))
     if len({part.weight is None for part in made}) > 1:
         raise InputError("data.parts: give every part a weight, or none, for shares by size.")

@@ -21,7 +21,7 @@ from r2flow.data.loader import Item, Order
 from r2flow.data.shards import Block, PairRecipe, PairStore
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution, knot_times
-from r2flow.generators import Generated, Generator, as_flow
+from r2flow.generators import Generated, Generator, Sampler, as_flow
 from r2flow.models import name_of
 
 
@@ -38,6 +38,16 @@ class Made:
     evaluations: int = 0
     unusable: int = 0  # pairs that are left out
     seconds: float = 0.0
+
+
+def _refuse_unlearned_times(own: Sampler, how: Sampler) -> None:
+    """A k-TD knows the velocity where its own steps begin, and nowhere else."""
+    if own.fixed and (own.method, own.steps, own.grid) != (how.method, how.steps, how.grid):
+        raise InputError(
+            f"this generator has learned {own.method} in {own.steps} steps, grid {own.grid}, and draws no pairs by "
+            f"{how.method} in {how.steps} steps, grid {how.grid}: give data.pairs.method={own.method} "
+            f"data.pairs.steps={own.steps} data.pairs.grid={own.grid}, or pairs of the flow that it comes from."
+        )
 
 
 def make_pairs(
@@ -62,6 +72,7 @@ def make_pairs(
     if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
         raise InputError(f"these pairs are of another noise than the generator's {generator.noise_shape}.")
     generator.check_sampler(store.recipe.sampler)
+    _refuse_unlearned_times(generator.sampler, store.recipe.sampler)
     store.begin()
     # Shards are checked by turns; who finds one damaged makes its batches, which the others hold to be there.
     shards = store.shards(num)

@@ -158,7 +158,8 @@ class Flow(Generator):
             raise InputError(f"a time grid is for a solver of fixed steps; {sampler.method} chooses its own.")
 
     def in_steps(self, steps: int) -> Sampler:
-        return Sampler("euler", steps)
+        own = self.sampler  # of a distilled flow the steps that it has learned
+        return own if own.fixed and own.steps == steps else Sampler("euler", steps)
 
     def evaluations_of(self, sampler: Sampler) -> int:
         if completes(sampler.method):

@@ -144,12 +144,15 @@ class Stage(L.LightningModule):
         for parameter in (p for group in optimizer.param_groups for p in group["params"]):
             if parameter.grad is not None:
                 parameter.grad = averaged(parameter.grad)
-        self.clip_gradients(optimizer.optimizer, self.gradient_clip_val)
         optimizer.step()
         schedules = self.lr_schedulers() or []
         for schedule in schedules if isinstance(schedules, list) else [schedules]:
             if schedule.optimizer is optimizer.optimizer:
                 schedule.step()  # type: ignore[call-arg]
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        if not self.automatic_optimization:  # gradients of float16 have been scaled back only now
+            self.clip_gradients(optimizer, self.gradient_clip_val)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["config"] = self.config

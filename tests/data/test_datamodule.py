@@ -223,6 +223,19 @@ def test_validation_is_never_augmented(numbered: Path):
     assert torch.equal(plain["x_1"], augmented["x_1"])
 
 
+@pytest.mark.parametrize(
+    ("split", "said"),
+    [
+        ({}, r"data\.scans: kitti_360 has a standard split: give split, one of "),
+        ({"split": "train"}, "x is not a folder"),
+        ({"split": None}, "x is not a folder"),
+    ],
+)
+def test_of_scans_beside_pairs_it_is_said_whether_test_drives_are_meant(split: dict, said: str):
+    with pytest.raises(InputError, match=said):
+        module(name="pairs", root="x", scans={"name": "kitti_360", "root": "x", **split})
+
+
 def test_pairs_are_not_augmented():
     with pytest.raises(InputError, match="data.augment changes scans"):
         module(name="pairs", root="x", augment={"flip": True})

@@ -23,7 +23,7 @@ from r2flow.data.pairs import (
 )
 from r2flow.data.shards import PairStore
 from r2flow.errors import InputError
-from r2flow.generators import Field
+from r2flow.generators import Field, Sampler
 from r2flow.noise import standard_normal
 from r2flow.reports.pairs import wait_for_others
 from tests.killing import MOMENTS, die_at, was_killed
@@ -228,6 +228,16 @@ def test_how_pairs_are_drawn_is_for_their_generator_to_say(tmp_path: Path):
     with pytest.raises(InputError, match="no solver named 'ancestral'"):  # of a flow it is one
         make_pairs(store, grow, 8)
     assert not store.folder.exists()
+
+
+def test_a_distilled_flow_draws_pairs_by_its_own_steps_alone(tmp_path: Path):
+    flow = Field(lambda t, x: x, SHAPE)
+    flow.sampler = Sampler("euler", 2, grid="power:3", fixed=True)
+    with pytest.raises(InputError, match=r"euler data\.pairs\.steps=2 data\.pairs\.grid=power:3"):
+        make_pairs(store_in(tmp_path / "others"), flow, 8)
+    assert not (tmp_path / "others").exists()
+    own = store_in(tmp_path / "own", method="euler", steps=2, grid="power:3")
+    assert make_pairs(own, flow, 8).unusable == 0
 
 
 def test_a_shorter_shard_never_replaces_a_longer_one(tmp_path: Path, monkeypatch):

@@ -56,7 +56,9 @@ def test_distillation_trains_at_the_times_of_its_steps_alone(k: int, grid: str):
     stage.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
     stage.training_step(pairs(0), 0)
     assert seen == ({i / k for i in range(k)} if grid == "uniform" else {0, 7 / 16, 12 / 16, 15 / 16})
-    assert (stage.generator.sampler.steps, stage.generator.sampler.grid) == (k, grid)
+    own = stage.generator.sampler
+    assert (own.method, own.steps, own.grid, own.fixed) == ("euler", k, grid, True)
+    assert stage.generator.in_steps(k) == own  # what the paper's table draws it with
 
 
 def test_the_paper_s_loss_and_times_are_the_defaults():

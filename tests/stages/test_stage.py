@@ -3,6 +3,7 @@
 import lightning as L
 import pytest
 import torch
+from lightning.pytorch.plugins import MixedPrecision
 from torch import nn
 from torch.utils.data import DataLoader
 
@@ -75,3 +76,31 @@ def test_steps_of_its_own_are_clipped_scheduled_and_counted_as_lightning_s(tmp_p
     assert automatic.rates[:2] == pytest.approx([0.05, 0.1])  # a warm-up of 16 images is one of two steps
     untouched = Manual().other.weight
     assert not torch.equal(manual.other.weight, untouched)
+
+
+class Slope(Stage):
+    """One step of SGD, of the length of its clipped gradient."""
+
+    def __init__(self, slope: float) -> None:
+        super().__init__(Linear(), warmup_images=0)
+        self.automatic_optimization, self.gradient_clip_val, self.slope = False, CLIP, slope
+
+    def configure_optimizers(self):
+        optimizer = torch.optim.SGD(self.generator.layer.parameters(), lr=1.0)
+        return [optimizer], []
+
+    def training_step(self, batch, batch_idx):
+        self.take_step(self.own_optimizers()[0], self.slope * self.generator.layer.bias.sum())
+
+
+@pytest.mark.parametrize("slope", [0.02, 0.5])
+def test_gradients_are_clipped_after_they_were_scaled_back(tmp_path, slope):
+    scaled = MixedPrecision("16-mixed", "cpu", torch.amp.GradScaler("cpu", init_scale=256.0))
+    stage = Slope(slope)
+    before = stage.generator.layer.bias.detach().clone()
+    trainer = L.Trainer(
+        accelerator="cpu", max_steps=1, default_root_dir=tmp_path, logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False, plugins=[scaled],
+    )  # fmt: skip
+    trainer.fit(stage, BATCHES)
+    assert float(before - stage.generator.layer.bias.detach()) == pytest.approx(min(slope, CLIP), rel=1e-3)

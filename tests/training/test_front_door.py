@@ -60,6 +60,7 @@ REFUSED = {
     "backbone.dropout=2": "dropout must be a finite number in [0, 1)",
     "data.split=train": "simulated scans are no files: leave data.split out",
     "data.scans={name: simulated, split: train}": "simulated scans are no files: leave data.scans.split out",
+    "trainer.precision=bf16-true": "rounds the times of a flow to three digits; use bf16-mixed",
     "data.scans={name: simulated}": "data.scans stand beside pairs, found data=simulated",
     "data.drives=[1]": "leave data.drives out",
     "data.projection=unfolding": "leave data.projection out",

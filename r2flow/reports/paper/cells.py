@@ -13,6 +13,7 @@ from r2flow.checkpoints import Checkpoint
 from r2flow.evaluation.measuring import Gathered, Work, measure, point_key
 from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
 from r2flow.files import atomic_write
+from r2flow.generators import Sampler
 from r2flow.metrics.base import ScanMetric, Side
 from r2flow.metrics.birds_eye import BINS
 from r2flow.metrics.jsd import JSD
@@ -51,11 +52,12 @@ class CellSettings:
     folder: Path
     device: str
 
-    def path(self, subject: PaperRun, steps: int) -> Path:
+    def path(self, subject: PaperRun, sampler: Sampler, steps: int) -> Path:
         """A cell's file, named by everything that it depends on."""
+        grid = {} if sampler.grid == "uniform" else {"grid": sampler.grid}
         key = point_key(
             self.real, self.metrics, weights=subject.weights, steps=steps, num=self.num, seed=SEED,
-            bootstrap=self.bootstrap, device=self.device, protocol=self.gathered.protocol.name,
+            bootstrap=self.bootstrap, device=self.device, protocol=self.gathered.protocol.name, **grid,
         )  # fmt: skip
         return self.folder / f"{key}.safetensors"
 
@@ -67,18 +69,18 @@ def measure_cells(settings: CellSettings, flow: Checkpoint, subject: PaperRun, s
     """
     own = {flow.generator.sampler.steps} if subject.system else set()
     for count in sorted({*steps, *own}) if subject.steps is None else [subject.steps]:
-        path = settings.path(subject, count)
+        sampler = flow.generator.in_steps(count)  # Euler for a flow, as in the paper
+        path = settings.path(subject, sampler, count)
         cell = _read(path)
         if cell is None:
-            cell = _measure(settings, flow, subject, count)
+            cell = _measure(settings, flow, subject, sampler, count)
             _write(path, cell)
         # The run's name and folder, and the other runs of its chain, may have changed since.
         row = {**cell.row, "label": subject.label, "role": subject.role, "family": subject.family, "kind": subject.kind}
         yield Cell(row, cell.birds_eye, cell.images)
 
 
-def _measure(settings: CellSettings, flow: Checkpoint, subject: PaperRun, steps: int) -> Cell:
-    sampler = flow.generator.in_steps(steps)  # Euler for a flow, as in the paper
+def _measure(settings: CellSettings, flow: Checkpoint, subject: PaperRun, sampler: Sampler, steps: int) -> Cell:
     drawn = sampled_set(flow, f"{subject.label}, {steps} steps", settings.num, sampler, SEED)
     sees = flow.encoding.reflectance
     metrics = {name: metric for name, metric in settings.metrics.items() if sees or not metric.needs_reflectance}
