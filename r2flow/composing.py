@@ -216,7 +216,8 @@ def explain(error: Exception) -> str:
     if choice:
         group, name = choice.groups()
         known = choices(group)
-        return f"no {group} config named '{name}'; known: {', '.join(known)}.{did_you_mean(name, known)}"
+        own = f" One of yours is found by --config-dir FOLDER, in FOLDER/{group}/NAME.yaml."
+        return f"no {group} config named '{name}'; known: {', '.join(known)}.{did_you_mean(name, known) or own}"
     return " ".join(lines[:2])
 
 

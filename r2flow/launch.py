@@ -129,7 +129,7 @@ def _checked_arguments(arguments: list[str]) -> list[str]:
     parser = get_args_parser()
 
     def refuse(message: str) -> NoReturn:
-        raise InputError(f"{message}; see --help.")
+        raise InputError(f"{message}; see --help. Keys have no dashes, as trainer.max_steps=100.")
 
     parser.error = refuse  # type: ignore[method-assign]  # its own prints all of the flags
     overrides = parser.parse_intermixed_args(arguments).overrides  # flags may stand between them

@@ -318,6 +318,8 @@ def _fit_in_folder(run: Run) -> int:
     """The step that the run has reached."""
     last = open_run(run.folder, run.config, run.stage.state_dict())
     if last is not None and step_of(last) >= run.trainer.max_steps:
+        if run.trainer.is_global_zero:
+            print(f"finished before, at step {step_of(last)}; to learn more: stage.init={run.folder} name=OTHER")
         return step_of(last)  # nothing is left to do, nor pairs to make
     if run.trainer.is_global_zero and run.data.files:
         (record_contents if last is None else check_contents)(run.folder, run.data.files)

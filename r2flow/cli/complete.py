@@ -117,6 +117,8 @@ def complete(
         print(f"{ending} is {why}: answers are .ply ({', '.join(WRITTEN)} are written)")
     if not loaded.encoding.reflectance:
         print("the model is of range alone: answers have no reflectance")
+    rows, columns = loaded.sensor.shape
+    print(f"an answer has a point a pixel of the model's image, {rows}x{columns}: {rows * columns} at most")
     job = Job(answers.num, answers.seed, known.keep, mask, answers.batch_size, known.surfaces, answers.pictures)
     about = {"mask": known.mask, "from": known.source, "surfaces": known.surfaces}
     found = write_completed(loaded, scans, out, job, sampler, about)

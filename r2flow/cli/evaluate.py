@@ -83,7 +83,7 @@ class SamplingOptions:
     """How scans are sampled from a flow."""
 
     steps: Annotated[
-        str | None, typer.Option(help="Of the sampled flow, 32 or k of a k-TD if left out; of a curve, 1,2,4,...,256.")
+        str | None, typer.Option(help="Of the sampled flow, its own if left out; of a curve, 1,2,4,...,256.")
     ] = None
     solver: Annotated[
         str | None,

@@ -228,9 +228,9 @@ def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tupl
 
 def _no_reflectance(path: str | Path) -> InputError:
     return InputError(
-        f"{path} has no reflectance and the config, the model or the first scan of its set has it. For range alone "
-        "give encoding.reflectance=false in training (auto lets the scans decide; a run with stage.init is as its "
-        "parent), metrics of range in measuring."
+        f"{path} has no reflectance and the config, the model or the first scan of its set has it. In training give "
+        "encoding.reflectance=false for range alone, and no stage.init that has reflectance; in measuring give metrics "
+        "of range."
     )
 
 

@@ -83,7 +83,7 @@ def add_model(name: str, file: Path) -> Path:
     if MODELS[name].page is None:
         raise InputError(f"the model {name} comes with the package; there is nothing to add.")
     if not file.is_file():
-        raise InputError(f"{file} is no file; give the one from {MODELS[name].page}.")
+        raise InputError(f"{file} is no file. That of {name} is {MODELS[name].page}.")
     _check(name, file)
     path = model_file(name)
     with atomic_write(path) as out:

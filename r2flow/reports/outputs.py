@@ -200,15 +200,16 @@ def draw_reflectances(images: Sequence[np.ndarray], out: Path) -> Path:
     return save_figure(figure, out / "samples.png")
 
 
-def what_next(checkpoint: Path, out: Path, options: str = "", config: Mapping[str, Any] | None = None) -> str:
+def what_next(checkpoint: Path, out: Path, config: Mapping[str, Any] | None = None) -> str:
     """The commands that come after scans were written to `out`.
 
     Args:
         config: The run's, if it is one run: what has been trained decides what can be trained next.
     """
+    plugins = "".join(f" --plugin {shlex.quote(str(name))}" for name in (config or {}).get("plugins") or ())
     return f"""
 next
-  r2flow sample --checkpoint {checkpoint} --num 16{options} --seed 1 --out {out.parent / "more"}
+  r2flow sample --checkpoint {checkpoint} --num 16{plugins} --seed 1 --out {out.parent / "more"}
   r2flow show {out / "000000.ply"} --out {out.parent / "views"}
   {_what_to_train(checkpoint, config)}"""
 
@@ -221,7 +222,7 @@ def _what_to_train(run: Path, config: Mapping[str, Any] | None) -> str:
     experiment = {"rectify": "reflow", "reflow": "distill"}.get(stage.get("name"))
     if experiment is not None:
         return f"r2flow train experiment={experiment} stage.init={shlex.quote(str(run))}"
-    return f"r2flow evaluate REAL {shlex.quote(str(run))} --floor"
+    return f"r2flow evaluate REAL {shlex.quote(str(run))}"
 
 
 def _save(image: np.ndarray, path: Path) -> None:

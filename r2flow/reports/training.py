@@ -43,7 +43,7 @@ def finish(run: str | Path, samples: Mapping[str, Any], seed: int, device: str, 
     if curves:
         save_figure(loss_figure(curves), run / "loss.png")
     if not checkpoints_of(run):
-        print(f"no checkpoint was kept, as configured; loss curve: {run / 'loss.png'}")
+        print("no checkpoint was kept, as configured" + (f"; loss curve: {run / 'loss.png'}" if curves else ""))
         return
     path = find_checkpoint(run)
     checkpoint = load_checkpoint(path, device)
@@ -63,7 +63,7 @@ checkpoint    {path}
 pictures      {out / "samples.png"} and one page a scan beside it; during training: {run / "pictures"}
 in 3-D        {out / "samples.html"}, in a browser
 point clouds  {out / "000000.ply"} ...
-loss curve    {run / "loss.png"}; tensorboard --logdir {run / "tensorboard"}
-{what_next(run, out, "" if checkpoint.generator.sampler.fixed else " --steps 64", checkpoint.config)}""",
+loss curve    {f"{run / 'loss.png'}; " if curves else ""}tensorboard --logdir {run / "tensorboard"}
+{what_next(run, out, config=checkpoint.config)}""",
         flush=True,
     )

@@ -47,7 +47,7 @@ def test_next_is_what_has_not_been_done(alone: tuple[Path, str]):
     for stage, data, words in (
         ("rectify", "simulated", "data=kitti_raw data.root=FOLDER"),
         ("reflow", "pairs", "experiment=distill stage.init=a"),
-        ("distill", "pairs", "r2flow evaluate REAL a --floor"),
+        ("distill", "pairs", "r2flow evaluate REAL a"),
     ):
         config = {"stage": {"name": stage}, "data": {"name": data}}
         assert words in what_next(Path("a"), Path("a/samples"), config=config).splitlines()[-1]
