@@ -2,8 +2,6 @@
 
 import copy
 import logging
-import os
-import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from torch.nn.utils import get_total_norm
 from r2flow.checkpoints import checkpoints_of
 from r2flow.errors import InputError
 from r2flow.registry import Count, NonNegative
+from r2flow.signals import outlive_parent
 
 log = logging.getLogger(__name__)
 
@@ -101,7 +100,7 @@ class Guard(L.Callback):
             "a lower stage.learning_rate."
         )
         if not trainer.is_global_zero:
-            _let_rank_zero_speak()
+            outlive_parent()
         return error
 
     def on_save_checkpoint(self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
@@ -117,7 +116,7 @@ class Guard(L.Callback):
                     "Start under another name with a lower stage.learning_rate."
                 )
                 if not trainer.is_global_zero:
-                    _let_rank_zero_speak()
+                    outlive_parent()
                 raise error
 
     def _last_good(self) -> str:
@@ -165,10 +164,3 @@ def _not_finite(tensors: Iterable[tuple[str, Tensor]]) -> list[str]:
         return []
     finite = torch.stack([torch.isfinite(value).all() for _, value in named]).tolist()
     return [name for (name, _), whole in zip(named, finite, strict=True) if not whole]
-
-
-def _let_rank_zero_speak(seconds: float = 10.0) -> None:
-    """Wait for the launching process to end: Lightning kills it, unheard, once it sees a child that has failed."""
-    parent, begin = os.getppid(), time.monotonic()
-    while os.getppid() == parent and time.monotonic() - begin < seconds:
-        time.sleep(0.1)

@@ -4,7 +4,6 @@ import logging
 import os
 import signal
 import subprocess
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +17,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from r2flow.checkpoints import FOLDER, checkpoints_of
 from r2flow.errors import InputError
 from r2flow.registry import Count
-from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening
+from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening, outlive_parent
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +103,7 @@ class Stopping(L.Callback):
                 self._keep_two(trainer)
             self._training = False
             if not trainer.is_global_zero and isinstance(_environment(trainer), LightningEnvironment):
-                _wait_for_parent()
+                outlive_parent()
             self._leave(f"stopped at step {trainer.global_step}")
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -144,13 +143,6 @@ class Stopping(L.Callback):
 
 def _environment(trainer: L.Trainer) -> Any:
     return getattr(trainer.strategy, "cluster_environment", None)
-
-
-def _wait_for_parent(seconds: float = 10.0) -> None:
-    """Lightning kills the launching process, unheard, once it sees that a child has ended with another code than 0."""
-    parent, begin = os.getppid(), time.monotonic()
-    while os.getppid() == parent and time.monotonic() - begin < seconds:
-        time.sleep(0.1)
 
 
 def slurm_job() -> str | None:

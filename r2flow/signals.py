@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
@@ -33,6 +34,13 @@ class Stopped(BaseException):
 def code_of(number: int) -> int:
     """The exit code by which a shell knows that a signal ended a process."""
     return 128 + number
+
+
+def outlive_parent(seconds: float = 10.0) -> None:
+    """Wait for the launching process: Lightning kills it, unheard, once a child has ended with another code than 0."""
+    parent, begin = os.getppid(), time.monotonic()
+    while os.getppid() == parent and time.monotonic() - begin < seconds:
+        time.sleep(0.1)
 
 
 @contextmanager

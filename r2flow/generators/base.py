@@ -112,6 +112,11 @@ class Sampler:
             raise InputError(f"a sampler needs at least 1 step, found {found.steps}.")
         return found
 
+    @property
+    def times(self) -> str | Tensor:
+        """The grid as solvers take it: by name, or its times in float64."""
+        return self.grid if isinstance(self.grid, str) else torch.tensor(self.grid, dtype=torch.float64)
+
     def unlike(self, other: Self) -> str:
         """What is another one's setting, in words: "steps 5, tolerance 0.1"."""
         theirs = other.asdict()

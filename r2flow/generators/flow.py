@@ -66,10 +66,9 @@ class Flow(Generator):
         """
         how = sampler or self.sampler
         field, x = self.field(condition), x.to(self.device)
-        grid = how.grid if isinstance(how.grid, str) else torch.tensor(how.grid, dtype=torch.float64)
 
         def by(field: Velocity, x: Tensor, steps: int) -> Solution:
-            return solve(field, x, t_0, t_1, how.method, steps, how.tolerance, progress, grid=grid, **options)
+            return solve(field, x, t_0, t_1, how.method, steps, how.tolerance, progress, grid=how.times, **options)
 
         return _by_levels(field, x, how, by) if how.levels else by(field, x, how.steps)
 
@@ -138,8 +137,7 @@ class Flow(Generator):
         return Generated(x, evaluations, x.isfinite().flatten(1).all(1))
 
     def _times(self, sampler: Sampler, t_0: float = 0.0, t_1: float = 1.0) -> Tensor:
-        grid = sampler.grid if isinstance(sampler.grid, str) else torch.tensor(sampler.grid, dtype=torch.float64)
-        return build_grid(grid, t_0, t_1, sampler.steps)
+        return build_grid(sampler.times, t_0, t_1, sampler.steps)
 
     def check_sampler(self, sampler: Sampler) -> None:
         if completes(sampler.method):
@@ -150,8 +148,8 @@ class Flow(Generator):
             return
         check_method(sampler.method, self.other_samplers)
         check_tolerance(sampler.tolerance)
-        grid, method = sampler.grid, fixed_step(sampler.method)
-        build_grid(grid if isinstance(grid, str) else torch.tensor(grid), 0.0, 1.0, sampler.steps)
+        method = fixed_step(sampler.method)
+        self._times(sampler)
         if sampler.levels and not (method and method.corrects):
             raise InputError(f"only a predictor-corrector says how many steps a scan needs, not {sampler.method}.")
         if adapts(sampler.method) and sampler.grid != "uniform":
