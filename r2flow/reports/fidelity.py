@@ -139,7 +139,7 @@ def markdown(result: Mapping[str, Any], name: str = "other") -> str:
             cells[0] = f"**{cells[0]}**"
         rows.append([line, *cells, *([f"{own / max(floor[line], 1e-9):.2f}"] if floor else [])])
     headings = ["distance to the real scans", *_named(sets, name), *([f"{name} / floor"] if floor else [])]
-    lists = {key: ", ".join(result[key]) or "nowhere" for key in ("won", "lost", "beyond", "blind")}
+    lists = {key: "; ".join(result[key]) or "nowhere" for key in ("won", "lost", "beyond", "blind")}
     about = "No floor: give --floor OTHER_REAL, or real scans of several drives, to see what real scans come to."
     if floor:
         about = f"The floor is {FLOORS[result['floor_is']]}. Farther than twice the floor: {lists['beyond']}."
