@@ -24,7 +24,8 @@ distance to the 1-RF's exact ends from the same noise (64 scans). Verdict at k =
 than the better of 2-RF and k-TD in any of seeds 0, 1, 2 and better in the mean, with a 95 % interval of Student's t
 over seeds; at 8 and at 16 evaluations it is better than at 4. Other objectives and numbers of pairs: seed 0 alone.
 
-Street: the same question of a trained 1-RF, the package's model `street`, 32 x 256, one seed, figures of 128 samples.
+Street: the same question of a trained 1-RF, 32 x 256, one seed, figures of 128 samples: the package's model `street` of
+2026-11-20, in the history of r2flow/models/street.safetensors. What is called so today is the map that came of it.
 4,096 pairs of it (adams3, 16 evaluations, seven knots) serve both sides. Chain: 2-RF 1,800 steps; 1,536 pairs of that
 (8 evaluations); k-TD 700 steps each. `map of 2-RF` learns by consistency from these 1,536 pairs for 1,800 steps in the
 place of the k-TDs. `map of street` learns the knots of the 1-RF and, at 36 % of its images, velocities from 8,000

@@ -36,13 +36,8 @@ class Model:
 MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
-        "street scenes, learned from simulated scans",
-        "b41ab872e1494a4bac5a730330d66491bf58dcdb65e5e409d6510d5d8ca66f77",
-    ),
-    street_map=Model(
-        "street scenes in any number of evaluations: the flow map of street",
-        "92507ad4b0a2dea5793d62c4f2ca21277ca3544306093ef83cfebe4a33e07772",
-        page="release/street_map.safetensors in the source of r2flow",
+        "street scenes in any number of evaluations, learned from simulated scans",
+        "112824514683b425d30790386a48be65e683d33bae535a84c15f47d6a99b774c",
     ),
 )
 DEFAULT = "street"
