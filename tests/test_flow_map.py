@@ -334,6 +334,8 @@ def test_a_map_is_drawn_on_the_grid_that_it_learned():
     found = stage(jumps={"grid": "power:3"}).generator
     assert (found.sampler.method, found.sampler.grid) == ("jump", "power:3")
     assert found.in_steps(2) == Sampler("jump", 2, grid="power:3")
+    found.sampler = Sampler("renoise", 8, grid="power:2")
+    assert found.in_steps(2) == Sampler("jump", 2, grid="power:2")
     found.sampler = Sampler("adams3", 16, grid="power:1.5")
     assert found.in_steps(2) == Sampler("jump", 2)
 

@@ -113,5 +113,5 @@ class FlowMap(RectifiedFlow):
         return sampler.steps if sampler.method in (JUMP, RENOISE) else super().evaluations_of(sampler)
 
     def in_steps(self, steps: int) -> Sampler:
-        learned = self.sampler.grid if self.sampler.method == JUMP else "uniform"
+        learned = self.sampler.grid if self.sampler.method in (JUMP, RENOISE) else "uniform"
         return Sampler(JUMP, 4, grid=learned).changed(steps=steps)

@@ -37,7 +37,7 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes in any number of evaluations, learned from simulated scans",
-        "112824514683b425d30790386a48be65e683d33bae535a84c15f47d6a99b774c",
+        "5391347f40a829b72abec7c3c2a938b21f3e4b5bca53bb0d12f92e07f6d75d95",
     ),
 )
 DEFAULT = "street"
