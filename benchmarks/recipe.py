@@ -14,6 +14,7 @@ import os
 import resource
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ SCENES, HELD_OUT, SAMPLES = 4096, 384, 128
 HELD_OUT_SEED = 1000
 TIMES = (0.1, 0.3, 0.5, 0.7, 0.85, 0.92, 0.96, 0.98)
 # From noise to data by the same solver for all: 32 evaluations, denser towards t = 1.
-SOLVER: dict[str, Any] = {"method": "midpoint", "steps": 16, "grid": "quadratic"}
+SOLVER: dict[str, Any] = {"method": "midpoint", "steps": 16, "grid": "power:2"}
 
 COMMON = [
     "sensor=hdl64e_small", "data=simulated", f"data.scenes={SCENES}", "data.batch_size=8", "data.augment.flip=true",
@@ -62,14 +63,25 @@ PARTS_BUDGET = 160  # of the others
 EARLY, LATE = BUDGETS[1:]
 
 
-def cpu_seconds(overrides: list[str], folder: Path, steps: int, seed: int) -> float:
+def cpu_seconds(overrides: list[str], folder: Path, steps: int, seed: int, out: Path) -> float:
     """Train, or go on; CPU seconds of the child process."""
     command = [sys.executable, str(ROOT / "train.py"), *COMMON, *overrides, f"seed={seed}", f"run_dir={folder}"]
-    command += [f"trainer.max_steps={steps}", f"data.root={folder.parent.parent / f'scenes-{seed}'}"]
+    command += [f"trainer.max_steps={steps}", f"data.root={out / f'scenes-{seed}'}"]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.DEVNULL)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def seconds_a_step(overrides: list[str], runs: Path, seed: int) -> float:
+    """From two short runs, so that what comes before the first step drops out."""
+    note = runs / "step.json"
+    if not note.exists():
+        with tempfile.TemporaryDirectory() as folder:
+            short = {n: cpu_seconds(overrides, Path(folder, str(n)), n, seed, runs.parent.parent) for n in (10, 60)}
+        with atomic_write(note) as file:
+            file.write(json.dumps((short[60] - short[10]) / 50).encode())
+    return float(json.loads(note.read_text()))
 
 
 def measure(folder: Path, truth: np.ndarray, real: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -116,14 +128,12 @@ def main() -> None:
         make_scenes(given.out / f"scenes-{seed}", seed)
         for name in given.only:
             runs = given.out / f"seed-{seed}" / name.replace(" ", "-")
-            # Seconds a step from two short runs, so that what comes before the first step drops out.
-            short = {n: cpu_seconds(RECIPES[name], runs / f"probe-{n}", n, seed) for n in (10, 60)}
-            step = (short[60] - short[10]) / 50
+            step = seconds_a_step(RECIPES[name], runs, seed)
             for budget in given.budgets if name in ALL_BUDGETS else [b for b in given.budgets if b == PARTS_BUDGET]:
                 folder, note = runs / str(budget), runs / f"{budget}.json"
                 if not note.exists():
                     steps = round(budget / step)
-                    cpu_seconds(RECIPES[name], folder, steps, seed)
+                    cpu_seconds(RECIPES[name], folder, steps, seed, given.out)
                     found = {"images": 8 * steps, "step": step, **measure(folder, truth, real)}
                     with atomic_write(note) as file:
                         file.write(json.dumps(found).encode())

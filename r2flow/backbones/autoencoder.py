@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from r2flow.backbones.base import integers
 from r2flow.backbones.convolutions import GroupNorm
+from r2flow.backbones.layers import wrapped
 from r2flow.backbones.quantiser import Quantised, Quantiser
 from r2flow.errors import InputError
 from r2flow.registry import Count, NonNegative, Portion
@@ -46,7 +47,7 @@ class CircularConv2d(nn.Conv2d):
 
     def forward(self, x: Tensor) -> Tensor:
         left, right, top, bottom = self.margins
-        x = F.pad(x, (left, right, 0, 0), mode="circular") if left or right else x
+        x = wrapped(x, left, right) if left or right else x
         return super().forward(F.pad(x, (0, 0, top, bottom)) if top or bottom else x)
 
 

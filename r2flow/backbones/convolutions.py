@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from r2flow.backbones.base import Backbone, CommonOptions, integers
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, position_name
-from r2flow.backbones.layers import ExactBuffers, ExactLinear, at_least_float32, zero_initialised
+from r2flow.backbones.layers import ExactBuffers, ExactLinear, at_least_float32, wrapped, zero_initialised
 from r2flow.errors import InputError
 from r2flow.registry import Count, Portion, Positive
 
@@ -27,7 +27,7 @@ class RingConv2d(nn.Conv2d):
         self.ring = ring
 
     def forward(self, x: Tensor) -> Tensor:
-        return super().forward(F.pad(x, (1, 1, 0, 0), mode="circular") if self.ring else x)
+        return super().forward(wrapped(x, 1, 1) if self.ring else x)
 
     def open_ring(self) -> None:
         """Zeros beyond the left and right edges too, from now on."""
@@ -60,7 +60,7 @@ class Resample(ExactBuffers):
         channels, margin = x.shape[1], self.margin
         rows, columns = self.repeat, self.ring or self.repeat  # whether they are padded here
         if columns and margin:
-            x = F.pad(x, (margin, margin, 0, 0), mode="circular" if self.ring else "replicate")
+            x = wrapped(x, margin, margin) if self.ring else F.pad(x, (margin, margin, 0, 0), mode="replicate")
         if rows and margin:
             x = F.pad(x, (0, 0, margin, margin), mode="replicate")
         kernel = torch.outer(self.kernel, self.kernel).to(x.dtype).expand(channels, 1, -1, -1)

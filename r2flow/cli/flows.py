@@ -190,6 +190,29 @@ def convert(
     print(f"{out}: {len(written) / 1e6:.1f} MB, SHA-256 {hashlib.sha256(written).hexdigest()}")
 
 
+@app.command(epilog="Example: r2flow grow street larger.safetensors --size 64x1024")
+def grow(
+    checkpoint: Annotated[Path, typer.Argument(help="A flow: a checkpoint file, a run folder or a model.")],
+    out: Annotated[Path, typer.Argument(help="What to write, a .safetensors.")],
+    size: Annotated[str, typer.Option(help="Rows x columns of the larger images, as 64x1024.")],
+) -> None:
+    """Put convolutions at a higher resolution around a trained flow's network, to train it on larger images.
+
+    Until it has learned more, it draws what the trained flow draws, spread over the larger images.
+    """
+    from r2flow.checkpoints import load_checkpoint, save_checkpoint
+    from r2flow.growing import grown
+
+    if out.suffix != ".safetensors":
+        raise InputError(f"{out}: give a .safetensors, which holds a flow and its config.")
+    found = load_checkpoint(checkpoint)
+    larger = grown(found, build_sized("hdl64e", size).shape)
+    save_checkpoint(larger, out)
+    before, after = ("x".join(map(str, one.sensor.shape)) for one in (found, larger))
+    print(f"{out}: images of {after} by a network for {before}. Now train it:")
+    print(f"  r2flow train experiment=finetune stage.init={out} data.root=FOLDER")
+
+
 @app.command(epilog="Example: r2flow backbones --size 64x1024")
 def backbones(
     only: Annotated[str | None, typer.Option(help="Names, separated by commas; all if left out.")] = None,

@@ -6,6 +6,7 @@ import os
 import resource
 import signal
 import time
+import traceback
 from pathlib import Path
 
 import numpy as np
@@ -273,11 +274,14 @@ def test_runs_that_share_pairs_share_the_work(tmp_path: Path):
     for _ in range(2):
         child = os.fork()
         if child == 0:
-            make_pairs(store_in(tmp_path / "pairs"), Field(slow, SHAPE), 200)
-            os._exit(0)
+            try:
+                make_pairs(store_in(tmp_path / "pairs"), Field(slow, SHAPE), 200)
+                os._exit(0)
+            except BaseException:
+                traceback.print_exc()
+                os._exit(1)
         children.append(child)
-    for child in children:
-        os.waitpid(child, 0)
+    assert [os.waitpid(child, 0)[1] for child in children] == [0, 0]
     # 50 batches: a few are made twice where the two meet, not all of them.
     assert 50 <= begun.stat().st_size <= 75
     assert len(PairSource(store_in(tmp_path / "pairs"), 200)) == 200

@@ -146,17 +146,17 @@ def test_the_full_networks_have_the_published_names_and_shapes(shared: Path):
 
 def test_a_learned_bias_is_added_after_the_first_convolution():
     torch.manual_seed(0)
-    plain = LatentUNet((8, 4, 8), **SMALL_UNET)
+    plain = LatentUNet((8, 4, 8), **SMALL_UNET).double()
     torch.nn.init.normal_(plain.out[-1].weight)
-    positioned = LatentUNet((8, 4, 8), **SMALL_UNET, position="learnable")
+    positioned = LatentUNet((8, 4, 8), **SMALL_UNET, position="learnable").double()
     positioned.load_state_dict({**plain.state_dict(), "position": torch.zeros(32, 4, 8)})
-    z, t = torch.randn(2, 8, 4, 8), torch.tensor([3, 500])
+    z, t = torch.randn(2, 8, 4, 8, dtype=torch.float64), torch.tensor([3, 500])
     assert torch.equal(positioned(z, t), plain(z, t))
     # A constant bias is that of the convolution itself.
     with torch.no_grad():
         positioned.position.copy_(torch.arange(32.0)[:, None, None].expand(32, 4, 8))
         plain.input_blocks[0][0].bias += torch.arange(32.0)
-    torch.testing.assert_close(positioned(z, t), plain(z, t), rtol=0, atol=1e-4)
+    torch.testing.assert_close(positioned(z, t), plain(z, t), rtol=0, atol=1e-9)
 
 
 def test_schedule_is_the_published(diffusion: dict[str, Any]):

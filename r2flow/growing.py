@@ -1,0 +1,56 @@
+"""A flow of larger images around a trained one: what small images taught goes on inside it."""
+
+from typing import Any
+
+import torch
+
+from r2flow.backbones import Pyramid
+from r2flow.checkpoints import Checkpoint, weights_hash
+from r2flow.errors import InputError
+from r2flow.generators import RectifiedFlow, build_generator
+from r2flow.noise import seed_torch
+
+
+def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Checkpoint:
+    """A flow of larger images of the same view, by a `Pyramid` around the network of a trained one.
+
+    Before it has learned more (`stage.init`), it draws the trained flow's images, spread over the larger ones.
+
+    Args:
+        checkpoint: A flow without a condition; of a flow map, its velocity.
+        shape: Rows and columns, multiples of the trained ones.
+        options: Further options of `Pyramid`.
+
+    Raises:
+        InputError: no such flow, or another size.
+    """
+    flow = checkpoint.generator
+    if not isinstance(flow, RectifiedFlow) or flow.condition_channels:
+        raise InputError(f"{checkpoint.path} holds a {type(flow).__name__}; only a flow of whole scans can grow.")
+    rows, columns = checkpoint.sensor.shape
+    if shape[0] % rows or shape[1] % columns or shape == (rows, columns):
+        raise InputError(
+            f"images of {rows}x{columns} cannot grow to {shape[0]}x{shape[1]}: give multiples of both, such as "
+            f"{2 * rows}x{4 * columns}."
+        )
+    inner = flow.backbone
+    config = {
+        "sensor": {**checkpoint.config["sensor"], "rows": shape[0], "columns": shape[1]},
+        "encoding": checkpoint.config["encoding"],
+        "generator": {"name": "rectified_flow"},
+        "backbone": {
+            "name": "pyramid",
+            "inner": checkpoint.config["backbone"],
+            "factor": [shape[0] // rows, shape[1] // columns],
+            **options,
+        },
+        "parent": {"path": str(checkpoint.path), "weights": weights_hash(checkpoint), "step": checkpoint.step},
+    }
+    with torch.random.fork_rng(devices=[]):
+        seed_torch(0, "weights")
+        larger = build_generator(config)
+    assert isinstance(larger, RectifiedFlow)
+    assert isinstance(larger.backbone, Pyramid)
+    kept = {name: value for name, value in inner.state_dict().items() if name not in inner.second_time_names()}
+    larger.backbone.inner.load_state_dict(kept)
+    return Checkpoint(larger.eval(), config)

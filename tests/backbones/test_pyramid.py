@@ -1,0 +1,100 @@
+"""A network for large images around one for small ones."""
+
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+from tiny_backbones import COLUMNS, ROWS, image, rays, tiny, untrained
+from torch import nn
+
+from r2flow.backbones import BACKBONES, build_backbone
+from r2flow.backbones.base import precondition
+from r2flow.backbones.layers import wrapped
+from r2flow.errors import InputError
+
+TIMES = (0.0, 0.01, 0.3, 0.7, 0.98, 1.0)
+
+
+def tiny_options(name: str) -> dict[str, Any]:
+    return {"name": name, **BACKBONES[name].tiny_options()}
+
+
+class OfAGaussian(nn.Module):
+    """The velocity of the flow to N(0, std^2), which is linear."""
+
+    def __init__(self, std: float) -> None:
+        super().__init__()
+        self.std = std
+
+    def forward(self, t: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        return precondition(t, self.std)[1] * y
+
+
+@pytest.mark.parametrize("t", TIMES)
+@pytest.mark.parametrize("factor", [[1, 2], [2, 4]])
+def test_it_is_the_velocity_of_a_gaussian_whose_means_and_rest_are_independent(t, factor):
+    """x_1 ~ N(0, C) with C = n S^2 Q + s^2 (1 - Q), Q the projection onto means: v = (t C - (1 - t)) V^-1 x_t, V the
+    covariance t^2 C + (1 - t)^2 of x_t."""
+    model = untrained("pyramid", factor=factor, below_std=0.3).double()
+    model.inner = OfAGaussian(0.8)
+    n, size = factor[0] * factor[1], ROWS * COLUMNS
+    pixels = torch.eye(size, dtype=torch.float64).reshape(size, 1, ROWS, COLUMNS)
+    q = F.avg_pool2d(pixels, factor).repeat_interleave(factor[0], 2).repeat_interleave(factor[1], 3).reshape(size, size)
+    one = torch.eye(size, dtype=torch.float64)
+    c = n * 0.8**2 * q + 0.3**2 * (one - q)
+    x = torch.randn(2, size, dtype=torch.float64)
+    expected = torch.linalg.solve(t**2 * c + (1 - t) ** 2 * one, x.T).T @ (t * c - (1 - t) * one)
+    with torch.no_grad():
+        found = model(t, x.reshape(1, 2, ROWS, COLUMNS)).reshape(2, size)
+    assert torch.allclose(found, expected, rtol=1e-6, atol=1e-6)  # times are float32
+
+
+def test_the_inner_network_sees_the_mean_rays():
+    model = untrained("pyramid", factor=[2, 4])
+    assert torch.allclose(model.inner.coords, rays(ROWS // 2, COLUMNS // 4), atol=1e-6)
+
+
+def test_a_turned_image_gives_a_turned_answer():
+    model = tiny("pyramid", inner={**tiny_options("adm_unet"), "position": "none"}).double()
+    x = image().double()
+    turned = model(0.4, x.roll(16, -1))
+    assert torch.allclose(turned, model(0.4, x).roll(16, -1), atol=1e-5)
+
+
+def test_a_condition_is_seen_inside_and_around():
+    model = tiny("pyramid", 5, 2)
+    x = image(1, 5)
+    for channel in (2, 3, 4):
+        other = x.clone()
+        other[:, channel] += 1
+        assert not torch.equal(model(0.5, x), model(0.5, other))
+        assert not torch.equal(model.inner(0.5, other[..., ::2]), model.inner(0.5, x[..., ::2]))
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"factor": [1, 1]}, "backbone.factor must be of more than one pixel"),
+    ({"factor": [2]}, "factor must be 2 integers"),
+    ({"inner": {"name": "hdi"}}, "hdit"),
+    ({"inner": {"depths": [1]}}, "needs a 'name'"),
+])  # fmt: skip
+def test_what_cannot_be_built(options, message):
+    with pytest.raises(InputError, match=message):
+        untrained("pyramid", **options)
+
+
+def test_images_that_the_inner_network_cannot_see_the_means_of():
+    options = {"name": "pyramid", "inner": {**tiny_options("hdit"), "patch": [2, 4]}}
+    for rows, columns in ((12, 64), (15, 64), (16, 48)):
+        with pytest.raises(InputError, match=r"it must be a multiple of (8|32); nearest"):
+            build_backbone(options, rays(rows, columns), 2)
+
+
+@pytest.mark.parametrize(("left", "right", "columns"), [(1, 1, 8), (2, 1, 3), (0, 3, 5), (1, 1, 2), (1, 1, 1)])
+def test_wrapped_is_circular_padding_with_its_gradient(left, right, columns):
+    x = torch.randn(2, 3, 4, columns, requires_grad=True)
+    weights = torch.randn(2, 3, 4, columns + left + right)
+    ours, theirs = wrapped(x, left, right), F.pad(x, (left, right, 0, 0), mode="circular")
+    assert torch.equal(ours, theirs)
+    (a,), (b,) = (torch.autograd.grad((y * weights).sum(), x) for y in (ours, theirs))
+    assert torch.allclose(a, b, atol=1e-6)
