@@ -20,7 +20,12 @@ ROOMS = {
     "evaluation": (4, 0, ("evaluation",), "sets of scans compared"),
     "runs": (4, 1, ("runs", "lineage"), "run folders"),
     "stages": (5, 1, ("stages",), "how a generator is learned"),
-    "checkpoints": (6, 1, ("checkpoints", "published", "sampling", "completion", "growing"), "a generator on disk; its scans"),
+    "checkpoints": (
+        6,
+        1,
+        ("checkpoints", "published", "sampling", "completion", "growing"),
+        "a generator on disk; its scans",
+    ),
     "data": (7, 1, ("data",), "data sets, pairs, batches"),
     "metrics": (8, 0, ("metrics",), "distances, their networks"),
     "simulator": (8, 1, ("simulator",), "street scenes, ray-cast"),

@@ -37,7 +37,7 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     target = Path(os.path.realpath(path))
     temporary = None
     try:
-        handle, temporary = tempfile.mkstemp(".part", f".{target.name}.", None if is_stream else target.parent)
+        handle, temporary = _temporary(target.name, None if is_stream else target.parent)
         # A file's name may be part of a text, and need not be UTF-8.
         encoding, errors = (None, None) if "b" in mode else ("utf-8", "backslashreplace")
         with os.fdopen(handle, mode, encoding=encoding, errors=errors) as file:
@@ -62,6 +62,16 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
         if temporary is not None:
             with suppress(FileNotFoundError):
                 os.unlink(temporary)
+
+
+def _temporary(name: str, folder: Path | None) -> tuple[int, str]:
+    """An open temporary file in a folder, which another process that is done with it may have removed meanwhile."""
+    for _ in range(20):
+        with suppress(FileNotFoundError):
+            return tempfile.mkstemp(".part", f".{name}.", folder)
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+    return tempfile.mkstemp(".part", f".{name}.", folder)
 
 
 def refuse_unreadable(path: Path, largest: int, what: str = "file") -> None:
@@ -130,7 +140,10 @@ def _umask() -> int:
 def _sync_folder(folder: Path) -> None:
     if os.name == "nt":  # folders cannot be opened for syncing there
         return
-    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except FileNotFoundError:  # whoever took the file out of it removed it
+        return
     try:
         os.fsync(descriptor)
     finally:

@@ -3,6 +3,7 @@ import io
 import os
 import socket
 import stat
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,36 @@ def test_the_file_that_a_link_leads_to_is_replaced(tmp_path, to):
     assert target.stat().st_ino != before  # replaced as a whole
     assert os.readlink(tmp_path / "link") == to
     assert os.listdir(target.parent) == ["file"]
+
+
+def test_a_folder_that_another_process_removes_is_made_again(tmp_path, monkeypatch):
+    """The batches of a shard lie in a folder that goes when the last of them is sealed, by whichever process."""
+    folder, make = tmp_path / "batches", tempfile.mkstemp
+    lost = iter([True, True, False])
+
+    def late(*arguments):
+        if next(lost):
+            folder.rmdir()
+        return make(*arguments)
+
+    monkeypatch.setattr(tempfile, "mkstemp", late)
+    with atomic_write(folder / "one", "w") as file:
+        file.write("kept")
+    assert (folder / "one").read_text() == "kept"
+
+
+def test_a_file_that_another_process_takes_with_its_folder_was_written(tmp_path, monkeypatch):
+    folder, replace = tmp_path / "batches", os.replace
+
+    def taken(source, target):
+        replace(source, target)
+        os.unlink(target)
+        folder.rmdir()
+
+    monkeypatch.setattr(os, "replace", taken)
+    with atomic_write(folder / "one", "w") as file:
+        file.write("taken")
+    assert not folder.exists()
 
 
 def test_a_link_to_nothing_is_refused_in_one_line(tmp_path):
