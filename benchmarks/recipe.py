@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 
 from r2flow.checkpoints import load_checkpoint
 from r2flow.files import atomic_write
@@ -27,6 +28,7 @@ from r2flow.flow.path import interpolate
 from r2flow.lidar.sensors import build_sensor
 from r2flow.metrics.fidelity import distances, panel
 from r2flow.noise import standard_normal
+from r2flow.reports.pages import STYLES, blank_figure, few_log_ticks
 from r2flow.reports.tables import table
 from r2flow.sampling import sample
 from r2flow.simulator import simulate
@@ -112,6 +114,31 @@ def make_scenes(folder: Path, seed: int) -> None:
     subprocess.run([*command, "--seed", str(seed), "--size", "32x256", "--format", "npy"], check=True)
 
 
+def curves(rows: list[list[Any]], floor: float) -> Figure:
+    """Panel and loss against seconds, a line for each recipe of several budgets and a dot for each seed."""
+    figure = blank_figure(9, 3.6)
+    for axes, key in zip(figure.subplots(1, 2), ("panel", "loss"), strict=True):
+        for name, style in zip(ALL_BUDGETS, STYLES, strict=False):
+            own = [(budget, found[key]) for one, budget, _, found in rows if one == name]
+            budgets = sorted({budget for budget, _ in own})
+            means = [np.mean([value for other, value in own if other == budget]) for budget in budgets]
+            axes.plot(budgets, means, label=name, **style)
+            axes.plot(*zip(*own, strict=True), ".", color=style["color"])
+        if key == "panel":
+            axes.axhline(floor, color="grey", ls="--", label="other simulated scans")
+        axes.set(
+            xlabel="CPU seconds",
+            ylabel={"panel": "panel's mean", "loss": "held-out loss"}[key],
+            xscale="log",
+            yscale="log",
+        )
+        few_log_ticks(axes.xaxis)
+        few_log_ticks(axes.yaxis)
+        axes.grid(alpha=0.3, which="both")
+        axes.legend(fontsize=8)
+    return figure
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
@@ -161,6 +188,7 @@ def main() -> None:
         text += f"{key}: fast at {EARLY} s is no farther than before at {LATE} s in {held} of {len(both)} seeds\n"
     with atomic_write(given.out / "recipe.md") as file:
         file.write(text.encode())
+    curves(rows, float(np.mean(list(floor.values())))).savefig(given.out / "recipe.png", dpi=110)
     print(text)
 
 
