@@ -51,6 +51,8 @@ RULES: dict[str, Key] = {
     "backbone": OF_THE_MODEL,
     "backbone.attention": replace(OF_THE_MODEL, inherited="unless_given"),  # the weights fit all the same
     "backbone.dropout": replace(OF_THE_MODEL, inherited="unless_given"),
+    "backbone.inner.attention": replace(OF_THE_MODEL, inherited="unless_given"),
+    "backbone.inner.dropout": replace(OF_THE_MODEL, inherited="unless_given"),
     "stage.init": FREE,
     "data": OF_SCANS,
     "data.root": replace(OF_SCANS, resume="free"),

@@ -5,16 +5,19 @@ from typing import Any
 import torch
 
 from r2flow.backbones import Pyramid
+from r2flow.backbones.base import CommonOptions
 from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.generators import RectifiedFlow, build_generator
 from r2flow.noise import seed_torch
+from r2flow.registry import options_of
 
 
 def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Checkpoint:
     """A flow of larger images of the same view, by a `Pyramid` around the network of a trained one.
 
-    Before it has learned more (`stage.init`), it draws the trained flow's images, spread over the larger ones.
+    The means of what it draws are the images of the trained flow. Below them is noise, until it has learned more
+    (`stage.init`).
 
     Args:
         checkpoint: A flow without a condition; of a flow map, its velocity.
@@ -27,6 +30,13 @@ def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Che
     flow = checkpoint.generator
     if not isinstance(flow, RectifiedFlow) or flow.condition_channels:
         raise InputError(f"{checkpoint.path} holds a {type(flow).__name__}; only a flow of whole scans can grow.")
+    if flow.sampler.fixed:
+        raise InputError(
+            f"{checkpoint.path} was distilled for its own steps and knows no other times: grow the flow that it was "
+            "distilled from."
+        )
+    if "published" in checkpoint.config and checkpoint.config["data"]["projection"] == "unfolding":
+        raise InputError(f"{checkpoint.path} was trained on unfolded scans, whose rings have no rows between them.")
     rows, columns = checkpoint.sensor.shape
     if shape[0] % rows or shape[1] % columns or shape == (rows, columns):
         raise InputError(
@@ -34,14 +44,18 @@ def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Che
             f"{2 * rows}x{4 * columns}."
         )
     inner = flow.backbone
+    usual = {key: list(value) if isinstance(value, tuple) else value for key, value in options_of(Pyramid, 1).items()}
+    usual = {key: value for key, value in usual.items() if key not in CommonOptions.__annotations__}
     config = {
         "sensor": {**checkpoint.config["sensor"], "rows": shape[0], "columns": shape[1]},
         "encoding": checkpoint.config["encoding"],
         "generator": {"name": "rectified_flow"},
         "backbone": {
             "name": "pyramid",
-            "inner": checkpoint.config["backbone"],
+            **usual,
             "factor": [shape[0] // rows, shape[1] // columns],
+            "inner": checkpoint.config["backbone"],
+            "ring": checkpoint.config["backbone"].get("ring", True),
             **options,
         },
         "parent": {"path": str(checkpoint.path), "weights": weights_hash(checkpoint), "step": checkpoint.step},

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint, load_checkpoint, weights_hash
 from r2flow.errors import InputError
-from r2flow.generators import build_generator
+from r2flow.generators import Sampler, build_generator
 from r2flow.growing import grown
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
@@ -53,8 +53,10 @@ def test_a_flow_map_gives_its_velocity():
 
 def test_it_is_the_same_every_time_and_other_draws_go_on_as_they_would():
     small, state = flow(), torch.random.get_rng_state()
-    assert weights_hash(grown(small, (16, 128))) == weights_hash(grown(small, (16, 128)))
+    first = weights_hash(grown(small, (16, 128)))
     assert torch.equal(torch.random.get_rng_state(), state)
+    torch.rand(1)
+    assert weights_hash(grown(small, (16, 128))) == first
 
 
 @pytest.mark.parametrize("shape", [(8, 64), (8, 100), (12, 64), (4, 32), (16, 63)])
@@ -66,6 +68,19 @@ def test_a_size_that_is_no_multiple(shape):
 def test_other_generators_do_not_grow():
     with pytest.raises(InputError, match="holds a ConditionalFlow; only a flow of whole scans can grow"):
         grown(flow(generator={"name": "conditional_flow"}), (16, 128))
+
+
+def test_flows_that_know_some_times_alone_do_not_grow():
+    small = flow()
+    small.generator.sampler = Sampler("euler", 2, fixed=True)
+    with pytest.raises(InputError, match="grow the flow that it was distilled from"):
+        grown(small, (16, 128))
+
+
+def test_a_diffusion_has_no_time_for_a_pyramid():
+    large = grown(flow(), (16, 128))
+    with pytest.raises(InputError, match="a pyramid needs the time of straight lines"):
+        build_generator({**large.config, "generator": {"name": "diffusion"}})
 
 
 def test_a_grown_flow_is_trained_and_drawn_from(r2flow, saved, tmp_path):  # noqa: F811

@@ -129,6 +129,17 @@ def test_weights_move_to_another_size_where_none_belongs_to_a_place(position: st
         assert torch.equal(ours.velocity(t, x), same.velocity(t, x))
 
 
+def test_a_network_inside_another_looks_elsewhere_too():
+    inner = {**CONFIG["backbone"], "position": "none"}
+    config = {**CONFIG, "backbone": {"name": "pyramid", "inner": inner, "factor": [1, 2]}}
+    theirs, ours = (build_generator(sized(config, *size)) for size in ((8, 64), (16, 128)))
+    rays = ours.backbone.inner.coords.clone()
+    assert rays.shape[2:] == (16, 64)
+    ours.start_from(theirs)
+    assert torch.equal(ours.backbone.inner.coords, rays)
+    assert torch.equal(ours.backbone.inner.tokenizer[0].weight, theirs.backbone.inner.tokenizer[0].weight)
+
+
 def test_weights_that_belong_to_a_place_do_not_move():
     theirs, ours = (build_generator(sized(CONFIG, *size, position="learnable")) for size in ((8, 64), (16, 128)))
     with pytest.raises(InputError, match=r"weights for images of 1x8x64 alone .*found 1x16x128: leave sensor out"):

@@ -206,7 +206,10 @@ class Backbone(ExactBuffers):
         if min(self.in_channels, self.out_channels) < 1:
             raise InputError(f"{name} needs channels; found {self.in_channels} in and {self.out_channels} out.")
         if self.second_time and not self.takes_second_time:
-            raise InputError(f"{name} takes no second time: choose a backbone that does, such as hdit.")
+            raise InputError(
+                f"{name} takes no second time: choose a backbone that does, such as hdit; without one, a "
+                "flow is straightened and distilled (stage=reflow, stage=distill), but has no flow map."
+            )
         for dimension, size, unit in zip(("height", "width"), rays.shape[1:], self.unit, strict=True):
             if size % unit or size == 0:
                 below = size // unit * unit

@@ -32,7 +32,8 @@ class Pyramid(Backbone):
 
         v(t, x_t) = U P v + skip(t) h + out(t) F(t, h, y, y + (1 - t') v')
 
-    F starts at zero. So the network draws as soon as the inner one does, in small images spread over large ones.
+    F starts at zero. So the means of what the network draws are at once the images of the inner one; below them is
+    noise.
 
     Args:
         rays: Elevation and azimuth of every pixel in radians, (2, H, W).
@@ -41,7 +42,8 @@ class Pyramid(Backbone):
         coarse: Blocks and channels of the path among the means.
         detail: Blocks and channels of the path among the pixels.
         time_channels: Width of the path's time embedding.
-        below_std: Standard deviation of x_1 - U P x_1 in model space.
+        below_std: Standard deviation of x_1 - U P x_1 in model space, times sqrt(n / (n - 1)), for a mean of n values
+            takes a degree of freedom.
         ring: Whether the columns are a full turn.
         common: See `Backbone`.
 
@@ -63,6 +65,8 @@ class Pyramid(Backbone):
     ) -> None:
         from r2flow.backbones import build_backbone
 
+        if common.get("data_std") is not None:
+            raise InputError("a pyramid has below_std, and its inner network data_std: leave backbone.data_std out.")
         rows, columns = integers("factor", factor, 2)
         if rows * columns == 1:
             raise InputError("backbone.factor must be of more than one pixel, such as [2, 4]; found [1, 1].")
@@ -72,8 +76,11 @@ class Pyramid(Backbone):
         seen = mean_rays(rays[None], (rows, columns))[0] if whole else rays.new_zeros(ANY_SIZE)
         try:
             small = build_backbone(inner, seen, channels, answered)
-        except InputError:
-            small = build_backbone(inner, rays.new_zeros(ANY_SIZE), channels, answered)  # unless the size is at fault
+        except InputError as error:
+            try:
+                small = build_backbone(inner, rays.new_zeros(ANY_SIZE), channels, answered)
+            except InputError:  # the size is not at fault
+                raise error from None
         super().__init__(rays, (rows * small.unit[0], columns * small.unit[1]), **common)
         self.factor, self.below_std, self.inner = (rows, columns), below_std, small
         blocks, width = integers("coarse", coarse, 2)
@@ -96,9 +103,8 @@ class Pyramid(Backbone):
         velocity = self.inner(later, y)
         estimate = state + (1 - later)[:, None, None, None] * velocity
         into, skip, out = precondition(t, self.below_std)
-        path = self._path(
-            t, torch.cat([into * below, self._spread(estimate), rest], dim=1), torch.cat([y, estimate], dim=1)
-        )
+        pixels = torch.cat([into * below, rest, self._spread(estimate)], dim=1)  # as the means: image, condition, more
+        path = self._path(t, pixels, torch.cat([y, estimate], dim=1)).to(x.dtype)
         return self._spread((root - 1) / root * state + velocity / wide) + skip * below + out * path
 
     def _path(self, t: Tensor, pixels: Tensor, means: Tensor) -> Tensor:
@@ -107,7 +113,7 @@ class Pyramid(Backbone):
         h = self.entrance(means.to(dtype))
         for block in self.coarse:
             h = block(h, condition)
-        return self.detail(pixels.to(dtype), h.permute(0, 2, 3, 1), condition).to(pixels.dtype)
+        return self.detail(pixels.to(dtype), h.permute(0, 2, 3, 1), condition)
 
     def _means(self, x: Tensor) -> Tensor:
         return x.unflatten(3, (-1, self.factor[1])).unflatten(2, (-1, self.factor[0])).mean((3, 5))

@@ -198,7 +198,7 @@ def grow(
 ) -> None:
     """Put convolutions at a higher resolution around a trained flow's network, to train it on larger images.
 
-    Until it has learned more, it draws what the trained flow draws, spread over the larger images.
+    The means of what it draws are the images of the trained flow. Below them is noise, until it has learned more.
     """
     from r2flow.checkpoints import load_checkpoint, save_checkpoint
     from r2flow.growing import grown

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from r2flow.backbones import Pyramid
 from r2flow.diffusion.log_snr import SCHEDULES, alpha_sigma, for_images, log_snr_of, straight_time
 from r2flow.diffusion.objectives import PREDICTIONS
 from r2flow.diffusion.sampling import DDIM, DDPM, eta_of, walk
@@ -53,6 +54,8 @@ class Diffusion(NetworkFlow):
         clip: Positive | None = 1.0,
     ) -> None:
         super().__init__(space, backbone)
+        if isinstance(self.backbone, Pyramid):
+            raise InputError("a pyramid needs the time of straight lines, and a diffusion has another: choose hdit.")
         self.prediction, self.clip, self.answer = PREDICTIONS[prediction], clip, f"{prediction}(z, log-SNR)"
         self.schedule = SCHEDULES.build(schedule or {"name": "cosine"})
         self.sampler = Sampler(DDPM, 256)  # as the published scripts

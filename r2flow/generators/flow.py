@@ -219,7 +219,7 @@ class NetworkFlow(Flow):
         new = {name: value for name, value in own.items() if not name.startswith("backbone.")}
         new |= {name: own[name] for name in (f"backbone.{name}" for name in self.backbone.second_time_names())}
         if not torch.equal(self.space.rays, parent.space.rays):
-            theirs = {**theirs, "backbone.coords": own["backbone.coords"]}
+            theirs |= {name: value for name, value in own.items() if name.endswith(".coords")}  # of an inner one too
             sized = [name for name, value in theirs.items() if name in own and value.shape != own[name].shape]
             if sized:
                 here, there = ("x".join(map(str, one.space.shape)) for one in (self, parent))

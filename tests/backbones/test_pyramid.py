@@ -62,14 +62,17 @@ def test_a_turned_image_gives_a_turned_answer():
     assert torch.allclose(turned, model(0.4, x).roll(16, -1), atol=1e-5)
 
 
-def test_a_condition_is_seen_inside_and_around():
-    model = tiny("pyramid", 5, 2)
+@pytest.mark.parametrize("channel", [2, 3, 4])
+def test_a_condition_is_seen_inside_and_around(channel):
+    model, seen = tiny("pyramid", 5, 2), []
+    model.inner.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[1]))
     x = image(1, 5)
-    for channel in (2, 3, 4):
-        other = x.clone()
-        other[:, channel] += 1
-        assert not torch.equal(model(0.5, x), model(0.5, other))
-        assert not torch.equal(model.inner(0.5, other[..., ::2]), model.inner(0.5, x[..., ::2]))
+    other = x.clone()
+    other[:, channel] += torch.tensor([1.0, -1.0]).repeat(COLUMNS // 2)  # the means are what they were
+    around = model(0.5, x), model(0.5, other)
+    assert torch.allclose(*seen, atol=1e-6)
+    assert (around[0] - around[1]).abs().max() > 1e-3
+    assert torch.allclose(seen[0][:, 2:], F.avg_pool2d(x[:, 2:], (1, 2)), atol=1e-6)
 
 
 @pytest.mark.parametrize(("options", "message"), [
@@ -77,6 +80,9 @@ def test_a_condition_is_seen_inside_and_around():
     ({"factor": [2]}, "factor must be 2 integers"),
     ({"inner": {"name": "hdi"}}, "hdit"),
     ({"inner": {"depths": [1]}}, "needs a 'name'"),
+    ({"inner": {"name": "hdit", "patch": [3, 4]}}, "height 16 cannot be used by HDiT"),
+    ({"data_std": 0.5}, "leave backbone.data_std out"),
+    ({"second_time": True}, "a flow is straightened and distilled"),
 ])  # fmt: skip
 def test_what_cannot_be_built(options, message):
     with pytest.raises(InputError, match=message):

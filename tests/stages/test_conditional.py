@@ -8,6 +8,7 @@ import torch
 from scipy.stats import norm
 
 from r2flow import noise
+from r2flow.backbones import Pyramid
 from r2flow.data.loader import FlowDataset
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
@@ -108,6 +109,19 @@ def test_a_rolled_scan_has_rolled_answers(flow, scans):
     plain = flow.generate(x_0, told, sampler=Sampler("euler", 2)).x
     rolled = flow.generate(x_0.roll(8, -1), turned, sampler=Sampler("euler", 2)).x
     assert torch.allclose(rolled, plain.roll(8, -1), atol=1e-4)
+
+
+def test_a_pyramid_too_starts_as_the_flow_that_it_starts_from():
+    config = {**CONFIG, "backbone": {"name": "pyramid", **Pyramid.tiny_options()}}
+    parent, child = (
+        build_generator({**config, "generator": {"name": n}}) for n in ("rectified_flow", "conditional_flow")
+    )
+    with torch.no_grad():
+        for parameter in parent.parameters():
+            parameter.normal_(std=0.2)
+        child.start_from(parent)
+        x, t = torch.randn(3, 2, 8, 32), torch.tensor(0.5)
+        assert torch.allclose(child.velocity(t, x), parent.velocity(t, x), atol=1e-5)
 
 
 @pytest.mark.parametrize("backbone", [{}, {"detail": None}])
