@@ -39,6 +39,11 @@ MODELS: Registry[Model] = Registry(
         "street scenes in any number of evaluations, learned from simulated scans",
         "5391347f40a829b72abec7c3c2a938b21f3e4b5bca53bb0d12f92e07f6d75d95",
     ),
+    street_full=Model(
+        "street scenes at 64 x 1024, learned from simulated scans",
+        "46ead53026a7d50cb691e030185f65b62264f8380a1109683f07e99d47bb49a8",
+        page="release/street_full.safetensors in the source of r2flow",
+    ),
 )
 DEFAULT = "street"
 
