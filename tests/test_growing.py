@@ -6,7 +6,7 @@ from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint, load_checkpoint, weights_hash
 from r2flow.errors import InputError
-from r2flow.generators import Sampler, build_generator
+from r2flow.generators import RectifiedFlow, Sampler, build_generator
 from r2flow.growing import grown
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
@@ -26,10 +26,11 @@ def means(x: Tensor) -> Tensor:
     return torch.nn.functional.avg_pool2d(x, (2, 4))
 
 
-def test_it_follows_the_trained_flow_in_the_means_of_its_images():
+@pytest.mark.parametrize("generator", ["rectified_flow", "flow_map"])
+def test_it_follows_the_trained_flow_in_the_means_of_its_images(generator):
     """Means of x_t are a state of the trained flow at t' = t sqrt(n) / w, w = t sqrt(n) + 1 - t, times w / sqrt(n): the
     trained flow's velocity there, with this factor's rate of change, is theirs."""
-    small = flow()
+    small = flow(generator={"name": generator})
     large = grown(small, (16, 256))
     assert large.sensor.shape == (16, 256)
     x, root = torch.randn(3, 2, 16, 256), 8**0.5
@@ -37,16 +38,16 @@ def test_it_follows_the_trained_flow_in_the_means_of_its_images():
         w = t * root + 1 - t
         y = means(x) * root / w
         # d(w / root y) / dt = (root - 1) / root y + w / root y' dt' / dt, dt' / dt = root / w^2
-        expected = (root - 1) / root * y + small.generator.velocity(torch.tensor(t * root / w), y) / w
         with torch.no_grad():
+            expected = (root - 1) / root * y + small.generator.velocity(torch.tensor(t * root / w), y) / w
             found = means(large.generator.velocity(torch.tensor(t), x))
         assert torch.allclose(found, expected, atol=1e-5)
 
 
-def test_a_flow_map_gives_its_velocity():
+def test_of_a_flow_map_a_flow_grows():
     small = flow(generator={"name": "flow_map"})
     large = grown(small, (16, 128))
-    assert type(large.generator).__name__ == "RectifiedFlow"
+    assert type(large.generator) is RectifiedFlow
     assert not large.generator.backbone.second_time
     assert large.config["parent"]["weights"] == weights_hash(small)
 
@@ -75,6 +76,13 @@ def test_flows_that_know_some_times_alone_do_not_grow():
     small.generator.sampler = Sampler("euler", 2, fixed=True)
     with pytest.raises(InputError, match="grow the flow that it was distilled from"):
         grown(small, (16, 128))
+
+
+def test_rings_do_not_grow():
+    small = flow()
+    published = Checkpoint(small.generator, {**small.config, "published": {}, "data": {"projection": "unfolding"}})
+    with pytest.raises(InputError, match="whose rings have no rows between them"):
+        grown(published, (16, 128))
 
 
 def test_a_diffusion_has_no_time_for_a_pyramid():

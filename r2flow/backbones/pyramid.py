@@ -91,6 +91,7 @@ class Pyramid(Backbone):
         count, wide = integers("detail", detail, 2)
         self.detail = Detail(count, wide, ends, width, self.factor, time_channels, ring)
 
+    # Not `velocity`: that is given x in the type of the weights, and means and rest are taken of the exact x.
     def _evaluated(self, t: Tensor, x: Tensor, s: Tensor | float | None) -> Tensor:
         image, rest = x[:, : self.out_channels], x[:, self.out_channels :]
         means = self._means(x)

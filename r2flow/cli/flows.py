@@ -17,6 +17,7 @@ from r2flow.cli.options import (
     SizeOption,
     build_sized,
     choose_device,
+    rows_and_columns,
 )
 from r2flow.errors import InputError
 
@@ -206,7 +207,7 @@ def grow(
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: give a .safetensors, which holds a flow and its config.")
     found = load_checkpoint(checkpoint)
-    larger = grown(found, build_sized("hdl64e", size).shape)
+    larger = grown(found, found.sensor.resized(*rows_and_columns(size)).shape)
     save_checkpoint(larger, out)
     before, after = ("x".join(map(str, one.sensor.shape)) for one in (found, larger))
     print(f"{out}: images of {after} by a network for {before}. Now train it:")

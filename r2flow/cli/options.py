@@ -65,7 +65,7 @@ def build_sized(sensor: str, size: str | None) -> "Sensor":
     from r2flow.lidar.sensor_files import ENDINGS, read_sensor
     from r2flow.lidar.sensors import build_sensor
 
-    rows, columns = _rows_and_columns(size)
+    rows, columns = rows_and_columns(size)
     if sensor.lower().endswith(ENDINGS):
         return read_sensor(sensor, rows, columns)
     return build_sensor(sensor, rows, columns)
@@ -107,7 +107,7 @@ def choose_reading(
     elif sensor is not None:
         found = replace(found, sensor=build_sized(sensor, size))
     elif size is not None:
-        found = replace(found, sensor=found.sensor.resized(*_rows_and_columns(size)))
+        found = replace(found, sensor=found.sensor.resized(*rows_and_columns(size)))
     check_words(projection=projection, convention=convention)
     for spec in named:  # before anything is read
         options, _ = parse(str(spec))
@@ -134,7 +134,8 @@ def check_words(**options: str | None) -> None:
             raise InputError(f"--{option.replace('_', '-')} must be one of {words}; found {value!r}.")
 
 
-def _rows_and_columns(size: str | None) -> tuple[int | None, int | None]:
+def rows_and_columns(size: str | None) -> tuple[int | None, int | None]:
+    """The numbers of an image size written as 64x1024; of no size, None for both."""
     if size is None:
         return None, None
     parts = size.lower().split("x")
