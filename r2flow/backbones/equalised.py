@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from r2flow.adversarial.masks import logistic, straight_through_mask
 from r2flow.adversarial.processes import averaged
-from r2flow.backbones.layers import ExactBuffers, at_least_float32
+from r2flow.backbones.layers import ExactBuffers, at_least_float32, wrapped
 from r2flow.errors import InputError
 
 IMAGE, LOGIT, MASK, ORIGINAL, CODE = "image", "raydrop_logit", "raydrop_mask", "image_orig", "w"
@@ -61,10 +61,11 @@ class Pad(nn.Module):
 
     def __init__(self, ring: bool, edge: str) -> None:
         super().__init__()
-        self.columns, self.rows = "circular" if ring else edge, edge
+        self.ring, self.edge = ring, edge
 
     def forward(self, x: Tensor) -> Tensor:
-        return F.pad(F.pad(x, (1, 1, 0, 0), mode=self.columns), (0, 0, 1, 1), mode=self.rows)
+        x = wrapped(x, 1, 1) if self.ring else F.pad(x, (1, 1, 0, 0), mode=self.edge)
+        return F.pad(x, (0, 0, 1, 1), mode=self.edge)
 
 
 class Filter(ExactBuffers):
@@ -81,14 +82,15 @@ class Filter(ExactBuffers):
         super().__init__()
         taps = torch.tensor(window, dtype=torch.float32)
         self.register_buffer("kernel", taps / taps.sum())
-        self.columns, self.axes = "circular" if ring else "replicate", axes
+        self.ring, self.axes = ring, axes
 
     def forward(self, x: Tensor) -> Tensor:
         size, channels = len(self.kernel), x.shape[1]
         before, after = size // 2, (size - 1) // 2
         kernel = self.kernel.to(x.dtype).expand(channels, 1, 1, -1)
         if "w" in self.axes:
-            x = F.conv2d(F.pad(x, (before, after, 0, 0), mode=self.columns), kernel, groups=channels)
+            x = wrapped(x, before, after) if self.ring else F.pad(x, (before, after, 0, 0), mode="replicate")
+            x = F.conv2d(x, kernel, groups=channels)
         if "h" in self.axes:
             x = F.conv2d(F.pad(x, (0, 0, before, after), mode="replicate"), kernel.mT, groups=channels)
         return x
