@@ -8,7 +8,7 @@ import torch
 from r2flow.errors import InputError
 from r2flow.generators.base import Condition, Generated, Generator, Sampler
 from r2flow.generators.budgets import Budget, levels
-from r2flow.generators.conditional import ConditionalFlow, Regression, condition_of
+from r2flow.generators.conditional import ConditionalFlow, ConditionalMap, Regression, condition_of
 from r2flow.generators.diffusion import Diffusion
 from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
 from r2flow.generators.flow_map import FlowMap
@@ -19,9 +19,9 @@ from r2flow.lidar.space import build_space
 from r2flow.registry import Registry
 
 __all__ = [
-    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "Diffusion", "DustyV1", "DustyV2", "Field", "Flow",
-    "FlowMap", "Gan", "Generated", "Generator", "LatentDiffusion", "RectifiedFlow", "Regression", "Sampler",
-    "ScoreModel", "VQAutoencoder", "VanillaGan", "as_flow",
+    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "ConditionalMap", "Diffusion", "DustyV1",
+    "DustyV2", "Field", "Flow", "FlowMap", "Gan", "Generated", "Generator", "LatentDiffusion", "RectifiedFlow",
+    "Regression", "Sampler", "ScoreModel", "VQAutoencoder", "VanillaGan", "as_flow",
     "build_generator", "condition_of", "levels",
 ]  # fmt: skip
 
@@ -30,6 +30,7 @@ GENERATORS: Registry[type[Generator]] = Registry(
     rectified_flow=RectifiedFlow,
     flow_map=FlowMap,
     conditional_flow=ConditionalFlow,
+    conditional_map=ConditionalMap,
     regression=Regression,
     diffusion=Diffusion,
     vanilla_gan=VanillaGan,

@@ -26,6 +26,7 @@ from r2flow.generators.base import (
     parts_of,
 )
 from r2flow.generators.flow import RectifiedFlow
+from r2flow.generators.flow_map import FlowMap
 from r2flow.lidar.interpolation import guess
 from r2flow.lidar.known import Ray
 from r2flow.lidar.region import Region
@@ -122,19 +123,24 @@ class ConditionalFlow(RectifiedFlow):
             self.trust = Trust(space.shape[0])
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
-        image, known, doubtful = parts_of(condition, x)
-        v: Tensor = self.backbone(t, torch.cat([x, image, known, doubtful], dim=1))
-        if condition is None:
-            return v
+        parts = parts_of(condition, x)
+        v: Tensor = self.backbone(t, torch.cat([x, *parts], dim=1))
+        return v if condition is None else self._informed(v, t, x, t, *parts)
+
+    def _informed(
+        self, u: Tensor, t: Tensor, x: Tensor, s: Tensor, image: Tensor, known: Tensor, doubtful: Tensor
+    ) -> Tensor:
+        """The mean velocity from t to s by what is known: u where that tells nothing. At s = t it is the velocity."""
         logit, sigma = self.trust(torch.cat([image, known, doubtful], dim=1))
-        t = expand_time(torch.as_tensor(t, device=x.device, dtype=torch.float32), x)
+        t, s = (expand_time(torch.as_tensor(time, device=x.device, dtype=torch.float32), x) for time in (t, s))
         left, off = 1 - t, x - t * image
         narrow, broad = ((t * std).square() + left.square() for std in (sigma, Trust.BROAD))
         near = logit - (narrow.log() - broad.log() + off.square() / narrow - x.square() / broad) / 2
         told = (known + doubtful).flatten(1).any(1)[:, None, None, None]
-        about = image + (t * sigma.square() - left) / narrow * off
-        mixed = v + near.sigmoid() * told * (about - v)
-        return torch.where(known > 0, (image - x) / left.clamp(min=LAST), mixed).to(v)
+        there = ((s * sigma).square() + (1 - s).square()).sqrt()
+        about = image + off * ((s + t) * sigma.square() - (1 - s) - left) / (narrow.sqrt() * (there + narrow.sqrt()))
+        mixed = u + near.sigmoid() * told * (about - u)
+        return torch.where(known > 0, (image - x) / left.clamp(min=LAST), mixed).to(u)
 
     def generate(
         self,
@@ -166,6 +172,20 @@ class ConditionalFlow(RectifiedFlow):
         flow.space, flow.noise_shape, flow.sampler = self.space, self.noise_shape, self.sampler
         flow.backbone = cast(Backbone, _Untold(self.backbone, self.condition_channels))
         return flow.train(self.training)
+
+
+class ConditionalMap(ConditionalFlow, FlowMap):
+    """u(x, t, s | y): the flow map of a `ConditionalFlow`, so that a scan is completed by a few jumps.
+
+    A known value is on its straight line, whose mean velocity is its velocity. About the guess the flow map of
+    N(g, sigma^2) is exact, X_{t->s}(x) = s g + (V_sigma(s) / V_sigma(t))^(1/2) (x - t g), and is blended with the
+    network's jump by the same r, of time t.
+    """
+
+    def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
+        parts = parts_of(condition, x)
+        u: Tensor = self.backbone(t, torch.cat([x, *parts], dim=1), s)
+        return u if condition is None else self._informed(u, t, x, s, *parts)
 
 
 class _Untold(nn.Module):

@@ -39,13 +39,13 @@ class Flow(Generator):
         """v(t, x), (B, C, H, W), at times t of shape () or (B,)."""
         raise NotImplementedError
 
-    def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+    def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
         """u(t, x, s), what is known at time t of the mean velocity from t to s: v(t, x), but for a flow map."""
-        return self.velocity(t, x)
+        return self.velocity(t, x, condition)
 
     def field(self, condition: Condition | None = None) -> Velocity:
         """v(t, x) under a condition, as solvers take it."""
-        return self.velocity if condition is None else _Conditioned(self, condition)
+        return self.velocity if condition is None else Conditioned(self, condition)
 
     @torch.no_grad()
     def solve(
@@ -323,18 +323,20 @@ def _by_levels(field: Velocity, x: Tensor, how: Sampler, by: Callable[[Velocity,
     return solution
 
 
-class _Conditioned:
-    """v(t, x) of a flow under a condition, which follows the scans that are still being solved."""
+class Conditioned:
+    """v(t, x) or u(t, x, s) of a flow under a condition, which follows the scans that are still asked for."""
 
     def __init__(self, flow: Flow, condition: Condition) -> None:
         self.flow, self.condition = flow, condition
         self.precision = max((p.dtype for p in flow.parameters()), key=lambda kind: torch.finfo(kind).eps)
 
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        return self.flow.velocity(t, x, self.condition)
+    def __call__(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
+        if s is None:
+            return self.flow.velocity(t, x, self.condition)
+        return self.flow.mean_velocity(t, x, s, self.condition)
 
-    def select(self, scenes: Tensor) -> "_Conditioned":
-        return _Conditioned(self.flow, {name: value[scenes.to(value.device)] for name, value in self.condition.items()})
+    def select(self, scenes: Tensor) -> "Conditioned":
+        return Conditioned(self.flow, {name: value[scenes.to(value.device)] for name, value in self.condition.items()})
 
 
 def as_flow(generator: Generator, what: str) -> Flow:

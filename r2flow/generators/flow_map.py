@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.maps import jump
+from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers import Solution
 from r2flow.generators.base import Condition, Generated, Progress, Sampler
-from r2flow.generators.flow import UNTOLD, RectifiedFlow
+from r2flow.generators.flow import UNTOLD, Conditioned, RectifiedFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 
@@ -42,10 +42,16 @@ class FlowMap(RectifiedFlow):
         super().__init__(space, backbone)
         self.sampler = Sampler(JUMP, 4)
 
-    def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+    def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
         """u(x, t, s), (B, C, H, W), the mean velocity from time t to time s, of shape () or (B,)."""
+        if condition is not None:
+            raise InputError(UNTOLD)
         u: Tensor = self.backbone(t, x, s)
         return u
+
+    def map(self, condition: Condition | None = None) -> MeanVelocity:
+        """u(t, x, s) under a condition, as objectives take it."""
+        return self.mean_velocity if condition is None else Conditioned(self, condition)
 
     @torch.no_grad()
     def solve(
@@ -55,16 +61,17 @@ class FlowMap(RectifiedFlow):
         t_1: float = 1.0,
         *,
         sampler: Sampler | None = None,
+        condition: Condition | None = None,
         progress: Progress = None,
         **options: Any,
     ) -> Solution:
         how = sampler or self.sampler
         if how.method != JUMP:
-            return super().solve(x, t_0, t_1, sampler=how, progress=progress, **options)
+            return super().solve(x, t_0, t_1, sampler=how, condition=condition, progress=progress, **options)
         given = [name for name, value in options.items() if value is not None]
         if given:
             raise InputError(f"jumps have no {', '.join(given)}; leave that out, or give a solver, as --solver adams3.")
-        end = self._jumps(x, self._times(how, t_0, t_1), None, progress)
+        end = self._jumps(x, self._times(how, t_0, t_1), condition, None, progress)
         return Solution.build(end.x, end.evaluations.cpu().numpy(), how.steps, 0, False, end.converged.cpu().numpy())
 
     def generate(
@@ -77,22 +84,22 @@ class FlowMap(RectifiedFlow):
         progress: Progress = None,
     ) -> Generated:
         how = sampler or self.sampler
-        if condition is not None and how.method in (JUMP, RENOISE):
-            raise InputError(UNTOLD)
         if how.method != RENOISE:
             return super().generate(noise, condition, sampler=how, draws=draws, progress=progress)
         if draws is None:
             raise InputError("renoise draws further noise: give draws.")
         with torch.no_grad():
-            return self._jumps(noise, self._times(how, 0.0, 1.0), draws, progress)
+            return self._jumps(noise, self._times(how, 0.0, 1.0), condition, draws, progress)
 
-    def _jumps(self, x: Tensor, times: Tensor, draws: Draws | None, progress: Progress) -> Generated:
-        x = x.to(self.device)
+    def _jumps(
+        self, x: Tensor, times: Tensor, condition: Condition | None, draws: Draws | None, progress: Progress
+    ) -> Generated:
+        x, u = x.to(self.device), self.map(condition)
         for n, (t, s) in enumerate(pairwise(times.to(x)), start=1):
             if draws is None:
-                following = jump(self.mean_velocity, t, x, s)
+                following = jump(u, t, x, s)
             else:
-                following = jump(self.mean_velocity, t, x, times[-1].to(x))
+                following = jump(u, t, x, times[-1].to(x))
                 if n < len(times) - 1:
                     following = (1 - s) * self.further_noise(draws, n).to(x) + s * following
             alive = following.isfinite().flatten(1).all(1)

@@ -8,7 +8,7 @@ from r2flow.errors import InputError
 from r2flow.generators import Generator, Sampler
 from r2flow.registry import Registry, check_options
 from r2flow.stages.base import Stage
-from r2flow.stages.conditional import Conditional, Regress
+from r2flow.stages.conditional import Conditional, LearnConditionalMap, Regress
 from r2flow.stages.diffusion import LearnDiffusion
 from r2flow.stages.flow_map import LearnFlowMap
 from r2flow.stages.gan import LearnGan
@@ -24,6 +24,7 @@ STAGES: Registry[type[Stage]] = Registry(
     distill=Distill,
     flow_map=LearnFlowMap,
     conditional=Conditional,
+    conditional_map=LearnConditionalMap,
     regress=Regress,
     diffusion=LearnDiffusion,
     gan=LearnGan,
@@ -55,11 +56,11 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
     options = {"batch_size": config["data"]["batch_size"], "seed": config["seed"], **config["stage"]}
     options.pop("init", None)  # the generator has its weights already
     stage: Stage = STAGES.build(options, generator)
+    stage.config = dict(config)
     stage.check_data(options["name"], config["data"])
     wanted = {key: value for key, value in (config.get("sampler") or {}).items() if value is not None}
     check_options("sampler", Sampler, wanted)
     sampler = generator.sampler.changed(**wanted)
     generator.check_sampler(sampler)
     generator.sampler = sampler
-    stage.config = dict(config)
     return stage

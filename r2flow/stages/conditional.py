@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.data.loader import Further
 from r2flow.errors import InputError
 from r2flow.generators import Condition, ConditionalFlow, Generator, Regression, condition_of
 from r2flow.generators.base import DOUBTFUL, IMAGE, KNOWN
@@ -16,7 +17,8 @@ from r2flow.lidar.faults import FAULTS
 from r2flow.lidar.known import Ray, every_row, random_points, random_rows, ray_states, without_sector
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Portion, check_options
-from r2flow.stages.base import Batch
+from r2flow.stages.base import Batch, Stage
+from r2flow.stages.flow_map import LearnFlowMap
 from r2flow.stages.rectify import Rectify
 
 
@@ -100,13 +102,50 @@ class Conditional(Rectify):
         **options: Any,
     ) -> None:
         super().__init__(generator, loss, time, **options)
-        if not isinstance(generator, ConditionalFlow):
-            raise InputError(f"this stage learns from what is known, which a {type(generator).__name__} is not told.")
-        check_options("stage.tasks", Tasks, tasks or {})
-        self.further = partial(Tasks(**(tasks or {})), generator.space)
+        self.further = _further(generator, tasks)
 
     def condition(self, batch: Batch) -> Condition:
-        return {name: batch[name] for name in (IMAGE, KNOWN, DOUBTFUL)}
+        return _said(batch)
+
+
+class LearnConditionalMap(LearnFlowMap):
+    """Flow map of scans of which a part is known: u(x_t, t, s | y), on scans, from the paths of a conditional flow.
+
+    Args:
+        objective: One that needs no pairs, as `solved`.
+        tasks: Options of `Tasks`.
+        options: Those of `LearnFlowMap`.
+    """
+
+    generator_name = "conditional_map"
+
+    def __init__(
+        self,
+        generator: Generator,
+        objective: str = "solved",
+        tasks: Mapping[str, Any] | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(generator, objective, **options)
+        self.further = _further(generator, tasks)
+
+    def check_data(self, name: str, data: Mapping[str, Any]) -> None:
+        Stage.check_data(self, name, data)
+        super().check_data(name, data)
+
+    def condition(self, batch: Batch) -> Condition:
+        return _said(batch)
+
+
+def _further(generator: Generator, tasks: Mapping[str, Any] | None) -> Further:
+    if not isinstance(generator, ConditionalFlow):
+        raise InputError(f"this stage learns from what is known, which a {type(generator).__name__} is not told.")
+    check_options("stage.tasks", Tasks, tasks or {})
+    return partial(Tasks(**(tasks or {})), generator.space)
+
+
+def _said(batch: Batch) -> Condition:
+    return {name: batch[name] for name in (IMAGE, KNOWN, DOUBTFUL)}
 
 
 class Regress(Conditional):

@@ -1,13 +1,14 @@
 """A flow map: jumps of any length, learned from the paths of an earlier flow, from its pairs or from scans."""
 
 from collections.abc import Mapping
+from copy import deepcopy
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots, corrected
+from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots, corrected, solved
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import FlowMap, Generator
@@ -22,14 +23,14 @@ class LearnFlowMap(Reflow):
     """Flow map: regress u(x_t, t, s) onto what an objective of `r2flow.flow.maps` says.
 
     From a 1-RF or a 2-RF on its pairs, with the inner states of their paths (`data.pairs.knots`) for the objectives
-    `knots` and `corrected`; or on scans, where noise and scan are drawn independently. With scans beside the pairs
-    (`data.scans`) velocities, s = t, are learned from these, as by `Rectify`, and jumps from the pairs.
+    `knots` and `corrected`; or on scans, where noise and scan are drawn independently, by `solved`. With scans beside
+    the pairs (`data.scans`) velocities, s = t, are learned from these, as by `Rectify`, and jumps from the pairs.
 
     Args:
         objective: Name in `r2flow.flow.maps.OBJECTIVES`.
         jumps: Options of `r2flow.flow.maps.JumpTimes`.
         rho: Where the share rho ends that a bootstrapped objective takes from the path: it falls from 1, by equal
-            factors, over the run. It is always 1 where s = t and for the jump from 0 to 1.
+            factors, over the run. It is always 1 where s = t and, on pairs, for the jump from 0 to 1.
     """
 
     generator_name = "flow_map"
@@ -52,14 +53,23 @@ class LearnFlowMap(Reflow):
         self.objective, self.objective_name, self.rho = OBJECTIVES[objective], objective, rho
         check_options("stage.jumps", JumpTimes, jumps or {})
         self.jumps = JumpTimes(**(jumps or {}))
+        self.on_pairs = True
+        # Its parent as it was, for an objective that asks it; in a list, so that it is no part of what learns.
+        self._parent = [deepcopy(generator).eval().requires_grad_(False)] if self.objective is solved else []
         generator.sampler = Sampler(JUMP, 4, grid=self.jumps.grid)
 
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
+        self.on_pairs = data["name"] == "pairs"
         knots = data["name"] == "pairs" and (data.get("pairs") or {}).get("knots")
         if self.objective in (along_knots, corrected) and not knots:
             raise InputError(
                 f"stage.objective={self.objective_name} learns from inner states of paths: give data=pairs "
                 "data.pairs.knots=7, or stage.objective=consistency."
+            )
+        if self._parent and not self.config.get("stage", {}).get("init"):
+            raise InputError(
+                f"stage.objective={self.objective_name} follows the paths of an earlier flow: give stage.init=RUN, or "
+                "stage.objective=consistency."
             )
         if data.get("scans") is not None and self.objective not in (along_knots, corrected):
             raise InputError(
@@ -67,22 +77,26 @@ class LearnFlowMap(Reflow):
                 "not those of scans: leave data.scans out, or give stage.objective=knots."
             )
 
+    def on_fit_start(self) -> None:
+        for parent in self._parent:
+            parent.to(self.device)
+
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         assert isinstance(self.generator, FlowMap)
         t, s = self.jumps(torch.cat([u[:, None], plastic_sequence(batch["k"])], 1))
-        paths = paths_of(batch)
+        paths, u_ts = paths_of(batch), self.generator.map(self.condition(batch))
         if self.training:
-            known = (t == s) | (s - t == 1)
+            known = (t == s) | (self.on_pairs & (s - t == 1))  # the end of independent noise is no scan of the data
             rho = torch.where(known, 1.0, self.rho ** (self.global_step / max(int(self.trainer.max_steps), 1)))
-            aim = self.objective(self.generator.mean_velocity, paths, t, s, rho)
+            asked = [parent.map(self.condition(batch)) for parent in self._parent] or [u_ts]
+            aim = self.objective(asked[0], paths, t, s, rho)
         else:  # one figure for all objectives
-            aim = along_knots(self.generator.mean_velocity, paths, t, s, torch.ones_like(t))
+            aim = along_knots(u_ts, paths, t, s, torch.ones_like(t))
         if "scan" in batch:
             x_t, v = interpolate(batch["noise"], batch["scan"], t)
             velocity = expand_time(t == s, x_t)
             aim = Aim(torch.where(velocity, x_t, aim.x_t), torch.where(velocity, v, aim.target))
-        found = self.generator.mean_velocity(t, aim.x_t, s)
-        return self.loss(found, aim.target).mean()
+        return self.loss(u_ts(t, aim.x_t, s), aim.target).mean()
 
 
 def paths_of(batch: Batch) -> Paths:

@@ -13,10 +13,11 @@ from r2flow.data.loader import FlowDataset
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
 from r2flow.flow.problems import Gaussian
-from r2flow.generators import ConditionalFlow, Regression, Sampler, build_generator, condition_of
+from r2flow.generators import ConditionalFlow, ConditionalMap, Regression, Sampler, build_generator, condition_of
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.noise import Draws
-from r2flow.stages.conditional import Conditional, Regress, Tasks
+from r2flow.stages import build_stage
+from r2flow.stages.conditional import Conditional, LearnConditionalMap, Regress, Tasks
 
 CONFIG = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
@@ -265,3 +266,107 @@ def test_a_plain_flow_that_starts_from_it_forgets_the_condition(flow):
     x, t = torch.randn(2, 2, 8, 32), torch.tensor([0.2, 0.7])
     with torch.no_grad():
         assert torch.allclose(plain.velocity(t, x), flow.velocity(t, x), atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def jumps() -> ConditionalMap:
+    return built("conditional_map")
+
+
+@pytest.mark.parametrize("method", ["jump", "renoise", "adams3"])
+def test_known_values_arrive_by_jumps_as_given(jumps, scans, method):
+    told = condition_of(jumps.space, scans, measured(scans))
+    known = told["known"] > 0
+    x_0, draws = Draws(0, range(3)).start((2, 8, 32)), Draws(0, range(3))
+    made = jumps.generate(x_0, told, sampler=Sampler(method, 3, grid="power:3"), draws=draws)
+    assert torch.equal(made.x[known], told["image"][known])
+    assert made.x.isfinite().all()
+    half = jumps.solve(x_0, 0.0, 0.5, sampler=Sampler("jump", 2), condition=told).x
+    assert torch.allclose(half[known], ((x_0 + told["image"]) / 2)[known], atol=1e-5)
+
+
+def test_a_jump_is_that_of_the_guess_or_the_network_s(jumps, scans):
+    told = condition_of(jumps.space, scans, measured(scans))
+    parts = [told[name] for name in ("image", "known", "doubtful")]
+    x = torch.randn(3, 2, 8, 32, generator=torch.Generator().manual_seed(2))
+    t, s = torch.tensor([0.0, 0.5, 0.7]), torch.tensor([1.0, 0.9, 0.3])
+    with torch.no_grad():
+        found = jumps.mean_velocity(t, x, s, told)
+        network = jumps.backbone(t, torch.cat([x, *parts], 1), s)
+        logit, sigma = jumps.trust(torch.cat(parts, 1))
+        assert torch.allclose(jumps.mean_velocity(t, x, t, told), jumps.velocity(t, x, told), atol=1e-5)
+        # to itself it is the velocity that the flow's own formula has
+        flow = built("conditional_flow")
+        flow.load_state_dict({k: v for k, v in jumps.state_dict().items() if k in flow.state_dict()})
+        assert torch.allclose(flow.velocity(t, x, told), jumps.velocity(t, x, told), atol=1e-5)
+    expected = torch.empty_like(x)
+    for index in np.ndindex(*x.shape):
+        guess, std, p = float(told["image"][index]), float(sigma[index]), float(logit[index].sigmoid())
+        begin, end, value = float(t[index[0]]), float(s[index[0]]), float(x[index])
+        spread = [math.hypot(at * std, 1 - at) for at in (begin, end)]
+        about = (end * guess + spread[1] / spread[0] * (value - begin * guess) - value) / (end - begin)
+        near = p * norm.pdf(value, begin * guess, spread[0])
+        far = (1 - p) * norm.pdf(value, 0, math.hypot(begin * 0.5, 1 - begin))
+        expected[index] = (near * about + far * float(network[index])) / (near + far)
+    unknown = told["known"] == 0
+    assert torch.allclose(found[unknown], expected[unknown], atol=1e-4)
+
+
+def test_a_conditional_map_starts_as_euler_s_steps_of_the_flow_that_it_starts_from(flow, scans):
+    child = build_generator({**CONFIG, "generator": {"name": "conditional_map"}}).eval()
+    child.start_from(flow)
+    told = condition_of(flow.space, scans, measured(scans))
+    x, t = torch.randn(3, 2, 8, 32), torch.tensor([0.1, 0.5, 0.9])
+    with torch.no_grad():
+        assert torch.allclose(child.velocity(t, x, told), flow.velocity(t, x, told), atol=1e-6)
+        v = flow.backbone(t, torch.cat([x, *told.values()], 1))
+        u = child.backbone(t, torch.cat([x, *told.values()], 1), torch.ones(3))
+        assert torch.allclose(u, v, atol=1e-6)
+
+
+def test_its_jumps_are_learned_from_its_parent_as_it_was(flow, scans):
+    generator = build_generator({**CONFIG, "generator": {"name": "conditional_map"}})
+    generator.start_from(flow)
+    stage = stage_of(LearnConditionalMap, generator)
+    names = [name for name, _ in stage.named_parameters()]
+    assert all(name.startswith("generator.") for name in names)  # the parent is no part of what learns
+    batch = {**batch_of(scans, flow.space), **condition_of(flow.space, scans, measured(scans))}
+    t, s = torch.zeros(3), torch.ones(3)
+    stage.jumps = lambda _: (t, s)  # type: ignore[assignment]
+    stage._trainer = type("Trainer", (), {"max_steps": 4, "global_step": 0})()
+    stage._parent[0].velocity = None  # type: ignore[assignment]  # it is asked as a map, s = t
+    aims = []
+    stage.loss = lambda found, target: aims.append(target) or (found - target).square()  # type: ignore[assignment]
+    stage.train()
+    for _ in range(2):
+        stage.regression_loss(batch, batch["u"])
+        with torch.no_grad():
+            for weight in generator.parameters():
+                weight.add_(0.3)  # it has learned
+    assert torch.equal(aims[0], aims[1])
+    steps = flow.solve(
+        batch["x_0"], sampler=Sampler("midpoint", 256, grid="power:1.5"), condition=stage.condition(batch)
+    )
+    exact = steps.x - batch["x_0"]
+    assert float((aims[0] - exact).square().mean().sqrt()) < 0.02 * float(exact.square().mean().sqrt())
+
+
+def test_it_learns_on_scans_and_from_a_parent(flow):
+    generator = build_generator({**CONFIG, "generator": {"name": "conditional_map"}})
+    config = {"stage": {"name": "conditional_map"}, "data": {"name": "simulated", "batch_size": 4}, "seed": 0}
+    with pytest.raises(InputError, match=r"give stage\.init=RUN"):
+        build_stage(config, generator)
+    with pytest.raises(InputError, match="learns from scans, and data=pairs has none"):
+        build_stage({**config, "data": {"name": "pairs", "batch_size": 4}}, generator)
+    with pytest.raises(InputError, match="which a ConditionalFlow does not have"):
+        LearnConditionalMap(flow)
+    plain = build_generator({**CONFIG, "generator": {"name": "flow_map"}})
+    with pytest.raises(InputError, match="which a FlowMap is not told"):
+        LearnConditionalMap(plain)
+
+
+def test_told_nothing_a_conditional_map_is_a_plain_one(jumps):
+    x, t, s = torch.randn(2, 2, 8, 32), torch.tensor([0.2, 0.7]), torch.tensor([0.5, 1.0])
+    nothing = {name: torch.zeros(2, 2, 8, 32) for name in ("image", "known", "doubtful")}
+    with torch.no_grad():
+        assert torch.allclose(jumps.mean_velocity(t, x, s), jumps.mean_velocity(t, x, s, nothing), atol=1e-6)
