@@ -15,7 +15,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.posterior import completes
-from r2flow.generators import Condition, Flow, Generator, Regression, Sampler, condition_of
+from r2flow.generators import Condition, Flow, FlowMap, Generator, Regression, Sampler, condition_of
 from r2flow.generators.base import Progress
 from r2flow.generators.flow import UNTOLD
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
@@ -90,7 +90,8 @@ def completing(generator: Generator, sampler: Sampler | None = None, doubtful: b
             f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images, best one that "
             "was trained with stage=conditional."
         )
-    own = generator.told and (doubtful or isinstance(generator, Regression) or not isinstance(generator, Flow))
+    guided = isinstance(generator, Flow) and not isinstance(generator, Regression | FlowMap)
+    own = generator.told and (doubtful or not guided)
     usual = generator.sampler if own else USUAL
     how = (sampler or usual).changed(**changes)
     generator.check_sampler(how)

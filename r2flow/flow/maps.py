@@ -232,7 +232,10 @@ BENT, WHOLE = 1.5, 16  # a path's grid, t = 1 - (1 - q)^BENT, and its steps from
 
 
 def _followed(u: MeanVelocity, x: Tensor, t: Tensor, s: Tensor) -> Tensor:
-    """x_s of dx/dt = u(x, t, t) from x_t, in equal steps of q by the rule of Adams and Bashforth, of order 2."""
+    """x_s of dx/dt = u(x, t, t) from x_t, in equal steps of q by the rule of Adams and Bashforth, of order 2.
+
+    The first step is one of the midpoint rule: most jumps have few steps, and some have one.
+    """
     begin, end = (1 - (1 - time.double()).clamp(min=0) ** (1 / BENT) for time in (t, s))
     counts = ((end - begin).abs() * WHOLE).ceil().clamp(min=1)
     slope, length = torch.zeros_like(x), torch.ones_like(t)  # of the step before
@@ -243,9 +246,14 @@ def _followed(u: MeanVelocity, x: Tensor, t: Tensor, s: Tensor) -> Tensor:
             1 - (1 - torch.lerp(begin, end, m / counts)[rows]).clamp(min=0) ** BENT for m in (n, n + 1)
         )  # fmt: skip
         here, step = here.to(t), (there - here).to(t)
-        v = _select(u, rows)(here, x[rows], here).to(x)
-        before = 0 if n == 0 else step / length[rows] / 2
-        x[rows] += expand_time(step * (1 + before), x) * v - expand_time(step * before, x) * slope[rows]
+        own = _select(u, rows)
+        v = own(here, x[rows], here).to(x)
+        if n == 0:
+            middle = here + step / 2
+            x += expand_time(step, x) * own(middle, x + expand_time(step / 2, x) * v, middle).to(x)
+        else:
+            before = step / length[rows] / 2
+            x[rows] += expand_time(step * (1 + before), x) * v - expand_time(step * before, x) * slope[rows]
         slope[rows], length[rows] = v, step
     return x
 

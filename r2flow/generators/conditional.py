@@ -167,7 +167,8 @@ class ConditionalFlow(RectifiedFlow):
         return part
 
     def untold(self) -> RectifiedFlow:
-        flow = RectifiedFlow.__new__(RectifiedFlow)
+        kind = FlowMap if self.second_time else RectifiedFlow
+        flow = kind.__new__(kind)
         nn.Module.__init__(flow)
         flow.space, flow.noise_shape, flow.sampler = self.space, self.noise_shape, self.sampler
         flow.backbone = cast(Backbone, _Untold(self.backbone, self.condition_channels))
@@ -179,7 +180,7 @@ class ConditionalMap(ConditionalFlow, FlowMap):
 
     A known value is on its straight line, whose mean velocity is its velocity. About the guess the flow map of
     N(g, sigma^2) is exact, X_{t->s}(x) = s g + (V_sigma(s) / V_sigma(t))^(1/2) (x - t g), and is blended with the
-    network's jump by the same r, of time t.
+    network's jump by the same r, of time t: at t = 0 it is p, and where the guess is wrong the network makes up for it.
     """
 
     def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
@@ -189,18 +190,16 @@ class ConditionalMap(ConditionalFlow, FlowMap):
 
 
 class _Untold(nn.Module):
-    """v(t, x) of a network with further input channels, of which nothing is known."""
-
-    second_time = False
+    """v(t, x) or u(x, t, s) of a network with further input channels, of which nothing is known."""
 
     def __init__(self, backbone: Backbone, channels: int) -> None:
         super().__init__()
-        self.backbone, self.channels = backbone, channels
+        self.backbone, self.channels, self.second_time = backbone, channels, backbone.second_time
         self.in_channels, self.coords, self.unit = backbone.in_channels - channels, backbone.coords, backbone.unit
 
-    def forward(self, t: Tensor, x: Tensor) -> Tensor:
+    def forward(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         unknown = x.new_zeros(x.shape[0], self.channels, x.shape[2], x.shape[3])
-        v: Tensor = self.backbone(t, torch.cat([x, unknown], dim=1))
+        v: Tensor = self.backbone(t, torch.cat([x, unknown], dim=1), s)
         return v
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -112,12 +112,13 @@ class LearnConditionalMap(LearnFlowMap):
     """Flow map of scans of which a part is known: u(x_t, t, s | y), on scans, from the paths of a conditional flow.
 
     Args:
-        objective: One that needs no pairs, as `solved`.
+        objective: One of `on_scans`.
         tasks: Options of `Tasks`.
         options: Those of `LearnFlowMap`.
     """
 
     generator_name = "conditional_map"
+    on_scans: ClassVar[tuple[str, ...]] = ("solved", "consistency", "two_halves")
 
     def __init__(
         self,
@@ -126,12 +127,20 @@ class LearnConditionalMap(LearnFlowMap):
         tasks: Mapping[str, Any] | None = None,
         **options: Any,
     ) -> None:
+        if objective not in self.on_scans:
+            raise InputError(f"this stage learns on scans: give stage.objective=solved, found {objective}.")
         super().__init__(generator, objective, **options)
         self.further = _further(generator, tasks)
 
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
         Stage.check_data(self, name, data)
         super().check_data(name, data)
+        parent = (self.config.get("parent") or {}).get("stage", "conditional")
+        if self.objective_name == "solved" and parent not in ("conditional", name):
+            raise InputError(
+                f"stage={name} follows a flow that was told a part of each scan: give stage.init=RUN of "
+                f"stage=conditional; this one is of stage={parent}."
+            )
 
     def condition(self, batch: Batch) -> Condition:
         return _said(batch)

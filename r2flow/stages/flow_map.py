@@ -54,8 +54,7 @@ class LearnFlowMap(Reflow):
         check_options("stage.jumps", JumpTimes, jumps or {})
         self.jumps = JumpTimes(**(jumps or {}))
         self.on_pairs = True
-        # Its parent as it was, for an objective that asks it; in a list, so that it is no part of what learns.
-        self._parent = [deepcopy(generator).eval().requires_grad_(False)] if self.objective is solved else []
+        self._parent = _Kept([deepcopy(generator).eval().requires_grad_(False)] if self.objective is solved else [])
         generator.sampler = Sampler(JUMP, 4, grid=self.jumps.grid)
 
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
@@ -66,10 +65,10 @@ class LearnFlowMap(Reflow):
                 f"stage.objective={self.objective_name} learns from inner states of paths: give data=pairs "
                 "data.pairs.knots=7, or stage.objective=consistency."
             )
-        if self._parent and not self.config.get("stage", {}).get("init"):
+        if self._parent and (self.on_pairs or not self.config.get("stage", {}).get("init")):
+            what = "data=DATASET, not pairs" if self.on_pairs else "stage.init=RUN"
             raise InputError(
-                f"stage.objective={self.objective_name} follows the paths of an earlier flow: give stage.init=RUN, or "
-                "stage.objective=consistency."
+                f"stage.objective={self.objective_name} learns on scans, by the paths of an earlier flow: give {what}."
             )
         if data.get("scans") is not None and self.objective not in (along_knots, corrected):
             raise InputError(
@@ -84,6 +83,8 @@ class LearnFlowMap(Reflow):
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         assert isinstance(self.generator, FlowMap)
         t, s = self.jumps(torch.cat([u[:, None], plastic_sequence(batch["k"])], 1))
+        if not (self.training or self.on_pairs):
+            t = s = self.jumps.velocities(u)  # of scans velocities alone are known
         paths, u_ts = paths_of(batch), self.generator.map(self.condition(batch))
         if self.training:
             known = (t == s) | (self.on_pairs & (s - t == 1))  # the end of independent noise is no scan of the data
@@ -97,6 +98,13 @@ class LearnFlowMap(Reflow):
             velocity = expand_time(t == s, x_t)
             aim = Aim(torch.where(velocity, x_t, aim.x_t), torch.where(velocity, v, aim.target))
         return self.loss(u_ts(t, aim.x_t, s), aim.target).mean()
+
+
+class _Kept(list[FlowMap]):
+    """The parent as it was, for an objective that asks it: no part of what learns, and not copied for the average."""
+
+    def __deepcopy__(self, memo: Any) -> "_Kept":
+        return self
 
 
 def paths_of(batch: Batch) -> Paths:

@@ -178,6 +178,18 @@ def test_the_jumps_of_a_solved_flow_are_right_to_second_order(monkeypatch, begin
     assert math.log2(errors[0] / errors[1]) / 2 == pytest.approx(2, abs=0.2)
 
 
+def test_a_jump_of_one_step_is_one_of_the_midpoint_rule():
+    """The last of eight jumps on power:3 has one step; by Euler's rule it would be the parent's own step."""
+    problem, t, s = (
+        Gaussian(),
+        torch.full((3,), 0.99, dtype=torch.float64),
+        torch.full((3,), 0.999, dtype=torch.float64),
+    )
+    x_t, target = solved(lambda t, x, s: problem(t, x), paths_of(problem.solution, TIMES[[0, -1]]), t, s, t)
+    middle = x_t + 0.0045 * problem(t[0], x_t)
+    torch.testing.assert_close(target, problem(t[0] + 0.0045, middle), rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("objective", [consistency, solved])
 def test_each_scan_is_asked_for_under_its_own_condition(objective):
     """Of three scans whose velocities are 1, 2 and 3 everywhere, the second has s = t and is not asked."""

@@ -9,6 +9,7 @@ from scipy.stats import norm
 
 from r2flow import noise
 from r2flow.backbones import Pyramid
+from r2flow.completion import complete
 from r2flow.data.loader import FlowDataset
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
@@ -358,6 +359,11 @@ def test_it_learns_on_scans_and_from_a_parent(flow):
         build_stage(config, generator)
     with pytest.raises(InputError, match="learns from scans, and data=pairs has none"):
         build_stage({**config, "data": {"name": "pairs", "batch_size": 4}}, generator)
+    begun = {**config, "stage": {"name": "conditional_map", "init": "RUN"}}
+    with pytest.raises(InputError, match="this one is of stage=regress"):
+        build_stage({**begun, "parent": {"stage": "regress"}}, generator)
+    with pytest.raises(InputError, match="learns on scans: give stage.objective=solved, found knots"):
+        LearnConditionalMap(generator, objective="knots")
     with pytest.raises(InputError, match="which a ConditionalFlow does not have"):
         LearnConditionalMap(flow)
     plain = build_generator({**CONFIG, "generator": {"name": "flow_map"}})
@@ -365,8 +371,36 @@ def test_it_learns_on_scans_and_from_a_parent(flow):
         LearnConditionalMap(plain)
 
 
+def test_on_scans_the_validation_loss_is_that_of_velocities(jumps, scans):
+    """The end of a path from independent noise is not the scan: against it a right map would be the worse one."""
+    stage = stage_of(LearnConditionalMap, jumps, nothing=0.5).eval()
+    stage.on_pairs = False
+    batch = {**batch_of(scans, jumps.space), **condition_of(jumps.space, scans, measured(scans))}
+    asked = []
+    stage.loss = lambda found, target: asked.append(target) or (found - target).flatten(1)  # type: ignore[assignment]
+    jumps_before = jumps.mean_velocity
+    times = []
+    stage.generator.mean_velocity = lambda t, x, s, y: times.append((t, s)) or jumps_before(t, x, s, y)  # type: ignore[method-assign]
+    try:
+        stage.regression_loss(batch, batch["u"])
+    finally:
+        del stage.generator.mean_velocity
+    assert all(torch.equal(t, s) for t, s in times)
+    assert torch.equal(asked[0], batch["x_1"] - batch["x_0"])
+
+
+def test_a_conditional_map_completes_by_its_own_jumps(jumps, scans):
+    (found, *_) = complete(jumps, scans, measured(scans))
+    assert found.evaluations.tolist() == [4]
+    (found, *_) = complete(jumps, scans, measured(scans), steps=2)
+    assert found.evaluations.tolist() == [2]
+
+
 def test_told_nothing_a_conditional_map_is_a_plain_one(jumps):
     x, t, s = torch.randn(2, 2, 8, 32), torch.tensor([0.2, 0.7]), torch.tensor([0.5, 1.0])
     nothing = {name: torch.zeros(2, 2, 8, 32) for name in ("image", "known", "doubtful")}
     with torch.no_grad():
         assert torch.allclose(jumps.mean_velocity(t, x, s), jumps.mean_velocity(t, x, s, nothing), atol=1e-6)
+        assert torch.equal(jumps.mean_velocity(t, x, s), jumps.untold().mean_velocity(t, x, s))
+    x_0 = Draws(0, range(2)).start((2, 8, 32))
+    assert torch.equal(jumps.generate(x_0).x, jumps.untold().generate(x_0).x)
