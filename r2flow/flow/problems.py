@@ -167,9 +167,11 @@ class Correlated(Problem):
 
         Args:
             forward: A, (M, D), of full rank where sigma is 0.
-            y: (M,).
+            y: (M,); with M = 0 nothing is measured.
             sigma: Of each measured value, (M,) or one for all.
         """
+        if not len(y):
+            return self
         seen = self.covariances @ forward.T  # (K, D, M)
         spread = forward @ seen + torch.diag_embed(torch.as_tensor(sigma).to(y).expand(len(y)) ** 2)
         gain = torch.linalg.solve(spread, seen.mT).mT

@@ -9,7 +9,16 @@ from torch import Tensor
 
 from benchmarks.posterior import Case, bures, gaussian, map_of, moments, ring, velocity_of
 from r2flow.errors import InputError
-from r2flow.flow.posterior import METHODS, Measurement, mmps, ot_ode, parse_method, repaint, sample_posterior
+from r2flow.flow.posterior import (
+    METHODS,
+    Measurement,
+    _conjugate_residuals,
+    mmps,
+    ot_ode,
+    parse_method,
+    repaint,
+    sample_posterior,
+)
 from r2flow.flow.problems import Correlated
 from r2flow.flow.solvers import named_grid
 from r2flow.generators import Field, Sampler, build_generator
@@ -84,7 +93,34 @@ def test_the_posterior_of_a_mixture_has_bayes_weights():
     torch.testing.assert_close(found.covariances.flatten(), torch.full((2,), 1 / (4 + 4)).double())
 
 
+def test_with_nothing_measured_the_posterior_is_the_prior():
+    prior = gaussian()
+    found = prior.posterior(torch.zeros(0, WIDTH).double(), torch.zeros(0).double(), 0.0)
+    assert torch.equal(found.means, prior.means)
+    assert torch.equal(found.covariances, prior.covariances)
+
+
 # What is measured
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_conjugate_residuals_leave_the_least_residual_of_their_directions(steps):
+    """Of matrices that are not quite symmetric and have eigenvalues from 1e-3 to 1, as a network's Jacobian."""
+    vectors = torch.linalg.qr(randn(WIDTH, WIDTH, seed=5))[0]
+    matrix = vectors * torch.logspace(-3, 0, WIDTH).double() @ vectors.T + 0.02 * randn(WIDTH, WIDTH, seed=6)
+    r = randn(3, WIDTH, seed=7)
+    found = _conjugate_residuals(lambda p: (p, p @ matrix.T), r, steps)
+    for row, x in zip(r, found, strict=True):
+        directions = torch.stack([torch.linalg.matrix_power(matrix, k) @ row for k in range(steps)], 1)
+        best = directions @ torch.linalg.lstsq(matrix @ directions, row[:, None]).solution[:, 0]
+        torch.testing.assert_close(x, best)
+
+
+def test_conjugate_residuals_end_where_the_matrix_is_not_positive_or_nothing_is_left():
+    matrix = torch.diag(torch.tensor([1.0, -1.0, 2.0]).double())
+    r = torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [1.0, 0, 1.0], [0, 0, 0]]).double()
+    found = _conjugate_residuals(lambda p: (p, p @ matrix.T), r, 4)
+    torch.testing.assert_close(found, torch.tensor([[1.0, 0, 0], [0, 0, 0], [1.0, 0, 0.5], [0, 0, 0]]).double())
 
 
 @pytest.mark.parametrize(("sigma", "blur"), [(0.0, False), (0.3, False), (0.3, True)])
