@@ -4,7 +4,7 @@
     python benchmarks/finetune.py --out try --steps 4 --seeds 1 --num 2
 
 31 real scans are trained on, 27 of other drives are held out, parted as in docs/simulator.md. Both kinds of run have
-the same network, scans, batch and number of steps, and therefore the same seconds; each has a learning rate of its own.
+the same network, scans, batch and number of steps; each has learning rates of its own, and from nothing a step of Muon.
 A budget is a run of its own, whose learning rate comes down within it. The same command goes on.
 """
 
@@ -37,10 +37,10 @@ HELD_OUT = {
     "raw/2011_09_26/2011_09_26_drive_0048_sync": 11,
     "odometry/sequences/08": 1,
 }
-# What each start adds to experiment=finetune: from nothing, the learning rate and warm-up of stage=rectify.
+# What each start adds to experiment=finetune: from nothing, the rates of experiment=fast.
 STARTS = {
     "fine-tuned": [],
-    "from nothing": ["stage.learning_rate=2e-3"],
+    "from nothing": ["stage.learning_rate=2e-3", "stage.muon=0.01"],
 }
 
 

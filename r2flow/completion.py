@@ -15,7 +15,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.posterior import completes
-from r2flow.generators import Condition, Flow, FlowMap, Generator, Regression, Sampler, condition_of
+from r2flow.generators import Condition, Flow, Generator, Regression, Sampler, condition_of
 from r2flow.generators.base import Progress
 from r2flow.generators.flow import UNTOLD
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
@@ -75,11 +75,10 @@ def spread_of(images: Tensor) -> Tensor:
     return torch.stack([(squares / (count - 1).clamp(min=1)).sqrt(), returned.double().mean(0)]).float()
 
 
-def completing(generator: Generator, sampler: Sampler | None = None, doubtful: bool = False, **changes: Any) -> Sampler:
-    """How a generator completes scans: a flow by `USUAL`, what is told of the scan otherwise by its own sampler.
+def completing(generator: Generator, sampler: Sampler | None = None, **changes: Any) -> Sampler:
+    """How a generator completes scans: what is told of the scan by its own sampler, another flow by `USUAL`.
 
     Args:
-        doubtful: Whether rays were measured that are not trusted: a flow that is told of them knows what goes wrong.
         changes: Single settings of the sampler.
 
     Raises:
@@ -90,9 +89,7 @@ def completing(generator: Generator, sampler: Sampler | None = None, doubtful: b
             f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images, best one that "
             "was trained with stage=conditional."
         )
-    guided = isinstance(generator, Flow) and not isinstance(generator, Regression | FlowMap)
-    own = generator.told and (doubtful or not guided)
-    usual = generator.sampler if own else USUAL
+    usual = generator.sampler if generator.told else USUAL
     how = (sampler or usual).changed(**changes)
     generator.check_sampler(how)
     if not generator.told and not completes(how.method):
@@ -134,7 +131,7 @@ def complete(
         batch_size: Answers at once. It does not change a fixed-step result beyond rounding.
         first: Number of the first scan.
         on_surfaces: Whether returns of an answer are moved towards the surfaces that the known ones lie on (`settled`);
-            if left out, those of a flow that was trained without a condition.
+            if left out, but for a regression's: its answer is a median, which has no scatter about them.
         progress: Called after every network evaluation of a batch.
         changes: Single settings of the sampler: steps, method, tolerance, grid.
 
@@ -143,8 +140,7 @@ def complete(
             its sensor, num or batch_size below 1.
     """
     generator = source if isinstance(source, Generator) else source.generator
-    doubtful = keep != "exact" or (state is not None and bool((state == Ray.DOUBTFUL).any()))
-    how = completing(generator, sampler, doubtful, **changes)
+    how = completing(generator, sampler, **changes)
     if num < 1 or batch_size < 1:
         raise InputError(f"needs at least one answer and a batch of at least one; found {num} and {batch_size}.")
     if keep not in KEEP:
@@ -158,7 +154,7 @@ def complete(
         state = torch.where(state == Ray.UNKNOWN, state, torch.tensor(int(Ray.DOUBTFUL), dtype=state.dtype))
     condition = condition_of(generator.space, images, state)
     if on_surfaces is None:
-        on_surfaces = not generator.told
+        on_surfaces = not isinstance(generator, Regression)
     last = _Last(images, state, keep == "mend", on_surfaces)
     yield from _answers(generator, how, last, condition, num, seed, batch_size, first, progress)
 

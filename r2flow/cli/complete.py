@@ -109,7 +109,7 @@ def complete(
     doubtful = known.keep != "exact"
     if doubtful and not loaded.generator.told:
         print("this model was not trained on faulty measurements and mends them badly: give one of stage=conditional")
-    sampler = completing(loaded.generator, solver.change(completing(loaded.generator, doubtful=doubtful)))
+    sampler = completing(loaded.generator, solver.change(completing(loaded.generator)))
     for line in said:
         print(line)
     for ending in sorted({scan.ending for scan in scans if answer_ending(loaded, scan) != scan.ending}):

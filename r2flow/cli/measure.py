@@ -89,7 +89,6 @@ def completion(
 
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.output import command, finish
-    from r2flow.lidar.faults import FAULTS
     from r2flow.progress import Bar
     from r2flow.reports.completion import TASKS, completion_page, completion_rows, given_by, pictured, ways_of
     from r2flow.reports.inversion import real_scans
@@ -109,7 +108,7 @@ def completion(
         raise InputError(f"{real}: no scan has a return, so there is nothing to hide.")
     prepare_folder(out)
     rows, shown = [], []
-    cost = [way.checkpoint.generator.evaluations_of(way.sampler(task in FAULTS)) for way in ways for task in named]
+    cost = [way.checkpoint.generator.evaluations_of(way.sampler) for way in ways for _ in named]
     with Bar("completing", -(-len(truths) * answers // batch_size) * sum(cost), "evaluations") as advance:
         options: dict[str, Any] = {"on_surfaces": surfaces, "progress": advance}
         for row, images in completion_rows(truths, first.sensor, ways, named, answers, seed, batch_size, **options):

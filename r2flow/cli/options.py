@@ -27,7 +27,7 @@ SurfacesOption = Annotated[
     bool | None,
     typer.Option(
         "--surfaces/--no-surfaces",
-        help="Whether answers are moved to the surfaces that measured returns lie on; for models without a condition.",
+        help="Whether answers are moved to the surfaces that measured returns lie on; a regression's are not.",
     ),
 ]
 SETS = "a folder of scans, samples, a run, prepared shards, NAME:FOLDER, simulated:SEED"

@@ -47,12 +47,14 @@ class Way:
     checkpoint: Checkpoint
     changes: Mapping[str, Any] = field(default_factory=dict)
 
-    def sampler(self, faulty: bool = False) -> Sampler:
-        """How it is run, on faulty measurements or on a part of a scan."""
-        return completing(self.checkpoint.generator, doubtful=faulty, **self.changes)
+    @property
+    def sampler(self) -> Sampler:
+        """How it is run."""
+        return completing(self.checkpoint.generator, **self.changes)
 
-    def name(self, faulty: bool = False) -> str:
-        how = self.sampler(faulty)
+    @property
+    def name(self) -> str:
+        how = self.sampler
         return f"{self.model}, {how.method} {how.steps}"
 
 
@@ -73,7 +75,7 @@ def ways_of(checkpoint: Checkpoint, name: str, solvers: Sequence[str] = (), step
         for count in (int(own),) if own else steps or (None,):
             named = {"method": method or None, "steps": count}
             ways.append(Way(name, checkpoint, {key: value for key, value in named.items() if value is not None}))
-            ways[-1].sampler()
+            _ = ways[-1].sampler  # one that cannot be is refused now
     return ways
 
 
@@ -152,7 +154,7 @@ def completion_rows(
             yield {**row, "evaluations": 0, "seconds": float("nan")}, [images[0] for images in found]
         for way in ways:
             found, seconds, evaluations = _answers(way, given, answers, seed, batch_size, on_surfaces, progress)
-            row = _row(task, way.name(task in FAULTS), truths, found, asked, sensor, whole)
+            row = _row(task, way.name, truths, found, asked, sensor, whole)
             yield {**row, "evaluations": evaluations, "seconds": seconds}, [images[0] for images in found]
 
 
@@ -170,7 +172,7 @@ def _answers(
     alike = isinstance(way.checkpoint.generator, Regression)
     faulty = bool((state == Ray.DOUBTFUL).any())
     options: dict[str, Any] = {
-        "sampler": way.sampler(faulty), "batch_size": batch_size, "on_surfaces": on_surfaces, "progress": progress,
+        "sampler": way.sampler, "batch_size": batch_size, "on_surfaces": on_surfaces, "progress": progress,
     }  # fmt: skip
     keep = "mend" if faulty else "exact"
     made = list(complete(way.checkpoint, images, state, 1 if alike else answers, seed, keep=keep, **options))

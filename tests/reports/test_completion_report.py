@@ -90,11 +90,11 @@ def test_a_task_that_is_none_is_one_line(checkpoint, truths, task):
 
 
 def test_a_model_is_run_by_every_solver_and_number_of_steps(checkpoint):
-    names = [way.name() for way in ways_of(checkpoint, "street", ["euler", "midpoint"], [2, 4])]
+    names = [way.name for way in ways_of(checkpoint, "street", ["euler", "midpoint"], [2, 4])]
     assert names == ["street, euler 2", "street, euler 4", "street, midpoint 2", "street, midpoint 4"]
-    assert [way.name() for way in ways_of(checkpoint, "street")] == ["street, mmps 10"]
+    assert [way.name for way in ways_of(checkpoint, "street")] == ["street, adams3 16"]
     own = ways_of(checkpoint, "street", ["euler/3", "midpoint"], [5])
-    assert [way.name() for way in own] == ["street, euler 3", "street, midpoint 5"]
+    assert [way.name for way in own] == ["street, euler 3", "street, midpoint 5"]
     with pytest.raises(InputError, match="behind a slash"):
         ways_of(checkpoint, "street", ["euler/x"])
 
