@@ -28,6 +28,7 @@ from r2flow.registry import Registry
 Linear = Callable[[Tensor], Tensor]
 Noise = Callable[[int], Tensor]  # N(0, 1) of the j-th draw, j = 1, 2, ..., in the state's shape
 
+GROWN = 10.0  # of |y - A x_1hat|^2: docs/completion.md
 EARLIEST = 0.1  # time before which `mmps` takes the flow's Jacobian of this time: at t = 0 it is divided by 0
 
 
@@ -89,7 +90,7 @@ class Measurement:
             back = self.transposed(p)
             return back, variance * self.apply(back) + self.sigma**2 * p
 
-        return _conjugate_residuals(multiply, residual, 50)
+        return _solved(multiply, residual, 50)
 
     def corrected(self, x: Tensor, variance: Tensor) -> Tensor:
         """x + r^2 `pull`: the mean of x_1 ~ N(x, r^2) given y. A known value is y."""
@@ -211,9 +212,9 @@ def mmps(u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, noise
 
     Cov(x_1 | x_t) = C = ((1 - t)^2 / t) J, the second-order Tweedie formula, so that
     E[x_1 | x_t, y] = x_1hat + C A^T (A C A^T + sigma^2)^-1 (y - A x_1hat), which is exact where x_1 is Gaussian given
-    x_t. The linear system is solved by `products` steps of conjugate residuals, each one product with J; where C is
-    not positive in a direction, as a network's may be, they end. The velocity to that mean is followed by the
-    Adams-Bashforth method of order 2, the last step by Euler's rule. Known values move straight to y.
+    x_t. The linear system is solved by `products` steps of conjugate gradients (`_solved`), each one product with J;
+    where C is not positive in a direction, as a network's may be, they end. The velocity to that mean is followed by
+    the Adams-Bashforth method of order 2, the last step by Euler's rule. Known values move straight to y.
     Evaluations: 1 + `products` a step, a vector-Jacobian product counting as one.
     """
     former: tuple[Tensor, Tensor] | None = None
@@ -225,7 +226,7 @@ def mmps(u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, noise
             moved = scale * product(measured.transposed(p))
             return moved, measured.apply(moved) + measured.sigma**2 * p
 
-        x_1 = measured.exact(x_1 + _conjugate_residuals(multiply, measured.residual(x_1), products))
+        x_1 = measured.exact(x_1 + _solved(multiply, measured.residual(x_1), products))
         v, step = (x_1 - x) / (1 - t), s - t
         slope = v if former is None or s == times[-1] else v + step / (2 * former[1]) * (v - former[0])
         former, x = (v, step), x + step * slope
@@ -244,27 +245,34 @@ def _linearised(u: MeanVelocity, t: Tensor, x: Tensor) -> tuple[Tensor, Linear]:
     return x_1.detach(), product
 
 
-def _conjugate_residuals(multiply: Callable[[Tensor], tuple[Tensor, Tensor]], r: Tensor, steps: int) -> Tensor:
+def _solved(multiply: Callable[[Tensor], tuple[Tensor, Tensor]], r: Tensor, steps: int) -> Tensor:
     """B S^-1 r for a positive S, each scan for itself, with `multiply(p)` = (B p, S p).
 
-    Each step takes the least residual along S r, made orthogonal to the step before. A network's J is not quite
-    symmetric, nor well conditioned: the residual of conjugate gradients would grow. A scan ends where its residual is 0
-    to rounding, or in a direction in which S is not positive.
+    By conjugate gradients or, where these have left more than `GROWN` r r, by the combination of the same directions
+    that leaves the least: a network's J is not quite symmetric, and their residual may then grow without end. A scan
+    ends where its residual is 0 to rounding, or in a direction in which S is not positive.
     """
-    found, enough = torch.zeros(()), torch.finfo(r.dtype).eps ** 2 * _dot(r, r)
-    former: tuple[Tensor, Tensor] | None = None
+    p, rr, found = r, _dot(r, r), torch.zeros(())
+    enough, most = torch.finfo(r.dtype).eps ** 2 * rr, GROWN * rr
+    rest, least = r, torch.zeros(())
+    last: tuple[Tensor, Tensor] | None = None  # the direction before, S p orthogonal to the others' and of length 1
     for _ in range(steps):
-        moved, q = multiply(r)
-        goes = (_dot(r, r) > enough) & (_dot(r, q) > 0)
-        if former is not None:
-            share = _dot(former[1], q)
-            moved, q = moved - share * former[0], q - share * former[1]
+        moved, q = multiply(p)
+        curvature = _dot(p, q)
+        goes = (rr > enough) & (curvature > 0)
+        step = torch.where(goes, rr / curvature, 0)
+        found, r = found + step * moved, r - step * q
+        former, rr = rr, _dot(r, r)
+        p = r + torch.where(goes, rr / former, 0) * p
+        if last is not None:
+            share = _dot(last[1], q)
+            moved, q = moved - share * last[0], q - share * last[1]
         length = _dot(q, q).sqrt()
         goes &= length > 0
-        former = torch.where(goes, moved / length, 0), torch.where(goes, q / length, 0)
-        step = _dot(r, former[1])
-        found, r = found + step * former[0], r - step * former[1]
-    return found
+        last = torch.where(goes, moved / length, 0), torch.where(goes, q / length, 0)
+        share = _dot(rest, last[1])
+        least, rest = least + share * last[0], rest - share * last[1]
+    return torch.where(rr <= most, found, least)
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:

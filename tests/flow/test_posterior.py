@@ -10,9 +10,10 @@ from torch import Tensor
 from benchmarks.posterior import Case, bures, gaussian, map_of, moments, ring, velocity_of
 from r2flow.errors import InputError
 from r2flow.flow.posterior import (
+    GROWN,
     METHODS,
     Measurement,
-    _conjugate_residuals,
+    _solved,
     mmps,
     ot_ode,
     parse_method,
@@ -103,23 +104,52 @@ def test_with_nothing_measured_the_posterior_is_the_prior():
 # What is measured
 
 
-@pytest.mark.parametrize("steps", [1, 2])
-def test_conjugate_residuals_leave_the_least_residual_of_their_directions(steps):
-    """Of matrices that are not quite symmetric and have eigenvalues from 1e-3 to 1, as a network's Jacobian."""
-    vectors = torch.linalg.qr(randn(WIDTH, WIDTH, seed=5))[0]
-    matrix = vectors * torch.logspace(-3, 0, WIDTH).double() @ vectors.T + 0.02 * randn(WIDTH, WIDTH, seed=6)
+def test_the_linear_system_is_solved_by_conjugate_gradients():
+    """Against their definition: of all x in the directions, the least of x S x / 2 - r x."""
+    spread = ring() + 0.1 * torch.eye(WIDTH).double()
     r = randn(3, WIDTH, seed=7)
-    found = _conjugate_residuals(lambda p: (p, p @ matrix.T), r, steps)
+    for steps in (1, 2, 3):
+        found = _solved(lambda p: (p, p @ spread), r, steps)
+        for row, x in zip(r, found, strict=True):
+            directions = torch.stack([torch.linalg.matrix_power(spread, k) @ row for k in range(steps)], 1)
+            inner = directions.T @ spread @ directions
+            torch.testing.assert_close(x, directions @ torch.linalg.solve(inner, directions.T @ row))
+
+
+def bad_matrix(least: float) -> tuple[Tensor, Tensor]:
+    """One that is not quite symmetric, as a network's Jacobian, and the eigenvectors of its symmetric part."""
+    vectors = torch.linalg.qr(randn(WIDTH, WIDTH, seed=5))[0]
+    spectrum = torch.logspace(math.log10(least), 0, WIDTH).double()
+    return vectors * spectrum @ vectors.T + 0.002 * randn(WIDTH, WIDTH, seed=6), vectors
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_the_least_residual_of_the_same_directions(steps, monkeypatch):
+    monkeypatch.setattr("r2flow.flow.posterior.GROWN", -1.0)
+    matrix, r = bad_matrix(1e-3)[0], randn(3, WIDTH, seed=7)
+    found = _solved(lambda p: (p, p @ matrix.T), r, steps)
     for row, x in zip(r, found, strict=True):
         directions = torch.stack([torch.linalg.matrix_power(matrix, k) @ row for k in range(steps)], 1)
         best = directions @ torch.linalg.lstsq(matrix @ directions, row[:, None]).solution[:, 0]
         torch.testing.assert_close(x, best)
 
 
-def test_conjugate_residuals_end_where_the_matrix_is_not_positive_or_nothing_is_left():
+def test_each_scan_whose_residual_grows_tenfold_gets_the_least_one():
+    matrix, vectors = bad_matrix(1e-4)
+    r = torch.stack([5 * vectors[:, 0] + vectors[:, -1], vectors[:, -1]])  # most of the first lies where S is least
+    found = _solved(lambda p: (p, p @ matrix.T), r, 1)
+    moved = r @ matrix.T
+    left = r - (r * r).sum(1, keepdim=True) / (r * moved).sum(1, keepdim=True) * moved
+    assert ((left * left).sum(1) > GROWN * (r * r).sum(1)).tolist() == [True, False]
+    least = (r * moved).sum(1) / (moved * moved).sum(1)
+    gradients = (r * r).sum(1) / (r * moved).sum(1)
+    torch.testing.assert_close(found, torch.stack([least[0] * r[0], gradients[1] * r[1]]))
+
+
+def test_a_system_ends_where_the_matrix_is_not_positive_or_nothing_is_left():
     matrix = torch.diag(torch.tensor([1.0, -1.0, 2.0]).double())
     r = torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [1.0, 0, 1.0], [0, 0, 0]]).double()
-    found = _conjugate_residuals(lambda p: (p, p @ matrix.T), r, 4)
+    found = _solved(lambda p: (p, p @ matrix.T), r, 4)
     torch.testing.assert_close(found, torch.tensor([[1.0, 0, 0], [0, 0, 0], [1.0, 0, 0.5], [0, 0, 0]]).double())
 
 
