@@ -41,7 +41,7 @@ MODELS: Registry[Model] = Registry(
     ),
     street_full=Model(
         "street scenes at 64 x 1024, learned from simulated scans",
-        "46ead53026a7d50cb691e030185f65b62264f8380a1109683f07e99d47bb49a8",
+        "cb640c27144b71b14c754397ac3e15923437b657c2ed91e5cce33441f77938e2",
         page="release/street_full.safetensors in the source of r2flow",
     ),
 )
