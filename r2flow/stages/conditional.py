@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -112,13 +112,12 @@ class LearnConditionalMap(LearnFlowMap):
     """Flow map of scans of which a part is known: u(x_t, t, s | y), on scans, from the paths of a conditional flow.
 
     Args:
-        objective: One of `on_scans`.
+        objective: `solved`; others learn from pairs.
         tasks: Options of `Tasks`.
         options: Those of `LearnFlowMap`.
     """
 
     generator_name = "conditional_map"
-    on_scans: ClassVar[tuple[str, ...]] = ("solved", "consistency", "two_halves")
 
     def __init__(
         self,
@@ -127,7 +126,7 @@ class LearnConditionalMap(LearnFlowMap):
         tasks: Mapping[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        if objective not in self.on_scans:
+        if objective != "solved":
             raise InputError(f"this stage learns on scans: give stage.objective=solved, found {objective}.")
         super().__init__(generator, objective, **options)
         self.further = _further(generator, tasks)
@@ -136,7 +135,7 @@ class LearnConditionalMap(LearnFlowMap):
         Stage.check_data(self, name, data)
         super().check_data(name, data)
         parent = (self.config.get("parent") or {}).get("stage", "conditional")
-        if self.objective_name == "solved" and parent not in ("conditional", name):
+        if parent not in ("conditional", name):
             raise InputError(
                 f"stage={name} follows a flow that was told a part of each scan: give stage.init=RUN of "
                 f"stage=conditional; this one is of stage={parent}."
