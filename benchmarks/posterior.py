@@ -11,6 +11,7 @@ python benchmarks/posterior.py --cases sector,blur --methods mmps,flowdps
 """
 
 import argparse
+import re
 from collections.abc import Callable
 
 import torch
@@ -22,7 +23,7 @@ from r2flow.flow.problems import Correlated
 from r2flow.flow.solvers import named_grid
 
 WIDTH = 32
-USUAL = "replace,replace_fresh,repaint:4,repaint:10,flowdps,pnp:1,pnp:5,ot_ode,mmps:1,mmps:2,mmps:4"
+USUAL = "replace,replace_fresh,repaint:4,repaint:10,flowdps,pnp:1,pnp:5,ot_ode,mmps:1,0,mmps:2,0,mmps:4,0,mmps:2,mmps:4"
 JUMPS = ("replace", "repaint", "pnp")  # what gains by a flow map; the others take its velocity
 ANSWERS = 16  # measurements of a case, over which the squared error of the mean is averaged
 
@@ -229,7 +230,7 @@ def main() -> None:
     parser.add_argument("--grid", default="uniform")
     parser.add_argument("--num", type=int, default=4096)
     args = parser.parse_args()
-    methods, evaluations = args.methods.split(","), [int(n) for n in args.evaluations.split(",")]
+    methods, evaluations = re.split(r",(?!\d)", args.methods), [int(n) for n in args.evaluations.split(",")]
     print("method".ljust(22) + "  ".join(f"{n:<19d}" for n in evaluations))
     for name in filter(None, args.cases.split(",")):
         table(name, methods, evaluations, args.grid)

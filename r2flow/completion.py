@@ -26,12 +26,12 @@ from r2flow.sampling import HasGenerator, Samples, draw
 
 KEEP = ("exact", "blend", "mend")
 CONFIRMED = 0.2  # of its range: nearer an answer confirms a doubtful return; docs/completion.md
-ROUGH = 0.03  # of its range: how far the answers of a flow lie about a surface
+ROUGH = 0.015  # of its range: how far the answers of a flow lie about a surface
 EXACT = 0.004  # of its range: no surface is known better
 TAILS = 2  # so many times the error at the measured rays is that between them taken for; docs/completion.md
 SURE = 0.05  # of its range: a surface known better than that holds wherever an answer has the return
 ANSWER = 2**32  # noise numbers from one answer to the next: answer 0 of scan i has the noise of sample i
-USUAL = Sampler("mmps", 10, grid="power:1.5")  # of flows; docs/completion.md has others
+USUAL = Sampler("mmps", 10, grid="power:2")  # of flows; docs/completion.md has others
 
 
 @dataclass(frozen=True)

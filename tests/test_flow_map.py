@@ -137,6 +137,18 @@ def test_renoised_samples_of_an_exact_map_have_the_data_s_distribution(exact):
     torch.testing.assert_close(twice, expected, rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("method", ["renoise:0.5", "renoise:4"])
+def test_any_share_of_fresh_noise_leaves_the_law_of_an_exact_map_s_samples(exact, method):
+    draws, count = Draws(5, range(64)), 64 * 512
+    found = exact.generate(draws.start(exact.noise_shape), sampler=Sampler(method, 4), draws=draws).x
+    assert float(found.mean()) == pytest.approx(0.7, abs=5 * 0.25 / count**0.5)
+    assert float(found.std()) == pytest.approx(0.25, abs=5 * 0.25 / (2 * count) ** 0.5)
+    apart = exact.generate(draws.start(exact.noise_shape), sampler=Sampler("jump", 4)).x
+    assert float((found - apart).std()) > 0.1  # another scan than that of its first noise alone
+    same = exact.generate(draws.start(exact.noise_shape), sampler=Sampler("renoise:0", 4), draws=draws).x
+    assert torch.equal(same, apart)
+
+
 def test_a_part_is_renoised_with_the_noise_of_the_whole(exact):
     region, draws, sampler = Region((8, 32), 0, 8, 8, 16), Draws(5, [0]), Sampler("renoise", 3)
     x_0 = draws.start(exact.noise_shape)
@@ -162,7 +174,7 @@ def test_a_scan_that_leaves_the_numbers_is_flagged_and_keeps_its_last_state(exac
     [
         (Sampler("jump", 4, finish=0.1), "neither levels nor a finish"),
         (Sampler("jump", 4, grid=(0.0, 0.5)), "time grid"),
-        (Sampler("jumps", 4), "no solver named 'jumps'; known: jump, renoise, ab2, "),
+        (Sampler("jumps", 4), "no solver named 'jumps'; known: jump, renoise, sde, ab2, "),
     ],
 )
 def test_samplers_that_jumps_do_not_have_are_refused(grown, sampler, said):

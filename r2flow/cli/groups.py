@@ -82,7 +82,8 @@ class SolverOptions:
     solver: Annotated[
         str | None,
         typer.Option(
-            help="adams2-4, euler, midpoint, heun2-3, rk4, ab2; adaptive: dopri5, bosh3, auto, torchdiffeq:NAME. "
+            help="adams2-4, euler, midpoint, heun2-3, rk4, ab2; adaptive: dopri5, bosh3, auto, torchdiffeq:NAME; with "
+            "fresh noise on the way: sde, sde:C. "
             "Other systems have their own (docs/systems.md), and so has completion (docs/completion.md)."
         ),
     ] = None

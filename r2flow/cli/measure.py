@@ -1,5 +1,6 @@
 """Reports: `r2flow report NAME`."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -96,7 +97,7 @@ def completion(
 
     first = load_checkpoint(checkpoint, choose_device(device))
     counts = [int(one) for one in steps.split(",")] if steps else []
-    ways = ways_of(first, Path(checkpoint).stem, solvers.split(",") if solvers else [], counts)
+    ways = ways_of(first, Path(checkpoint).stem, re.split(r",(?!\d)", solvers) if solvers else [], counts)
     for other in also or []:
         ways += ways_of(load_checkpoint(other, choose_device(device)), Path(other).stem)
     named = tasks.split() if tasks else list(TASKS)

@@ -13,6 +13,7 @@ is exact for every flow: docs/completion.md has how far each is from the posteri
 """
 
 import contextlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -23,10 +24,10 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity, jump
+from r2flow.flow.stochastic import Noise, back, sde
 from r2flow.registry import Registry
 
 Linear = Callable[[Tensor], Tensor]
-Noise = Callable[[int], Tensor]  # N(0, 1) of the j-th draw, j = 1, 2, ..., in the state's shape
 
 GROWN = 10.0  # of |y - A x_1hat|^2: docs/completion.md
 EARLIEST = 0.1  # time before which `mmps` takes the flow's Jacobian of this time: at t = 0 it is divided by 0
@@ -151,9 +152,8 @@ def repaint(
         part = times[first : first + length + 1]
         for again in range(repeats if first else 1):
             if again:
-                j, share = j + 1, part[0] / part[-1]
-                left = (1 - part[0]) ** 2 - share**2 * (1 - part[-1]) ** 2
-                x = share * x + left.sqrt() * noise(j)
+                j += 1
+                x = back(x, float(part[-1]), float(part[0]), noise(j))
             for t, s in pairwise(part):
                 j += 1
                 x = measured.on_path(s, jump(u, t, x, s), noise(j))
@@ -207,29 +207,36 @@ def ot_ode(
     return x
 
 
-def mmps(u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, noise: Noise, products: int = 2) -> Tensor:
+def mmps(
+    u: MeanVelocity,
+    x: Tensor,
+    measured: Measurement,
+    times: Tensor,
+    noise: Noise,
+    products: int = 2,
+    churn: float = 1.0,
+) -> Tensor:
     """The flow's own covariance in the place of r^2 (Rozet et al. 2024, moment matching posterior sampling).
 
     Cov(x_1 | x_t) = C = ((1 - t)^2 / t) J, the second-order Tweedie formula, so that
     E[x_1 | x_t, y] = x_1hat + C A^T (A C A^T + sigma^2)^-1 (y - A x_1hat), which is exact where x_1 is Gaussian given
     x_t. The linear system is solved by `products` steps of conjugate gradients (`_solved`), each one product with J;
-    where C is not positive in a direction, as a network's may be, they end. The velocity to that mean is followed by
-    the Adams-Bashforth method of order 2, the last step by Euler's rule. Known values move straight to y.
+    where C is not positive in a direction, as a network's may be, they end. With that mean `r2flow.flow.stochastic.sde`
+    takes the steps, with `churn` times the reversed diffusion's fresh noise: 0 is the ODE.
     Evaluations: 1 + `products` a step, a vector-Jacobian product counting as one.
     """
-    former: tuple[Tensor, Tensor] | None = None
-    for t, s in pairwise(times):
+
+    def mean(t: Tensor, x: Tensor) -> Tensor:
         at = t.clamp(min=EARLIEST)
         x_1, product = _linearised(u, at, x * ((1 - at) / (1 - t)))
 
-        def multiply(p: Tensor, product: Linear = product, scale: Tensor = (1 - at) ** 2 / at) -> tuple[Tensor, Tensor]:
-            moved = scale * product(measured.transposed(p))
+        def multiply(p: Tensor) -> tuple[Tensor, Tensor]:
+            moved = (1 - at) ** 2 / at * product(measured.transposed(p))
             return moved, measured.apply(moved) + measured.sigma**2 * p
 
-        x_1 = measured.exact(x_1 + _solved(multiply, measured.residual(x_1), products))
-        v, step = (x_1 - x) / (1 - t), s - t
-        slope = v if former is None or s == times[-1] else v + step / (2 * former[1]) * (v - former[0])
-        former, x = (v, step), x + step * slope
+        return measured.exact(x_1 + _solved(multiply, measured.residual(x_1), products))
+
+    *_, x = sde(mean, x, times, churn, noise)
     return x
 
 
@@ -280,6 +287,18 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).flatten(1).sum(1).view(-1, *(1,) * (a.ndim - 1))
 
 
+class Number(NamedTuple):
+    """A number of a method: what it is if it is left out, what it must be, and that in words."""
+
+    usual: int | float
+    valid: Callable[[float], bool]
+    says: str
+
+
+def _whole(usual: int) -> Number:
+    return Number(usual, lambda n: n >= 1, "a whole number of at least 1")
+
+
 @dataclass(frozen=True)
 class Method:
     """A way to sample given a measurement.
@@ -287,14 +306,14 @@ class Method:
     Attributes:
         run: `run(u, x_0, measured, times, noise, *numbers)` to x_1.
         evaluations: Network evaluations of a number of steps and the numbers.
-        numbers: Defaults of what may follow the name, as in `repaint:10,2`.
+        numbers: What may follow the name, as in `repaint:10,2`.
         draws: Whether it draws noise on the way.
         masks: Whether it takes masks alone, and no other linear A.
     """
 
     run: Callable[..., Tensor]
     evaluations: Callable[..., int]
-    numbers: tuple[int | float, ...] = ()
+    numbers: tuple[Number, ...] = ()
     draws: bool = False
     masks: bool = False
 
@@ -303,11 +322,18 @@ METHODS: Registry[Method] = Registry(
     "method of completion",
     replace=Method(replace, lambda n: n, masks=True),
     replace_fresh=Method(replace_fresh, lambda n: n, draws=True, masks=True),
-    repaint=Method(repaint, lambda n, repeats, length: n + (repeats - 1) * max(n - length, 0), (4, 1), True, True),
+    repaint=Method(
+        repaint, lambda n, repeats, length: n + (repeats - 1) * max(n - length, 0), (_whole(4), _whole(1)), True, True
+    ),
     flowdps=Method(flowdps, lambda n: n, draws=True),
-    pnp=Method(pnp, lambda n, repeats: n * repeats, (5,), draws=True),
-    ot_ode=Method(ot_ode, lambda n, start: 2 * n, (0.2,)),
-    mmps=Method(mmps, lambda n, products: n * (1 + products), (2,)),
+    pnp=Method(pnp, lambda n, repeats: n * repeats, (_whole(5),), draws=True),
+    ot_ode=Method(ot_ode, lambda n, start: 2 * n, (Number(0.2, lambda n: 0 < n < 1, "a start in (0, 1)"),)),
+    mmps=Method(
+        mmps,
+        lambda n, products, _: n * (1 + products),
+        (_whole(2), Number(1.0, lambda c: 0 <= c < math.inf, "a share of fresh noise of at least 0")),
+        draws=True,
+    ),
 )
 
 
@@ -329,7 +355,7 @@ def completes(text: str) -> bool:
 
 
 def parse_method(text: str) -> Chosen:
-    """A method by its text, `NAME` or `NAME:NUMBER,...`: whole numbers of at least 1, and a start in (0, 1).
+    """A method by its text, `NAME` or `NAME:NUMBER,...`.
 
     Raises:
         InputError: no such method, or numbers that it does not take.
@@ -338,14 +364,16 @@ def parse_method(text: str) -> Chosen:
     method, numbers = METHODS[name], []
     words = given.split(",") if given else []
     with contextlib.suppress(ValueError):
-        numbers = [type(default)(word) for default, word in zip(method.numbers, words, strict=False)]
-    right = len(numbers) == len(words) and all(n >= 1 if isinstance(n, int) else 0 < n < 1 for n in numbers)
-    if not right:
-        usual = ":" + ",".join(map(str, method.numbers)) if method.numbers else " without numbers"
-        kinds = {int: " (whole numbers of at least 1)", float: " (a start in (0, 1))"}
-        takes = kinds[type(method.numbers[0])] if method.numbers else ""
+        numbers = [type(number.usual)(word) for number, word in zip(method.numbers, words, strict=False)]
+    right = all(number.valid(n) for number, n in zip(method.numbers, numbers, strict=False))
+    if len(numbers) != len(words) or not right:
+        usual = (
+            ":" + ",".join(f"{number.usual:g}" for number in method.numbers) if method.numbers else " without numbers"
+        )
+        takes = " and ".join(dict.fromkeys(number.says for number in method.numbers))
+        takes = f" ({takes})" if takes else ""
         raise InputError(f"the numbers of {text!r} are none that {name} takes{takes}: give {name}{usual}.")
-    return Chosen(name, method, (*numbers, *method.numbers[len(numbers) :]))
+    return Chosen(name, method, (*numbers, *(number.usual for number in method.numbers[len(numbers) :])))
 
 
 def sample_posterior(

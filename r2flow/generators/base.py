@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
-from r2flow.flow.solvers import usual_grid
+from r2flow.flow.solvers import TORCHDIFFEQ, usual_grid
+from r2flow.flow.stochastic import SDE
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
@@ -90,19 +91,21 @@ class Sampler:
     def changed(self, **options: Any) -> Self:
         """The same with the options that are not None. Given times decide the number of steps.
 
-        Another method starts from its usual grid, without `finish` and `levels`: those were the former one's.
+        Another method starts from its usual grid and `finish`, without `levels`: those were the former one's. The same
+        one with other numbers, as `sde:2` for `sde`, keeps them.
 
         Raises:
             InputError: fewer than one step, or times and a number of steps that contradict.
         """
         given = {key: value for key, value in options.items() if value is not None}
-        if given.get("method", self.method) != self.method:
-            given = {"grid": usual_grid(given["method"]), "finish": 0.0, "levels": (), "limits": (), **given}
+        finish = given.get("finish", 0.0)
+        if _kind(given.get("method", self.method)) != _kind(self.method):
+            given = {**_usual(given["method"]), "levels": (), "limits": (), **given}
         if "steps" in given:
             given = {"levels": (), "limits": (), **given}
         grid = given.get("grid", "uniform")
         if not isinstance(grid, str):
-            given = {"finish": 0.0, **given, "grid": tuple(float(t) for t in grid)}
+            given = {**given, "finish": finish, "grid": tuple(float(t) for t in grid)}
             if given.setdefault("steps", len(given["grid"]) - 1) != len(given["grid"]) - 1:
                 raise InputError(f"the time grid has {len(given['grid']) - 1} steps, found steps={given['steps']}.")
         elif "steps" in given and "grid" not in given and not isinstance(self.grid, str):
@@ -125,6 +128,18 @@ class Sampler:
     def asdict(self) -> dict[str, Any]:
         """Plain values, as a config or a checkpoint holds them."""
         return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+
+
+def _kind(method: str) -> str:
+    """A method's name without its numbers; torchdiffeq's have their own after the colon."""
+    return method if method.startswith(TORCHDIFFEQ) else method.partition(":")[0]
+
+
+def _usual(method: str) -> Mapping[str, Any]:
+    """Where its steps fall; of `sde`, what was best or nearly so of `street`, `street_full` and a flow of minutes."""
+    if _kind(method) == SDE:
+        return {"grid": "power:2.5", "finish": 1 / 128}
+    return {"grid": usual_grid(method), "finish": 0.0}
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class Diffusion(NetworkFlow):
         clip: Expected data are clamped to [-clip, clip] whenever scans are made; null leaves them as they are.
     """
 
-    other_samplers = DDPM, f"{DDIM}:ETA"
+    other_samplers = DDPM, f"{DDIM}:ETA", *NetworkFlow.other_samplers
 
     def __init__(
         self,

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from r2flow.backbones import build_backbone
 from r2flow.errors import InputError
+from r2flow.flow.path import expand_time
 from r2flow.flow.posterior import METHODS, Measurement, completes, parse_method, sample_posterior
 from r2flow.flow.solvers import (
     Solution,
@@ -21,6 +22,7 @@ from r2flow.flow.solvers import (
     solve,
 )
 from r2flow.flow.solvers.grids import build_grid
+from r2flow.flow.stochastic import SDE, churn_of, sde
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, parts_of
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
@@ -30,10 +32,16 @@ USUAL = Sampler("adams3", 16, grid="power:1.5", finish=1 / 32)  # of a new flow:
 UNTOLD = f"this flow was trained without a condition; a scan is completed with it by --solver {', '.join(METHODS)}."
 
 
-class Flow(Generator):
-    """A generator by an ODE. A subclass gives its velocity, and names what it is sampled by beside solvers."""
+CHURN = 1.0  # of `sde`: the reversed diffusion
 
-    other_samplers: ClassVar[tuple[str, ...]] = ()
+
+class Flow(Generator):
+    """A generator by an ODE. A subclass gives its velocity, and names what it is sampled by beside solvers.
+
+    The sampler `sde:C` replaces noise on the way, by C times the reversed diffusion's share (`r2flow.flow.stochastic`).
+    """
+
+    other_samplers: ClassVar[tuple[str, ...]] = (SDE,)
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         """v(t, x), (B, C, H, W), at times t of shape () or (B,)."""
@@ -65,6 +73,8 @@ class Flow(Generator):
             InputError: as `solve` does.
         """
         how = sampler or self.sampler
+        if churn_of(how.method, SDE, CHURN) is not None:
+            raise InputError(f"{how.method} draws noise on the way: give a solver, as --solver adams3.")
         field, x = self.field(condition), x.to(self.device)
 
         def by(field: Velocity, x: Tensor, steps: int) -> Solution:
@@ -89,11 +99,52 @@ class Flow(Generator):
             image, known, doubtful = parts_of(condition, noise)
             measured = Measurement(image, (known + doubtful > 0).to(noise), how.doubt * doubtful)
             return self.given(noise, measured, sampler=how, draws=draws, progress=progress)
+        churn = churn_of(how.method, SDE, CHURN)
+        if churn is not None:
+            return self._stochastic(noise, condition, how, churn, draws, progress)
         options: dict[str, Any] = {}
         if how.finish and how.steps > 1:
             how, options = replace(how, steps=how.steps - 1), {"finish": how.finish}
         end = self.solve(noise, sampler=how, condition=condition, progress=progress, **options)
         return Generated(end.x, end.evaluations, end.converged)
+
+    @torch.no_grad()
+    def _stochastic(
+        self,
+        noise: Tensor,
+        condition: Condition | None,
+        how: Sampler,
+        churn: float,
+        draws: Draws | None,
+        progress: Progress,
+    ) -> Generated:
+        if draws is None:
+            raise InputError(f"{how.method} draws further noise: give draws.")
+        noise = noise.to(self.device)
+        x = noise = noise if noise.dtype == torch.float64 else noise.float()
+        last = how.finish and how.steps > 1
+        times = self._times(replace(how, steps=how.steps - 1), 0.0, 1 - how.finish) if last else self._times(how)
+        times = torch.cat([times, times.new_ones(1)]) if last else times
+        alive = torch.ones(len(x), dtype=torch.bool, device=x.device)
+
+        field = self.field(condition)
+
+        def estimate(t: Tensor, x: Tensor) -> Tensor:
+            return x + (1 - t) * field(t, x).to(x)
+
+        def fresh(j: int) -> Tensor:
+            return self.further_noise(draws, j).to(noise)
+
+        for following in sde(estimate, x, times, churn, fresh):
+            alive = alive & following.isfinite().flatten(1).all(1)
+            x = torch.where(expand_time(alive, x), following, x)
+            if progress is not None:
+                progress()
+        return Generated(x, torch.full((len(x),), how.steps, device=x.device), alive)
+
+    def further_noise(self, draws: Draws, j: int) -> Tensor:
+        """The noise of step j."""
+        return draws.step(self.noise_shape, j)
 
     @torch.no_grad()
     def given(
@@ -146,6 +197,11 @@ class Flow(Generator):
                 raise InputError(f"{sampler.method} has neither levels nor a finish; leave them out.")
             self._times(sampler)
             return
+        if churn_of(sampler.method, SDE, CHURN) is not None:
+            if sampler.levels:
+                raise InputError(f"{sampler.method} has no levels; leave them out, or give a solver.")
+            self._times(sampler)
+            return
         check_method(sampler.method, self.other_samplers)
         check_tolerance(sampler.tolerance)
         method = fixed_step(sampler.method)
@@ -162,6 +218,8 @@ class Flow(Generator):
     def evaluations_of(self, sampler: Sampler) -> int:
         if completes(sampler.method):
             return parse_method(sampler.method).evaluations(sampler.steps)
+        if churn_of(sampler.method, SDE, CHURN) is not None:
+            return sampler.steps
         method = fixed_step(sampler.method)
         return 0 if method is None or sampler.levels else method.cost(sampler.steps)
 

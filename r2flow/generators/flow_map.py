@@ -1,5 +1,6 @@
 """A flow map: one network that jumps from any time to any other."""
 
+import math
 from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any, ClassVar
@@ -11,6 +12,7 @@ from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers import Solution
+from r2flow.flow.stochastic import ahead, back, churn_of
 from r2flow.generators.base import Condition, Generated, Progress, Sampler
 from r2flow.generators.flow import UNTOLD, Conditioned, RectifiedFlow
 from r2flow.lidar.space import ModelSpace
@@ -27,7 +29,10 @@ class FlowMap(RectifiedFlow):
     - `jump`: from each time of the grid to the next;
     - `renoise`: from each time t to the end, then back to the next time s along a line to fresh noise,
       x_s = (1 - s) e + s X_{t->1}(x_t): a sample of the same distribution where the map is exact, and not the end of
-      this noise's own path (Song et al. 2023, consistency models, algorithm 1).
+      this noise's own path (Song et al. 2023, consistency models, algorithm 1);
+    - `renoise:C`: from t not to the end but so far beyond s that the way back replaces C times the noise that the
+      reversed diffusion would (`r2flow.flow.stochastic.ahead`; Kim et al. 2024, consistency trajectory models, call a
+      jump beyond s and back gamma-sampling).
 
     Args:
         space: The images it makes.
@@ -36,7 +41,7 @@ class FlowMap(RectifiedFlow):
 
     second_time: ClassVar[bool] = True
     goes_on_as = "rectified_flow"  # where velocities alone are learned, the jumps would be those of another flow
-    other_samplers = JUMP, RENOISE
+    other_samplers = JUMP, RENOISE, *RectifiedFlow.other_samplers
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space, backbone)
@@ -71,7 +76,7 @@ class FlowMap(RectifiedFlow):
         given = [name for name, value in options.items() if value is not None]
         if given:
             raise InputError(f"jumps have no {', '.join(given)}; leave that out, or give a solver, as --solver adams3.")
-        end = self._jumps(x, self._times(how, t_0, t_1), condition, None, progress)
+        end = self._jumps(x, self._times(how, t_0, t_1), condition, progress)
         return Solution.build(end.x, end.evaluations.cpu().numpy(), how.steps, 0, False, end.converged.cpu().numpy())
 
     def generate(
@@ -84,24 +89,30 @@ class FlowMap(RectifiedFlow):
         progress: Progress = None,
     ) -> Generated:
         how = sampler or self.sampler
-        if how.method != RENOISE:
+        churn = _churn(how)
+        if churn is None or how.method == JUMP:
             return super().generate(noise, condition, sampler=how, draws=draws, progress=progress)
         if draws is None:
-            raise InputError("renoise draws further noise: give draws.")
+            raise InputError(f"{how.method} draws further noise: give draws.")
         with torch.no_grad():
-            return self._jumps(noise, self._times(how, 0.0, 1.0), condition, draws, progress)
+            return self._jumps(noise, self._times(how), condition, progress, churn, draws)
 
     def _jumps(
-        self, x: Tensor, times: Tensor, condition: Condition | None, draws: Draws | None, progress: Progress
+        self,
+        x: Tensor,
+        times: Tensor,
+        condition: Condition | None,
+        progress: Progress,
+        churn: float = 0.0,
+        draws: Draws | None = None,
     ) -> Generated:
         x, u = x.to(self.device), self.map(condition)
-        for n, (t, s) in enumerate(pairwise(times.to(x)), start=1):
-            if draws is None:
-                following = jump(u, t, x, s)
-            else:
-                following = jump(u, t, x, times[-1].to(x))
-                if n < len(times) - 1:
-                    following = (1 - s) * self.further_noise(draws, n).to(x) + s * following
+        for n, (t, s) in enumerate(pairwise(times.tolist()), start=1):
+            r = s if draws is None else ahead(t, s, churn)
+            at, to = torch.tensor([t, r], dtype=torch.float64).to(x)
+            following = jump(u, at, x, to)
+            if draws is not None and r > s:
+                following = back(following, r, s, self.further_noise(draws, n).to(x))
             alive = following.isfinite().flatten(1).all(1)
             x = following if bool(alive.all()) else torch.where(expand_time(alive, x), following, x)
             if progress is not None:
@@ -109,7 +120,7 @@ class FlowMap(RectifiedFlow):
         return Generated.after(x, len(times) - 1)
 
     def check_sampler(self, sampler: Sampler) -> None:
-        if sampler.method not in (JUMP, RENOISE):
+        if _churn(sampler) is None:
             super().check_sampler(sampler)
             return
         if sampler.levels or sampler.finish:
@@ -117,8 +128,13 @@ class FlowMap(RectifiedFlow):
         self._times(sampler, 0.0, 1.0)
 
     def evaluations_of(self, sampler: Sampler) -> int:
-        return sampler.steps if sampler.method in (JUMP, RENOISE) else super().evaluations_of(sampler)
+        return sampler.steps if _churn(sampler) is not None else super().evaluations_of(sampler)
 
     def in_steps(self, steps: int) -> Sampler:
-        learned = self.sampler.grid if self.sampler.method in (JUMP, RENOISE) else "uniform"
+        learned = self.sampler.grid if _churn(self.sampler) is not None else "uniform"
         return Sampler(JUMP, 4, grid=learned).changed(steps=steps)
+
+
+def _churn(how: Sampler) -> float | None:
+    """c of a sampler of jumps, 0 for `jump`; None of another."""
+    return 0.0 if how.method == JUMP else churn_of(how.method, RENOISE, math.inf)

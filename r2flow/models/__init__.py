@@ -37,11 +37,11 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes in any number of evaluations, learned from simulated scans",
-        "5391347f40a829b72abec7c3c2a938b21f3e4b5bca53bb0d12f92e07f6d75d95",
+        "cc31b551e2d5de9b733c732ab7dd021944ee56a13e78a3a5b3183d76ef46c25c",
     ),
     street_full=Model(
         "street scenes at 64 x 1024, learned from simulated scans",
-        "cb640c27144b71b14c754397ac3e15923437b657c2ed91e5cce33441f77938e2",
+        "993c3e99dcf38d8078745ac2819c65371fd7e9f8e278ec861a55bd30858f8656",
         page="release/street_full.safetensors in the source of r2flow",
     ),
 )

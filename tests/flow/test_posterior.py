@@ -396,7 +396,7 @@ def test_what_does_not_fit_is_said_in_one_line():
     flow, x_0 = Field(gaussian(), (WIDTH,)), torch.zeros(1, WIDTH)
     part = condition_of_part(x_0, torch.ones_like(x_0).tril(), torch.zeros_like(x_0))
     for how, words in (
-        (Sampler("repaint:0"), r"none that repaint takes \(whole numbers of at least 1\): give repaint:4,1"),
+        (Sampler("repaint:0"), r"none that repaint takes \(a whole number of at least 1\): give repaint:4,1"),
         (Sampler("ot_ode:1"), r"none that ot_ode takes \(a start in \(0, 1\)\): give ot_ode:0.2"),
         (Sampler("flowdps:2"), "none that flowdps takes: give flowdps without numbers"),
         (Sampler("repaint:1,2,3"), "none that repaint takes"),

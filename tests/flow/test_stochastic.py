@@ -1,0 +1,176 @@
+"""Samplers with fresh noise on the way, against closed forms: they draw the same scans, along other paths."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.export import tableau
+from r2flow.flow.solvers import named_grid
+from r2flow.flow.stochastic import ahead, back, churn_of, sde, sde_step
+from r2flow.generators import Field, Sampler, build_generator
+from r2flow.lidar.region import Region
+from r2flow.noise import Draws
+from r2flow.sampling import draw
+
+STD = 0.4  # of x_1 ~ N(0, STD^2), where everything is linear
+
+
+def times(steps: int, grid: str = "power:2") -> Tensor:
+    return named_grid(grid)(0.0, 1.0, steps)
+
+
+def estimate(t: Tensor, x: Tensor) -> Tensor:
+    """E[x_1 | x_t] of the Gaussian."""
+    return t * STD**2 / (t**2 * STD**2 + (1 - t) ** 2) * x
+
+
+def variance(t: float) -> float:
+    """Var x_t = t^2 STD^2 + (1 - t)^2."""
+    return t**2 * STD**2 + (1 - t) ** 2
+
+
+def variances(steps: int, c: float, grid: str = "power:2") -> list[float]:
+    """Var x_t after each step, exactly: of a linear method, the squares of what each draw of noise becomes."""
+    units = torch.eye(steps + 1, dtype=torch.float64)[:, :, None]
+    states = sde(estimate, units[0], times(steps, grid), c, lambda j: units[j])
+    return [float(x.square().sum()) for x in states]
+
+
+@pytest.mark.parametrize("c", [0.0, 0.5, 1.0, 3.0])
+def test_at_any_share_of_fresh_noise_the_law_of_x_t_is_the_flow_s_and_its_error_of_order_2(c):
+    errors = []
+    for steps in (40, 80, 160):
+        grid = times(steps).tolist()[1:-1]  # the last step is Euler's, of a length that shrinks as its square
+        found = variances(steps, c)
+        errors.append(max(abs(v / variance(t) - 1) for t, v in zip(grid, found[:-1], strict=True)))
+        assert found[-1] == pytest.approx(STD**2, rel=2 * errors[-1] + 2e-3)
+    assert errors[-1] < 1e-3 * (1 + c)
+    orders = [math.log2(a / b) for a, b in pairwise(errors)]
+    assert min(orders) > 1.7
+
+
+@pytest.mark.parametrize("c", [0.0, 1.0, 2.5])
+def test_a_step_is_exact_where_the_estimate_is_linear_in_time(c):
+    """Against the mean's own equation, dx/dt = (D - x) / (1 - t) - c (x - t D) / (t (1 - t)), by scipy."""
+    t_b, t, s, a, b, x = 0.1, 0.35, 0.8, 0.7, -1.9, 0.3
+    step = sde_step(t, s, c, t_b)
+
+    def slope(t: float, x: np.ndarray) -> np.ndarray:
+        end = a + b * t
+        return (end - x) / (1 - t) - c * (x - t * end) / (t * (1 - t))
+
+    expected = solve_ivp(slope, (t, s), [x], rtol=1e-11, atol=1e-12).y[0, -1]
+    assert step.keep * x + step.now * (a + b * t) + step.before * (a + b * t_b) == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_first_step_is_euler_s_and_the_last_one_goes_to_the_estimate():
+    assert sde_step(0.0, 0.3, 2.0) == pytest.approx((0.7, 0.3, 0.0, 0.0))
+    assert sde_step(0.6, 1.0, 2.0, 0.5) == (0.0, 1.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("c", [0.0, 0.7, 4.0])
+def test_a_jump_ahead_and_back_keeps_the_law_and_replaces_the_sde_s_share(c):
+    t, s = 0.3, 0.55
+    r = ahead(t, s, c)
+    assert r >= s
+    units = torch.eye(2, dtype=torch.float64)[:, :, None]
+    there = math.sqrt(variance(r)) * units[0]  # the flow map of a Gaussian scales its deviation
+    found = back(there, r, s, units[1])
+    assert float(found.square().sum()) == pytest.approx(variance(s), rel=1e-12)
+    noise_kept = s / r * (1 - r) / (1 - s)
+    odds = t / (1 - t) / (s / (1 - s))
+    assert noise_kept == pytest.approx(odds**c, rel=1e-12)
+    assert noise_kept * (1 - s) / (1 - t) == pytest.approx(sde_step(t, s, c).keep, rel=1e-12)
+
+
+def test_where_all_is_noise_a_jump_goes_no_farther_and_without_end_to_the_end():
+    assert ahead(0.0, 0.4, 2.0) == 0.4
+    assert ahead(0.2, 0.4, 0.0) == 0.4
+    assert ahead(0.2, 0.4, math.inf) == ahead(0.2, 1.0, 1.0) == 1.0
+
+
+def test_the_share_is_in_the_name():
+    assert churn_of("sde", "sde", 1.0) == 1.0
+    assert churn_of("sde:0.25", "sde", 1.0) == 0.25
+    assert churn_of("euler", "sde", 1.0) is None
+    assert churn_of("renoise", "renoise", math.inf) == math.inf
+    for wrong in ("sde:", "sde:x", "sde:-1", "sde:inf", "sde:nan"):
+        with pytest.raises(InputError, match=r"sde:C must be a number of at least 0, found 'sde:"):
+            churn_of(wrong, "sde", 1.0)
+
+
+CONFIG = {
+    "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
+    "encoding": {"format": "logscale", "reflectance": True},
+    "backbone": {"name": "hdit", "base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
+}
+
+
+def normal() -> Field:
+    return Field(lambda t, x: (estimate(t, x) - x) / (1 - t), (2, 8, 32), build_generator(CONFIG).space)
+
+
+@pytest.mark.parametrize("method", ["sde", "sde:3"])
+def test_a_flow_draws_the_data_s_distribution(method):
+    flow, who = normal(), Draws(3, range(48))
+    how = Sampler(method, 32, grid="power:2", finish=1 / 64)
+    made = flow.generate(who.start(flow.noise_shape), sampler=how, draws=who)
+    count = made.x.numel()  # 24,576 values
+    # Of an Euler step over 1/64 the deviation lacks (1/64)^2 / (2 STD^2), the rest is the steps' error of order 2.
+    assert float(made.x.std()) == pytest.approx(STD, abs=5 * STD / (2 * count) ** 0.5 + 0.004)
+    assert float(made.x.mean()) == pytest.approx(0, abs=5 * STD / count**0.5)
+    assert made.evaluations.tolist() == [32] * 48
+    assert flow.evaluations_of(how) == 32
+    assert made.converged.all()
+
+
+def test_a_scan_is_a_function_of_its_number_and_what_fails_does_not_touch_the_others():
+    flow, how = normal(), Sampler("sde", 5)
+    whole = draw(flow, range(3), 7, how).images
+    for i in range(3):
+        torch.testing.assert_close(draw(flow, [i], 7, how).images[0], whole[i])
+    x_0 = Draws(7, range(3)).start(flow.noise_shape)
+    fine = flow.generate(x_0, sampler=how, draws=Draws(7, range(3))).x
+    x_0[1, 0, 0, 0] = math.inf
+    made = flow.generate(x_0, sampler=how, draws=Draws(7, range(3)))
+    assert made.converged.tolist() == [True, False, True]
+    assert torch.equal(made.x[::2], fine[::2])
+
+
+def test_a_part_has_the_noise_of_the_whole():
+    flow = build_generator(CONFIG).eval()  # untrained, its velocity is 0 and nothing is seen of other rays
+    region, who, how = Region((8, 32), 0, 8, 8, 16), Draws(5, [0]), Sampler("sde", 4)
+    x_0 = who.start(flow.noise_shape)
+    whole = flow.generate(x_0, sampler=how, draws=who).x
+    part = flow.part(region).generate(region.crop(x_0), sampler=how, draws=who).x
+    torch.testing.assert_close(part, region.crop(whole), rtol=0, atol=1e-6)
+
+
+def test_what_needs_the_ode_says_so():
+    flow = build_generator(CONFIG).eval()
+    x_0 = torch.zeros(1, *flow.noise_shape)
+    with pytest.raises(InputError, match="sde draws further noise: give draws"):
+        flow.generate(x_0, sampler=Sampler("sde", 2))
+    with pytest.raises(InputError, match="sde:2 draws noise on the way: give a solver, as --solver adams3"):
+        flow.solve(x_0, sampler=Sampler("sde:2", 2))
+    with pytest.raises(InputError, match="sde cannot be exported"):
+        tableau(flow, Sampler("sde", 2))
+    with pytest.raises(InputError, match="sde has no levels"):
+        flow.check_sampler(Sampler("sde", 2, levels=(2, 4), limits=(0.1,)))
+
+
+def test_another_method_starts_from_its_usual_steps_and_another_number_of_the_same_keeps_them():
+    usual = Sampler("adams3", 16, grid="power:1.5", finish=1 / 32).changed(method="sde", steps=32)
+    assert usual == Sampler("sde", 32, grid="power:2.5", finish=1 / 128)
+    own = Sampler("renoise", 8, grid="power:3")
+    assert own.changed(method="renoise:3") == Sampler("renoise:3", 8, grid="power:3")
+    assert own.changed(method="euler").grid == "uniform"
+    assert Sampler("torchdiffeq:rk4", grid="power:2").changed(method="torchdiffeq:euler").grid == "uniform"
+    timed = own.changed(method="sde", grid=(0.0, 0.5, 1.0))
+    assert (timed.finish, timed.steps) == (0.0, 2)
