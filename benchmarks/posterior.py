@@ -11,14 +11,13 @@ python benchmarks/posterior.py --cases sector,blur --methods mmps,flowdps
 """
 
 import argparse
-import re
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from r2flow.flow.maps import MeanVelocity
-from r2flow.flow.posterior import METHODS, Measurement, parse_method, sample_posterior
+from r2flow.flow.posterior import METHODS, Measurement, methods_in, parse_method, sample_posterior
 from r2flow.flow.problems import Correlated
 from r2flow.flow.solvers import named_grid
 
@@ -230,7 +229,7 @@ def main() -> None:
     parser.add_argument("--grid", default="uniform")
     parser.add_argument("--num", type=int, default=4096)
     args = parser.parse_args()
-    methods, evaluations = re.split(r",(?!\d)", args.methods), [int(n) for n in args.evaluations.split(",")]
+    methods, evaluations = methods_in(args.methods), [int(n) for n in args.evaluations.split(",")]
     print("method".ljust(22) + "  ".join(f"{n:<19d}" for n in evaluations))
     for name in filter(None, args.cases.split(",")):
         table(name, methods, evaluations, args.grid)

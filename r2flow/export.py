@@ -80,9 +80,10 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
     basis = torch.eye(count + 1, dtype=torch.float64)[:, :1, None, None]  # x_0 is the first unit vector
     try:
         x_1 = shadow.generate(basis, sampler=sampler).x
-    except InputError as error:  # it draws noise on the way
-        problem = str(error).rstrip(".")
-        raise InputError(f"{sampler.method} cannot be exported, {problem!r}: give another --solver.") from None
+    except InputError:
+        raise InputError(
+            f"{sampler.method} cannot be exported, it draws noise on the way: give another --solver."
+        ) from None
     times, states, second = zip(*recorder.calls, strict=True)
     rows = torch.stack([*states, x_1]).reshape(-1, count + 1)[:, : len(times) + 1]  # a `finish` takes fewer than count
     return Tableau([float(t) for t in times], [float(s) for s in second] if flow.second_time else None, rows)

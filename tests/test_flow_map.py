@@ -149,8 +149,9 @@ def test_any_share_of_fresh_noise_leaves_the_law_of_an_exact_map_s_samples(exact
     assert torch.equal(same, apart)
 
 
-def test_a_part_is_renoised_with_the_noise_of_the_whole(exact):
-    region, draws, sampler = Region((8, 32), 0, 8, 8, 16), Draws(5, [0]), Sampler("renoise", 3)
+@pytest.mark.parametrize("method", ["renoise", "renoise:2"])
+def test_a_part_is_renoised_with_the_noise_of_the_whole(exact, method):
+    region, draws, sampler = Region((8, 32), 0, 8, 8, 16), Draws(5, [0]), Sampler(method, 3)
     x_0 = draws.start(exact.noise_shape)
     whole = exact.generate(x_0, sampler=sampler, draws=draws)
     part = exact.part(region).generate(region.crop(x_0), sampler=sampler, draws=draws)

@@ -1,6 +1,5 @@
 """Reports: `r2flow report NAME`."""
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -90,6 +89,7 @@ def completion(
 
     from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.output import command, finish
+    from r2flow.flow.posterior import methods_in
     from r2flow.progress import Bar
     from r2flow.reports.completion import TASKS, completion_page, completion_rows, given_by, pictured, ways_of
     from r2flow.reports.inversion import real_scans
@@ -97,7 +97,7 @@ def completion(
 
     first = load_checkpoint(checkpoint, choose_device(device))
     counts = [int(one) for one in steps.split(",")] if steps else []
-    ways = ways_of(first, Path(checkpoint).stem, re.split(r",(?!\d)", solvers) if solvers else [], counts)
+    ways = ways_of(first, Path(checkpoint).stem, methods_in(solvers) if solvers else [], counts)
     for other in also or []:
         ways += ways_of(load_checkpoint(other, choose_device(device)), Path(other).stem)
     named = tasks.split() if tasks else list(TASKS)

@@ -21,7 +21,7 @@ from r2flow.data.loader import Item, Order
 from r2flow.data.shards import Block, PairRecipe, PairStore
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution, knot_times
-from r2flow.generators import Generated, Generator, Sampler, as_flow
+from r2flow.generators import Flow, Generated, Generator, Sampler, as_flow
 from r2flow.models import name_of
 
 
@@ -72,6 +72,9 @@ def make_pairs(
     if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
         raise InputError(f"these pairs are of another noise than the generator's {generator.noise_shape}.")
     generator.check_sampler(store.recipe.sampler)
+    if isinstance(generator, Flow) and generator.draws_noise(store.recipe.sampler):
+        drawn = store.recipe.sampler.method
+        raise InputError(f"a pair is one path's ends, and {drawn} draws noise on the way; give a solver, as adams3.")
     _refuse_unlearned_times(generator.sampler, store.recipe.sampler)
     store.begin()
     # Shards are checked by turns; who finds one damaged makes its batches, which the others hold to be there.

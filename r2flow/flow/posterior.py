@@ -14,6 +14,7 @@ is exact for every flow: docs/completion.md has how far each is from the posteri
 
 import contextlib
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -307,32 +308,29 @@ class Method:
         run: `run(u, x_0, measured, times, noise, *numbers)` to x_1.
         evaluations: Network evaluations of a number of steps and the numbers.
         numbers: What may follow the name, as in `repaint:10,2`.
-        draws: Whether it draws noise on the way.
         masks: Whether it takes masks alone, and no other linear A.
     """
 
     run: Callable[..., Tensor]
     evaluations: Callable[..., int]
     numbers: tuple[Number, ...] = ()
-    draws: bool = False
     masks: bool = False
 
 
 METHODS: Registry[Method] = Registry(
     "method of completion",
     replace=Method(replace, lambda n: n, masks=True),
-    replace_fresh=Method(replace_fresh, lambda n: n, draws=True, masks=True),
+    replace_fresh=Method(replace_fresh, lambda n: n, masks=True),
     repaint=Method(
-        repaint, lambda n, repeats, length: n + (repeats - 1) * max(n - length, 0), (_whole(4), _whole(1)), True, True
+        repaint, lambda n, repeats, length: n + (repeats - 1) * max(n - length, 0), (_whole(4), _whole(1)), True
     ),
-    flowdps=Method(flowdps, lambda n: n, draws=True),
-    pnp=Method(pnp, lambda n, repeats: n * repeats, (_whole(5),), draws=True),
+    flowdps=Method(flowdps, lambda n: n),
+    pnp=Method(pnp, lambda n, repeats: n * repeats, (_whole(5),)),
     ot_ode=Method(ot_ode, lambda n, start: 2 * n, (Number(0.2, lambda n: 0 < n < 1, "a start in (0, 1)"),)),
     mmps=Method(
         mmps,
         lambda n, products, _: n * (1 + products),
         (_whole(2), Number(1.0, lambda c: 0 <= c < math.inf, "a share of fresh noise of at least 0")),
-        draws=True,
     ),
 )
 
@@ -352,6 +350,11 @@ class Chosen(NamedTuple):
 def completes(text: str) -> bool:
     """Whether a sampler's method is one of `METHODS`."""
     return text.partition(":")[0] in METHODS
+
+
+def methods_in(text: str) -> list[str]:
+    """The methods of a list with commas between them, `NAME,NAME:NUMBER,NUMBER,NAME`: no name begins with a number."""
+    return re.split(r",\s*(?=[A-Za-z])", text)
 
 
 def parse_method(text: str) -> Chosen:
@@ -395,6 +398,8 @@ def sample_posterior(
     if chosen.method.masks and measured.forward is not None:
         others = ", ".join(name for name, one in METHODS.items() if not one.masks)
         raise InputError(f"{chosen.called} is for masks alone; for another measurement give {others}.")
-    if chosen.method.draws and noise is None:
-        raise InputError(f"{chosen.called} draws further noise: give draws.")
-    return measured.exact(chosen.method.run(u, x_0, measured, times.to(x_0), noise, *chosen.numbers))
+
+    def missing(j: int) -> Tensor:
+        raise InputError(f"{method} draws further noise: give draws.")
+
+    return measured.exact(chosen.method.run(u, x_0, measured, times.to(x_0), noise or missing, *chosen.numbers))

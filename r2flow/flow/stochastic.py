@@ -25,11 +25,11 @@ from r2flow.errors import InputError
 Estimate = Callable[[Tensor, Tensor], Tensor]  # x_1hat of t, of shape (), and x_t
 Noise = Callable[[int], Tensor]  # N(0, 1) of the j-th draw, j = 1, 2, ..., in the state's shape
 
-SDE = "sde"
+SDE, CHURN = "sde", 1.0  # the sampler's name, and its C where none is given: the reversed diffusion
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
-def churn_of(method: str, name: str, usual: float) -> float | None:
+def churn_of(method: str, name: str = SDE, usual: float = CHURN) -> float | None:
     """c of a sampler's text, `NAME` or `NAME:c`; None of another method.
 
     Raises:

@@ -98,14 +98,13 @@ class Sampler:
             InputError: fewer than one step, or times and a number of steps that contradict.
         """
         given = {key: value for key, value in options.items() if value is not None}
-        finish = given.get("finish", 0.0)
         if _kind(given.get("method", self.method)) != _kind(self.method):
             given = {**_usual(given["method"]), "levels": (), "limits": (), **given}
         if "steps" in given:
             given = {"levels": (), "limits": (), **given}
         grid = given.get("grid", "uniform")
         if not isinstance(grid, str):
-            given = {**given, "finish": finish, "grid": tuple(float(t) for t in grid)}
+            given |= {"finish": options.get("finish") or 0.0, "grid": tuple(float(t) for t in grid)}
             if given.setdefault("steps", len(given["grid"]) - 1) != len(given["grid"]) - 1:
                 raise InputError(f"the time grid has {len(given['grid']) - 1} steps, found steps={given['steps']}.")
         elif "steps" in given and "grid" not in given and not isinstance(self.grid, str):

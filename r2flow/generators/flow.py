@@ -32,9 +32,6 @@ USUAL = Sampler("adams3", 16, grid="power:1.5", finish=1 / 32)  # of a new flow:
 UNTOLD = f"this flow was trained without a condition; a scan is completed with it by --solver {', '.join(METHODS)}."
 
 
-CHURN = 1.0  # of `sde`: the reversed diffusion
-
-
 class Flow(Generator):
     """A generator by an ODE. A subclass gives its velocity, and names what it is sampled by beside solvers.
 
@@ -73,7 +70,7 @@ class Flow(Generator):
             InputError: as `solve` does.
         """
         how = sampler or self.sampler
-        if churn_of(how.method, SDE, CHURN) is not None:
+        if self.draws_noise(how):
             raise InputError(f"{how.method} draws noise on the way: give a solver, as --solver adams3.")
         field, x = self.field(condition), x.to(self.device)
 
@@ -99,7 +96,7 @@ class Flow(Generator):
             image, known, doubtful = parts_of(condition, noise)
             measured = Measurement(image, (known + doubtful > 0).to(noise), how.doubt * doubtful)
             return self.given(noise, measured, sampler=how, draws=draws, progress=progress)
-        churn = churn_of(how.method, SDE, CHURN)
+        churn = churn_of(how.method)
         if churn is not None:
             return self._stochastic(noise, condition, how, churn, draws, progress)
         options: dict[str, Any] = {}
@@ -121,10 +118,8 @@ class Flow(Generator):
         if draws is None:
             raise InputError(f"{how.method} draws further noise: give draws.")
         noise = noise.to(self.device)
-        x = noise = noise if noise.dtype == torch.float64 else noise.float()
-        last = how.finish and how.steps > 1
-        times = self._times(replace(how, steps=how.steps - 1), 0.0, 1 - how.finish) if last else self._times(how)
-        times = torch.cat([times, times.new_ones(1)]) if last else times
+        noise = noise if noise.dtype == torch.float64 else noise.float()
+        x, times = noise, self._stochastic_times(how)
         alive = torch.ones(len(x), dtype=torch.bool, device=x.device)
 
         field = self.field(condition)
@@ -140,7 +135,19 @@ class Flow(Generator):
             x = torch.where(expand_time(alive, x), following, x)
             if progress is not None:
                 progress()
-        return Generated(x, torch.full((len(x),), how.steps, device=x.device), alive)
+        return Generated(x, torch.full((len(x),), len(times) - 1, device=x.device), alive)
+
+    def _stochastic_times(self, how: Sampler) -> Tensor:
+        if not how.finish or how.steps == 1:
+            return self._times(how)
+        if how.finish == 1:
+            raise InputError("finish must be shorter than the interval from 0 to 1, found 1.")
+        times = self._times(replace(how, steps=how.steps - 1), 0.0, 1 - how.finish)
+        return torch.cat([times, times.new_ones(1)])
+
+    def draws_noise(self, sampler: Sampler) -> bool:
+        """Whether a sampler draws noise on the way, so that a scan is no function of its first noise alone."""
+        return churn_of(sampler.method) is not None
 
     def further_noise(self, draws: Draws, j: int) -> Tensor:
         """The noise of step j."""
@@ -180,7 +187,7 @@ class Flow(Generator):
                         found.register_hook(lambda _: progress())  # each product with the Jacobian
                 return found
 
-            further = None if draws is None else lambda j: draws.step(self.noise_shape, j).to(x_0)[left]
+            further = None if draws is None else lambda j: self.further_noise(draws, j).to(x_0)[left]
             times = self._times(sampler)
             made = sample_posterior(u, x_0[left], measured.select(left), sampler.method, times, further)
             x = made if len(left) == len(x_0) else x.index_copy(0, left, made)
@@ -197,10 +204,10 @@ class Flow(Generator):
                 raise InputError(f"{sampler.method} has neither levels nor a finish; leave them out.")
             self._times(sampler)
             return
-        if churn_of(sampler.method, SDE, CHURN) is not None:
+        if churn_of(sampler.method) is not None:
             if sampler.levels:
                 raise InputError(f"{sampler.method} has no levels; leave them out, or give a solver.")
-            self._times(sampler)
+            self._stochastic_times(sampler)
             return
         check_method(sampler.method, self.other_samplers)
         check_tolerance(sampler.tolerance)
@@ -218,7 +225,7 @@ class Flow(Generator):
     def evaluations_of(self, sampler: Sampler) -> int:
         if completes(sampler.method):
             return parse_method(sampler.method).evaluations(sampler.steps)
-        if churn_of(sampler.method, SDE, CHURN) is not None:
+        if churn_of(sampler.method) is not None:
             return sampler.steps
         method = fixed_step(sampler.method)
         return 0 if method is None or sampler.levels else method.cost(sampler.steps)
@@ -395,6 +402,11 @@ class Conditioned:
 
     def select(self, scenes: Tensor) -> "Conditioned":
         return Conditioned(self.flow, {name: value[scenes.to(value.device)] for name, value in self.condition.items()})
+
+
+def ode_sampler(flow: Flow) -> Sampler:
+    """A flow's own sampler, or the usual one where its own draws noise on the way."""
+    return USUAL if flow.draws_noise(flow.sampler) else flow.sampler
 
 
 def as_flow(generator: Generator, what: str) -> Flow:

@@ -92,7 +92,7 @@ class FlowMap(RectifiedFlow):
         churn = _churn(how)
         if churn is None or how.method == JUMP:
             return super().generate(noise, condition, sampler=how, draws=draws, progress=progress)
-        if draws is None:
+        if draws is None and churn:
             raise InputError(f"{how.method} draws further noise: give draws.")
         with torch.no_grad():
             return self._jumps(noise, self._times(how), condition, progress, churn, draws)
@@ -118,6 +118,9 @@ class FlowMap(RectifiedFlow):
             if progress is not None:
                 progress()
         return Generated.after(x, len(times) - 1)
+
+    def draws_noise(self, sampler: Sampler) -> bool:
+        return super().draws_noise(sampler) or (sampler.method != JUMP and _churn(sampler) is not None)
 
     def check_sampler(self, sampler: Sampler) -> None:
         if _churn(sampler) is None:

@@ -11,9 +11,11 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.export import tableau
-from r2flow.flow.solvers import named_grid
+from r2flow.flow.posterior import methods_in
+from r2flow.flow.solvers import check_method, named_grid
 from r2flow.flow.stochastic import ahead, back, churn_of, sde, sde_step
-from r2flow.generators import Field, Sampler, build_generator
+from r2flow.generators import USUAL, Field, Sampler, build_generator
+from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.region import Region
 from r2flow.noise import Draws
 from r2flow.sampling import draw
@@ -174,3 +176,71 @@ def test_another_method_starts_from_its_usual_steps_and_another_number_of_the_sa
     assert Sampler("torchdiffeq:rk4", grid="power:2").changed(method="torchdiffeq:euler").grid == "uniform"
     timed = own.changed(method="sde", grid=(0.0, 0.5, 1.0))
     assert (timed.finish, timed.steps) == (0.0, 2)
+
+
+@pytest.mark.parametrize("method", ["mmps", "repaint:2", "flowdps"])
+def test_a_part_is_completed_with_the_noise_of_the_whole(method):
+    flow = build_generator(CONFIG).eval()
+    region, who = Region((8, 32), 0, 8, 8, 16), Draws(5, [0])
+    x_0 = who.start(flow.noise_shape)
+    known = torch.zeros_like(x_0)
+    known[:, :, ::2] = 1
+    told = {"image": 0.3 * known, "known": known, "doubtful": torch.zeros_like(x_0)}
+    whole = flow.generate(x_0, told, sampler=Sampler(method, 3), draws=who).x
+    cut = {name: region.crop(value) for name, value in told.items()}
+    part = flow.part(region).generate(region.crop(x_0), cut, sampler=Sampler(method, 3), draws=who).x
+    torch.testing.assert_close(part, region.crop(whole), rtol=0, atol=1e-6)
+
+
+def test_a_method_asks_for_draws_where_it_needs_them():
+    flow, x_0 = normal(), torch.ones(1, 2, 8, 32)
+    known = torch.zeros_like(x_0)
+    known[:, :, ::2] = 1
+    told = {"image": 0.3 * known, "known": known, "doubtful": torch.zeros_like(x_0)}
+    assert flow.generate(x_0, told, sampler=Sampler("mmps:1,0", 2)).converged.all()
+    with pytest.raises(InputError, match="mmps:1 draws further noise: give draws"):
+        flow.generate(x_0, told, sampler=Sampler("mmps:1", 3))
+
+
+def test_what_is_known_arrives_as_it_was_given():
+    torch.manual_seed(0)
+    flow = build_generator({**CONFIG, "generator": {"name": "conditional_flow"}}).eval()
+    who = Draws(5, range(2))
+    x_0 = who.start(flow.noise_shape)
+    known = torch.zeros_like(x_0)
+    known[:, :, ::2] = 1
+    told = {"image": x_0.roll(1, 3) * known, "known": known, "doubtful": torch.zeros_like(x_0)}
+    made = flow.generate(x_0, told, sampler=Sampler("sde", 6), draws=who)
+    assert made.converged.all()
+    assert torch.equal(made.x[known > 0], told["image"][known > 0])
+
+
+def test_pairs_are_the_ends_of_paths():
+    with pytest.raises(InputError, match="sde:2 draws noise on the way; give a solver of the ODE, such as adams3"):
+        check_method("sde:2")
+    flow = build_generator({**CONFIG, "generator": {"name": "flow_map"}})
+    ways = "sde", "renoise:3", "renoise", "jump", "adams3"
+    assert [flow.draws_noise(Sampler(way)) for way in ways] == [True, True, True, False, False]
+    with pytest.raises(InputError, match="renoise:3 draws noise on the way: give a solver"):
+        flow.solve(torch.zeros(1, *flow.noise_shape), sampler=Sampler("renoise:3", 2))
+    flow.sampler = Sampler("renoise:3", 4)
+    assert ode_sampler(flow) == USUAL
+    flow.sampler = Sampler("euler", 3)
+    assert ode_sampler(flow) == flow.sampler
+
+
+def test_the_steps_that_are_taken_are_those_that_were_checked():
+    flow, x_0, who = normal(), Draws(1, [0]).start((2, 8, 32)), Draws(1, [0])
+    timed = Sampler("sde", 3, grid=(0.0, 0.5, 0.8, 0.9), finish=0.1).changed(steps=None)
+    with pytest.raises(InputError, match="shorter than the interval"):
+        flow.check_sampler(Sampler("sde", 3, finish=1.0))
+    flow.check_sampler(timed)
+    assert flow.generate(x_0, sampler=timed, draws=who).evaluations.tolist() == [4]
+    with pytest.raises(InputError, match="this time grid runs from 0 to 1, the solution from 0"):
+        flow.check_sampler(Sampler("sde", 3, grid=(0.0, 0.5, 0.8, 1.0), finish=0.1))
+
+
+def test_a_list_of_methods_may_hold_numbers():
+    assert methods_in("replace/32, mmps:2,0/10,mmps:2,.5,repaint:4,1/9") == [
+        "replace/32", "mmps:2,0/10", "mmps:2,.5", "repaint:4,1/9",
+    ]  # fmt: skip

@@ -104,12 +104,13 @@ def test_the_verb_writes_a_page_with_its_picture(checkpoint, tmp_path: Path, mon
     out = tmp_path / "out"
     monkeypatch.setattr("sys.argv", [
         "r2flow", "report", "completion", "simulated:3", "-c", str(tmp_path / "model.safetensors"), "--num", "2",
-        "--answers", "2", "--solvers", "euler/1", "--tasks", "rows:4 rain", "--out", str(out),
+        "--answers", "2", "--solvers", "euler/1,mmps:1,0/1", "--tasks", "rows:4 rain", "--out", str(out),
     ])  # fmt: skip
     with pytest.raises(SystemExit) as ended:
         main()
     assert not ended.value.code
     assert (out / "completion.png").stat().st_size > 10_000
     rows = json.loads((out / "completion.json").read_text())["rows"]
-    assert [row["method"] for row in rows] == [*OPPONENTS, "model, euler 1", "as it is", "model, euler 1"]
+    ways = "model, euler 1", "model, mmps:1,0 1"
+    assert [row["method"] for row in rows] == [*OPPONENTS, *ways, "as it is", *ways]
     assert "coverage" in (out / "completion.md").read_text()

@@ -242,3 +242,7 @@ def test_a_recording_takes_the_place_of_a_page(r2flow, given):  # noqa: F811
     code, _, said = r2flow("view", "simulated:0", *given)
     assert code == 2
     assert "takes the place of --out" in said
+
+
+def test_the_way_of_a_model_that_draws_noise_is_that_of_its_ode(r2flow, tmp_path):  # noqa: F811
+    assert r2flow("view", "street", "--num", 1, "--times", 2, "--out", tmp_path / "way.html")[0] == 0

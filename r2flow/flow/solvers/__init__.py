@@ -25,6 +25,7 @@ from r2flow.flow.solvers.grids import build_grid, extended, halved, named_grid, 
 from r2flow.flow.solvers.multistep import adams
 from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite
 from r2flow.flow.solvers.step_size import Limits
+from r2flow.flow.stochastic import churn_of
 from r2flow.registry import Registry, did_you_mean
 
 __all__ = [
@@ -210,6 +211,8 @@ def check_method(method: str, others: Iterable[str] = ()) -> None:
     """
     if method.startswith(TORCHDIFFEQ):
         check_torchdiffeq(method.removeprefix(TORCHDIFFEQ))
+    elif churn_of(method) is not None:
+        raise InputError(f"{method} draws noise on the way; give a solver of the ODE, such as adams3.")
     elif method not in SOLVERS:
         known = [*others, *sorted(SOLVERS)]
         raise InputError(f"no solver named {method!r}; known: {', '.join(known)}.{did_you_mean(method, known)}")

@@ -15,6 +15,7 @@ from r2flow.checkpoints import Checkpoint
 from r2flow.data.sets import ScanSet
 from r2flow.errors import InputError
 from r2flow.generators import as_flow
+from r2flow.generators.flow import ode_sampler
 from r2flow.noise import Draws
 from r2flow.reports.outputs import ScanBar, warn_unsolved
 from r2flow.reports.view import write_page
@@ -105,7 +106,8 @@ def way_panels(
 ) -> tuple[list[Panel], list[str]]:
     """x_t of scans 0 to num - 1 of a seed at `times` times from t = 0 to 1, decoded, and what the slider says.
 
-    Between two times the flow's own solver takes its share of the steps, at least one.
+    Between two times the flow's own solver takes its share of the steps, at least one, or the usual one where its own
+    draws noise.
 
     Raises:
         InputError: a generator without an ODE, or fewer than two times.
@@ -113,7 +115,7 @@ def way_panels(
     if times < 2:
         raise InputError(f"a way has two ends: --times must be at least 2, found {times}.")
     solved = as_flow(flow.generator, "x_t")
-    how = solved.sampler.changed(steps=steps)
+    how = ode_sampler(solved).changed(steps=steps)
     share = how.changed(steps=math.ceil(how.steps / (times - 1)), grid="uniform", finish=0.0)
     solved.check_sampler(share)
     x = Draws(seed, range(num)).start(solved.noise_shape)
