@@ -75,15 +75,16 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
             f"an exported sampler takes a fixed number of steps by a solver of ours, found {found}: give "
             f"--solver {USUAL.method} --steps {USUAL.steps}."
         )
+    if flow.draws_noise(sampler):
+        raise InputError(f"{sampler.method} cannot be exported, it draws noise on the way: give another --solver.")
     recorder, shadow = _Recorder(), copy(flow)
     shadow._modules = {**flow._modules, "backbone": recorder}
     basis = torch.eye(count + 1, dtype=torch.float64)[:, :1, None, None]  # x_0 is the first unit vector
     try:
         x_1 = shadow.generate(basis, sampler=sampler).x
-    except InputError:
-        raise InputError(
-            f"{sampler.method} cannot be exported, it draws noise on the way: give another --solver."
-        ) from None
+    except InputError as error:  # it needs more than the noise
+        problem = str(error).rstrip(".")
+        raise InputError(f"{sampler.method} cannot be exported, {problem!r}: give another --solver.") from None
     times, states, second = zip(*recorder.calls, strict=True)
     rows = torch.stack([*states, x_1]).reshape(-1, count + 1)[:, : len(times) + 1]  # a `finish` takes fewer than count
     return Tableau([float(t) for t in times], [float(s) for s in second] if flow.second_time else None, rows)

@@ -226,7 +226,7 @@ class Flow(Generator):
         if completes(sampler.method):
             return parse_method(sampler.method).evaluations(sampler.steps)
         if churn_of(sampler.method) is not None:
-            return sampler.steps
+            return len(self._stochastic_times(sampler)) - 1
         method = fixed_step(sampler.method)
         return 0 if method is None or sampler.levels else method.cost(sampler.steps)
 

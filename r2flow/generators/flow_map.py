@@ -108,7 +108,7 @@ class FlowMap(RectifiedFlow):
     ) -> Generated:
         x, u = x.to(self.device), self.map(condition)
         for n, (t, s) in enumerate(pairwise(times.tolist()), start=1):
-            r = s if draws is None else ahead(t, s, churn)
+            r = ahead(t, s, churn)
             at, to = torch.tensor([t, r], dtype=torch.float64).to(x)
             following = jump(u, at, x, to)
             if draws is not None and r > s:

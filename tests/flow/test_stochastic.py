@@ -161,8 +161,10 @@ def test_what_needs_the_ode_says_so():
         flow.generate(x_0, sampler=Sampler("sde", 2))
     with pytest.raises(InputError, match="sde:2 draws noise on the way: give a solver, as --solver adams3"):
         flow.solve(x_0, sampler=Sampler("sde:2", 2))
-    with pytest.raises(InputError, match="sde cannot be exported"):
+    with pytest.raises(InputError, match="sde cannot be exported, it draws noise on the way"):
         tableau(flow, Sampler("sde", 2))
+    with pytest.raises(InputError, match="mmps cannot be exported, 'mmps completes a scan"):
+        tableau(flow, Sampler("mmps", 2))
     with pytest.raises(InputError, match="sde has no levels"):
         flow.check_sampler(Sampler("sde", 2, levels=(2, 4), limits=(0.1,)))
 
@@ -235,6 +237,7 @@ def test_the_steps_that_are_taken_are_those_that_were_checked():
     with pytest.raises(InputError, match="shorter than the interval"):
         flow.check_sampler(Sampler("sde", 3, finish=1.0))
     flow.check_sampler(timed)
+    assert flow.evaluations_of(timed) == 4
     assert flow.generate(x_0, sampler=timed, draws=who).evaluations.tolist() == [4]
     with pytest.raises(InputError, match="this time grid runs from 0 to 1, the solution from 0"):
         flow.check_sampler(Sampler("sde", 3, grid=(0.0, 0.5, 0.8, 1.0), finish=0.1))
