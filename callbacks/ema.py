@@ -54,7 +54,7 @@ class EMA(WeightAveraging):
     def __init__(
         self, decay: Portion = 0.995, every: Count = 10, warmup_steps: Natural | None = None, rule: str = "power"
     ) -> None:
-        # Buffers are constants here (ray angles, frequencies): averaging them would only cost time.
+        # Most buffers are constants (ray angles, frequencies); those that count go on counting, and are no average.
         super().__init__(use_buffers=False, avg_fn=self._average)
         self.decay, self.every, self.warmup_steps = decay, every, warmup_steps
         self._decay_at = DECAYS[rule]
@@ -92,7 +92,10 @@ class EMA(WeightAveraging):
     def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if self._average_model is not None:
             self._raw = [p.detach().clone() for p in pl_module.parameters()]
-            self._copy_average_to_current(pl_module)
+            averages = self._average_model.module.parameters()
+            with torch.no_grad():
+                for weight, average in zip(pl_module.parameters(), averages, strict=True):
+                    weight.copy_(average)
 
     def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if self._raw:

@@ -84,8 +84,8 @@ def metres_apart(image: Tensor, other: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """How far decoded images, (B, 2 or 1, H, W), are from others, scan by scan, each (B,) float64.
 
     Returns:
-        Median and root mean square of |r' - r| in metres over the rays that return in both, NaN where none does; the
-        share of all rays that return in one alone.
+        Lower median and root mean square of |r' - r| in metres over the rays that return in both, NaN where none does;
+        the share of all rays that return in one alone.
     """
     before, after = image[:, 0].double(), other[:, 0].double()
     both = (before > 0) & (after > 0)

@@ -111,7 +111,10 @@ def draw(
         generator, noise = generator.part(seen), seen.crop(noise)
         if condition is not None:  # what is known of each pixel
             condition = {n: seen.crop(value) if value.shape[-2:] == whole else value for n, value in condition.items()}
-    noise, start = noise.to(generator.device), time.perf_counter()
+    noise = noise.to(generator.device)
+    if condition is not None:
+        condition = {name: value.to(generator.device) for name, value in condition.items()}
+    start = time.perf_counter()
     made = generator.generate(noise, condition, sampler=sampler, draws=draws, progress=progress)
     x_1 = made.x.cpu()  # which also waits for a GPU
     seconds = time.perf_counter() - start

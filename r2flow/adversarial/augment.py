@@ -134,11 +134,11 @@ class AdaptiveAugment(nn.Module):
 
     def draw(self, source: Source) -> dict[str, Draw]:
         """The transformations of a batch, by name. How many numbers are drawn does not depend on p."""
-        found = {}
+        found, p = {}, float(self.p)
         for name, values in (GEOMETRY | COLOUR).items():
             if self.policy[name]:
                 value, u = values(source), source.uniform((1,))[:, 0]
-                chosen = (u < float(self.p) * self.policy[name]).float()
+                chosen = (u < p * self.policy[name]).float()
                 found[name] = Draw(value.to(self.p.device), chosen.to(self.p.device))
         return found
 

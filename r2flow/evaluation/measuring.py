@@ -130,7 +130,8 @@ def measure(
         metric.load_real_state(gathered.statistics[name].states)
     empty = _update(metrics, generated, range(len(generated)), 0, False, work, gathered.protocol)
     results = []
-    unsolved = generated.source.unsolved if isinstance(generated.source, SampledScans) else 0
+    drawn = generated.source.unsolved if isinstance(generated.source, SampledScans) else 0
+    unsolved = _sum_over_processes(drawn, work)
     for name, metric in metrics.items():
         real = gathered.statistics[name]
         figures = {key: float(value) for key, value in metric.compute().items()}

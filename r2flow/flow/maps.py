@@ -135,8 +135,8 @@ class JumpTimes:
         """t and s, (B,) each, from uniform draws in [0, 1), (B, 3)."""
         which, a, b = u.unbind(1)
         times, counts = self.times.to(u), torch.tensor(tuple(self.steps), device=u.device)
-        row = (a * len(counts)).long().clamp(max=len(counts) - 1)
-        step = torch.minimum((b * counts[row]).long(), counts[row] - 1)
+        row = (a * len(counts)).long()
+        step = (b * counts[row]).long()
         low, high = torch.minimum(a, b), torch.maximum(a, b)
         rest = (which - self.share) / (1 - self.share)
         velocity = self.velocities(a)

@@ -261,13 +261,14 @@ def _solved(multiply: Callable[[Tensor], tuple[Tensor, Tensor]], r: Tensor, step
     ends where its residual is 0 to rounding, or in a direction in which S is not positive.
     """
     p, rr, found = r, _dot(r, r), torch.zeros(())
+    goes = torch.ones_like(rr, dtype=torch.bool)
     enough, most = torch.finfo(r.dtype).eps ** 2 * rr, GROWN * rr
     rest, least = r, torch.zeros(())
     last: tuple[Tensor, Tensor] | None = None  # the direction before, S p orthogonal to the others' and of length 1
     for _ in range(steps):
         moved, q = multiply(p)
         curvature = _dot(p, q)
-        goes = (rr > enough) & (curvature > 0)
+        goes = goes & (rr > enough) & (curvature > 0)
         step = torch.where(goes, rr / curvature, 0)
         found, r = found + step * moved, r - step * q
         former, rr = rr, _dot(r, r)
@@ -276,7 +277,7 @@ def _solved(multiply: Callable[[Tensor], tuple[Tensor, Tensor]], r: Tensor, step
             share = _dot(last[1], q)
             moved, q = moved - share * last[0], q - share * last[1]
         length = _dot(q, q).sqrt()
-        goes &= length > 0
+        goes = goes & (length > 0)
         last = torch.where(goes, moved / length, 0), torch.where(goes, q / length, 0)
         share = _dot(rest, last[1])
         least, rest = least + share * last[0], rest - share * last[1]

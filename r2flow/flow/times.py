@@ -78,8 +78,7 @@ class Discrete:
         self.k, self.times = k, build_grid(grid, 0.0, 1.0, k)
 
     def __call__(self, u: Tensor) -> Tensor:
-        # u just below 1 times k can round up to k in float32.
-        return self.times.to(u)[(u * self.k).long().clamp(max=self.k - 1)]
+        return self.times.to(u)[(u * self.k).long()]
 
 
 def golden_sequence(k: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ Condition = Mapping[str, Tensor]
 Progress = Callable[[], None] | None
 
 IMAGE, KNOWN, DOUBTFUL = "image", "known", "doubtful"  # the names of what is known of a part of a scan
+LOGIT, SIGMA = "logit", "sigma"  # and of what a conditional flow finds of these once (`r2flow.generators.conditional`)
 
 WHOLE_ONLY = "a {} makes whole images and no part of one; leave the region out."
 
@@ -33,7 +34,7 @@ def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor, Te
     """
     if condition is None:
         return (torch.zeros_like(x),) * 3
-    if condition.keys() != {IMAGE, KNOWN, DOUBTFUL}:
+    if condition.keys() - {LOGIT, SIGMA} != {IMAGE, KNOWN, DOUBTFUL}:
         raise InputError(f"this generator is told '{IMAGE}', '{KNOWN}' and '{DOUBTFUL}', found {', '.join(condition)}.")
     image, known, doubtful = (condition[name].to(x) for name in (IMAGE, KNOWN, DOUBTFUL))
     if image.shape != x.shape or known.shape != x.shape or doubtful.shape != x.shape:
@@ -156,10 +157,20 @@ class Generated:
     converged: Tensor
 
     @classmethod
-    def after(cls, x: Tensor, evaluations: int) -> Self:
-        """Scans of a method that always comes to its end, after the same number of evaluations for all."""
+    def after(cls, x: Tensor, evaluations: int, converged: Tensor | None = None) -> Self:
+        """Scans of a method that always comes to its end, after the same number of evaluations for all.
+
+        Args:
+            converged: Whether each was finite all the way, (B,) bool; None: where x is. An x that was clamped, or
+                kept from an earlier step, does not tell.
+        """
         counted = torch.full((len(x),), evaluations, dtype=torch.int64, device=x.device)
-        return cls(x, counted, x.isfinite().flatten(1).all(1))
+        return cls(x, counted, finite(x) if converged is None else converged)
+
+
+def finite(x: Tensor) -> Tensor:
+    """Whether all values of each scan are finite, (B,) bool."""
+    return x.isfinite().flatten(1).all(1)
 
 
 class Generator(nn.Module):

@@ -18,6 +18,8 @@ from r2flow.generators.base import (
     DOUBTFUL,
     IMAGE,
     KNOWN,
+    LOGIT,
+    SIGMA,
     Condition,
     Generated,
     Generator,
@@ -125,13 +127,13 @@ class ConditionalFlow(RectifiedFlow):
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         parts = parts_of(condition, x)
         v: Tensor = self.backbone(t, torch.cat([x, *parts], dim=1))
-        return v if condition is None else self._informed(v, t, x, t, *parts)
+        return v if condition is None else self._informed(v, t, x, t, condition)
 
-    def _informed(
-        self, u: Tensor, t: Tensor, x: Tensor, s: Tensor, image: Tensor, known: Tensor, doubtful: Tensor
-    ) -> Tensor:
+    def _informed(self, u: Tensor, t: Tensor, x: Tensor, s: Tensor, condition: Condition) -> Tensor:
         """The mean velocity from t to s by what is known: u where that tells nothing. At s = t it is the velocity."""
-        logit, sigma = self.trust(torch.cat([image, known, doubtful], dim=1))
+        image, known, doubtful = parts_of(condition, x)
+        trusted = self._trusted(condition, x)
+        logit, sigma = trusted[LOGIT], trusted[SIGMA]
         t, s = (expand_time(torch.as_tensor(time, device=x.device, dtype=torch.float32), x) for time in (t, s))
         left, off = 1 - t, x - t * image
         narrow, broad = ((t * std).square() + left.square() for std in (sigma, Trust.BROAD))
@@ -151,16 +153,25 @@ class ConditionalFlow(RectifiedFlow):
         draws: Draws | None = None,
         progress: Progress = None,
     ) -> Generated:
-        made = super().generate(noise, condition, sampler=sampler, draws=draws, progress=progress)
         if condition is None:
-            return made
+            return super().generate(noise, sampler=sampler, draws=draws, progress=progress)
+        with torch.no_grad():
+            condition = self._trusted(condition, noise.to(self.device))
+        made = super().generate(noise, condition, sampler=sampler, draws=draws, progress=progress)
         image, known, _ = parts_of(condition, made.x)
         return Generated(torch.where(known > 0, image, made.x), made.evaluations, made.converged)
+
+    def _trusted(self, condition: Condition, like: Tensor) -> Condition:
+        """The condition with what `Trust` says of it, which no step changes and which is found once therefore."""
+        if LOGIT in condition or not self.trusts:
+            return condition
+        logit, sigma = self.trust(torch.cat(parts_of(condition, like), dim=1))
+        return {**condition, LOGIT: logit, SIGMA: sigma}
 
     def part(self, region: Region) -> Self:
         part = super().part(region)
         if self.trusts and part is not self:
-            part.trust = deepcopy(self.trust)
+            part.trust = deepcopy(self.trust, {id(weight): weight for weight in self.trust.parameters()})
             for layer in part.trust.modules():
                 if isinstance(layer, RingConv2d) and region.width < region.shape[1]:
                     layer.open_ring()
@@ -186,7 +197,7 @@ class ConditionalMap(ConditionalFlow, FlowMap):
     def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
         parts = parts_of(condition, x)
         u: Tensor = self.backbone(t, torch.cat([x, *parts], dim=1), s)
-        return u if condition is None else self._informed(u, t, x, s, *parts)
+        return u if condition is None else self._informed(u, t, x, s, condition)
 
 
 class _Untold(nn.Module):

@@ -13,7 +13,7 @@ from r2flow.diffusion.objectives import PREDICTIONS
 from r2flow.diffusion.sampling import DDIM, DDPM, eta_of, walk
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution
-from r2flow.generators.base import Condition, Generated, Progress, Sampler
+from r2flow.generators.base import Condition, Generated, Progress, Sampler, finite
 from r2flow.generators.flow import UNTOLD, NetworkFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
@@ -70,7 +70,7 @@ class Diffusion(NetworkFlow):
     def denoise(self, z: Tensor, log_snr: Tensor) -> Tensor:
         """The data that are expected behind z, clamped."""
         x, _ = self.prediction.split(z, self.predict(z, log_snr), log_snr)
-        return x if self.clip is None else x.clamp(-self.clip, self.clip)
+        return x if self.clip is None else x.clamp(-self.clip, self.clip) + 0 * x  # NaN of what is not finite
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         if condition is not None:
@@ -118,7 +118,7 @@ class Diffusion(NetworkFlow):
                 z = following
                 if progress is not None:
                     progress()
-        return Generated.after(z if self.clip is None else z.clamp(-self.clip, self.clip), how.steps)
+        return Generated.after(z if self.clip is None else z.clamp(-self.clip, self.clip), how.steps, finite(z))
 
     def _log_snrs(self, how: Sampler) -> Tensor:
         """Of the sampler's grid, whose times run from noise to data, (N + 1,) float64."""

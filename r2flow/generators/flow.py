@@ -23,7 +23,7 @@ from r2flow.flow.solvers import (
 )
 from r2flow.flow.solvers.grids import build_grid
 from r2flow.flow.stochastic import SDE, churn_of, sde
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, parts_of
+from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, finite, parts_of
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
@@ -120,9 +120,7 @@ class Flow(Generator):
         noise = noise.to(self.device)
         noise = noise if noise.dtype == torch.float64 else noise.float()
         x, times = noise, self._stochastic_times(how)
-        alive = torch.ones(len(x), dtype=torch.bool, device=x.device)
-
-        field = self.field(condition)
+        field, alive = self.field(condition), finite(x)
 
         def estimate(t: Tensor, x: Tensor) -> Tensor:
             return x + (1 - t) * field(t, x).to(x)
@@ -131,11 +129,11 @@ class Flow(Generator):
             return self.further_noise(draws, j).to(noise)
 
         for following in sde(estimate, x, times, churn, fresh):
-            alive = alive & following.isfinite().flatten(1).all(1)
+            alive = alive & finite(following)
             x = torch.where(expand_time(alive, x), following, x)
             if progress is not None:
                 progress()
-        return Generated(x, torch.full((len(x),), len(times) - 1, device=x.device), alive)
+        return Generated.after(x, len(times) - 1, alive)
 
     def _stochastic_times(self, how: Sampler) -> Tensor:
         if not how.finish or how.steps == 1:
@@ -192,7 +190,7 @@ class Flow(Generator):
             made = sample_posterior(u, x_0[left], measured.select(left), sampler.method, times, further)
             x = made if len(left) == len(x_0) else x.index_copy(0, left, made)
             evaluations[left] = parse_method(sampler.method).evaluations(len(times) - 1)
-        return Generated(x, evaluations, x.isfinite().flatten(1).all(1))
+        return Generated(x, evaluations, finite(x))
 
     def _times(self, sampler: Sampler, t_0: float = 0.0, t_1: float = 1.0) -> Tensor:
         return build_grid(sampler.times, t_0, t_1, sampler.steps)

@@ -13,7 +13,7 @@ from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers import Solution
 from r2flow.flow.stochastic import ahead, back, churn_of
-from r2flow.generators.base import Condition, Generated, Progress, Sampler
+from r2flow.generators.base import Condition, Generated, Progress, Sampler, finite
 from r2flow.generators.flow import UNTOLD, Conditioned, RectifiedFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
@@ -107,17 +107,18 @@ class FlowMap(RectifiedFlow):
         draws: Draws | None = None,
     ) -> Generated:
         x, u = x.to(self.device), self.map(condition)
+        alive = finite(x)
         for n, (t, s) in enumerate(pairwise(times.tolist()), start=1):
             r = ahead(t, s, churn)
             at, to = torch.tensor([t, r], dtype=torch.float64).to(x)
             following = jump(u, at, x, to)
             if draws is not None and r > s:
                 following = back(following, r, s, self.further_noise(draws, n).to(x))
-            alive = following.isfinite().flatten(1).all(1)
-            x = following if bool(alive.all()) else torch.where(expand_time(alive, x), following, x)
+            alive = alive & finite(following)
+            x = torch.where(expand_time(alive, x), following, x)
             if progress is not None:
                 progress()
-        return Generated.after(x, len(times) - 1)
+        return Generated.after(x, len(times) - 1, alive)
 
     def draws_noise(self, sampler: Sampler) -> bool:
         return super().draws_noise(sampler) or (sampler.method != JUMP and _churn(sampler) is not None)

@@ -10,7 +10,7 @@ from torch import Tensor
 from r2flow.backbones import dcgan, style_gan
 from r2flow.backbones.equalised import LatentGenerator
 from r2flow.errors import InputError
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
+from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, finite
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import Count, Positive
@@ -73,7 +73,7 @@ class Gan(Generator):
         made = self.made(z, uniform, truncation=truncation_of(sampler or self.sampler))
         if progress is not None:
             progress()
-        return Generated.after(made["image"].clamp(-1, 1), 1)
+        return Generated.after(made["image"].clamp(-1, 1), 1, finite(made["image"]))
 
     def check_sampler(self, sampler: Sampler) -> None:
         known = sampler.method == DIRECT or sampler.method.startswith(TRUNCATE)

@@ -9,7 +9,7 @@ from torch import Tensor
 from r2flow.backbones.refinenet import RefineNet
 from r2flow.diffusion.langevin import annealed_langevin, noise_levels, toward
 from r2flow.errors import InputError
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, parts_of
+from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, finite, parts_of
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import Count, Positive
@@ -86,7 +86,7 @@ class ScoreModel(Generator):
             x = end
             if progress is not None:
                 progress()
-        return Generated.after(2 * x.clamp(0, 1) - 1, self.evaluations_of(how))
+        return Generated.after(2 * x.clamp(0, 1) - 1, self.evaluations_of(how), finite(x))
 
     def _pulled(self, condition: Condition | None, x: Tensor) -> Callable[[Tensor], Tensor] | None:
         if condition is None:

@@ -41,7 +41,7 @@ class BatchDraws:
     """
 
     def __init__(self, seed: int, batch: Batch, part: Part) -> None:
-        self.streams = [stream(seed, "training", int(k), part) for k in batch["k"]]
+        self.streams = [stream(seed, "training", k, part) for k in batch["k"].tolist()]
         self.device = batch["x_1"].device
 
     def uniform(self, shape: tuple[int, ...]) -> Tensor:

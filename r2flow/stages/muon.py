@@ -19,7 +19,7 @@ class Muon(torch.optim.AdamW):
         M <- m M + (1 - m) G,    W <- W - rate sqrt(max(1, rows / columns)) orthogonalised((1 - m) G + m M)
 
     All singular directions of the momentum are learned at one speed, not the few large ones first. Biases, norms and
-    matrices of fewer than 8 rows or columns, such as those that see an image's channels, are AdamW's.
+    matrices of fewer than 8 rows or columns, such as those that see two or six channels of an image, are AdamW's.
 
     Args:
         parameters: What is learned.

@@ -81,6 +81,21 @@ def test_validation_sees_the_average_and_leaves_the_weights(tmp_path):
     assert module.weight.item() == pytest.approx(average)  # after fit the module is the model
 
 
+def test_a_look_at_the_average_leaves_what_the_module_counts():
+    module = Scripted([])
+    module.register_buffer("count", torch.tensor(1))
+    ema = EMA(every=10, warmup_steps=0)
+    ema.setup(None, module, "fit")  # type: ignore[arg-type]
+    with torch.no_grad():
+        module.weight.fill_(2.0)
+    module.count += 1  # since the average was last updated
+    with ema.averaged(None, module):  # type: ignore[arg-type]
+        assert module.weight == 0
+        assert module.count == 2
+    assert module.weight == 2
+    assert module.count == 2
+
+
 def test_the_average_is_float32_whatever_the_weights_are():
     module = Scripted([])
     module.to(torch.bfloat16)

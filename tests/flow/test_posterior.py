@@ -153,6 +153,22 @@ def test_a_system_ends_where_the_matrix_is_not_positive_or_nothing_is_left():
     torch.testing.assert_close(found, torch.tensor([[1.0, 0, 0], [0, 0, 0], [1.0, 0, 0.5], [0, 0, 0]]).double())
 
 
+def test_behind_a_direction_that_is_not_positive_nothing_is_searched():
+    matrix = torch.diag(torch.tensor([1.0, 2.0, -0.5, 3.0]).double())
+    r = torch.tensor([[1.0, 1.0, 2.0, 1.0]]).double()
+    products = []
+
+    def multiply(p: Tensor) -> tuple[Tensor, Tensor]:
+        products.append(float((p * (p @ matrix)).sum()))
+        return p, p @ matrix
+
+    found = [_solved(multiply, r, steps) for steps in range(1, 7)]
+    first = next(n for n, curvature in enumerate(products[-6:]) if curvature <= 0)
+    assert first > 0
+    for later in found[first:]:
+        torch.testing.assert_close(later, found[first - 1])
+
+
 @pytest.mark.parametrize(("sigma", "blur"), [(0.0, False), (0.3, False), (0.3, True)])
 def test_the_pull_is_the_gradient_of_the_measurement_s_log_density(sigma, blur):
     case = Case(ROWS if not blur else torch.ones(WIDTH), sigma, blur)

@@ -96,6 +96,23 @@ def test_known_values_arrive_as_given_and_on_their_line(flow, scans, steps):
     assert torch.allclose(half[known], ((x_0 + told["image"]) / 2)[known], atol=1e-5)
 
 
+@pytest.mark.parametrize("method", ["euler", "dopri5", "sde"])
+def test_how_far_the_guess_holds_is_found_once(flow, scans, method, monkeypatch):
+    told, draws, calls = condition_of(flow.space, scans, measured(scans)), Draws(0, range(3)), []
+    how, x_0 = Sampler(method, 3, 1e-3), draws.start((2, 8, 32))
+    made = flow.generate(x_0, told, sampler=how, draws=draws).x
+    forward = flow.trust.forward
+    monkeypatch.setattr(flow.trust, "forward", lambda x: calls.append(1) or forward(x))
+    assert torch.equal(flow.generate(x_0, told, sampler=how, draws=draws).x, made)
+    assert len(calls) == 1
+    monkeypatch.setattr(
+        flow, "_trusted", lambda condition, x: type(flow)._trusted(flow, {n: condition[n] for n in told}, x)
+    )
+    again = flow.generate(x_0, told, sampler=how, draws=draws).x
+    assert len(calls) > 3  # at every evaluation
+    assert torch.equal(again, made)
+
+
 @pytest.mark.parametrize("method", ["dopri5", "heun2", "rk4", "adams3"])
 def test_solvers_that_look_at_the_end_find_no_infinity_there(flow, scans, method):
     told = condition_of(flow.space, scans, measured(scans))

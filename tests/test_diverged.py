@@ -1,0 +1,64 @@
+"""A network whose numbers have no end: every generator says which of its scans are none."""
+
+import math
+from typing import Any
+
+import pytest
+from torch import nn
+
+import r2flow
+from r2flow.evaluation.sets import sampled_set
+from r2flow.generators import Generator, Sampler, build_generator
+from r2flow.noise import Draws
+from r2flow.training import compose
+
+SIZE = ["sensor.rows=16", "sensor.columns=32", "encoding.reflectance=true"]
+TINY = ["backbone=hdit_tiny", "backbone.base_channels=16", "backbone.num_heads=[1,2,4]"]
+
+
+def endless(network: nn.Module, count: int) -> None:
+    """Let the first `count` answers of each batch be infinite."""
+
+    def at_the_end(_: nn.Module, __: Any, found: Any) -> Any:
+        if isinstance(found, dict):
+            return {name: at_the_end(_, __, value) for name, value in found.items()}
+        found = found.clone()
+        found[:count] = math.inf
+        return found
+
+    network.register_forward_hook(at_the_end)
+
+
+@pytest.mark.parametrize(
+    ("words", "sampler"),
+    [
+        (TINY, Sampler("euler", 2)),
+        (TINY, Sampler("sde", 2)),
+        ([*TINY, "+generator.name=flow_map"], Sampler("jump", 1)),
+        ([*TINY, "+generator.name=flow_map"], Sampler("jump", 3)),
+        ([*TINY, "+generator.name=flow_map"], Sampler("renoise:1", 2)),
+        (["experiment=r2dm_small", "+generator.name=diffusion"], Sampler("ddpm", 2)),
+        (["experiment=r2dm_small", "+generator.name=diffusion"], Sampler("ddim:0", 1)),
+        (["experiment=lidargen_small", "generator.levels=2", "generator.width=4"], Sampler("langevin", 1)),
+        (["experiment=vanilla_gan_small", "generator.base_channels=4"], Sampler("direct", 1)),
+        (["experiment=dusty2_small", "generator.base_channels=4"], Sampler("direct", 1)),
+    ],
+)
+def test_a_scan_that_leaves_the_numbers_is_flagged_whatever_is_clamped(words: list[str], sampler: Sampler):
+    generator: Generator = build_generator(compose([*words, *SIZE])).eval()
+    endless(getattr(generator, "backbone", None) or generator.network, 1)
+    draws = Draws(0, range(3))
+    made = generator.generate(draws.start(generator.noise_shape), sampler=sampler, draws=draws)
+    assert made.converged.tolist() == [False, True, True]
+
+
+def test_a_sampled_set_says_all_that_its_scans_depend_on():
+    street = r2flow.load("street")
+
+    def about(**settings: Any) -> dict[str, Any]:
+        return dict(sampled_set(street, "street", 2, street.generator.sampler.changed(**settings)).about)
+
+    found = [about(), about(method="sde:2"), about(steps=8)]
+    found += [about(method="dopri5", tolerance=tolerance) for tolerance in (1e-2, 1e-4)]
+    found += [about(method="adams3", levels=(4, 8), limits=(most,)) for most in (0.1, 0.2)]
+    assert all(a != b for i, a in enumerate(found) for b in found[:i])
