@@ -17,17 +17,26 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 if TYPE_CHECKING:
     from pathlib import Path
 
+    import torch
+
     from r2flow.checkpoints import Checkpoint
 
 __version__ = "0.2.0"
 
 
-def load(name: "str | Path", device: str = "cpu") -> "Checkpoint":
+def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoint":
     """A trained generator: a model by its name (`r2flow weights` lists them), a run folder or a checkpoint file.
 
+    Args:
+        device: cpu, cuda, cuda:1, ..., or auto for a GPU where there is one.
+
     Raises:
-        InputError: there is none.
+        InputError: there is none, or no such device.
     """
     from r2flow.checkpoints import load_checkpoint  # takes as long as torch
+    from r2flow.devices import choose_device
+    from r2flow.errors import InputError
 
-    return load_checkpoint(name, device)
+    if not isinstance(name, str | os.PathLike):
+        raise InputError(f"a model has a name, a run folder or a file; found {name!r}.")
+    return load_checkpoint(name, choose_device(str(device), "device"))

@@ -9,6 +9,7 @@ A sampler that draws noise in every step counts the steps as well (`Draws`).
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import index as index_of
 
 import numpy as np
 import torch
@@ -32,11 +33,15 @@ def generator(seed: int, purpose: str, index: int, step: int = 0) -> np.random.G
         step: Step of a sampler that draws noise on the way, 0 <= step < 2^64; 0 is everything else.
 
     Raises:
-        InputError: a seed outside its range, which is the user's to choose.
+        InputError: a seed that is no whole number or outside its range, which is the user's to choose.
         ValueError: an unknown purpose, or an index or a step outside its range.
     """
     if purpose not in PURPOSES:
         raise ValueError(f"no purpose named {purpose!r}; known: {', '.join(PURPOSES)}.")
+    try:
+        seed = index_of(seed)
+    except TypeError:
+        raise InputError(f"a seed must be a whole number, found {seed!r}.") from None
     if not 0 <= seed < 2**64:
         raise InputError(f"a seed must lie in [0, 2^64), found {seed}.")
     for what, number in (("an index", index), ("a step", step)):

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow import cli
+from r2flow import cli, load
 from r2flow.checkpoints import load_checkpoint
+from r2flow.errors import InputError
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS
 from tests.data.conftest import write_scan
@@ -97,6 +98,16 @@ def test_show_draws_files_folders_and_range_images(r2flow, scan, tmp_path):
     assert sorted(p.name for p in (tmp_path / "views").iterdir()) == ["ground.png", "image.png"]
     assert (tmp_path / "views" / "ground.png").read_bytes().startswith(b"\x89PNG")
     assert "views/ground.png" in said
+
+
+def test_pictures_of_files_of_one_name_have_names_of_their_own(r2flow, tmp_path):
+    files = [tmp_path / drive / "velodyne_points" / "data" / "000000.bin" for drive in ("d1", "d2", "d3")]
+    for file in files:
+        write_scan(file, 3)
+    code, said, _ = r2flow("show", *files, "--size", "32x256", "--out", tmp_path / "views")
+    assert code == 0
+    names = ["data_000000_bin.png", "data_000000_bin_2.png", "data_000000_bin_3.png"]
+    assert said.splitlines() == [str(tmp_path / "views" / name) for name in names]
 
 
 def test_info_says_what_is_in_a_checkpoint(r2flow, saved):  # noqa: F811
@@ -201,6 +212,58 @@ class TestBadInput:
         write_scan(tmp_path / "one.bin", 3)
         result = r2flow("project", tmp_path / "one.bin", "--projection", "unfolding", "-o", tmp_path / "o.npy")
         self.check(result, tmp_path / "o.npy", "unfolds into 1 rings")
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (MemoryError(), "has no room;"),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has"), "for 20.00 GiB more;"),
+        (
+            RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 96 bytes.\nx"),
+            "96 bytes more",
+        ),
+        (RuntimeError("not enough memory: you tried to allocate 96 bytes."), "for 96 bytes more;"),
+    ],
+)
+def test_too_much_at_once_is_one_line(r2flow, monkeypatch, tmp_path, error, words):
+    def full(*_, **__):
+        raise error
+
+    monkeypatch.setattr("r2flow.checkpoints.load_checkpoint", full)
+    monkeypatch.setattr("r2flow.backbones.configurations", full)
+    for verb, instead in ((("sample", "-o", tmp_path), "a smaller --batch-size"), (("backbones",), "smaller batches")):
+        code, _, said = r2flow(*verb)
+        assert code == 2
+        assert len(said.splitlines()) == 1
+        assert words in said
+        assert instead in said
+
+
+def test_another_error_of_torch_keeps_its_traceback(r2flow, monkeypatch):
+    def broken():
+        raise RuntimeError("shapes do not match")
+
+    monkeypatch.setattr("r2flow.backbones.configurations", broken)
+    with pytest.raises(RuntimeError, match="shapes"):
+        r2flow("backbones")
+
+
+@pytest.mark.parametrize("device", ["nope", "meta", "cpu:3", "cuda:99", None])
+def test_a_model_is_loaded_on_a_device_that_is_here(saved, device):  # noqa: F811
+    with pytest.raises(InputError, match="^device") as refused:
+        load(saved[0], device)
+    assert str(device) in str(refused.value)
+
+
+@pytest.mark.parametrize("name", [None, 3])
+def test_a_model_has_a_name(name):
+    with pytest.raises(InputError, match=f"a model has a name, a run folder or a file; found {name}"):
+        load(name)
+
+
+def test_a_model_is_loaded_on_a_device_of_torch(saved):  # noqa: F811
+    assert load(saved[0], torch.device("cpu")).generator.device == load(saved[0]).generator.device
 
 
 def test_importing_r2flow_loads_neither_lightning_nor_matplotlib():

@@ -210,6 +210,10 @@ def test_what_cannot_be_done_is_one_line(r2flow, run, tmp_path, options, message
             lambda path: np.save(path, np.full((2, 8, 64), 3, np.float32)),
             "reflectances of [0, 1]; found 3 to 3, 3 to 3. Divide",
         ),
+        (
+            lambda path: np.save(path, scans()[0].numpy() * np.float32([[[1000]], [[1]]])),
+            "none of its ranges lies within 1.45-80 m, found ",
+        ),
         (lambda path: path.write_bytes(b""), "is empty"),
         (lambda path: None, "does not exist"),
     ],
@@ -271,6 +275,37 @@ def test_answers_of_another_sampler_are_told_apart_by_its_setting(r2flow, run, t
     asked = [*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out", "--steps"]
     assert r2flow(*asked, 1)[0] == 0
     assert "completed with steps 1, not 2; give another --out" in r2flow(*asked, 2)[2]
+
+
+@pytest.mark.parametrize("ending", [".npy", ".bin"])
+def test_answers_to_another_scan_of_the_same_name_are_none(r2flow, run, tmp_path, ending):  # noqa: F811
+    for number, drive in enumerate("ab"):
+        full_scan(tmp_path / drive / f"one{ending}", number)
+    asked = "-c", run, "--mask", "rows:2", "--out", tmp_path / "out"
+    assert r2flow(*COMPLETE, tmp_path / "a", *asked)[0] == 0
+    before = (tmp_path / "out" / f"one{ending}").read_bytes()
+    code, _, error = r2flow(*COMPLETE, tmp_path / "b", *asked)
+    assert code == 2
+    assert "holds answers to another scan of the name one; give another --out" in error
+    assert (tmp_path / "out" / f"one{ending}").read_bytes() == before
+    full_scan(tmp_path / "b" / f"two{ending}", 0)
+    (tmp_path / "b" / f"one{ending}").unlink()
+    assert "1 scans completed" in r2flow(*COMPLETE, tmp_path / "b", *asked)[1]
+    assert r2flow(*COMPLETE, tmp_path / "a" / f"one{ending}", *asked)[0] == 0  # still known after the other one
+
+
+def test_answers_by_another_mask_file_or_scale_are_none(r2flow, run, tmp_path):  # noqa: F811
+    full_scan(tmp_path / "one.bin")
+    mask = np.arange(8)[:, None] % 2 == np.zeros(64)
+    np.save(tmp_path / "mask.npy", mask)
+    asked = *COMPLETE, tmp_path / "one.bin", "-c", run, "--mask", tmp_path / "mask.npy", "--out", tmp_path / "out"
+    assert r2flow(*asked)[0] == 0
+    assert "1 were there already" in r2flow(*asked)[1]
+    assert "completed with reflectance_scale null, not 2.0" in r2flow(*asked, "--reflectance-scale", 2)[2]
+    np.save(tmp_path / "mask.npy", ~mask)
+    code, _, error = r2flow(*asked)
+    assert code == 2
+    assert "holds scans that were completed with mask" in error
 
 
 def test_a_folder_of_other_samples_is_not_written_into(r2flow, run, tmp_path):  # noqa: F811

@@ -138,6 +138,17 @@ def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):
     assert "--projection must be one of spherical, unfolding; found 'flat'" in said
 
 
+def test_how_many_scans_are_drawn_is_said_where_nobody_asked(r2flow, saved, real, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.setattr("r2flow.cli.evaluate.SAMPLED", 3)
+    run, quick = saved[0].parent.parent, ("--metrics", "jsd", "--steps", 1, "--workers", 0)
+    code, said, _ = r2flow("evaluate", real, run, *quick)
+    assert (code, said.splitlines()[0]) == (0, f"{run}: 3 scans of it are drawn (--num says how many)")
+    code, said, _ = r2flow("evaluate", real, "-c", run, *quick, "-o", tmp_path / "curve")
+    assert (code, said.splitlines()[0]) == (0, f"{run}: 3 scans of each point are drawn (--num says how many)")
+    code, said, _ = r2flow("evaluate", real, run, *quick, "--num", 2)
+    assert (code, "drawn (" in said) == (0, False)
+
+
 def test_a_curve_of_several_solvers_has_a_line_for_each_with_intervals(r2flow, saved, real, tmp_path):  # noqa: F811
     code, _, err = r2flow(
         "evaluate", real, "-c", saved[0], "--solver", "euler,heun2", "--steps", "1,2", "--metrics", "jsd", "--num", 4,

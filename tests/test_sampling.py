@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -18,7 +19,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.reports.outputs import write_samples
-from r2flow.sampling import evaluated_region, sample
+from r2flow.sampling import draw, evaluated_region, sample
 from tests.test_checkpoints import CONFIG
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
@@ -40,7 +41,7 @@ class GaussianFlow(nn.Module):
 def flow(model: nn.Module | None = None, **encoding) -> Checkpoint:
     space = ModelSpace(SENSOR, Encoding(SENSOR, **encoding), SENSOR.rays())
     generator = Field((model or GaussianFlow()).requires_grad_(False), space.shape, space)
-    return Checkpoint(generator, {}, 0, Path("none"), "r2flow")
+    return Checkpoint(generator, {"sensor": {}, "encoding": {}}, 0, Path("none"), "r2flow")
 
 
 def network(reflectance: bool = True) -> Checkpoint:
@@ -232,6 +233,37 @@ def test_a_scan_that_is_not_solved_is_flagged_and_said(tmp_path, caplog):
     assert "not solved, so no scans of this flow: 1" in caplog.text
 
 
+def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path, monkeypatch):
+    def names() -> list[str]:
+        return sorted(path.name for path in tmp_path.glob("*.npy"))
+
+    def write(num: int, seed: int = 0, **options) -> list[int]:
+        drawn: list[int] = []
+        monkeypatch.setattr(
+            "r2flow.reports.outputs.draw", lambda *asked, **how: drawn.extend(asked[1]) or draw(*asked, **how)
+        )
+        how = Sampler("euler", 2)
+        write_samples(checkpoint, tmp_path, num, seed, how, ["npy"], pictures=0, batch_size=2, **options)
+        return drawn
+
+    checkpoint = flow()
+    assert write(4) == [0, 1, 2, 3]
+    whole = {name: (tmp_path / name).read_bytes() for name in names()}
+    (tmp_path / "000001.npy").unlink()
+    assert write(5) == [0, 1, 4]
+    assert {name: (tmp_path / name).read_bytes() for name in names()[:4]} == whole
+    with pytest.raises(InputError, match=r"samples of other settings, more than the 2 .*000002.npy"):
+        write(2, seed=1)
+    assert names() == [f"{number:06d}.npy" for number in range(5)]
+    assert write(2, seed=1, replace=True) == [0, 1]
+    assert names() == ["000000.npy", "000001.npy"]
+    assert write(3) == [0, 1, 2]
+    assert (tmp_path / "000000.npy").read_bytes() == whole["000000.npy"]
+    (tmp_path / "scans.json").unlink()
+    with pytest.raises(InputError, match=r"holds scans already \(000000.npy\) and no scans.json"):
+        write(3)
+
+
 def test_the_region_that_is_all_changes_nothing():
     checkpoint = network()
     (part,) = sample(checkpoint, 1, steps=2, region=region(SENSOR.shape))
@@ -286,3 +318,41 @@ def test_another_method_does_not_take_over_the_grid_of_the_former_one():
     assert own.changed(method="euler", tolerance=1e-3).grid == own.grid
     assert own.changed(method="heun2", grid="power:2").grid == "power:2"
     one.check_sampler(own.changed(method="dopri5"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"foo": 1}, "sampler has no option 'foo'; it knows: method, steps, tolerance"),
+        ({"times": "uniform"}, "sampler has no option 'times'"),
+        ({"grid": 3}, "grid must be a word or a list, each a finite number, found 3"),
+        ({"grid": ("a", "b")}, "grid must be a word or a list"),
+        ({"steps": 1.5}, "steps must be a whole number of at least 1, found 1.5"),
+        ({"steps": True}, "steps must be a whole number"),
+        ({"tolerance": "x"}, "tolerance must be a finite number"),
+        ({"method": 3}, "method must be a word"),
+    ],
+)
+def test_settings_of_another_type_are_refused(changes, message):
+    with pytest.raises(InputError) as refused:
+        next(sample(flow(), 1, **changes))
+    assert message in str(refused.value)
+
+
+def test_settings_may_be_numpy_s_and_torch_s():
+    own = Sampler("euler", 2)
+    times = torch.tensor([0.0, 0.25, 1.0])
+    assert own.changed(steps=np.int64(4), tolerance=np.float32(0.5)) == Sampler("euler", 4, 0.5)
+    assert own.changed(grid=times) == own.changed(grid=times.numpy()) == own.changed(grid=[0, 0.25, 1])
+
+
+@pytest.mark.parametrize("seed", [1.9, 1.0, "1", math.nan])
+def test_a_seed_is_a_whole_number(seed):
+    with pytest.raises(InputError, match="a seed must be a whole number, found"):
+        flow().sample(1, seed, steps=1)
+
+
+def test_seeds_of_numpy_are_those_of_python():
+    assert torch.equal(flow().sample(1, np.uint8(3), steps=1), flow().sample(1, 3, steps=1))
+    with pytest.raises(InputError, match=r"a seed must lie in \[0, 2\^64\), found -1"):
+        flow().sample(1, -1, steps=1)

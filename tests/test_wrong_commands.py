@@ -19,6 +19,7 @@ import yaml
 import r2flow.chain
 import r2flow.training
 from r2flow import cli
+from r2flow.checkpoints import load_checkpoint, save_checkpoint
 from r2flow.generators import build_generator
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
@@ -53,6 +54,13 @@ sample -c run -o out --tolerance 0
 sample -c run -o out --tolerance nan
 sample -c run -o out --tolerance a
 sample -c run -o out --tolerance -1
+sample -c run -o out --solver euler --tolerance 0.1 # --tolerance is for an adaptive solver, as dopri5, and euler is
+sample -c run -o out --solver nope --tolerance 0.1 # --tolerance is for an adaptive solver
+sample -c run -o out --solver sde:2 --tolerance 0.1 # --tolerance is for an adaptive solver
+sample -c run -o out --solver torchdiffeq:rk4 --tolerance 0.1 # --tolerance is for an adaptive solver
+sample -c run -o out --solver torchdiffeq:nope --tolerance 0.1 # torchdiffeq has no method 'nope'
+sample -c run -o out --solver dopri5 --steps 50 # --steps is for a solver of fixed steps, and dopri5 chooses its own
+sample -c run -o out --solver torchdiffeq:bosh3 --steps 50 # --steps is for a solver of fixed steps
 sample -c run -o out --seed -1
 sample -c run -o out --seed 99999999999999999999999
 sample -c run -o out --seed a
@@ -86,6 +94,8 @@ sample -c run -o out --grid file.txt
 sample -c run -o out --grid empty
 sample -c run -o out --solver dopri5 --grid power:2
 sample -c run -o out --grid power:0
+sample -c run -o out --grid power:10 --steps 64 # 64 steps do not fit under power:10 in double precision
+sample -c run -o out --grid power:3 --steps 1000000 # fewer steps or a smaller power
 sample -c run -o out --error 0.05m # measure them
 sample -c run -o out --error nope
 sample -c run -o out --error 0.05m --steps 4 # leave solver
@@ -119,6 +129,8 @@ convert run out.onnx
 convert run empty
 convert nowhere out.pth
 convert bad.ckpt out.pth
+convert flow.safetensors ./flow.safetensors --half # flow.safetensors would be replaced
+grow flow.safetensors flow.safetensors --size 16x256 # give another name
 convert run file.txt/a.pth
 backbones --only nope
 backbones --size 64
@@ -149,6 +161,10 @@ view scans -o out.html --num 0
 view scans -o out.html --num 257
 view scans -o out.html --sensor nope
 view scans -o out.html --steps 1,2 # of a run, a checkpoint or a model
+view run -o out.html --size nonsense # --size
+view run -o out.html --size 64x1024 --sensor vlp16 --reflectance-scale 7 # are of scans; found none
+view run -o out.html --projection unfolding # are of scans; found none
+view run -o out.html --columns x,y,z # are of scans; found none
 view run -o out.html --steps 0
 view run -o out.html --steps 1,a
 view run -o out.html --times 1
@@ -186,6 +202,7 @@ invert scans -c run -o out --num 0
 invert scans -c run -o out --solver nope
 invert scans -c run -o out --solver bosh3 --steps 0
 invert scans -c run -o out --tolerance 0
+invert scans -c run -o out --steps 4 # dopri5 chooses its own
 invert scans -c run -o out --reflectance-scale 0
 invert scans -c run -o out --reflectance-scale nan
 invert scans -c run -o out --batch-size 0
@@ -329,6 +346,13 @@ evaluate scans scans --real-num 0
 evaluate scans scans --split train # no split named 'train'
 evaluate scans scans --generated-split train # no split named 'train'
 evaluate scans scans --generated-scale 0
+evaluate scans scans --steps 4 --solver nope # are of a run, a checkpoint or a model to sample; found none
+evaluate scans scans --tolerance 1 # found none
+evaluate scans scans --seed 3 # found none
+evaluate scans --floor --steps 4 # found none
+evaluate scans run --generated-scale 255 # are of files in GENERATED; found none
+evaluate scans run --generated-split foo # are of files in GENERATED; found none
+evaluate scans -c run -o out --generated-split foo # are of files in GENERATED; found none
 evaluate scans scans --json empty
 evaluate scans scans --json file.txt/a.json
 evaluate scans scans -o file.txt
@@ -348,13 +372,17 @@ evaluate scans -c run -o out --steps a
 evaluate scans -c run -o out --steps 1,,2
 evaluate scans -c run -o out --solver nope
 evaluate scans -c run -o out --tolerance 0
+evaluate scans -c run -o out --solver euler,heun2 --tolerance 0.1 # --tolerance is for an adaptive solver
 evaluate scans run --steps 1,2
+evaluate scans run --steps 2 --solver dopri5 # --steps is for a solver of fixed steps
+evaluate scans run --tolerance 0.1 # --tolerance is for an adaptive solver
 evaluate scans run --solver nope
 evaluate scans run --sensor vlp16
 evaluate scans run --size 16x64
 evaluate scans run --seed -1
 evaluate image.npy # nothing to compare with
 evaluate simulated:x scans
+evaluate simulated:² scans # as simulated:0; found 'simulated:²'
 report fidelity scans # Missing
 report fidelity scans nowhere
 report fidelity nowhere scans
@@ -733,6 +761,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         content = {"state_dict": state, "current_model_state": state, "config": config, "global_step": 7}
         AtomicCheckpointIO().save_checkpoint(content, place / name / "checkpoints" / "step-00000007.ckpt")
         (place / name / "config.yaml").write_text(yaml.safe_dump(config))
+    save_checkpoint(load_checkpoint(place / "run"), place / "flow.safetensors")
     (place / "empty").mkdir()
     np.save(place / "image.npy", np.stack([np.full((8, 64), 9.0), np.full((8, 64), 0.5)]).astype(np.float32))
     (place / "bad.bin").write_bytes(b"\0" * 30)

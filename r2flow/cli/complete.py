@@ -92,7 +92,7 @@ def complete(
     from r2flow.completion import KEEP, completing
     from r2flow.data.partial import open_partial
     from r2flow.evaluation.sets import reading_of_flow
-    from r2flow.lidar.known import parse_mask
+    from r2flow.lidar.known import mask_identity, parse_mask
     from r2flow.models import DEFAULT, MODELS, find_model
     from r2flow.reports.completed import WRITTEN, Job, answer_ending, write_completed
 
@@ -120,7 +120,10 @@ def complete(
     rows, columns = loaded.sensor.shape
     print(f"an answer has a point a pixel of the model's image, {rows}x{columns}: {rows * columns} at most")
     job = Job(answers.num, answers.seed, known.keep, mask, answers.batch_size, known.surfaces, answers.pictures)
-    about = {"mask": known.mask, "from": known.source, "surfaces": known.surfaces}
+    about = {
+        "mask": known.mask and mask_identity(known.mask), "from": known.source, "surfaces": known.surfaces,
+        "reflectance_scale": known.reflectance_scale, "columns": known.columns,
+    }  # fmt: skip
     found = write_completed(loaded, scans, out, job, sampler, about)
     there = len(scans) - len(found)
     print(f"{len(found)} scans completed in {out}" + (f", {there} were there already" if there else ""))

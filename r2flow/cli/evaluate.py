@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from r2flow.cli.app import app, report
-from r2flow.cli.groups import ReadingOptions, WorkOptions, grouped
-from r2flow.cli.options import SETS, OutOption, choose_device, choose_reading
+from r2flow.cli.groups import ReadingOptions, SolverOptions, WorkOptions, grouped
+from r2flow.cli.options import SETS, OutOption, choose_device, choose_reading, takes_tolerance
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -137,13 +137,17 @@ def evaluate(
     from r2flow.reports.pages import prepare_folder
 
     named = list(dict.fromkeys(generated or []))
-    rules = _check_evaluation(named, checkpoint, measured, output)
     sampled = [one for one in named if _is_flow(one)]
+    rules = _check_evaluation(named, checkpoint, measured, output)
+    _check_used(len(named) > len(sampled), bool(sampled or checkpoint), scans, sampling)
     with joined(choose_device(work.device)) as place:
         wanted = (
             None if measured.metrics in (None, ALL) else _build(measured.metrics.split(","), measured.bootstrap, place)
         )
         flows = _load_flows([*(checkpoint or []), *map(Path, sampled)], place.device)
+        if flows and scans.num is None and place.rank == 0:
+            each = "each point" if checkpoint else "each" if len(flows) > 1 else "it"
+            print(f"{', '.join(flows)}: {SAMPLED} scans of {each} are drawn (--num says how many)")
         reading = reading_of([real, *(one for one in named if one not in sampled)], list(flows.values()), how)
         if rules.convention is not None and how.convention is None:
             reading = replace(reading, convention=rules.convention)
@@ -209,6 +213,16 @@ def _check_evaluation(
     if output.json is not None and output.json.is_dir():
         raise InputError(f"--json {output.json} is a folder; name a file to write to.")
     return rules
+
+
+def _check_used(files: bool, flows: bool, scans: SetOptions, sampling: SamplingOptions) -> None:
+    """Refuse options of generated files, or of flows, where there are none."""
+    if not flows and sampling != SamplingOptions():
+        raise InputError(
+            "--steps, --solver, --tolerance and --seed are of a run, a checkpoint or a model to sample; found none."
+        )
+    if not files and (scans.generated_split is not None or scans.generated_scale is not None):
+        raise InputError("--generated-split and --generated-scale are of files in GENERATED; found none.")
 
 
 def _names(generated: Sequence[str]) -> list[str]:
@@ -278,6 +292,9 @@ def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOption
     steps = _many(sampling.steps)
     for (label, flow), drawing in product(flows.items(), drawings):
         steps_of(flow, label, steps, drawing)
+    methods = {drawing.method or flow.generator.sampler.method for flow in flows.values() for drawing in drawings}
+    if sampling.tolerance is not None and not any(map(takes_tolerance, methods)):
+        raise InputError(f"--tolerance is for an adaptive solver, as dopri5; found {', '.join(sorted(methods))}.")
     return drawings, steps
 
 
@@ -402,7 +419,7 @@ def _sampled(label: str, flow: "Checkpoint", num: int, sampling: SamplingOptions
         raise InputError(
             f"one comparison takes one number of --steps, found {sampling.steps}; --checkpoint makes a curve."
         )
-    how = flow.generator.sampler.changed(steps=steps[0], method=sampling.solver, tolerance=sampling.tolerance)
+    how = SolverOptions(sampling.solver, steps[0], sampling.tolerance).change(flow.generator.sampler)
     return sampled_set(flow, label, num, how, sampling.seed)
 
 

@@ -186,9 +186,16 @@ def convert(
 
     from r2flow.checkpoints import load_checkpoint, save_checkpoint
 
-    save_checkpoint(load_checkpoint(checkpoint), out, half)
+    found = load_checkpoint(checkpoint)
+    _keep_source(found, out)
+    save_checkpoint(found, out, half)
     written = out.read_bytes()
     print(f"{out}: {len(written) / 1e6:.1f} MB, SHA-256 {hashlib.sha256(written).hexdigest()}")
+
+
+def _keep_source(checkpoint: "Checkpoint", out: Path) -> None:
+    if out.exists() and out.samefile(checkpoint.path):
+        raise InputError(f"{out} would be replaced by what is made of it; give another name.")
 
 
 @app.command(epilog="Example: r2flow grow street larger.safetensors --size 64x1024")
@@ -207,6 +214,7 @@ def grow(
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: give a .safetensors, which holds a flow and its config.")
     found = load_checkpoint(checkpoint)
+    _keep_source(found, out)
     larger = grown(found, found.sensor.resized(*rows_and_columns(size)).shape)
     save_checkpoint(larger, out)
     before, after = ("x".join(map(str, one.sensor.shape)) for one in (found, larger))

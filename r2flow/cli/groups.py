@@ -16,6 +16,7 @@ from r2flow.cli.options import (
     ScaleChoice,
     SensorChoice,
     SizeOption,
+    check_control,
 )
 
 if TYPE_CHECKING:
@@ -93,8 +94,14 @@ class SolverOptions:
     tolerance: Annotated[float | None, typer.Option(help="Of an adaptive solver.")] = None
 
     def change(self, sampler: "Sampler", **more: Any) -> "Sampler":
-        """A sampler with what was asked for, and `more` of its settings."""
-        return sampler.changed(method=self.solver, steps=self.steps, tolerance=self.tolerance, **more)
+        """A sampler with what was asked for, and `more` of its settings.
+
+        Raises:
+            InputError: a tolerance for fixed steps, or a number of steps for an adaptive solver.
+        """
+        found = sampler.changed(method=self.solver, steps=self.steps, tolerance=self.tolerance, **more)
+        check_control(found.method, self.steps, self.tolerance)
+        return found
 
 
 @dataclass(frozen=True)

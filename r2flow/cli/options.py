@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from r2flow.devices import choose_device as choose_device  # for every verb
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -134,6 +135,33 @@ def check_words(**options: str | None) -> None:
             raise InputError(f"--{option.replace('_', '-')} must be one of {words}; found {value!r}.")
 
 
+def check_control(method: str, steps: int | None, tolerance: float | None) -> None:
+    """Check what was given to say how exact a method shall be; None where it was left out.
+
+    Raises:
+        InputError: a tolerance for fixed steps, or a number of steps for an adaptive solver.
+    """
+    adaptive = takes_tolerance(method)
+    if adaptive and steps is not None:
+        raise InputError(f"--steps is for a solver of fixed steps, and {method} chooses its own; give --tolerance.")
+    if not adaptive and tolerance is not None:
+        raise InputError(f"--tolerance is for an adaptive solver, as dopri5, and {method} is none; give --steps.")
+
+
+def takes_tolerance(method: str) -> bool:
+    """Whether a generator's method is an adaptive solver; what is no solver is none.
+
+    Raises:
+        InputError: torchdiffeq has no such method.
+    """
+    from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, adapts, check_method
+
+    if method.startswith(TORCHDIFFEQ):
+        check_method(method)
+        return adapts(method)
+    return method in SOLVERS and adapts(method)
+
+
 def rows_and_columns(size: str | None) -> tuple[int | None, int | None]:
     """The numbers of an image size written as 64x1024; of no size, None for both."""
     if size is None:
@@ -147,22 +175,3 @@ def rows_and_columns(size: str | None) -> tuple[int | None, int | None]:
 def cores() -> int:
     """The cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def choose_device(name: str) -> str:
-    """`auto` takes a GPU where there is one."""
-    import torch
-
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        device = torch.device("meta")
-    if device.type not in ("cpu", "cuda", "mps", "xpu") or (device.type == "cpu" and device.index):
-        raise InputError(f"--device must be auto, cpu, cuda, cuda:1, ...; found {name!r}.")
-    there = {"cuda": torch.cuda, "mps": torch.mps, "xpu": torch.xpu}.get(device.type)
-    if there is not None and (device.index or 0) >= there.device_count():
-        seen = f"{there.device_count()} of them" if there.device_count() else "no GPU"
-        raise InputError(f"--device {name}, but torch sees {seen} here; use --device cpu.")
-    return name

@@ -1,6 +1,7 @@
 """Verbs for scans."""
 
 from collections.abc import Sequence
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -47,11 +48,10 @@ def show(
     from r2flow.reports.views import label_view
 
     views = views_to_draw(scans, sensor, size, projection, reflectance_scale, columns, most)
-    paths = [view.path for view in views]
-    for view in views:
+    for view, name in zip(views, unique_stems([view.path for view in views]), strict=True):
         classes = label_view(view) if labels else None
         figure = scan_figure(view.image, view.rays, view.path.name, classes)
-        print(save_figure(figure, out / f"{unique_stem(view.path, paths)}.png"))
+        print(save_figure(figure, out / f"{name}.png"))
 
 
 @app.command(
@@ -108,7 +108,13 @@ def views_to_draw(
     return [view for spec in scans for view in views_of(spec, chosen, projection, reflectance_scale, most, named)]
 
 
-def unique_stem(path: Path, paths: list[Path]) -> str:
-    """The file's stem, with its folder's name where two files share one."""
-    shared = sum(other.stem == path.stem for other in paths) > 1
-    return f"{path.parent.name}_{path.name.replace('.', '_')}" if shared else path.stem
+def unique_stems(paths: Sequence[Path]) -> list[str]:
+    """The files' stems, with their folder's name where two share one, and with a number where they share that too."""
+    stems = [path.stem for path in paths]
+    found: list[str] = []
+    for path in paths:
+        shared = stems.count(path.stem) > 1
+        name = f"{path.parent.name}_{path.name.replace('.', '_')}" if shared else path.stem
+        names = chain([name], (f"{name}_{number}" for number in count(2)))
+        found.append(next(one for one in names if one not in found))
+    return found

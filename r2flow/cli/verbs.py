@@ -2,7 +2,9 @@
 
 import logging
 import os
+import re
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import typer
@@ -35,6 +37,9 @@ from r2flow.signals import Stopped, listening, stop_at_once
 
 # Its home is click in older releases of typer and typer itself in newer ones.
 USAGE_ERROR: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+
+
+FULL = ("can't allocate memory", "not enough memory", "out of memory")  # of the RuntimeErrors of torch
 
 
 def run() -> None:
@@ -70,7 +75,26 @@ def _run() -> None:
     except (InputError, OSError) as error:
         print(f"error: {explain_mistake(error)}", file=sys.stderr)
         sys.exit(2)
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not any(words in str(error) for words in FULL):
+            raise
+        asked = re.search(r"allocate ([\d.]+ \w+)", str(error))
+        more = f" for {asked[1]} more" if asked else ""
+        print(f"error: the memory has no room{more}; give {_less_at_once(sys.argv)}.", file=sys.stderr)
+        sys.exit(2)
     except USAGE_ERROR as error:
         print(f"error: {one_line(error.format_message()) or 'no verb is given.'} See --help.", file=sys.stderr)
         sys.exit(2)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _less_at_once(arguments: Sequence[str]) -> str:
+    """What takes less memory with a verb."""
+    verb: Any = typer.main.get_command(app)
+    for word in arguments:
+        verb = getattr(verb, "commands", {}).get(word, verb)
+    return (
+        "a smaller --batch-size"
+        if any("--batch-size" in one.opts for one in verb.params)
+        else "smaller batches or images"
+    )

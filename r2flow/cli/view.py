@@ -89,6 +89,11 @@ def view(
     flows = [one for one in what if is_checkpoint(one)]
     if not flows and (drawn.steps or drawn.times):
         raise InputError("--steps and --times are of a run, a checkpoint or a model; found none.")
+    of_files = (sensor, size, reflectance_scale, columns)
+    if len(flows) == len(what) and (projection != "spherical" or any(one is not None for one in of_files)):
+        raise InputError(
+            "--sensor, --size, --projection, --reflectance-scale and --columns are of scans; found none beside a model."
+        )
     if sequence and drawn.times:
         raise InputError("--sequence and --times both use the slider; give one of them.")
     panels: list[Panel] = []

@@ -10,7 +10,7 @@ from pathlib import Path
 from r2flow.data.options import SourceOptions
 from r2flow.data.sources import Reading, ScanFiles, ScanSource, lacks_reflectance, warn_of_other_sensor
 from r2flow.errors import InputError
-from r2flow.lidar.scan_files import ELSEWHERE, LOOSE_ENDINGS, SCAN_ENDINGS
+from r2flow.lidar.scan_files import ELSEWHERE, FIRM_ENDINGS, LOOSE_ENDINGS
 
 log = logging.getLogger(__name__)
 
@@ -179,8 +179,7 @@ def folder(root: Path) -> list[Drive]:
     its range image, else the last by its ending.
     """
     below = sorted(Path(place) for place, _, _ in os.walk(root))
-    firm = tuple(ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS)
-    for endings in (firm, LOOSE_ENDINGS):
+    for endings in (FIRM_ENDINGS, LOOSE_ENDINGS):
         drives = [Drive(str(place.relative_to(root)), _one_of_each(_files(place, endings))) for place in below]
         if any(drive.scans for drive in drives):
             break

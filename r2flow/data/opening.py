@@ -143,7 +143,7 @@ def parse(text: str) -> tuple[SourceOptions, Path | None]:
     path = Path(text).expanduser()
     kind, colon, rest = text.partition(":")
     if colon and kind in SOURCES:
-        if kind == SIMULATED and not rest.isdigit():
+        if kind == SIMULATED and not rest.isdecimal():
             raise InputError(f"simulated scans are named by their seed, as simulated:0; found {text!r}.")
         return SourceOptions(kind, rest, scenes=SCENES), None
     if colon and not path.exists() and "/" not in kind and "\\" not in kind:
@@ -169,11 +169,16 @@ def find_drives(
 # What scans say of themselves
 
 
-def write_samples_note(folder: Path, reading: Reading, **about: Any) -> None:
-    """Say in a folder of samples whose images they are: `open_scans` then needs no sensor and no size."""
+def samples_note(reading: Reading, **about: Any) -> dict[str, Any]:
+    """What a folder of samples says of their images, as plain values: `open_scans` then needs no sensor and no size."""
     images = {"sensor": reading.sensor.described(), "projection": reading.projection, "convention": reading.convention}
+    found: dict[str, Any] = json.loads(json.dumps({"format": "r2flow samples 1", **images, **about}))
+    return found
+
+
+def write_samples_note(folder: Path, reading: Reading, **about: Any) -> None:
     with atomic_write(folder / SAMPLES, "w") as file:
-        json.dump({"format": "r2flow samples 1", **images, **about}, file, indent=1)
+        json.dump(samples_note(reading, **about), file, indent=1)
 
 
 def samples_of(run: Path) -> Path | None:

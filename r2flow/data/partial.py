@@ -4,6 +4,7 @@ scans, said = open_partial(["scans"], reading_of_flow(flow))
 scans[0].read()         image, state, xyz
 """
 
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -51,6 +52,10 @@ class PartialScan:
     read: Callable[[], Partial]
     path: Path | None = None
     image: bool = True
+
+    def identity(self) -> str:
+        """What tells its answers from those to another scan of this name: a hash of its file."""
+        return hashlib.sha256(self.path.read_bytes()).hexdigest()[:16] if self.path else self.name
 
 
 def open_partial(
@@ -222,6 +227,12 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
         wanted = "x".join(map(str, target.shape))
         advice = f"--from {source.name} has {source.shape[0]} rows" if source else "name its sensor by --from"
         raise InputError(f"{path} is a range image of {found}, those of the model are {wanted}: {advice}.")
+    r = image[0]
+    if r.any() and not ((r >= target.min_range) & (r <= target.max_range)).any():
+        raise InputError(
+            f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m, found "
+            f"{r[r > 0].min():g} to {r.max():g}. Are they metres?"
+        )
     return image_of_same(image, target)
 
 

@@ -96,9 +96,13 @@ class Sampler:
         one with other numbers, as `sde:2` for `sde`, keeps them.
 
         Raises:
-            InputError: fewer than one step, or times and a number of steps that contradict.
+            InputError: an unknown option or a value of the wrong type, fewer than one step, or times and a number of
+                steps that contradict.
         """
-        given = {key: value for key, value in options.items() if value is not None}
+        given = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in options.items() if v is not None}
+        own = vars(self)  # the range of a number is judged with the method that takes it
+        odd = {k: v for k, v in given.items() if isinstance(v, tuple) or type(v) is not type(own.get(k))}
+        check_options("sampler", type(self), odd)
         if _kind(given.get("method", self.method)) != _kind(self.method):
             given = {**_usual(given["method"]), "levels": (), "limits": (), **given}
         if "steps" in given:

@@ -3,6 +3,7 @@
 state = ray_states(images, parse_mask("rows:4")(images.shape[-2:], rng))
 """
 
+import hashlib
 import math
 from collections.abc import Callable
 from enum import IntEnum
@@ -97,6 +98,15 @@ def parse_mask(text: str) -> Mask:
     """
     parts = [_one_mask(part.strip()) for part in text.split("+")]
     return lambda shape, draws: np.logical_and.reduce([part(shape, draws) for part in parts])
+
+
+def mask_identity(text: str) -> str:
+    """A mask's text with a hash of each file that it names."""
+    parts = [part.strip() for part in text.split("+")]
+    return "+".join(
+        f"{part} ({hashlib.sha256(Path(part).read_bytes()).hexdigest()[:16]})" if part.endswith(".npy") else part
+        for part in parts
+    )
 
 
 def _one_mask(text: str) -> Mask:

@@ -25,7 +25,7 @@ from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.transfer import Partial
 from r2flow.metrics.completion import errors
-from r2flow.reports.outputs import ScanBar, keep_note, warn_unsolved
+from r2flow.reports.outputs import ScanBar, note_of, warn_unsolved, write_note
 from r2flow.reports.pictures import completed_figure, save_figure
 from r2flow.reports.view import write_page
 
@@ -79,7 +79,7 @@ def write_completed(
         InputError: a folder that holds other answers, or a scan that cannot be completed.
     """
     asked = {"num": job.num, "seed": job.seed, "keep": job.keep, "weights": weights_hash(checkpoint), **about}
-    settings = {**asked, "sampler": sampler.asdict()}
+    settings = {**asked, "sampler": sampler.asdict(), "inputs": {scan.name: scan.identity() for scan in scans}}
     files = [answer_files(checkpoint, scan, out, job.num) for scan in scans]
     inputs = {scan.path.resolve() for scan in scans if scan.path}
     replaced = [path for paths in files for path in paths if path.resolve() in inputs]
@@ -88,7 +88,7 @@ def write_completed(
     for scan in scans:
         if scan.path and (out / scan.name).resolve().parent == scan.path.resolve().parent:
             raise InputError(f"{out} is the folder of the scans; answers need one of their own: give another --out.")
-    _refuse_others(out, settings, [path for paths in files for path in paths])
+    settings["inputs"] |= _refuse_others(out, settings, [path for paths in files for path in paths])
     left = [number for number, paths in enumerate(files) if not all(path.is_file() for path in paths)]
     found: dict[str, dict[str, float] | None] = {}
     known = []
@@ -104,7 +104,7 @@ def write_completed(
                 batch_size=job.batch_size, first=number, on_surfaces=job.on_surfaces, progress=bar.evaluated,
             )  # fmt: skip
             if not found:  # the first answer shows that the settings can be used
-                keep_note(checkpoint, out, job.seed, {"completion": settings}, **sampler.asdict())
+                write_note(out, note_of(checkpoint, job.seed, {"completion": settings}, **sampler.asdict()))
             warn_unsolved(made.converged)
             if number < job.pictures:
                 _draw(checkpoint, scan, out, given, made, whole if job.mask else None)
@@ -161,12 +161,17 @@ def answer_files(checkpoint: Checkpoint, scan: PartialScan, out: Path, num: int)
     return [out / f"{scan.name}{number}{ending}" for number in numbers]
 
 
-def _refuse_others(out: Path, settings: Mapping[str, Any], files: Sequence[Path]) -> None:
+def _refuse_others(out: Path, settings: Mapping[str, Any], files: Sequence[Path]) -> dict[str, str]:
+    """Refuse a folder with answers by other settings or to other scans.
+
+    Returns:
+        The scans that were completed there, by name, with what identifies them.
+    """
     note = out / SAMPLES
     if not note.exists():  # it is written before the first answer
         if foreign := next((path for path in files if path.exists()), None):
             raise InputError(f"{foreign} is there and no answer of this command; give another --out.")
-        return
+        return {}
     try:
         there = json.loads(note.read_text(encoding="utf-8")).get("completion")
     except (ValueError, AttributeError):
@@ -174,6 +179,7 @@ def _refuse_others(out: Path, settings: Mapping[str, Any], files: Sequence[Path]
     ours = _flat(json.loads(json.dumps(settings)))
     if there is None:
         raise InputError(f"{out} holds other scans than completed ones (its {SAMPLES} says so); give another --out.")
+    before: dict[str, str] = there.get("inputs") or {}
     there = _flat(there)
     wrong = next((key for key in ours if there.get(key) != ours[key]), None)
     if wrong is not None:
@@ -181,11 +187,16 @@ def _refuse_others(out: Path, settings: Mapping[str, Any], files: Sequence[Path]
         raise InputError(
             f"{out} holds scans that were completed with {wrong} {found}, not {asked}; give another --out."
         )
+    other = next((name for name, scan in settings["inputs"].items() if before.get(name, scan) != scan), None)
+    if other is not None:
+        raise InputError(f"{out} holds answers to another scan of the name {other}; give another --out.")
+    return before
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of the sampler beside the others."""
-    return {key: value for key, value in settings.items() if key != "sampler"} | settings.get("sampler", {})
+    """The settings of the sampler beside the others, without the scans."""
+    apart = ("sampler", "inputs")
+    return {key: value for key, value in settings.items() if key not in apart} | settings.get("sampler", {})
 
 
 def _write(

@@ -1,8 +1,10 @@
 """Generated scans as files and pictures."""
 
+import json
 import logging
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +12,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.checkpoints import Checkpoint
-from r2flow.data.opening import write_samples_note
+from r2flow.checkpoints import Checkpoint, weights_hash
+from r2flow.data.opening import SAMPLES, samples_note
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import reading_of_flow
 from r2flow.files import atomic_write
 from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.region import Region
-from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.scan_files import FIRM_ENDINGS, write_points
 from r2flow.progress import Bar, track
 from r2flow.reports.view import most_images, write_page
-from r2flow.sampling import batches, sample
+from r2flow.sampling import batches, draw
 
 log = logging.getLogger(__name__)
 
@@ -46,10 +48,11 @@ def write_samples(
     batch_size: int = 1,
     region: Region | None = None,
     channels: str = "both",
+    replace: bool = False,
 ) -> list[np.ndarray]:
     """Draw scans and write each as `out/NNNNNN.FORMAT`, the first ones also as pictures and in 3-D (`samples.html`).
 
-    Scan i of a seed is the same whatever `num` and `batch_size` are.
+    Scan i of a seed is the same whatever `num` and `batch_size` are. A call that was stopped goes on where it was.
 
     Args:
         sampler: How the generator is run; its own if left out.
@@ -57,21 +60,28 @@ def write_samples(
             float32 (2 or 1, H, W) in metres and reflectance; reflectance alone is `NNNNNN.reflectance.npy`.
         pictures: How many scans get a page of their own; the contact sheet shows at most 8 of them.
         region, channels: See `r2flow.sampling.sample`. Files are of the sensor's shape, 0 outside the region.
+        replace: Whether more samples of other settings than `num` are replaced.
 
     Returns:
         The images drawn as pictures.
 
     Raises:
-        InputError: an unknown format, one that cannot hold what is asked for, or nothing to draw.
+        InputError: an unknown format, one that cannot hold what is asked for, nothing to draw, or a folder with scans
+            that are none of these samples.
     """
     if num < 1 or batch_size < 1:
         raise InputError(f"needs at least one scan and a batch of at least one; found {num} and {batch_size}.")
     generator = checkpoint.generator
     sampler = sampler or generator.sampler
+    generator.space.check_channels(channels)
     formats = formats_of(checkpoint, channels) if formats is None else formats
     check_formats(checkpoint, formats, channels)
     generator.check_sampler(sampler)
     out, rays = Path(out), checkpoint.sensor.rays()
+    part: dict[str, Any] = {} if region is None else {"region": asdict(region)}
+    part |= {} if channels == "both" else {"channels": channels}
+    about = note_of(checkpoint, seed, part, **sampler.asdict())
+    begun = channels != "reflectance" and _begun(out, about, num, replace)
     if {"ply", "bin"} & set(formats) and not torch.equal(generator.space.rays, rays):
         log.warning(
             "the model was told rays through the corners of the bins (rays=reference); points are written along rays "
@@ -79,10 +89,19 @@ def write_samples(
         )
     shown: list[np.ndarray] = []
     with ScanBar("sampling", num, batches(num, batch_size) * generator.evaluations_of(sampler)) as bar:
-        for drawn in sample(
-            generator, num, seed, sampler=sampler, batch_size=batch_size, region=region, channels=channels,
-            progress=bar.evaluated,
-        ):  # fmt: skip
+        for first in range(0, num, batch_size):
+            numbers = range(first, min(first + batch_size, num))
+            files = [out / f"{number:06d}.{ending}" for number in numbers for ending in formats]
+            if begun and first >= pictures and all(file.is_file() for file in files):
+                bar.finished(numbers.stop)
+                continue
+            drawn = draw(generator, numbers, seed, sampler, region=region, channels=channels, progress=bar.evaluated)
+            if channels != "reflectance" and not begun:
+                for former in _scans(out):
+                    if former.name[:6].isdecimal():
+                        former.unlink()
+                write_note(out, about)
+                begun = True
             warn_unsolved(drawn.converged, drawn.first)
             for number, image in enumerate(drawn.images.numpy(), drawn.first):
                 if channels == "reflectance":
@@ -91,9 +110,7 @@ def write_samples(
                     write_scan(image, rays, out, f"{number:06d}", formats)
                 if len(shown) < pictures:
                     shown.append(image)
-            bar.finished(min(drawn.first + batch_size, num))
-    if channels != "reflectance":
-        keep_note(checkpoint, out, seed, **sampler.asdict())
+            bar.finished(numbers.stop)
     parts = shown if region is None else [region.crop(torch.from_numpy(image)).numpy() for image in shown]
     if parts and channels == "reflectance":
         draw_reflectances(parts[:8], out)
@@ -113,16 +130,49 @@ def warn_unsolved(converged: Tensor, first: int = 0) -> None:
         log.warning("not solved, so no scans of this flow: %s; try another solver.", ", ".join(lost))
 
 
-def keep_note(
-    checkpoint: Checkpoint, out: Path, seed: int, more: Mapping[str, Any] | None = None, **sampler: Any
-) -> None:
-    """Write beside samples what they are and `more`, so that readers know their size and sensor."""
+def _scans(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.glob("*") if file.name.endswith(FIRM_ENDINGS))
+
+
+def _begun(out: Path, about: Mapping[str, Any], num: int, replace: bool) -> bool:
+    """Whether a folder holds samples of these settings.
+
+    Raises:
+        InputError: it holds scans that are no samples, or more samples of other settings than are drawn now.
+    """
+    scans, note = [file.name for file in _scans(out)], out / SAMPLES
+    if not note.is_file():
+        if scans:
+            raise InputError(f"{out} holds scans already ({scans[0]}) and no {SAMPLES}; give another --out.")
+        return False
+    try:
+        there = json.loads(note.read_text(encoding="utf-8"))
+    except ValueError:
+        there = {}
+    if there == about:
+        return True
+    others = [name for name in scans if not name[:6].isdecimal() or int(name[:6]) >= num]
+    if others and not replace:
+        raise InputError(
+            f"{out} holds samples of other settings, more than the {num} that would replace them ({others[0]}): give "
+            "another --out, or empty it."
+        )
+    return False
+
+
+def note_of(checkpoint: Checkpoint, seed: int, more: Mapping[str, Any] | None = None, **sampler: Any) -> dict[str, Any]:
+    """What is written beside samples: what they are and `more`, so that readers know their size and sensor."""
     about = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
     about |= {"min_range": checkpoint.sensor.min_range, "max_range": checkpoint.sensor.max_range}
     reading, step = reading_of_flow(checkpoint), checkpoint.step
     # Points lie on rays through the middles of the bins, whatever rays the model was told.
-    write_samples_note(out, reading, encoding=about, seed=seed, sampler=sampler, step=step, rays="centre",
-                       **(more or {}))  # fmt: skip
+    return samples_note(reading, encoding=about, seed=seed, sampler=sampler, step=step,
+                        weights=weights_hash(checkpoint), rays="centre", **(more or {}))  # fmt: skip
+
+
+def write_note(out: Path, note: Mapping[str, Any]) -> None:
+    with atomic_write(out / SAMPLES, "w") as file:
+        json.dump(note, file, indent=1)
 
 
 def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str) -> None:

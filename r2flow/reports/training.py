@@ -53,7 +53,7 @@ def finish(run: str | Path, samples: Mapping[str, Any], seed: int, device: str, 
     if samples["num"] == 0:
         print(f"checkpoint    {path}")
         return
-    write_samples(checkpoint, out, samples["num"], seed, pictures=samples["num"])
+    write_samples(checkpoint, out, samples["num"], seed, pictures=samples["num"], replace=True)
     for name, (steps, values) in curves.items():
         tenth = max(len(values) // 10, 1)
         print(f"{name}: {values[:tenth].mean():.4f} at the start, {values[-tenth:].mean():.4f} at step {steps[-1]}")

@@ -16,7 +16,7 @@ from r2flow import noise
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, sole_use
 from r2flow.lidar.projection import image_to_points
-from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.scan_files import FIRM_ENDINGS, write_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.signals import end_with_parent, out_of_reach
 from r2flow.simulator import REVISION, simulate
@@ -80,9 +80,12 @@ class SimulatedFolder:
                     f"{_short(ours[key])}; choose another folder, or the same {key}."
                 )
             return True
-        taken = [file for name in FORMATS for file in self.path.glob(f"*.{name}")] if self.path.is_dir() else []
+        taken = next((file for file in self.path.rglob("*") if file.name.endswith(FIRM_ENDINGS)), None)
         if taken:
-            raise InputError(f"{self.path} holds scans already ({taken[0].name}) and no {MANIFEST}; choose another.")
+            raise InputError(
+                f"{self.path} holds scans already ({taken.relative_to(self.path)}) and no {MANIFEST}: give another "
+                "folder, or data=folder to learn from them."
+            )
         return False
 
     def begin(self) -> None:

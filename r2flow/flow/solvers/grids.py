@@ -61,13 +61,18 @@ def build_grid(grid: str | Tensor, t_0: float, t_1: float, steps: int) -> Tensor
     """Times from t_0 to t_1, (N + 1,) float64 on the CPU, N = steps unless the times are given.
 
     Raises:
-        InputError: an unknown name, or given times that do not run from t_0 to t_1 in one direction.
+        InputError: an unknown name, steps that are too short for float64, or given times that do not run from t_0 to
+            t_1 in one direction.
     """
     if isinstance(grid, str):
         times = named_grid(grid)(t_0, t_1, steps)
     else:
         times = grid.detach().to("cpu", torch.float64, copy=True)
     if times.ndim != 1 or len(times) < 2 or not ((times[1:] - times[:-1]) * (t_1 - t_0) > 0).all():
+        if isinstance(grid, str) and len(times) > 1:
+            raise InputError(
+                f"{steps} steps do not fit under {grid} in double precision; give fewer steps or a smaller power."
+            )
         raise InputError(f"a time grid must be (N + 1,) times that run in one direction, found {grid}.")
     if max(abs(times[0] - t_0), abs(times[-1] - t_1)) > 1e-6:
         raise InputError(f"this time grid runs from {times[0]:g} to {times[-1]:g}, the solution from {t_0} to {t_1}.")

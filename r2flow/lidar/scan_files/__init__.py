@@ -32,6 +32,7 @@ from r2flow.lidar.scan_files.tables import read_arrow, read_las, read_npz, read_
 
 __all__ = [
     "ELSEWHERE",
+    "FIRM_ENDINGS",
     "LOOSE_ENDINGS",
     "SCAN_ENDINGS",
     "NoPointsError",
@@ -96,6 +97,7 @@ _WRITERS: dict[str, Callable[[IO[bytes], np.ndarray], object]] = {
 
 SCAN_ENDINGS = tuple(_READERS)
 LOOSE_ENDINGS = (".csv", ".txt", ".npz")  # which other things than scans have too
+FIRM_ENDINGS = tuple(ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS)
 
 LARGEST_FILE = 1 << 30  # bytes: 67 million points, hundreds of scans; reading more exhausts the memory
 
