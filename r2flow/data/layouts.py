@@ -148,7 +148,7 @@ def kitti_raw(root: Path) -> list[Drive]:
 def odometry(root: Path) -> list[Drive]:
     """`sequences/XX/velodyne/*.bin`, also below `dataset/`: KITTI odometry and SemanticKITTI."""
     base = root / "dataset" if (root / "dataset" / "sequences").is_dir() else root
-    folders = sorted(f for f in base.glob("sequences/*/velodyne") if f.parent.name.isdigit())
+    folders = sorted(f for f in base.glob("sequences/*/velodyne") if f.parent.name.isdecimal())
     return [Drive(folder.parent.name, _files(folder, (".bin",))) for folder in folders]
 
 
@@ -210,7 +210,7 @@ def spans_of(drives: Sequence[Drive]) -> list[range]:
 
 def named_drive(drives: list[Drive], name: str) -> Drive:
     """The drive of a name, or of a number in its name; none and several are refused."""
-    matches = [d for d in drives if name == d.name or (name.isdigit() and int(name) in _numbers(d.name))]
+    matches = [d for d in drives if name == d.name or (name.isdecimal() and int(name) in _numbers(d.name))]
     if len(matches) != 1:
         known = ", ".join(d.name for d in drives)
         problem = "no drive" if not matches else f"{len(matches)} drives"
@@ -222,7 +222,7 @@ def _numbers(name: str) -> set[int]:
     """The drive number in a KITTI name: the digits after 'drive', or the whole name."""
     parts = name.split("_")
     digits = parts[parts.index("drive") + 1] if "drive" in parts[:-1] else name
-    return {int(digits)} if digits.isdigit() else set()
+    return {int(digits)} if digits.isdecimal() else set()
 
 
 def _files(folder: Path, endings: tuple[str, ...]) -> tuple[str, ...]:
