@@ -35,7 +35,9 @@ ROOMS = {
     "backbones": (9, 2, ("backbones",), "networks v(t, x)"),
 }
 # What all rooms stand on; lines to it would cover the others.
-GROUND = ("config", "plugins", "registry", "models", "noise", "files", "hashing", "progress", "signals", "errors")
+GROUND = (
+    "config", "plugins", "registry", "models", "devices", "noise", "files", "hashing", "progress", "signals", "errors",
+)  # fmt: skip
 
 WIDE, HIGH, ACROSS, DOWN, EDGE = 206, 52, 232, 88, 26  # size of a room, from one to the next, margin
 SIZE = (2 * EDGE + 2 * ACROSS + WIDE, 2 * EDGE + 11 * DOWN + HIGH - 18)

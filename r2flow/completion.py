@@ -234,7 +234,7 @@ def _check_values(sensor: Sensor, images: Tensor) -> None:
     if not bool(images.isfinite().all()):
         raise InputError("the images to complete hold NaN or infinite values; a ray without a return has the range 0.")
     strength = images[:, 1:]
-    if bool(((strength < 0) | (strength > 1 + LIMIT_TOLERANCE)).any()):
+    if bool(((strength < -LIMIT_TOLERANCE) | (strength > 1 + LIMIT_TOLERANCE)).any()):
         raise InputError(
             f"reflectance must lie in [0, 1], found {float(strength.min()):g} to {float(strength.max()):g}; divide it "
             "by what means full reflectance."

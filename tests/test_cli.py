@@ -231,22 +231,21 @@ def test_too_much_at_once_is_one_line(r2flow, monkeypatch, tmp_path, error, word
         raise error
 
     monkeypatch.setattr("r2flow.checkpoints.load_checkpoint", full)
-    monkeypatch.setattr("r2flow.backbones.configurations", full)
-    for verb, instead in ((("sample", "-o", tmp_path), "a smaller --batch-size"), (("backbones",), "smaller batches")):
-        code, _, said = r2flow(*verb)
+    for more, instead in ((("--batch-size", 4), "a smaller --batch-size"), ((), "smaller batches or images")):
+        code, _, said = r2flow("sample", "-o", tmp_path, *more)
         assert code == 2
         assert len(said.splitlines()) == 1
         assert words in said
         assert instead in said
 
 
-def test_another_error_of_torch_keeps_its_traceback(r2flow, monkeypatch):
-    def broken():
+def test_another_error_of_torch_keeps_its_traceback(r2flow, monkeypatch, tmp_path):
+    def broken(*_, **__):
         raise RuntimeError("shapes do not match")
 
-    monkeypatch.setattr("r2flow.backbones.configurations", broken)
+    monkeypatch.setattr("r2flow.checkpoints.load_checkpoint", broken)
     with pytest.raises(RuntimeError, match="shapes"):
-        r2flow("backbones")
+        r2flow("sample", "-o", tmp_path)
 
 
 @pytest.mark.parametrize("device", ["nope", "meta", "cpu:3", "cuda:99", None])

@@ -294,6 +294,20 @@ def test_answers_to_another_scan_of_the_same_name_are_none(r2flow, run, tmp_path
     assert r2flow(*COMPLETE, tmp_path / "a" / f"one{ending}", *asked)[0] == 0  # still known after the other one
 
 
+def test_a_bad_scan_may_be_mended_and_the_command_given_again(r2flow, run, tmp_path):  # noqa: F811
+    full_scan(tmp_path / "in" / "a.npy", 0)
+    image = full_scan(tmp_path / "in" / "b.npy", 1)
+    np.save(tmp_path / "in" / "b.npy", np.where(image == image.max(), np.nan, image))
+    asked = *COMPLETE, tmp_path / "in", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out"
+    assert r2flow(*asked)[0] == 2
+    np.save(tmp_path / "in" / "b.npy", image)
+    code, said, _ = r2flow(*asked)
+    assert code == 0
+    assert "1 scans completed" in said
+    full_scan(tmp_path / "in" / "b.npy", 0)
+    assert "answers to another scan of the name b" in r2flow(*asked)[2]
+
+
 def test_answers_by_another_mask_file_or_scale_are_none(r2flow, run, tmp_path):  # noqa: F811
     full_scan(tmp_path / "one.bin")
     mask = np.arange(8)[:, None] % 2 == np.zeros(64)

@@ -127,7 +127,7 @@ def test_one_channel_is_written_alone(r2flow, run, tmp_path):  # noqa: F811
     np.testing.assert_array_equal(np.load(tmp_path / "reflectance" / "000000.reflectance.npy"), both[1:])
     assert read_points(tmp_path / "range" / "000000.ply").reflectance is None
     assert not list((tmp_path / "range").glob("*.bin"))
-    assert [path.suffix for path in sorted((tmp_path / "reflectance").iterdir())] == [".npy", ".png"]
+    assert [path.suffix for path in sorted((tmp_path / "reflectance").iterdir())] == [".npy", ".png", ".json"]
 
 
 def test_named_grids_are_sampled_on(r2flow, run, tmp_path):  # noqa: F811

@@ -216,6 +216,8 @@ def test_a_flow_without_a_condition_says_what_completes_with_it():
         ({"images": torch.full((1, 2, 8, 64), 3.0)}, r"reflectance must lie in \[0, 1\], found 3 to 3; divide"),
         ({"state": torch.zeros(1, 8, 32)}, "states of the rays must be"),
         ({"state": torch.full((1, 8, 64), 9)}, "the state of a ray must be one of .*, found 9"),
+        ({"state": torch.full((1, 8, 64), -1)}, "the state of a ray must be one of .*, found -1"),
+        ({"state": torch.full((1, 8, 64), 0.5)}, "the state of a ray must be one of .*, found 0.5"),
         ({"state": torch.full((1, 8, 64), int(Ray.RETURN))}, "a ray with a return must have a range above 0"),
         ({"keep": "all"}, "keep must be exact, blend or mend"),
         ({"num": 0}, "at least one answer"),

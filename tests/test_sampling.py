@@ -259,8 +259,16 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
     assert names() == ["000000.npy", "000001.npy"]
     assert write(3) == [0, 1, 2]
     assert (tmp_path / "000000.npy").read_bytes() == whole["000000.npy"]
+    (tmp_path / "mine.ply").write_text("")
+    with pytest.raises(InputError, match=r"holds files that are no samples of r2flow \(mine.ply\)"):
+        write(3, seed=1)
+    (tmp_path / "mine.ply").unlink()
+    (tmp_path / "camera").mkdir()
+    (tmp_path / "camera" / "000000.png").write_text("")
+    with pytest.raises(InputError, match=r"holds files that are no samples of r2flow \(000000.png\)"):
+        write_samples(checkpoint, tmp_path / "camera", 1, 0)
     (tmp_path / "scans.json").unlink()
-    with pytest.raises(InputError, match=r"holds scans already \(000000.npy\) and no scans.json"):
+    with pytest.raises(InputError, match=r"holds files that are no samples of r2flow \(000000.npy\)"):
         write(3)
 
 

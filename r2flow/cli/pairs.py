@@ -8,7 +8,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import SolverOptions, grouped
-from r2flow.cli.options import CheckpointOption, DeviceOption, choose_device
+from r2flow.cli.options import CheckpointOption, DeviceOption, check_control, choose_device
 from r2flow.errors import InputError
 
 
@@ -94,6 +94,7 @@ def pairs(
     recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(
         flow.encoding.shape, flow.generator.noise_shape
     )
+    check_control(recipe.sampler.method, solver.steps, solver.tolerance)
     store = PairStore(out or default_folder(flow.path), recipe)
     make_and_tell(store, flow, num, rank, ranks, where)
     lacking = len(store.missing(num))

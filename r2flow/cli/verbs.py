@@ -89,12 +89,5 @@ def _run() -> None:
 
 
 def _less_at_once(arguments: Sequence[str]) -> str:
-    """What takes less memory with a verb."""
-    verb: Any = typer.main.get_command(app)
-    for word in arguments:
-        verb = getattr(verb, "commands", {}).get(word, verb)
-    return (
-        "a smaller --batch-size"
-        if any("--batch-size" in one.opts for one in verb.params)
-        else "smaller batches or images"
-    )
+    batched = any(word.startswith("--batch-size") for word in arguments)
+    return "a smaller --batch-size" if batched else "smaller batches or images"

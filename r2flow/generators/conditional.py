@@ -57,8 +57,9 @@ def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
         raise InputError(f"the images to complete must be (B, 2 or 1, {h}, {w}), found {tuple(images.shape)}.")
     if state.shape != images[:, 0].shape:
         raise InputError(f"the states of the rays must be {tuple(images[:, 0].shape)}, found {tuple(state.shape)}.")
-    if int(state.max()) > max(Ray):
-        raise InputError(f"the state of a ray must be one of r2flow.lidar.known.Ray, found {int(state.max())}.")
+    odd = state[~torch.isin(state, torch.tensor(list(map(int, Ray)), device=state.device))]
+    if len(odd):
+        raise InputError(f"the state of a ray must be one of r2flow.lidar.known.Ray, found {odd[0].item():g}.")
     returned, wrong = images[:, 0] > 0, (images[:, 0] > 0) & (state == Ray.EMPTY)
     if bool(wrong.any()) or bool((~returned & (state == Ray.RETURN)).any()):
         raise InputError("a ray with a return must have a range above 0, an empty one the range 0.")
@@ -158,7 +159,7 @@ class ConditionalFlow(RectifiedFlow):
         if condition is None:
             return super().generate(noise, sampler=sampler, draws=draws, progress=progress)
         with torch.no_grad():
-            condition = self._trusted(condition, noise.to(self.device))
+            condition = self._trusted(condition, noise.to(next(self.parameters())))
         made = super().generate(noise, condition, sampler=sampler, draws=draws, progress=progress)
         image, known, _ = parts_of(condition, made.x)
         return Generated(torch.where(known > 0, image, made.x), made.evaluations, made.converged)

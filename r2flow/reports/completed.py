@@ -88,7 +88,9 @@ def write_completed(
     for scan in scans:
         if scan.path and (out / scan.name).resolve().parent == scan.path.resolve().parent:
             raise InputError(f"{out} is the folder of the scans; answers need one of their own: give another --out.")
-    settings["inputs"] |= _refuse_others(out, settings, [path for paths in files for path in paths])
+    there = {scan.name: any(path.exists() for path in paths) for scan, paths in zip(scans, files, strict=True)}
+    before = _refuse_others(out, settings, [path for paths in files for path in paths], there)
+    settings["inputs"] = {**before, **settings["inputs"]}
     left = [number for number, paths in enumerate(files) if not all(path.is_file() for path in paths)]
     found: dict[str, dict[str, float] | None] = {}
     known = []
@@ -161,8 +163,13 @@ def answer_files(checkpoint: Checkpoint, scan: PartialScan, out: Path, num: int)
     return [out / f"{scan.name}{number}{ending}" for number in numbers]
 
 
-def _refuse_others(out: Path, settings: Mapping[str, Any], files: Sequence[Path]) -> dict[str, str]:
+def _refuse_others(
+    out: Path, settings: Mapping[str, Any], files: Sequence[Path], answered: Mapping[str, bool]
+) -> dict[str, str]:
     """Refuse a folder with answers by other settings or to other scans.
+
+    Args:
+        answered: Of each scan, by name, whether an answer to one of this name is there.
 
     Returns:
         The scans that were completed there, by name, with what identifies them.
@@ -187,7 +194,9 @@ def _refuse_others(out: Path, settings: Mapping[str, Any], files: Sequence[Path]
         raise InputError(
             f"{out} holds scans that were completed with {wrong} {found}, not {asked}; give another --out."
         )
-    other = next((name for name, scan in settings["inputs"].items() if before.get(name, scan) != scan), None)
+    other = next(
+        (name for name, scan in settings["inputs"].items() if answered[name] and before.get(name, scan) != scan), None
+    )
     if other is not None:
         raise InputError(f"{out} holds answers to another scan of the name {other}; give another --out.")
     return before

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -28,6 +29,8 @@ from r2flow.sampling import batches, draw
 log = logging.getLogger(__name__)
 
 FORMATS = ("ply", "bin", "npy")
+OWN = re.compile(r"\d{6}(\.reflectance)?\.(ply|bin|npy|png)|samples\.(png|html)")  # what samples are written to
+UNSOLVED = "unsolved"  # in the note: numbers of the samples that are none
 
 
 def formats_of(checkpoint: Checkpoint, channels: str = "both") -> list[str]:
@@ -81,7 +84,10 @@ def write_samples(
     part: dict[str, Any] = {} if region is None else {"region": asdict(region)}
     part |= {} if channels == "both" else {"channels": channels}
     about = note_of(checkpoint, seed, part, **sampler.asdict())
-    begun = channels != "reflectance" and _begun(out, about, num, replace)
+    former = _former(out, about, num, replace)
+    ending = "reflectance.npy" if channels == "reflectance" else ""
+    if former and former.get(UNSOLVED):
+        _warn_lost(former[UNSOLVED])
     if {"ply", "bin"} & set(formats) and not torch.equal(generator.space.rays, rays):
         log.warning(
             "the model was told rays through the corners of the bins (rays=reference); points are written along rays "
@@ -91,18 +97,19 @@ def write_samples(
     with ScanBar("sampling", num, batches(num, batch_size) * generator.evaluations_of(sampler)) as bar:
         for first in range(0, num, batch_size):
             numbers = range(first, min(first + batch_size, num))
-            files = [out / f"{number:06d}.{ending}" for number in numbers for ending in formats]
-            if begun and first >= pictures and all(file.is_file() for file in files):
+            files = [out / f"{number:06d}.{ending or one}" for number in numbers for one in formats]
+            if former and first >= pictures and all(file.is_file() for file in files):
                 bar.finished(numbers.stop)
                 continue
             drawn = draw(generator, numbers, seed, sampler, region=region, channels=channels, progress=bar.evaluated)
-            if channels != "reflectance" and not begun:
-                for former in _scans(out):
-                    if former.name[:6].isdecimal():
-                        former.unlink()
-                write_note(out, about)
-                begun = True
-            warn_unsolved(drawn.converged, drawn.first)
+            lost = warn_unsolved(drawn.converged, drawn.first)
+            if former is None and (out / SAMPLES).is_file():
+                for file in out.glob("*"):
+                    if OWN.fullmatch(file.name):
+                        file.unlink()
+            if former is None or lost:
+                former = {**about, UNSOLVED: sorted({*(former or {}).get(UNSOLVED, []), *lost})}
+                write_note(out, former)
             for number, image in enumerate(drawn.images.numpy(), drawn.first):
                 if channels == "reflectance":
                     _save(image, out / f"{number:06d}.reflectance.npy")
@@ -123,41 +130,45 @@ def write_samples(
     return shown
 
 
-def warn_unsolved(converged: Tensor, first: int = 0) -> None:
-    """Warn of the scans that are none of the flow, by number."""
-    lost = [str(first + offset) for offset, solved in enumerate(converged.tolist()) if not solved]
+def warn_unsolved(converged: Tensor, first: int = 0) -> list[int]:
+    """Warn of the scans that are none of the flow, and return their numbers."""
+    lost = [first + offset for offset, solved in enumerate(converged.tolist()) if not solved]
     if lost:
-        log.warning("not solved, so no scans of this flow: %s; try another solver.", ", ".join(lost))
+        _warn_lost(lost)
+    return lost
 
 
-def _scans(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.glob("*") if file.name.endswith(FIRM_ENDINGS))
+def _warn_lost(numbers: Sequence[int]) -> None:
+    log.warning("not solved, so no scans of this flow: %s; try another solver.", ", ".join(map(str, numbers)))
 
 
-def _begun(out: Path, about: Mapping[str, Any], num: int, replace: bool) -> bool:
-    """Whether a folder holds samples of these settings.
+def _former(out: Path, about: Mapping[str, Any], num: int, replace: bool) -> dict[str, Any] | None:
+    """The note of a folder that holds samples of these settings.
 
     Raises:
         InputError: it holds scans that are no samples, or more samples of other settings than are drawn now.
     """
-    scans, note = [file.name for file in _scans(out)], out / SAMPLES
-    if not note.is_file():
-        if scans:
-            raise InputError(f"{out} holds scans already ({scans[0]}) and no {SAMPLES}; give another --out.")
-        return False
+    names, note = sorted(file.name for file in out.glob("*")), out / SAMPLES
     try:
-        there = json.loads(note.read_text(encoding="utf-8"))
+        there = json.loads(note.read_text(encoding="utf-8")) if note.is_file() else {}
     except ValueError:
         there = {}
-    if there == about:
-        return True
-    others = [name for name in scans if not name[:6].isdecimal() or int(name[:6]) >= num]
-    if others and not replace:
+    scans = [name for name in names if name.endswith(FIRM_ENDINGS)]
+    ours = there and "completion" not in there
+    foreign = [name for name in scans if not OWN.fullmatch(name)] if ours else [*scans, *filter(OWN.fullmatch, names)]
+    if {key: value for key, value in there.items() if key != UNSOLVED} == about:
+        return there
+    if replace:
+        return None
+    if foreign:
+        raise InputError(f"{out} holds files that are no samples of r2flow ({foreign[0]}); give another --out.")
+    others = [name for name in scans if int(name[:6]) >= num]
+    if others:
         raise InputError(
             f"{out} holds samples of other settings, more than the {num} that would replace them ({others[0]}): give "
             "another --out, or empty it."
         )
-    return False
+    return None
 
 
 def note_of(checkpoint: Checkpoint, seed: int, more: Mapping[str, Any] | None = None, **sampler: Any) -> dict[str, Any]:

@@ -113,6 +113,13 @@ def test_how_far_the_guess_holds_is_found_once(flow, scans, method, monkeypatch)
     assert torch.equal(again, made)
 
 
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
+def test_noise_of_half_precision_is_completed(flow, scans, kind):
+    told, x_0 = condition_of(flow.space, scans, measured(scans)), Draws(0, range(3)).start((2, 8, 32)).to(kind)
+    half, single = (flow.generate(x, told, sampler=Sampler("euler", 2)).x for x in (x_0, x_0.float()))
+    torch.testing.assert_close(half.float(), single, atol=0.05, rtol=0.05)
+
+
 @pytest.mark.parametrize("method", ["dopri5", "heun2", "rk4", "adams3"])
 def test_solvers_that_look_at_the_end_find_no_infinity_there(flow, scans, method):
     told = condition_of(flow.space, scans, measured(scans))
