@@ -17,7 +17,7 @@ import yaml
 
 from r2flow.checkpoints import load_checkpoint, save_checkpoint
 from r2flow.data.contents import RECORD, record_contents
-from r2flow.data.opening import write_samples_note
+from r2flow.data.opening import samples_note, write_samples_note
 from r2flow.data.preparing import Preparation, plan_files
 from r2flow.data.shards import Block, PairRecipe, PairStore
 from r2flow.data.sources import Reading
@@ -95,7 +95,7 @@ def write_stores(folder: Path, beside: Path) -> None:
     DRAW.integers(0, 100, 64).astype("<u4").tofile(folder / "labels" / "scan.label")
     (folder / "image").mkdir()
     np.save(folder / "image" / "image.npy", DRAW.uniform(2, 70, (2, 8, 64)).astype(np.float32))
-    write_samples_note(beside / "samples", Reading(SENSOR), seed=0)
+    write_samples_note(beside / "samples", samples_note(Reading(SENSOR), seed=0))
     keep(folder, "samples", beside / "samples" / "scans.json")
     (beside / "run").mkdir()
     (beside / "run" / "config.yaml").write_text(yaml.safe_dump(CONFIG))

@@ -267,6 +267,10 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
     (tmp_path / "camera" / "000000.png").write_text("")
     with pytest.raises(InputError, match=r"holds files that are no samples of r2flow \(000000.png\)"):
         write_samples(checkpoint, tmp_path / "camera", 1, 0)
+    for note in ("[]", "{"):
+        (tmp_path / "scans.json").write_text(note)
+        with pytest.raises(InputError, match=r"holds files that are no samples"):
+            write(3)
     (tmp_path / "scans.json").unlink()
     with pytest.raises(InputError, match=r"holds files that are no samples of r2flow \(000000.npy\)"):
         write(3)

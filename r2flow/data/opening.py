@@ -176,9 +176,9 @@ def samples_note(reading: Reading, **about: Any) -> dict[str, Any]:
     return found
 
 
-def write_samples_note(folder: Path, reading: Reading, **about: Any) -> None:
+def write_samples_note(folder: Path, note: Mapping[str, Any]) -> None:
     with atomic_write(folder / SAMPLES, "w") as file:
-        json.dump(samples_note(reading, **about), file, indent=1)
+        json.dump(note, file, indent=1)
 
 
 def samples_of(run: Path) -> Path | None:

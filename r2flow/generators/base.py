@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
+from r2flow.flow.path import expand_time
 from r2flow.flow.solvers import TORCHDIFFEQ, usual_grid
 from r2flow.flow.stochastic import SDE
 from r2flow.lidar.region import Region
@@ -175,6 +176,12 @@ class Generated:
 def finite(x: Tensor) -> Tensor:
     """Whether all values of each scan are finite, (B,) bool."""
     return x.isfinite().flatten(1).all(1)
+
+
+def stepped(x: Tensor, following: Tensor, alive: Tensor) -> tuple[Tensor, Tensor]:
+    """The states after a step, (B, ...), a scan no longer finite in its last one, and which are finite still, (B,)."""
+    alive = alive & finite(following)
+    return torch.where(expand_time(alive, x), following, x), alive
 
 
 class Generator(nn.Module):

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from r2flow.backbones import build_backbone
 from r2flow.errors import InputError
-from r2flow.flow.path import expand_time
 from r2flow.flow.posterior import METHODS, Measurement, completes, parse_method, sample_posterior
 from r2flow.flow.solvers import (
     Solution,
@@ -23,7 +22,7 @@ from r2flow.flow.solvers import (
 )
 from r2flow.flow.solvers.grids import build_grid
 from r2flow.flow.stochastic import SDE, churn_of, sde
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, finite, parts_of
+from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, finite, parts_of, stepped
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
@@ -129,8 +128,7 @@ class Flow(Generator):
             return self.further_noise(draws, j).to(noise)
 
         for following in sde(estimate, x, times, churn, fresh):
-            alive = alive & finite(following)
-            x = torch.where(expand_time(alive, x), following, x)
+            x, alive = stepped(x, following, alive)
             if progress is not None:
                 progress()
         return Generated.after(x, len(times) - 1, alive)

@@ -10,10 +10,9 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity, jump
-from r2flow.flow.path import expand_time
 from r2flow.flow.solvers import Solution
 from r2flow.flow.stochastic import ahead, back, churn_of
-from r2flow.generators.base import Condition, Generated, Progress, Sampler, finite
+from r2flow.generators.base import Condition, Generated, Progress, Sampler, finite, stepped
 from r2flow.generators.flow import UNTOLD, Conditioned, RectifiedFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
@@ -114,8 +113,7 @@ class FlowMap(RectifiedFlow):
             following = jump(u, at, x, to)
             if draws is not None and r > s:
                 following = back(following, r, s, self.further_noise(draws, n).to(x))
-            alive = alive & finite(following)
-            x = torch.where(expand_time(alive, x), following, x)
+            x, alive = stepped(x, following, alive)
             if progress is not None:
                 progress()
         return Generated.after(x, len(times) - 1, alive)

@@ -14,7 +14,7 @@ import torch
 from r2flow import noise
 from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.completion import Completed, complete
-from r2flow.data.opening import SAMPLES
+from r2flow.data.opening import SAMPLES, write_samples_note
 from r2flow.data.partial import PartialScan
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
@@ -25,7 +25,7 @@ from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.transfer import Partial
 from r2flow.metrics.completion import errors
-from r2flow.reports.outputs import ScanBar, note_of, warn_unsolved, write_note
+from r2flow.reports.outputs import ScanBar, note_of, warn_unsolved
 from r2flow.reports.pictures import completed_figure, save_figure
 from r2flow.reports.view import write_page
 
@@ -106,7 +106,7 @@ def write_completed(
                 batch_size=job.batch_size, first=number, on_surfaces=job.on_surfaces, progress=bar.evaluated,
             )  # fmt: skip
             if not found:  # the first answer shows that the settings can be used
-                write_note(out, note_of(checkpoint, job.seed, {"completion": settings}, **sampler.asdict()))
+                write_samples_note(out, note_of(checkpoint, job.seed, {"completion": settings}, **sampler.asdict()))
             warn_unsolved(made.converged)
             if number < job.pictures:
                 _draw(checkpoint, scan, out, given, made, whole if job.mask else None)

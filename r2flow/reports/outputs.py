@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint, weights_hash
-from r2flow.data.opening import SAMPLES, samples_note
+from r2flow.data.opening import SAMPLES, samples_note, write_samples_note
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import reading_of_flow
 from r2flow.files import atomic_write
@@ -109,7 +109,7 @@ def write_samples(
                         file.unlink()
             if former is None or lost:
                 former = {**about, UNSOLVED: sorted({*(former or {}).get(UNSOLVED, []), *lost})}
-                write_note(out, former)
+                write_samples_note(out, former)
             for number, image in enumerate(drawn.images.numpy(), drawn.first):
                 if channels == "reflectance":
                     _save(image, out / f"{number:06d}.reflectance.npy")
@@ -150,9 +150,10 @@ def _former(out: Path, about: Mapping[str, Any], num: int, replace: bool) -> dic
     """
     names, note = sorted(file.name for file in out.glob("*")), out / SAMPLES
     try:
-        there = json.loads(note.read_text(encoding="utf-8")) if note.is_file() else {}
+        found = json.loads(note.read_text(encoding="utf-8")) if note.is_file() else {}
     except ValueError:
-        there = {}
+        found = {}
+    there: dict[str, Any] = found if isinstance(found, dict) else {}
     scans = [name for name in names if name.endswith(FIRM_ENDINGS)]
     ours = there and "completion" not in there
     foreign = [name for name in scans if not OWN.fullmatch(name)] if ours else [*scans, *filter(OWN.fullmatch, names)]
@@ -179,11 +180,6 @@ def note_of(checkpoint: Checkpoint, seed: int, more: Mapping[str, Any] | None = 
     # Points lie on rays through the middles of the bins, whatever rays the model was told.
     return samples_note(reading, encoding=about, seed=seed, sampler=sampler, step=step,
                         weights=weights_hash(checkpoint), rays="centre", **(more or {}))  # fmt: skip
-
-
-def write_note(out: Path, note: Mapping[str, Any]) -> None:
-    with atomic_write(out / SAMPLES, "w") as file:
-        json.dump(note, file, indent=1)
 
 
 def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str) -> None:

@@ -16,6 +16,7 @@ from r2flow.data.opening import (
     open_source,
     own_reading,
     resolve_reflectance,
+    samples_note,
     usual_reading,
     write_samples_note,
 )
@@ -109,7 +110,7 @@ class TestSamples:
 
     def samples(self, folder: Path, size: tuple[int, int] = (8, 32)) -> Path:
         write_image(folder / "000000.npy", 2, size=size)
-        write_samples_note(folder, Reading(SENSORS["hdl64e"].resized(*size)), seed=3)
+        write_samples_note(folder, samples_note(Reading(SENSORS["hdl64e"].resized(*size)), seed=3))
         return folder
 
     def test_nobody_types_their_size(self, tmp_path: Path):
