@@ -1,14 +1,15 @@
-"""A flow of larger images around a trained one: what small images taught goes on inside it."""
+"""Larger networks out of trained ones: what they have learned goes on inside."""
 
 from typing import Any
 
 import torch
 
-from r2flow.backbones import Pyramid
+from r2flow.backbones import HDiT, Pyramid
 from r2flow.backbones.base import CommonOptions
+from r2flow.backbones.detail import Detail
 from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.errors import InputError
-from r2flow.generators import RectifiedFlow, build_generator
+from r2flow.generators import Generator, RectifiedFlow, build_generator
 from r2flow.noise import seed_torch
 from r2flow.registry import options_of
 
@@ -58,13 +59,63 @@ def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Che
             "ring": checkpoint.config["backbone"].get("ring", True),
             **options,
         },
-        "parent": {"path": str(checkpoint.path), "weights": weights_hash(checkpoint), "step": checkpoint.step},
+        "parent": _parent(checkpoint),
     }
-    with torch.random.fork_rng(devices=[]):
-        seed_torch(0, "weights")
-        larger = build_generator(config)
+    larger = _fresh(config)
     assert isinstance(larger, RectifiedFlow)
     assert isinstance(larger.backbone, Pyramid)
     kept = {name: value for name, value in inner.state_dict().items() if name not in inner.second_time_names()}
     larger.backbone.inner.load_state_dict(kept)
     return Checkpoint(larger.eval(), config)
+
+
+def widened(checkpoint: Checkpoint, blocks: int, channels: int) -> Checkpoint:
+    """The same generator with more convolutions at full resolution (`Detail`). It draws the same scans, and can learn
+    more.
+
+    Args:
+        checkpoint: Of an HDiT or a pyramid, whatever it generates.
+        blocks: At least as many as it has.
+        channels: The same.
+
+    Raises:
+        InputError: another network, or one that has more already.
+    """
+    network = getattr(checkpoint.generator, "backbone", None)
+    if not isinstance(network, HDiT | Pyramid):
+        raise InputError(
+            f"{checkpoint.path} holds a network of the kind {checkpoint.config['backbone']['name']}; hdit and pyramid "
+            "have convolutions at full resolution."
+        )
+    before = network.detail and network.detail.size
+    if before and (blocks < before[0] or channels < before[1]):
+        raise InputError(
+            f"{checkpoint.path} has {before[0]} blocks of {before[1]} channels at full resolution and cannot shrink "
+            f"to {blocks} of {channels}."
+        )
+    config = {
+        **{key: checkpoint.config[key] for key in ("sensor", "encoding")},
+        "generator": checkpoint.config.get("generator") or {"name": "rectified_flow"},
+        "backbone": {**checkpoint.config["backbone"], "detail": [blocks, channels]},
+        "parent": _parent(checkpoint),
+    }
+    wider = _fresh(config)
+    path = wider.get_submodule("backbone.detail")
+    assert isinstance(path, Detail)
+    own = {f"backbone.detail.{name}": weight for name, weight in path.state_dict().items()}
+    wider.load_state_dict({**checkpoint.generator.state_dict(), **own})
+    if network.detail is not None:
+        path.take_over(network.detail)
+    wider.sampler = checkpoint.generator.sampler
+    return Checkpoint(wider.eval(), config)
+
+
+def _fresh(config: dict[str, Any]) -> Generator:
+    """With random weights that are the same every time."""
+    with torch.random.fork_rng(devices=[]):
+        seed_torch(0, "weights")
+        return build_generator(config)
+
+
+def _parent(checkpoint: Checkpoint) -> dict[str, Any]:
+    return {"path": str(checkpoint.path), "weights": weights_hash(checkpoint), "step": checkpoint.step}

@@ -1,4 +1,4 @@
-"""A flow of larger images around a trained one."""
+"""Larger networks out of trained ones."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from torch import Tensor
 from r2flow.checkpoints import Checkpoint, load_checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.generators import RectifiedFlow, Sampler, build_generator
-from r2flow.growing import grown
+from r2flow.growing import grown, widened
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 
@@ -112,3 +112,69 @@ def test_a_grown_flow_is_trained_and_drawn_from(r2flow, saved, tmp_path):  # noq
     assert trained.config["parent"]["weights"] == weights_hash(load_checkpoint(out))
     code, _, said = r2flow("grow", path, tmp_path / "larger.ckpt", "--size", "16x128")
     assert (code, "give a .safetensors" in said) == (2, True)
+
+
+@pytest.mark.parametrize("before", [None, [1, 8], [2, 8]])
+@pytest.mark.parametrize("generator", ["rectified_flow", "flow_map"])
+def test_a_wider_one_draws_the_same(generator, before):
+    small = flow(generator={"name": generator}, backbone={**STREET_LIKE["backbone"], "detail": before})
+    small.generator.sampler = Sampler("euler", 3)
+    wider = widened(small, 3, 24)
+    assert type(wider.generator) is type(small.generator)
+    assert wider.config["backbone"]["detail"] == [3, 24]
+    assert wider.config["parent"]["weights"] == weights_hash(small)
+    expected = small.sample(2)
+    assert expected.std() > 1
+    assert torch.allclose(wider.sample(2), expected, atol=1e-3)  # metres
+
+
+def test_a_wider_pyramid_draws_the_same():
+    small = grown(flow(), (16, 128), detail=[1, 8])
+    torch.nn.init.normal_(small.generator.get_parameter("backbone.detail.answer.weight"), std=0.1)
+    t, x = torch.tensor(0.9), torch.randn(1, 2, 16, 128)
+    with torch.no_grad():
+        expected = small.generator.velocity(t, x)
+        assert torch.allclose(widened(small, 2, 16).generator.velocity(t, x), expected, atol=1e-5)
+
+
+def test_all_that_is_new_can_learn():
+    """Of new channels and new blocks no weight is without a gradient for good: after one step all have one."""
+    network = widened(flow(backbone={**STREET_LIKE["backbone"], "detail": [1, 8]}), 2, 16).generator.backbone.train()
+    optimiser = torch.optim.SGD(network.parameters(), lr=0.1)
+    for _ in range(3):
+        optimiser.zero_grad()
+        network(torch.rand(2), torch.randn(2, 2, 8, 64)).square().mean().backward()
+        optimiser.step()
+    for name, parameter in network.detail.named_parameters():
+        rows = parameter.grad.flatten(1) if parameter.ndim > 1 else parameter.grad[:, None]
+        assert (rows != 0).any(1).all(), name
+
+
+@pytest.mark.parametrize("size", [(1, 24), (3, 8), (-1, 24), (0, 0)])
+def test_it_cannot_shrink(size):
+    with pytest.raises(InputError, match=r"has 2 blocks of 16 channels at full resolution and cannot shrink to"):
+        widened(flow(backbone={**STREET_LIKE["backbone"], "detail": [2, 16]}), *size)
+
+
+def test_a_network_without_convolutions_at_full_resolution_does_not_widen():
+    unet = {"name": "efficient_unet", "base_channels": 16, "time_channels": 16}
+    with pytest.raises(InputError, match="holds a network of the kind efficient_unet; hdit and pyramid have"):
+        widened(flow(backbone=unet), 2, 16)
+
+
+def test_a_wider_one_from_the_command_line(r2flow, saved, tmp_path):  # noqa: F811
+    path, _ = saved
+    out = tmp_path / "wider.safetensors"
+    code, said, _ = r2flow("grow", path, out, "--detail", "2,8")
+    assert (code, "2 blocks of 8 channels at full resolution; it draws the same scans" in said) == (0, True)
+    assert load_checkpoint(out).config["backbone"]["detail"] == [2, 8]
+    code, _, _ = r2flow("grow", path, tmp_path / "both.safetensors", "--size", "16x128", "--detail", "2,8")
+    assert code == 0
+    assert load_checkpoint(tmp_path / "both.safetensors").config["backbone"]["detail"] == [2, 8]
+    for options, problem in (
+        ([], "nothing to grow: give --size, as --size 64x1024, or --detail, as --detail 6,48."),
+        (["--detail", "6"], "--detail must be blocks and channels, as 6,48; found '6'."),
+        (["--detail", "1,-8"], "detail must be 2 integers of at least 1, found [1, -8]."),
+    ):
+        code, _, said = r2flow("grow", path, tmp_path / "none.safetensors", *options)
+        assert (code, problem in said) == (2, True), said

@@ -1,5 +1,8 @@
 """A convolutional path at full resolution, beside a network of tokens."""
 
+from typing import Self
+
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -34,7 +37,7 @@ class Detail(nn.Module):
         ring: bool,
     ) -> None:
         super().__init__()
-        self.patch = patch
+        self.size, self.patch = (blocks, channels), patch
         self.norm = RMSNorm(token_channels)
         self.spread = nn.Linear(token_channels, patch[0] * patch[1] * channels, bias=False)
         self.image = RingConv2d(ends[0], channels, ring)
@@ -49,6 +52,20 @@ class Detail(nn.Module):
         for block in self.blocks:
             h = block(h, condition)
         return self.answer(F.silu(h))
+
+    @torch.no_grad()
+    def take_over(self, other: Self) -> None:
+        """Answer what a narrower and shallower path answers, to learn on from there.
+
+        The new channels see the old ones and have random weights of their own. No weight leads back from them yet
+        (Chen et al. 2016, Net2Net, in spirit), and new blocks add nothing.
+        """
+        new = self.state_dict()
+        for name, weight in other.state_dict().items():
+            parts = {"spread": self.patch[0] * self.patch[1], "modulation": 2}.get(name.split(".")[-2], 1)
+            into, old = (w.unflatten(0, (parts, -1)) for w in (new[name], weight))  # (parts, channels, ...)
+            into = into[:, : old.shape[1]].zero_()
+            into[tuple(map(slice, old.shape))] = old
 
 
 class DetailBlock(nn.Module):

@@ -202,23 +202,38 @@ def _keep_source(checkpoint: "Checkpoint", out: Path) -> None:
 def grow(
     checkpoint: Annotated[Path, typer.Argument(help="A flow: a checkpoint file, a run folder or a model.")],
     out: Annotated[Path, typer.Argument(help="What to write, a .safetensors.")],
-    size: Annotated[str, typer.Option(help="Rows x columns of the larger images, as 64x1024.")],
+    size: Annotated[str | None, typer.Option(help="Rows x columns of the larger images, as 64x1024.")] = None,
+    detail: Annotated[
+        str | None, typer.Option(help="Blocks and channels of the convolutions at full resolution, as 6,48.")
+    ] = None,
 ) -> None:
-    """Put convolutions at a higher resolution around a trained flow's network, to train it on larger images.
+    """Put a trained flow's network inside a larger one, to go on learning from what it knows.
 
-    The means of what it draws are the images of the trained flow. Below them is noise, until it has learned more.
+    With --size convolutions at a higher resolution surround it: the means of what it draws are the images of the
+    trained flow. Below them is noise, until it has learned more. With --detail alone it has more convolutions, and
+    draws the same scans.
     """
     from r2flow.checkpoints import load_checkpoint, save_checkpoint
-    from r2flow.growing import grown
+    from r2flow.growing import grown, widened
 
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: give a .safetensors, which holds a flow and its config.")
+    if size is None and detail is None:
+        raise InputError("nothing to grow: give --size, as --size 64x1024, or --detail, as --detail 6,48.")
+    path = detail and _pair("--detail", detail, ",", int, "blocks and channels, as 6,48")
     found = load_checkpoint(checkpoint)
     _keep_source(found, out)
-    larger = grown(found, found.sensor.resized(*rows_and_columns(size)).shape)
+    before = "x".join(map(str, found.sensor.shape))
+    if size is not None:
+        options = {"detail": list(path)} if path else {}
+        larger = grown(found, found.sensor.resized(*rows_and_columns(size)).shape, **options)
+        said = f"images of {'x'.join(map(str, larger.sensor.shape))} by a network for {before}"
+    else:
+        assert path
+        larger = widened(found, *path)
+        said = f"{path[0]} blocks of {path[1]} channels at full resolution; it draws the same scans"
     save_checkpoint(larger, out)
-    before, after = ("x".join(map(str, one.sensor.shape)) for one in (found, larger))
-    print(f"{out}: images of {after} by a network for {before}. Now train it:")
+    print(f"{out}: {said}. Now train it:")
     print(f"  r2flow train experiment=finetune stage.init={out} data.root=FOLDER")
 
 
