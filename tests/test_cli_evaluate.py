@@ -164,6 +164,16 @@ def test_a_curve_of_several_solvers_has_a_line_for_each_with_intervals(r2flow, s
     assert (tmp_path / "speed_quality.md").read_text().count(" to ") >= 4
 
 
+def test_of_an_adaptive_solver_a_curve_has_one_point(r2flow, saved, real, tmp_path):  # noqa: F811
+    measured = ("evaluate", real, "-c", saved[0], "--metrics", "jsd", "--num", 2, "--workers", 0, "--out", tmp_path)
+    code, _, err = r2flow(*measured, "--solver", "dopri5,euler", "--steps", "1,2", "--tolerance", 1e-2)
+    assert code == 0, err
+    rows = json.loads((tmp_path / "speed_quality.json").read_text())["rows"]
+    assert [row["solver"] for row in rows] == ["dopri5", "euler", "euler"]
+    code, _, said = r2flow(*measured, "--solver", "dopri5", "--steps", "1,2")
+    assert (code, "--steps is for a solver of fixed steps; dopri5 chooses its own." in said) == (2, True)
+
+
 def test_a_curve_goes_on_where_it_stopped(r2flow, saved, real, tmp_path, monkeypatch):  # noqa: F811
     import r2flow.reports.speed_quality as speed_quality
 

@@ -170,6 +170,7 @@ view run -o out.html --steps 1,a
 view run -o out.html --times 1
 view run -o out.html --times 3 --steps 1,2 # one number of --steps
 view run scans -o out.html --times 3 --sequence # give one of them
+view run -o out.html --sequence # for samples of a model on a slider give --steps
 view empty -o out.html
 simulate # Missing
 simulate -o out --num 0 # --num

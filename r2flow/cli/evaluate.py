@@ -293,6 +293,8 @@ def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOption
     for (label, flow), drawing in product(flows.items(), drawings):
         steps_of(flow, label, steps, drawing)
     methods = {drawing.method or flow.generator.sampler.method for flow in flows.values() for drawing in drawings}
+    if sampling.steps and all(map(takes_tolerance, methods)):
+        raise InputError(f"--steps is for a solver of fixed steps; {', '.join(sorted(methods))} chooses its own.")
     if sampling.tolerance is not None and not any(map(takes_tolerance, methods)):
         raise InputError(f"--tolerance is for an adaptive solver, as dopri5; found {', '.join(sorted(methods))}.")
     return drawings, steps

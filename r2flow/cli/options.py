@@ -154,12 +154,11 @@ def takes_tolerance(method: str) -> bool:
     Raises:
         InputError: torchdiffeq has no such method.
     """
-    from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, adapts, check_method
+    from r2flow.flow.solvers import TORCHDIFFEQ, adapts, check_method
 
     if method.startswith(TORCHDIFFEQ):
         check_method(method)
-        return adapts(method)
-    return method in SOLVERS and adapts(method)
+    return adapts(method)
 
 
 def rows_and_columns(size: str | None) -> tuple[int | None, int | None]:

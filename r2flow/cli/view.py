@@ -96,6 +96,8 @@ def view(
         )
     if sequence and drawn.times:
         raise InputError("--sequence and --times both use the slider; give one of them.")
+    if sequence and len(flows) == len(what):
+        raise InputError("--sequence is of scans; for samples of a model on a slider give --steps.")
     panels: list[Panel] = []
     frames: list[str] = []
     for one in what:

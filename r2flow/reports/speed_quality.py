@@ -15,6 +15,7 @@ from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.evaluation.measuring import Gathered, Work, measure, point_key
 from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
+from r2flow.flow.solvers import adapts
 from r2flow.generators import Sampler
 from r2flow.metrics.base import ScanMetric
 from r2flow.reports.evaluation import heading
@@ -74,6 +75,8 @@ class Curve:
 def steps_of(flow: Checkpoint, label: str, steps: Sequence[int], drawing: Drawing) -> list[int]:
     """The numbers of steps, out of some, that a generator can be run with; a GAN with 1 alone.
 
+    An adaptive solver chooses its own: it has one point, under its sampler's number.
+
     Raises:
         InputError: it can be run with none of them.
     """
@@ -86,7 +89,8 @@ def steps_of(flow: Checkpoint, label: str, steps: Sequence[int], drawing: Drawin
             refused = str(error)
     if not found:
         raise InputError(f"{label}: {refused}")
-    return found
+    own = flow.generator.sampler
+    return [own.steps] if adapts(drawing.method or own.method) else found
 
 
 def measure_curve(

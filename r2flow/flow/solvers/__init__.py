@@ -251,10 +251,10 @@ def check_tolerance(tolerance: float) -> None:
 
 
 def adapts(method: str) -> bool:
-    """Whether a method chooses its steps by a tolerance."""
+    """Whether a method chooses its steps by a tolerance; what is no solver does not."""
     if method.startswith(TORCHDIFFEQ):
         return not is_fixed(method.removeprefix(TORCHDIFFEQ))
-    return isinstance(SOLVERS[method], EmbeddedMethod | ExponentialMethod)
+    return method in SOLVERS and isinstance(SOLVERS[method], EmbeddedMethod | ExponentialMethod)
 
 
 def fixed_step(method: str) -> FixedStep | None:
