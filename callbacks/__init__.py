@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 
 from r2flow.checkpoints import FOLDER
+from r2flow.errors import InputError
 from r2flow.lineage import drawn_by
 from r2flow.registry import Count, Registry, check_options
 
@@ -38,6 +39,10 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
     for name in config["callbacks"]:
         CALLBACKS[name]
     wanted = {name: options for name, options in config["callbacks"].items() if options is not None}
+    averages = [name for name in wanted if name in ("ema", "half_life_ema")]
+    if len(averages) > 1:
+        raise InputError(f"a run keeps one average of its weights, found callbacks.{' and callbacks.'.join(averages)}; "
+                         "leave one out, as callbacks.ema=null.")  # fmt: skip
     for name, key in (("checkpoint", "enable_checkpointing"), ("progress", "enable_progress_bar")):
         if not config["trainer"][key]:
             wanted.pop(name, None)

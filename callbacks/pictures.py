@@ -32,9 +32,9 @@ class SamplePictures(Periodic):
         from r2flow.reports.pictures import contact_sheet, figure_pixels, save_figure
 
         step, path = trainer.global_step, self.folder / f"step-{trainer.global_step:08d}.png"
-        if path.exists():
-            return
         generator: Generator = pl_module.generator  # type: ignore[assignment]
+        if path.exists() or not generator.draws:
+            return
         drawn = draw(generator, range(self.num), self.seed, generator.sampler.changed(steps=self.steps))
         figure = contact_sheet(list(drawn.images.numpy()), generator.space.sensor.rays(), [f"step {step}"])
         save_figure(figure, path)

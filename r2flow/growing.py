@@ -36,8 +36,7 @@ def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Che
             f"{checkpoint.path} was distilled for its own steps and knows no other times: grow the flow that it was "
             "distilled from."
         )
-    if "published" in checkpoint.config and checkpoint.config["data"]["projection"] == "unfolding":
-        raise InputError(f"{checkpoint.path} was trained on unfolded scans, whose rings have no rows between them.")
+    _refuse_rings(checkpoint)
     rows, columns = checkpoint.sensor.shape
     if shape[0] % rows or shape[1] % columns or shape == (rows, columns):
         raise InputError(
@@ -50,6 +49,7 @@ def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Che
     config = {
         "sensor": {**checkpoint.config["sensor"], "rows": shape[0], "columns": shape[1]},
         "encoding": checkpoint.config["encoding"],
+        **_reading(checkpoint),
         "generator": {"name": "rectified_flow"},
         "backbone": {
             "name": "pyramid",
@@ -81,6 +81,7 @@ def widened(checkpoint: Checkpoint, blocks: int, channels: int) -> Checkpoint:
     Raises:
         InputError: another network, or one that has more already.
     """
+    _refuse_rings(checkpoint)
     network = getattr(checkpoint.generator, "backbone", None)
     if not isinstance(network, HDiT | Pyramid):
         raise InputError(
@@ -95,6 +96,7 @@ def widened(checkpoint: Checkpoint, blocks: int, channels: int) -> Checkpoint:
         )
     config = {
         **{key: checkpoint.config[key] for key in ("sensor", "encoding")},
+        **_reading(checkpoint),
         "generator": checkpoint.config.get("generator") or {"name": "rectified_flow"},
         "backbone": {**checkpoint.config["backbone"], "detail": [blocks, channels]},
         "parent": _parent(checkpoint),
@@ -119,3 +121,18 @@ def _fresh(config: dict[str, Any]) -> Generator:
 
 def _parent(checkpoint: Checkpoint) -> dict[str, Any]:
     return {"path": str(checkpoint.path), "weights": weights_hash(checkpoint), "step": checkpoint.step}
+
+
+def _reading(checkpoint: Checkpoint) -> dict[str, Any]:
+    """How its scans became images, which those that it is measured with will become too."""
+    data = checkpoint.config.get("data") or {}
+    known = {key: data[key] for key in ("projection", "convention", "reflectance_scale") if key in data}
+    return {"data": known} if known else {}
+
+
+def _refuse_rings(checkpoint: Checkpoint) -> None:
+    if "published" in checkpoint.config and checkpoint.config["data"]["projection"] == "unfolding":
+        raise InputError(
+            f"{checkpoint.path} was trained on unfolded scans, whose rings have no rows between them and whose "
+            "lasers a new run's sensor does not carry."
+        )

@@ -77,6 +77,7 @@ class TrainerRanges:
     max_epochs: Annotated[int, Bound("other than 0", lambda n: n != 0)] | None
     max_time: str | Mapping[str, Any] | None
     num_sanity_val_steps: Annotated[int, Bound("of at least -1", lambda n: n >= -1)] | None
+    overfit_batches: Annotated[float, Bound("0 (data.scenes or data.drives choose few scans)", lambda n: n == 0)]
     limit_train_batches: Annotated[None, Bound("(trainer.max_steps is the length of a run)", lambda n: True)]
     val_check_interval: Positive | str | Mapping[str, Any] | None
     check_val_every_n_epoch: Count | None

@@ -178,3 +178,21 @@ def test_a_wider_one_from_the_command_line(r2flow, saved, tmp_path):  # noqa: F8
     ):
         code, _, said = r2flow("grow", path, tmp_path / "none.safetensors", *options)
         assert (code, problem in said) == (2, True), said
+
+
+def test_how_scans_became_images_is_kept_and_unfolded_ones_are_refused():
+    read = {"name": "folder", "projection": "spherical", "convention": "reference", "reflectance_scale": 255.0}
+    known = {key: value for key, value in read.items() if key != "name"}
+    assert widened(flow(data=read), 2, 16).config["data"] == known
+    assert grown(flow(data=read), (16, 128)).config["data"] == known
+    small = flow()
+    rings = Checkpoint(small.generator, {**small.config, "published": {}, "data": {"projection": "unfolding"}})
+    with pytest.raises(InputError, match="trained on unfolded scans"):
+        widened(rings, 2, 16)
+
+
+def test_the_card_of_what_has_not_learned_yet(r2flow, saved, tmp_path):  # noqa: F811
+    out = tmp_path / "wider.safetensors"
+    assert r2flow("grow", saved[0], out, "--detail", "2,8")[0] == 0
+    code, said, _ = r2flow("info", out, "--card")
+    assert (code, "| starts from | a flow of" in said, "learned from" in said) == (0, True, False)

@@ -143,10 +143,11 @@ class AdaptiveAugment(nn.Module):
         return found
 
     def forward(self, x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
-        """x (B, C, H, W) transformed, differentiable twice, in float32."""
+        """x (B, C, H, W) transformed, differentiable twice, in float32 at least."""
         with torch.autocast(x.device.type, enabled=False):
-            x = transformed(x.float(), affine(draws, x.shape[-2], x.shape[-1]))
-            return coloured(x, colour(draws))
+            x = x.to(torch.promote_types(x.dtype, torch.float32))
+            x = transformed(x, affine(draws, x.shape[-2], x.shape[-1]))
+            return coloured(x, colour(draws).to(x))
 
 
 def affine(draws: Mapping[str, Draw], height: int, width: int) -> Tensor:
@@ -212,7 +213,7 @@ def transformed(x: Tensor, maps: Tensor) -> Tensor:
     shift = -maps[:, :2, 2].double() * scale
     columns = resampling(x.shape[3], scale[:, 0], shift[:, 0], "circular")
     rows = resampling(x.shape[2], scale[:, 1], shift[:, 1], "reflect")
-    return rows[:, None] @ x @ columns[:, None].mT
+    return rows[:, None].to(x) @ x @ columns[:, None].mT.to(x)
 
 
 @torch.no_grad()

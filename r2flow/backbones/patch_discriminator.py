@@ -13,10 +13,14 @@ class PatchDiscriminator(nn.Module):
         channels: Of the images.
         width: Of the first convolution; each further one doubles it, up to 8 times.
         layers: Convolutions that halve the image.
+
+    Attributes:
+        smallest: The fewest rows or columns of an image that leave a score.
     """
 
     def __init__(self, channels: Count = 1, width: Count = 64, layers: Count = 3) -> None:
         super().__init__()
+        self.smallest = 3 * 2**layers  # halved so often, and two convolutions of 4 without stride
         parts: list[nn.Module] = [nn.Conv2d(channels, width, 4, 2, 1), nn.LeakyReLU(0.2)]
         here = width
         for layer in range(1, layers + 1):

@@ -1,6 +1,7 @@
 """`r2flow unpack`: the scans of a recording as files."""
 
 import logging
+from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
@@ -23,19 +24,25 @@ def unpack(
         int | None, typer.Option("--num", min=1, help="The most scans to write.", show_default=False)
     ] = None,
 ) -> None:
-    """Write the PointCloud2 messages of a recording as scan files: x, y, z and intensity, named by their time in ns."""
+    """Write the PointCloud2 messages of a recording as scan files, named by their time in ns.
+
+    They hold x, y, z and, where the messages do, intensity and ring.
+    """
     from r2flow.lidar.bags import read_bag
     from r2flow.lidar.scan_files import write_points
     from r2flow.progress import track
 
-    written = 0
+    written, stamps = 0, Counter[int]()
     for number, (stamp, points) in enumerate(track(read_bag(recording, topic), "unpacking", "scans", most or 0)):
         if number % every:
             continue
         if isinstance(points, InputError):
             log.warning("left out: %s", points)
             continue
-        write_points(out / f"{stamp:019d}.ply", points.xyz, points.reflectance)
+        stamps[stamp] += 1
+        again = f"-{stamps[stamp]}" if stamps[stamp] > 1 else ""  # clouds of one time keep apart
+        points = points.with_lost_rays()
+        write_points(out / f"{stamp:019d}{again}.ply", points.xyz, points.reflectance, points.ring)
         written += 1
         if written == most:
             break

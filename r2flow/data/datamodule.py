@@ -179,8 +179,10 @@ class ScanDataModule(L.LightningDataModule):
             return source
         for i, part in enumerate(parts):
             if part.slow and len(part):
-                numbers = track(range(len(part)), f"reading {what}", least=16)
-                parts[i] = InMemory(np.stack([part[number] for number in numbers]), part.names)
+                images = np.empty((len(part), 1 + self.encoding.reflectance, *self.sensor.shape), np.float32)
+                for number in track(range(len(part)), f"reading {what}", least=16):
+                    images[number] = part[number]
+                parts[i] = InMemory(images, part.names)
         return _joined(parts)
 
     def _ranks(self) -> tuple[int, int]:

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
@@ -65,7 +65,13 @@ class SourceKind:
                 known = f"known: {', '.join(self.splits)}" if self.splits else "the data set has no standard split"
                 raise InputError(f"no split named {split!r}; {known}.")
             drives = [drive for drive in drives if self.split_of(drive.name) == split]
-        return drives if names is None else [named_drive(drives, str(name)) for name in names]
+        if names is None:
+            return drives
+        found = [named_drive(drives, str(name)) for name in names]
+        twice = next((drive.name for i, drive in enumerate(found) if drive in found[:i]), None)
+        if twice is not None:
+            raise InputError(f"drive {twice} is named twice in {', '.join(map(str, names))}; name it once.")
+        return found
 
 
 @dataclass(frozen=True)
@@ -178,7 +184,7 @@ def folder(root: Path) -> list[Drive]:
     Each folder below it that holds some is a drive. Of a scan that lies there in several formats, one file is taken:
     its range image, else the last by its ending.
     """
-    below = sorted(Path(place) for place, _, _ in os.walk(root))
+    below = sorted(Path(place) for place, _ in _walk(root))
     for endings in (FIRM_ENDINGS, LOOSE_ENDINGS):
         drives = [Drive(str(place.relative_to(root)), _one_of_each(_files(place, endings))) for place in below]
         if any(drive.scans for drive in drives):
@@ -186,9 +192,22 @@ def folder(root: Path) -> list[Drive]:
     return drives
 
 
+def _walk(root: Path) -> Iterator[tuple[str, list[str]]]:
+    """Every folder from a root down and its files, through links to folders too, each folder once."""
+    seen: set[str] = set()
+    for place, folders, names in os.walk(root, followlinks=True):
+        real = os.path.realpath(place)
+        if real in seen:
+            folders.clear()
+            continue
+        seen.add(real)
+        folders.sort()
+        yield place, names
+
+
 def _elsewhere(root: Path) -> str:
     """What turns the files of a folder that holds no scan into some, where they hold scans in another form."""
-    for place, _, names in os.walk(root):
+    for place, names in _walk(root):
         for name in sorted(names):
             for ending, advice in ELSEWHERE.items():
                 if name.lower().endswith(ending):

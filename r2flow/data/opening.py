@@ -317,12 +317,21 @@ def split_parts(options: DataOptions) -> list[PartOptions]:
         if "name" not in part or part["name"] in (MIXED, PAIRS):
             raise InputError(f"{what} needs the name of a data set, found {part.get('name')!r}.")
         _check_split(what, part)
-        made.append(PartOptions(**{**options.common, "root": None, "split": None, "drives": None, **part}))
+        own = {"root": None, "split": None, "drives": None, "reflectance_scale": _scale(options, part["name"])}
+        made.append(PartOptions(**{**options.common, **own, **part}))
     if len({part.weight is None for part in made}) > 1:
         raise InputError("data.parts: give every part a weight, or none, for shares by size.")
     if sum(part.name == SIMULATED for part in made) > 1:
         raise InputError("data.parts: simulated scenes are numbered; give one simulated part, with all its scenes.")
     return made
+
+
+def _scale(options: DataOptions, name: Any) -> float:
+    """What means full reflectance in a part of a run's scans that is of this kind and does not say."""
+    said_for_all = options.name == MIXED and options.reflectance_scale != 1
+    if said_for_all or name not in SOURCES:
+        return options.reflectance_scale
+    return SOURCES[name].reflectance_scale
 
 
 def held_out_options(options: DataOptions) -> list[SourceOptions]:
@@ -333,8 +342,10 @@ def held_out_options(options: DataOptions) -> list[SourceOptions]:
     check_options("data.validation.data", SourceOptions, other)
     common = {**options.common, "split": None, "drives": None}
     kinds = {options.name, other.get("name", options.name)}
-    if len(kinds) == 2 and SIMULATED in kinds:
-        common["root"] = None  # where simulated scans are kept, no others lie
+    if len(kinds) == 2:  # other files, with columns and a scale of their own
+        common |= {"columns": None, "reflectance_scale": _scale(options, other["name"])}
+        if SIMULATED in kinds:
+            common["root"] = None  # where simulated scans are kept, no others lie
     held = SourceOptions(**{**common, **other})
     if held.name in (MIXED, PAIRS):
         raise InputError(f"data.validation.data must name one data set, found {held.name}; hold out a part of it.")

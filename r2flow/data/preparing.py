@@ -40,6 +40,7 @@ from r2flow.data.sources import (
     ScanFiles,
     ScanSource,
     SimulatedScans,
+    lacks_reflectance,
     spread,
     stored_reflectance,
     warn_of_other_sensor,
@@ -123,19 +124,18 @@ def _plan(
 
 
 def _reflectance_levels(paths: Sequence[str], reading: Reading, levels: int | None) -> int | None:
-    """Levels of reflectance, `levels` where given; None where one of some scans has none, or all have 0 throughout."""
+    """Levels of reflectance, `levels` where given; None where the scans have none, by `lacks_reflectance`."""
+    if lacks_reflectance(paths, "skip", reading.columns) is not None:
+        return None
     found, scale = [], reading.reflectance_scale or 1.0
     for index in spread(len(paths), PROBED):
         with suppress(InputError):  # it is met again, and dealt with, when its turn comes
             reflectance = stored_reflectance(paths[index], reading.columns)
-            if reflectance is None:
-                return None
-            found.append(reflectance / np.float32(scale))
-    if not found:
-        return OTHER_LEVELS if levels is None else levels
-    values = np.concatenate(found)
+            if reflectance is not None:
+                found.append(reflectance / np.float32(scale))
+    values = np.concatenate(found) if found else np.zeros(0)
     if not values.any():
-        return None
+        return OTHER_LEVELS if levels is None else levels
     if levels is not None:
         return levels
     levels, highest = find_levels(values), float(values.max())

@@ -48,9 +48,11 @@ class ScanSet:
 
     def part(self, numbers: Sequence[int], name: str) -> "ScanSet":
         """Some of the scans, in the given order; `name` says which for a reader."""
-        chosen = hashlib.sha256(np.asarray(numbers, dtype=np.int64).tobytes()).hexdigest()[:16]
+        identity = self.identity
+        if identity is not None:  # a part of a part is told apart from the same numbers of the whole
+            chosen = str(identity.get("part", "")).encode() + np.asarray(numbers, dtype=np.int64).tobytes()
+            identity = {**identity, "part": hashlib.sha256(chosen).hexdigest()[:16]}
         about = {**self.about, "part": name}
-        identity = None if self.identity is None else {**self.identity, "part": chosen}
         return ScanSet(self.label, self.source.subset(numbers), self.sensor, about, identity, self._drives_of(numbers))
 
     def _drives_of(self, numbers: Sequence[int]) -> dict[str, list[int]]:

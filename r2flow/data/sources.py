@@ -192,6 +192,8 @@ def read_projected(
             "%s: dropped %d points with NaN or infinite coordinates, or %g m and more away",
             path, points.dropped, FARTHEST,
         )  # fmt: skip
+    if projection == "unfolding":
+        points = points.with_lost_rays()
     scaled = _scaled_reflectance(path, points, reflectance_scale) if reflectance else None
     pixels, chosen, kept = project_indices(points.xyz, sensor, projection, convention, points.ring)
     image = image_of(sensor, pixels, kept, None if scaled is None else scaled[chosen])
@@ -279,10 +281,24 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     if len(image) < channels:
         raise _no_reflectance(path)
     image = image[:channels]
-    if reading.within_limits:
-        seen = (image[0] >= sensor.min_range) & (image[0] <= sensor.max_range)
-        image = np.where(seen, image, np.float32(0))
-        image[1:] = image[1:].clip(0, 1)
+    return _within_limits(path, image, reading) if reading.within_limits else image
+
+
+def _within_limits(path: Path, image: np.ndarray, reading: Reading) -> np.ndarray:
+    nearest, farthest = reading.sensor.min_range, reading.sensor.max_range
+    seen = (image[0] >= nearest) & (image[0] <= farthest)
+    if not seen.any() and reading.on_bad_scan != "empty":
+        found = image[0][image[0] > 0]
+        ranges = f"; its ranges are {found.min():.4g} to {found.max():.4g}, in metres" if found.size else ""
+        raise NoPointsError(f"{path} has no return from {nearest:g} to {farthest:g} m{ranges}.")
+    image = np.where(seen, image, np.float32(0))
+    lowest, highest = image[1:].min(initial=0), image[1:].max(initial=0)
+    if lowest < 0 or highest > 1 + 1e-3:
+        raise InputError(
+            f"{path}: reflectance of a range image lies in [0, 1], found {lowest:.4g} to {highest:.4g}; divide it by "
+            "what means full reflectance."
+        )
+    image[1:] = image[1:].clip(0, 1)
     return image
 
 

@@ -6,12 +6,13 @@ time of image k depends on k alone.
 
 import math
 from collections.abc import Callable
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from r2flow.flow.solvers.grids import build_grid
-from r2flow.registry import Count, Portion, Positive, Registry
+from r2flow.registry import Bound, Count, Portion, Positive, Registry
 
 GOLDEN = -7046029254386353131  # (sqrt(5) - 1) / 2 of 2^64, as a signed integer
 PLASTIC = -4521708957497675121, -7935046062780286180  # 1/p and 1/p^2 of 2^64, p^3 = p + 1
@@ -33,7 +34,9 @@ class UShaped:
     taken half of the time; one has the inverse CDF t = ln(u (e^a - 1) + 1) / a, the other is its mirror.
     """
 
-    def __init__(self, a: Positive = 4.0) -> None:
+    def __init__(
+        self, a: Annotated[float, Bound("above 0 and at most 80", lambda a: 0 < a <= 80)] = 4.0
+    ) -> None:
         self.a = a
 
     def __call__(self, u: Tensor) -> Tensor:

@@ -194,10 +194,12 @@ class Generator(nn.Module):
         space: The images it makes.
         noise_shape: What one scan is made of: (C, H, W) for a flow, (latent,) for a GAN.
         sampler: How it is run when nobody says otherwise.
+        draws: Whether it makes scans of noise; an autoencoder by itself does not, and no picture or sample is drawn.
         told: Whether it takes a condition of `r2flow.generators.condition_of` by its own sampler.
         goes_on_as: The family that a stage for any flow makes of it; None for its own.
     """
 
+    draws: ClassVar[bool] = True
     told: ClassVar[bool] = False
     goes_on_as: ClassVar[str | None] = None
 

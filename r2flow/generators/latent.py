@@ -32,6 +32,8 @@ class VQAutoencoder(Generator):
         autoencoder: Options of `r2flow.backbones.autoencoder.Autoencoder`.
     """
 
+    draws = False
+
     def __init__(
         self, space: ModelSpace, backbone: Mapping[str, Any], autoencoder: Mapping[str, Any] | None = None
     ) -> None:

@@ -65,6 +65,7 @@ def find_beams(scans: Sequence[Points]) -> Beams:
         NoBeamsError: the points lie on no beams at all.
         InputError: no beams can be told apart.
     """
+    scans = [scan.with_lost_rays() for scan in scans]
     elevations = [elevations_of(scan.xyz) for scan in scans]
     if all(scan.ring is not None for scan in scans):
         lasers = [np.asarray(scan.ring, dtype=np.int64) for scan in scans]

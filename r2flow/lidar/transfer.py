@@ -115,7 +115,8 @@ def points_through(points: Points, fired: Fired, target: Sensor, reflectance: np
     empty = np.zeros(target.shape, dtype=bool)
     for r, angles in lost:
         empty[r, _columns(angles, target.shape[1])] = True
-    keeps_empty = points.kept is not None or bool((beam < 0).any() and (~points.xyz.any(axis=1)).any())
+    many = points.dropped > (len(points.xyz) + points.dropped) / 100  # a damaged row or two are no lost rays
+    keeps_empty = many or bool((beam < 0).any() and (~points.xyz.any(axis=1)).any())
     if not keeps_empty:
         empty[:, _blind(azimuth[beam >= 0], target.shape[1], 3 * 360 / fired.steps)] = False
     inside = (beam >= 0) & (row[beam] >= 0)

@@ -40,8 +40,8 @@ def describe(path: str | Path) -> dict[str, Any]:
 def card(contents: dict[str, Any]) -> str:
     """What the file of a model says of itself: the table of its model card."""
     config, sampler = contents["config"], contents["sampler"]
-    data, stage, parent = config["data"], config.get("stage") or {}, config.get("parent")
-    learned_from = [data["name"], config.get("scans"), *_said(data.get("augment") or {})]
+    data, stage, parent = config.get("data") or {}, config.get("stage") or {}, config.get("parent")
+    learned_from = [data.get("name"), config.get("scans"), *_said(data.get("augment") or {})]
     steps, batch_size = contents["step"], data.get("batch_size")
     seen = f" of {batch_size} images, {steps * batch_size:,} images" if batch_size else ""
     facts = {
@@ -51,14 +51,21 @@ def card(contents: dict[str, Any]) -> str:
         "network": f"{contents['backbone'] or contents['generator']}, {contents['parameters']:,} parameters",
         "file": f"{contents['bytes'] / 1e6:.1f} MB",
         "drawn with": f"{sampler['method']}, {sampler['steps']} steps",
-        "learned from": ", ".join(filter(None, learned_from)),
-        "stage": ", ".join([contents["stage"], *_said({key: stage.get(key) for key in ("loss", "time")})]),
-        "starts from": parent and f"a {parent['stage']} flow of {parent['step']:,} steps, weights {parent['weights']}",
+        "learned from": ", ".join(filter(None, learned_from)) or None,
+        "stage": ", ".join([contents["stage"], *_said({key: stage.get(key) for key in ("loss", "time")})])
+        if contents["stage"]
+        else None,
+        "starts from": parent and _lineage(parent),
         "budget": f"{steps:,} steps{seen}",
         "seed": config.get("seed"),
         "licence": contents.get("licence"),
     }
     return table([(key, value) for key, value in facts.items() if value is not None], ("", ""))
+
+
+def _lineage(parent: Mapping[str, Any]) -> str:
+    kind = f"a {parent['stage']} flow" if "stage" in parent else "a flow"
+    return f"{kind} of {parent['step']:,} steps, weights {parent['weights']}"
 
 
 def _said(options: Mapping[str, Any]) -> list[str]:

@@ -50,7 +50,7 @@ def finish(run: str | Path, samples: Mapping[str, Any], seed: int, device: str, 
     if checkpoint.step < max_steps:
         print(f"stopped at step {checkpoint.step} of {max_steps}: the same command goes on from here")
     out = run / "samples"
-    if samples["num"] == 0:
+    if samples["num"] == 0 or not checkpoint.generator.draws:
         print(f"checkpoint    {path}")
         return
     write_samples(checkpoint, out, samples["num"], seed, pictures=samples["num"], replace=True)

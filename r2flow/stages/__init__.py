@@ -5,6 +5,8 @@ from typing import Any
 
 from r2flow.data.augment import Augmentation
 from r2flow.errors import InputError
+from r2flow.flow.posterior import completes
+from r2flow.flow.solvers import adapts
 from r2flow.generators import Generator, Sampler
 from r2flow.registry import Registry, check_options
 from r2flow.stages.base import Stage
@@ -60,7 +62,31 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
     stage.check_data(options["name"], config["data"])
     wanted = {key: value for key, value in (config.get("sampler") or {}).items() if value is not None}
     check_options("sampler", Sampler, wanted)
-    sampler = generator.sampler.changed(**wanted)
-    generator.check_sampler(sampler)
-    generator.sampler = sampler
+    generator.sampler = _sampler(generator, wanted)
     return stage
+
+
+def _sampler(generator: Generator, wanted: Mapping[str, Any]) -> Sampler:
+    """A generator's own sampler with what a config asks for.
+
+    Raises:
+        InputError: it cannot be run so, it has learned the steps of its own sampler alone, or an option has no effect.
+    """
+    own = generator.sampler
+    found = own.changed(**wanted)
+    if own.fixed and found != own:
+        raise InputError(
+            f"this flow learns {own.steps} steps of {own.method} and is run by these alone: leave sampler.* out; in a "
+            "chain give it to one link, as chain.rf1.sampler.steps=32."
+        )
+    if completes(found.method):
+        raise InputError(
+            f"sampler.method={found.method} completes a scan of which a part is known; give it to r2flow complete by "
+            "--solver."
+        )
+    useless = "steps" if adapts(found.method) else "tolerance"
+    if useless in wanted:
+        kind = "of fixed steps" if useless == "steps" else "that adapts its steps, as dopri5"
+        raise InputError(f"sampler.{useless} is for a solver {kind}, and {found.method} is none; leave it out.")
+    generator.check_sampler(found)
+    return found

@@ -37,4 +37,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             ) from None
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
-        return read_checkpoint(path, map_location)
+        found = read_checkpoint(path, map_location)
+        # Lightning's timer would go on where it stopped, with its time spent; trainer.max_time is of each command.
+        found["callbacks"] = {k: v for k, v in (found.get("callbacks") or {}).items() if not k.startswith("Timer")}
+        return found

@@ -64,6 +64,12 @@ class LearnAutoencoder(Stage):
         self.autoencoder = generator.first_stage_model
         channels = generator.space.shape[0] + self.autoencoder.mask
         self.discriminator = PatchDiscriminator(channels, **(discriminator or {}))
+        rows, columns = generator.space.shape[1:]
+        if min(rows, columns) < self.discriminator.smallest:
+            raise InputError(
+                f"stage.discriminator judges images of at least {self.discriminator.smallest} rows and columns, found "
+                f"{rows} x {columns}; give it fewer layers, as stage.discriminator='{{layers: 1}}'."
+            )
         self.adversarial_weight, self.codebook_weight = adversarial_weight, codebook_weight
         self.adversarial_start, self.inverted = adversarial_start, inverted
         self.mask_factor = mask_factor

@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from r2flow.errors import InputError
-from r2flow.generators import Generator, Sampler
+from r2flow.generators import Flow, Generator, Sampler
+from r2flow.generators.flow import ode_sampler
 from r2flow.registry import Count
 from r2flow.stages.rectify import Rectify
 
@@ -22,6 +23,8 @@ class Reflow(Rectify):
         self, generator: Generator, loss: str = "pseudo_huber", time: Mapping[str, Any] | None = None, **options: Any
     ) -> None:
         super().__init__(generator, loss, time or {"name": "u_shaped", "a": 4.0}, **options)
+        if isinstance(generator, Flow):  # of pairs that belong together, noise drawn on the way would part them
+            generator.sampler = ode_sampler(generator)
 
 
 class Distill(Reflow):

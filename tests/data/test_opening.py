@@ -303,3 +303,34 @@ def test_pairs_are_made_of_noise_of_their_own_shape(tmp_path: Path):
     assert torch.equal(x_1, x_0.half().float())
     with pytest.raises(InputError, match="holds other pairs: noise_shape"):
         PairStore(tmp_path, plain)
+
+
+def test_a_part_of_a_part_is_not_the_same_part_of_the_whole(numbered: Path):
+    """Statistics are kept by a set's identity: other scans must have another one."""
+    whole = open_scans(numbered, READING)
+    for some, other in ((8, 9), (8, None)):
+        a, b = (whole.limited(most).part(range(4), "first") for most in (some, other))
+        assert numbers(a) != numbers(b)
+        assert a.identity != b.identity
+
+
+class TestRangeImagesForAModel:
+    READ = Reading(SENSOR, within_limits=True, on_bad_scan="error")
+
+    def image(self, path: Path, ranges: float, reflectance: float) -> Path:
+        np.save(path, np.stack([np.full((8, 32), ranges), np.full((8, 32), reflectance)]).astype(np.float32))
+        return path
+
+    def test_reflectance_beyond_one_is_not_clipped_in_silence(self, tmp_path: Path):
+        path = self.image(tmp_path / "0.npy", 5, 200)
+        with pytest.raises(InputError, match=r"reflectance of a range image lies in \[0, 1\], found 0 to 200; divide"):
+            open_scans(path, self.READ).source[0]
+        assert open_scans(self.image(tmp_path / "1.npy", 5, 1.0005), self.READ).source[0][1].max() == 1
+
+    @pytest.mark.parametrize(("ranges", "said"), [(5000, "its ranges are 5000 to 5000, in metres"), (0, "80 m.")])
+    def test_one_without_a_return_is_refused_or_stays_empty(self, tmp_path: Path, ranges: float, said: str):
+        path = self.image(tmp_path / "0.npy", ranges, 0.5)
+        with pytest.raises(InputError, match="has no return from 1.45 to 80 m") as refused:
+            open_scans(path, self.READ).source[0]
+        assert str(refused.value).endswith(f"{said}.".replace("..", "."))
+        assert not open_scans(path, Reading(SENSOR, within_limits=True, on_bad_scan="empty")).source[0].any()

@@ -748,3 +748,12 @@ def test_shards_of_another_recipe_are_not_taken_for_these(clouds: Path, tmp_path
         make(tmp_path / "two", replace(other, source=Stopped(other.source, 6)))
     (tmp_path / "two" / MANIFEST).unlink()
     assert files(make(tmp_path / "two", plan_of(clouds))) == one
+
+
+def test_the_first_scan_decides_whether_there_is_reflectance(tmp_path: Path):
+    """As everywhere. One later scan without it is an error of its own, and takes no channel from the others."""
+    for number in range(20):
+        write_cloud(tmp_path / f"{number:02}.ply", number, None if number == 11 else 255)
+    assert plan_of(tmp_path).recipe.levels == 255
+    write_cloud(tmp_path / "00.ply", 0, None)
+    assert plan_of(tmp_path).recipe.levels is None

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.data.opening import held_out_options
+from r2flow.data.opening import held_out_options, split_parts
 from r2flow.data.options import DataOptions
 from r2flow.data.sources import InMemory, Reading, ScanFiles, SimulatedScans, holdout_block, read_scan, spread
 from r2flow.errors import InputError
@@ -186,3 +186,18 @@ class TestKeptSimulatedScans:
         assert [one.root for one in held] == [None]
         held = held_out_options(DataOptions("simulated", "kept", validation={"data": {"name": "simulated"}}))
         assert [one.root for one in held] == ["kept"]
+
+    def test_held_out_scans_of_another_kind_have_a_scale_and_columns_of_their_own(self):
+        run = {"reflectance_scale": 255.0, "columns": ["x", "y", "z", "intensity"]}
+        for name, scale in (("kitti_360", 1.0), ("nuscenes", 255.0), ("folder", 255.0)):
+            held = held_out_options(DataOptions("folder", "mine", **run, validation={"data": {"name": name}}))[0]
+            assert (held.reflectance_scale, held.columns is None) == (scale, name != "folder")
+        said = {"name": "kitti_360", "reflectance_scale": 2.0}
+        held = held_out_options(DataOptions("folder", "mine", **run, validation={"data": said}))[0]
+        assert held.reflectance_scale == 2
+
+    def test_so_has_a_part_unless_the_run_says_one_for_all(self):
+        parts = [{"name": "kitti_360", "root": "A", "split": "train"}, {"name": "nuscenes", "root": "B"}]
+        assert [p.reflectance_scale for p in split_parts(DataOptions("mixed", parts=parts))] == [1, 255]
+        both = split_parts(DataOptions("mixed", parts=parts, reflectance_scale=100.0))
+        assert [p.reflectance_scale for p in both] == [100, 100]

@@ -53,7 +53,13 @@ def message(store, xyz: np.ndarray, order: str = "<", extra: int = 0):
     )
 
 
-def record(path: Path, storage: str, topics: tuple[str, ...] = ("/points",), kind: str = "cloud") -> Path:
+def record(
+    path: Path,
+    storage: str,
+    topics: tuple[str, ...] = ("/points",),
+    kind: str = "cloud",
+    stamps: tuple[int, ...] = (1, 2, 3),
+) -> Path:
     """A recording of the three clouds in each topic; the file that a user would name."""
     one = storage == "bag"
     store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
@@ -62,12 +68,12 @@ def record(path: Path, storage: str, topics: tuple[str, ...] = ("/points",), kin
     with writer:
         for topic in topics:
             connection = writer.add_connection(topic, name, typestore=store)
-            for number, xyz in enumerate(CLOUDS):
+            for number, (xyz, stamp) in enumerate(zip(CLOUDS, stamps, strict=True)):
                 content = (
                     message(store, xyz, "<>"[number % 2], 8 * number) if kind == "cloud" else store.types[name]("text")
                 )
                 data = store.serialize_ros1(content, name) if one else store.serialize_cdr(content, name)
-                writer.write(connection, 10**9 * (number + 1), data)
+                writer.write(connection, 10**9 * stamp, data)
     return path if one else next(file for file in path.iterdir() if file.suffix != ".yaml")
 
 
@@ -116,3 +122,16 @@ def test_recordings_without_clouds_or_damaged_are_one_line(r2flow, tmp_path: Pat
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="holds no topic '/rear'"):
         list(read_bag(tmp_path / "drive", "/rear"))
+
+
+def test_unpack_keeps_clouds_of_one_time_and_ring_numbers(r2flow, tmp_path: Path):  # noqa: F811
+    file = record(tmp_path / "drive", "MCAP", stamps=(1, 1, 2))
+    code, said, _ = r2flow("unpack", file, "--out", tmp_path / "scans")
+    assert (code, said) == (0, f"3 scans in {tmp_path / 'scans'}\n")
+    names = [f"{10**9:019d}.ply", f"{10**9:019d}-2.ply", f"{2 * 10**9:019d}.ply"]
+    assert {path.name for path in (tmp_path / "scans").iterdir()} == set(names)
+    for name, xyz in zip(names, CLOUDS, strict=True):
+        points = read_points(tmp_path / "scans" / name)
+        np.testing.assert_array_equal(points.xyz, xyz)
+        np.testing.assert_array_equal(points.ring, np.arange(len(xyz)) % 32)
+        np.testing.assert_array_equal(points.reflectance, np.arange(len(xyz)) % 256)

@@ -3,6 +3,7 @@
 import itertools
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.known import Ray
 from r2flow.lidar.projection import project
 from r2flow.lidar.scan_files import Points
+from r2flow.lidar.scan_files.points import checked_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.transfer import (
     Fired,
@@ -184,3 +186,15 @@ def test_a_range_image_says_all_its_rays():
     seen = image_of_same(image, TARGET)
     assert seen.state.tolist() == [[Ray.RETURN, Ray.EMPTY, Ray.UNKNOWN, Ray.EMPTY]]
     assert seen.image.tolist() == [[[5.0, 0, 0, 0]], [[0.5, 0, 0, 0]]]
+
+
+def test_one_damaged_row_does_not_make_a_cut_sector_measured():
+    firing = fired()
+    lost = np.zeros((16, 1800), bool)
+    lost[:, 300:1200] = True
+    some = wall(firing, lost)
+    clean = points_through(some, firing, TARGET).state
+    damaged = checked_points(Path("scan.pcd"), np.vstack([some.xyz, np.full((1, 3), np.nan, np.float32)]))
+    assert damaged.dropped == 1
+    assert (points_through(damaged, firing, TARGET).state == clean).all()
+    assert (clean == Ray.UNKNOWN).sum() > (clean == Ray.EMPTY).sum()

@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
 
+from r2flow.data.sources import read_projected
 from r2flow.errors import InputError
+from r2flow.lidar.beams import find_beams
 from r2flow.lidar.projection import project
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -99,3 +101,14 @@ def test_a_real_scan_unfolds_by_ring_and_by_firing_alike(shared):
     # The file counts its rings from the lowest up.
     within = (np.linalg.norm(points.xyz, axis=1) >= 1) & (points.ring == 31)
     assert (by_ring[0, 0] > 0).sum() <= within.sum() < 1.8 * (by_ring[0, 0] > 0).sum()
+
+
+def test_lost_rays_of_whole_firings_may_be_nan(tmp_path):
+    sensor = SENSORS["vlp16"].resized(columns=48)
+    firings, image = cloud(sensor)
+    xyz = firings[:, packet_order(sensor, "firing")].reshape(-1, 3)
+    xyz[~xyz.any(axis=1)] = np.nan
+    np.save(tmp_path / "0.npy", xyz)
+    found = read_projected(tmp_path / "0.npy", sensor, "unfolding", reflectance=False)
+    np.testing.assert_allclose(found.image[0], image, rtol=1e-6)
+    assert find_beams([read_points(tmp_path / "0.npy")]).firing is not None

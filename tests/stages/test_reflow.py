@@ -5,6 +5,7 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.flow.solvers import solve
+from r2flow.generators import Sampler
 from r2flow.stages import STAGES, build_stage
 from r2flow.stages.reflow import Distill, Reflow
 from tests.stages.test_rectify import Affine, M, S, affine
@@ -94,3 +95,21 @@ def test_stage_and_data_belong_together(stage: str, data: str):
     config = {"stage": {"name": stage}, "data": {"name": data, "batch_size": 4}, "seed": 0}
     with pytest.raises(InputError, match=f"stage={stage} learns from"):
         build_stage(config, affine())
+
+
+def test_a_straightened_generator_is_drawn_without_fresh_noise():
+    """Its pairs of noise and scan belong together; SDE and DDPM would part them."""
+    flow = affine()
+    flow.sampler = Sampler("sde", 32)
+    assert not flow.draws_noise(Reflow(flow).generator.sampler)
+    own = affine()
+    own.sampler = Sampler("heun2", 5)
+    assert Reflow(own).generator.sampler == Sampler("heun2", 5)
+
+
+def test_a_distilled_flow_keeps_the_steps_that_it_learns():
+    config = {"stage": {"name": "distill", "steps": 2}, "data": {"batch_size": 4, "name": "pairs"}, "seed": 0}
+    assert build_stage({**config, "sampler": {"steps": 2}}, affine()).generator.sampler.steps == 2
+    for other in ({"steps": 8}, {"method": "adams3"}):
+        with pytest.raises(InputError, match=r"this flow learns 2 steps of euler and is run by these alone: leave"):
+            build_stage({**config, "sampler": other}, affine())

@@ -251,3 +251,12 @@ def test_fast_dev_run_leaves_a_run_as_it_was(train: Run, copied: Path):
     before = {path: path.stat().st_mtime_ns for path in copied.rglob("*")}
     train("trainer.fast_dev_run=true", "name=copied")
     assert {path: path.stat().st_mtime_ns for path in copied.rglob("*")} == before
+
+
+def test_a_run_out_of_time_goes_on_for_as_long_again(train: Run, tmp_path: Path):
+    command = ["run_dir=run", "trainer.max_steps=100000", "trainer.max_time=00:00:00:02", "samples.num=0"]
+    reached = []
+    for _ in range(2):
+        assert train(*command, check=False).returncode == 75
+        reached.append(step_of(checkpoints_of(tmp_path / "run")[0]))
+    assert 0 < reached[0] < reached[1]

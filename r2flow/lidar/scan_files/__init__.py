@@ -8,6 +8,7 @@ from half a file, and the bindings to LZF need a compiler.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -26,7 +27,7 @@ from r2flow.lidar.scan_files.arrays import (
 )
 from r2flow.lidar.scan_files.fields import check_columns
 from r2flow.lidar.scan_files.pcd import read_pcd, write_pcd
-from r2flow.lidar.scan_files.ply import read_ply, write_ply
+from r2flow.lidar.scan_files.ply import PLY_NAMES, read_ply, write_ply
 from r2flow.lidar.scan_files.points import NoPointsError, Points
 from r2flow.lidar.scan_files.tables import read_arrow, read_las, read_npz, read_text
 
@@ -165,7 +166,9 @@ def read_numbers(path: str | Path) -> np.ndarray:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
 
 
-def write_points(path: str | Path, xyz: np.ndarray, reflectance: np.ndarray | None = None) -> None:
+def write_points(
+    path: str | Path, xyz: np.ndarray, reflectance: np.ndarray | None = None, ring: np.ndarray | None = None
+) -> None:
     """Write one scan as little-endian float32, whole or not at all.
 
     Args:
@@ -173,6 +176,7 @@ def write_points(path: str | Path, xyz: np.ndarray, reflectance: np.ndarray | No
             missing, an existing file is replaced.
         xyz: Points in metres, (N, 3), sensor frame.
         reflectance: (N,), or None for none.
+        ring: Number of each point's beam, (N,), or None; for a .ply.
 
     Raises:
         InputError: an unknown format, a .bin without reflectance, shapes that do not fit, values that are not finite in
@@ -183,9 +187,15 @@ def write_points(path: str | Path, xyz: np.ndarray, reflectance: np.ndarray | No
     if ending == ".bin" and reflectance is None:
         raise InputError(f"{path}: KITTI's .bin needs a reflectance; give one, or choose .ply, .pcd or .npy.")
     table = _table(path, xyz, reflectance)
+    write = _WRITERS[ending]
+    if ring is not None:
+        if ending != ".ply" or np.shape(ring) != (len(table),):
+            raise InputError(f"{path}: ring numbers, one for each point, are written as .ply alone.")
+        table = np.column_stack([table, ring]).astype("<f4")
+        write = partial(write_ply, names=(*PLY_NAMES[: table.shape[1] - 1], "ring"))
     try:
         with atomic_write(path) as file:
-            _WRITERS[ending](file, table)
+            write(file, table)
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror or error}.") from None
 

@@ -113,9 +113,12 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
     return kind, elements, end
 
 
-def write_ply(file: IO[bytes], table: np.ndarray) -> None:
-    """Vertices x, y, z and, from a table (N, 4), intensity, as little-endian float32."""
-    names = ("x", "y", "z", "intensity")[: table.shape[1]]
+PLY_NAMES = "x", "y", "z", "intensity"
+
+
+def write_ply(file: IO[bytes], table: np.ndarray, names: tuple[str, ...] = PLY_NAMES) -> None:
+    """Vertices x, y, z and, from a table (N, 4), intensity, or other `names`, as little-endian float32."""
+    names = names[: table.shape[1]]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     header += [f"property float {name}" for name in names]
     file.write("\n".join([*header, "end_header", ""]).encode())

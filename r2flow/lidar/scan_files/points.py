@@ -39,6 +39,22 @@ class Points:
     dropped: int = 0
     kept: np.ndarray | None = None
 
+    def with_lost_rays(self) -> "Points":
+        """The rows of the file again, those that were dropped as rays without return, at the origin.
+
+        Where lasers are told by the order of the points, a lost ray keeps its place, stored as NaN or as (0, 0, 0).
+        Points with ring numbers need no order and stay as they are.
+        """
+        if self.kept is None or self.ring is not None:
+            return self
+        xyz = np.zeros((len(self.xyz) + self.dropped, 3), np.float32)
+        xyz[self.kept] = self.xyz
+        reflectance = None
+        if self.reflectance is not None:
+            reflectance = np.zeros(len(xyz), np.float32)
+            reflectance[self.kept] = self.reflectance
+        return Points(xyz, reflectance)
+
 
 def checked_points(
     path: Path,
