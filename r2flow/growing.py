@@ -1,12 +1,12 @@
 """Larger networks out of trained ones: what they have learned goes on inside."""
 
+import copy
 from typing import Any
 
 import torch
 
 from r2flow.backbones import HDiT, Pyramid
 from r2flow.backbones.base import CommonOptions
-from r2flow.backbones.detail import Detail
 from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.generators import Generator, RectifiedFlow, build_generator
@@ -69,17 +69,17 @@ def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Che
     return Checkpoint(larger.eval(), config)
 
 
-def widened(checkpoint: Checkpoint, blocks: int, channels: int) -> Checkpoint:
-    """The same generator with more convolutions at full resolution (`Detail`). It draws the same scans, and can learn
-    more.
+def widened(checkpoint: Checkpoint, detail: tuple[int, int] | None = None, position: str | None = None) -> Checkpoint:
+    """The same generator in a network that can learn more. It draws the same scans.
 
     Args:
-        checkpoint: Of an HDiT or a pyramid, whatever it generates.
-        blocks: At least as many as it has.
-        channels: The same.
+        checkpoint: Of an HDiT or a pyramid around one, whatever it generates.
+        detail: Blocks and channels at full resolution (`Detail`), at least as many as it has; None for its own.
+        position: A position encoding for an HDiT that has none, which makes all directions alike: where the own car
+            stands and where the street runs it can learn with one alone.
 
     Raises:
-        InputError: another network, or one that has more already.
+        InputError: another network, one that has more already, or a position already.
     """
     _refuse_rings(checkpoint)
     network = getattr(checkpoint.generator, "backbone", None)
@@ -88,26 +88,41 @@ def widened(checkpoint: Checkpoint, blocks: int, channels: int) -> Checkpoint:
             f"{checkpoint.path} holds a network of the kind {checkpoint.config['backbone']['name']}; hdit and pyramid "
             "have convolutions at full resolution."
         )
-    before = network.detail and network.detail.size
-    if before and (blocks < before[0] or channels < before[1]):
-        raise InputError(
-            f"{checkpoint.path} has {before[0]} blocks of {before[1]} channels at full resolution and cannot shrink "
-            f"to {blocks} of {channels}."
-        )
+    backbone = copy.deepcopy(checkpoint.config["backbone"])
+    if detail is not None:
+        (blocks, channels), before = detail, network.detail and network.detail.size
+        if before and (blocks < before[0] or channels < before[1]):
+            raise InputError(
+                f"{checkpoint.path} has {before[0]} blocks of {before[1]} channels at full resolution and cannot "
+                f"shrink to {blocks} of {channels}."
+            )
+        backbone["detail"] = list(detail)
+    if position is not None:
+        inner, options = (network.inner, backbone["inner"]) if isinstance(network, Pyramid) else (network, backbone)
+        if not isinstance(inner, HDiT) or inner.spatial_pe is not None:
+            raise InputError(f"{checkpoint.path} holds no hdit without a position; it keeps its own.")
+        options["position"] = position
     config = {
         **{key: checkpoint.config[key] for key in ("sensor", "encoding")},
         **_reading(checkpoint),
         "generator": checkpoint.config.get("generator") or {"name": "rectified_flow"},
-        "backbone": {**checkpoint.config["backbone"], "detail": [blocks, channels]},
+        "backbone": backbone,
         "parent": _parent(checkpoint),
     }
     wider = _fresh(config)
-    path = wider.get_submodule("backbone.detail")
-    assert isinstance(path, Detail)
-    own = {f"backbone.detail.{name}": weight for name, weight in path.state_dict().items()}
-    wider.load_state_dict({**checkpoint.generator.state_dict(), **own})
-    if network.detail is not None:
-        path.take_over(network.detail)
+    grown = wider.get_submodule("backbone")
+    assert isinstance(grown, HDiT | Pyramid)
+    if position is not None:
+        hdit = grown.inner if isinstance(grown, Pyramid) else grown
+        assert isinstance(hdit, HDiT)
+        hdit.start_without_position()
+    kept = checkpoint.generator.state_dict()
+    if detail is not None:
+        kept = {name: weight for name, weight in kept.items() if not name.startswith("backbone.detail.")}
+    wider.load_state_dict({**wider.state_dict(), **kept})
+    if detail is not None and network.detail is not None:
+        assert grown.detail is not None
+        grown.detail.take_over(network.detail)
     wider.sampler = checkpoint.generator.sampler
     return Checkpoint(wider.eval(), config)
 

@@ -206,20 +206,26 @@ def grow(
     detail: Annotated[
         str | None, typer.Option(help="Blocks and channels of the convolutions at full resolution, as 6,48.")
     ] = None,
+    position: Annotated[
+        str | None,
+        typer.Option(help="A position encoding for a network that has none, as fourier_features: where is ahead."),
+    ] = None,
 ) -> None:
     """Put a trained flow's network inside a larger one, to go on learning from what it knows.
 
     With --size convolutions at a higher resolution surround it: the means of what it draws are the images of the
-    trained flow. Below them is noise, until it has learned more. With --detail alone it has more convolutions, and
-    draws the same scans.
+    trained flow. Below them is noise, until it has learned more. With --detail and --position alone it draws the same
+    scans, and can learn more.
     """
     from r2flow.checkpoints import load_checkpoint, save_checkpoint
     from r2flow.growing import grown, widened
 
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: give a .safetensors, which holds a flow and its config.")
-    if size is None and detail is None:
-        raise InputError("nothing to grow: give --size, as --size 64x1024, or --detail, as --detail 6,48.")
+    if size is None and detail is None and position is None:
+        raise InputError("nothing to grow: give --size, as 64x1024, --detail, as 6,48, or --position.")
+    if size is not None and position is not None:
+        raise InputError("--size and --position are two steps: grow one, and what that wrote by the other.")
     path = detail and _pair("--detail", detail, ",", int, "blocks and channels, as 6,48")
     found = load_checkpoint(checkpoint)
     _keep_source(found, out)
@@ -229,9 +235,9 @@ def grow(
         larger = grown(found, found.sensor.resized(*rows_and_columns(size)).shape, **options)
         said = f"images of {'x'.join(map(str, larger.sensor.shape))} by a network for {before}"
     else:
-        assert path
-        larger = widened(found, *path)
-        said = f"{path[0]} blocks of {path[1]} channels at full resolution; it draws the same scans"
+        larger = widened(found, path or None, position)
+        more = [f"{path[0]} blocks of {path[1]} channels at full resolution"] if path else []
+        said = f"{', '.join([*more, *([f'position {position}'] if position else [])])}; it draws the same scans"
     save_checkpoint(larger, out)
     print(f"{out}: {said}. Now train it:")
     print(f"  r2flow train experiment=finetune stage.init={out} data.root=FOLDER")

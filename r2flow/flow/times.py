@@ -34,9 +34,7 @@ class UShaped:
     taken half of the time; one has the inverse CDF t = ln(u (e^a - 1) + 1) / a, the other is its mirror.
     """
 
-    def __init__(
-        self, a: Annotated[float, Bound("above 0 and at most 80", lambda a: 0 < a <= 80)] = 4.0
-    ) -> None:
+    def __init__(self, a: Annotated[float, Bound("above 0 and at most 80", lambda a: 0 < a <= 80)] = 4.0) -> None:
         self.a = a
 
     def __call__(self, u: Tensor) -> Tensor:

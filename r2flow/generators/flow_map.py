@@ -12,12 +12,10 @@ from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.flow.solvers import Solution
 from r2flow.flow.stochastic import ahead, back, churn_of
-from r2flow.generators.base import Condition, Generated, Progress, Sampler, finite, stepped
+from r2flow.generators.base import JUMP, RENOISE, Condition, Generated, Progress, Sampler, finite, stepped
 from r2flow.generators.flow import UNTOLD, Conditioned, RectifiedFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
-
-JUMP, RENOISE = "jump", "renoise"
 
 
 class FlowMap(RectifiedFlow):

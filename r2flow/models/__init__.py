@@ -37,11 +37,11 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes in any number of evaluations, learned from simulated scans",
-        "cc31b551e2d5de9b733c732ab7dd021944ee56a13e78a3a5b3183d76ef46c25c",
+        "e623f8ff5b4ba7c34d11de67d535f3bf9f861d841a320f01ae22819849996496",
     ),
     street_full=Model(
         "street scenes at 64 x 1024, learned from simulated scans",
-        "993c3e99dcf38d8078745ac2819c65371fd7e9f8e278ec861a55bd30858f8656",
+        "20e34aa5c6d6731431ef74aa75b15bae6cc3d97f572140bc889f7ab8acb76392",
         page="release/street_full.safetensors in the source of r2flow",
     ),
 )

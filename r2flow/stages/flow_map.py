@@ -12,8 +12,7 @@ from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots, cor
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import FlowMap, Generator
-from r2flow.generators.base import Sampler
-from r2flow.generators.flow_map import JUMP
+from r2flow.generators.base import JUMP, Sampler
 from r2flow.registry import Positive, check_options
 from r2flow.stages.base import Batch
 from r2flow.stages.reflow import Reflow

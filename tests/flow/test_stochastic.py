@@ -175,6 +175,8 @@ def test_another_method_starts_from_its_usual_steps_and_another_number_of_the_sa
     own = Sampler("renoise", 8, grid="power:3")
     assert own.changed(method="renoise:3") == Sampler("renoise:3", 8, grid="power:3")
     assert own.changed(method="euler").grid == "uniform"
+    learned = Sampler("jump", 4, grid="power:3")  # the steps of a map are those that it has learned, in both its ways
+    assert learned.changed(method="renoise:3", steps=16) == Sampler("renoise:3", 16, grid="power:3")
     assert Sampler("torchdiffeq:rk4", grid="power:2").changed(method="torchdiffeq:euler").grid == "uniform"
     timed = own.changed(method="sde", grid=(0.0, 0.5, 1.0))
     assert (timed.finish, timed.steps) == (0.0, 2)
