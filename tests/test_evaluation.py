@@ -18,7 +18,7 @@ from r2flow.evaluation import measuring
 from r2flow.evaluation.floor import floor_sets
 from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
 from r2flow.evaluation.sets import ScanSet, fixed_choice, sampled_set
-from r2flow.evaluation.statistics import Cache, key_of
+from r2flow.evaluation.statistics import FORMAT, Cache, key_of
 from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
@@ -142,7 +142,7 @@ class TestCache:
             key(reading=Reading(SENSOR, reflectance_scale=2)),
         ]
         keys.append(key_of(JSD(), open_scans(str(real), READING, num=7), "all"))
-        monkeypatch.setattr("r2flow.evaluation.statistics.FORMAT", 2)
+        monkeypatch.setattr("r2flow.evaluation.statistics.FORMAT", FORMAT + 1)
         keys.append(key())
         monkeypatch.undo()
         scan = real / "000003.npy"

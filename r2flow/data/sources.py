@@ -292,11 +292,11 @@ def _within_limits(path: Path, image: np.ndarray, reading: Reading) -> np.ndarra
         ranges = f"; its ranges are {found.min():.4g} to {found.max():.4g}, in metres" if found.size else ""
         raise NoPointsError(f"{path} has no return from {nearest:g} to {farthest:g} m{ranges}.")
     image = np.where(seen, image, np.float32(0))
-    lowest, highest = image[1:].min(initial=0), image[1:].max(initial=0)
-    if lowest < 0 or highest > 1 + 1e-3:
+    highest = image[1:].max(initial=0)
+    if highest > 1 + 1e-3:
         raise InputError(
-            f"{path}: reflectance of a range image lies in [0, 1], found {lowest:.4g} to {highest:.4g}; divide it by "
-            "what means full reflectance."
+            f"{path}: reflectance of a range image lies in [0, 1], found up to {highest:.4g}; divide it by what means "
+            "full reflectance."
         )
     image[1:] = image[1:].clip(0, 1)
     return image

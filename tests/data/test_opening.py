@@ -323,7 +323,7 @@ class TestRangeImagesForAModel:
 
     def test_reflectance_beyond_one_is_not_clipped_in_silence(self, tmp_path: Path):
         path = self.image(tmp_path / "0.npy", 5, 200)
-        with pytest.raises(InputError, match=r"reflectance of a range image lies in \[0, 1\], found 0 to 200; divide"):
+        with pytest.raises(InputError, match=r"reflectance of a range image lies in \[0, 1\], found up to 200; divide"):
             open_scans(path, self.READ).source[0]
         assert open_scans(self.image(tmp_path / "1.npy", 5, 1.0005), self.READ).source[0][1].max() == 1
 
