@@ -52,9 +52,7 @@ def card(contents: dict[str, Any]) -> str:
         "file": f"{contents['bytes'] / 1e6:.1f} MB",
         "drawn with": f"{sampler['method']}, {sampler['steps']} steps",
         "learned from": ", ".join(filter(None, learned_from)) or None,
-        "stage": ", ".join([contents["stage"], *_said({key: stage.get(key) for key in ("loss", "time")})])
-        if contents["stage"]
-        else None,
+        "stage": ", ".join([contents["stage"], *_said({key: stage.get(key) for key in ("loss", "time")})]),
         "starts from": parent and _lineage(parent),
         "budget": f"{steps:,} steps{seen}",
         "seed": config.get("seed"),
