@@ -312,6 +312,14 @@ def weights_hash(checkpoint: Checkpoint) -> str:
     return state_hash(state, json.dumps(meaning, sort_keys=True).encode())[:16]
 
 
+def as_parent(config: Mapping[str, Any], path: Path, step: int, weights: str | None) -> dict[str, Any]:
+    """What a child's config says of the generator that it starts from; of a grown one also what that came from."""
+    before = None if config.get("stage") else config.get("parent")
+    grown_from = {"grown_from": {key: value for key, value in before.items() if key != "path"}} if before else {}
+    stage = (before or {}).get("stage") or (config.get("stage") or {}).get("name", "rectify")
+    return {"path": str(path), "weights": weights, "step": step, "stage": stage, **grown_from}
+
+
 def read_safetensors(path: Path) -> dict[str, Any]:
     """Weights and config of a `.safetensors` of ours, in the shape of our other checkpoints.
 

@@ -7,7 +7,7 @@ import torch
 
 from r2flow.backbones import HDiT, Pyramid
 from r2flow.backbones.base import CommonOptions
-from r2flow.checkpoints import Checkpoint, weights_hash
+from r2flow.checkpoints import Checkpoint, as_parent, weights_hash
 from r2flow.errors import InputError
 from r2flow.generators import Generator, RectifiedFlow, build_generator
 from r2flow.noise import seed_torch
@@ -59,7 +59,7 @@ def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Che
             "ring": checkpoint.config["backbone"].get("ring", True),
             **options,
         },
-        "parent": _parent(checkpoint),
+        "parent": as_parent(checkpoint.config, checkpoint.path, checkpoint.step, weights_hash(checkpoint)),
     }
     larger = _fresh(config)
     assert isinstance(larger, RectifiedFlow)
@@ -107,7 +107,7 @@ def widened(checkpoint: Checkpoint, detail: tuple[int, int] | None = None, posit
         **_reading(checkpoint),
         "generator": checkpoint.config.get("generator") or {"name": "rectified_flow"},
         "backbone": backbone,
-        "parent": _parent(checkpoint),
+        "parent": as_parent(checkpoint.config, checkpoint.path, checkpoint.step, weights_hash(checkpoint)),
     }
     wider = _fresh(config)
     grown = wider.get_submodule("backbone")
@@ -132,10 +132,6 @@ def _fresh(config: dict[str, Any]) -> Generator:
     with torch.random.fork_rng(devices=[]):
         seed_torch(0, "weights")
         return build_generator(config)
-
-
-def _parent(checkpoint: Checkpoint) -> dict[str, Any]:
-    return {"path": str(checkpoint.path), "weights": weights_hash(checkpoint), "step": checkpoint.step}
 
 
 def _reading(checkpoint: Checkpoint) -> dict[str, Any]:

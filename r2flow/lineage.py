@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from r2flow.checkpoints import Checkpoint, load_checkpoint, weights_hash
+from r2flow.checkpoints import Checkpoint, as_parent, load_checkpoint, weights_hash
 from r2flow.config import flatten, groups_of, key_of, rule
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import default_folder
@@ -87,8 +87,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         own = {key.partition(".")[2]: dict(flatten({group: config[group]}))[key] for key in given}
         config[group] = {**there, **own}
     config["generator"] = generator_of(config, parent)
-    stage = (parent.config.get("stage") or {}).get("name", "rectify")
-    config["parent"] = {"path": str(parent.path), "weights": parent.weights, "step": parent.step, "stage": stage}
+    config["parent"] = as_parent(parent.config, parent.path, parent.step, parent.weights)
     data = config["data"]
     if data["name"] == "pairs":
         drawer = _drawer(config, parent)

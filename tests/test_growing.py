@@ -110,6 +110,10 @@ def test_a_grown_flow_is_trained_and_drawn_from(r2flow, saved, tmp_path):  # noq
     assert trained.config["backbone"]["name"] == "pyramid"
     assert trained.sensor.shape == (16, 128)
     assert trained.config["parent"]["weights"] == weights_hash(load_checkpoint(out))
+    assert trained.config["parent"]["grown_from"]["weights"] == weights_hash(load_checkpoint(path))
+    code, said, _ = r2flow("info", tmp_path / "run2", "--card")
+    assert code == 0
+    assert f"grown from a rectify flow of 7 steps, weights {weights_hash(load_checkpoint(path))}" in said
     code, _, said = r2flow("grow", path, tmp_path / "larger.ckpt", "--size", "16x128")
     assert (code, "give a .safetensors" in said) == (2, True)
 
@@ -195,7 +199,7 @@ def test_the_card_of_what_has_not_learned_yet(r2flow, saved, tmp_path):  # noqa:
     out = tmp_path / "wider.safetensors"
     assert r2flow("grow", saved[0], out, "--detail", "2,8")[0] == 0
     code, said, _ = r2flow("info", out, "--card")
-    assert (code, "| starts from | a flow of" in said, "learned from" in said) == (0, True, False)
+    assert (code, "| starts from | a rectify flow of 7 steps" in said, "learned from" in said) == (0, True, False)
 
 
 @pytest.mark.parametrize("position", ["learnable", "fourier_features"])

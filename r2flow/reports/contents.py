@@ -62,6 +62,8 @@ def card(contents: dict[str, Any]) -> str:
 
 
 def _lineage(parent: Mapping[str, Any]) -> str:
+    if "grown_from" in parent:
+        return f"a network of weights {parent['weights']}, grown from {_lineage(parent['grown_from'])}"
     kind = f"a {parent['stage']} flow" if "stage" in parent else "a flow"
     return f"{kind} of {parent['step']:,} steps, weights {parent['weights']}"
 
