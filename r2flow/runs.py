@@ -76,6 +76,8 @@ def _in_todays_keys(config: Mapping[str, Any]) -> dict[str, Any]:
     found = dict(config)
     if "data" in found:
         found["data"] = upgraded(found["data"])
+        if isinstance(found["data"].get("pairs"), Mapping):
+            found["data"]["pairs"] = {"precision": "32-true", **found["data"]["pairs"]}
     callbacks = found.get("callbacks")
     if isinstance(callbacks, Mapping) and isinstance(callbacks.get("ema"), Mapping):
         found["callbacks"] = {**callbacks, "ema": {"rule": "power", **callbacks["ema"]}}

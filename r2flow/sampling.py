@@ -67,7 +67,7 @@ def sample(
             noise as in the whole image.
         channels: `range` or `reflectance` skips the decoding of the other one; `both` takes what the model has.
         progress: Called after every network evaluation of a batch.
-        changes: Single settings of the sampler: steps, method, tolerance, grid.
+        changes: Single settings of the sampler: steps, method, tolerance, grid, precision.
 
     Raises:
         InputError: num or batch_size below 1, a sampler or a channel that the generator does not have, a region that
@@ -115,7 +115,8 @@ def draw(
     if condition is not None:
         condition = {name: value.to(generator.device) for name, value in condition.items()}
     start = time.perf_counter()
-    made = generator.generate(noise, condition, sampler=sampler, draws=draws, progress=progress)
+    with (sampler or generator.sampler).autocast(generator.device):
+        made = generator.generate(noise, condition, sampler=sampler, draws=draws, progress=progress)
     x_1 = made.x.cpu()  # which also waits for a GPU
     seconds = time.perf_counter() - start
     images = generator.space.decode(x_1, channels)

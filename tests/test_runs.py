@@ -58,6 +58,19 @@ def test_a_run_from_before_steps_had_a_grid_goes_on(tmp_path: Path, then: dict, 
     assert contradictions(kept, {**CONFIG, "stage": now}) == []
 
 
+def test_a_run_from_before_pairs_had_a_precision_goes_on(tmp_path: Path):
+    data = {"name": "pairs", "pairs": {"num": 4}}
+    write_config(tmp_path, {**CONFIG, "data": data})
+    kept = read_config(tmp_path)
+    assert kept is not None
+    pairs = {"num": 4, "precision": "32-true"}
+    assert contradictions(kept, {**CONFIG, "data": {**data, "pairs": pairs}}) == []
+    pairs["precision"] = "bf16-mixed"
+    assert contradictions(kept, {**CONFIG, "data": {**data, "pairs": pairs}}) == [
+        "data.pairs.precision=32-true there, bf16-mixed here"
+    ]
+
+
 def test_where_it_computes_may_change_and_what_may_not(tmp_path: Path):
     assert contradictions(CONFIG, changed(trainer__devices=4, data__root="moved")) == []
     assert contradictions(CONFIG, changed(seed=1)) == ["seed=0 there, 1 here"]

@@ -11,6 +11,7 @@ from torch import nn
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
+from r2flow.evaluation.sets import sampled_set
 from r2flow.generators import Field, Sampler, build_generator
 from r2flow.inversion import interpolate_scans, invert, round_trip, slerp
 from r2flow.lidar.encoding import Encoding
@@ -343,12 +344,27 @@ def test_another_method_does_not_take_over_the_grid_of_the_former_one():
         ({"steps": True}, "steps must be a whole number"),
         ({"tolerance": "x"}, "tolerance must be a finite number"),
         ({"method": 3}, "method must be a word"),
+        ({"precision": "bf16"}, "precision must be '32-true' or 'bf16-mixed', found 'bf16'"),
     ],
 )
 def test_settings_of_another_type_are_refused(changes, message):
     with pytest.raises(InputError) as refused:
         next(sample(flow(), 1, **changes))
     assert message in str(refused.value)
+
+
+def test_the_network_is_computed_in_the_precision_that_is_asked_for():
+    one, seen = network(), []
+    linear = next(m for m in one.generator.modules() if type(m) is nn.Linear)
+    linear.register_forward_hook(lambda module, given, made: seen.append(made.dtype))
+    exact, coarse = (next(sample(one, 2, steps=3, precision=name)).images for name in ("32-true", "bf16-mixed"))
+    assert seen == [torch.float32] * 3 + [torch.bfloat16] * 3
+    assert 0 < (exact - coarse).norm() < 2**-4 * exact.norm()  # bfloat16 has 8 bits, of which some products take a few
+    one.generator.sampler = one.generator.sampler.changed(precision="bf16-mixed")
+    assert torch.equal(next(sample(one, 2, steps=3)).images, coarse)
+    assert Sampler.of(one.generator.sampler.asdict()) == one.generator.sampler
+    assert "precision" not in Sampler().asdict()  # as files of 0.1.0 are
+    assert sampled_set(one, "", 2).about != sampled_set(network(), "", 2).about
 
 
 def test_settings_may_be_numpy_s_and_torch_s():

@@ -49,6 +49,11 @@ sample -c run -o out --num 1.5
 sample -c run -o out --steps 0
 sample -c run -o out --steps a
 sample -c run -o out --solver nope
+sample -c run -o out --precision 16-mixed # precision must be '32-true' or 'bf16-mixed'
+sample -c run -o out --error 0.1m --precision bf16-mixed # leave solver, steps, tolerance, grid and precision out
+pairs -c run --precision bf16 # precision must be '32-true' or 'bf16-mixed'
+evaluate simulated:1 run --precision half # precision must be '32-true' or 'bf16-mixed'
+complete scans -c run -o out --precision half # precision must be '32-true' or 'bf16-mixed'
 sample -c run -o out --solver torchdiffeq:nope
 sample -c run -o out --tolerance 0
 sample -c run -o out --tolerance nan
@@ -603,6 +608,7 @@ name=x stage=reflow stage.init=run
 name=x stage=reflow data=pairs stage.init=run data.pairs.num=0
 name=x stage=reflow data=pairs stage.init=run data.pairs.method=eulr
 name=x stage=reflow data=pairs stage.init=run data.pairs.steps=0
+name=x stage=reflow data=pairs stage.init=run data.pairs.precision=half
 name=x stage=reflow data=pairs stage.init=run data.pairs.tolerance=0
 name=x stage=reflow data=pairs stage.init=run data.pairs.shard_mib=0
 name=x stage=reflow data=pairs stage.init=run data.pairs.batch_size=0

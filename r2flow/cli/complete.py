@@ -13,6 +13,7 @@ from r2flow.cli.options import (
     ColumnsOption,
     DeviceOption,
     OutOption,
+    PrecisionOption,
     SurfacesOption,
     build_sized,
     choose_device,
@@ -79,6 +80,7 @@ def complete(
         Path | None,
         typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model; street if left out."),
     ] = None,
+    precision: PrecisionOption = None,
 ) -> None:
     """Complete scans: from fewer beams to more, from a part to the whole, from a bad measurement to a good one.
 
@@ -109,7 +111,7 @@ def complete(
     doubtful = known.keep != "exact"
     if doubtful and not loaded.generator.told:
         print("this model was not trained on faulty measurements and mends them badly: give one of stage=conditional")
-    sampler = completing(loaded.generator, solver.change(completing(loaded.generator)))
+    sampler = completing(loaded.generator, solver.change(completing(loaded.generator), precision=precision))
     for line in said:
         print(line)
     for ending in sorted({scan.ending for scan in scans if answer_ending(loaded, scan) != scan.ending}):

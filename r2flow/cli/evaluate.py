@@ -13,7 +13,7 @@ import typer
 
 from r2flow.cli.app import app, report
 from r2flow.cli.groups import ReadingOptions, SolverOptions, WorkOptions, grouped
-from r2flow.cli.options import SETS, OutOption, choose_device, choose_reading, takes_tolerance
+from r2flow.cli.options import SETS, OutOption, PrecisionOption, choose_device, choose_reading, takes_tolerance
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -90,6 +90,7 @@ class SamplingOptions:
         typer.Option(help="Of the sampled flow: euler, heun2, dopri5, ...; of a curve, several as ddpm,adams3."),
     ] = None
     tolerance: Annotated[float | None, typer.Option(help="Of an adaptive solver.")] = None
+    precision: PrecisionOption = None
     seed: Annotated[int, typer.Option(min=0, help="Of sampled scans.")] = 0
 
 
@@ -219,7 +220,8 @@ def _check_used(files: bool, flows: bool, scans: SetOptions, sampling: SamplingO
     """Refuse options of generated files, or of flows, where there are none."""
     if not flows and sampling != SamplingOptions():
         raise InputError(
-            "--steps, --solver, --tolerance and --seed are of a run, a checkpoint or a model to sample; found none."
+            "--steps, --solver, --tolerance, --precision and --seed are of a run, a checkpoint or a model to sample; "
+            "found none."
         )
     if not files and (scans.generated_split is not None or scans.generated_scale is not None):
         raise InputError("--generated-split and --generated-scale are of files in GENERATED; found none.")
@@ -288,7 +290,7 @@ def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOption
     from r2flow.reports.speed_quality import Drawing, steps_of
 
     solvers: list[str | None] = [*dict.fromkeys(sampling.solver.split(","))] if sampling.solver else [None]
-    drawings = [Drawing(num, sampling.seed, solver, sampling.tolerance) for solver in solvers]
+    drawings = [Drawing(num, sampling.seed, solver, sampling.tolerance, sampling.precision) for solver in solvers]
     steps = _many(sampling.steps)
     for (label, flow), drawing in product(flows.items(), drawings):
         steps_of(flow, label, steps, drawing)
@@ -421,7 +423,8 @@ def _sampled(label: str, flow: "Checkpoint", num: int, sampling: SamplingOptions
         raise InputError(
             f"one comparison takes one number of --steps, found {sampling.steps}; --checkpoint makes a curve."
         )
-    how = SolverOptions(sampling.solver, steps[0], sampling.tolerance).change(flow.generator.sampler)
+    asked = SolverOptions(sampling.solver, steps[0], sampling.tolerance)
+    how = asked.change(flow.generator.sampler, precision=sampling.precision)
     return sampled_set(flow, label, num, how, sampling.seed)
 
 

@@ -13,6 +13,7 @@ from r2flow.cli.options import (
     CheckpointOption,
     DeviceOption,
     OutOption,
+    PrecisionOption,
     SensorOption,
     SizeOption,
     build_sized,
@@ -87,6 +88,7 @@ def sample(
     grid: Annotated[
         str | None, typer.Option(help="Where fixed steps fall: uniform, power:P or power-start:P, as power:1.75.")
     ] = None,
+    precision: PrecisionOption = None,
     error: Annotated[
         str | None, typer.Option(help="Largest error of a scan, as 0.05m of range or 0.002 in model space.")
     ] = None,
@@ -106,9 +108,11 @@ def sample(
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
     loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(draw.device))
     if error is None:
-        sampler = solver.change(loaded.generator.sampler, grid=grid)
-    elif solver != SolverOptions() or grid:
-        raise InputError("--error says how many steps each scan takes: leave solver, steps, tolerance and grid out.")
+        sampler = solver.change(loaded.generator.sampler, grid=grid, precision=precision)
+    elif solver != SolverOptions() or grid or precision:
+        raise InputError(
+            "--error says how many steps each scan takes: leave solver, steps, tolerance, grid and precision out."
+        )
     else:
         sampler = sampler_within(loaded, error)
     formats = format.split(",") if format else formats_of(loaded, part.channels)

@@ -19,6 +19,9 @@ CheckpointOption = Annotated[
     Path, typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model.", show_default=False)
 ]
 DeviceOption = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")]
+PrecisionOption = Annotated[
+    str | None, typer.Option(help="Of the network: 32-true or, in half the time where there is bfloat16, bf16-mixed.")
+]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", show_default=False)]
 SensorOption = Annotated[str, typer.Option(help="Name of the sensor, or the YAML file of your own (r2flow sensor).")]
 SizeOption = Annotated[str | None, typer.Option(help="Rows x columns, as 64x1024; the sensor's own if left out.")]

@@ -8,7 +8,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import SolverOptions, grouped
-from r2flow.cli.options import CheckpointOption, DeviceOption, check_control, choose_device
+from r2flow.cli.options import CheckpointOption, DeviceOption, PrecisionOption, check_control, choose_device
 from r2flow.errors import InputError
 
 
@@ -67,6 +67,7 @@ def pairs(
     grid: Annotated[
         str | None, typer.Option(help="Where fixed steps fall; the solver's usual grid if left out.")
     ] = None,
+    precision: PrecisionOption = None,
     knots: Annotated[int | None, typer.Option(min=1, help="Inner states to keep of each path, for a flow map.")] = None,
 ) -> None:
     """Draw reflow pairs from a flow: what is missing or damaged, as one of any number of processes.
@@ -85,7 +86,7 @@ def pairs(
     rank, ranks, where = share.place()
     flow = load_checkpoint(checkpoint)
     check_finished(checkpoint, flow)
-    asked = {"method": solver.solver, "steps": solver.steps, "tolerance": solver.tolerance}
+    asked = {"method": solver.solver, "steps": solver.steps, "tolerance": solver.tolerance, "precision": precision}
     options = {
         **{key: value for key, value in asked.items() if value is not None},
         "num": num, "batch_size": batch_size, "shard_mib": shard_mib, "seed": seed, "first": first,

@@ -8,6 +8,7 @@ from typing import Any, Self
 from r2flow.data.shards import PairRecipe
 from r2flow.errors import InputError
 from r2flow.flow.solvers import check_knots, check_tolerance, named_grid, usual_grid
+from r2flow.generators.base import Precision
 from r2flow.lidar.scan_files.fields import check_columns
 from r2flow.registry import NonNegative, Positive, check_options
 
@@ -90,6 +91,7 @@ class PairOptions:
     shard_mib: float = 256.0
     seed: int = 0  # of the noise; not the run's: runs of several seeds can share one set of pairs
     first: int | None = None  # index of the first pair; None: behind the pairs that the flow itself was trained on
+    precision: Precision = "32-true"  # of the network
     knots: int | None = None  # inner states of each path to keep with its pair, for stage=flow_map
     of: str | None = None  # the flow that draws them; None: that of stage.init
     parent: str | None = None  # hash of the flow; the run fills it in
@@ -121,6 +123,7 @@ class PairOptions:
         return PairRecipe(
             self.parent or "", shape, self.seed, first, self.method, self.steps, tolerance, self.batch_size,
             shard_batches, None if noise_shape == shape else noise_shape, grid, self.knots or 0,
+            self.precision,
         )  # fmt: skip
 
 

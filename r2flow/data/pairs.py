@@ -133,10 +133,11 @@ def solve_batch(recipe: PairRecipe, generator: Generator, batch: int) -> Block:
     x_0 = torch.stack([pair_noise(recipe, index) for index in range(first, first + recipe.batch_size)])
     x_0 = x_0.to(generator.device)
     end: Generated | Solution
-    if recipe.knots:
-        end = as_flow(generator, "data.pairs.knots").solve(x_0, sampler=recipe.sampler, knots=recipe.knots)
-    else:
-        end = generator.generate(x_0, sampler=recipe.sampler)
+    with recipe.sampler.autocast(generator.device):
+        if recipe.knots:
+            end = as_flow(generator, "data.pairs.knots").solve(x_0, sampler=recipe.sampler, knots=recipe.knots)
+        else:
+            end = generator.generate(x_0, sampler=recipe.sampler)
     x_1, usable = end.x.to(torch.float16).cpu(), end.converged.cpu()
     usable = usable & x_1.isfinite().flatten(1).all(1)
     block = Block(x_1.numpy(), end.evaluations.cpu().numpy().astype(np.int32), usable.numpy())

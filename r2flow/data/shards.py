@@ -27,6 +27,7 @@ from r2flow.data.store import (
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.generators import Sampler
+from r2flow.generators.base import Precision
 
 ELSEWHERE = "data.root=FOLDER (r2flow pairs --out FOLDER)"  # how another folder is given
 STALE = 3600  # seconds after which a temporary file has no writer any more
@@ -48,16 +49,17 @@ class PairRecipe:
     noise_shape: tuple[int, ...] | None = None  # of x_0, where it is not the scan's
     grid: str = "uniform"  # where fixed steps fall
     knots: int = 0  # inner states of each path that are kept with it
+    precision: Precision = "32-true"  # of the network
 
     def describe(self) -> dict[str, Any]:
         """All of it as plain values; what pairs of older versions did not have only where it is not as it was then."""
-        then = {"noise_shape": None, "grid": "uniform", "knots": 0}
+        then = {"noise_shape": None, "grid": "uniform", "knots": 0, "precision": "32-true"}
         return {key: value for key, value in asdict(self).items() if key not in then or value != then[key]}
 
     @property
     def sampler(self) -> Sampler:
         """How the generator is run."""
-        return Sampler(self.method, self.steps, self.tolerance, self.grid)
+        return Sampler(self.method, self.steps, self.tolerance, self.grid).changed(precision=self.precision)
 
     @cached_property
     def digest(self) -> str:

@@ -52,8 +52,8 @@ def sampled_set(flow: Checkpoint, label: str, num: int, sampler: Sampler | None 
         "steps": sampler.steps, "grid": sampler.grid, "finish": sampler.finish, "seed": seed, "noise": "evaluation",
         "reflectance": flow.encoding.reflectance,
     }  # fmt: skip
-    usual, more = Sampler().asdict(), ("tolerance", "levels", "limits")
-    about |= {key: value for key, value in sampler.asdict().items() if key in more and value != usual[key]}
+    usual, more = Sampler().asdict(), ("tolerance", "levels", "limits", "precision")
+    about |= {key: value for key, value in sampler.asdict().items() if key in more and value != usual.get(key)}
     return ScanSet(label, SampledScans(flow, range(num), sampler, seed), flow.sensor, about)
 
 

@@ -1,8 +1,9 @@
 """What every generator has in common: noise in, scan out."""
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +21,8 @@ Condition = Mapping[str, Tensor]
 """What is known of each scan, by name: tensors of shape (B, ...). Which names there are, the generator says."""
 
 Progress = Callable[[], None] | None
+
+Precision = Literal["32-true", "bf16-mixed"]  # words of Lightning's trainer
 
 IMAGE, KNOWN, DOUBTFUL = "image", "known", "doubtful"  # the names of what is known of a part of a scan
 LOGIT, SIGMA = "logit", "sigma"  # and of what a conditional flow finds of these once (`r2flow.generators.conditional`)
@@ -63,6 +66,8 @@ class Sampler:
         doubt: Standard deviation, in model space, of the error of a doubtful value, for a method of
             `r2flow.flow.posterior`. Model space is 2 wide: false returns are further off than a tenth of that, the
             noise of a ranging sensor is far less.
+        precision: Of the network, as `trainer.precision`: `bf16-mixed` computes its products in bfloat16, by
+            `torch.autocast`. States and steps stay as they are.
     """
 
     method: str = "euler"
@@ -74,6 +79,7 @@ class Sampler:
     limits: tuple[float, ...] = ()
     fixed: bool = False
     doubt: Positive = 0.2
+    precision: Precision = "32-true"
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> Self:
@@ -105,6 +111,7 @@ class Sampler:
         given = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in options.items() if v is not None}
         own = vars(self)  # the range of a number is judged with the method that takes it
         odd = {k: v for k, v in given.items() if isinstance(v, tuple) or type(v) is not type(own.get(k))}
+        odd |= {k: v for k, v in given.items() if k == "precision"}
         check_options("sampler", type(self), odd)
         if _kind(given.get("method", self.method)) != _kind(self.method):
             given = {**_usual(given["method"]), "levels": (), "limits": (), **given}
@@ -127,14 +134,18 @@ class Sampler:
         """The grid as solvers take it: by name, or its times in float64."""
         return self.grid if isinstance(self.grid, str) else torch.tensor(self.grid, dtype=torch.float64)
 
+    def autocast(self, device: torch.device) -> AbstractContextManager[Any]:
+        """In which the network is computed with `precision`."""
+        return nullcontext() if self.precision == "32-true" else torch.autocast(device.type, torch.bfloat16)
+
     def unlike(self, other: Self) -> str:
         """What is another one's setting, in words: "steps 5, tolerance 0.1"."""
-        theirs = other.asdict()
-        return ", ".join(f"{key} {value}" for key, value in self.asdict().items() if value != theirs[key])
+        return ", ".join(f"{key} {value}" for key, value in asdict(self).items() if value != getattr(other, key))
 
     def asdict(self) -> dict[str, Any]:
-        """Plain values, as a config or a checkpoint holds them."""
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        """Plain values, as a config or a checkpoint holds them; `precision`, younger than others, if not `32-true`."""
+        found = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        return found if found.pop("precision") == "32-true" else {**found, "precision": self.precision}
 
 
 def _kind(method: str) -> str:
@@ -242,7 +253,7 @@ class Generator(nn.Module):
             InputError: this generator cannot be run so.
         """
         own = self.sampler
-        if sampler != own:
+        if sampler != replace(own, precision=sampler.precision):
             raise InputError(
                 f"a {type(self).__name__} can be run in one way only, {own.method} with {own.steps} "
                 f"step{'s' * (own.steps > 1)}; found {sampler.unlike(own)}."

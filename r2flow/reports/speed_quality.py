@@ -36,10 +36,12 @@ class Drawing:
     seed: int
     method: str | None = None
     tolerance: float | None = None
+    precision: str | None = None
 
     def sampler(self, flow: Checkpoint, steps: int) -> Sampler:
         """How a flow is run at this number of steps."""
-        return flow.generator.sampler.changed(steps=steps, method=self.method, tolerance=self.tolerance)
+        more = {"method": self.method, "tolerance": self.tolerance, "precision": self.precision}
+        return flow.generator.sampler.changed(steps=steps, **more)
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,8 @@ class Curve:
     def key(self, flow: Checkpoint, steps: int, drawing: Drawing) -> str:
         """Of a point; when it changes, the point is measured again."""
         how = drawing.sampler(flow, steps)
-        more = {"bootstrap": self.bootstrap} if self.bootstrap else {}
+        more: dict[str, Any] = {"bootstrap": self.bootstrap} if self.bootstrap else {}
+        more |= {} if how.precision == "32-true" else {"precision": how.precision}
         return point_key(
             self.real, self.metrics, **more, weights=weights_hash(flow), steps=steps, num=drawing.num,
             seed=drawing.seed, method=how.method, grid=how.grid, finish=how.finish, tolerance=how.tolerance,

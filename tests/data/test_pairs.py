@@ -214,6 +214,9 @@ def test_of_two_recipes_begun_at_once_one_is_refused(tmp_path: Path):
 
 def test_one_and_one_point_nought_are_one_tolerance():
     assert PairOptions(tolerance=1).recipe(SHAPE).digest == PairOptions(tolerance=1.0).recipe(SHAPE).digest
+    coarse = PairOptions(precision="bf16-mixed").recipe(SHAPE)
+    assert coarse.sampler.precision == coarse.describe()["precision"] == "bf16-mixed"
+    assert "precision" not in PairOptions().recipe(SHAPE).describe()  # nor in pairs of 0.1.0
 
 
 @pytest.mark.parametrize(("option", "value"), [("first", -5), ("seed", -1), ("shard_mib", math.inf), ("tolerance", 0)])
