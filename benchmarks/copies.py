@@ -16,8 +16,9 @@ from functools import partial
 import numpy as np
 
 from r2flow.data.opening import open_scans
+from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import Reading, ScanSource
+from r2flow.data.sources import ScanSource
 from r2flow.evaluation.measuring import Work
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.neighbours import WAYS, Nearest, described

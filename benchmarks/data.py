@@ -26,7 +26,8 @@ from r2flow.data.opening import find_drives, open_prepared
 from r2flow.data.prepared import Manifest, ScanRecipe, ShardEntry, checksum, describe_sensor, shard_name, write_manifest
 from r2flow.data.preparing import Preparation, plan_files
 from r2flow.data.quantise import RangeCodes
-from r2flow.data.sources import read_scan, spread
+from r2flow.data.reading import read_scan
+from r2flow.data.sources import spread
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from r2flow.data.opening import open_scans
-from r2flow.data.sources import Reading
+from r2flow.data.reading import Reading
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics import METRICS
 from r2flow.metrics.base import ScanMetric, Side

@@ -46,7 +46,8 @@ from damage import CHOOSING, HIDDEN, KINDS, damaged
 from torch import Tensor
 
 from r2flow.checkpoints import load_checkpoint
-from r2flow.data.sources import Reading, SimulatedScans
+from r2flow.data.reading import Reading
+from r2flow.data.sources import SimulatedScans
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
 from r2flow.metrics.extractors import load_extractor

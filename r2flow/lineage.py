@@ -9,7 +9,7 @@ from r2flow.checkpoints import Checkpoint, as_parent, load_checkpoint, weights_h
 from r2flow.config import flatten, groups_of, key_of, rule
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import default_folder
-from r2flow.data.sources import AUTO
+from r2flow.data.reading import AUTO
 from r2flow.errors import InputError
 from r2flow.generators import GENERATORS
 from r2flow.models import name_of

@@ -29,7 +29,7 @@ from r2flow.data.contents import check_contents, record_contents
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import SOURCES, Layout, Prepared, resolve_reflectance
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, SourceOptions
-from r2flow.data.sources import AUTO
+from r2flow.data.reading import AUTO
 from r2flow.errors import InputError
 from r2flow.flow.solvers import check_method
 from r2flow.generators import GENERATORS, Flow, Generator, build_generator

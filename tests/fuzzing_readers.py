@@ -9,8 +9,8 @@ from r2flow.checkpoints import load_checkpoint
 from r2flow.data.contents import check_contents
 from r2flow.data.opening import open_prepared, own_reading
 from r2flow.data.prepared import check_prepared
+from r2flow.data.reading import Reading, read_image
 from r2flow.data.shards import PairRecipe, PairStore
-from r2flow.data.sources import Reading, read_image
 from r2flow.errors import InputError
 from r2flow.lidar.labels import read_labels
 from r2flow.lidar.scan_files import read_points

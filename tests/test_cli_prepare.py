@@ -14,7 +14,7 @@ import yaml
 
 from r2flow.data.opening import open_prepared
 from r2flow.data.prepared import read_manifest
-from r2flow.data.sources import read_scan
+from r2flow.data.reading import read_scan
 from r2flow.lidar.sensors import SENSORS
 from tests.data.conftest import kitti_360, numbered, write_scan  # noqa: F401  fixtures
 from tests.test_cli import r2flow  # noqa: F401  a fixture

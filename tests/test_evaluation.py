@@ -12,7 +12,7 @@ import torch
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.data.opening import open_scans
-from r2flow.data.sources import Reading
+from r2flow.data.reading import Reading
 from r2flow.errors import InputError
 from r2flow.evaluation import measuring
 from r2flow.evaluation.floor import floor_sets

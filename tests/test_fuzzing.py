@@ -19,8 +19,8 @@ from r2flow.checkpoints import load_checkpoint, save_checkpoint
 from r2flow.data.contents import RECORD, record_contents
 from r2flow.data.opening import samples_note, write_samples_note
 from r2flow.data.preparing import Preparation, plan_files
+from r2flow.data.reading import Reading
 from r2flow.data.shards import Block, PairRecipe, PairStore
-from r2flow.data.sources import Reading
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensor_files import write_sensor
 from r2flow.lidar.sensors import SENSORS

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from r2flow.data.opening import open_scans
-from r2flow.data.sources import Reading
+from r2flow.data.reading import Reading
 from r2flow.errors import InputError
 from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
 from r2flow.evaluation.protocols import PAPER, PROTOCOLS, R2FLOW, named_rules, published_choice

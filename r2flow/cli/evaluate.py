@@ -18,8 +18,8 @@ from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.checkpoints import Checkpoint
+    from r2flow.data.reading import Reading
     from r2flow.data.sets import ScanSet
-    from r2flow.data.sources import Reading
     from r2flow.evaluation.measuring import Work
     from r2flow.evaluation.processes import Process
     from r2flow.evaluation.protocols import Rules

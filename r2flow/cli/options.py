@@ -12,7 +12,7 @@ from r2flow.devices import choose_device as choose_device  # for every verb
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
-    from r2flow.data.sources import Reading
+    from r2flow.data.reading import Reading
     from r2flow.lidar.sensors import Sensor
 
 CheckpointOption = Annotated[

@@ -71,7 +71,7 @@ def project(
     import numpy as np
 
     from r2flow.data.opening import open_scans, usual_scale
-    from r2flow.data.sources import Reading
+    from r2flow.data.reading import Reading
     from r2flow.files import atomic_write
 
     chosen = build_sized(sensor, size)

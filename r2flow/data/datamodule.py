@@ -20,8 +20,9 @@ from r2flow.data.mixture import MixedOrder, Mixture, refuse_shared_scans
 from r2flow.data.opening import held_out_options, open_source, split_parts
 from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
 from r2flow.data.pairs import PairDataset, PairSource
+from r2flow.data.reading import Reading
 from r2flow.data.shards import PairStore
-from r2flow.data.sources import InMemory, Reading, ScanSource, holdout_block, spread
+from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor

@@ -8,7 +8,8 @@ from itertools import accumulate
 from pathlib import Path
 
 from r2flow.data.options import SourceOptions
-from r2flow.data.sources import Reading, ScanFiles, ScanSource, lacks_reflectance, warn_of_other_sensor
+from r2flow.data.reading import Reading, lacks_reflectance
+from r2flow.data.sources import ScanFiles, ScanSource, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import ELSEWHERE, FIRM_ENDINGS, LOOSE_ENDINGS
 

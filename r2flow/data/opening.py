@@ -29,17 +29,9 @@ from r2flow.data.options import (
     SourceOptions,
 )
 from r2flow.data.prepared import PreparedScans, find_prepared, read_manifest
+from r2flow.data.reading import AUTO, Reading, lacks_reflectance, range_image
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import (
-    AUTO,
-    Reading,
-    ScanFiles,
-    ScanSource,
-    SimulatedScans,
-    lacks_reflectance,
-    range_image,
-    warn_of_other_sensor,
-)
+from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, warn_of_other_sensor
 from r2flow.data.store import MANIFEST
 from r2flow.errors import InputError
 from r2flow.files import atomic_write

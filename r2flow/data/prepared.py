@@ -50,7 +50,7 @@ class ScanRecipe:
     scans: int
     names: str  # SHA-256 of the names of the scans
     sensor: dict[str, Any]  # `Sensor.described`
-    projection: str  # as in `r2flow.data.sources.Reading`, like the next two
+    projection: str  # as in `r2flow.data.reading.Reading`, like the next two
     convention: str
     reflectance_scale: float
     levels: int | None  # code n of reflectance is n / levels; None where the scans have none

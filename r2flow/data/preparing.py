@@ -35,16 +35,8 @@ from r2flow.data.prepared import (
     write_manifest,
 )
 from r2flow.data.quantise import OTHER_LEVELS, RangeCodes, ReflectanceCodes, find_levels
-from r2flow.data.sources import (
-    Reading,
-    ScanFiles,
-    ScanSource,
-    SimulatedScans,
-    lacks_reflectance,
-    spread,
-    stored_reflectance,
-    warn_of_other_sensor,
-)
+from r2flow.data.reading import Reading, lacks_reflectance, stored_reflectance
+from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, spread, warn_of_other_sensor
 from r2flow.data.store import MANIFEST, clear_leftovers, refuse_other, shard_bytes, warn_damaged
 from r2flow.errors import InputError
 from r2flow.files import atomic_write

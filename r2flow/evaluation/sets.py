@@ -8,8 +8,9 @@ import numpy as np
 from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint, checkpoints_of, weights_hash
+from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet, fixed_choice
-from r2flow.data.sources import Reading, ScanSource
+from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
 from r2flow.generators import Sampler
 from r2flow.models import MODELS

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from r2flow.data.opening import open_scans
-from r2flow.data.sources import Reading
+from r2flow.data.reading import Reading
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.fidelity import PANEL, PER_PIXEL, controls, distances, nearest, panel
 from r2flow.progress import track

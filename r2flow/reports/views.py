@@ -10,15 +10,9 @@ from torch import Tensor
 
 from r2flow.data.opening import find_drives, open_scans, own_reading, parse, usual_reading
 from r2flow.data.options import FOLDER, SIMULATED
+from r2flow.data.reading import range_image, read_labelled_scan
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import (
-    ScanFiles,
-    SimulatedScans,
-    range_image,
-    read_labelled_scan,
-    spread,
-    warn_of_other_sensor,
-)
+from r2flow.data.sources import ScanFiles, SimulatedScans, spread, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.labels import labels_beside
 from r2flow.lidar.sensors import Sensor

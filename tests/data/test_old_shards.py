@@ -13,8 +13,8 @@ from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairSource, make_pairs
 from r2flow.data.prepared import check_prepared, read_manifest
 from r2flow.data.preparing import Plan, Preparation, plan_files
+from r2flow.data.reading import read_scan
 from r2flow.data.shards import PairStore
-from r2flow.data.sources import read_scan
 from r2flow.generators import Field
 from r2flow.lidar.sensors import SENSORS
 from r2flow.noise import standard_normal

@@ -23,9 +23,10 @@ from r2flow.data.opening import (
 from r2flow.data.options import PairOptions, SourceOptions
 from r2flow.data.pairs import PairSource, make_pairs, pair_noise
 from r2flow.data.preparing import Preparation, plan_files
+from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet
 from r2flow.data.shards import PairStore
-from r2flow.data.sources import Reading, ScanSource
+from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
 from r2flow.generators import Field
 from r2flow.lidar.encoding import Encoding

@@ -23,7 +23,8 @@ from r2flow.data.opening import find_drives, open_prepared
 from r2flow.data.prepared import PreparedScans, check_prepared, read_manifest
 from r2flow.data.preparing import Plan, Preparation, plan_files, plan_simulated
 from r2flow.data.quantise import RangeCodes, ReflectanceCodes, find_levels
-from r2flow.data.sources import Reading, ScanFiles, SimulatedScans
+from r2flow.data.reading import Reading
+from r2flow.data.sources import ScanFiles, SimulatedScans
 from r2flow.data.store import MANIFEST
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import FORMATS, Encoding

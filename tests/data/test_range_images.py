@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.data.sources import Reading, range_image, read_image
+from r2flow.data.reading import Reading, range_image, read_image
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
 from tests.test_cli import r2flow  # noqa: F401  a fixture

@@ -6,7 +6,8 @@ import pytest
 
 from r2flow.data.opening import held_out_options, split_parts
 from r2flow.data.options import DataOptions
-from r2flow.data.sources import InMemory, Reading, ScanFiles, SimulatedScans, holdout_block, read_scan, spread
+from r2flow.data.reading import Reading, read_scan
+from r2flow.data.sources import InMemory, ScanFiles, SimulatedScans, holdout_block, spread
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.data.sources import read_labelled_scan
+from r2flow.data.reading import read_labelled_scan
 from r2flow.errors import InputError
 from r2flow.lidar.labels import LABELS, labels_beside, read_labels
 from r2flow.lidar.scan_files import read_points, write_points

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.data.sources import read_scan
+from r2flow.data.reading import read_scan
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import Points, read_points, write_points
 from r2flow.lidar.sensors import SENSORS

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from r2flow.data.sources import read_projected
+from r2flow.data.reading import read_projected
 from r2flow.errors import InputError
 from r2flow.lidar.beams import find_beams
 from r2flow.lidar.projection import project

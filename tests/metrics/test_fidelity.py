@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.data.sources import Reading
+from r2flow.data.reading import Reading
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
 from r2flow.metrics.fidelity import (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from r2flow.data.opening import open_scans
-from r2flow.data.sources import Reading
+from r2flow.data.reading import Reading
 from r2flow.errors import InputError
 from r2flow.evaluation.measuring import Work
 from r2flow.lidar.sensors import SENSORS

@@ -1,0 +1,281 @@
+"""How a scan file, or a range image, becomes an image of one sensor."""
+
+import logging
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from r2flow.errors import InputError
+from r2flow.lidar.labels import labels_beside, read_labels
+from r2flow.lidar.projection import Convention, Projection, image_of, project_indices
+from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
+from r2flow.lidar.scan_files.points import FARTHEST
+from r2flow.lidar.sensors import Sensor
+
+log = logging.getLogger(__name__)
+
+AUTO = "auto"
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How scans of any kind become images of one sensor.
+
+    Attributes:
+        projection, convention: As in `r2flow.lidar.projection.project`.
+        reflectance_scale: The value in the files that means full reflectance; None guesses it from each file, which is
+            good enough for a picture and for nothing else.
+        reflectance: Whether images have reflectance: True needs it of every scan, False leaves it out, `auto` decides
+            by `lacks_reflectance` when the scans are opened.
+        on_bad_scan: What is done with a scan that cannot be used. `error` stops; `skip` takes the next usable scan in
+            its place; `empty` stops too, but a scan without a return in the sensor's view is an empty image: a
+            generator that makes such scans is judged by them.
+        within_limits: Whether a range beyond the sensor's limits in a range image is a dropped ray, as it is in a file
+            of points: what a model is given.
+        columns: What the columns of files without names hold, as in `r2flow.lidar.scan_files.read_points`.
+    """
+
+    sensor: Sensor
+    projection: Projection = "spherical"
+    convention: Convention = "centre"
+    reflectance_scale: float | None = 1.0
+    reflectance: bool | str = AUTO
+    on_bad_scan: str = "empty"
+    within_limits: bool = False
+    columns: tuple[str, ...] | None = None
+
+
+class Projected(NamedTuple):
+    """A scan file, and which of its points each pixel has kept.
+
+    Attributes:
+        image: (2 or 1, H, W).
+        points: All of the file.
+        pixels, chosen: The pixels that keep one, h W + w, and the index of that point, (M,) each.
+    """
+
+    image: np.ndarray
+    points: Points
+    pixels: np.ndarray
+    chosen: np.ndarray
+
+    def spread(self, values: np.ndarray) -> np.ndarray:
+        """Values of the kept points, (M, ...), at their pixels, (H, W, ...); 0 elsewhere."""
+        shape = self.image.shape[1:]
+        found = np.zeros((math.prod(shape), *values.shape[1:]), values.dtype)
+        found[self.pixels] = values
+        return found.reshape(*shape, *values.shape[1:])
+
+
+def read_scan(
+    path: str | Path,
+    sensor: Sensor,
+    projection: Projection = "spherical",
+    convention: Convention = "centre",
+    reflectance: bool = True,
+    reflectance_scale: float | None = 1.0,
+    columns: Sequence[str] | None = None,
+) -> np.ndarray:
+    """One scan file as a range image, (2, H, W); without `reflectance`, (1, H, W). The options are those of `Reading`.
+
+    Raises:
+        InputError: the file cannot be read, no point of it lies in the sensor's view and range (`NoPointsError`), or it
+            has no reflectance, or one beyond the scale, where it is needed.
+    """
+    return read_projected(path, sensor, projection, convention, reflectance, reflectance_scale, columns).image
+
+
+def read_projected(
+    path: str | Path,
+    sensor: Sensor,
+    projection: Projection = "spherical",
+    convention: Convention = "centre",
+    reflectance: bool = True,
+    reflectance_scale: float | None = 1.0,
+    columns: Sequence[str] | None = None,
+) -> Projected:
+    """`read_scan` with the points behind its image.
+
+    Raises:
+        InputError: as `read_scan`.
+    """
+    points = read_points(path, columns)
+    if points.dropped:
+        log.warning(
+            "%s: dropped %d points with NaN or infinite coordinates, or %g m and more away",
+            path, points.dropped, FARTHEST,
+        )  # fmt: skip
+    if projection == "unfolding":
+        points = points.with_lost_rays()
+    scaled = _scaled_reflectance(path, points, reflectance_scale) if reflectance else None
+    pixels, chosen, kept = project_indices(points.xyz, sensor, projection, convention, points.ring)
+    image = image_of(sensor, pixels, kept, None if scaled is None else scaled[chosen])
+    if not image[0].any():
+        raise nothing_in_view(path, points, sensor)
+    return Projected(image if reflectance else image[:1], points, pixels, chosen)
+
+
+def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPointsError:
+    """That a scan has no return that the sensor's image shows."""
+    r = np.linalg.norm(points.xyz, axis=1)
+    return NoPointsError(
+        f"{path}: none of its {len(r)} points lies within {sensor.min_range:g}-{sensor.max_range:g} m and the "
+        f"view of sensor '{sensor.name}' (ranges found: {r.min():.3g}-{r.max():.3g} m). "
+        "Are its units metres and its sensor the configured one?"
+    )
+
+
+def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tuple[np.ndarray, np.ndarray | None]:
+    """The image of `read_scan`, and the semantic id of each pixel's return, (H, W) uint16, 0 where none was kept.
+
+    The ids are None where no labels lie beside the scan.
+
+    Raises:
+        InputError: what `read_scan` refuses, or labels that are damaged or of another scan.
+    """
+    found = read_projected(path, sensor, **options)
+    file = labels_beside(path)
+    if file is None:
+        return found.image, None
+    labels = read_labels(file, path, found.points)[found.chosen].astype(np.uint16)
+    return found.image, found.spread(labels)
+
+
+def _no_reflectance(path: str | Path) -> InputError:
+    return InputError(
+        f"{path} has no reflectance and the config, the model or the first scan of its set has it. In training give "
+        "encoding.reflectance=false for range alone, and no stage.init that has reflectance; in measuring give metrics "
+        "of range."
+    )
+
+
+def _scaled_reflectance(path: str | Path, points: Points, scale: float | None) -> np.ndarray:
+    if points.reflectance is None:
+        raise _no_reflectance(path)
+    highest = float(np.nan_to_num(points.reflectance).max(initial=0))
+    if scale is None:
+        scale = 1.0 if highest <= 1 else max(highest, 255.0)
+    scaled = points.reflectance / np.float32(scale)
+    # NaN compares false: it is refused like a value out of scale.
+    if not (float(scaled.max(initial=0)) <= 1 + 1e-3 and float(scaled.min(initial=0)) >= 0):
+        raise InputError(
+            f"{path}: reflectance must lie in [0, {scale:g}], found up to {highest:g}. "
+            "Say what means full reflectance there, often 255: data.reflectance_scale=255, or the reflectance_scale of "
+            "its part of data.parts, or --reflectance-scale 255."
+        )
+    return scaled
+
+
+def range_image(path: Path, shape: tuple[int, int] | None = None) -> np.ndarray | None:
+    """The range image in a file, `read_range_image`; None where the file holds no range image.
+
+    Raises:
+        InputError: the file cannot be read, or its size is not the (H, W) of `shape`.
+    """
+    array = read_range_image(path)
+    if array is not None and shape is not None and array.shape[1:] != shape:
+        found, wanted = ("x".join(map(str, one)) for one in (array.shape[1:], shape))
+        raise InputError(f"{path} is a range image of {found}, the sensor's is {wanted}; give --size {found}.")
+    return array
+
+
+def read_image(path: Path, reading: Reading) -> np.ndarray:
+    """A scan file or a range image as an image, (2 or 1, H, W).
+
+    Raises:
+        InputError: it cannot be read, has another size, or no reflectance where that is needed; it has no return in the
+            sensor's view and `reading.on_bad_scan` is not `empty`.
+    """
+    sensor, channels = reading.sensor, 1 + bool(reading.reflectance)
+    image = range_image(path, sensor.shape)
+    if image is None:
+        found = _projected(path, reading)
+        return _empty(reading) if found is None else found.image
+    if len(image) < channels:
+        raise _no_reflectance(path)
+    image = image[:channels]
+    return _within_limits(path, image, reading) if reading.within_limits else image
+
+
+def _within_limits(path: Path, image: np.ndarray, reading: Reading) -> np.ndarray:
+    nearest, farthest = reading.sensor.min_range, reading.sensor.max_range
+    seen = (image[0] >= nearest) & (image[0] <= farthest)
+    if not seen.any() and reading.on_bad_scan != "empty":
+        found = image[0][image[0] > 0]
+        ranges = f"; its ranges are {found.min():.4g} to {found.max():.4g}, in metres" if found.size else ""
+        raise NoPointsError(f"{path} has no return from {nearest:g} to {farthest:g} m{ranges}.")
+    image = np.where(seen, image, np.float32(0))
+    highest = image[1:].max(initial=0)
+    if highest > 1 + 1e-3:
+        raise InputError(
+            f"{path}: reflectance of a range image lies in [0, 1], found up to {highest:.4g}; divide it by what means "
+            "full reflectance."
+        )
+    image[1:] = image[1:].clip(0, 1)
+    return image
+
+
+def read_points_image(path: Path, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
+    """A file of points as an image, (2 or 1, H, W), and its pixels' points in metres, (3, H, W) float32, 0 for none.
+
+    Raises:
+        InputError: as `read_image`.
+    """
+    found = _projected(path, reading)
+    if found is None:
+        return _empty(reading), np.zeros((3, *reading.sensor.shape), np.float32)
+    xyz = found.spread(found.points.xyz[found.chosen].astype(np.float32))
+    return found.image, np.ascontiguousarray(np.moveaxis(xyz, -1, 0))
+
+
+def _projected(path: Path, reading: Reading) -> Projected | None:
+    """A file of points; None for one without a return where that may be."""
+    how = reading.projection, reading.convention, bool(reading.reflectance), reading.reflectance_scale, reading.columns
+    try:
+        return read_projected(path, reading.sensor, *how)
+    except NoPointsError:
+        if reading.on_bad_scan != "empty":
+            raise
+        return None
+
+
+def _empty(reading: Reading) -> np.ndarray:
+    return np.zeros((1 + bool(reading.reflectance), *reading.sensor.shape), np.float32)
+
+
+def lacks_reflectance(
+    paths: Iterable[str | Path], on_bad_scan: str = "error", columns: Sequence[str] | None = None
+) -> str | None:
+    """Why scan files count as files without reflectance; None where they have it.
+
+    The one rule, for training, measuring and pictures: the first scan that has a return decides, and reflectance that
+    is 0 throughout is none, because a KITTI .bin has a column for it whatever the sensor reports.
+
+    Raises:
+        InputError: a scan that cannot be read. With `on_bad_scan="skip"` it is passed over; with `empty`, one alone
+            that has no point.
+    """
+    for path in paths:
+        try:
+            found = stored_reflectance(path, columns)
+        except InputError as error:
+            if on_bad_scan == "error" or (on_bad_scan == "empty" and not isinstance(error, NoPointsError)):
+                raise
+            continue
+        if found is None:
+            return f"{path} has no reflectance"
+        if found.size:
+            return None if found.any() else f"the reflectance in {path} is 0 throughout"
+    return "no scan has a return"
+
+
+def stored_reflectance(path: str | Path, columns: Sequence[str] | None = None) -> np.ndarray | None:
+    """The reflectance of all returns of a scan file or a range image, as it is stored; None where there is none."""
+    image = range_image(Path(path))
+    if image is None:
+        return read_points(path, columns).reflectance
+    return image[1][image[0] > 0] if len(image) > 1 else None
