@@ -54,10 +54,12 @@ class CellSettings:
 
     def path(self, subject: PaperRun, sampler: Sampler, steps: int) -> Path:
         """A cell's file, named by everything that it depends on."""
-        grid = {} if sampler.grid == "uniform" else {"grid": sampler.grid}
+        usual = Sampler()
+        more = {key: getattr(sampler, key) for key in ("grid", "precision")}
+        more = {key: value for key, value in more.items() if value != getattr(usual, key)}
         key = point_key(
             self.real, self.metrics, weights=subject.weights, steps=steps, num=self.num, seed=SEED,
-            bootstrap=self.bootstrap, device=self.device, protocol=self.gathered.protocol.name, **grid,
+            bootstrap=self.bootstrap, device=self.device, protocol=self.gathered.protocol.name, **more,
         )  # fmt: skip
         return self.folder / f"{key}.safetensors"
 
