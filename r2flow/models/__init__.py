@@ -37,11 +37,11 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes in any number of evaluations, learned from simulated scans",
-        "e623f8ff5b4ba7c34d11de67d535f3bf9f861d841a320f01ae22819849996496",
+        "1580761c63bdb579cc95185c875501b4a32832e98d1114d875bc72acfbaf2137",
     ),
     street_full=Model(
         "street scenes at 64 x 1024, learned from simulated scans",
-        "20e34aa5c6d6731431ef74aa75b15bae6cc3d97f572140bc889f7ab8acb76392",
+        "149abed5b6b796ee5eb5cac9e7caa21a2799bff45bbdaf1173a061790e720378",
         page="release/street_full.safetensors in the source of r2flow",
     ),
 )
