@@ -205,7 +205,7 @@ class TestBadInput:
             self.check(r2flow(*options, "--grid", grid), out, "power:P or power-start:P with P from 1 to 10", str(grid))
         self.check(r2flow(*options, "--grid", "power:2", "--solver", "dopri5"), out, "dopri5 chooses its own")
         self.check(r2flow(*options, "--error", "0.1m"), out, "are not known yet; measure them: r2flow calibrate")
-        self.check(r2flow(*options, "--error", "0.1m", "--steps", 3), out, "leave solver, steps, tolerance, grid and precision")
+        self.check(r2flow(*options, "--error", "0.1m", "--steps", 3), out, "leave solver, steps, tolerance, grid")
         self.check(
             r2flow("calibrate", "-c", run, "--solver", "bosh3"), out, "only predictor-correctors", "adams3", "'bosh3'"
         )
