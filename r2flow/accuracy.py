@@ -106,4 +106,5 @@ def sampler_within(checkpoint: Checkpoint, error: str) -> Sampler:
     if not checkpoint.accuracy:
         raise InputError(f"the errors of {checkpoint.path} are not known yet; measure them: r2flow calibrate -c RUN.")
     steps, limits = levels(checkpoint.accuracy, value, metres)
-    return replace(checkpoint.generator.sampler, levels=steps, limits=limits)
+    # The errors were measured in float32.
+    return replace(checkpoint.generator.sampler, levels=steps, limits=limits, precision="32-true")

@@ -129,6 +129,8 @@ def test_an_error_out_of_reach_is_refused():
     for text, asked in (("0.05m", (0.05, True)), ("0.02", (0.02, False))):
         sampler = sampler_within(known, text)
         assert (sampler.levels, sampler.limits) == levels([EASY, MIDDLE, FINE], *asked)
+    known.generator.sampler = known.generator.sampler.changed(precision="bf16-mixed")
+    assert sampler_within(known, "0.05m").precision == "32-true"  # in which errors are measured
 
 
 def test_only_predictor_correctors_are_calibrated():
