@@ -34,6 +34,10 @@ class Parent:
     weights: str | None = None
 
 
+# How scans became the images that pairs are of; real scans are read so beside what is learned from pairs.
+READING = ("projection", "convention", "reflectance_scale")
+
+
 def find_parent(config: Mapping[str, Any]) -> tuple[Parent, Checkpoint] | None:
     """The trained flow that a config's `stage.init` names, if it names one.
 
@@ -93,6 +97,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         drawer = _drawer(config, parent)
         data["root"] = data["root"] or str(default_folder(drawer.path))
         data["pairs"] = pairs_of(drawer, data["pairs"] or {}, drawer.weights)
+        data |= {key: value for key, value in drawer.config.get("data", {}).items() if key in READING}
     return config
 
 

@@ -310,6 +310,18 @@ def test_with_scans_beside_the_pairs_velocities_are_those_of_the_scans_and_jumps
         torch.testing.assert_close(aims[0][row], slope[row])
 
 
+def test_jumps_have_a_loss_of_their_own_beside_that_of_velocities(monkeypatch):
+    """Of an estimate of 0: mean absolute values of the jumps' targets, mean squares of the velocities'."""
+    batch = batch_of()
+    learned = stage(objective="knots", loss="mse", jump_loss="absolute").eval()
+    t, s = torch.tensor([0.0, 0.3, 0.5, 1.0]), torch.tensor([1.0, 0.3, 0.75, 1.0])
+    learned.jumps = lambda u: (t, s)  # type: ignore[assignment]
+    monkeypatch.setattr(learned.generator, "mean_velocity", lambda t, x, s: torch.zeros_like(x), raising=False)
+    slope = (batch["x_1"] - batch["x_0"]).flatten(1)
+    expected = (slope[[0, 2]].abs().mean(1).sum() + slope[[1, 3]].square().mean(1).sum()) / 4
+    torch.testing.assert_close(learned.regression_loss(batch, batch["u"]), expected)
+
+
 def test_scans_beside_pairs_are_for_objectives_on_the_parents_own_paths():
     scans = {"name": "simulated", "scenes": 4}
     assert stage({**DATA, "scans": scans}, objective="knots").objective is not None

@@ -85,6 +85,17 @@ def test_pairs_are_images_of_the_parents_sensor(parent: Path):
         completed(config, ["sensor.rows=16"])
 
 
+def test_what_is_learned_from_pairs_reads_real_scans_as_the_flow_that_drew_them(tmp_path: Path):
+    read = {"projection": "unfolding", "convention": "reference", "reflectance_scale": 255.0}
+    config = {**CONFIG, "data": {**CONFIG["data"], **read}}
+    state, path = build_stage(config, build_generator(config)).state_dict(), tmp_path / "parent.ckpt"
+    AtomicCheckpointIO().save_checkpoint({"state_dict": state, "config": config, "global_step": 7}, path)
+    usual = {"projection": "spherical", "convention": "centre", "reflectance_scale": None}
+    data = {"name": "pairs", "root": None, "pairs": {}, **usual}
+    child = completed({**CONFIG, "data": data, "stage": {"name": "reflow", "init": str(path)}}, [])
+    assert {key: child["data"][key] for key in read} == read
+
+
 def test_pairs_can_be_those_of_another_flow(parent: Path, tmp_path: Path):
     def written(name: str, rows: int) -> Path:
         config = sized(CONFIG, rows, 64)
@@ -142,5 +153,5 @@ def test_a_network_inside_another_looks_elsewhere_too():
 
 def test_weights_that_belong_to_a_place_do_not_move():
     theirs, ours = (build_generator(sized(CONFIG, *size, position="learnable")) for size in ((8, 64), (16, 128)))
-    with pytest.raises(InputError, match=r"weights for images of 1x8x64 alone .*found 1x16x128: leave sensor out"):
+    with pytest.raises(InputError, match=r"weights for images of 1x8x64 .*found 1x16x128: leave sensor out"):
         ours.start_from(theirs)

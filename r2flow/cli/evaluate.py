@@ -279,7 +279,11 @@ def _compare(job: Job, judged: "dict[str, ScanSet]", measured: MeasureOptions, o
         for path in write_page(page, output.out):
             print(path)
         print(
-            write_sets(output.out / "evaluation.html", {"real": job.truth, **judged}, title="Generated and real scans")
+            write_sets(
+                output.out / "evaluation.html",
+                {"real": job.truth} | {"real, judged" if name == "real" else name: one for name, one in judged.items()},
+                title="Generated and real scans",
+            )
         )
 
 

@@ -39,8 +39,8 @@ class RegionOptions:
         typer.Option(
             min=0,
             max=180,
-            help="Degrees on either side of --sector that are generated and cut off: error .065 without, "
-            ".015 with 11.25, which is the default, .006 with 45.",
+            help="Degrees on either side of --sector that are generated and cut off; 11.25 if left out. What that "
+            "changes depends on the model: r2flow report savings.",
         ),
     ] = None
     rows: Annotated[str | None, typer.Option(help="Rows of the image, as 0-31 for the upper half of 64.")] = None

@@ -136,6 +136,9 @@ class Diffusion(NetworkFlow):
             raise InputError(f"{sampler.method} has neither levels nor a finish; leave them out, or give a solver.")
         self._log_snrs(sampler)
 
+    def draws_noise(self, sampler: Sampler) -> bool:
+        return bool(eta_of(sampler.method)) or super().draws_noise(sampler)
+
     def evaluations_of(self, sampler: Sampler) -> int:
         return super().evaluations_of(sampler) if eta_of(sampler.method) is None else sampler.steps
 

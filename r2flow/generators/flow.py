@@ -285,8 +285,9 @@ class NetworkFlow(Flow):
             if sized:
                 here, there = ("x".join(map(str, one.space.shape)) for one in (self, parent))
                 raise InputError(
-                    f"the network to start from has weights for images of {there} alone ('{sized[0]}'), found {here}: "
-                    "leave sensor out, or start from one that was trained with backbone.position=none."
+                    f"the network to start from has weights for images of {there} ('{sized[0]}'), found {here}: leave "
+                    f"sensor out, give sensor.rows={parent.space.shape[1]} sensor.columns={parent.space.shape[2]}, or "
+                    "start from one that was trained with backbone.position=none."
                 )
         self._take(parent, {**new, **theirs})
 

@@ -39,6 +39,11 @@ MODELS: Registry[Model] = Registry(
         "street scenes in any number of evaluations, learned from simulated scans",
         "1580761c63bdb579cc95185c875501b4a32832e98d1114d875bc72acfbaf2137",
     ),
+    street_few=Model(
+        "street scenes in one or two evaluations, learned from simulated scans",
+        "7aa54e44670176046dd197d85f3912fc07bcca2d2eb35b7a1cacd745a99d0d52",
+        page="release/street_few.safetensors in the source of r2flow",
+    ),
     street_full=Model(
         "street scenes at 64 x 1024, learned from simulated scans",
         "149abed5b6b796ee5eb5cac9e7caa21a2799bff45bbdaf1173a061790e720378",

@@ -120,16 +120,16 @@ def published_cfg(config: Mapping[str, Any]) -> dict[str, Any]:
     rows, columns = built.shape
     defaults = {key: list(v) if isinstance(v, tuple) else v for key, v in options_of(BACKBONES[name], given=1).items()}
     backbone = {**defaults, **backbone}
-    position = backbone["position"]
+    position, data = backbone["position"], config.get("data") or {}  # a grown network has learned from none yet
     architecture = next(theirs for theirs, ours in ARCHITECTURES.items() if ours == name)
     return {
         "data": {
-            "dataset": config["data"]["name"],
+            "dataset": data.get("name", "kitti_360"),
             "data_format": encoding["format"],
             "train_reflectance": encoding["reflectance"],
             "min_depth": sensor.get("min_range") or built.min_range,
             "max_depth": sensor.get("max_range") or built.max_range,
-            "projection": f"{config['data'].get('projection', 'spherical')}-{columns}",
+            "projection": f"{data.get('projection', 'spherical')}-{columns}",
             "resolution": [rows, columns],
         },
         "model": {
@@ -144,7 +144,7 @@ def published_cfg(config: Mapping[str, Any]) -> dict[str, Any]:
             "gn_num_groups": backbone.get("groups", 8),
             "gn_eps": backbone.get("eps", 1e-6),
         },
-        "training": {"batch_size": config["data"].get("batch_size", 8)},
+        "training": {"batch_size": data.get("batch_size", 8)},
     }
 
 

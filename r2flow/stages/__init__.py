@@ -1,6 +1,7 @@
 """LightningModules: how a generator is learned."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from r2flow.data.augment import Augmentation
@@ -74,7 +75,7 @@ def _sampler(generator: Generator, wanted: Mapping[str, Any]) -> Sampler:
     """
     own = generator.sampler
     found = own.changed(**wanted)
-    if own.fixed and found != own:
+    if own.fixed and replace(found, precision=own.precision) != own:
         raise InputError(
             f"this flow learns {own.steps} steps of {own.method} and is run by these alone: leave sampler.* out; in a "
             "chain give it to one link, as chain.rf1.sampler.steps=32."

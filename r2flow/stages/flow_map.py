@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
+from r2flow.flow.losses import LOSSES
 from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots, corrected, solved
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
@@ -30,6 +31,9 @@ class LearnFlowMap(Reflow):
         jumps: Options of `r2flow.flow.maps.JumpTimes`.
         rho: Where the share rho ends that a bootstrapped objective takes from the path: it falls from 1, by equal
             factors, over the run. It is always 1 where s = t and, on pairs, for the jump from 0 to 1.
+        jump_loss: Name of the loss of jumps in `r2flow.flow.losses.LOSSES`; None: `loss`, which velocities have. By
+            `absolute` a jump that the network cannot know goes to the median of each element, which has edges, and not
+            to the mean, which blurs them.
     """
 
     generator_name = "flow_map"
@@ -42,6 +46,7 @@ class LearnFlowMap(Reflow):
         jumps: Mapping[str, Any] | None = None,
         rho: Positive = 0.01,
         loss: str = "pseudo_huber",
+        jump_loss: str | None = None,
         **options: Any,
     ) -> None:
         if options.pop("time", None) is not None:
@@ -50,6 +55,7 @@ class LearnFlowMap(Reflow):
         if not isinstance(generator, FlowMap):
             raise InputError(f"this stage learns jumps, which a {type(generator).__name__} does not have.")
         self.objective, self.objective_name, self.rho = OBJECTIVES[objective], objective, rho
+        self.jump_loss = LOSSES[jump_loss or loss]
         check_options("stage.jumps", JumpTimes, jumps or {})
         self.jumps = JumpTimes(**(jumps or {}))
         self.on_pairs = True
@@ -96,7 +102,8 @@ class LearnFlowMap(Reflow):
             x_t, v = interpolate(batch["noise"], batch["scan"], t)
             velocity = expand_time(t == s, x_t)
             aim = Aim(torch.where(velocity, x_t, aim.x_t), torch.where(velocity, v, aim.target))
-        return self.loss(u_ts(t, aim.x_t, s), aim.target).mean()
+        estimate = u_ts(t, aim.x_t, s)
+        return torch.where(t == s, self.loss(estimate, aim.target), self.jump_loss(estimate, aim.target)).mean()
 
 
 class _Kept(list[FlowMap]):

@@ -23,7 +23,7 @@ class Rectify(SingleLoss):
         options: Those of `Stage`.
 
     Raises:
-        InputError: the generator has no velocity; an unknown loss or density.
+        InputError: the generator has no velocity, or is told what this stage does not give; an unknown loss or density.
     """
 
     def __init__(
@@ -32,6 +32,11 @@ class Rectify(SingleLoss):
         super().__init__(generator, **options)
         if not isinstance(generator, Flow):
             raise InputError(f"this stage learns a velocity, which a {type(generator).__name__} does not have.")
+        if generator.told and type(self).condition is Rectify.condition:
+            raise InputError(
+                f"a {type(generator).__name__} is told a part of each scan, and this stage tells it nothing: give "
+                "stage=conditional (or regress, conditional_map), as it was trained."
+            )
         self.loss = LOSSES[loss]
         self.time = TIMES.build(time or {"name": "uniform"})
 

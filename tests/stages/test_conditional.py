@@ -57,6 +57,14 @@ def measured(images: torch.Tensor, text: str = "rows:4") -> torch.Tensor:
     return ray_states(images, mask)
 
 
+@pytest.mark.parametrize("name", ["conditional_flow", "conditional_map", "regression"])
+@pytest.mark.parametrize("stage", ["rectify", "reflow"])
+def test_a_stage_that_tells_nothing_refuses_a_generator_that_is_told(name, stage):
+    config = {"data": {"name": "simulated", "batch_size": 4}, "seed": 0, "stage": {"name": stage}}
+    with pytest.raises(InputError, match=r"is told a part of each scan.*stage=conditional"):
+        build_stage({**CONFIG, **config}, built(name))
+
+
 def test_known_values_are_encoded_and_the_rest_is_a_guess(flow, scans):
     state = measured(scans)
     told = condition_of(flow.space, scans, state)

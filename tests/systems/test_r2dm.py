@@ -23,6 +23,7 @@ from r2flow.diffusion.objectives import ERRORS, PREDICTIONS, mean_errors, weight
 from r2flow.diffusion.sampling import eta_of, forward_step, noised, repaint, step, walk
 from r2flow.errors import InputError
 from r2flow.generators import Diffusion, Sampler, build_generator
+from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.region import Region
@@ -487,6 +488,14 @@ def test_a_sampler_that_a_diffusion_does_not_have_is_refused(exact, case):
     method, _, finish = case.partition(" ")
     with pytest.raises(InputError, match=REFUSED[case]):
         exact.check_sampler(Sampler(method, 4, finish=0.1 if finish else 0.0))
+
+
+@pytest.mark.parametrize(("method", "draws"), [("ddpm", True), ("ddim:0.3", True), ("ddim", False), ("adams3", False)])
+def test_which_samplers_draw_noise_on_the_way(exact, method, draws):
+    """What is straightened is drawn by none of them: its pairs belong to their first noise."""
+    exact.sampler = Sampler(method, 4)
+    assert exact.draws_noise(exact.sampler) is draws
+    assert not exact.draws_noise(ode_sampler(exact))
 
 
 def test_what_a_diffusion_cannot_do_is_said(exact):
