@@ -369,7 +369,7 @@ def test_its_jumps_are_learned_from_its_parent_as_it_was(flow, scans):
     stage._trainer = type("Trainer", (), {"max_steps": 4, "global_step": 0})()
     stage._parent[0].velocity = None  # type: ignore[assignment]  # it is asked as a map, s = t
     aims = []
-    stage.loss = lambda found, target: aims.append(target) or (found - target).square()  # type: ignore[assignment]
+    stage.loss = lambda found, target: aims.append(target) or found.flatten(1).mean(1)  # type: ignore[assignment]
     stage.train()
     for _ in range(2):
         stage.regression_loss(batch, batch["u"])
@@ -409,7 +409,7 @@ def test_on_scans_the_validation_loss_is_that_of_velocities(jumps, scans):
     stage.on_pairs = False
     batch = {**batch_of(scans, jumps.space), **condition_of(jumps.space, scans, measured(scans))}
     asked = []
-    stage.loss = lambda found, target: asked.append(target) or (found - target).flatten(1)  # type: ignore[assignment]
+    stage.loss = lambda found, target: asked.append(target) or found.flatten(1).mean(1)  # type: ignore[assignment]
     jumps_before = jumps.mean_velocity
     times = []
     stage.generator.mean_velocity = lambda t, x, s, y: times.append((t, s)) or jumps_before(t, x, s, y)  # type: ignore[method-assign]
