@@ -156,7 +156,9 @@ def complete(
     if on_surfaces is None:
         on_surfaces = not isinstance(generator, Regression)
     last = _Last(images, state, keep == "mend", on_surfaces)
-    yield from _answers(generator, how, last, condition, num, seed, batch_size, first, progress)
+    # A method that reads the condition has nothing to do without one.
+    plain = generator.sampler.changed(precision=changes.get("precision")) if completes(how.method) else how
+    yield from _answers(generator, how, plain, last, condition, num, seed, batch_size, first, progress)
 
 
 def settled(r: Tensor, surface: Tensor, error: Tensor) -> Tensor:
@@ -183,6 +185,7 @@ def settled(r: Tensor, surface: Tensor, error: Tensor) -> Tensor:
 def _answers(
     generator: Generator,
     how: Sampler,
+    plain: Sampler,
     last: "_Last",
     condition: Condition,
     num: int,
@@ -193,8 +196,6 @@ def _answers(
 ) -> Iterator[Completed]:
     images = last.images
     told = [_told(condition, i) for i in range(len(images))]
-    # A method that reads the condition has nothing to do without one.
-    plain = generator.sampler if completes(how.method) else how
     pairs = ((i, a) for i in range(len(images)) for a in range(num))
     done: list[Samples] = []
     for said, group in groupby(pairs, key=lambda pair: told[pair[0]]):

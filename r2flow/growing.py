@@ -124,7 +124,7 @@ def widened(checkpoint: Checkpoint, detail: tuple[int, int] | None = None, posit
         assert grown.detail is not None
         grown.detail.take_over(network.detail)
     wider.sampler = checkpoint.generator.sampler
-    return Checkpoint(wider.eval(), config)
+    return Checkpoint(wider.eval(), config, accuracy=checkpoint.accuracy)
 
 
 def _fresh(config: dict[str, Any]) -> Generator:

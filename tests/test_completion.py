@@ -85,6 +85,13 @@ def test_a_scan_of_which_nothing_is_known_is_the_sample_of_its_number():
     assert torch.equal(later.images, found[2, :1])
 
 
+def test_a_scan_of_which_nothing_is_known_is_drawn_in_the_precision_that_was_asked_for():
+    flow = network("rectified_flow")
+    nothing, coarse = torch.zeros(1, 2, *SHAPE), flow.sample(1, precision="bf16-mixed")
+    assert not torch.equal(coarse, flow.sample(1))
+    assert torch.equal(flow.complete(nothing, precision="bf16-mixed")[:, 0], coarse)
+
+
 def test_an_answer_depends_on_seed_scan_and_its_number_alone():
     images = scans(3)
     state = halved(images)

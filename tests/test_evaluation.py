@@ -238,6 +238,12 @@ class TestSets:
             write_points(generated / f"{number:06d}.ply", *image_to_points(image, SENSOR.rays()))
         assert open_scans(str(generated), READING).source.names == [f"{n:06d}.npy" for n in range(10)]
 
+    def test_a_pcd_and_a_pcd_bin_of_a_name_are_one_sample(self, tmp_path):
+        cloud = image_to_points(images(1, 2)[0], SENSOR.rays())
+        write_points(tmp_path / "a.pcd", *cloud)
+        np.column_stack([*cloud, np.zeros(len(cloud[0]))]).astype("<f4").tofile(tmp_path / "a.pcd.bin")
+        assert open_scans(str(tmp_path), READING).source.names == ["a.pcd.bin"]
+
     def test_a_layout_with_its_split_and_drives(self, kitti_360):  # noqa: F811
         found = open_scans(f"kitti_360:{kitti_360}", READING, "test")
         assert len(found) == 6

@@ -1,5 +1,7 @@
 """Larger networks out of trained ones."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -7,10 +9,12 @@ from torch import Tensor
 from r2flow.checkpoints import Checkpoint, load_checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.generators import RectifiedFlow, Sampler, build_generator
+from r2flow.generators.budgets import Budget
 from r2flow.growing import grown, widened
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 
+MEASURED = (Budget(8, (0.01, 0.02), (0.1, 0.4), (0.05, 0.06)),)
 STREET_LIKE = {**CONFIG, "backbone": {**CONFIG["backbone"], "position": "none"}}
 
 
@@ -123,10 +127,12 @@ def test_a_grown_flow_is_trained_and_drawn_from(r2flow, saved, tmp_path):  # noq
 def test_a_wider_one_draws_the_same(generator, before):
     small = flow(generator={"name": generator}, backbone={**STREET_LIKE["backbone"], "detail": before})
     small.generator.sampler = Sampler("euler", 3)
+    small = replace(small, accuracy=MEASURED)
     wider = widened(small, (3, 24))
     assert type(wider.generator) is type(small.generator)
     assert wider.config["backbone"]["detail"] == [3, 24]
     assert wider.config["parent"]["weights"] == weights_hash(small)
+    assert wider.accuracy == small.accuracy == MEASURED  # the same scans have the same errors
     expected = small.sample(2)
     assert expected.std() > 1
     assert torch.allclose(wider.sample(2), expected, atol=1e-3)  # metres

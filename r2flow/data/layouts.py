@@ -218,8 +218,13 @@ def _elsewhere(root: Path) -> str:
 
 
 def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:
-    chosen = {os.path.splitext(path)[0]: path for path in sorted(paths, key=lambda p: p.endswith(".npy"))}
+    chosen = {_without_ending(path): path for path in sorted(paths, key=lambda p: p.endswith(".npy"))}
     return paths if len(chosen) == len(paths) else tuple(sorted(chosen.values()))
+
+
+def _without_ending(path: str) -> str:
+    stem, ending = os.path.splitext(path)
+    return stem.removesuffix(".pcd") if ending == ".bin" else stem
 
 
 def spans_of(drives: Sequence[Drive]) -> list[range]:

@@ -30,6 +30,8 @@ from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 
 ELSEWHERE = "data.root=FOLDER (r2flow pairs --out FOLDER)"  # how another folder is given
+# What pairs of older versions did not have, as it was then.
+THEN: dict[str, Any] = {"noise_shape": None, "grid": "uniform", "knots": 0, "precision": "32-true"}
 STALE = 3600  # seconds after which a temporary file has no writer any more
 
 
@@ -52,9 +54,8 @@ class PairRecipe:
     precision: Precision = "32-true"  # of the network
 
     def describe(self) -> dict[str, Any]:
-        """All of it as plain values; what pairs of older versions did not have only where it is not as it was then."""
-        then = {"noise_shape": None, "grid": "uniform", "knots": 0, "precision": "32-true"}
-        return {key: value for key, value in asdict(self).items() if key not in then or value != then[key]}
+        """All of it as plain values; what pairs of older versions did not have only where it is not as `THEN`."""
+        return {key: value for key, value in asdict(self).items() if key not in THEN or value != THEN[key]}
 
     @property
     def sampler(self) -> Sampler:
@@ -126,7 +127,7 @@ class PairStore:
             found = dict(json.loads(path.read_text(encoding="utf-8"))["recipe"])
         except (ValueError, KeyError, TypeError):
             raise InputError(f"{path} is damaged. Delete it: the shards beside it know their recipe.") from None
-        refuse_other(self.folder, "pairs", found, self.recipe.describe(), ELSEWHERE)
+        refuse_other(self.folder, "pairs", found | THEN | found, asdict(self.recipe), ELSEWHERE)
 
     def begin(self) -> None:
         """Write the manifest where there is none, and clear away what killed writers left."""

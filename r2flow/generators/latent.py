@@ -122,8 +122,10 @@ class LatentDiffusion(Generator):
 
     def check_sampler(self, sampler: Sampler) -> None:
         ddim_walk(self.alpha_bar, sampler.steps, _eta(sampler.method))
-        if sampler != Sampler(sampler.method, sampler.steps, sampler.tolerance):
-            raise InputError("a latent diffusion's steps are its own: leave the time grid, finish and levels out.")
+        plain = Sampler(sampler.method, sampler.steps, sampler.tolerance, precision=sampler.precision)
+        if sampler != plain:
+            other = sampler.unlike(plain)
+            raise InputError(f"a latent diffusion's steps are its own: leave out what is other, {other}.")
 
     def evaluations_of(self, sampler: Sampler) -> int:
         return len(ddim_walk(self.alpha_bar, sampler.steps, 0.0).times)

@@ -455,6 +455,13 @@ def test_a_sampler_that_a_latent_diffusion_does_not_have_is_refused(changes: dic
         generator.check_sampler(generator.sampler.changed(**changes))
 
 
+def test_a_latent_diffusion_names_what_is_other_and_takes_any_precision():
+    generator = build_generator(DIFFUSION)
+    generator.check_sampler(generator.sampler.changed(precision="bf16-mixed"))
+    with pytest.raises(InputError, match=r"leave out what is other, finish 0\.1\.$"):
+        generator.check_sampler(generator.sampler.changed(precision="bf16-mixed", finish=0.1))
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

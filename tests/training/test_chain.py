@@ -17,6 +17,7 @@ from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint,
 from r2flow.composing import compose, override
 from r2flow.errors import InputError
 from r2flow.models import find_model
+from r2flow.training import build
 from tests.training.conftest import (
     TINY,
     Done,
@@ -180,6 +181,7 @@ def test_a_killed_chain_ends_as_the_one_left_alone(
         (["experiment=reflow", "stage.init=RF1", "data.augment.flip=true"], "data.augment changes scans"),
         (["experiment=reflow", "stage.init=RF1", "data.pairs.num=0"], "num, batch_size, steps must be at least 1"),
         (["experiment=reflow", "stage.init=RF1", "data.pairs.method=dopri"], "Did you mean 'dopri5'"),
+        (["experiment=reflow", "stage.init=RF1", "data.pairs.method=jump"], "no solver named 'jump'"),
         (["experiment=reflow", "stage.init=RF1"], "holds other pairs: method is midpoint there, adams3 here"),
         (
             ["experiment=distill", "stage.init=RF1", "stage.steps=0", "data.root=x"],
@@ -210,6 +212,13 @@ def test_an_unfinished_parent_is_refused_and_its_checkpoint_taken(chained: tuple
     done = train_child(tmp_path, *overrides, f"stage.init={before}")
     assert done.returncode == 0, done.stderr
     assert (parent / "pairs" / "manifest.json").is_file()
+
+
+def test_pairs_of_a_flow_map_can_be_its_jumps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    given = ["stage.init=street", "data.root=pairs", "data.pairs.method=jump", "data.pairs.steps=4", "trainer=cpu"]
+    run = build(compose(["experiment=reflow", *given]))
+    assert run.data.pairs.recipe(run.data.encoding.shape).method == "jump"
 
 
 @pytest.mark.slow
