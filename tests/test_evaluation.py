@@ -17,7 +17,7 @@ from r2flow.errors import InputError
 from r2flow.evaluation import measuring
 from r2flow.evaluation.floor import floor_sets
 from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
-from r2flow.evaluation.sets import ScanSet, fixed_choice, sampled_set
+from r2flow.evaluation.sets import ScanSet, fixed_choice, reading_of_flow, sampled_set
 from r2flow.evaluation.statistics import FORMAT, Cache, key_of
 from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
@@ -258,6 +258,13 @@ class TestSets:
         assert len(found) == 2
         assert found.about["seed"] == 3
         np.testing.assert_array_equal(found.source[1], open_scans("simulated:3", READING, num=3).source[1])
+
+    def test_scans_are_read_as_all_parts_of_a_mixture_were(self):
+        parts = [{"convention": "reference", "reflectance_scale": 255.0}, {"convention": "reference"}]
+        learned = flow()
+        learned.config["data"] = {"name": "mixed", "convention": "centre", "reflectance_scale": 1.0, "parts": parts}
+        found = reading_of_flow(learned)
+        assert (found.projection, found.convention, found.reflectance_scale) == ("spherical", "reference", 1.0)
 
     def test_a_flow_is_sampled_from_the_noise_of_evaluations(self):
         drawn = sampled_set(flow(), "flow", 5, Sampler("euler", 1), seed=9)

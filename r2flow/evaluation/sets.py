@@ -30,10 +30,14 @@ def is_checkpoint(text: str) -> bool:
 
 
 def reading_of_flow(flow: Checkpoint) -> Reading:
-    """How a generator's training scans became images."""
+    """How a generator's training scans became images; of a mixture, what all its parts say, else what the run says."""
     data = flow.config.get("data", {})
-    projection, convention = data.get("projection", "spherical"), data.get("convention", "centre")
-    return Reading(flow.sensor, projection, convention, data.get("reflectance_scale", 1.0))
+    usual = {"projection": "spherical", "convention": "centre", "reflectance_scale": 1.0}
+    own = {key: data.get(key, value) for key, value in usual.items()}
+    for key, value in own.items():
+        said = {part.get(key, value) for part in data.get("parts") or ()}
+        own[key] = said.pop() if len(said) == 1 else value
+    return Reading(flow.sensor, **own)
 
 
 def sampled_set(flow: Checkpoint, label: str, num: int, sampler: Sampler | None = None, seed: int = 0) -> ScanSet:
