@@ -310,6 +310,22 @@ def test_with_scans_beside_the_pairs_velocities_are_those_of_the_scans_and_jumps
         torch.testing.assert_close(aims[0][row], slope[row])
 
 
+def test_from_a_time_on_jumps_to_the_end_are_those_of_the_scans(monkeypatch):
+    noise, scan = torch.randn(2, 4, 2, 8, 32, generator=torch.Generator().manual_seed(1)).unbind(0)
+    batch = batch_of(noise=noise, scan=scan)
+    learned = stage({**DATA, "scans": {"name": "simulated"}}, objective="knots", ends_from=0.5).train()
+    learned._trainer = type("Trainer", (), {"max_steps": 2, "global_step": 2})()
+    monkeypatch.setattr(LearnFlowMap, "global_step", 2, raising=False)
+    t, s = torch.tensor([0.0, 0.25, 0.75, 0.75]), torch.tensor([1.0, 1.0, 1.0, 0.9])
+    learned.jumps = lambda u: (t, s)  # type: ignore[assignment]
+    of_pairs, of_scans = batch["x_1"] - batch["x_0"], scan - noise
+    for training, expected in ((True, [*of_pairs[:2], of_scans[2], of_pairs[3]]), (False, of_pairs)):
+        aims: list[torch.Tensor] = []
+        learned.jump_loss = lambda found, target, aims=aims: aims.append(target) or found.flatten(1).mean(1)
+        learned.train(training).regression_loss(batch, batch["u"])
+        torch.testing.assert_close(aims[0], torch.stack([*expected]))
+
+
 def test_jumps_have_a_loss_of_their_own_beside_that_of_velocities(monkeypatch):
     """Of an estimate of 0: mean absolute values of the jumps' targets, mean squares of the velocities'."""
     batch = batch_of()
@@ -327,6 +343,8 @@ def test_scans_beside_pairs_are_for_objectives_on_the_parents_own_paths():
     assert stage({**DATA, "scans": scans}, objective="knots").objective is not None
     with pytest.raises(InputError, match=r"leave data\.scans out, or give stage\.objective=knots"):
         stage({**DATA, "scans": scans})
+    with pytest.raises(InputError, match=r"stage\.ends_from is the time .* give data\.scans"):
+        stage(DATA, objective="knots", ends_from=0.9)
     with pytest.raises(InputError, match=r"stage=reflow learns from pairs alone: leave data\.scans out"):
         build_stage({"stage": {"name": "reflow"}, "data": {**DATA, "scans": scans}, "seed": 0}, parent())
     with pytest.raises(InputError, match=r"data\.scans stand beside pairs, found data=simulated"):

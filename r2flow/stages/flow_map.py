@@ -14,7 +14,7 @@ from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import FlowMap, Generator
 from r2flow.generators.base import JUMP, Sampler
-from r2flow.registry import Positive, check_options
+from r2flow.registry import Portion, Positive, check_options
 from r2flow.stages.base import Batch
 from r2flow.stages.reflow import Reflow
 
@@ -33,7 +33,10 @@ class LearnFlowMap(Reflow):
             factors, over the run. It is always 1 where s = t and, on pairs, for the jump from 0 to 1.
         jump_loss: Name of the loss of jumps in `r2flow.flow.losses.LOSSES`; None: `loss`, which velocities have. By
             `absolute` a jump that the network cannot know goes to the median of each element, which has edges, and not
-            to the mean, which blurs them.
+            to the mean, which blurs them; `gradient_matching` is the same with smooth surfaces.
+        ends_from: From this time on jumps to the end, s = 1, are learned from `data.scans`, as velocities are, and not
+            from the pairs: there little noise is left, the scan is all but known, and pairs are rougher than scans.
+            None: never.
     """
 
     generator_name = "flow_map"
@@ -47,6 +50,7 @@ class LearnFlowMap(Reflow):
         rho: Positive = 0.01,
         loss: str = "pseudo_huber",
         jump_loss: str | None = None,
+        ends_from: Portion | None = None,
         **options: Any,
     ) -> None:
         if options.pop("time", None) is not None:
@@ -55,7 +59,7 @@ class LearnFlowMap(Reflow):
         if not isinstance(generator, FlowMap):
             raise InputError(f"this stage learns jumps, which a {type(generator).__name__} does not have.")
         self.objective, self.objective_name, self.rho = OBJECTIVES[objective], objective, rho
-        self.jump_loss = LOSSES[jump_loss or loss]
+        self.jump_loss, self.ends_from = LOSSES[jump_loss or loss], ends_from
         check_options("stage.jumps", JumpTimes, jumps or {})
         self.jumps = JumpTimes(**(jumps or {}))
         self.on_pairs = True
@@ -74,6 +78,11 @@ class LearnFlowMap(Reflow):
             what = "data=DATASET, not pairs" if self.on_pairs else "stage.init=RUN"
             raise InputError(
                 f"stage.objective={self.objective_name} learns on scans, by the paths of an earlier flow: give {what}."
+            )
+        if self.ends_from is not None and data.get("scans") is None:
+            raise InputError(
+                "stage.ends_from is the time from which jumps to the end are learned from scans beside the pairs: give "
+                "data.scans, as {name: simulated}, or leave it out."
             )
         if data.get("scans") is not None and self.objective not in (along_knots, corrected):
             raise InputError(
@@ -100,8 +109,11 @@ class LearnFlowMap(Reflow):
             aim = along_knots(u_ts, paths, t, s, torch.ones_like(t))
         if "scan" in batch:
             x_t, v = interpolate(batch["noise"], batch["scan"], t)
-            velocity = expand_time(t == s, x_t)
-            aim = Aim(torch.where(velocity, x_t, aim.x_t), torch.where(velocity, v, aim.target))
+            of_scans = t == s
+            if self.training and self.ends_from is not None:
+                of_scans = of_scans | ((s == 1) & (t >= self.ends_from))
+            of_scans = expand_time(of_scans, x_t)
+            aim = Aim(torch.where(of_scans, x_t, aim.x_t), torch.where(of_scans, v, aim.target))
         estimate = u_ts(t, aim.x_t, s)
         return torch.where(t == s, self.loss(estimate, aim.target), self.jump_loss(estimate, aim.target)).mean()
 
