@@ -85,7 +85,7 @@ def _in_todays_keys(config: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(stage, Mapping) and stage.get("name") == "distill":
         found["stage"] = {"grid": "uniform", **stage}
     if isinstance(stage, Mapping) and isinstance(stage.get("jumps"), Mapping):
-        found["stage"] = {"jump_loss": None, "ends_from": None, **stage, "jumps": {"grid": "uniform", **stage["jumps"]}}
+        found["stage"] = {"end_loss": None, "ends_from": None, **stage, "jumps": {"grid": "uniform", **stage["jumps"]}}
     return found
 
 

@@ -321,20 +321,20 @@ def test_from_a_time_on_jumps_to_the_end_are_those_of_the_scans(monkeypatch):
     of_pairs, of_scans = batch["x_1"] - batch["x_0"], scan - noise
     for training, expected in ((True, [*of_pairs[:2], of_scans[2], of_pairs[3]]), (False, of_pairs)):
         aims: list[torch.Tensor] = []
-        learned.jump_loss = lambda found, target, aims=aims: aims.append(target) or found.flatten(1).mean(1)
+        learned.end_loss = lambda found, target, aims=aims: aims.append(target) or found.flatten(1).mean(1)
         learned.train(training).regression_loss(batch, batch["u"])
         torch.testing.assert_close(aims[0], torch.stack([*expected]))
 
 
-def test_jumps_have_a_loss_of_their_own_beside_that_of_velocities(monkeypatch):
-    """Of an estimate of 0: mean absolute values of the jumps' targets, mean squares of the velocities'."""
+def test_jumps_to_the_end_have_a_loss_of_their_own(monkeypatch):
+    """Of an estimate of 0: mean absolute values of the ends' targets, mean squares of all others'."""
     batch = batch_of()
-    learned = stage(objective="knots", loss="mse", jump_loss="absolute").eval()
+    learned = stage(objective="knots", loss="mse", end_loss="absolute").eval()
     t, s = torch.tensor([0.0, 0.3, 0.5, 1.0]), torch.tensor([1.0, 0.3, 0.75, 1.0])
     learned.jumps = lambda u: (t, s)  # type: ignore[assignment]
     monkeypatch.setattr(learned.generator, "mean_velocity", lambda t, x, s: torch.zeros_like(x), raising=False)
     slope = (batch["x_1"] - batch["x_0"]).flatten(1)
-    expected = (slope[[0, 2]].abs().mean(1).sum() + slope[[1, 3]].square().mean(1).sum()) / 4
+    expected = (slope[0].abs().mean() + slope[1:].square().mean(1).sum()) / 4
     torch.testing.assert_close(learned.regression_loss(batch, batch["u"]), expected)
 
 

@@ -41,7 +41,7 @@ MODELS: Registry[Model] = Registry(
     ),
     street_few=Model(
         "street scenes in one or two evaluations, learned from simulated scans",
-        "7aa54e44670176046dd197d85f3912fc07bcca2d2eb35b7a1cacd745a99d0d52",
+        "ba54f1d1a80562cda323f1fe789ef8beb79b7182dd285e846979f749134d5993",
         page="release/street_few.safetensors in the source of r2flow",
     ),
     street_full=Model(

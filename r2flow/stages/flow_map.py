@@ -31,9 +31,10 @@ class LearnFlowMap(Reflow):
         jumps: Options of `r2flow.flow.maps.JumpTimes`.
         rho: Where the share rho ends that a bootstrapped objective takes from the path: it falls from 1, by equal
             factors, over the run. It is always 1 where s = t and, on pairs, for the jump from 0 to 1.
-        jump_loss: Name of the loss of jumps in `r2flow.flow.losses.LOSSES`; None: `loss`, which velocities have. By
-            `absolute` a jump that the network cannot know goes to the median of each element, which has edges, and not
-            to the mean, which blurs them; `gradient_matching` is the same with smooth surfaces.
+        end_loss: Name of the loss of jumps to the end, s = 1, in `r2flow.flow.losses.LOSSES`; None: `loss`, which
+            velocities and all other jumps have. By `absolute` an end that the network cannot know goes to the median of
+            each element, which has edges, and not to the mean, which blurs them; `gradient_matching` is the same with
+            smooth surfaces.
         ends_from: From this time on jumps to the end, s = 1, are learned from `data.scans`, as velocities are, and not
             from the pairs: there little noise is left, the scan is all but known, and pairs are rougher than scans.
             None: never.
@@ -49,7 +50,7 @@ class LearnFlowMap(Reflow):
         jumps: Mapping[str, Any] | None = None,
         rho: Positive = 0.01,
         loss: str = "pseudo_huber",
-        jump_loss: str | None = None,
+        end_loss: str | None = None,
         ends_from: Portion | None = None,
         **options: Any,
     ) -> None:
@@ -59,7 +60,7 @@ class LearnFlowMap(Reflow):
         if not isinstance(generator, FlowMap):
             raise InputError(f"this stage learns jumps, which a {type(generator).__name__} does not have.")
         self.objective, self.objective_name, self.rho = OBJECTIVES[objective], objective, rho
-        self.jump_loss, self.ends_from = LOSSES[jump_loss or loss], ends_from
+        self.end_loss, self.ends_from = LOSSES[end_loss or loss], ends_from
         check_options("stage.jumps", JumpTimes, jumps or {})
         self.jumps = JumpTimes(**(jumps or {}))
         self.on_pairs = True
@@ -99,6 +100,7 @@ class LearnFlowMap(Reflow):
         t, s = self.jumps(torch.cat([u[:, None], plastic_sequence(batch["k"])], 1))
         if not (self.training or self.on_pairs):
             t = s = self.jumps.velocities(u)  # of scans velocities alone are known
+        ends = (s == 1) & (t < s)
         paths, u_ts = paths_of(batch), self.generator.map(self.condition(batch))
         if self.training:
             known = (t == s) | (self.on_pairs & (s - t == 1))  # the end of independent noise is no scan of the data
@@ -111,11 +113,11 @@ class LearnFlowMap(Reflow):
             x_t, v = interpolate(batch["noise"], batch["scan"], t)
             of_scans = t == s
             if self.training and self.ends_from is not None:
-                of_scans = of_scans | ((s == 1) & (t >= self.ends_from))
+                of_scans = of_scans | (ends & (t >= self.ends_from))
             of_scans = expand_time(of_scans, x_t)
             aim = Aim(torch.where(of_scans, x_t, aim.x_t), torch.where(of_scans, v, aim.target))
         estimate = u_ts(t, aim.x_t, s)
-        return torch.where(t == s, self.loss(estimate, aim.target), self.jump_loss(estimate, aim.target)).mean()
+        return torch.where(ends, self.end_loss(estimate, aim.target), self.loss(estimate, aim.target)).mean()
 
 
 class _Kept(list[FlowMap]):
