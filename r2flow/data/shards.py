@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import MISSING, asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,8 +30,6 @@ from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 
 ELSEWHERE = "data.root=FOLDER (r2flow pairs --out FOLDER)"  # how another folder is given
-# What pairs of older versions did not have, as it was then.
-THEN: dict[str, Any] = {"noise_shape": None, "grid": "uniform", "knots": 0, "precision": "32-true"}
 STALE = 3600  # seconds after which a temporary file has no writer any more
 
 
@@ -54,8 +52,10 @@ class PairRecipe:
     precision: Precision = "32-true"  # of the network
 
     def describe(self) -> dict[str, Any]:
-        """All of it as plain values; what pairs of older versions did not have only where it is not as `THEN`."""
-        return {key: value for key, value in asdict(self).items() if key not in THEN or value != THEN[key]}
+        """All of it as plain values; what pairs of older versions did not have only where it is not as it was then, the
+        default."""
+        then = {f.name: f.default for f in fields(self)}
+        return {key: value for key, value in asdict(self).items() if value != then[key]}
 
     @property
     def sampler(self) -> Sampler:
@@ -127,7 +127,8 @@ class PairStore:
             found = dict(json.loads(path.read_text(encoding="utf-8"))["recipe"])
         except (ValueError, KeyError, TypeError):
             raise InputError(f"{path} is damaged. Delete it: the shards beside it know their recipe.") from None
-        refuse_other(self.folder, "pairs", found | THEN | found, asdict(self.recipe), ELSEWHERE)
+        then = {f.name: f.default for f in fields(PairRecipe) if f.default is not MISSING and f.name not in found}
+        refuse_other(self.folder, "pairs", found | then, asdict(self.recipe), ELSEWHERE)
 
     def begin(self) -> None:
         """Write the manifest where there is none, and clear away what killed writers left."""
