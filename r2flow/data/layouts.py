@@ -11,7 +11,7 @@ from r2flow.data.options import SourceOptions
 from r2flow.data.reading import Reading, lacks_reflectance
 from r2flow.data.sources import ScanFiles, ScanSource, warn_of_other_sensor
 from r2flow.errors import InputError
-from r2flow.lidar.scan_files import ELSEWHERE, FIRM_ENDINGS, LOOSE_ENDINGS
+from r2flow.lidar.scan_files import ELSEWHERE, FIRM_ENDINGS, LOOSE_ENDINGS, scan_ending
 
 log = logging.getLogger(__name__)
 
@@ -218,13 +218,10 @@ def _elsewhere(root: Path) -> str:
 
 
 def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:
-    chosen = {_without_ending(path): path for path in sorted(paths, key=lambda p: p.endswith(".npy"))}
+    chosen = {
+        path[: len(path) - len(scan_ending(path))]: path for path in sorted(paths, key=lambda p: p.endswith(".npy"))
+    }
     return paths if len(chosen) == len(paths) else tuple(sorted(chosen.values()))
-
-
-def _without_ending(path: str) -> str:
-    stem, ending = os.path.splitext(path)
-    return stem.removesuffix(".pcd") if ending == ".bin" else stem
 
 
 def spans_of(drives: Sequence[Drive]) -> list[range]:

@@ -20,7 +20,7 @@ from r2flow.data.sources import LOOKED_AT, ScanSource, spread
 from r2flow.errors import InputError
 from r2flow.lidar.calibration import reflectance_of
 from r2flow.lidar.recognition import other_sensor
-from r2flow.lidar.scan_files import SCAN_ENDINGS, Points, read_numbers, read_points, read_range_image
+from r2flow.lidar.scan_files import Points, read_numbers, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.transfer import (
     Fired,
@@ -274,7 +274,7 @@ def _is_image(path: Path) -> bool:
 
 
 def _ending(path: Path) -> str:
-    return next((ending for ending in SCAN_ENDINGS if path.name.lower().endswith(ending)), path.suffix)
+    return scan_ending(path.name) or path.suffix
 
 
 def _name(path: Path, folder: Path) -> str:

@@ -200,10 +200,15 @@ def write_points(
         raise InputError(f"{path} cannot be written: {error.strerror or error}.") from None
 
 
+def scan_ending(name: str) -> str:
+    """The ending of a scan file's name, in lower case, `.pcd.bin` as one; empty where it is none."""
+    return next((ending for ending in SCAN_ENDINGS if name.lower().endswith(ending)), "")
+
+
 def _ending(path: Path, known: Iterable[str]) -> str:
     name = path.name.lower()
-    ending = next((ending for ending in _READERS if name.endswith(ending)), None)
-    if ending is None:
+    ending = scan_ending(name)
+    if not ending:
         for other, advice in ELSEWHERE.items():
             if name.endswith(other):
                 raise InputError(f"{path} {advice.format(path=path)}.")
