@@ -245,7 +245,9 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
 
     from r2flow.reports.chain import report
 
-    device = "cuda" if torch.cuda.is_available() and settings["trainer"]["accelerator"] != "cpu" else "cpu"
+    device, cards = "cpu", settings["trainer"]["devices"]
+    if torch.cuda.is_available() and settings["trainer"]["accelerator"] != "cpu":
+        device = f"cuda:{cards[0]}" if isinstance(cards, list) else "cuda"
     report({link.name: link.run_dir for link in links}, out, device=device, command=" ".join(["python", *sys.argv]))
     record_report(links, out)
     return 0

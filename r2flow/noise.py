@@ -98,5 +98,8 @@ class Draws:
 
 
 def seed_torch(seed: int, purpose: str, index: int = 0) -> None:
-    """Start torch's own generators from a draw of ours, for what draws from them: initial weights, dropout."""
+    """Start torch's own generators from a draw of ours, for what draws from them: initial weights, dropout.
+
+    On the CPU torch keeps the low 32 bits.
+    """
     torch.manual_seed(int(generator(seed, purpose, index).integers(2**63)))

@@ -31,8 +31,8 @@ class Samples:
         images: Range in metres and reflectance, (B, 2 or 1, H, W), on the CPU; 0 where a ray was dropped or not
             asked for. One channel where only one was asked for.
         first: Number of the first one; scan i depends on (seed, i) alone.
-        evaluations: Network evaluations of each, (B,).
-        converged: Whether each is a scan of the generator, (B,) bool.
+        evaluations: Network evaluations of each, (B,), on the CPU.
+        converged: Whether each is a scan of the generator, (B,) bool, on the CPU.
         seconds: Of the generation of all of them; neither their noise nor their decoding counts.
     """
 
@@ -122,7 +122,7 @@ def draw(
     images = generator.space.decode(x_1, channels)
     if region is not None and seen is not None:
         images = region.place(region.crop(seen.place(images)))
-    return Samples(images, numbers[0], made.evaluations, made.converged, seconds)
+    return Samples(images, numbers[0], made.evaluations.cpu(), made.converged.cpu(), seconds)
 
 
 def batches(num: int, batch_size: int) -> int:

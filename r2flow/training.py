@@ -305,14 +305,9 @@ def fit(run: Run) -> Result:
         with run_lock(run.folder) if run.trainer.is_global_zero else nullcontext():
             step = _fit_in_folder(run)
             if run.trainer.is_global_zero:
-                gpu = torch.cuda.is_available() and run.config["trainer"]["accelerator"] != "cpu"
-                finish(
-                    run.folder,
-                    run.config["samples"],
-                    run.config["seed"],
-                    "cuda" if gpu else "cpu",
-                    run.trainer.max_steps,
-                )
+                device = run.trainer.strategy.root_device
+                drawn_on = str(device) if device.type == "cuda" else "cpu"
+                finish(run.folder, run.config["samples"], run.config["seed"], drawn_on, run.trainer.max_steps)
                 log_figures(run.trainer.loggers, run.folder, step)
     return _result(run, step, finished=step >= run.trainer.max_steps)
 

@@ -75,6 +75,16 @@ class Malicious:
         return (Path.touch, (Path("touched-by-a-checkpoint"),))
 
 
+def test_a_run_goes_on_without_the_gpu_that_it_began_on(saved, monkeypatch):
+    path, averaged = saved
+    content = torch.load(path, weights_only=True)
+    monkeypatch.setattr(torch.serialization, "location_tag", lambda storage: "cuda:0")  # as a GPU's run writes it
+    AtomicCheckpointIO().save_checkpoint(content, path)
+    monkeypatch.undo()
+    found = AtomicCheckpointIO().load_checkpoint(path)["state_dict"]
+    assert all(torch.equal(value, averaged[name]) for name, value in found.items())
+
+
 def test_a_file_that_would_run_code_is_refused(tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     torch.save({"state_dict": Malicious()}, tmp_path / "evil.ckpt")

@@ -162,7 +162,8 @@ def _compiled_flex() -> Callable[..., Tensor]:
 
     # A graph for each level, type and mode; past the limit the form that keeps all scores would run.
     config = torch._dynamo.config
-    config.recompile_limit = max(GRAPHS, config.recompile_limit)
+    limit = "recompile_limit" if hasattr(config, "recompile_limit") else "cache_size_limit"  # its name in torch 2.6
+    setattr(config, limit, max(GRAPHS, getattr(config, limit)))
     return torch.compile(flex_attention)
 
 

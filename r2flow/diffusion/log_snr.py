@@ -51,7 +51,7 @@ class CosineShifted:
     Args:
         image_d: Side of the images.
         noise_d: Side at which images would be as noisy under the cosine schedule.
-        ends: `lowest` and `highest` of `Cosine`, before the shift.
+        lowest, highest: Of `Cosine`, before the shift.
     """
 
     def __init__(self, image_d: Positive, noise_d: Positive, lowest: float = -15.0, highest: float = 15.0) -> None:
@@ -68,7 +68,7 @@ class CosineInterpolated:
         image_d: Side of the images.
         noise_d_low: `noise_d` of `CosineShifted` towards t = 1.
         noise_d_high: The same towards t = 0.
-        ends: `lowest` and `highest` of `Cosine`, before the shift.
+        lowest, highest: Of `Cosine`, before the shift.
     """
 
     def __init__(

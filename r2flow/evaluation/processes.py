@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 
 import torch
@@ -38,7 +39,8 @@ def joined(device: str, environment: Mapping[str, str] = os.environ) -> Iterator
         device = f"cuda:{local % torch.cuda.device_count()}"
         torch.cuda.set_device(device)
     # Counts are exchanged on the CPU, statistics on the device that they are on.
-    dist.init_process_group("cpu:gloo,cuda:nccl" if device.startswith("cuda") else "gloo")
+    # The first process alone resamples, which can take hours (`--bootstrap`), and the others wait for it.
+    dist.init_process_group("cpu:gloo,cuda:nccl" if device.startswith("cuda") else "gloo", timeout=timedelta(days=7))
     shared: list[str | None] = [tempfile.mkdtemp(prefix="r2flow-rows-") if rank == 0 else None]
     try:
         dist.broadcast_object_list(shared, src=0)

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
-from r2flow.flow.path import expand_time
 from r2flow.flow.solvers import TORCHDIFFEQ, usual_grid
+from r2flow.flow.solvers.solution import finite
 from r2flow.flow.stochastic import SDE
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
@@ -166,7 +166,7 @@ class Generated:
     """Scans in model space.
 
     Attributes:
-        x: x_1, (B, C, H, W), on the generator's device.
+        x: x_1, (B, C, H, W), on the generator's device, float32 or float64.
         evaluations: Network evaluations of each, (B,) int64.
         converged: Whether each is a scan of the generator, (B,) bool: finite and, for an adaptive method, solved.
     """
@@ -184,18 +184,8 @@ class Generated:
                 kept from an earlier step, does not tell.
         """
         counted = torch.full((len(x),), evaluations, dtype=torch.int64, device=x.device)
+        x = x if x.dtype == torch.float64 else x.float()
         return cls(x, counted, finite(x) if converged is None else converged)
-
-
-def finite(x: Tensor) -> Tensor:
-    """Whether all values of each scan are finite, (B,) bool."""
-    return x.isfinite().flatten(1).all(1)
-
-
-def stepped(x: Tensor, following: Tensor, alive: Tensor) -> tuple[Tensor, Tensor]:
-    """The states after a step, (B, ...), a scan no longer finite in its last one, and which are finite still, (B,)."""
-    alive = alive & finite(following)
-    return torch.where(expand_time(alive, x), following, x), alive
 
 
 class Generator(nn.Module):

@@ -13,7 +13,8 @@ from r2flow.diffusion.objectives import PREDICTIONS
 from r2flow.diffusion.sampling import DDIM, DDPM, eta_of, walk
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution
-from r2flow.generators.base import Condition, Generated, Progress, Sampler, finite
+from r2flow.flow.solvers.solution import finite
+from r2flow.generators.base import Condition, Generated, Progress, Sampler
 from r2flow.generators.flow import UNTOLD, NetworkFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws

@@ -21,8 +21,9 @@ from r2flow.flow.solvers import (
     solve,
 )
 from r2flow.flow.solvers.grids import build_grid
+from r2flow.flow.solvers.solution import finite, stepped
 from r2flow.flow.stochastic import SDE, churn_of, sde
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, finite, parts_of, stepped
+from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, parts_of
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws

@@ -11,8 +11,9 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.flow.solvers import Solution
+from r2flow.flow.solvers.solution import finite, stepped
 from r2flow.flow.stochastic import ahead, back, churn_of
-from r2flow.generators.base import JUMP, RENOISE, Condition, Generated, Progress, Sampler, finite, stepped
+from r2flow.generators.base import JUMP, RENOISE, Condition, Generated, Progress, Sampler
 from r2flow.generators.flow import UNTOLD, Conditioned, RectifiedFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws

@@ -10,7 +10,8 @@ from torch import Tensor
 from r2flow.backbones import dcgan, style_gan
 from r2flow.backbones.equalised import LatentGenerator
 from r2flow.errors import InputError
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, finite
+from r2flow.flow.solvers.solution import finite
+from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import Count, Positive

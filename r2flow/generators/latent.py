@@ -118,7 +118,9 @@ class LatentDiffusion(Generator):
             z = state
             if progress is not None:
                 progress()
-        return Generated.after(self.first_stage_model.decode(z), len(walk.times))
+        with torch.autocast(z.device.type, enabled=False):  # what it answers is the scan, and no step follows
+            scans = self.first_stage_model.decode(z)
+        return Generated.after(scans, len(walk.times))
 
     def check_sampler(self, sampler: Sampler) -> None:
         ddim_walk(self.alpha_bar, sampler.steps, _eta(sampler.method))

@@ -9,7 +9,8 @@ from torch import Tensor
 from r2flow.backbones.refinenet import RefineNet
 from r2flow.diffusion.langevin import annealed_langevin, noise_levels, toward
 from r2flow.errors import InputError
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, finite, parts_of
+from r2flow.flow.solvers.solution import finite
+from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, parts_of
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import Count, Positive

@@ -141,9 +141,10 @@ class Stage(L.LightningModule):
         # DDP waits for gradients of all parameters in every backward pass, and a loss has those of some.
         with model.no_sync() if isinstance(model, DistributedDataParallel) else nullcontext():
             self.manual_backward(loss)
-        for parameter in (p for group in optimizer.param_groups for p in group["params"]):
-            if parameter.grad is not None:
-                parameter.grad = averaged(parameter.grad)
+        taught = [p for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+        mean = averaged(torch.cat([p.grad.flatten() for p in taught])).split([p.numel() for p in taught])
+        for parameter, gradient in zip(taught, mean, strict=True):
+            parameter.grad = gradient.view_as(parameter)
         optimizer.step()
         schedules = self.lr_schedulers() or []
         for schedule in schedules if isinstance(schedules, list) else [schedules]:

@@ -135,6 +135,6 @@ class LearnLatentDiffusion(SingleLoss):
         diffusion = self.generator
         assert isinstance(diffusion, LatentDiffusion)
         with torch.no_grad():
-            z = diffusion.first_stage_model.eval().encode(batch["x_1"])
+            z = diffusion.first_stage_model.eval().encode(batch["x_1"]).float()  # for noise levels of all digits
         t = (u * len(diffusion.alpha_bar)).to(torch.int64)
         return noise_loss(diffusion.unet, z, t, batch["x_0"], diffusion.alpha_bar).mean()

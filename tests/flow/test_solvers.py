@@ -258,7 +258,7 @@ def test_bad_requests_are_refused():
         solve(logistic, X_0, method="torchdiffeq:dopri5", tolerance=0)
 
 
-@pytest.mark.parametrize("method", ["euler", "adams3", "dopri5", "auto"])
+@pytest.mark.parametrize("method", ["euler", "adams3", "dopri5", "auto", "torchdiffeq:dopri5"])
 def test_knots_are_states_of_the_path(method):
     """dx/dt = x: (1 + h)^n after n Euler steps, e^t else."""
     x_0 = torch.tensor([[1.0, -2.0], [0.5, 3.0]], dtype=torch.float64)
@@ -300,3 +300,14 @@ def test_a_scene_that_fails_between_two_knots_stays_failed():
     found = solve(lambda t, x: x * x, x_0, method="dopri5", knots=3, max_evaluations=400)
     assert found.converged.tolist() == [True, False]
     torch.testing.assert_close(found.x[0], torch.tensor([1.0], dtype=torch.float64), rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("method", ["dopri5", "auto", "torchdiffeq:dopri5"])
+def test_a_scene_has_one_budget_whatever_the_knots(method):
+    x_0 = torch.tensor([[0.5], [3.0]], dtype=torch.float64)
+    easy = solve(lambda t, x: x * x, x_0[:1], method=method, knots=3, tolerance=1e-4)
+    found = solve(lambda t, x: x * x, x_0, method=method, knots=3, tolerance=1e-4, max_evaluations=400)
+    assert easy.converged.all()
+    assert found.converged.tolist() == [True, False]
+    assert found.evaluations[0] == easy.evaluations[0]
+    assert found.evaluations[1] <= 400 + 4 * 8  # a step that was begun in each piece

@@ -46,6 +46,24 @@ def test_auto_hands_over_the_stiff_scenes_and_leaves_the_others_as_they_are():
         assert torch.equal(getattr(found, name)[order], getattr(turned, name)), name
 
 
+def test_a_network_in_lower_precision_leaves_the_steps_as_they_are():
+    class Rounded:
+        precision = torch.bfloat16
+
+        def __init__(self, problem):
+            self.problem = problem
+
+        def __call__(self, t, x):
+            return self.problem(t, x)
+
+    x_0 = X_0[:1].float()
+    plain = solve(Rounded(StiffLinear(1e4)), x_0, method="exprb43", tolerance=1e-2)
+    with torch.autocast("cpu", torch.bfloat16):  # nothing in this velocity is a matrix product
+        found = solve(StiffLinear(1e4), x_0, method="exprb43", tolerance=1e-2)
+    assert torch.equal(found.x, plain.x)
+    assert torch.equal(found.evaluations, plain.evaluations)
+
+
 def test_rates_that_lie_far_apart_are_solved():
     rates = torch.logspace(0, 4, 16, dtype=torch.float64)
 

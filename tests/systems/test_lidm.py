@@ -37,6 +37,7 @@ from r2flow.lidar.sensors import build_sensor
 from r2flow.noise import Draws
 from r2flow.published.lidm import _autoencoder, _unet
 from r2flow.registry import options_of
+from r2flow.sampling import sample
 from r2flow.stages.latent import returns
 
 SMALL_AUTOENCODER = {"width": 32, "multipliers": [1, 1], "strides": [[2, 2]], "blocks": 1, "codes": 16}
@@ -460,6 +461,14 @@ def test_a_latent_diffusion_names_what_is_other_and_takes_any_precision():
     generator.check_sampler(generator.sampler.changed(precision="bf16-mixed"))
     with pytest.raises(InputError, match=r"leave out what is other, finish 0\.1\.$"):
         generator.check_sampler(generator.sampler.changed(precision="bf16-mixed", finish=0.1))
+
+
+def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():
+    generator = build_generator(DIFFUSION).eval()
+    images = next(sample(generator, 1, steps=2, precision="bf16-mixed")).images
+    assert images.dtype == torch.float32
+    returned = images[images > 0]
+    assert not torch.equal(returned, returned.bfloat16().float())
 
 
 @pytest.mark.parametrize(

@@ -137,7 +137,7 @@ class _Run(NamedTuple):
     progress: Callable[[], None] | None
 
     def solve(self, velocity: Velocity, x: Tensor, knots: int = 0) -> Solution:
-        v = Evaluations(velocity, len(x), self.progress)
+        v = velocity if isinstance(velocity, Evaluations) else Evaluations(velocity, len(x), self.progress)
         method = None if self.method.startswith(TORCHDIFFEQ) else SOLVERS[self.method]
         if isinstance(method, EmbeddedMethod):
             return advance(v, x, self.t_0, self.t_1, method, self.limits)[0]
@@ -152,11 +152,15 @@ class _Run(NamedTuple):
         """An adaptive solution from each knot to the next; a scene that fails in one piece stays failed."""
         ends = [*uniform(self.t_0, self.t_1, knots + 1).tolist()[1:-1], self.t_1]
         states, pieces, t = [x], [], self.t_0
+        v = Evaluations(velocity, len(x), self.progress)  # counts on from piece to piece: a scene has one budget
         for end in ends:
-            pieces.append(self._replace(t_0=t, t_1=end).solve(velocity, states[-1]))
+            v.only(np.arange(len(x)))
+            times = torch.tensor([t, end], dtype=torch.float64)
+            pieces.append(self._replace(t_0=t, t_1=end, times=times).solve(v, states[-1]))
             states.append(pieces[-1].x)
             t = end
-        sums = {name: sum(getattr(piece, name) for piece in pieces) for name in ("evaluations", "accepted", "rejected")}
+        sums = {name: sum(getattr(piece, name) for piece in pieces) for name in ("accepted", "rejected")}
+        sums["evaluations"] = pieces[-1].evaluations
         stiff = torch.stack([piece.stiff for piece in pieces]).any(0)
         converged = torch.stack([piece.converged for piece in pieces]).all(0)
         return Solution(states[-1], **sums, stiff=stiff, converged=converged, knots=torch.stack(states[1:-1], 1))

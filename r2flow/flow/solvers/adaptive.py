@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.flow.solvers.batched import column, norms, powered, rows, unpowered, weighted
+from r2flow.flow.path import expand_time
+from r2flow.flow.solvers.batched import norms, powered, rows, unpowered, weighted
 from r2flow.flow.solvers.defect import Tried, inspect
 from r2flow.flow.solvers.embedded import EmbeddedMethod
 from r2flow.flow.solvers.solution import Evaluations, Solution, finite
@@ -58,7 +59,7 @@ def advance(
             last = rows(x, gone)
             if closing:
                 ended = torch.from_numpy(arrived).to(device)
-                last = torch.where(column(ended, x), last + closing * rows(k_1, gone), last)
+                last = torch.where(expand_time(ended, x), last + closing * rows(k_1, gone), last)
             results[torch.from_numpy(control.places[gone]).to(device)] = last
             rest = (~control.leaving).nonzero()[0]
             x, k_1 = rows(x, rest), rows(k_1, rest)
@@ -78,11 +79,11 @@ def _step(
     *stages, h = torch.from_numpy(times).to(x.device, x.dtype)
     k, y = [k_1], x
     for t, row in zip(stages, method.rows, strict=True):
-        before, y = y, torch.addcmul(x, weighted(row, k), column(h, x))
+        before, y = y, torch.addcmul(x, weighted(row, k), expand_time(h, x))
         k.append(v(t, y))
     with torch.no_grad():
         scale = torch.maximum(x.abs(), y.abs()).mul_(tolerance).add_(tolerance)
-        error = weighted(method.error, k).mul_(column(h, x)).div_(scale)
+        error = weighted(method.error, k).mul_(expand_time(h, x)).div_(scale)
         powers, dk, dy = norms(powered(error), k[-1] - k[-2], y - before)
     size = unpowered(powers)
     good = control.within(size, dk, dy)
@@ -93,7 +94,7 @@ def _step(
     if accepted.all():
         x, k_1 = y, k[-1]
     elif accepted.any():
-        chosen = column(torch.from_numpy(accepted).to(x.device), x)
+        chosen = expand_time(torch.from_numpy(accepted).to(x.device), x)
         x, k_1 = torch.where(chosen, y, x), torch.where(chosen, k[-1], k_1)
     return _cross(v, control, x, k_1) if control.crossing.any() else (x, k_1)
 
@@ -106,7 +107,7 @@ def _confirm_stiffness(v: Evaluations, control: StepController, t: Tensor, y: Te
     sizes, ways = norms(y, way)
     with np.errstate(divide="ignore", invalid="ignore"):
         length = np.where(ways > 0, torch.finfo(v.precision).eps ** 0.5 * (1 + sizes) / ways, 0.0)
-    moved = torch.addcmul(y, way, column(torch.from_numpy(length).to(y), y))
+    moved = torch.addcmul(y, way, expand_time(torch.from_numpy(length).to(y), y))
     control.confirm(*norms(v.some(places, t, moved) - k, moved - y))
 
 
@@ -114,11 +115,11 @@ def _cross(v: Evaluations, control: StepController, x: Tensor, k_1: Tensor) -> t
     """Cross the jumps that scenes stand before, by the mean of the velocities on either side."""
     places = control.crossing.nonzero()[0]
     t, h = torch.from_numpy(control.cross()).to(x.device, x.dtype)
-    here, before, h = rows(x, places), rows(k_1, places), column(h, x)
+    here, before, h = rows(x, places), rows(k_1, places), expand_time(h, x)
     after = v.some(places, t, here + h * before)
     there = here + h / 2 * (before + after)
     whole = finite(there) & finite(after)
     control.give_up(places[~whole.cpu().numpy()])
-    there, after = (torch.where(column(whole, x), new, old) for new, old in ((there, here), (after, before)))
+    there, after = (torch.where(expand_time(whole, x), new, old) for new, old in ((there, here), (after, before)))
     at = torch.from_numpy(places).to(x.device)
     return x.index_copy(0, at, there), k_1.index_copy(0, at, after)

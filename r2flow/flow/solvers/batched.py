@@ -48,11 +48,6 @@ def weighted(weights: Sequence[float | Tensor], k: Sequence[Tensor]) -> Tensor:
     return total
 
 
-def column(per_scene: Tensor, x: Tensor) -> Tensor:
-    """(B,) in a shape that multiplies x, (B, ...)."""
-    return per_scene.view(-1, *(1,) * (x.ndim - 1))
-
-
 def rows(x: Tensor, places: np.ndarray) -> Tensor:
     """Some of the scenes."""
     return x[torch.from_numpy(places).to(x.device)]

@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.flow.solvers.batched import column, norms, powered, rows, unpowered, weighted
+from r2flow.flow.path import expand_time
+from r2flow.flow.solvers.batched import norms, powered, rows, unpowered, weighted
 from r2flow.flow.solvers.embedded import EmbeddedMethod
 from r2flow.flow.solvers.solution import Evaluations
 from r2flow.flow.solvers.step_size import REMEMBERED, StepController
@@ -55,12 +56,12 @@ class Tried(NamedTuple):
     def at(self, theta: np.ndarray) -> tuple[Tensor, Tensor]:
         """State and slope of the interpolant at a share of the step, 0 to 1, for every scene."""
         state, slope = (torch.from_numpy(w).to(self.x.device, self.x.dtype) for w in self.method.interpolant(theta))
-        way, slope = (weighted([column(w, self.x) for w in weights], self.k) for weights in (state, slope))
-        return torch.addcmul(self.x, way, column(self.h, self.x)), slope
+        way, slope = (weighted([expand_time(w, self.x) for w in weights], self.k) for weights in (state, slope))
+        return torch.addcmul(self.x, way, expand_time(self.h, self.x)), slope
 
     def changes(self, *differences: Tensor) -> np.ndarray:
         """Norms of h times differences of velocities, in tolerances, (N, B)."""
-        length = column(self.h, self.x) / self.scale
+        length = expand_time(self.h, self.x) / self.scale
         return unpowered(norms(*(powered(difference * length) for difference in differences)))
 
     def roughness(self) -> np.ndarray:
@@ -173,7 +174,7 @@ def _locate(
             torch.stack([getattr(bracket, name) for bracket in own]) for name in ("trend", "before", "after")
         )
         found = _ask(v, control, places, theta, step.at(theta)[0])
-        found -= trends * column(torch.from_numpy(theta).to(trends), trends)
+        found -= trends * expand_time(torch.from_numpy(theta).to(trends), trends)
         changes = step.changes(found - before, after - found)
         for row, (place, bracket) in enumerate(zip(places, own, strict=True)):
             if not bracket.halve(found[row], *changes[:, row]):

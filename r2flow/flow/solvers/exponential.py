@@ -80,10 +80,19 @@ class _Scene:
         self.length = abs(t_1 - t_0) - limits.finish
         self.t_0, self.t_end = t_0, t_0 + self.direction * self.length if limits.finish else t_1
         self.accepted = self.rejected = 0
+        kind = x.device.type
+        lower = torch.get_autocast_dtype(kind)
+        self._of_network, self._of_steps = (
+            torch.autocast(kind, lower, enabled=on) for on in (torch.is_autocast_enabled(kind), False)
+        )
 
     @torch.no_grad()
     def solve(self) -> bool:
         """Go to the end; whether it is reached."""
+        with self._of_steps:  # products of states have all digits, whatever the network's have
+            return self._solve()
+
+    def _solve(self) -> bool:
         try:
             f = self.velocity(self.t, self.u)
             self.tolerance = attainable(self.limits, self.v.precision)
@@ -120,7 +129,8 @@ class _Scene:
         if self.v.counts[self.v.scenes[0]] >= self.limits.max_evaluations:
             raise _Spent
         low, high = sorted((self.t_0, self.t_end))
-        return self.v(u.new_full((1,), min(max(t, low), high)), u.view(1, *self.shape)).flatten()
+        with self._of_network:
+            return self.v(u.new_full((1,), min(max(t, low), high)), u.view(1, *self.shape)).flatten()
 
     def product(self, f: Tensor, way: Tensor) -> Tensor:
         """J times a vector: a difference of v, forward in time, so that no time beyond the interval is needed."""

@@ -67,7 +67,7 @@ def solve_torchdiffeq(
     ends, taken, lost, converged = [], [], [], []
     for index in range(total):
         v.only(np.array([index]))
-        field = _Scene(v, x[index : index + 1], limits.max_evaluations)
+        field = _Scene(v, x[index : index + 1], limits.max_evaluations - int(v.counts[index]))
         end, whole = _end(field, times, name, tolerance, finish)
         if not whole:
             log.warning("%s%s gave up on scene %d: %s.", TORCHDIFFEQ, name, index, field.trouble or "not finite")
@@ -91,7 +91,7 @@ class _Scene:
         self.last, self.steps, self.rejected, self.trouble = x, 0, 0, ""
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        if self._left == 0:
+        if self._left <= 0:
             raise _Spent("its evaluations are used up")
         self._left -= 1
         return self._v(t, x)

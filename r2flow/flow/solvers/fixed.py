@@ -8,8 +8,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
-from r2flow.flow.path import expand_time
-from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite
+from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite, stepped
 
 Step = Callable[[Velocity, Tensor, Tensor, Tensor], Tensor]
 
@@ -97,9 +96,7 @@ def solve_fixed(
     for n, (t, h, advance) in enumerate(steps):
         if knots and n and n % (len(steps) // (knots + 1)) == 0:
             kept.append(x)
-        following = advance(inside, t.to(x), h.to(x), x)
-        alive = alive & finite(following)
-        x = torch.where(expand_time(alive, x), following, x)
+        x, alive = stepped(x, advance(inside, t.to(x), h.to(x), x), alive)
     solution = Solution.build(x, v.counts, len(times) - 1, 0, False, alive.cpu().numpy())
     if knots:
         solution = replace(solution, knots=torch.stack(kept, 1))

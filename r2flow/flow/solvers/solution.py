@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.flow.path import expand_time
+
 Velocity = Callable[[Tensor, Tensor], Tensor]
 PerScene = np.ndarray | Sequence[int] | Sequence[bool] | int | bool
 
@@ -150,3 +152,9 @@ def _own_types(velocity: Velocity) -> set[torch.dtype]:
 def finite(x: Tensor) -> Tensor:
     """Which scenes of x, (B, ...), hold no NaN and no infinity, (B,) bool."""
     return torch.isfinite(x).flatten(1).all(1)
+
+
+def stepped(x: Tensor, following: Tensor, alive: Tensor) -> tuple[Tensor, Tensor]:
+    """The states after a step, (B, ...), and which are finite still, (B,); one that is not stays in its last state."""
+    alive = alive & finite(following)
+    return torch.where(expand_time(alive, x), following, x), alive

@@ -1,8 +1,7 @@
 """The feature network that comes with the package: a small segmentation network for range images of any sensor.
 
 It is trained on simulated scans only (benchmarks/train_extractor.py), so that a Frechet distance needs no download.
-It is not the field's RangeNet-53, and its distance is no FRD. docs/metrics.md says what it is worth.
-correctly, docs/metrics.md has the results and its limits.
+It is not the field's RangeNet-53, and its distance is no FRD. docs/metrics.md has what it is worth and its limits.
 """
 
 import hashlib
