@@ -93,7 +93,7 @@ class Paths:
 
 @dataclass(frozen=True)
 class JumpTimes:
-    """Which jumps (t, s) are learned: those of some numbers of steps, velocities (s = t), and any others.
+    """Which jumps (t, s) are learned: those of some numbers of steps, velocities (s = t), ends, and any others.
 
     Args:
         steps: Numbers of steps; one that stands here twice is asked for twice as often.
@@ -101,6 +101,7 @@ class JumpTimes:
         share: Of the jumps that these steps take.
         diagonal: Share of the rest with s = t.
         backward: Share of the rest with s < t.
+        ends: Share of the rest that goes to the end, s = 1, from times of the density `time`.
         time: Density of the times of velocities, of `r2flow.flow.times.TIMES`; None: `u_shaped`, as in reflow.
     """
 
@@ -109,15 +110,17 @@ class JumpTimes:
     share: Portion = 0.55
     diagonal: Portion = 0.55
     backward: Portion = 0.0
+    ends: Portion = 0.0
     time: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if not self.steps or min(self.steps) < 1:
             raise InputError(f"the steps of a flow map's jumps must be numbers of at least 1, found {self.steps}.")
         _ = self.velocities, self.times  # an unknown density or grid is refused now
-        if self.diagonal + self.backward > 1:
+        if self.diagonal + self.backward + self.ends > 1:
             raise InputError(
-                f"diagonal and backward are shares of one rest; found {self.diagonal} and {self.backward}."
+                "diagonal, backward and ends are shares of one rest, at most 1 in all; "
+                f"found {self.diagonal}, {self.backward} and {self.ends}."
             )
 
     @cached_property
@@ -143,6 +146,8 @@ class JumpTimes:
         low, high = (torch.where(rest < self.diagonal, velocity, time) for time in (low, high))
         turned = (rest >= self.diagonal) & (rest < self.diagonal + self.backward)
         low, high = torch.where(turned, high, low), torch.where(turned, low, high)
+        last = rest >= 1 - self.ends
+        low, high = torch.where(last, velocity, low), torch.where(last, 1.0, high)
         given = which < self.share
         return torch.where(given, times[row, step], low), torch.where(given, times[row, step + 1], high)
 

@@ -41,7 +41,7 @@ MODELS: Registry[Model] = Registry(
     ),
     street_few=Model(
         "street scenes in one or two evaluations, learned from simulated scans",
-        "ba54f1d1a80562cda323f1fe789ef8beb79b7182dd285e846979f749134d5993",
+        "7bf890761e00ae660e9d20586012e35daa1788b22bde2e443b1f4a8252e2be63",
         page="release/street_few.safetensors in the source of r2flow",
     ),
     street_full=Model(

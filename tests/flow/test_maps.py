@@ -78,6 +78,16 @@ def test_jump_times_keep_their_shares():
     assert float(torch.cat([t, s]).max()) <= 1
 
 
+def test_ends_begin_at_times_of_the_density():
+    u = torch.rand(200_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    late = {"name": "logit_normal", "mean": 3.0, "std": 1.6}
+    t, s = JumpTimes(steps=(1,), share=0.5, diagonal=0.2, backward=0.2, ends=0.6, time=late)(u)
+    ends = (s == 1) & (t > 0) & (t < 1)
+    assert abs(float(ends.double().mean()) - 0.5 * 0.6) < 0.005
+    quantiles = torch.logit(t[ends]).quantile(torch.tensor([0.5, 0.8413], dtype=torch.float64))
+    torch.testing.assert_close(quantiles, torch.tensor([3.0, 4.6], dtype=torch.float64), atol=0.03, rtol=0)
+
+
 def test_the_last_draw_below_one_is_still_a_jump():
     top = torch.full((1, 3), 1 - 2**-24)
     for share in (0.0, 0.999999):
@@ -97,7 +107,14 @@ def test_jumps_fall_on_the_grid_that_they_are_drawn_with():
 
 @pytest.mark.parametrize(
     "options",
-    [{"steps": ()}, {"grid": "power:0.5"}, {"grid": "cubic"}, {"steps": (0, 1)}, {"diagonal": 0.6, "backward": 0.6}],
+    [
+        {"steps": ()},
+        {"grid": "power:0.5"},
+        {"grid": "cubic"},
+        {"steps": (0, 1)},
+        {"diagonal": 0.6, "backward": 0.6},
+        {"ends": 0.6},
+    ],
 )
 def test_jump_times_that_cannot_be_are_refused(options):
     with pytest.raises(InputError, match="found"):
