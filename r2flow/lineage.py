@@ -7,7 +7,8 @@ from typing import Any
 
 from r2flow.checkpoints import Checkpoint, as_parent, load_checkpoint, weights_hash
 from r2flow.config import flatten, groups_of, key_of, rule
-from r2flow.data.options import PairOptions
+from r2flow.data.opening import scale_of_folder
+from r2flow.data.options import FOLDER, MIXED, SIMULATED, PairOptions, SourceOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
 from r2flow.errors import InputError
@@ -60,7 +61,8 @@ def find_parent(config: Mapping[str, Any]) -> tuple[Parent, Checkpoint] | None:
 def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
     """The config of a run, completed by what its parent says.
 
-    Encoding and backbone are the parent's, and so is the sensor unless another is asked for; pairs are those of its
+    Encoding and backbone are the parent's, and so are the sensor and how scans in files become images (projection and
+    convention) unless others are asked for; pairs are those of its
     averaged weights, in its folder, and of its sensor, or those of another flow (`data.pairs.of`).
 
     Args:
@@ -98,6 +100,40 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         data["root"] = data["root"] or str(default_folder(drawer.path))
         data["pairs"] = pairs_of(drawer, data["pairs"] or {}, drawer.weights)
         data |= {key: value for key, value in drawer.config.get("data", {}).items() if key in READING}
+    elif data["name"] not in (SIMULATED, MIXED):  # other images than the parent's would not be what it has learned
+        theirs = {key: parent.config.get("data", {}).get(key) for key in ("projection", "convention")}
+        unsaid = {key for key in theirs if f"data.{key}" not in keys and data.get(key) == getattr(SourceOptions, key)}
+        data |= {key: value for key, value in theirs.items() if value is not None and key in unsaid}
+    return config
+
+
+def with_scales(config: dict[str, Any], given: Mapping[str, Any], asked: Sequence[str]) -> dict[str, Any]:
+    """The config with what means full reflectance in each folder of scan files where nobody said it: what its sensor
+    says, which may be the parent's.
+
+    Args:
+        given: The config before `inherit`, whose own sensor's scale `data=folder` has.
+        asked: See `inherit`.
+    """
+    data, of_sensor = config["data"], config["sensor"].get("reflectance_scale")
+    usual = (data["name"] == FOLDER and given["sensor"].get("reflectance_scale")) or 1.0
+    said = data.get("reflectance_scale", 1.0) != usual or "data.reflectance_scale" in map(key_of, asked)
+    if data["name"] == FOLDER and data.get("root") is not None and not said:
+        config["data"] = data = {**data, "reflectance_scale": scale_of_folder(str(data["root"]), of_sensor)}
+
+    def told(scans: Any) -> Any:
+        unsaid = isinstance(scans, Mapping) and scans.get("name") == FOLDER and "reflectance_scale" not in scans
+        if not unsaid or scans.get("root") is None:
+            return scans
+        return {**scans, "reflectance_scale": scale_of_folder(str(scans["root"]), of_sensor)}
+
+    if data["name"] == MIXED and not said and isinstance(data.get("parts"), Sequence):
+        data["parts"] = [told(part) for part in data["parts"]]
+    if data.get("scans") is not None:
+        data["scans"] = told(data["scans"])
+    held = data.get("validation") or {}
+    if data["name"] != FOLDER and held.get("data") is not None:
+        data["validation"] = {**held, "data": told(held["data"])}
     return config
 
 

@@ -34,7 +34,7 @@ from r2flow.errors import InputError
 from r2flow.flow.solvers import check_method
 from r2flow.generators import GENERATORS, Flow, FlowMap, Generator, build_generator
 from r2flow.generators.base import JUMP
-from r2flow.lineage import Parent, find_parent, inherit
+from r2flow.lineage import Parent, find_parent, inherit, with_scales
 from r2flow.noise import seed_torch
 from r2flow.plugins import made_with
 from r2flow.registry import Bound, Count, Natural, NonNegative, Positive, check_options
@@ -197,7 +197,7 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
     check_trainer(config["trainer"])
     check_options("samples", SampleOptions, config["samples"])
     with made_with(parent.config if parent else {}, "the run that it starts from"):
-        config = inherit(config, asked, parent)
+        config = with_scales(inherit(config, asked, parent), config, asked)
     check_options("data", DataOptions, config["data"])
     for key, scans in (("data", config["data"]), ("data.scans", config["data"].get("scans"))):
         if scans is not None:

@@ -8,7 +8,7 @@ import torch
 from r2flow.checkpoints import load_checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
-from r2flow.lineage import drawn_by, find_parent, inherit
+from r2flow.lineage import Parent, drawn_by, find_parent, inherit, with_scales
 from r2flow.stages import build_stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 
@@ -155,3 +155,51 @@ def test_weights_that_belong_to_a_place_do_not_move():
     theirs, ours = (build_generator(sized(CONFIG, *size, position="learnable")) for size in ((8, 64), (16, 128)))
     with pytest.raises(InputError, match=r"weights for images of 1x8x64 .*found 1x16x128: leave sensor out"):
         ours.start_from(theirs)
+
+
+OWN = {"name": "own", "reflectance_scale": 0.012}
+
+
+@pytest.mark.parametrize(
+    ("data", "asked", "expected"),
+    [
+        ({"name": "folder", "root": "scans", "reflectance_scale": 1.0}, [], 0.012),
+        ({"name": "folder", "root": "scans", "reflectance_scale": 255.0}, [], 255.0),
+        ({"name": "folder", "root": "scans", "reflectance_scale": 1.0}, ["data.reflectance_scale=1"], 1.0),
+        ({"name": "folder", "root": "drawn", "reflectance_scale": 1.0}, [], 1.0),
+        ({"name": "folder", "root": "simulated", "reflectance_scale": 1.0}, [], 1.0),
+        ({"name": "kitti_raw", "root": "scans", "reflectance_scale": 1.0}, [], 1.0),
+    ],
+)
+def test_full_reflectance_in_a_folder_is_the_inherited_sensors(tmp_path: Path, data, asked, expected):
+    for name, note in (("drawn", "scans.json"), ("simulated", "simulated.json"), ("scans", "other.json")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / note).touch()
+    data["root"] = str(tmp_path / data["root"])
+    given = {"sensor": {"name": "hdl64e"}, "data": data}
+    found = with_scales({"sensor": OWN, "data": dict(data)}, given, asked)
+    assert found["data"]["reflectance_scale"] == expected
+
+
+def test_full_reflectance_in_the_folders_of_a_mixture_and_of_those_held_out_is_the_sensors():
+    part, said = {"name": "folder", "root": "a"}, {"name": "folder", "root": "b", "reflectance_scale": 255.0}
+    simulated = {"name": "simulated", "scenes": 2}
+    mixed = {"name": "mixed", "parts": [part, said, simulated], "validation": {"data": part, "scans": 4}}
+    given = {"sensor": OWN, "data": {**mixed, "reflectance_scale": 1.0}}
+    found = with_scales({**given, "sensor": {**OWN, "reflectance_scale": 255.0}}, given, [])["data"]
+    assert [one.get("reflectance_scale") for one in found["parts"]] == [255.0, 255.0, None]
+    assert found["validation"] == {"data": {**part, "reflectance_scale": 255.0}, "scans": 4}
+    pairs = {"name": "pairs", "reflectance_scale": 1.0, "scans": part}
+    assert with_scales({"sensor": OWN, "data": pairs}, given, [])["data"]["scans"]["reflectance_scale"] == 0.012
+
+
+def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Path):
+    there = Parent({**CONFIG, "data": {"name": "folder", "projection": "unfolding", "convention": "reference"}}, parent)
+    files = {"name": "folder", "root": "scans", "projection": "spherical", "convention": "centre"}
+    config = {**child(parent, False), "data": files}
+    found = inherit(config, [], there)["data"]
+    assert (found["projection"], found["convention"]) == ("unfolding", "reference")
+    found = inherit(config, ["data.projection=spherical"], there)["data"]
+    assert (found["projection"], found["convention"]) == ("spherical", "reference")
+    simulated = {**files, "name": "simulated", "root": None}
+    assert inherit({**config, "data": simulated}, [], there)["data"]["projection"] == "spherical"

@@ -84,7 +84,7 @@ def _plan(
     scenes: SceneOptions,
     shards: ShardOptions,
 ) -> "Plan":
-    from r2flow.data.opening import SOURCES
+    from r2flow.data.opening import SOURCES, scale_of_folder
     from r2flow.data.options import FOLDER
     from r2flow.data.preparing import plan_files, plan_simulated
 
@@ -105,7 +105,7 @@ def _plan(
         raise InputError(f"r2flow prepare {layout} needs the folder of its scans: r2flow prepare {layout} ROOT --out.")
     if scenes.num is not None:
         raise InputError("--num is for simulated scans; choose files by --split and --drives.")
-    scale = (layout == FOLDER and sensor.reflectance_scale) or usual.reflectance_scale
+    scale = scale_of_folder(root, sensor.reflectance_scale) if layout == FOLDER else usual.reflectance_scale
     return plan_files(
         layout, root, sensor, reading.projection or "spherical", reading.convention or "centre", files.split,
         files.drives.split(",") if files.drives else None, reading.reflectance_scale or scale,

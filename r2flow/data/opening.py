@@ -206,10 +206,20 @@ def usual_reading(spec: str | Path) -> Reading:
 
 
 def usual_scale(spec: str | Path, sensor: Sensor) -> float:
-    """The value in the files of a set of scans that usually means full reflectance; of a folder, its sensor's."""
-    name = parse(str(spec))[0].name
-    is_noted = own_reading(spec) is not None  # samples have reflectances of [0, 1]
-    return (name == FOLDER and not is_noted and sensor.reflectance_scale) or SOURCES[name].reflectance_scale
+    """The value in the files of a set of scans that usually means full reflectance."""
+    options = parse(str(spec))[0]
+    if options.name == FOLDER:
+        return scale_of_folder(options.folder, sensor.reflectance_scale)
+    return SOURCES[options.name].reflectance_scale
+
+
+def scale_of_folder(root: str | Path, of_sensor: float | None) -> float:
+    """The same in a folder of scan files: its sensor's, but 1 in samples and simulated scans of r2flow."""
+    from r2flow.simulator.folder import MANIFEST
+
+    folder = Path(root).expanduser()
+    ours = any((folder / note).is_file() for note in (SAMPLES, MANIFEST))
+    return 1.0 if ours else of_sensor or 1.0
 
 
 def _noted(folder: Path) -> Reading | None:
