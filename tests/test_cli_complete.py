@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from r2flow.data.opening import open_scans
+from r2flow.data.preparing import Preparation, plan_files
 from r2flow.lidar.known import parse_mask
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import read_points, write_points
@@ -292,6 +293,38 @@ def test_answers_to_another_scan_of_the_same_name_are_none(r2flow, run, tmp_path
     (tmp_path / "b" / f"one{ending}").unlink()
     assert "1 scans completed" in r2flow(*COMPLETE, tmp_path / "b", *asked)[1]
     assert r2flow(*COMPLETE, tmp_path / "a" / f"one{ending}", *asked)[0] == 0  # still known after the other one
+
+
+def prepared(folder: Path, numbers: list[int]) -> Path:
+    """Some scans of `full_scan`, as they are prepared."""
+    for place, number in enumerate(numbers):
+        full_scan(folder / "scans" / f"{place}.npy", number)
+    work = Preparation(folder / "prep", plan_files("folder", folder / "scans", SENSOR))
+    work.make(work.begin())
+    return folder / "prep"
+
+
+def test_prepared_scans_are_named_by_their_numbers_in_the_set(r2flow, run, tmp_path):  # noqa: F811
+    given = prepared(tmp_path, [0, 1, 0, 1])
+    asked = *COMPLETE, given, "-c", run, "--mask", "rows:2", "--out", tmp_path / "out", "--scans"
+    for most, numbers in ((1, [2]), (2, [1, 2, 3])):  # evenly spread
+        assert r2flow(*asked, most)[0] == 0
+        assert sorted(path.stem for path in (tmp_path / "out").glob("*.npy")) == [f"prep-{n:06d}" for n in numbers]
+    whole = open_scans(given).source
+    for number in numbers:
+        assert np.array_equal(np.load(tmp_path / "out" / f"prep-{number:06d}.npy")[:, ::2], whole[number][:, ::2])
+    assert "1 scans completed" in (said := r2flow(*asked, 4)[1])
+    assert "3 were there already" in said
+
+
+def test_answers_to_other_prepared_scans_of_the_same_name_are_none(r2flow, run, tmp_path):  # noqa: F811
+    one, other = (prepared(tmp_path / drive, [number]) for number, drive in enumerate("ab"))
+    asked = "-c", run, "--mask", "rows:2", "--out", tmp_path / "out"
+    assert r2flow(*COMPLETE, one, *asked)[0] == 0
+    code, _, error = r2flow(*COMPLETE, other, *asked)
+    assert code == 2
+    assert "holds answers to another scan of the name prep-000000; give another --out" in error
+    assert "1 were there already" in r2flow(*COMPLETE, one, *asked)[1]
 
 
 def test_a_bad_scan_may_be_mended_and_the_command_given_again(r2flow, run, tmp_path):  # noqa: F811

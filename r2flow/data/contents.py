@@ -20,7 +20,7 @@ def record_contents(run: Path, files: Mapping[str, str | Path]) -> None:
     """Note of each file, by its name, its size and a CRC-32 of its contents or, of many files, its time of change."""
     size = sum(os.stat(path).st_size for path in files.values() if os.path.exists(path))
     by = "contents" if size <= MOST_READ else "times"
-    content = {"format": FORMAT, "by": by, "files": {name: _stamp(path, by) for name, path in files.items()}}
+    content = {"format": FORMAT, "by": by, "files": {name: stamp(path, by) for name, path in files.items()}}
     with atomic_write(run / RECORD, "w") as file:
         json.dump(content, file)
 
@@ -38,7 +38,7 @@ def check_contents(run: Path, files: Mapping[str, str | Path]) -> None:
         record_contents(run, files)
         return
     for name, path in files.items():
-        if name in there and there[name] != _stamp(path, by):
+        if name in there and there[name] != stamp(path, by):
             copied = f" Or, if they were copied alone, remove {run / RECORD}." if by == "times" else ""
             raise InputError(
                 f"{path} has changed since {run} began to train on it. Give back the scans that it began with, or take "
@@ -46,7 +46,7 @@ def check_contents(run: Path, files: Mapping[str, str | Path]) -> None:
             )
 
 
-def _stamp(path: str | Path, by: str) -> list[int]:
+def stamp(path: str | Path, by: str) -> list[int]:
     """Size and CRC-32 or time of change in nanoseconds of a regular file; of others, nothing is read."""
     try:
         found = os.stat(path)

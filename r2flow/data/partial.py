@@ -46,6 +46,7 @@ class PartialScan:
         read: What is known of it.
         path: Its file; None where it has none of its own.
         image: Whether it is a range image, as its answers are then, or points.
+        content: What it holds, where it has no file and its name does not tell.
     """
 
     name: str
@@ -53,10 +54,12 @@ class PartialScan:
     read: Callable[[], Partial]
     path: Path | None = None
     image: bool = True
+    content: Callable[[], bytes] | None = None
 
     def identity(self) -> str:
-        """What tells its answers from those to another scan of this name: a hash of its file."""
-        return hashlib.sha256(self.path.read_bytes()).hexdigest()[:16] if self.path else self.name
+        """What tells its answers from those to another scan of this name: a hash of what it holds."""
+        content = self.path.read_bytes if self.path else self.content
+        return hashlib.sha256(content()).hexdigest()[:16] if content else self.name
 
 
 def open_partial(
@@ -146,18 +149,23 @@ def _files(
 
 
 def _images(spec: str, reading: Reading, source: Sensor | None, most: int | None, said: list[str]) -> list[PartialScan]:
-    """Simulated and prepared scans."""
+    """Simulated and prepared scans, by their numbers in the whole set."""
     target, how = reading.sensor, own_reading(spec)
     simulated = how is None
     how = how or replace(reading, sensor=source or target)
     opened = open_scans(spec, how, num=(most or FEW) if simulated else None)
-    scans = opened.spread(most or len(opened)).source
+    scans = opened.source
     if not _same_image(how.sensor, target):
         said.append(_described(spec, np.asarray(how.sensor.elevations), how.sensor.name, target))
     kind = spec.replace(":", "-") if simulated else Path(spec).name
     return [
-        PartialScan(f"{kind}-{number:06d}", ".npy", partial(_read_set, scans, number, how.sensor, target))
-        for number in range(len(scans))
+        PartialScan(
+            f"{kind}-{number:06d}",
+            ".npy",
+            partial(_read_set, scans, number, how.sensor, target),
+            content=None if simulated else partial(_content, scans, number),
+        )
+        for number in spread(len(scans), most or len(scans))
     ]
 
 
@@ -239,6 +247,10 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
 
 def _read_set(scans: ScanSource, number: int, source: Sensor, target: Sensor) -> Partial:
     return _seen(scans[number], source, target)
+
+
+def _content(scans: ScanSource, number: int) -> bytes:
+    return scans[number].tobytes()
 
 
 def _seen(image: np.ndarray, source: Sensor, target: Sensor) -> Partial:

@@ -6,9 +6,9 @@ import logging
 import os
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +18,7 @@ from filelock import FileLock, Timeout
 from torch.utils.data import DataLoader, Dataset
 
 from r2flow import simulator
+from r2flow.data.contents import RECORD, record_contents, stamp
 from r2flow.data.layouts import Drive
 from r2flow.data.opening import find_drives
 from r2flow.data.options import SIMULATED
@@ -35,7 +36,7 @@ from r2flow.data.prepared import (
     write_manifest,
 )
 from r2flow.data.quantise import OTHER_LEVELS, RangeCodes, ReflectanceCodes, find_levels
-from r2flow.data.reading import Reading, lacks_reflectance, stored_reflectance
+from r2flow.data.reading import Reading, lacks_reflectance, range_image, stored_reflectance
 from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, spread, warn_of_other_sensor
 from r2flow.data.store import MANIFEST, clear_leftovers, refuse_other, shard_bytes, warn_damaged
 from r2flow.errors import InputError
@@ -54,11 +55,12 @@ Advance = Callable[[int], None]  # told a number of scans whenever they are done
 
 @dataclass(frozen=True)
 class Plan:
-    """The scans to prepare, and how."""
+    """The scans to prepare, and how; `files` are those that they are read from, by their names and in their order."""
 
     recipe: ScanRecipe
     drives: tuple[Drive, ...]
     source: ScanSource
+    files: Mapping[str, str | Path] = field(default_factory=dict)
 
 
 def plan_files(
@@ -87,7 +89,8 @@ def plan_files(
     warn_of_other_sensor(paths, reading, root)
     known = _reflectance_levels(paths, reading, levels)
     reading = replace(reading, reflectance=known is not None)
-    return _plan(layout, named, ScanFiles(paths, reading), reading, known, shard_scans, PROJECTION)
+    plan = _plan(layout, named, ScanFiles(paths, reading), reading, known, shard_scans, PROJECTION)
+    return replace(plan, files=dict(zip((name for drive in named for name in drive.scans), paths, strict=True)))
 
 
 def plan_simulated(
@@ -119,19 +122,21 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading, levels: int | No
     """Levels of reflectance, `levels` where given; None where the scans have none, by `lacks_reflectance`."""
     if lacks_reflectance(paths, "skip", reading.columns) is not None:
         return None
-    found, scale = [], reading.reflectance_scale or 1.0
+    found, scale, images = [], reading.reflectance_scale or 1.0, False
     for index in spread(len(paths), PROBED):
         with suppress(InputError):  # it is met again, and dealt with, when its turn comes
             reflectance = stored_reflectance(paths[index], reading.columns)
             if reflectance is not None:
-                found.append(reflectance / np.float32(scale))
+                is_image = range_image(Path(paths[index])) is not None  # which has reflectances of [0, 1]
+                found.append(reflectance / np.float32(1.0 if is_image else scale))
+                images |= is_image
     values = np.concatenate(found) if found else np.zeros(0)
     if not values.any():
         return OTHER_LEVELS if levels is None else levels
     if levels is not None:
         return levels
     levels, highest = find_levels(values), float(values.max())
-    if highest < 0.25 and not ReflectanceCodes(levels).fits(values):
+    if not images and highest < 0.25 and not ReflectanceCodes(levels).fits(values):
         log.warning(
             "reflectance goes up to %.3g of 1 alone and is kept in steps of 1/%d: --reflectance-scale %.3g spreads it",
             highest, levels, highest * scale,
@@ -182,7 +187,7 @@ class Preparation:
         What is finished is only read: it may lie where nothing can be written.
 
         Raises:
-            InputError: other scans are in the folder.
+            InputError: other scans are in the folder, or its shards were made of other contents of the same files.
         """
         if not self._is_taken():
             with self._lock("manifest", wait=True):
@@ -194,6 +199,9 @@ class Preparation:
             if not self._is_whole(shard, logging.WARNING):
                 missing.append(shard)
             advance(len(self.recipe.numbers_of(shard)))
+        self._refuse_changed(missing)
+        if missing and not self.finished and self.plan.files:
+            record_contents(self.folder, self.plan.files)
         return missing
 
     def make(
@@ -311,6 +319,22 @@ class Preparation:
         refuse_other(self.folder, "scans", manifest.recipe.describe(), self.recipe.describe(), "--out FOLDER")
         self.finished = manifest.shards
 
+    def _refuse_changed(self, missing: Sequence[int]) -> None:
+        """Refuse files that have changed since they became shards; a folder of an older version has noted none."""
+        try:
+            noted = json.loads((self.folder / RECORD).read_text(encoding="utf-8"))
+            by, there = noted["by"], dict(noted["files"])
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            return
+        left = {number for shard in missing for number in self.recipe.numbers_of(shard)}
+        for number, (name, path) in enumerate(self.plan.files.items()):
+            if number not in left and name in there and there[name] != stamp(path, by):
+                copied = f" Or, if they were copied alone, remove {self.folder / RECORD}." if by == "times" else ""
+                raise InputError(
+                    f"{path} has changed since {self.folder} was prepared from it. Give back the scans that it was "
+                    f"made of, or prepare these into another folder by --out FOLDER.{copied}"
+                )
+
     def _note(self, shard: int) -> Path:
         return self.making / f"{shard:06d}.json"
 
@@ -394,7 +418,8 @@ class Preparation:
                     )
                 write_manifest(self.folder, Manifest(self.recipe, self.plan.drives, shards))
             with suppress(OSError):  # another process may have removed the folder, or opened a lock in it
-                for path in (*self.folder.glob(f".{MANIFEST}.*.part"), *self.making.iterdir()):
+                written = [path for name in (MANIFEST, RECORD) for path in self.folder.glob(f".{name}.*.part")]
+                for path in (*written, *self.making.iterdir()):
                     path.unlink(missing_ok=True)
                 self.making.rmdir()
         return read_manifest(self.folder)

@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.fidelity import PANEL, PER_PIXEL, controls, distances, nearest, panel
+from r2flow.metrics.scans import check_values
 from r2flow.progress import track
 from r2flow.reports.tables import table
 
@@ -36,11 +38,12 @@ def load_scans(spec: str | Path, reading: Reading, most: int = 1000) -> tuple[np
         Images, (N, 2 or 1, H, W), and names, (N,).
 
     Raises:
-        InputError: no scan there, or one that is not of the reading's sensor.
+        InputError: no scan there, one that is not of the reading's sensor, or values that no scan has.
     """
     scans = open_scans(spec, reading).spread(most)
     numbers = track(range(len(scans)), f"reading {spec}", "scans", least=32)
     images = np.stack([scans.source[number] for number in numbers])
+    check_values(torch.from_numpy(images), [f"{number} of {spec}" for number in range(len(images))])
     drives = {number: f"{spec}: {drive}" for drive, held in scans.drives.items() for number in held}
     return images, [drives.get(number, str(spec)) for number in range(len(scans))]
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.data import preparing
+from r2flow.data import contents, preparing
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive
 from r2flow.data.opening import find_drives, open_prepared
@@ -142,6 +142,18 @@ def test_reflectance_that_would_lose_most_of_its_steps_is_told(tmp_path: Path, c
     assert caplog.text == ""
 
 
+@pytest.mark.parametrize("levels", [256, 100, 255])
+def test_the_scale_of_files_of_points_is_not_that_of_range_images(tmp_path: Path, caplog, levels: int):
+    draw = np.random.default_rng(0)
+    image = np.stack([draw.uniform(2, 70, (4, 16)), draw.integers(0, levels, (4, 16)) / levels]).astype(np.float32)
+    (tmp_path / "scans").mkdir()
+    np.save(tmp_path / "scans" / "1.npy", image)
+    assert plan_of(tmp_path / "scans", reflectance_scale=255.0).recipe.levels == levels
+    np.save(tmp_path / "scans" / "1.npy", image * np.float32([[[1]], [[0.03]]]))
+    plan_of(tmp_path / "scans", reflectance_scale=255.0)
+    assert caplog.text == ""  # nothing spreads them
+
+
 # What is read is what was projected
 
 
@@ -256,7 +268,7 @@ def test_a_shard_is_three_bytes_a_pixel_and_readable_by_anybody(clouds: Path, tm
     from safetensors.numpy import load_file
 
     make(tmp_path, plan_of(clouds))
-    assert list(files(tmp_path)) == [MANIFEST, *(f"scans-{i:06d}.safetensors" for i in range(4))]
+    assert list(files(tmp_path)) == [contents.RECORD, MANIFEST, *(f"scans-{i:06d}.safetensors" for i in range(4))]
     tensors = load_file(tmp_path / "scans-000003.safetensors")  # ten scans by threes: one is left
     found = {name: (tensor.dtype.name, tensor.shape) for name, tensor in tensors.items()}
     assert found == {
@@ -472,9 +484,10 @@ def test_killed_again_and_again_the_same_command_ends_alike(clouds: Path, tmp_pa
 
 def test_what_a_killed_process_was_writing_is_cleared_away(clouds: Path, tmp_path: Path):
     (tmp_path / ".scans-000002.safetensors.abc.part").write_bytes(b"half")
-    (tmp_path / f".{MANIFEST}.abc.part").write_bytes(b"{")
+    for name in (MANIFEST, contents.RECORD):
+        (tmp_path / f".{name}.abc.part").write_bytes(b"{")
     make(tmp_path, plan_of(clouds))
-    assert list(files(tmp_path)) == [MANIFEST, *(f"scans-{i:06d}.safetensors" for i in range(4))]
+    assert list(files(tmp_path)) == [contents.RECORD, MANIFEST, *(f"scans-{i:06d}.safetensors" for i in range(4))]
 
 
 def test_several_at_once_share_the_work(clouds: Path, tmp_path: Path):
@@ -728,6 +741,47 @@ def test_a_damaged_shard_whose_files_have_changed_is_not_mended(tmp_path: Path):
     _cut(tmp_path / "out" / "scans-000001.safetensors")
     write_scan(tmp_path / "scans" / "4.bin", 30)
     with pytest.raises(InputError, match=r"what it was made of has changed since: prepare all scans into another"):
+        make(tmp_path / "out", plan_of(tmp_path / "scans"))
+
+
+@pytest.mark.parametrize("by", ["contents", "times"])
+def test_files_that_have_changed_since_they_were_prepared_are_refused(tmp_path: Path, monkeypatch, by: str):
+    if by == "times":
+        monkeypatch.setattr(contents, "MOST_READ", 0)
+    for number in range(6):
+        write_cloud(tmp_path / "scans" / f"{number}.bin", number)
+    make(tmp_path / "out", plan_of(tmp_path / "scans"))
+    before = files(tmp_path / "out")
+    make(tmp_path / "out", plan_of(tmp_path / "scans"))
+    write_cloud(tmp_path / "scans" / "4.bin", 30)
+    copied = f" Or, if they were copied alone, remove {tmp_path}/out/files.json." if by == "times" else ""
+    with pytest.raises(InputError) as error:
+        make(tmp_path / "out", plan_of(tmp_path / "scans"))
+    assert str(error.value) == (
+        f"{tmp_path}/scans/4.bin has changed since {tmp_path}/out was prepared from it. Give back the scans that it "
+        f"was made of, or prepare these into another folder by --out FOLDER.{copied}"
+    )
+    assert files(tmp_path / "out") == before
+    for harmless in ("", "{", "[]"):  # as in a folder of an older version, which has none
+        (tmp_path / "out" / contents.RECORD).write_text(harmless)
+        make(tmp_path / "out", plan_of(tmp_path / "scans"))
+
+
+def test_a_file_of_which_no_shard_was_made_may_be_mended_and_others_not(tmp_path: Path):
+    for number in range(6):
+        write_cloud(tmp_path / "scans" / f"{number}.bin", number)
+    (tmp_path / "scans" / "4.bin").write_bytes(b"")
+    with pytest.raises(InputError, match=r"4\.bin is empty"):
+        make(tmp_path / "out", plan_of(tmp_path / "scans"))
+    write_cloud(tmp_path / "scans" / "4.bin", 4)
+    write_cloud(tmp_path / "scans" / "1.bin", 30)
+    with pytest.raises(InputError, match=r"1\.bin has changed since"):
+        make(tmp_path / "out", plan_of(tmp_path / "scans"))
+    write_cloud(tmp_path / "scans" / "1.bin", 1)
+    make(tmp_path / "out", plan_of(tmp_path / "scans"))
+    assert files(tmp_path / "out") == files(make(tmp_path / "one", plan_of(tmp_path / "scans")))
+    write_cloud(tmp_path / "scans" / "4.bin", 30)
+    with pytest.raises(InputError, match=r"4\.bin has changed since"):
         make(tmp_path / "out", plan_of(tmp_path / "scans"))
 
 

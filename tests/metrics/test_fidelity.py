@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from r2flow.data.reading import Reading
+from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
 from r2flow.metrics.fidelity import (
@@ -145,6 +146,21 @@ def test_drives_are_the_folders_of_the_scans(tmp_path):
     images, drives = load_scans(tmp_path, Reading(SENSOR))
     assert drives == [f"{tmp_path}: one/data"] * 2 + [f"{tmp_path}: two/data"]
     assert len(images) == 3
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda x: np.where(x > 0, x, -1), "scan 0 of .*: its range goes down to -1"),
+        (lambda x: x * 1000, "millimetres"),
+    ],
+)
+def test_images_that_are_no_scans_are_not_judged(tmp_path, spoil, said):
+    images = walls(1, 0)
+    images[:, :, 0] = 0
+    np.save(tmp_path / "0.npy", spoil(images).astype(np.float32)[0])
+    with pytest.raises(InputError, match=said):
+        load_scans(tmp_path, Reading(SENSOR))
 
 
 def test_the_page_holds_the_table_and_is_read_by_compare(tmp_path):
