@@ -22,7 +22,7 @@ from r2flow import __version__
 from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.errors import InputError, require
 from r2flow.files import atomic_write
-from r2flow.generators import USUAL, RectifiedFlow, Sampler
+from r2flow.generators import USUAL, RectifiedFlow, Regression, Sampler
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
@@ -128,6 +128,22 @@ def _sum(row: list[float], known: list[Tensor]) -> Tensor:
     return x
 
 
+def flow_of(checkpoint: Checkpoint) -> RectifiedFlow:
+    """The flow of a checkpoint.
+
+    Raises:
+        InputError: it holds another generator.
+    """
+    flow = checkpoint.generator
+    if isinstance(flow, Regression):
+        raise InputError(
+            f"{checkpoint.path} holds a regression, which has no way from noise to a scan: use it with r2flow complete."
+        )
+    if not isinstance(flow, RectifiedFlow):
+        raise InputError(f"only flows can be exported, and {checkpoint.path} holds a {type(flow).__name__}.")
+    return flow
+
+
 @dataclass(frozen=True)
 class Exported:
     """A file that was written.
@@ -159,10 +175,8 @@ def export(checkpoint: Checkpoint, path: str | Path, sampler: Sampler | None = N
         InputError: another ending, no flow, a sampler without a fixed number of steps, a package that is missing, or
             a network that torch cannot export.
     """
-    path, flow = Path(path), checkpoint.generator
+    path, flow = Path(path), flow_of(checkpoint)
     write = FORMATS[path.suffix.removeprefix(".")]
-    if not isinstance(flow, RectifiedFlow):
-        raise InputError(f"only flows can be exported, and {checkpoint.path} holds a {type(flow).__name__}.")
     flow, how = flow.untold(), sampler or flow.sampler
     steps = None if network else tableau(flow, how)
     notes = _notes(checkpoint, how, steps)

@@ -36,6 +36,7 @@ from r2flow.composing import (
     override,
     plain,
 )
+from r2flow.config import key_of
 from r2flow.errors import InputError, explain_mistake, one_line, print_any_name
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.signals import LATER, Stopped, listening, stop_at_once
@@ -124,7 +125,7 @@ def _checked_arguments(arguments: list[str]) -> list[str]:
     """Hydra's flags, then its overrides.
 
     Raises:
-        InputError: a flag that it does not have.
+        InputError: a flag that it does not have, or one folder for all runs of a sweep.
     """
     parser = get_args_parser()
 
@@ -132,7 +133,14 @@ def _checked_arguments(arguments: list[str]) -> list[str]:
         raise InputError(f"{message}; see --help. Keys have no dashes, as trainer.max_steps=100.")
 
     parser.error = refuse  # type: ignore[method-assign]  # its own prints all of the flags
-    overrides = parser.parse_intermixed_args(arguments).overrides  # flags may stand between them
+    parsed = parser.parse_intermixed_args(arguments)  # flags may stand between them
+    overrides = parsed.overrides
+    for one in overrides if parsed.multirun or "hydra.mode=MULTIRUN" in overrides else ():
+        # Several names are a sweep like any other.
+        if key_of(one) == "run_dir" or (key_of(one) == "name" and "," not in one):
+            raise InputError(
+                f"a sweep gives each run a folder of its own: leave {one} out, or give hydra.sweep.dir=FOLDER."
+            )
     return [*(one for one in arguments if one not in overrides), *as_hydra_takes(overrides)]
 
 

@@ -12,7 +12,7 @@ import yaml
 from filelock import FileLock, Timeout
 from torch import Tensor
 
-from r2flow.checkpoints import FOLDER, checkpoints_of, read_checkpoint
+from r2flow.checkpoints import FOLDER, checkpoints_of, read_checkpoint, step_of
 from r2flow.config import flatten, rule
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
@@ -133,14 +133,36 @@ def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Ten
     found = _resumable(run)
     newest = next(found, None)
     if not differing:
+        last = newest and _fitting(run, [newest, *found] if state else [newest], state)
+        if last and step_of(last) >= config["trainer"]["max_steps"]:
+            _check_sampler(run, old, config)
         # Free keys moved: the folder says what runs now.
-        if newest is not None and (old != dict(config) or not Path(run, CONFIG).is_file()):
+        if last and (old != dict(config) or not Path(run, CONFIG).is_file()):
             write_config(run, config)
-        return newest and _fitting(run, [newest, *found] if state else [newest], state)
+        return last
     if newest is None:  # nothing has been learned there yet
         write_config(run, config)
         return None
     raise InputError(_another_config(run, differing))
+
+
+def _check_sampler(run: str | Path, old: Mapping[str, Any], new: Mapping[str, Any]) -> None:
+    """Refuse another sampler for a run that is finished: its checkpoint would keep the one that it has.
+
+    Raises:
+        InputError: the samplers differ.
+    """
+    before, now = (dict(flatten({"sampler": config.get("sampler") or {}})) for config in (old, new))
+    differing = [
+        f"{key}={before.get(key)} there, {now.get(key)} here"
+        for key in sorted(before.keys() | now.keys())
+        if before.get(key) != now.get(key)
+    ]
+    if differing:
+        raise InputError(
+            f"{run} is finished and keeps its sampler: {'; '.join(differing)}. Leave it as it was, and draw by another "
+            f"with r2flow sample -c {run} --solver NAME --steps N."
+        )
 
 
 def check_run(run: str | Path, config: Mapping[str, Any]) -> None:

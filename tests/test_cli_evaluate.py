@@ -274,16 +274,19 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
         (("{real}", *QUICK), "give GENERATED, --checkpoint RUN or --floor"),
         (("{real}", "-c", "run", *QUICK), "a curve needs --out"),
         (("{real}", "{generated}", *QUICK, "--json", "{real}"), "is a folder; name a file"),
+        (("{real}", "{generated}", *QUICK, "--json", "{scan}"), "--json must be a file that ends in .json, found "),
         (("{real}", "{bare}", "--metrics", "frechet_embedded", *QUICK[2:]), "has no reflectance"),
     ],
 )
 def test_a_mistake_is_one_line(r2flow, real, generated, tmp_path, arguments, message):  # noqa: F811
-    places = {"real": real, "generated": generated, "bare": tmp_path / "bare"}
+    places = {"real": real, "generated": generated, "bare": tmp_path / "bare", "scan": min(real.iterdir())}
     folder(places["bare"], images(3, 4)[:, :1])
+    before = places["scan"].read_bytes()
     code, _, said = r2flow("evaluate", *(str(one).format(**places) for one in arguments))
     assert code == 2
     assert message in said
     assert len([line for line in said.splitlines() if not line.startswith("WARNING")]) == 1
+    assert places["scan"].read_bytes() == before
 
 
 def test_help_has_an_example(r2flow):  # noqa: F811

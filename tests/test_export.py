@@ -120,6 +120,21 @@ def test_wrong_options_are_one_line(options, answer, tmp_path, monkeypatch, caps
     assert [path.name for path in tmp_path.iterdir()] == ["flow.safetensors"]
 
 
+@pytest.mark.parametrize("options", [[], ["--solver", "euler", "--steps", "2"], ["--what", "network"]])
+def test_a_regression_is_refused(options, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    save_checkpoint(flow("efficient_unet", "regression"), "flow.safetensors")
+    monkeypatch.setattr(sys, "argv", ["r2flow", "export", "flow.safetensors", "--to", "pt2", *options])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == (
+        "error: flow.safetensors holds a regression, which has no way from noise to a scan: "
+        "use it with r2flow complete.\n"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["flow.safetensors"]
+
+
 def test_a_missing_package_names_its_extra(tmp_path, monkeypatch):
     monkeypatch.setattr("r2flow.errors.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"an .onnx needs the package onnx: python -m pip install 'r2flow\[export\]'"):

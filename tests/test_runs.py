@@ -82,6 +82,21 @@ def test_where_it_computes_may_change_and_what_may_not(tmp_path: Path):
     assert read_config(tmp_path) == changed(trainer__devices=4)  # what runs now, and not what was refused
 
 
+def test_a_finished_run_keeps_its_sampler(tmp_path: Path):
+    open_run(tmp_path, changed(sampler={"method": None, "steps": None}))
+    other = changed(sampler={"method": "euler", "steps": 3})
+    unfinished = checkpoint(tmp_path, 5)
+    assert open_run(tmp_path, other) == unfinished
+    assert read_config(tmp_path) == other
+    finished = checkpoint(tmp_path, 10)
+    with pytest.raises(InputError, match=r"sampler.steps=3 there, 4 here\..* r2flow sample -c .* --solver NAME"):
+        open_run(tmp_path, changed(sampler={"method": "euler", "steps": 4}))
+    assert read_config(tmp_path) == other
+    moved = changed(sampler={"method": "euler", "steps": 3, "precision": None}, data__root="b")  # a key of today
+    assert open_run(tmp_path, moved) == finished
+    assert read_config(tmp_path) == moved
+
+
 def test_each_part_of_a_mixture_may_move_and_must_stay_what_it_is():
     def parts(root: str, weight: float) -> dict:
         return {

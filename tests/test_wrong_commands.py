@@ -361,6 +361,7 @@ evaluate scans run --generated-split foo # are of files in GENERATED; found none
 evaluate scans -c run -o out --generated-split foo # are of files in GENERATED; found none
 evaluate scans scans --json empty
 evaluate scans scans --json file.txt/a.json
+evaluate scans scans --json file.txt
 evaluate scans scans -o file.txt
 evaluate scans scans --sensor nope
 evaluate scans scans --size 8
@@ -723,8 +724,10 @@ name=x --config-dir nowhere
 name=x --config-name nope
 name=x --config-path nope
 name=x --multirun -x # -x; see --help
-name=x -m hydra/launcher=nope
-name=x -m hydra/sweeper=nope
+-m seed=1,2 hydra/launcher=nope
+-m seed=1,2 hydra/sweeper=nope
+-m seed=1,2 run_dir=x # hydra.sweep.dir=FOLDER
+-m seed=1,2 name=x # hydra.sweep.dir=FOLDER
 name=x seed=1,2
 name=x hydra.run.dir=file.txt
 name=x hydra=3

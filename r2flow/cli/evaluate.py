@@ -213,6 +213,8 @@ def _check_evaluation(
         raise InputError("--floor, --controls and --json belong to a comparison; a curve writes its page to --out.")
     if output.json is not None and output.json.is_dir():
         raise InputError(f"--json {output.json} is a folder; name a file to write to.")
+    if output.json is not None and output.json.suffix.lower() != ".json":
+        raise InputError(f"--json must be a file that ends in .json, found {output.json}.")
     return rules
 
 

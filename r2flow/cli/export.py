@@ -37,7 +37,7 @@ def export(
     if network and (solver != SolverOptions() or grid):
         raise InputError("--what network has no sampler: leave solver, steps, tolerance and grid out.")
     loaded = load_checkpoint(checkpoint)
-    sampler: Sampler = solver.change(loaded.generator.sampler, grid=grid)
+    sampler: Sampler = solver.change(writing.flow_of(loaded).sampler, grid=grid)
     if out is None:
         out = Path(f"{checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name}.{to}")
     elif out.suffix != f".{to}":

@@ -192,6 +192,14 @@ def test_a_conditional_map_resumes_with_the_parent_that_it_began_with(train: Run
     assert not (tmp_path / "runs/odd").exists()
 
 
+def test_another_sampler_for_a_finished_run_is_refused(train: Run, copied: Path):
+    before = (copied / "config.yaml").read_text()
+    done = train("name=copied", "sampler.method=euler", check=False)
+    assert done.returncode == 2
+    assert "runs/copied is finished and keeps its sampler: sampler.method=None there, euler here" in done.stderr
+    assert (copied / "config.yaml").read_text() == before
+
+
 def test_another_config_in_the_same_folder_is_refused(train: Run, copied: Path):
     before = (copied / "config.yaml").read_text()
     done = train("name=copied", "seed=5", check=False)
@@ -219,6 +227,16 @@ def test_a_sweep_runs_every_job_and_reports_the_failed(train: Run, tmp_path: Pat
     finished = {path.parent.name for path in (tmp_path / "runs" / "sweep").glob("*/samples")}
     assert len(finished) == 1
     assert "mse" in finished.pop()
+
+
+@pytest.mark.parametrize("option", ["run_dir=here", "run_dir=a,b", "name=here"])
+def test_a_sweep_refuses_one_folder_for_all_of_its_runs(train: Run, tmp_path: Path, option: str):
+    done = train("seed=1,2", option, check=False, flags=("-m",))
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"error: a sweep gives each run a folder of its own: leave {option} out, or give hydra.sweep.dir=FOLDER.\n"
+    )
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.slow
