@@ -7,7 +7,7 @@ from typing import Any
 from r2flow.data.augment import Augmentation
 from r2flow.errors import InputError
 from r2flow.flow.posterior import completes
-from r2flow.flow.solvers import adapts
+from r2flow.flow.solvers import TORCHDIFFEQ, adapts, check_method
 from r2flow.generators import Generator, Sampler
 from r2flow.registry import Registry, check_options
 from r2flow.stages.base import Stage
@@ -85,6 +85,8 @@ def _sampler(generator: Generator, wanted: Mapping[str, Any]) -> Sampler:
             f"sampler.method={found.method} completes a scan of which a part is known; give it to r2flow complete by "
             "--solver."
         )
+    if found.method.startswith(TORCHDIFFEQ):
+        check_method(found.method)
     useless = "steps" if adapts(found.method) else "tolerance"
     if useless in wanted:
         kind = "of fixed steps" if useless == "steps" else "that adapts its steps, as dopri5"
