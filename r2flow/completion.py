@@ -286,9 +286,8 @@ class _Last:
 
 def _one_by_one(made: Samples) -> list[Samples]:
     share = made.seconds / len(made.images)
-    evaluations, converged = made.evaluations.cpu(), made.converged.cpu()
     return [
-        Samples(made.images[b : b + 1], made.first, evaluations[b : b + 1], converged[b : b + 1], share)
+        Samples(made.images[b : b + 1], made.first, made.evaluations[b : b + 1], made.converged[b : b + 1], share)
         for b in range(len(made.images))
     ]
 

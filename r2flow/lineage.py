@@ -109,17 +109,16 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     return config
 
 
-def with_scales(config: dict[str, Any], given: Mapping[str, Any], asked: Sequence[str]) -> dict[str, Any]:
+def with_scales(config: dict[str, Any], asked: Sequence[str]) -> dict[str, Any]:
     """The config with what means full reflectance in each folder of scan files where nobody said it: what its sensor
     says, which may be the parent's.
 
     Args:
-        given: The config before `inherit`, whose own sensor's scale `data=folder` has.
-        asked: See `inherit`.
+        config: Of `inherit`.
+        asked: See there.
     """
     data, of_sensor = config["data"], config["sensor"].get("reflectance_scale")
-    usual = (data["name"] == FOLDER and given["sensor"].get("reflectance_scale")) or 1.0
-    said = data.get("reflectance_scale", 1.0) != usual or "data.reflectance_scale" in map(key_of, asked)
+    said = data.get("reflectance_scale", 1.0) != 1 or "data.reflectance_scale" in map(key_of, asked)
     if data["name"] == FOLDER and data.get("root") is not None and not said:
         config["data"] = data = {**data, "reflectance_scale": scale_of_folder(str(data["root"]), of_sensor)}
 

@@ -85,7 +85,8 @@ def _in_todays_keys(config: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(stage, Mapping) and stage.get("name") == "distill":
         found["stage"] = {"grid": "uniform", **stage}
     if isinstance(stage, Mapping) and isinstance(stage.get("jumps"), Mapping):
-        found["stage"] = {"end_loss": None, "ends_from": None, **stage, "jumps": {"grid": "uniform", **stage["jumps"]}}
+        jumps = {"grid": "uniform", "ends": 0.0, **stage["jumps"]}
+        found["stage"] = {"end_loss": None, "ends_from": None, **stage, "jumps": jumps}
     return found
 
 

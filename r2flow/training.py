@@ -197,7 +197,7 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
     check_trainer(config["trainer"])
     check_options("samples", SampleOptions, config["samples"])
     with made_with(parent.config if parent else {}, "the run that it starts from"):
-        config = with_scales(inherit(config, asked, parent), config, asked)
+        config = with_scales(inherit(config, asked, parent), asked)
     check_options("data", DataOptions, config["data"])
     for key, scans in (("data", config["data"]), ("data.scans", config["data"].get("scans"))):
         if scans is not None:

@@ -176,8 +176,7 @@ def test_full_reflectance_in_a_folder_is_the_inherited_sensors(tmp_path: Path, d
         (tmp_path / name).mkdir()
         (tmp_path / name / note).touch()
     data["root"] = str(tmp_path / data["root"])
-    given = {"sensor": {"name": "hdl64e"}, "data": data}
-    found = with_scales({"sensor": OWN, "data": dict(data)}, given, asked)
+    found = with_scales({"sensor": OWN, "data": data}, asked)
     assert found["data"]["reflectance_scale"] == expected
 
 
@@ -185,12 +184,12 @@ def test_full_reflectance_in_the_folders_of_a_mixture_and_of_those_held_out_is_t
     part, said = {"name": "folder", "root": "a"}, {"name": "folder", "root": "b", "reflectance_scale": 255.0}
     simulated = {"name": "simulated", "scenes": 2}
     mixed = {"name": "mixed", "parts": [part, said, simulated], "validation": {"data": part, "scans": 4}}
-    given = {"sensor": OWN, "data": {**mixed, "reflectance_scale": 1.0}}
-    found = with_scales({**given, "sensor": {**OWN, "reflectance_scale": 255.0}}, given, [])["data"]
+    config = {"sensor": {**OWN, "reflectance_scale": 255.0}, "data": {**mixed, "reflectance_scale": 1.0}}
+    found = with_scales(config, [])["data"]
     assert [one.get("reflectance_scale") for one in found["parts"]] == [255.0, 255.0, None]
     assert found["validation"] == {"data": {**part, "reflectance_scale": 255.0}, "scans": 4}
     pairs = {"name": "pairs", "reflectance_scale": 1.0, "scans": part}
-    assert with_scales({"sensor": OWN, "data": pairs}, given, [])["data"]["scans"]["reflectance_scale"] == 0.012
+    assert with_scales({"sensor": OWN, "data": pairs}, [])["data"]["scans"]["reflectance_scale"] == 0.012
 
 
 def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Path):

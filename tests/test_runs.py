@@ -47,7 +47,7 @@ def test_the_same_config_goes_on_from_the_newest_whole_checkpoint(tmp_path: Path
         ({"name": "distill", "steps": 2}, {"name": "distill", "steps": 2, "grid": "uniform"}),
         (
             {"name": "flow_map", "jumps": {"share": 0.5}},
-            {"name": "flow_map", "jumps": {"share": 0.5, "grid": "uniform"}},
+            {"name": "flow_map", "jumps": {"share": 0.5, "grid": "uniform", "ends": 0.0}},
         ),
     ],
 )

@@ -1,4 +1,4 @@
-"""What the files of a run held when it began: a run goes on with the same contents alone."""
+"""What files held when a run, or a preparation, began: it goes on with the same contents alone."""
 
 import json
 import os
@@ -10,18 +10,18 @@ from stat import S_ISREG
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 
-RECORD = "files.json"  # in the run folder
+RECORD = "files.json"  # in the folder of the run or of the shards
 FORMAT = "r2flow files 1"
 MOST_READ = 1 << 30  # bytes of all files up to which contents are compared; of more, sizes and times of change
 CHUNK = 1 << 20
 
 
-def record_contents(run: Path, files: Mapping[str, str | Path]) -> None:
+def record_contents(folder: Path, files: Mapping[str, str | Path]) -> None:
     """Note of each file, by its name, its size and a CRC-32 of its contents or, of many files, its time of change."""
     size = sum(os.stat(path).st_size for path in files.values() if os.path.exists(path))
     by = "contents" if size <= MOST_READ else "times"
-    content = {"format": FORMAT, "by": by, "files": {name: stamp(path, by) for name, path in files.items()}}
-    with atomic_write(run / RECORD, "w") as file:
+    content = {"format": FORMAT, "by": by, "files": {name: _stamp(path, by) for name, path in files.items()}}
+    with atomic_write(folder / RECORD, "w") as file:
         json.dump(content, file)
 
 
@@ -31,22 +31,34 @@ def check_contents(run: Path, files: Mapping[str, str | Path]) -> None:
     Raises:
         InputError: a file is another one now.
     """
-    try:
-        noted = json.loads((run / RECORD).read_text(encoding="utf-8")) if (run / RECORD).is_file() else {}
-        by, there = noted["by"], dict(noted["files"])
-    except (ValueError, KeyError, TypeError, RecursionError):
+    advice = "Give back the scans that it began with, or take name=OTHER for a new run."
+    if not refuse_changed(run, files, "began to train on it", advice):
         record_contents(run, files)
-        return
+
+
+def refuse_changed(folder: Path, files: Mapping[str, str | Path], since: str, advice: str) -> bool:
+    """Compare files with what `record_contents` has noted, if it has: whether there is a note.
+
+    Args:
+        since: What the folder did with them then, for the message.
+        advice: What to do, likewise.
+
+    Raises:
+        InputError: a file is another one now.
+    """
+    try:
+        noted = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        by, there = noted["by"], dict(noted["files"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return False
     for name, path in files.items():
-        if name in there and there[name] != stamp(path, by):
-            copied = f" Or, if they were copied alone, remove {run / RECORD}." if by == "times" else ""
-            raise InputError(
-                f"{path} has changed since {run} began to train on it. Give back the scans that it began with, or take "
-                f"name=OTHER for a new run.{copied}"
-            )
+        if name in there and there[name] != _stamp(path, by):
+            copied = f" Or, if they were copied alone, remove {folder / RECORD}." if by == "times" else ""
+            raise InputError(f"{path} has changed since {folder} {since}. {advice}{copied}")
+    return True
 
 
-def stamp(path: str | Path, by: str) -> list[int]:
+def _stamp(path: str | Path, by: str) -> list[int]:
     """Size and CRC-32 or time of change in nanoseconds of a regular file; of others, nothing is read."""
     try:
         found = os.stat(path)

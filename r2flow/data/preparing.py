@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 from torch.utils.data import DataLoader, Dataset
 
 from r2flow import simulator
-from r2flow.data.contents import RECORD, record_contents, stamp
+from r2flow.data.contents import RECORD, record_contents, refuse_changed
 from r2flow.data.layouts import Drive
 from r2flow.data.opening import find_drives
 from r2flow.data.options import SIMULATED
@@ -321,19 +321,10 @@ class Preparation:
 
     def _refuse_changed(self, missing: Sequence[int]) -> None:
         """Refuse files that have changed since they became shards; a folder of an older version has noted none."""
-        try:
-            noted = json.loads((self.folder / RECORD).read_text(encoding="utf-8"))
-            by, there = noted["by"], dict(noted["files"])
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
-            return
         left = {number for shard in missing for number in self.recipe.numbers_of(shard)}
-        for number, (name, path) in enumerate(self.plan.files.items()):
-            if number not in left and name in there and there[name] != stamp(path, by):
-                copied = f" Or, if they were copied alone, remove {self.folder / RECORD}." if by == "times" else ""
-                raise InputError(
-                    f"{path} has changed since {self.folder} was prepared from it. Give back the scans that it was "
-                    f"made of, or prepare these into another folder by --out FOLDER.{copied}"
-                )
+        made = {name: path for number, (name, path) in enumerate(self.plan.files.items()) if number not in left}
+        advice = "Give back the scans that it was made of, or prepare these into another folder by --out FOLDER."
+        refuse_changed(self.folder, made, "was prepared from it", advice)
 
     def _note(self, shard: int) -> Path:
         return self.making / f"{shard:06d}.json"

@@ -10,6 +10,7 @@ import torch
 
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
+from r2flow.data.sources import spread
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.fidelity import PANEL, PER_PIXEL, controls, distances, nearest, panel
 from r2flow.metrics.scans import check_values
@@ -40,10 +41,11 @@ def load_scans(spec: str | Path, reading: Reading, most: int = 1000) -> tuple[np
     Raises:
         InputError: no scan there, one that is not of the reading's sensor, or values that no scan has.
     """
-    scans = open_scans(spec, reading).spread(most)
+    whole = open_scans(spec, reading)
+    scans = whole.spread(most)
     numbers = track(range(len(scans)), f"reading {spec}", "scans", least=32)
     images = np.stack([scans.source[number] for number in numbers])
-    check_values(torch.from_numpy(images), [f"{number} of {spec}" for number in range(len(images))])
+    check_values(torch.from_numpy(images), [f"{number} of {spec}" for number in spread(len(whole), most)])
     drives = {number: f"{spec}: {drive}" for drive, held in scans.drives.items() for number in held}
     return images, [drives.get(number, str(spec)) for number in range(len(scans))]
 

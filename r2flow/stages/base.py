@@ -11,7 +11,7 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from r2flow.adversarial.processes import averaged
+from r2flow.adversarial.processes import average_gradients
 from r2flow.data.loader import Further
 from r2flow.errors import InputError
 from r2flow.flow.times import golden_sequence
@@ -141,10 +141,7 @@ class Stage(L.LightningModule):
         # DDP waits for gradients of all parameters in every backward pass, and a loss has those of some.
         with model.no_sync() if isinstance(model, DistributedDataParallel) else nullcontext():
             self.manual_backward(loss)
-        taught = [p for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
-        mean = averaged(torch.cat([p.grad.flatten() for p in taught])).split([p.numel() for p in taught])
-        for parameter, gradient in zip(taught, mean, strict=True):
-            parameter.grad = gradient.view_as(parameter)
+        average_gradients(parameter for group in optimizer.param_groups for parameter in group["params"])
         optimizer.step()
         schedules = self.lr_schedulers() or []
         for schedule in schedules if isinstance(schedules, list) else [schedules]:
