@@ -110,6 +110,11 @@ def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):  # no
     assert "generating rows 0-3, columns 24-39, rounded outward from rows 0-2, columns 24-39: 12% of the image" in said
     image = np.load(tmp_path / "o" / "000000.npy")
     assert image.shape == (2, 8, 64)
+    part = tmp_path / "o"
+    for judged in (("evaluate", part, "simulated:0"), ("report", "fidelity", "simulated:0", part, "-o", tmp_path)):
+        code, _, complaint = r2flow(*judged)
+        assert code == 2
+        assert f"{part} holds a part of each scan alone" in complaint
     inside = np.zeros((8, 64), bool)
     inside[:3, 24:40] = True
     assert (image[0][inside] > 0).any()

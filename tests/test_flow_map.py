@@ -18,7 +18,7 @@ from r2flow.flow.problems import Gaussian
 from r2flow.generators import Field, FlowMap, RectifiedFlow, Sampler, build_generator
 from r2flow.lidar.region import Region
 from r2flow.lineage import Parent, generator_of
-from r2flow.noise import Draws
+from r2flow.noise import Draws, standard_normal
 from r2flow.stages import build_stage
 from r2flow.stages.flow_map import LearnFlowMap, paths_of
 
@@ -237,6 +237,31 @@ def test_the_knots_of_pairs_on_disk_are_the_path_of_the_flow_that_drew_them(tmp_
     t[-1] = s[-1] = 0.5
     mean = torch.where(s == t, t.exp(), (s.exp() - t.exp()) / (s - t).clamp(min=1e-9))
     torch.testing.assert_close(paths.mean_velocity(t, s), mean.view(wide) * x_0, rtol=1e-2, atol=2e-2)
+
+
+def test_renoised_pairs_are_one_jump_and_what_the_map_makes_of_it_later(exact, tmp_path: Path):
+    options = PairOptions(num=6, method="renoise", steps=2, grid="power:5", batch_size=2, seed=3, parent="a")
+    store = PairStore(tmp_path, options.recipe(exact.space.shape))
+    make_pairs(store, exact, 6)
+    mean, std = exact.problem.mean, exact.problem.std
+    late = 1 - 0.5**5  # where the second of two steps on power:5 begins
+    for index, (x_0, x_1) in enumerate(PairSource(store, 6)[k] for k in range(6)):
+        assert torch.equal(x_0, standard_normal(exact.noise_shape, 3, "pairs", index))
+        guess = mean + std * x_0
+        fresh = standard_normal(exact.noise_shape, 3, "pairs", index, 1)
+        x_t = late * guess + (1 - late) * fresh
+        expected = mean + std * (x_t - late * mean) / ((1 - late) ** 2 + (late * std) ** 2) ** 0.5
+        torch.testing.assert_close(x_1, expected, rtol=2**-11, atol=2e-5)
+    other = PairOptions(num=6, method="renoise:3", steps=2, parent="a").recipe(exact.space.shape)
+    with pytest.raises(InputError, match="renoise:3 draws noise on the way; give a solver, as adams3, or of a flow"):
+        make_pairs(PairStore(tmp_path / "other", other), exact, 6)
+
+
+def test_renoised_pairs_need_no_knots(tmp_path: Path):
+    data = {**DATA, "pairs": {"method": "renoise"}}
+    assert stage(data, objective="knots").objective is OBJECTIVES["knots"]
+    with pytest.raises(InputError, match=r"data\.pairs\.knots=7"):
+        stage(data, objective="corrected")
 
 
 @pytest.mark.parametrize("ranks", [2, 3])

@@ -412,9 +412,10 @@ def _rescaled(generated: str, reading: "Reading", scale: float | None) -> "Readi
 
 
 def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> "ScanSet":
-    from r2flow.data.opening import open_scans
+    from r2flow.data.opening import open_scans, refuse_parts
 
     scans = open_scans(text, reading, split, num)
+    refuse_parts(text)
     if len(scans):
         _ = scans.source[0]  # what does not fit is better known now than after the other set was read
     return scans

@@ -22,6 +22,7 @@ from r2flow.data.shards import Block, PairRecipe, PairStore
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution, knot_times
 from r2flow.generators import Flow, Generated, Generator, Sampler, as_flow
+from r2flow.generators.base import RENOISE
 from r2flow.models import name_of
 
 
@@ -60,10 +61,11 @@ def make_pairs(
 ) -> Made:
     """Make those of the first `num` pairs that are missing or damaged, as one of `ranks` processes.
 
-    x_1 is where the generator carries x_0 = `pair_noise`, neither clamped nor snapped, in half precision. Rank r owns
-    the batches r, r + R, ... and talks to no other; a batch is computed alike whoever owns it, so the shards are the
-    same, byte for byte, for every R. What is there already, from any earlier process, is kept. `progress` is called
-    after each batch that is on the disk.
+    x_1 is where the generator carries x_0 = `pair_noise`, neither clamped nor snapped, in half precision. By `renoise`
+    of a flow map it is where its first jump goes, as its later jumps correct it; their fresh noise is a function of
+    (seed, index, step). Rank r owns the batches r, r + R, ... and talks to no other; a batch is computed alike whoever
+    owns it, so the shards are the same, byte for byte, for every R. What is there already, from any earlier process, is
+    kept. `progress` is called after each batch that is on the disk.
 
     Raises:
         InputError: no pair is usable: the flow is broken, or the tolerance out of its reach; or the folder cannot be
@@ -72,9 +74,12 @@ def make_pairs(
     if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
         raise InputError(f"these pairs are of another noise than the generator's {generator.noise_shape}.")
     generator.check_sampler(store.recipe.sampler)
-    if isinstance(generator, Flow) and generator.draws_noise(store.recipe.sampler):
-        drawn = store.recipe.sampler.method
-        raise InputError(f"a pair is one path's ends, and {drawn} draws noise on the way; give a solver, as adams3.")
+    drawn = store.recipe.sampler.method
+    if isinstance(generator, Flow) and generator.draws_noise(store.recipe.sampler) and drawn != RENOISE:
+        raise InputError(
+            f"a pair is one path's ends, and {drawn} draws noise on the way; give a solver, as adams3, or of a flow "
+            "map renoise, whose first jump goes to the end."
+        )
     _refuse_unlearned_times(generator.sampler, store.recipe.sampler)
     store.begin()
     # Shards are checked by turns; who finds one damaged makes its batches, which the others hold to be there.
@@ -137,7 +142,9 @@ def solve_batch(recipe: PairRecipe, generator: Generator, batch: int) -> Block:
         if recipe.knots:
             end = as_flow(generator, "data.pairs.knots").solve(x_0, sampler=recipe.sampler, knots=recipe.knots)
         else:
-            end = generator.generate(x_0, sampler=recipe.sampler)
+            fresh = noise.Draws(recipe.seed, range(first, first + recipe.batch_size), "pairs")
+            draws = fresh if recipe.method == RENOISE else None
+            end = generator.generate(x_0, sampler=recipe.sampler, draws=draws)
     x_1, usable = end.x.to(torch.float16).cpu(), end.converged.cpu()
     usable = usable & x_1.isfinite().flatten(1).all(1)
     block = Block(x_1.numpy(), end.evaluations.cpu().numpy().astype(np.int32), usable.numpy())

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from r2flow.data.opening import open_scans
+from r2flow.data.opening import open_scans, refuse_parts
 from r2flow.data.reading import Reading
 from r2flow.data.sources import spread
 from r2flow.lidar.sensors import Sensor
@@ -42,6 +42,7 @@ def load_scans(spec: str | Path, reading: Reading, most: int = 1000) -> tuple[np
         InputError: no scan there, one that is not of the reading's sensor, or values that no scan has.
     """
     whole = open_scans(spec, reading)
+    refuse_parts(spec)
     scans = whole.spread(most)
     numbers = track(range(len(scans)), f"reading {spec}", "scans", least=32)
     images = np.stack([scans.source[number] for number in numbers])
