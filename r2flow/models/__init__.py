@@ -41,7 +41,7 @@ MODELS: Registry[Model] = Registry(
     ),
     street_few=Model(
         "street scenes in one or two evaluations, learned from simulated scans",
-        "7bf890761e00ae660e9d20586012e35daa1788b22bde2e443b1f4a8252e2be63",
+        "9bdd5e0d95710c7384e560eeedefc37aa069cb9efa6d133012e83734593597b6",
         page="release/street_few.safetensors in the source of r2flow",
     ),
     street_full=Model(
