@@ -254,13 +254,13 @@ def refuse_parts(spec: str | Path) -> None:
     """Refuse samples of a part of each image: beside whole scans they would be judged as scans that lack the rest.
 
     Raises:
-        InputError: the folder's note names a region.
+        InputError: the folder's note names a region, or cannot be read.
     """
     options, _ = parse(str(spec))
     if options.name != FOLDER:
         return
-    note = Path(options.folder) / SAMPLES
-    if note.is_file() and json.loads(note.read_text(encoding="utf-8")).get("region"):
+    folder = Path(options.folder)
+    if _noted(folder) is not None and json.loads((folder / SAMPLES).read_text(encoding="utf-8")).get("region"):
         raise InputError(
             f"{spec} holds a part of each scan alone (its {SAMPLES} says so) and cannot be judged beside whole scans: "
             "sample without --sector and --rows."
