@@ -124,6 +124,32 @@ def test_backward_jumps_lead_back_to_the_noise(exact):
     assert back.evaluations.tolist() == [3, 3]
 
 
+def test_the_chord_leads_to_where_a_jump_to_the_end_would(exact):
+    """Of N(m, sd^2): x_s = (1 - s) x_0 + s (m + sd x_0), and the jump from there."""
+    x_0 = Draws(0, range(3)).start(exact.noise_shape)
+    mean, std = exact.problem.mean, exact.problem.std
+    expected = mean + std * x_0
+    for s in (0.25, 0.5, 0.75):
+        x_s = (1 - s) * x_0 + s * expected
+        size = ((1 - s) ** 2 + (s * std) ** 2) ** 0.5
+        expected = mean + std / size * (x_s - s * mean)
+        x_0 = (x_s - s * expected) / (1 - s)  # the chord from here begins elsewhere
+    start = Draws(0, range(3)).start(exact.noise_shape)
+    found = exact.generate(start, sampler=Sampler("chord", 4), draws=Draws(0, range(3)))
+    torch.testing.assert_close(found.x, expected, rtol=0, atol=1e-5)
+    assert found.evaluations.tolist() == [4, 4, 4]
+    whole = exact.generate(start, sampler=Sampler("chord", 1)).x
+    assert torch.equal(whole, exact.generate(start, sampler=Sampler("jump", 1)).x)
+
+
+def test_chords_of_a_map_that_has_not_learned_jumps_are_euler_s_steps(grown):
+    x_0 = Draws(0, range(2)).start(grown.noise_shape)
+    for begin, end in ((0.0, 1.0), (1.0, 0.0)):
+        walked = parent().solve(x_0, begin, end, sampler=Sampler("euler", 3, grid="power:2"))
+        found = grown.solve(x_0, begin, end, sampler=Sampler("chord", 3, grid="power:2"))
+        torch.testing.assert_close(found.x, walked.x, rtol=0, atol=1e-5)
+
+
 def test_renoised_samples_of_an_exact_map_have_the_data_s_distribution(exact):
     draws = Draws(5, range(64))
     x_0 = draws.start(exact.noise_shape)
@@ -175,7 +201,7 @@ def test_a_scan_that_leaves_the_numbers_is_flagged_and_keeps_its_last_state(exac
     [
         (Sampler("jump", 4, finish=0.1), "neither levels nor a finish"),
         (Sampler("jump", 4, grid=(0.0, 0.5)), "time grid"),
-        (Sampler("jumps", 4), "no solver named 'jumps'; known: jump, renoise, sde, ab2, "),
+        (Sampler("jumps", 4), "no solver named 'jumps'; known: jump, chord, renoise, sde, ab2, "),
     ],
 )
 def test_samplers_that_jumps_do_not_have_are_refused(grown, sampler, said):
@@ -189,7 +215,7 @@ def test_renoising_needs_draws(grown):
         grown.generate(noise, sampler=Sampler("renoise", 2))
 
 
-@pytest.mark.parametrize("method", ["jump", "renoise", "euler"])
+@pytest.mark.parametrize("method", ["jump", "chord", "renoise", "euler"])
 def test_a_condition_that_it_has_not_learned_is_refused(grown, method):
     noise = torch.zeros(1, *grown.noise_shape)
     with pytest.raises(InputError, match="condition"):
@@ -257,8 +283,20 @@ def test_renoised_pairs_are_one_jump_and_what_the_map_makes_of_it_later(exact, t
         make_pairs(PairStore(tmp_path / "other", other), exact, 6)
 
 
-def test_renoised_pairs_need_no_knots(tmp_path: Path):
-    data = {**DATA, "pairs": {"method": "renoise"}}
+def test_pairs_by_the_chord_are_its_samples(exact, tmp_path: Path):
+    options = PairOptions(num=4, method="chord", steps=2, grid="power:5", batch_size=2, seed=3, parent="a")
+    store = PairStore(tmp_path, options.recipe(exact.space.shape))
+    make_pairs(store, exact, 4)
+    mean, std, late = exact.problem.mean, exact.problem.std, 1 - 0.5**5
+    for x_0, x_1 in (PairSource(store, 4)[k] for k in range(4)):
+        x_t = (1 - late) * x_0 + late * (mean + std * x_0)
+        expected = mean + std * (x_t - late * mean) / ((1 - late) ** 2 + (late * std) ** 2) ** 0.5
+        torch.testing.assert_close(x_1, expected, rtol=2**-11, atol=2e-5)
+
+
+@pytest.mark.parametrize("method", ["chord", "renoise"])
+def test_a_map_s_own_pairs_need_no_knots(method):
+    data = {**DATA, "pairs": {"method": method}}
     assert stage(data, objective="knots").objective is OBJECTIVES["knots"]
     with pytest.raises(InputError, match=r"data\.pairs\.knots=7"):
         stage(data, objective="corrected")

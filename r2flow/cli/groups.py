@@ -84,7 +84,8 @@ class SolverOptions:
         str | None,
         typer.Option(
             help="adams2-4, euler, midpoint, heun2-3, rk4, ab2; adaptive: dopri5, bosh3, auto, torchdiffeq:NAME; with "
-            "fresh noise on the way, where no ODE is needed: sde, sde:C, and of flow maps renoise:C. "
+            "fresh noise on the way, where no ODE is needed: sde, sde:C, and of flow maps renoise:C; theirs too: "
+            "jump, chord. "
             "Other systems have their own (docs/systems.md), and so has completion (docs/completion.md)."
         ),
     ] = None

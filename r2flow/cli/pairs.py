@@ -74,7 +74,7 @@ def pairs(
 
     `python train.py experiment=reflow stage.init=RUN` makes them itself; this makes them alone, under torchrun or as a
     SLURM array, with the settings of `data.pairs`. The solver is adams3 in 32 steps if left out; --solver dopri5 is the
-    paper's; --solver renoise gives a flow map's first jump as its later ones correct it.
+    paper's; --solver chord or renoise gives a flow map's first jump as its later ones correct it.
     """
     from r2flow.checkpoints import load_checkpoint, weights_hash
     from r2flow.data.options import PairOptions

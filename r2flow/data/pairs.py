@@ -61,8 +61,8 @@ def make_pairs(
 ) -> Made:
     """Make those of the first `num` pairs that are missing or damaged, as one of `ranks` processes.
 
-    x_1 is where the generator carries x_0 = `pair_noise`, neither clamped nor snapped, in half precision. By `renoise`
-    of a flow map it is where its first jump goes, as its later jumps correct it; their fresh noise is a function of
+    x_1 is where the generator carries x_0 = `pair_noise`, neither clamped nor snapped, in half precision. By `chord` or
+    `renoise` of a flow map it is where its first jump goes, as its later jumps correct it; fresh noise is a function of
     (seed, index, step). Rank r owns the batches r, r + R, ... and talks to no other; a batch is computed alike whoever
     owns it, so the shards are the same, byte for byte, for every R. What is there already, from any earlier process, is
     kept. `progress` is called after each batch that is on the disk.

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.maps import MeanVelocity, jump
+from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.solvers import Solution
 from r2flow.flow.solvers.solution import finite, stepped
 from r2flow.flow.stochastic import ahead, back, churn_of
-from r2flow.generators.base import JUMP, RENOISE, Condition, Generated, Progress, Sampler
+from r2flow.generators.base import CHORD, JUMP, RENOISE, Condition, Generated, Progress, Sampler
 from r2flow.generators.flow import UNTOLD, Conditioned, RectifiedFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
@@ -25,6 +25,10 @@ class FlowMap(RectifiedFlow):
     Samplers beside a flow's solvers, which follow v(t, x) = u(x, t, t):
 
     - `jump`: from each time of the grid to the next;
+    - `chord`: from each time t to the next time s on the straight line to the end of a jump,
+      x_s = x_t + (s - t) u(x_t, t, 1). The next jump sees that end under what is left of the same noise, and mends it.
+      This is DDIM's step (Song et al. 2021) with X_{t->1}(x_t) for the estimate of the scan; with v for u it would be
+      Euler's. Exact where paths are straight;
     - `renoise`: from each time t to the end, then back to the next time s along a line to fresh noise,
       x_s = (1 - s) e + s X_{t->1}(x_t): a sample of the same distribution where the map is exact, and not the end of
       this noise's own path (Song et al. 2023, consistency models, algorithm 1);
@@ -39,7 +43,7 @@ class FlowMap(RectifiedFlow):
 
     second_time: ClassVar[bool] = True
     goes_on_as = "rectified_flow"  # where velocities alone are learned, the jumps would be those of another flow
-    other_samplers = JUMP, RENOISE, *RectifiedFlow.other_samplers
+    other_samplers = JUMP, CHORD, RENOISE, *RectifiedFlow.other_samplers
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space, backbone)
@@ -69,12 +73,12 @@ class FlowMap(RectifiedFlow):
         **options: Any,
     ) -> Solution:
         how = sampler or self.sampler
-        if how.method != JUMP:
+        if how.method not in (JUMP, CHORD):
             return super().solve(x, t_0, t_1, sampler=how, condition=condition, progress=progress, **options)
         given = [name for name, value in options.items() if value is not None]
         if given:
             raise InputError(f"jumps have no {', '.join(given)}; leave that out, or give a solver, as --solver adams3.")
-        end = self._jumps(x, self._times(how, t_0, t_1), condition, progress)
+        end = self._jumps(x, self._times(how, t_0, t_1), condition, progress, chord=how.method == CHORD)
         return Solution.build(end.x, end.evaluations.cpu().numpy(), how.steps, 0, False, end.converged.cpu().numpy())
 
     def generate(
@@ -88,7 +92,7 @@ class FlowMap(RectifiedFlow):
     ) -> Generated:
         how = sampler or self.sampler
         churn = _churn(how)
-        if churn is None or how.method == JUMP:
+        if churn is None or how.method in (JUMP, CHORD):
             return super().generate(noise, condition, sampler=how, draws=draws, progress=progress)
         if draws is None and churn:
             raise InputError(f"{how.method} draws further noise: give draws.")
@@ -103,13 +107,14 @@ class FlowMap(RectifiedFlow):
         progress: Progress,
         churn: float = 0.0,
         draws: Draws | None = None,
+        chord: bool = False,
     ) -> Generated:
         x, u = x.to(self.device), self.map(condition)
         alive = finite(x)
         for n, (t, s) in enumerate(pairwise(times.tolist()), start=1):
-            r = ahead(t, s, churn)
-            at, to = torch.tensor([t, r], dtype=torch.float64).to(x)
-            following = jump(u, at, x, to)
+            r = s if chord else ahead(t, s, churn)  # how far it goes, to begin with
+            at, to, aim = torch.tensor([t, r, float(times[-1]) if chord else r], dtype=torch.float64).to(x)
+            following = x + (to - at) * u(at, x, aim)
             if draws is not None and r > s:
                 following = back(following, r, s, self.further_noise(draws, n).to(x))
             x, alive = stepped(x, following, alive)
@@ -118,7 +123,7 @@ class FlowMap(RectifiedFlow):
         return Generated.after(x, len(times) - 1, alive)
 
     def draws_noise(self, sampler: Sampler) -> bool:
-        return super().draws_noise(sampler) or (sampler.method != JUMP and _churn(sampler) is not None)
+        return super().draws_noise(sampler) or (sampler.method not in (JUMP, CHORD) and _churn(sampler) is not None)
 
     def check_sampler(self, sampler: Sampler) -> None:
         if _churn(sampler) is None:
@@ -137,5 +142,5 @@ class FlowMap(RectifiedFlow):
 
 
 def _churn(how: Sampler) -> float | None:
-    """c of a sampler of jumps, 0 for `jump`; None of another."""
-    return 0.0 if how.method == JUMP else churn_of(how.method, RENOISE, math.inf)
+    """c of a sampler of jumps, 0 for those that draw no noise; None of another."""
+    return 0.0 if how.method in (JUMP, CHORD) else churn_of(how.method, RENOISE, math.inf)

@@ -13,7 +13,7 @@ from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots, cor
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import FlowMap, Generator
-from r2flow.generators.base import JUMP, RENOISE, Sampler
+from r2flow.generators.base import CHORD, JUMP, RENOISE, Sampler
 from r2flow.registry import Portion, Positive, check_options
 from r2flow.stages.base import Batch
 from r2flow.stages.reflow import Reflow
@@ -25,7 +25,8 @@ class LearnFlowMap(Reflow):
     From a 1-RF or a 2-RF on its pairs, with the inner states of their paths (`data.pairs.knots`) for the objectives
     `knots` and `corrected`; or on scans, where noise and scan are drawn independently, by `solved`. With scans beside
     the pairs (`data.scans`) velocities, s = t, are learned from these, as by `Rectify`, and jumps from the pairs.
-    Pairs of a map by its own `renoise` have no inner states; by `knots` their jumps are those of straight lines.
+    Pairs of a map by its own `chord` or `renoise` have no inner states; by `knots` their jumps are those of straight
+    lines.
 
     Args:
         objective: Name in `r2flow.flow.maps.OBJECTIVES`.
@@ -71,7 +72,7 @@ class LearnFlowMap(Reflow):
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
         self.on_pairs = data["name"] == "pairs"
         pairs = (data.get("pairs") or {}) if self.on_pairs else {}
-        refined = self.objective is along_knots and pairs.get("method") == RENOISE
+        refined = self.objective is along_knots and pairs.get("method") in (CHORD, RENOISE)
         if self.objective in (along_knots, corrected) and not (pairs.get("knots") or refined):
             raise InputError(
                 f"stage.objective={self.objective_name} learns from inner states of paths: give data=pairs "
