@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.convolutions import RingConv2d, zero_convolution
-from r2flow.backbones.layers import ExactLinear, RMSNorm, unshuffle, zero_initialised
+from r2flow.backbones.layers import ExactLinear, RMSNorm, uncast, unshuffle, zero_initialised
 
 
 class Detail(nn.Module):
@@ -48,10 +48,11 @@ class Detail(nn.Module):
     def forward(self, x: Tensor, tokens: Tensor, condition: Tensor) -> Tensor:
         """x (B, C, H, W), tokens (B, H/p, W/q, K), condition (B or 1, L) to (B, C', H, W)."""
         h = unshuffle(self.spread(self.norm(tokens)), self.patch).permute(0, 3, 1, 2)
-        h = h + self.image(x) * (1 + self.gain(condition)[:, :, None, None]).to(h.dtype)
+        seen = uncast(self.image, x)
+        h = h + seen * (1 + self.gain(condition)[:, :, None, None]).to(seen.dtype)
         for block in self.blocks:
             h = block(h, condition)
-        return self.answer(F.silu(h))
+        return uncast(self.answer, F.silu(h))
 
     @torch.no_grad()
     def take_over(self, other: Self) -> None:

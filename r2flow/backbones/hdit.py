@@ -23,6 +23,7 @@ from r2flow.backbones.layers import (
     at_least_float32,
     in_bands,
     mapping_network,
+    uncast,
     unshuffle,
     zero_initialised,
 )
@@ -123,7 +124,7 @@ class HDiT(Backbone):
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         condition = self.condition(self.timestep_pe, t, s)
-        h = self.tokenizer(x).permute(0, 2, 3, 1).contiguous()
+        h = uncast(self.tokenizer, x).permute(0, 2, 3, 1).contiguous()
         if self.spatial_pe is not None:
             h = h + self.spatial_pe().to(h.dtype)
         skips = []
@@ -138,7 +139,7 @@ class HDiT(Backbone):
             h = self.up_levels[f"expand_{level}"](h, skips.pop())
             for block in _level(self.up_levels, level):
                 h = block(h, condition, self._table(level))
-        v = unshuffle(self.detokenizer(h), self.patch).permute(0, 3, 1, 2)
+        v = unshuffle(uncast(self.detokenizer, h), self.patch).permute(0, 3, 1, 2)
         return v if self.detail is None else v + self.detail(x, h, condition)
 
     def follow_rays(self) -> None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Self
+from typing import Self, cast
 
 import torch
 import torch.nn.functional as F
@@ -39,6 +39,16 @@ class ExactLinear(nn.Linear):
         kind = x.device.type if x.device.type != "meta" else "cpu"  # shapes alone have no autocast of their own
         with torch.autocast(kind, enabled=False):
             return F.linear(x.to(weight.dtype), weight, None if bias is None else bias.to(weight.dtype))
+
+
+def uncast(layer: nn.Module, x: Tensor) -> Tensor:
+    """layer(x) in the type of its weights, whatever autocast does.
+
+    For the layers at both ends of a network, which see an image's own values: rounded to bfloat16, of 8 bits, these are
+    rougher than surfaces are.
+    """
+    with torch.autocast(x.device.type if x.device.type != "meta" else "cpu", enabled=False):
+        return cast(Tensor, layer(x.to(next(layer.parameters()).dtype)))
 
 
 def zero_initialised(layer: nn.Linear) -> nn.Linear:

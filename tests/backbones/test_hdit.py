@@ -155,6 +155,22 @@ def test_autocast_is_near_float32_and_returns_it(dtype, position):
     assert relative(found, expected) < (0.05 if dtype == torch.bfloat16 else 0.01)
 
 
+def test_autocast_does_not_round_the_image_at_the_ends():
+    """Where blocks add nothing and inner levels are left out, the network is linear layers between two images."""
+    model, x, t = small(detail=[1, 8]), image(), torch.tensor([0.1, 0.9985])
+    with torch.no_grad():
+        for name, weight in model.named_parameters():
+            if name.endswith(("out_proj.weight", "linear.weight", "spread.weight", "second.weight", "second.bias")):
+                weight.zero_()
+            elif name.endswith("alpha"):  # the share of the inner level is its sigmoid
+                weight.fill_(-1e4)
+        expected = model(t, x)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            found = model(t, x)
+    assert expected.std() > 0.1
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+
+
 def test_gradcheck_of_a_block():
     torch.manual_seed(0)
     block = Block(BlockOptions(8, 2, 6, (2, 4), Neighbourhood((3, 5), True, "auto"), 0.0))
