@@ -41,7 +41,7 @@ MODELS: Registry[Model] = Registry(
     ),
     street_few=Model(
         "street scenes in one or two evaluations, learned from simulated scans",
-        "9bdd5e0d95710c7384e560eeedefc37aa069cb9efa6d133012e83734593597b6",
+        "c658d0563803c108027ffe7106fe272bb00ba8bf068ce00085af4e1f01844a6d",
         page="release/street_few.safetensors in the source of r2flow",
     ),
     street_full=Model(
