@@ -44,13 +44,13 @@ TIMES = (0.1, 0.3, 0.5, 0.7, 0.85, 0.92, 0.96, 0.98)
 SOLVER: dict[str, Any] = {"method": "midpoint", "steps": 16, "grid": "power:2"}
 
 COMMON = [
-    "sensor=hdl64e_small", "data=simulated", f"data.scenes={SCENES}", "data.batch_size=8", "data.augment.flip=true",
+    "sensor=hdl64e_small", "data=simulated", f"data.scenes={SCENES}", "data.batch_size=8",
     "samples.num=0", "callbacks.pictures=null", "callbacks.curvature=null", "loggers=[csv]", "trainer=cpu",
     "callbacks.checkpoint.every=1000000", "trainer.val_check_interval=1000000",
 ]  # fmt: skip
 FAST = ["experiment=fast"]
 RECIPES: dict[str, list[str]] = {
-    "before": ["backbone=hdit_tiny"],
+    "before": ["backbone=hdit_tiny", "data.augment.flip=true"],
     "fast": [*FAST, "trainer.precision=bf16-mixed"],
     "fast in float32": FAST,
     "without Muon": [*FAST, "trainer.precision=bf16-mixed", "stage.muon=null"],
@@ -58,11 +58,11 @@ RECIPES: dict[str, list[str]] = {
     "without the path": [*FAST, "trainer.precision=bf16-mixed", "backbone.detail=null"],
     "without preconditioning": [*FAST, "trainer.precision=bf16-mixed", "backbone.data_std=null"],
     "a wider path": [*FAST, "trainer.precision=bf16-mixed", "backbone.detail=[3, 24]"],
-    "a position": [
+    "without a position": [
         *FAST,
         "trainer.precision=bf16-mixed",
-        "backbone.position=fourier_features",
-        "data.augment.flip=false",
+        "backbone.position=none",
+        "data.augment.flip=true",
     ],
 }
 ALL_BUDGETS = ("before", "fast")
