@@ -33,7 +33,7 @@ from r2flow.data.reading import AUTO
 from r2flow.errors import InputError
 from r2flow.flow.solvers import check_method
 from r2flow.generators import GENERATORS, Flow, FlowMap, Generator, build_generator
-from r2flow.generators.base import CHORD, JUMP, RENOISE
+from r2flow.generators.base import WAYS
 from r2flow.lineage import Parent, find_parent, inherit, with_scales
 from r2flow.noise import seed_torch
 from r2flow.plugins import made_with
@@ -231,7 +231,7 @@ def _assembled(config: dict[str, Any], generator: Generator, parent: Parent | No
         data.pairs.recipe(data.encoding.shape, data.noise_shape)  # refuses what is out of its range
         usual = {"name": "rectified_flow"}
         family = GENERATORS[(parent.config.get("generator") or usual)["name"]] if parent else None
-        jumps = isinstance(family, type) and issubclass(family, FlowMap) and data.pairs.method in (JUMP, CHORD, RENOISE)
+        jumps = isinstance(family, type) and issubclass(family, FlowMap) and data.pairs.method in WAYS
         if isinstance(family, type) and issubclass(family, Flow) and not jumps:  # others say themselves how they run
             check_method(data.pairs.method)
     check_roll(data.augment, generator)

@@ -37,7 +37,7 @@ class HDiT(Backbone):
     Tokens of patch_h x patch_w pixels; at each outer level `depths[l]` blocks of neighbourhood attention on the way
     down and as many on the way up, 2 x 2 tokens merged between levels and the width doubled; in the middle
     `depths[-1]` blocks of global attention. Queries and keys are rotated by the ray angles (`Rotary`). Parameters
-    carry the names of the published weights.
+    carry the names of the published weights. Under autocast the layers at both ends keep the weights' type (`uncast`).
 
     Args:
         rays: Elevation and azimuth of every pixel in radians, (2, H, W).

@@ -27,7 +27,7 @@ Precision = Literal["32-true", "bf16-mixed"]  # words of Lightning's trainer
 IMAGE, KNOWN, DOUBTFUL = "image", "known", "doubtful"  # the names of what is known of a part of a scan
 LOGIT, SIGMA = "logit", "sigma"  # and of what a conditional flow finds of these once (`r2flow.generators.conditional`)
 
-JUMP, CHORD, RENOISE = "jump", "chord", "renoise"  # the ways of a flow map, on the same steps
+JUMP, CHORD, RENOISE = WAYS = "jump", "chord", "renoise"  # of a flow map, on the same steps
 
 WHOLE_ONLY = "a {} makes whole images and no part of one; leave the region out."
 
@@ -151,7 +151,7 @@ class Sampler:
 def _kind(method: str) -> str:
     """A method's name without its numbers; torchdiffeq's have their own after the colon. A map's ways are one."""
     name = method if method.startswith(TORCHDIFFEQ) else method.partition(":")[0]
-    return JUMP if name in (CHORD, RENOISE) else name
+    return JUMP if name in WAYS else name
 
 
 def _usual(method: str) -> Mapping[str, Any]:

@@ -13,10 +13,12 @@ from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.solvers import Solution
 from r2flow.flow.solvers.solution import finite, stepped
 from r2flow.flow.stochastic import ahead, back, churn_of
-from r2flow.generators.base import CHORD, JUMP, RENOISE, Condition, Generated, Progress, Sampler
+from r2flow.generators.base import CHORD, JUMP, RENOISE, WAYS, Condition, Generated, Progress, Sampler
 from r2flow.generators.flow import UNTOLD, Conditioned, RectifiedFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
+
+QUIET = JUMP, CHORD  # what draws no noise on the way
 
 
 class FlowMap(RectifiedFlow):
@@ -43,7 +45,7 @@ class FlowMap(RectifiedFlow):
 
     second_time: ClassVar[bool] = True
     goes_on_as = "rectified_flow"  # where velocities alone are learned, the jumps would be those of another flow
-    other_samplers = JUMP, CHORD, RENOISE, *RectifiedFlow.other_samplers
+    other_samplers = *WAYS, *RectifiedFlow.other_samplers
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space, backbone)
@@ -73,7 +75,7 @@ class FlowMap(RectifiedFlow):
         **options: Any,
     ) -> Solution:
         how = sampler or self.sampler
-        if how.method not in (JUMP, CHORD):
+        if how.method not in QUIET:
             return super().solve(x, t_0, t_1, sampler=how, condition=condition, progress=progress, **options)
         given = [name for name, value in options.items() if value is not None]
         if given:
@@ -92,7 +94,7 @@ class FlowMap(RectifiedFlow):
     ) -> Generated:
         how = sampler or self.sampler
         churn = _churn(how)
-        if churn is None or how.method in (JUMP, CHORD):
+        if churn is None or how.method in QUIET:
             return super().generate(noise, condition, sampler=how, draws=draws, progress=progress)
         if draws is None and churn:
             raise InputError(f"{how.method} draws further noise: give draws.")
@@ -112,7 +114,7 @@ class FlowMap(RectifiedFlow):
         x, u = x.to(self.device), self.map(condition)
         alive = finite(x)
         for n, (t, s) in enumerate(pairwise(times.tolist()), start=1):
-            r = s if chord else ahead(t, s, churn)  # how far it goes, to begin with
+            r = ahead(t, s, churn)
             at, to, aim = torch.tensor([t, r, float(times[-1]) if chord else r], dtype=torch.float64).to(x)
             following = x + (to - at) * u(at, x, aim)
             if draws is not None and r > s:
@@ -123,7 +125,7 @@ class FlowMap(RectifiedFlow):
         return Generated.after(x, len(times) - 1, alive)
 
     def draws_noise(self, sampler: Sampler) -> bool:
-        return super().draws_noise(sampler) or (sampler.method not in (JUMP, CHORD) and _churn(sampler) is not None)
+        return super().draws_noise(sampler) or (sampler.method not in QUIET and _churn(sampler) is not None)
 
     def check_sampler(self, sampler: Sampler) -> None:
         if _churn(sampler) is None:
@@ -143,4 +145,4 @@ class FlowMap(RectifiedFlow):
 
 def _churn(how: Sampler) -> float | None:
     """c of a sampler of jumps, 0 for those that draw no noise; None of another."""
-    return 0.0 if how.method in (JUMP, CHORD) else churn_of(how.method, RENOISE, math.inf)
+    return 0.0 if how.method in QUIET else churn_of(how.method, RENOISE, math.inf)
