@@ -110,7 +110,7 @@ class Backbone(ExactBuffers):
             raise InputError(f"this backbone was built for images of {expected}, found {tuple(x.shape[1:])}.")
         if s is not None and not self.second_time:
             raise InputError("this backbone was built for one time and takes no s: build it with second_time=True.")
-        t = _times("t", t, x)
+        t, s = _times("t", t, x), None if s is None else _times("s", s, x)
         if self.data_std is None:
             return self._evaluated(t, x, s).to(x.dtype)
         image, rest = at_least_float32(x[:, : self.out_channels]), x[:, self.out_channels :]
@@ -118,11 +118,11 @@ class Backbone(ExactBuffers):
         inner = torch.cat([into * image, rest], dim=1) if rest.shape[1] else into * image
         return (skip * image + out * self._evaluated(t, inner, s)).to(x.dtype)
 
-    def _evaluated(self, t: Tensor, x: Tensor, s: Tensor | float | None) -> Tensor:
+    def _evaluated(self, t: Tensor, x: Tensor, s: Tensor | None) -> Tensor:
         y = x.to(next(self.parameters()).dtype)
         if not self.second_time:
             return self.velocity(t, y)
-        return self.velocity(t, y, t if s is None else _times("s", s, x))
+        return self.velocity(t, y, t if s is None else s)
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         """The field for t of shape (B,), or (1,) for the whole batch, in float32 or better.

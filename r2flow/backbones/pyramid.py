@@ -12,6 +12,7 @@ from r2flow.backbones.convolutions import RingConv2d
 from r2flow.backbones.detail import Detail, DetailBlock
 from r2flow.backbones.encodings import mean_rays
 from r2flow.backbones.hdit import time_embedding
+from r2flow.backbones.layers import ExactLinear, zero_initialised
 from r2flow.errors import InputError
 from r2flow.registry import Count, Positive
 
@@ -33,7 +34,9 @@ class Pyramid(Backbone):
         v(t, x_t) = U P v + skip(t) h + out(t) F(t, h, y, y + (1 - t') v')
 
     F starts at zero. So the means of what the network draws are at once the images of the inner one; below them is
-    noise.
+    noise. With a second time the inner network gives the mean velocity u'(y, t', s'), s' of s as t' of t. The formula
+    stays: P x_s = w_s / sqrt(n) y_s and s' - t' = sqrt(n) (s - t) / (w_s w), so that
+    P u = (P x_s - P x_t) / (s - t) = (sqrt(n) - 1) / sqrt(n) y + u' / w.
 
     Args:
         rays: Elevation and azimuth of every pixel in radians, (2, H, W).
@@ -50,6 +53,8 @@ class Pyramid(Backbone):
     Raises:
         InputError: an inner network that cannot be built, or an image that it cannot see the means of.
     """
+
+    takes_second_time = True
 
     def __init__(
         self,
@@ -90,27 +95,33 @@ class Pyramid(Backbone):
         ends = channels + self.out_channels, self.out_channels
         count, wide = integers("detail", detail, 2)
         self.detail = Detail(count, wide, ends, width, self.factor, time_channels, ring)
+        if self.second_time:
+            last = zero_initialised(ExactLinear(time_channels, time_channels, bias=False))
+            self.interval_embedding = time_embedding(time_channels, dropout=0.0).append(last)
+            self.inner = build_backbone(inner, seen, channels, answered, second_time=True)
+            self.inner.load_state_dict({**self.inner.state_dict(), **small.state_dict()})
 
     # Not `velocity`: that is given x in the type of the weights, and means and rest are taken of the exact x.
-    def _evaluated(self, t: Tensor, x: Tensor, s: Tensor | float | None) -> Tensor:
+    def _evaluated(self, t: Tensor, x: Tensor, s: Tensor | None) -> Tensor:
         image, rest = x[:, : self.out_channels], x[:, self.out_channels :]
         means = self._means(x)
         below = image - self._spread(means[:, : self.out_channels])
         root = (self.factor[0] * self.factor[1]) ** 0.5
         w = t * root + 1 - t
         later, wide = t * root / w, w[:, None, None, None]
+        inner_s = () if s is None else (s * root / (s * root + 1 - s),)
         y = torch.cat([root / wide * means[:, : self.out_channels], means[:, self.out_channels :]], dim=1)
         state = y[:, : self.out_channels]
-        velocity = self.inner(later, y)
+        velocity = self.inner(later, y, *inner_s)
         estimate = state + (1 - later)[:, None, None, None] * velocity
         into, skip, out = precondition(t, self.below_std)
         pixels = torch.cat([into * below, rest, self._spread(estimate)], dim=1)  # as the means: image, condition, more
-        path = self._path(t, pixels, torch.cat([y, estimate], dim=1)).to(x.dtype)
+        path = self._path(t, s, pixels, torch.cat([y, estimate], dim=1)).to(x.dtype)
         return self._spread((root - 1) / root * state + velocity / wide) + skip * below + out * path
 
-    def _path(self, t: Tensor, pixels: Tensor, means: Tensor) -> Tensor:
+    def _path(self, t: Tensor, s: Tensor | None, pixels: Tensor, means: Tensor) -> Tensor:
         dtype = self.entrance.weight.dtype
-        condition = self.timestep_pe(t)
+        condition = self.condition(self.timestep_pe, t, s)
         h = self.entrance(means.to(dtype))
         for block in self.coarse:
             h = block(h, condition)
@@ -121,6 +132,9 @@ class Pyramid(Backbone):
 
     def _spread(self, x: Tensor) -> Tensor:
         return F.interpolate(x, scale_factor=self.factor, mode="nearest")
+
+    def second_time_names(self) -> frozenset[str]:
+        return super().second_time_names() | {f"inner.{name}" for name in self.inner.second_time_names()}
 
     @property
     def learns_directions(self) -> bool:

@@ -75,6 +75,22 @@ def test_a_condition_is_seen_inside_and_around(channel):
     assert torch.allclose(seen[0][:, 2:], F.avg_pool2d(x[:, 2:], (1, 2)), atol=1e-6)
 
 
+def test_jumps_move_the_means_as_the_inner_network_does():
+    """The mean of n pixels, x_t = t x_1 + (1 - t) x_0, is w / sqrt(n) times a state y of the small flow at t' =
+    t sqrt(n) / w, w = t sqrt(n) + 1 - t. The inner network jumps from y to y + (s' - t') u'(y, t', s')."""
+    model, x, root = tiny("pyramid", second_time=True), image(1), 2**0.5
+    nn.init.zeros_(model.detail.answer.weight)  # what the path adds has a mean of its own
+    nn.init.zeros_(model.detail.answer.bias)
+    for t, s in ((0.0, 1.0), (0.3, 0.8), (0.9, 0.2)):
+        w, w_s = (time * root + 1 - time for time in (t, s))
+        later, later_s = t * root / w, s * root / w_s
+        y = F.avg_pool2d(x, (1, 2)) * root / w
+        with torch.no_grad():
+            arrived = y + (later_s - later) * model.inner(later, y, later_s)
+            found = F.avg_pool2d(x + (s - t) * model(t, x, s), (1, 2))
+        assert torch.allclose(found, w_s / root * arrived, atol=1e-5)
+
+
 @pytest.mark.parametrize(("options", "message"), [
     ({"factor": [1, 1]}, "backbone.factor must be of more than one pixel"),
     ({"factor": [2]}, "factor must be 2 integers"),
@@ -82,7 +98,6 @@ def test_a_condition_is_seen_inside_and_around(channel):
     ({"inner": {"depths": [1]}}, "needs a 'name'"),
     ({"inner": {"name": "hdit", "patch": [3, 4]}}, "height 16 cannot be used by HDiT"),
     ({"data_std": 0.5}, "leave backbone.data_std out"),
-    ({"second_time": True}, "a flow is straightened and distilled"),
 ])  # fmt: skip
 def test_what_cannot_be_built(options, message):
     with pytest.raises(InputError, match=message):
