@@ -209,6 +209,45 @@ def test_samplers_that_jumps_do_not_have_are_refused(grown, sampler, said):
         grown.check_sampler(sampler)
 
 
+OWN = Sampler("adams3", 16, grid="power:1.75", fewer="chord")
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        ({"steps": 2}, ("chord", 2, "power:5")),
+        ({"steps": 15}, ("chord", 15, "power:5")),
+        ({"steps": 2, "grid": "power:3"}, ("chord", 2, "power:3")),
+        ({"steps": 16}, ("adams3", 16, "power:1.75")),
+        ({"steps": 32}, ("adams3", 32, "power:1.75")),
+        ({"steps": 4, "method": "adams3"}, ("adams3", 4, "power:1.75")),
+        ({"steps": 4, "method": "euler"}, ("euler", 4, "uniform")),
+        ({"precision": "bf16-mixed"}, ("adams3", 16, "power:1.75")),
+    ],
+)
+def test_fewer_steps_alone_go_over_to_the_method_for_these(asked, expected):
+    found = OWN.changed(**asked)
+    assert (found.method, found.steps, found.grid) == expected
+    assert (found.fewer is None) == (found.method == "chord" or "method" in asked)
+
+
+def test_a_map_drawn_as_a_flow_draws_two_steps_by_jumps(grown):
+    grown.sampler, x_0 = OWN, Draws(0, range(2)).start(grown.noise_shape)
+    few = grown.generate(x_0, sampler=OWN.changed(steps=2))
+    assert torch.equal(few.x, grown.generate(x_0, sampler=Sampler("chord", 2, grid="power:5")).x)
+    assert few.evaluations.tolist() == [2, 2]
+    assert grown.in_steps(2) == OWN.changed(steps=2)
+
+
+def test_a_file_says_which_method_is_for_fewer_steps_where_there_is_one():
+    assert Sampler.of(OWN.asdict()) == OWN
+    assert "fewer" not in Sampler("adams3", 16).asdict()
+    config = {"stage": {"name": "flow_map"}, "data": DATA, "seed": 0}
+    assert build_stage({**config, "sampler": {"fewer": "chord"}}, flow_map()).generator.sampler.fewer == "chord"
+    with pytest.raises(InputError, match="no solver named 'cord'"):
+        build_stage({**config, "sampler": {"fewer": "cord"}}, flow_map())
+
+
 def test_renoising_needs_draws(grown):
     noise = torch.zeros(1, *grown.noise_shape)
     with pytest.raises(InputError, match="give draws"):

@@ -68,6 +68,7 @@ class Sampler:
             noise of a ranging sensor is far less.
         precision: Of the network, as `trainer.precision`: `bf16-mixed` computes its products in bfloat16, by
             `torch.autocast`. States and steps stay as they are.
+        fewer: Method in fewer steps than `steps`, where another is better there; a flow map may have `chord`.
     """
 
     method: str = "euler"
@@ -80,6 +81,7 @@ class Sampler:
     fixed: bool = False
     doubt: Positive = 0.2
     precision: Precision = "32-true"
+    fewer: str | None = None
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> Self:
@@ -101,6 +103,7 @@ class Sampler:
     def changed(self, **options: Any) -> Self:
         """The same with the options that are not None. Given times decide the number of steps.
 
+        Fewer steps alone go over to the method `fewer`, if there is one.
         Another method starts from its usual grid and `finish`, without `levels`: those were the former one's. The same
         one with other numbers, as `sde:2` for `sde`, keeps them.
 
@@ -113,6 +116,10 @@ class Sampler:
         odd = {k: v for k, v in given.items() if isinstance(v, tuple) or type(v) is not type(own.get(k))}
         odd |= {k: v for k, v in given.items() if k == "precision"}
         check_options("sampler", type(self), odd)
+        if self.fewer and "method" not in given and given.get("steps", self.steps) < self.steps:
+            given["method"] = self.fewer
+        if "method" in given:
+            given = {"fewer": None, **given}
         if _kind(given.get("method", self.method)) != _kind(self.method):
             given = {**_usual(given["method"]), "levels": (), "limits": (), **given}
         if "steps" in given:
@@ -143,9 +150,12 @@ class Sampler:
         return ", ".join(f"{key} {value}" for key, value in asdict(self).items() if value != getattr(other, key))
 
     def asdict(self) -> dict[str, Any]:
-        """Plain values, as a config or a checkpoint holds them; `precision`, younger than others, if not `32-true`."""
+        """Plain values, as a config or a checkpoint holds them; `precision` and `fewer`, younger keys, if given."""
         found = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
-        return found if found.pop("precision") == "32-true" else {**found, "precision": self.precision}
+        return {key: value for key, value in found.items() if (key, value) not in YOUNGER}
+
+
+YOUNGER = ("precision", "32-true"), ("fewer", None)
 
 
 def _kind(method: str) -> str:
@@ -155,9 +165,11 @@ def _kind(method: str) -> str:
 
 
 def _usual(method: str) -> Mapping[str, Any]:
-    """Where its steps fall; of `sde`, what was best or nearly so of `street`, `street_full` and a flow of minutes."""
+    """Where its steps fall; of `sde` and `chord`, what was best or nearly so of the models that were measured."""
     if _kind(method) == SDE:
         return {"grid": "power:2.5", "finish": 1 / 128}
+    if method == CHORD:
+        return {"grid": "power:5", "finish": 0.0}
     return {"grid": usual_grid(method), "finish": 0.0}
 
 

@@ -139,7 +139,10 @@ class FlowMap(RectifiedFlow):
         return sampler.steps if _churn(sampler) is not None else super().evaluations_of(sampler)
 
     def in_steps(self, steps: int) -> Sampler:
-        learned = self.sampler.grid if _churn(self.sampler) is not None else "uniform"
+        own = self.sampler
+        if own.fewer in QUIET:
+            return own.changed(method=own.fewer, steps=steps)
+        learned = own.grid if _churn(own) is not None else "uniform"
         return Sampler(JUMP, 4, grid=learned).changed(steps=steps)
 
 

@@ -37,12 +37,7 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes in any number of evaluations, learned from simulated scans",
-        "1580761c63bdb579cc95185c875501b4a32832e98d1114d875bc72acfbaf2137",
-    ),
-    street_few=Model(
-        "street scenes in one or two evaluations, learned from simulated scans",
-        "c658d0563803c108027ffe7106fe272bb00ba8bf068ce00085af4e1f01844a6d",
-        page="release/street_few.safetensors in the source of r2flow",
+        "d8499b97a39197071e24256c6dc2a065bfa80870b90865360c584d34ddf01cee",
     ),
     street_full=Model(
         "street scenes at 64 x 1024, learned from simulated scans",

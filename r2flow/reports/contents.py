@@ -50,7 +50,8 @@ def card(contents: dict[str, Any]) -> str:
         "sensor": contents["sensor"],
         "network": f"{contents['backbone'] or contents['generator']}, {contents['parameters']:,} parameters",
         "file": f"{contents['bytes'] / 1e6:.1f} MB",
-        "drawn with": f"{sampler['method']}, {sampler['steps']} steps",
+        "drawn with": f"{sampler['method']}, {sampler['steps']} steps"
+        + (f"; {sampler['fewer']} in fewer" if sampler.get("fewer") else ""),
         "learned from": ", ".join(filter(None, learned_from)) or None,
         "stage": ", ".join([contents["stage"], *_said({key: stage.get(key) for key in ("loss", "time")})]),
         "starts from": parent and _lineage(parent),

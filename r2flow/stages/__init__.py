@@ -92,4 +92,6 @@ def _sampler(generator: Generator, wanted: Mapping[str, Any]) -> Sampler:
         kind = "of fixed steps" if useless == "steps" else "that adapts its steps, as dopri5"
         raise InputError(f"sampler.{useless} is for a solver {kind}, and {found.method} is none; leave it out.")
     generator.check_sampler(found)
+    if found.fewer is not None:
+        generator.check_sampler(found.changed(method=found.fewer))
     return found
