@@ -1,6 +1,7 @@
 """The progress bar of everything that takes a while."""
 
 import sys
+import time
 from collections.abc import Iterable, Iterator
 from operator import length_hint
 from typing import Self, TypeVar
@@ -11,6 +12,8 @@ from rich.text import Text
 
 T = TypeVar("T")
 
+EVERY = 30  # seconds between two lines where there is no terminal, as in a cluster's log
+
 
 class Bar:
     """A progress bar with rate and time left, on standard error: results on standard output may be piped.
@@ -19,7 +22,7 @@ class Bar:
         doing: What is being done, as "sampling".
         total: Number of units.
         unit: What is counted, as "scans".
-        shown: Whether it is drawn; on a terminal only if left out.
+        shown: Whether it is drawn; if left out, on a terminal, and elsewhere as a line every `EVERY` seconds.
     """
 
     def __init__(self, doing: str, total: int, unit: str = "", shown: bool | None = None) -> None:
@@ -29,8 +32,13 @@ class Bar:
             console=Console(stderr=True), transient=True, disable=not (sys.stderr.isatty() if shown is None else shown),
         )  # fmt: skip
         self._task = self._progress.add_task(unit, total=total, note="")
+        self._line = f"{doing} {{done:.0f}}/{total} {unit}"
+        self._lines = shown is None and self._progress.disable
+        self._told = time.monotonic()
+        self._first: tuple[float, float] | None = None  # what was done, and when: work that goes on begins with some
 
     def __enter__(self) -> Self:
+        self._told = time.monotonic()
         self._progress.start()
         return self
 
@@ -40,13 +48,24 @@ class Bar:
     def __call__(self, units: float = 1) -> None:
         """So many more units are done."""
         self._progress.advance(self._task, units)
+        self._tell()
 
     def set(self, done: float | None = None, note: str | None = None) -> None:
         """How many units are done by now, and what stands behind the bar."""
         if done is not None:
             self._progress.update(self._task, completed=done)
+            self._tell()
         if note is not None:
             self._progress.update(self._task, note=note)
+
+    def _tell(self) -> None:
+        now, task = time.monotonic(), self._progress.tasks[0]
+        before, began = self._first = self._first or (task.completed, now)
+        done = task.completed - before
+        if self._lines and done > 0 and now - self._told >= EVERY:
+            self._told, rate = now, done / (now - began)
+            left = duration(max((task.total or 0) - task.completed, 0) / rate)
+            print(f"{self._line.format(done=task.completed)}  {rate:.2f}/s  {left} left", file=sys.stderr, flush=True)
 
 
 class _Rate(ProgressColumn):

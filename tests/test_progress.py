@@ -21,3 +21,20 @@ def test_track_gives_every_item_once_and_shows_nothing_without_a_terminal(items,
     expected = [1, 2] if not hasattr(items, "__len__") else list(items)
     assert list(track(items, "reading", total=len(expected))) == expected
     assert capsys.readouterr() == ("", "")
+
+
+def test_without_a_terminal_there_is_a_line_every_half_minute(capsys, monkeypatch):
+    now = 100.0
+    monkeypatch.setattr("r2flow.progress.time.monotonic", lambda: now)
+    with Bar("completing", 300, "scans") as bar:
+        bar.set(100)  # of an earlier run
+        for _ in range(8):
+            now += 10.0
+            bar(5)
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    # 15 scans in 30 s leave 185 for 6 min 10 s; 30 in 60 s leave 170 for 5 min 40 s
+    assert shown.err.splitlines() == [
+        "completing 115/300 scans  0.50/s  6:10 left",
+        "completing 130/300 scans  0.50/s  5:40 left",
+    ]

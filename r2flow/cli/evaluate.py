@@ -1,7 +1,6 @@
 """`r2flow evaluate` and `r2flow report neighbours`: generated scans against real ones."""
 
 import logging
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -372,7 +371,7 @@ def work_of(batch_size: int, workers: int, rank: int = 0, ranks: int = 1) -> "Wo
     """How the work is done, its bars on standard error where somebody watches."""
     from r2flow.evaluation.measuring import Work
 
-    return Work(batch_size, workers, rank, ranks, watched=rank == 0 and sys.stderr.isatty())
+    return Work(batch_size, workers, rank, ranks, watched=rank == 0)
 
 
 def _is_flow(text: str | None) -> bool:

@@ -32,11 +32,11 @@ class Work:
     workers: int = 0  # further processes that read
     rank: int = 0  # number of this process among those that take batches by turns
     ranks: int = 1  # how many these are
-    watched: bool = False  # whether progress bars are shown
+    watched: bool = False  # whether progress is shown, by one process of several
 
     def bar(self, doing: str, total: int, unit: str = "scans") -> Bar:
         """A progress bar of `total` units; shows nothing unless the work is watched."""
-        return Bar(doing, total, unit, shown=self.watched)
+        return Bar(doing, total, unit, shown=None if self.watched else False)
 
 
 @dataclass(frozen=True)
