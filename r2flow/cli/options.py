@@ -20,7 +20,7 @@ CheckpointOption = Annotated[
 ]
 DeviceOption = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")]
 PrecisionOption = Annotated[
-    str | None, typer.Option(help="Of the network: 32-true or, in half the time where there is bfloat16, bf16-mixed.")
+    str | None, typer.Option(help="Of the network: 32-true or, faster where there is bfloat16, bf16-mixed.")
 ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", show_default=False)]
 SensorOption = Annotated[str, typer.Option(help="Name of the sensor, or the YAML file of your own (r2flow sensor).")]
