@@ -41,8 +41,8 @@ def calibrate(
     flow = as_flow(checkpoint.generator, "a time grid")
     if flow.sampler.fixed or isinstance(flow, FlowMap):
         raise InputError(
-            f"{checkpoint.path} is drawn by {flow.sampler.method} in steps that it has learned: there is no time grid "
-            "to find."
+            f"{checkpoint.path} holds a {'flow map' if isinstance(flow, FlowMap) else 'flow'} that has learned its "
+            "steps: there is no time grid to find."
         )
     x_0 = Draws(0, range(num), "validation").start(flow.noise_shape).to(flow.device)
     exact = flow.solve(x_0.double(), sampler=EXACT, progress=progress)
