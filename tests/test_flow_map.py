@@ -231,6 +231,11 @@ def test_fewer_steps_alone_go_over_to_the_method_for_these(asked, expected):
     assert (found.fewer is None) == (found.method == "chord" or "method" in asked)
 
 
+def test_pairs_by_chord_have_the_grid_that_it_is_drawn_on():
+    drawn = OWN.changed(steps=2)
+    assert PairOptions(method="chord", steps=2).recipe((2, 8, 64)).grid == drawn.grid == "power:5"
+
+
 def test_a_map_drawn_as_a_flow_draws_two_steps_by_jumps(grown):
     grown.sampler, x_0 = OWN, Draws(0, range(2)).start(grown.noise_shape)
     few = grown.generate(x_0, sampler=OWN.changed(steps=2))

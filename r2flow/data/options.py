@@ -7,8 +7,8 @@ from typing import Any, Self
 
 from r2flow.data.shards import PairRecipe
 from r2flow.errors import InputError
-from r2flow.flow.solvers import check_knots, check_tolerance, named_grid, usual_grid
-from r2flow.generators.base import Precision
+from r2flow.flow.solvers import check_knots, check_tolerance, named_grid
+from r2flow.generators.base import Precision, usual_steps
 from r2flow.lidar.scan_files.fields import check_columns
 from r2flow.registry import NonNegative, Positive, check_options
 
@@ -113,7 +113,7 @@ class PairOptions:
                 f"data.pairs: seed and first must be at least 0 and below 2^63, found {self.seed} and {first}."
             )
         check_tolerance(self.tolerance)
-        grid = self.grid or usual_grid(self.method)
+        grid = self.grid or usual_steps(self.method)["grid"]
         named_grid(grid)
         if self.knots:
             check_knots(self.method, self.steps, self.knots)

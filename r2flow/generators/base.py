@@ -121,7 +121,7 @@ class Sampler:
         if "method" in given:
             given = {"fewer": None, **given}
         if _kind(given.get("method", self.method)) != _kind(self.method):
-            given = {**_usual(given["method"]), "levels": (), "limits": (), **given}
+            given = {**usual_steps(given["method"]), "levels": (), "limits": (), **given}
         if "steps" in given:
             given = {"levels": (), "limits": (), **given}
         grid = given.get("grid", "uniform")
@@ -164,7 +164,7 @@ def _kind(method: str) -> str:
     return JUMP if name in WAYS else name
 
 
-def _usual(method: str) -> Mapping[str, Any]:
+def usual_steps(method: str) -> Mapping[str, Any]:
     """Where its steps fall; of `sde` and `chord`, what was best or nearly so of the models that were measured."""
     if _kind(method) == SDE:
         return {"grid": "power:2.5", "finish": 1 / 128}
