@@ -368,7 +368,7 @@ def neighbours(
 
 
 def work_of(batch_size: int, workers: int, rank: int = 0, ranks: int = 1) -> "Work":
-    """How the work is done, its bars on standard error where somebody watches."""
+    """How the work is done; the first process shows its progress on standard error."""
     from r2flow.evaluation.measuring import Work
 
     return Work(batch_size, workers, rank, ranks, watched=rank == 0)

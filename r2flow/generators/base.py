@@ -155,7 +155,7 @@ class Sampler:
         return {key: value for key, value in found.items() if (key, value) not in YOUNGER}
 
 
-YOUNGER = ("precision", "32-true"), ("fewer", None)
+YOUNGER = ("precision", "32-true"), ("fewer", None)  # what files without these keys mean by it
 
 
 def _kind(method: str) -> str:
@@ -165,7 +165,7 @@ def _kind(method: str) -> str:
 
 
 def usual_steps(method: str) -> Mapping[str, Any]:
-    """Where its steps fall; of `sde` and `chord`, what was best or nearly so of the models that were measured."""
+    """Its usual `grid` and `finish`; of `sde` and `chord` what was best, or nearly so, of `street` and `street_full`."""
     if _kind(method) == SDE:
         return {"grid": "power:2.5", "finish": 1 / 128}
     if method == CHORD:
