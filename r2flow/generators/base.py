@@ -165,7 +165,7 @@ def _kind(method: str) -> str:
 
 
 def usual_steps(method: str) -> Mapping[str, Any]:
-    """Its usual `grid` and `finish`; of `sde` and `chord` what was best, or nearly so, of `street` and `street_full`."""
+    """Its usual `grid` and `finish`; of `sde` and `chord` what was best, or nearly so, of the package's models."""
     if _kind(method) == SDE:
         return {"grid": "power:2.5", "finish": 1 / 128}
     if method == CHORD:
