@@ -32,7 +32,7 @@ class Bar:
             console=Console(stderr=True), transient=True, disable=not (sys.stderr.isatty() if shown is None else shown),
         )  # fmt: skip
         self._task = self._progress.add_task(unit, total=total, note="")
-        self._line = f"{doing} {{done:.0f}}/{total} {unit}"
+        self._doing, self._unit = doing, unit
         self._lines = shown is None and self._progress.disable
         self._told = time.monotonic()
         self._first: tuple[float, float] | None = None  # what was done, and when: work that goes on begins with some
@@ -65,7 +65,8 @@ class Bar:
         if self._lines and done > 0 and now - self._told >= EVERY:
             self._told, rate = now, done / (now - began)
             left = duration(max((task.total or 0) - task.completed, 0) / rate)
-            print(f"{self._line.format(done=task.completed)}  {rate:.2f}/s  {left} left", file=sys.stderr, flush=True)
+            counted = f"{self._doing} {task.completed:.0f}/{task.total:.0f} {self._unit}"
+            print(f"{counted}  {rate:.2f}/s  {left} left", file=sys.stderr, flush=True)
 
 
 class _Rate(ProgressColumn):

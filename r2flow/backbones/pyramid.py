@@ -95,7 +95,7 @@ class Pyramid(Backbone):
         ends = channels + self.out_channels, self.out_channels
         count, wide = integers("detail", detail, 2)
         self.detail = Detail(count, wide, ends, width, self.factor, time_channels, ring)
-        if self.second_time:
+        if self.second_time:  # after all else, so that a seed gives the weights of one time with it and without
             last = zero_initialised(ExactLinear(time_channels, time_channels, bias=False))
             self.interval_embedding = time_embedding(time_channels, dropout=0.0).append(last)
             self.inner = build_backbone(inner, seen, channels, answered, second_time=True)
