@@ -15,13 +15,13 @@ from r2flow.registry import options_of
 
 
 def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Checkpoint:
-    """A flow of larger images of the same view, by a `Pyramid` around the network of a trained one.
+    """A flow, or a flow map, of larger images of the same view, by a `Pyramid` around the network of a trained one.
 
-    The means of what it draws are the images of the trained flow. Below them is noise, until it has learned more
+    The means of what it draws are the images of the trained one. Below them is noise, until it has learned more
     (`stage.init`).
 
     Args:
-        checkpoint: A flow without a condition; of a flow map, its velocity.
+        checkpoint: Of a flow or a flow map, without a condition.
         shape: Rows and columns, multiples of the trained ones.
         options: Further options of `Pyramid`.
 
@@ -50,7 +50,7 @@ def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Che
         "sensor": {**checkpoint.config["sensor"], "rows": shape[0], "columns": shape[1]},
         "encoding": checkpoint.config["encoding"],
         **_reading(checkpoint),
-        "generator": {"name": "rectified_flow"},
+        "generator": checkpoint.config.get("generator") or {"name": "rectified_flow"},
         "backbone": {
             "name": "pyramid",
             **usual,
@@ -64,8 +64,7 @@ def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Che
     larger = _fresh(config)
     assert isinstance(larger, RectifiedFlow)
     assert isinstance(larger.backbone, Pyramid)
-    kept = {name: value for name, value in inner.state_dict().items() if name not in inner.second_time_names()}
-    larger.backbone.inner.load_state_dict(kept)
+    larger.backbone.inner.load_state_dict(inner.state_dict())
     return Checkpoint(larger.eval(), config)
 
 

@@ -23,17 +23,19 @@ class Bar:
         total: Number of units.
         unit: What is counted, as "scans".
         shown: Whether it is drawn; if left out, on a terminal, and elsewhere as a line every `EVERY` seconds.
+        lines: Lines on a terminal too, where the bars of several processes would write over each other.
     """
 
-    def __init__(self, doing: str, total: int, unit: str = "", shown: bool | None = None) -> None:
+    def __init__(self, doing: str, total: int, unit: str = "", shown: bool | None = None, lines: bool = False) -> None:
+        drawn = not lines and (sys.stderr.isatty() if shown is None else shown)
         self._progress = Progress(
             TextColumn(doing), BarColumn(), MofNCompleteColumn(), TextColumn(unit), _Rate(), TimeRemainingColumn(),
             TextColumn("{task.fields[note]}"),
-            console=Console(stderr=True), transient=True, disable=not (sys.stderr.isatty() if shown is None else shown),
+            console=Console(stderr=True), transient=True, disable=not drawn,
         )  # fmt: skip
         self._task = self._progress.add_task(unit, total=total, note="")
         self._doing, self._unit = doing, unit
-        self._lines = shown is None and self._progress.disable
+        self._lines = lines or (shown is None and not drawn)
         self._told = time.monotonic()
         self._first: tuple[float, float] | None = None  # what was done, and when: work that goes on begins with some
 

@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from r2flow.checkpoints import Checkpoint, load_checkpoint, weights_hash
+from r2flow.checkpoints import Checkpoint, load_checkpoint, save_checkpoint, weights_hash
 from r2flow.errors import InputError
-from r2flow.generators import RectifiedFlow, Sampler, build_generator
+from r2flow.flow.maps import jump
+from r2flow.generators import FlowMap, Sampler, build_generator
 from r2flow.generators.budgets import Budget
 from r2flow.growing import grown, widened
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
@@ -48,12 +49,35 @@ def test_it_follows_the_trained_flow_in_the_means_of_its_images(generator):
         assert torch.allclose(found, expected, atol=1e-5)
 
 
-def test_of_a_flow_map_a_flow_grows():
+def test_the_means_of_a_grown_map_jump_as_the_map_does():
+    """Means of x_s are a state of the map at s', as those of x_t at t'."""
     small = flow(generator={"name": "flow_map"})
-    large = grown(small, (16, 128))
-    assert type(large.generator) is RectifiedFlow
-    assert not large.generator.backbone.second_time
-    assert large.config["parent"]["weights"] == weights_hash(small)
+    large = grown(small, (16, 256))
+    assert type(large.generator) is FlowMap
+    x, root = torch.randn(3, 2, 16, 256), 8**0.5
+    for times in ((0.0, 1.0), (0.2, 0.7), (0.6, 0.6)):
+        t, s = torch.tensor(times)
+        w_t, w_s = (time * root + 1 - time for time in (t, s))
+        y = means(x) * root / w_t
+        with torch.no_grad():
+            expected = jump(small.generator.mean_velocity, t * root / w_t, y, s * root / w_s) * w_s / root
+            found = means(jump(large.generator.mean_velocity, t, x, s))
+        assert torch.allclose(found, expected, atol=1e-5)
+
+
+def test_a_grown_map_learns_on_as_a_map(r2flow, tmp_path):  # noqa: F811
+    small = flow(generator={"name": "flow_map"})
+    save_checkpoint(small, tmp_path / "map.safetensors")
+    out, run = tmp_path / "larger.safetensors", tmp_path / "run"
+    assert r2flow("grow", tmp_path / "map.safetensors", out, "--size", "16x128")[0] == 0
+    said = r2flow(
+        *("train", "experiment=flow_map", f"stage.init={out}", f"run_dir={run}", "data.pairs.num=4", "trainer=cpu"),
+        *("data.pairs.steps=2", "trainer.max_steps=2", "data.batch_size=2", "samples.num=0", "callbacks.pictures=null"),
+    )
+    assert said[0] == 0, said
+    found = load_checkpoint(run)
+    assert type(found.generator) is FlowMap
+    assert found.config["parent"]["grown_from"]["weights"] == weights_hash(small)
 
 
 def test_it_is_the_same_every_time_and_other_draws_go_on_as_they_would():

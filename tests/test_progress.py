@@ -38,3 +38,14 @@ def test_without_a_terminal_there_is_a_line_every_half_minute(capsys, monkeypatc
         "completing 115/300 scans  0.50/s  6:10 left",
         "completing 130/300 scans  0.50/s  5:40 left",
     ]
+
+
+def test_several_processes_write_lines_on_a_terminal_too(capsys, monkeypatch):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    now = 100.0
+    monkeypatch.setattr("r2flow.progress.time.monotonic", lambda: now)
+    with Bar("process 2 of 8: drawing", 64, "pairs", lines=True) as bar:
+        for done in (16, 32):
+            now += 40.0
+            bar.set(done)
+    assert capsys.readouterr() == ("", "process 2 of 8: drawing 32/64 pairs  0.40/s  1:20 left\n")

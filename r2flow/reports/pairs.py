@@ -1,7 +1,6 @@
 """Reflow pairs made with progress: how many, how fast, how long still."""
 
 import os
-import sys
 import time
 from collections.abc import Mapping
 
@@ -10,7 +9,7 @@ import torch
 from r2flow.checkpoints import Checkpoint
 from r2flow.data.pairs import Made, make_pairs
 from r2flow.data.shards import PairStore
-from r2flow.progress import Bar, duration
+from r2flow.progress import Bar
 
 
 def make_and_tell(
@@ -20,36 +19,21 @@ def make_and_tell(
     rank: int = 0,
     ranks: int = 1,
     device: torch.device | str = "cpu",
-    seconds: float = 15.0,
 ) -> Made:
-    """`make_pairs` with a bar; with a line every `seconds` outside a terminal and where several processes work."""
+    """`make_pairs` with a bar; with lines where several processes work."""
     generator = checkpoint.generator.to(device)
     there = sum(store.shard_path(shard).is_file() for shard in store.shards(num))
     if there > 4 and rank == 0:
         print(f"checking {there} shards of pairs", flush=True)
     who = f"process {rank + 1} of {ranks}: " if ranks > 1 else ""
-    watched, last = sys.stdout.isatty() and ranks == 1, time.monotonic()
     total = sum(batch % ranks == rank for batch in store.missing(num)) * store.recipe.batch_size
-    with Bar("drawing", total, "pairs", shown=watched) as bar:
-
-        def progress(made: Made) -> None:
-            nonlocal last
-            bar.set(made.pairs, rate(made))
-            if not watched and time.monotonic() - last >= seconds:
-                last = time.monotonic()
-                left = max(total - made.pairs, 0) * made.seconds / made.pairs
-                print(f"{who}pair {made.pairs}/{total}  {rate(made)}  {duration(left)} left", flush=True)
-
-        made = make_pairs(store, generator, num, rank, ranks, progress)
+    with Bar(f"{who}drawing", total, "pairs", lines=ranks > 1) as bar:
+        made = make_pairs(store, generator, num, rank, ranks, lambda made: bar.set(made.pairs))
     if made.pairs:
         unusable = f", {made.unusable} did not converge and are left out" if made.unusable else ""
-        print(f"{who}{made.pairs} pairs, {rate(made)}{unusable}", flush=True)
+        rate, cost = made.pairs / made.seconds, made.evaluations / made.pairs
+        print(f"{who}{made.pairs} pairs, {rate:.2f} pairs/s, {cost:.1f} evaluations a pair{unusable}", flush=True)
     return made
-
-
-def rate(made: Made) -> str:
-    """Pairs a second, evaluations a pair."""
-    return f"{made.pairs / made.seconds:.2f} pairs/s, {made.evaluations / made.pairs:.1f} evaluations a pair"
 
 
 def wait_for_others(
