@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 import torch
 
+from r2flow.checkpoints import Checkpoint, save_checkpoint
 from r2flow.data.opening import open_scans
+from r2flow.generators import Sampler, build_generator
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.metrics import METRICS
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.sums import SumMetric
-from tests.test_checkpoints import saved  # noqa: F401  a fixture
+from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_evaluation import SENSOR, folder, generated, images, real  # noqa: F401  fixtures
 
@@ -162,6 +164,23 @@ def test_a_curve_of_several_solvers_has_a_line_for_each_with_intervals(r2flow, s
     assert [row["flow"].partition(", ")[2] for row in rows] == ["euler", "euler", "heun2", "heun2"]
     assert all(row["jsd/jsd low"] < row["jsd/jsd high"] for row in rows)
     assert (tmp_path / "speed_quality.md").read_text().count(" to ") >= 4
+
+
+def test_a_curve_names_the_solver_where_a_model_has_another_in_fewer_steps(r2flow, real, tmp_path):  # noqa: F811
+    config = {**CONFIG, "generator": {"name": "flow_map"}}
+    generator = build_generator(config).eval()
+    generator.sampler = Sampler("adams3", 2, grid="power:1.75", fewer="chord")
+    save_checkpoint(Checkpoint(generator, config), tmp_path / "map.safetensors")
+    code, _, err = r2flow(
+        "evaluate", real, "-c", tmp_path / "map.safetensors", "--steps", "1,2", "--metrics", "jsd", "--num", 4,
+        "--workers", 0, "--out", tmp_path,
+    )  # fmt: skip
+    assert code == 0, err
+    page = (tmp_path / "speed_quality.md").read_text()
+    assert "by chord, adams3; measured" in page
+    assert [line.split(" | ")[1:3] for line in page.splitlines() if "map.safetensors | " in line] == [
+        ["1", "chord"], ["2", "adams3"],
+    ]  # fmt: skip
 
 
 def test_of_an_adaptive_solver_a_curve_has_one_point(r2flow, saved, real, tmp_path):  # noqa: F811

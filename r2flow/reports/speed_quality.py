@@ -183,18 +183,21 @@ def speed_quality_page(
         figures: False while it is still being measured.
     """
     drawing, keys = curve.drawings[0], {row["key"] for row in rows}
-    solvers = ", ".join(one.method or "its own solver" for one in curve.drawings)
+    solvers = list(dict.fromkeys(row["solver"] for row in rows))
     # METRIC/FIGURE, without the ends of its interval
     names = [n for n in dict.fromkeys(n for row in rows for n in row) if "/" in n and not n.endswith(ENDS)]
     headings = {name: heading(*name.split("/", 1)) for name in names}
-    columns = {"flow": "flow", "steps": "steps", "evaluations": "evaluations", "seconds": "s a scan"}
+    columns = {"flow": "flow", "steps": "steps"}
+    if len(solvers) > len(curve.drawings):  # a flow may have another in fewer steps
+        columns["solver"] = "solver"
+    columns |= {"evaluations": "evaluations", "seconds": "s a scan"}
     columns |= {name: said for name, (said, _) in headings.items()}
     printed = [
         {**row, **{n: _shown(row, n, factor) for n, (_, factor) in headings.items() if n in row}} for row in rows
     ]
     sampled = (
         f"{drawing.num} scans of seed {drawing.seed} at every point, from the same noise, by "
-        f"{solvers}; measured against {len(curve.real)} scans of {curve.real.label}, "
+        f"{', '.join(solvers)}; measured against {len(curve.real)} scans of {curve.real.label}, "
         f"under the protocol `{curve.gathered.protocol.name}`. "
         "Seconds are those of the network and its solver, the median over batches."
     )
