@@ -38,12 +38,8 @@ def calibrate(
         InputError: another method, fewer than one step, a flow that has learned its steps, or that cannot be solved.
     """
     check_predictor_corrector(method)
+    check_calibrates(checkpoint)
     flow = as_flow(checkpoint.generator, "a time grid")
-    if flow.sampler.fixed or isinstance(flow, FlowMap):
-        raise InputError(
-            f"{checkpoint.path} holds a {'flow map' if isinstance(flow, FlowMap) else 'flow'} that has learned its "
-            "steps: there is no time grid to find."
-        )
     x_0 = Draws(0, range(num), "validation").start(flow.noise_shape).to(flow.device)
     exact = flow.solve(x_0.double(), sampler=EXACT, progress=progress)
     if not exact.converged.all():
@@ -63,6 +59,20 @@ def calibrate(
         budgets.append(Budget(count, *(_plain(x) for x in (rms(found.x - exact.x), metres, found.correction))))
     flow.sampler = sampler
     return replace(checkpoint, accuracy=tuple(budgets))
+
+
+def check_calibrates(checkpoint: Checkpoint) -> None:
+    """Refuse a generator that has learned its steps.
+
+    Raises:
+        InputError: it has, or it is no flow.
+    """
+    flow = as_flow(checkpoint.generator, "a time grid")
+    if flow.sampler.fixed or isinstance(flow, FlowMap):
+        raise InputError(
+            f"{checkpoint.path} holds a {'flow map' if isinstance(flow, FlowMap) else 'flow'} that has learned its "
+            "steps: there is no time grid to find, and its error is not known beforehand; give --steps."
+        )
 
 
 def _plain(x: torch.Tensor) -> tuple[float, ...]:
@@ -104,6 +114,7 @@ def sampler_within(checkpoint: Checkpoint, error: str) -> Sampler:
     if not 0 < value < math.inf:
         raise InputError(f"--error must be metres of range, as 0.05m, or a number in model space; found {error!r}.")
     if not checkpoint.accuracy:
+        check_calibrates(checkpoint)
         raise InputError(f"the errors of {checkpoint.path} are not known yet; measure them: r2flow calibrate -c RUN.")
     steps, limits = levels(checkpoint.accuracy, value, metres)
     # The errors were measured in float32.

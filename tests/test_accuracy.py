@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from r2flow.accuracy import GRIDS, STEPS, calibrate, evaluations_of_calibration, sampler_within
-from r2flow.checkpoints import keep_sampler, load_checkpoint, save_checkpoint
+from r2flow.checkpoints import Checkpoint, keep_sampler, load_checkpoint, save_checkpoint
 from r2flow.errors import InputError
 from r2flow.flow.problems import Gaussian, Mixed, Straight, TwoModes
 from r2flow.flow.solvers import solve
-from r2flow.generators import Budget, Field, Sampler, levels
+from r2flow.generators import Budget, Field, Sampler, build_generator, levels
 from r2flow.noise import Draws
-from tests.test_checkpoints import saved  # noqa: F401  a fixture
+from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 from tests.test_sampling import GaussianFlow, M, S, flow
 
 
@@ -122,6 +122,11 @@ def test_an_error_out_of_reach_is_refused():
         levels([EASY, MIDDLE, FINE], 0.007, metres=True)
     with pytest.raises(InputError, match="are not known yet; measure them: r2flow calibrate"):
         sampler_within(flow(), "0.05m")
+    config = {**CONFIG, "generator": {"name": "flow_map"}}
+    learned = Checkpoint(build_generator(config).eval(), config)
+    for ask in (lambda: sampler_within(learned, "0.05m"), lambda: calibrate(learned)):
+        with pytest.raises(InputError, match="holds a flow map that has learned its steps: .* give --steps"):
+            ask()
     known = replace(flow(), accuracy=(EASY, MIDDLE, FINE))
     for text in ("", "m", "5cm", "-1m", "nan", "inf"):
         with pytest.raises(InputError, match="must be metres of range, as 0.05m, or a number in model space"):

@@ -119,7 +119,7 @@ calibrate -c run --solver nope
 calibrate -c run --num 0
 calibrate -c nowhere
 calibrate -c bad.ckpt
-calibrate -c street # stays as it is
+calibrate -c street # has learned its steps
 info # Missing
 info nowhere
 info empty

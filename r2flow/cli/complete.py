@@ -120,7 +120,10 @@ def complete(
     if not loaded.encoding.reflectance:
         print("the model is of range alone: answers have no reflectance")
     rows, columns = loaded.sensor.shape
-    print(f"an answer has a point a pixel of the model's image, {rows}x{columns}: {rows * columns} at most")
+    print(
+        f"an answer has one point in a pixel of the model's image, {rows}x{columns}: {rows * columns} at most; of "
+        "several measured points in a pixel it keeps the nearest"
+    )
     job = Job(answers.num, answers.seed, known.keep, mask, answers.batch_size, known.surfaces, answers.pictures)
     about = {
         "mask": known.mask and mask_identity(known.mask), "from": known.source, "surfaces": known.surfaces,

@@ -386,7 +386,8 @@ def _load_flows(paths: list[Path], device: str) -> "dict[str, Checkpoint]":
     flows = {str(path): load_checkpoint(path, device) for path in dict.fromkeys(paths)}
     sensors = {(flow.sensor.shape, flow.sensor.elevations) for flow in flows.values()}
     if len(sensors) > 1:
-        raise InputError(f"{', '.join(flows)} look through different sensors or sizes; measure each by itself.")
+        seen = (f"{name} {flow.sensor.name} {'x'.join(map(str, flow.sensor.shape))}" for name, flow in flows.items())
+        raise InputError(f"flows of different sensors or sizes, {', '.join(seen)}: measure each by itself.")
     return flows
 
 

@@ -135,17 +135,18 @@ def calibrate(
 ) -> None:
     """Find the time grid that suits a flow, measure its errors, and keep both in the checkpoint."""
     from r2flow.accuracy import calibrate as measure
-    from r2flow.accuracy import check_predictor_corrector, evaluations_of_calibration
+    from r2flow.accuracy import check_calibrates, check_predictor_corrector, evaluations_of_calibration
     from r2flow.checkpoints import keep_sampler, load_checkpoint
     from r2flow.models import MODELS
     from r2flow.progress import Bar
     from r2flow.reports.tables import print_table
 
     check_predictor_corrector(solver)
+    loaded = load_checkpoint(checkpoint, choose_device(device))
+    check_calibrates(loaded)
     if str(checkpoint) in MODELS:
         copy = f"r2flow convert {checkpoint} {checkpoint}.safetensors"
         raise InputError(f"the model {checkpoint} stays as it is; make a copy and give that: {copy}.")
-    loaded = load_checkpoint(checkpoint, choose_device(device))
     with Bar("measuring", evaluations_of_calibration(steps), "evaluations") as advance:
         found = measure(loaded, steps, solver, num, advance)
     keep_sampler(found)

@@ -246,7 +246,7 @@ def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
     there, here = (f"{one.name} {one.shape[0]}x{one.shape[1]}" for one in (own.sensor, sensor))
     raise InputError(
         f"{folder} holds images of {there} (its {SAMPLES} says so), not of {here}: leave --sensor and --size out, and "
-        "name no scans of another size beside them."
+        "name no scans of another sensor or size beside them."
     )
 
 

@@ -23,7 +23,7 @@ from r2flow.flow.solvers import (
 from r2flow.flow.solvers.grids import build_grid
 from r2flow.flow.solvers.solution import finite, stepped
 from r2flow.flow.stochastic import SDE, churn_of, sde
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, parts_of
+from r2flow.generators.base import WAYS, Condition, Generated, Generator, Progress, Sampler, parts_of
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
@@ -206,6 +206,10 @@ class Flow(Generator):
                 raise InputError(f"{sampler.method} has no levels; leave them out, or give a solver.")
             self._stochastic_times(sampler)
             return
+        if sampler.method.partition(":")[0] in WAYS:
+            raise InputError(
+                f"{sampler.method} is for flow maps (experiment=flow_map), and this is none: give a solver, as adams3."
+            )
         check_method(sampler.method, self.other_samplers)
         check_tolerance(sampler.tolerance)
         method = fixed_step(sampler.method)
@@ -287,8 +291,8 @@ class NetworkFlow(Flow):
                 here, there = ("x".join(map(str, one.space.shape)) for one in (self, parent))
                 raise InputError(
                     f"the network to start from has weights for images of {there} ('{sized[0]}'), found {here}: leave "
-                    f"sensor out, give sensor.rows={parent.space.shape[1]} sensor.columns={parent.space.shape[2]}, or "
-                    "start from one that was trained with backbone.position=none."
+                    f"sensor out, give sensor.rows={parent.space.shape[1]} sensor.columns={parent.space.shape[2]}, "
+                    "or first grow it to a multiple of its size (r2flow grow)."
                 )
         self._take(parent, {**new, **theirs})
 

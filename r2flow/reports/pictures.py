@@ -155,7 +155,7 @@ def draw_range(axes: Any, image: np.ndarray, label: bool = True) -> None:
 
 
 def draw_reflectance(axes: Any, image: np.ndarray, label: bool = True) -> None:
-    """Reflectance of [0, 1] in greys, its square root shown, dropped rays black."""
+    """Reflectance of [0, 1] from blue to yellow, its square root shown, dropped rays black."""
     shown = np.ma.masked_where(image[0] <= 0, np.sqrt(np.clip(image[1], 0, 1)))
     axes.imshow(shown, cmap=_colours("cividis"), vmin=0, vmax=0.9, aspect="auto", interpolation="nearest")
     _strip(axes, "reflectance" if label else "")
