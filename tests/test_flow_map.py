@@ -433,6 +433,29 @@ def test_from_a_time_on_jumps_to_the_end_are_those_of_the_scans(monkeypatch):
         torch.testing.assert_close(aims[0], torch.stack([*expected]))
 
 
+def test_on_scans_alone_a_map_goes_on_with_velocities_and_late_ends(monkeypatch):
+    """What scans and independent noise do not tell, jumps from early times and to earlier ones, become velocities."""
+    learned = stage({"name": "simulated", "batch_size": 4}, objective="knots", ends_from=0.5).train()
+    learned._trainer = type("Trainer", (), {"max_steps": 2, "global_step": 2})()
+    monkeypatch.setattr(LearnFlowMap, "global_step", 2, raising=False)
+    t, s = torch.tensor([0.0, 0.3, 0.75, 0.6]), torch.tensor([1.0, 0.3, 1.0, 0.8])
+    learned.jumps = lambda u: (t, s)  # type: ignore[assignment]
+    asked: list[torch.Tensor] = []
+    monkeypatch.setattr(
+        learned.generator, "mean_velocity", lambda t, x, s: asked.extend((x, s)) or torch.zeros_like(x), raising=False
+    )
+    aims: list[torch.Tensor] = []
+    learned.loss = lambda found, target: aims.append(target) or found.flatten(1).mean(1)  # type: ignore[assignment]
+    batch = batch_of()
+    learned.regression_loss(batch, batch["u"])
+    x_t, v = interpolate(batch["x_0"], batch["x_1"], t)
+    torch.testing.assert_close(aims[0], v)
+    torch.testing.assert_close(asked[0], x_t)
+    assert asked[1].tolist() == torch.tensor([0.0, 0.3, 1.0, 0.6]).tolist()
+    with pytest.raises(InputError, match=r"of a map on scans alone stage\.ends_from=0\.5"):
+        stage({"name": "simulated", "batch_size": 4}, objective="knots")
+
+
 def test_jumps_to_the_end_have_a_loss_of_their_own(monkeypatch):
     """Of an estimate of 0: mean absolute values of the ends' targets, mean squares of all others'."""
     batch = batch_of()

@@ -26,7 +26,8 @@ class LearnFlowMap(Reflow):
     `knots` and `corrected`; or on scans, where noise and scan are drawn independently, by `solved`. With scans beside
     the pairs (`data.scans`) velocities, s = t, are learned from these, as by `Rectify`, and jumps from the pairs.
     Pairs of a map by its own `chord` or `renoise` have no inner states; by `knots` their jumps are those of straight
-    lines.
+    lines. On scans alone, by `knots` with `ends_from`, a map goes on with velocities and ends from that time on; its
+    other jumps follow as far as they share what is learned.
 
     Args:
         objective: Name in `r2flow.flow.maps.OBJECTIVES`.
@@ -37,8 +38,8 @@ class LearnFlowMap(Reflow):
             velocities and all other jumps have. By `absolute` an end that the network cannot know goes to the median of
             each element, which has edges, and not to the mean, which blurs them; `gradient_matching` is the same with
             smooth surfaces.
-        ends_from: From this time on jumps to the end, s = 1, are learned from `data.scans`, as velocities are, and not
-            from the pairs: there little noise is left, the scan is all but known, and pairs are rougher than scans.
+        ends_from: From this time on jumps to the end, s = 1, are learned from scans, as velocities are, and not from
+            the pairs: there little noise is left, the scan is all but known, and pairs are rougher than scans.
             None: never.
     """
 
@@ -73,20 +74,21 @@ class LearnFlowMap(Reflow):
         self.on_pairs = data["name"] == "pairs"
         pairs = (data.get("pairs") or {}) if self.on_pairs else {}
         refined = self.objective is along_knots and pairs.get("method") in (CHORD, RENOISE)
-        if self.objective in (along_knots, corrected) and not (pairs.get("knots") or refined):
+        late = self.objective is along_knots and self.ends_from is not None and not self.on_pairs
+        if self.objective in (along_knots, corrected) and not (pairs.get("knots") or refined or late):
             raise InputError(
                 f"stage.objective={self.objective_name} learns from inner states of paths: give data=pairs "
-                "data.pairs.knots=7, or stage.objective=consistency."
+                "data.pairs.knots=7, or stage.objective=consistency; of a map on scans alone stage.ends_from=0.5."
             )
         if self._parent and (self.on_pairs or not self.config.get("stage", {}).get("init")):
             what = "data=DATASET, not pairs" if self.on_pairs else "stage.init=RUN"
             raise InputError(
                 f"stage.objective={self.objective_name} learns on scans, by the paths of an earlier flow: give {what}."
             )
-        if self.ends_from is not None and data.get("scans") is None:
+        if self.ends_from is not None and self.on_pairs and data.get("scans") is None:
             raise InputError(
-                "stage.ends_from is the time from which jumps to the end are learned from scans beside the pairs: give "
-                "data.scans, as {name: simulated}, or leave it out."
+                "stage.ends_from is the time from which jumps to the end are learned from scans: give data.scans "
+                "beside the pairs, as {name: simulated}, or leave it out."
             )
         if data.get("scans") is not None and self.objective not in (along_knots, corrected):
             raise InputError(
@@ -103,22 +105,25 @@ class LearnFlowMap(Reflow):
         t, s = self.jumps(torch.cat([u[:, None], plastic_sequence(batch["k"])], 1))
         if not (self.training or self.on_pairs):
             t = s = self.jumps.velocities(u)  # of scans velocities alone are known
+        of_scans = t == s
+        if self.training and self.ends_from is not None:
+            of_scans = of_scans | ((s == 1) & (t >= self.ends_from))
+            if not self.on_pairs and self.objective is along_knots:
+                s = torch.where(of_scans, s, t)  # all that a scan and independent noise tell
+                of_scans = torch.ones_like(of_scans)
         ends = (s == 1) & (t < s)
         paths, u_ts = paths_of(batch), self.generator.map(self.condition(batch))
         if self.training:
-            known = (t == s) | (self.on_pairs & (s - t == 1))  # the end of independent noise is no scan of the data
+            known = of_scans | (self.on_pairs & (s - t == 1))  # the end of independent noise is no scan of the data
             rho = torch.where(known, 1.0, self.rho ** (self.global_step / max(int(self.trainer.max_steps), 1)))
             asked = [parent.map(self.condition(batch)) for parent in self._parent] or [u_ts]
-            aim = self.objective(asked[0], paths, t, s, rho)
+            aim = self.objective(asked[0], paths, t, torch.where(of_scans, t, s), rho)
         else:  # one figure for all objectives
             aim = along_knots(u_ts, paths, t, s, torch.ones_like(t))
         if "scan" in batch:
             x_t, v = interpolate(batch["noise"], batch["scan"], t)
-            of_scans = t == s
-            if self.training and self.ends_from is not None:
-                of_scans = of_scans | (ends & (t >= self.ends_from))
-            of_scans = expand_time(of_scans, x_t)
-            aim = Aim(torch.where(of_scans, x_t, aim.x_t), torch.where(of_scans, v, aim.target))
+            here = expand_time(of_scans, x_t)
+            aim = Aim(torch.where(here, x_t, aim.x_t), torch.where(here, v, aim.target))
         estimate = u_ts(t, aim.x_t, s)
         return torch.where(ends, self.end_loss(estimate, aim.target), self.loss(estimate, aim.target)).mean()
 
