@@ -227,15 +227,17 @@ def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
 def _assembled(config: dict[str, Any], generator: Generator, parent: Parent | None) -> Run:
     space = generator.space
     data = ScanDataModule(space.sensor, space.encoding, config["seed"], generator.noise_shape, **config["data"])
+    usual = {"name": "rectified_flow"}
+    family = GENERATORS[(parent.config.get("generator") or usual)["name"]] if parent else None
+    jumps = isinstance(family, type) and issubclass(family, FlowMap)
     if data.pairs is not None:
         data.pairs.recipe(data.encoding.shape, data.noise_shape)  # refuses what is out of its range
-        usual = {"name": "rectified_flow"}
-        family = GENERATORS[(parent.config.get("generator") or usual)["name"]] if parent else None
-        jumps = isinstance(family, type) and issubclass(family, FlowMap) and data.pairs.method in WAYS
-        if isinstance(family, type) and issubclass(family, Flow) and not jumps:  # others say themselves how they run
+        own = jumps and data.pairs.method in WAYS
+        if isinstance(family, type) and issubclass(family, Flow) and not own:  # others say themselves how they run
             check_method(data.pairs.method)
     check_roll(data.augment, generator)
     stage = build_stage(config, generator)
+    stage.check_parent(jumps)
     data.further = stage.further
     trainer = _build_trainer(config, stage)
     data.check_run(trainer.world_size, trainer.accumulate_grad_batches, trainer.max_steps)

@@ -154,6 +154,22 @@ def test_a_scan_of_which_everything_is_known_comes_back_and_says_so(r2flow, run,
     assert "one: everything is known, so it came back as it was given" in error
 
 
+def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(r2flow, run, tmp_path):  # noqa: F811
+    """Returns come back to the bit, and of the gaps some return; without --fill-gaps a gap is a ray without a return."""
+    image = full_scan(tmp_path / "one.npy")
+    image[:, ::2, ::3] = 0
+    np.save(tmp_path / "one.npy", image)
+    asked = [*COMPLETE, tmp_path / "one.npy", "-c", run, "--out", tmp_path / "out"]
+    assert r2flow(*asked, "--fill-gaps")[0] == 0
+    filled = np.load(tmp_path / "out" / "one.npy")
+    there = image[0] > 0
+    assert np.array_equal(filled[:, there], image[:, there])
+    assert (filled[0][~there] > 0).any()
+    code, _, error = r2flow(*asked)
+    assert code == 2
+    assert "completed with fill_gaps true, not null; give another --out" in error
+
+
 def test_simulated_scans_are_seen_through_another_sensor(r2flow, run, tmp_path):  # noqa: F811
     code, said, _ = r2flow(
         *COMPLETE, "simulated:3", "-c", run, "--from", "vlp16", "--scans", 1, "--steps", 1, "--out", tmp_path / "out"

@@ -21,6 +21,7 @@ from r2flow.lineage import Parent, generator_of
 from r2flow.noise import Draws, standard_normal
 from r2flow.stages import build_stage
 from r2flow.stages.flow_map import LearnFlowMap, paths_of
+from r2flow.training import check, compose
 
 CONFIG = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
@@ -531,3 +532,12 @@ def test_the_stage_s_options_are_those_of_its_config():
     text = (Path(__file__).parent.parent / "conf/stage/flow_map.yaml").read_text(encoding="utf-8")
     options = {key: value for key, value in yaml.safe_load(text).items() if key not in ("defaults", "init")}
     assert stage(**{key: value for key, value in options.items() if key != "name"}).jumps.steps
+
+
+def test_jumps_that_are_kept_are_those_of_a_map():
+    """A rectified flow has none to keep, and without a run to start from there are none at all."""
+    config = compose(["experiment=finetune_map", "data=simulated", "backbone=hdit_tiny"])
+    for wrong in ({}, {"generator": {"name": "rectified_flow"}}):
+        with pytest.raises(InputError, match=r"stage\.init is none: give a map, as stage\.init=street"):
+            check(config, parent=Parent({**config, **wrong}, Path("rf1")))
+    check(config, parent=Parent({**config, "generator": {"name": "flow_map"}}, Path("map")))

@@ -40,6 +40,10 @@ class KnownOptions:
         str | None,
         typer.Option(help="Keep a part of what was measured: rows:4, random:0.5, points:0.1, sector:-30,30, FILE.npy."),
     ] = None
+    fill_gaps: Annotated[
+        bool,
+        typer.Option("--fill-gaps", help="Rays without a return are completed too, as of a thinned scan: not measured."),
+    ] = False
     keep: Annotated[
         str,
         typer.Option(
@@ -124,9 +128,13 @@ def complete(
         f"an answer has one point in a pixel of the model's image, {rows}x{columns}: {rows * columns} at most; of "
         "several measured points in a pixel it keeps the nearest"
     )
-    job = Job(answers.num, answers.seed, known.keep, mask, answers.batch_size, known.surfaces, answers.pictures)
+    job = Job(
+        answers.num, answers.seed, known.keep, mask, known.fill_gaps, answers.batch_size, known.surfaces,
+        answers.pictures,
+    )  # fmt: skip
     about = {
         "mask": known.mask and mask_identity(known.mask), "from": known.source, "surfaces": known.surfaces,
+        "fill_gaps": known.fill_gaps or None,
         "reflectance_scale": known.reflectance_scale, "columns": known.columns,
     }  # fmt: skip
     found = write_completed(loaded, scans, out, job, sampler, about)

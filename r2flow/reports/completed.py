@@ -4,7 +4,7 @@ import json
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,7 @@ class Job:
         num: Answers to each scan.
         keep: As in `r2flow.completion.complete`.
         mask: Of the measured rays of each scan those that are kept; None for all.
+        fill_gaps: Whether rays without a return count as not measured.
         on_surfaces: As in `r2flow.completion.complete`.
         pictures: How many scans get a picture and a page in 3-D.
     """
@@ -51,6 +52,7 @@ class Job:
     seed: int = 0
     keep: str = "exact"
     mask: Mask | None = None
+    fill_gaps: bool = False
     batch_size: int = 1
     on_surfaces: bool | None = None
     pictures: int = 8
@@ -99,6 +101,9 @@ def write_completed(
         for number in left:
             scan = scans[number]
             whole = scan.read()
+            if job.fill_gaps:
+                gaps = np.where(whole.state == Ray.EMPTY, int(Ray.UNKNOWN), whole.state)
+                whole = replace(whole, state=gaps.astype(np.uint8))
             given = masked(whole, job.mask, number, job.seed, scan.name)
             images, state = torch.from_numpy(given.image)[None], torch.from_numpy(given.state)[None]
             (made,) = complete(
@@ -116,7 +121,8 @@ def write_completed(
             bar.finished(len(found))
     if known:
         log.warning(
-            "%s: everything is known, so it came back as it was given; --mask hides a part, --keep mend repairs it",
+            "%s: everything is known, so it came back as it was given; --fill-gaps completes the rays without a return, "
+            "--mask hides a part, --keep mend repairs it",
             known[0] if len(known) == 1 else f"{len(known)} scans",
         )  # fmt: skip
     return found

@@ -7,6 +7,7 @@ from typing import Any
 from r2flow.backbones import Backbone
 from r2flow.checkpoints import load_checkpoint
 from r2flow.config import flatten
+from r2flow.generators import Sampler
 from r2flow.models import MODELS, name_of
 from r2flow.reports.tables import print_table, table
 
@@ -79,8 +80,10 @@ def print_contents(contents: dict[str, Any]) -> None:
     """Print them as two short tables."""
     summary = {key: value for key, value in contents.items() if key != "config"}
     summary["image"] = " x ".join(map(str, contents["image"]))
-    for name in ("encoding", "sampler"):
-        summary[name] = ", ".join(f"{key} {value}" for key, value in contents[name].items())
+    usual = {key: value for key, value in Sampler().asdict().items() if key not in ("method", "steps", "grid")}
+    sampler = {key: value for key, value in contents["sampler"].items() if value != usual.get(key)}
+    for name, options in (("encoding", contents["encoding"]), ("sampler", sampler)):
+        summary[name] = ", ".join(f"{key} {value}" for key, value in options.items())
     summary |= {key: f"{value:,}" for key, value in summary.items() if isinstance(value, int)}
     print_table([(key, str(value)) for key, value in summary.items()], ("", ""))
     print()

@@ -74,8 +74,7 @@ class LearnFlowMap(Reflow):
         self.on_pairs = data["name"] == "pairs"
         pairs = (data.get("pairs") or {}) if self.on_pairs else {}
         refined = self.objective is along_knots and pairs.get("method") in (CHORD, RENOISE)
-        late = self.objective is along_knots and self.ends_from is not None and not self.on_pairs
-        if self.objective in (along_knots, corrected) and not (pairs.get("knots") or refined or late):
+        if self.objective in (along_knots, corrected) and not (pairs.get("knots") or refined or self._goes_on):
             raise InputError(
                 f"stage.objective={self.objective_name} learns from inner states of paths: give data=pairs "
                 "data.pairs.knots=7, or stage.objective=consistency; of a map on scans alone stage.ends_from=0.5."
@@ -96,6 +95,18 @@ class LearnFlowMap(Reflow):
                 "not those of scans: leave data.scans out, or give stage.objective=knots."
             )
 
+    @property
+    def _goes_on(self) -> bool:
+        """Whether velocities and late ends alone are learned, on scans, and the other jumps are the parent's."""
+        return self.objective is along_knots and self.ends_from is not None and not self.on_pairs
+
+    def check_parent(self, jumps: bool) -> None:
+        if self._goes_on and not jumps:
+            raise InputError(
+                "on scans alone stage.objective=knots keeps the jumps of a flow map, and stage.init is none: give a "
+                "map, as stage.init=street; to go on from another flow experiment=finetune."
+            )
+
     def on_fit_start(self) -> None:
         for parent in self._parent:
             parent.to(self.device)
@@ -108,7 +119,7 @@ class LearnFlowMap(Reflow):
         of_scans = t == s
         if self.training and self.ends_from is not None:
             of_scans = of_scans | ((s == 1) & (t >= self.ends_from))
-            if not self.on_pairs and self.objective is along_knots:
+            if self._goes_on:
                 s = torch.where(of_scans, s, t)  # all that a scan and independent noise tell
                 of_scans = torch.ones_like(of_scans)
         ends = (s == 1) & (t < s)
