@@ -155,7 +155,7 @@ def test_a_scan_of_which_everything_is_known_comes_back_and_says_so(r2flow, run,
 
 
 def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(r2flow, run, tmp_path):  # noqa: F811
-    """Returns come back to the bit, and of the gaps some return; without --fill-gaps a gap is a ray without a return."""
+    """Returns come back to the bit and some gaps return; without the option all gaps are rays without a return."""
     image = full_scan(tmp_path / "one.npy")
     image[:, ::2, ::3] = 0
     np.save(tmp_path / "one.npy", image)

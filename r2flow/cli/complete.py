@@ -42,7 +42,7 @@ class KnownOptions:
     ] = None
     fill_gaps: Annotated[
         bool,
-        typer.Option("--fill-gaps", help="Rays without a return are completed too, as of a thinned scan: not measured."),
+        typer.Option("--fill-gaps", help="Take rays without a return as not measured, as in a thinned scan."),
     ] = False
     keep: Annotated[
         str,

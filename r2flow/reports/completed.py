@@ -121,7 +121,7 @@ def write_completed(
             bar.finished(len(found))
     if known:
         log.warning(
-            "%s: everything is known, so it came back as it was given; --fill-gaps completes the rays without a return, "
+            "%s: everything is known, so it came back as it was given; --fill-gaps completes rays without a return, "
             "--mask hides a part, --keep mend repairs it",
             known[0] if len(known) == 1 else f"{len(known)} scans",
         )  # fmt: skip
