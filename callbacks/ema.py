@@ -16,7 +16,7 @@ from r2flow.registry import Count, Natural, Portion, Positive, Registry
 def ema_decay(step: int, warmup: int, highest: float = 0.995, power: float = 2 / 3) -> float:
     """min(highest, 1 - (1 + n)^(-power)) with n the steps since the warm-up ended, and 0 during it.
 
-    A decay of 0 copies the weights, so the average is never that of an untrained model.
+    A decay of 0 copies the weights.
     """
     n = step - warmup
     return 0.0 if n <= 0 else min(highest, 1 - (1 + n) ** -power)
@@ -41,7 +41,8 @@ DECAYS: Registry[Callable[[int, int, float], float]] = Registry(
 class EMA(WeightAveraging):
     """Exponential moving average of the weights, in float32, for validation, pictures and the checkpoint.
 
-    Every `every` steps: average <- decay average + (1 - decay) weights.
+    Every `every` steps: average <- decay average + (1 - decay) weights. A run that ends before the first update behind
+    the warm-up ends with the weights that it learned.
 
     Args:
         decay: Highest decay.
@@ -58,12 +59,12 @@ class EMA(WeightAveraging):
         super().__init__(use_buffers=False, avg_fn=self._average)
         self.decay, self.every, self.warmup_steps = decay, every, warmup_steps
         self._decay_at = DECAYS[rule]
-        self._step = 0
+        self._step, self._end, self._copies = 0, -1, False
         self._raw: list[Tensor] = []
 
     def _decay(self) -> float:
         """After step `_step`, counted from 0."""
-        return self._decay_at(self._step, self.warmup_steps or 0, self.decay)
+        return 0.0 if self._copies else self._decay_at(self._step, self.warmup_steps or 0, self.decay)
 
     def _average(self, average: Tensor, weight: Tensor, updates: Any) -> Tensor:
         return average + (1 - self._decay()) * (weight - average)
@@ -72,7 +73,9 @@ class EMA(WeightAveraging):
         if step_idx is None:
             return False
         self._step = step_idx
-        return step_idx % self.every == 0
+        before = step_idx - step_idx % self.every  # the last regular update
+        self._copies = step_idx == self._end and before <= (self.warmup_steps or 0)
+        return before == step_idx or self._copies
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         super().setup(trainer, pl_module, stage)
@@ -81,6 +84,9 @@ class EMA(WeightAveraging):
         if self._average_model is not None:
             # A half-precision average stalls: its steps are smaller than its spacing.
             self._average_model.float().requires_grad_(False)
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._end = trainer.max_steps - 1
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         # Built before the module moved to its device; left behind, every update would cross the bus.

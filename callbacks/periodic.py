@@ -20,6 +20,9 @@ class Periodic(L.Callback):
         """What a subclass does."""
         raise NotImplementedError
 
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._last = trainer.global_step  # which a resumed run has looked at
+
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.flow.posterior import completes
 from r2flow.generators import Condition, Flow, Generator, Regression, Sampler, condition_of
-from r2flow.generators.base import Progress
+from r2flow.generators.base import Progress, check_control
 from r2flow.generators.flow import UNTOLD
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
 from r2flow.lidar.interpolation import surfaces
@@ -91,6 +91,7 @@ def completing(generator: Generator, sampler: Sampler | None = None, **changes: 
         )
     usual = generator.sampler if generator.told else USUAL
     how = (sampler or usual).changed(**changes)
+    check_control(how.method, changes)
     generator.check_sampler(how)
     if not generator.told and not completes(how.method):
         raise InputError(UNTOLD)

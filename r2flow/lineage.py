@@ -91,9 +91,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
             continue
         if group in keys and inherited(group, config) == "unless_given":
             continue
-        given = [key for key in keys if inherited(key, config) == "unless_given" and key.startswith(f"{group}.")]
-        own = {key.partition(".")[2]: dict(flatten({group: config[group]}))[key] for key in given}
-        config[group] = {**there, **own}
+        config[group] = _with_own(there, config[group], group, keys, config)
     config["generator"] = generator_of(config, parent)
     config["parent"] = as_parent(parent.config, parent.path, parent.step, parent.weights)
     data = config["data"]
@@ -101,12 +99,30 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         drawer = _drawer(config, parent)
         data["root"] = data["root"] or str(default_folder(drawer.path))
         data["pairs"] = pairs_of(drawer, data["pairs"] or {}, drawer.weights)
-        data |= {key: value for key, value in drawer.config.get("data", {}).items() if key in READING}
+        theirs = {key: value for key, value in drawer.config.get("data", {}).items() if key in READING}
+        other = next((key for key in theirs if f"data.{key}" in keys and data.get(key) != theirs[key]), None)
+        if other:
+            raise InputError(f"data.{other} is that of the flow that draws the pairs, {theirs[other]}: leave it out.")
+        data |= theirs
     elif data["name"] not in (SIMULATED, MIXED):  # other images than the parent's would not be what it has learned
         theirs = {key: parent.config.get("data", {}).get(key) for key in ("projection", "convention")}
         unsaid = {key for key in theirs if f"data.{key}" not in keys and data.get(key) == getattr(SourceOptions, key)}
         data |= {key: value for key, value in theirs.items() if value is not None and key in unsaid}
     return config
+
+
+def _with_own(
+    theirs: Mapping[str, Any], ours: Mapping[str, Any], group: str, asked: Sequence[str], config: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The parent's group of options, with ours where they were asked for and may be other than the parent's."""
+    found = dict(theirs)
+    for name, value in ours.items():
+        key = f"{group}.{name}"
+        if isinstance(value, Mapping) and isinstance(theirs.get(name), Mapping):
+            found[name] = _with_own(theirs[name], value, key, asked, config)
+        elif inherited(key, config) == "unless_given" and any(f"{key}.".startswith(f"{one}.") for one in asked):
+            found[name] = value
+    return found
 
 
 def with_scales(config: dict[str, Any], asked: Sequence[str]) -> dict[str, Any]:

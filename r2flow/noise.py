@@ -30,7 +30,7 @@ def generator(seed: int, purpose: str, index: int, step: int = 0) -> np.random.G
         seed: Run seed, 0 <= seed < 2^64.
         purpose: One of `PURPOSES`.
         index: Number of the image, scene or epoch, 0 <= index < 2^64.
-        step: Step of a sampler that draws noise on the way, 0 <= step < 2^64; 0 is everything else.
+        step: Step of what draws several times for one index, a sampler or a GAN's batch, 0 <= step < 2^64.
 
     Raises:
         InputError: a seed that is no whole number or outside its range, which is the user's to choose.

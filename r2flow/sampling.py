@@ -11,7 +11,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.generators import Condition, Generator, Sampler
-from r2flow.generators.base import Progress
+from r2flow.generators.base import Progress, check_control
 from r2flow.lidar.region import Region
 from r2flow.noise import Draws
 
@@ -77,8 +77,12 @@ def sample(
     if num < 1 or batch_size < 1:
         raise InputError(f"needs at least one scan and a batch of at least one; found {num} and {batch_size}.")
     how = (sampler or generator.sampler).changed(**changes)
+    check_control(how.method, changes)
     generator.check_sampler(how)
     generator.space.check_channels(channels)
+    for name, value in (condition or {}).items():
+        if len(value) != num:
+            raise InputError(f"the condition's {name} is of {len(value)} scans, and {num} are asked for.")
     for first in range(0, num, batch_size):
         numbers = range(first, min(first + batch_size, num))
         known = condition and {name: value[first : numbers.stop] for name, value in condition.items()}

@@ -25,6 +25,7 @@ from r2flow.callbacks import build_callbacks, build_loggers, log_config, log_fig
 from r2flow.callbacks.stopping import Stopping
 from r2flow.checkpoints import Allowance, checkpoints_of, step_of
 from r2flow.composing import check_keys, compose
+from r2flow.config import key_of
 from r2flow.data.contents import check_contents, record_contents
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import SOURCES, Layout, Prepared, resolve_reflectance
@@ -34,7 +35,7 @@ from r2flow.errors import InputError
 from r2flow.flow.solvers import check_method
 from r2flow.generators import GENERATORS, Flow, FlowMap, Generator, build_generator
 from r2flow.generators.base import WAYS
-from r2flow.lineage import Parent, find_parent, inherit, with_scales
+from r2flow.lineage import READING, Parent, find_parent, inherit, with_scales
 from r2flow.noise import seed_torch
 from r2flow.plugins import made_with
 from r2flow.registry import Bound, Count, Natural, NonNegative, Positive, check_options
@@ -199,6 +200,9 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
     with made_with(parent.config if parent else {}, "the run that it starts from"):
         config = with_scales(inherit(config, asked, parent), asked)
     check_options("data", DataOptions, config["data"])
+    drawn = sorted(key for key in map(key_of, asked) if f"{key}.".startswith("data.pairs."))
+    if drawn and config["data"]["name"] != PAIRS:
+        raise InputError(f"{', '.join(drawn)} are of data=pairs, found data={config['data']['name']}: leave them out.")
     for key, scans in (("data", config["data"]), ("data.scans", config["data"].get("scans"))):
         if scans is not None:
             _refuse_unread(key, scans)
@@ -209,18 +213,22 @@ def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
     """Refuse what the set of scans under this key would pass over in silence.
 
     Raises:
-        InputError: the options of files with simulated scans, or the other way round.
+        InputError: the options of files with simulated scans, those of scans with pairs, and the like.
     """
-    simulated = data.get("name") == SIMULATED
-    if not simulated and (
-        data.get("name") in (None, PAIRS, MIXED) or not isinstance(SOURCES[data["name"]], Layout | Prepared)
-    ):
+    name, usual = data.get("name"), SourceOptions()
+    every = {f.name for f in fields(usual)} - {"name"}
+    if name == SIMULATED:
+        what, unread = "simulated scans are no files", every - {"root", "scenes"}
+    elif name == PAIRS:
+        what, unread = "pairs are drawn, not read", every - {"root", *READING}
+    elif name == MIXED:
+        what, unread = "each of data.parts has its own", {"root", "split", "drives"}
+    elif name is not None and isinstance(SOURCES[name], Layout | Prepared):
+        what, unread = "scans in files are no simulated scenes", {"scenes"}
+    else:
         return
-    usual = SourceOptions()
-    unread = {f.name for f in fields(usual)} - {"name", "root", "scenes"} if simulated else {"scenes"}
-    wrong = sorted(f"{key}.{name}" for name in unread if data.get(name, getattr(usual, name)) != getattr(usual, name))
+    wrong = sorted(f"{key}.{one}" for one in unread if data.get(one, getattr(usual, one)) != getattr(usual, one))
     if wrong:
-        what = "simulated scans are no files" if simulated else "scans in files are no simulated scenes"
         raise InputError(f"{what}: leave {', '.join(wrong)} out.")
 
 

@@ -167,7 +167,7 @@ def test_a_calibrated_sampler_stays_with_its_file(saved, tmp_path, ending):  # n
 
 def test_samplers_of_older_versions_are_read():
     # Version 0.1.0 called t = 1 - (1 - u)^2 quadratic, and knew no levels.
-    old = {"method": "ab2", "steps": 4, "tolerance": 1e-5, "grid": "quadratic", "straight_first": False, "fixed": False}
+    old = {"method": "ab2", "steps": 4, "tolerance": 1e-5, "grid": "quadratic", "fixed": False}
     assert Sampler.of(old) == Sampler("ab2", 4, grid="power:2")
     own = Sampler("adams3", 8, levels=(8, 16), limits=(0.1,))
     assert Sampler.of(own.asdict()) == own

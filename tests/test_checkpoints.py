@@ -141,14 +141,6 @@ def test_a_file_written_without_checksums_or_in_torchs_older_format_is_read(save
             assert torch.equal(value, averaged[f"generator.{key}"])
 
 
-def test_a_sampler_with_the_straight_exit_that_there_was_once_is_read(saved):
-    path, _ = saved
-    content = torch.load(path, weights_only=True)
-    sampler = {"method": "dopri5", "steps": 4, "tolerance": 1e-3, "straight_first": True}
-    torch.save({**content, "sampler": sampler}, path)
-    assert load_checkpoint(path).generator.sampler == Sampler("dopri5", 4, 1e-3)
-
-
 def test_names_of_0_1_0_are_read(saved, tmp_path: Path):
     path, averaged = saved
     content = torch.load(path, weights_only=True)

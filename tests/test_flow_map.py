@@ -541,3 +541,15 @@ def test_jumps_that_are_kept_are_those_of_a_map():
         with pytest.raises(InputError, match=r"stage\.init is none: give a map, as stage\.init=street"):
             check(config, parent=Parent({**config, **wrong}, Path("rf1")))
     check(config, parent=Parent({**config, "generator": {"name": "flow_map"}}, Path("map")))
+
+
+def test_a_way_of_no_length_and_no_scans_need_no_jump(grown):
+    x_0 = Draws(0, range(2)).start(grown.noise_shape)
+    assert torch.equal(grown.solve(x_0, 0.5, 0.5).x, x_0)
+    assert len(grown.solve(x_0[:0]).x) == 0
+    assert torch.equal(grown.solve(x_0, knots=0).x, grown.solve(x_0).x)
+
+
+def test_jumps_of_half_precision_noise_are_taken_in_float32(grown):
+    x_0 = Draws(0, range(2)).start(grown.noise_shape).bfloat16()
+    assert torch.equal(grown.generate(x_0).x, grown.generate(x_0.float()).x)

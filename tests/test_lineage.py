@@ -202,3 +202,22 @@ def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Pa
     assert (found["projection"], found["convention"]) == ("spherical", "reference")
     simulated = {**files, "name": "simulated", "root": None}
     assert inherit({**config, "data": simulated}, [], there)["data"]["projection"] == "spherical"
+
+
+@pytest.mark.parametrize("asked", ["backbone.inner.dropout", "backbone.inner", "backbone"])
+def test_of_a_network_inside_another_that_may_change_which_is_no_weight(parent: Path, asked: str):
+    """A key of its own, however it was given; the rest stays the parent's, and an unknown group is refused as ever."""
+    inner = {"name": "hdit", "base_channels": 8, "dropout": 0.0}
+    there = {**CONFIG, "backbone": {"name": "pyramid", "inner": inner, "channels": 4}}
+    config = {**child(parent, False), "backbone": {"inner": {"dropout": 0.1}}}
+    found = inherit(config, [asked], Parent(there, parent))["backbone"]
+    assert found == {"name": "pyramid", "inner": {**inner, "dropout": 0.1}, "channels": 4}
+    assert inherit(config, [], Parent(there, parent))["backbone"] == there["backbone"]
+
+
+def test_pairs_are_read_as_the_flow_that_draws_them_says(parent: Path):
+    config = {**child(parent, False), "data": {"name": "pairs", "root": None, "pairs": {}, "projection": "unfolding"}}
+    there = {**CONFIG, "data": {"name": "folder", "projection": "spherical", "convention": "centre"}}
+    assert inherit(config, [], Parent(there, parent))["data"]["projection"] == "spherical"
+    with pytest.raises(InputError, match="data.projection is that of the flow that draws the pairs, spherical"):
+        inherit(config, ["data.projection"], Parent(there, parent))

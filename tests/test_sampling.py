@@ -344,6 +344,11 @@ def test_another_method_does_not_take_over_the_grid_of_the_former_one():
         ({"steps": True}, "steps must be a whole number"),
         ({"tolerance": "x"}, "tolerance must be a finite number"),
         ({"method": 3}, "method must be a word"),
+        ({"method": "sde", "finish": 1.5}, "finish must be a finite number in [0, 1), found 1.5"),
+        ({"doubt": -1.0}, "doubt must be a finite number above 0, found -1.0"),
+        ({"method": "dopri5", "steps": 3}, "steps is for a solver of fixed steps, and dopri5 chooses its own"),
+        ({"method": "euler", "tolerance": 0.1}, "tolerance is for an adaptive solver, as dopri5, and euler is none"),
+        ({"condition": {"known": torch.ones(3, 1, 8, 32)}}, "the condition's known is of 3 scans, and 1 are asked for"),
         ({"precision": "bf16"}, "precision must be '32-true' or 'bf16-mixed', found 'bf16'"),
     ],
 )

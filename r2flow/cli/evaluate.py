@@ -12,7 +12,7 @@ import typer
 
 from r2flow.cli.app import app, report
 from r2flow.cli.groups import ReadingOptions, SolverOptions, WorkOptions, grouped
-from r2flow.cli.options import SETS, OutOption, PrecisionOption, choose_device, choose_reading, takes_tolerance
+from r2flow.cli.options import SETS, OutOption, PrecisionOption, choose_device, choose_reading
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -292,6 +292,7 @@ def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOption
     """What is drawn for each line of a curve, and the numbers of steps; what they cannot be is refused before anything
     is read.
     """
+    from r2flow.generators.base import takes_tolerance
     from r2flow.reports.speed_quality import Drawing, steps_of
 
     solvers: list[str | None] = [*dict.fromkeys(sampling.solver.split(","))] if sampling.solver else [None]

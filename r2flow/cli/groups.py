@@ -16,7 +16,6 @@ from r2flow.cli.options import (
     ScaleChoice,
     SensorChoice,
     SizeOption,
-    check_control,
 )
 
 if TYPE_CHECKING:
@@ -100,8 +99,10 @@ class SolverOptions:
         Raises:
             InputError: a tolerance for fixed steps, or a number of steps for an adaptive solver.
         """
+        from r2flow.generators.base import check_control
+
         found = sampler.changed(method=self.solver, steps=self.steps, tolerance=self.tolerance, **more)
-        check_control(found.method, self.steps, self.tolerance)
+        check_control(found.method, {"steps": self.steps, "tolerance": self.tolerance}, "--{}")
         return found
 
 

@@ -138,32 +138,6 @@ def check_words(**options: str | None) -> None:
             raise InputError(f"--{option.replace('_', '-')} must be one of {words}; found {value!r}.")
 
 
-def check_control(method: str, steps: int | None, tolerance: float | None) -> None:
-    """Check what was given to say how exact a method shall be; None where it was left out.
-
-    Raises:
-        InputError: a tolerance for fixed steps, or a number of steps for an adaptive solver.
-    """
-    adaptive = takes_tolerance(method)
-    if adaptive and steps is not None:
-        raise InputError(f"--steps is for a solver of fixed steps, and {method} chooses its own; give --tolerance.")
-    if not adaptive and tolerance is not None:
-        raise InputError(f"--tolerance is for an adaptive solver, as dopri5, and {method} is none; give --steps.")
-
-
-def takes_tolerance(method: str) -> bool:
-    """Whether a generator's method is an adaptive solver; what is no solver is none.
-
-    Raises:
-        InputError: torchdiffeq has no such method.
-    """
-    from r2flow.flow.solvers import TORCHDIFFEQ, adapts, check_method
-
-    if method.startswith(TORCHDIFFEQ):
-        check_method(method)
-    return adapts(method)
-
-
 def rows_and_columns(size: str | None) -> tuple[int | None, int | None]:
     """The numbers of an image size written as 64x1024; of no size, None for both."""
     if size is None:

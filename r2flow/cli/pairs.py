@@ -8,7 +8,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import SolverOptions, grouped
-from r2flow.cli.options import CheckpointOption, DeviceOption, PrecisionOption, check_control, choose_device
+from r2flow.cli.options import CheckpointOption, DeviceOption, PrecisionOption, choose_device
 from r2flow.errors import InputError
 
 
@@ -80,6 +80,7 @@ def pairs(
     from r2flow.data.options import PairOptions
     from r2flow.data.pairs import default_folder
     from r2flow.data.shards import PairStore
+    from r2flow.generators.base import check_control
     from r2flow.lineage import check_finished, pairs_of
     from r2flow.reports.pairs import make_and_tell
 
@@ -95,7 +96,7 @@ def pairs(
     recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(
         flow.encoding.shape, flow.generator.noise_shape
     )
-    check_control(recipe.sampler.method, solver.steps, solver.tolerance)
+    check_control(recipe.sampler.method, {"steps": solver.steps, "tolerance": solver.tolerance}, "--{}")
     store = PairStore(out or default_folder(flow.path), recipe)
     make_and_tell(store, flow, num, rank, ranks, where)
     lacking = len(store.missing(num))

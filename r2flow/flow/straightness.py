@@ -75,6 +75,7 @@ class Straightness:
         return self.s / self.curvature.squared_length[:, None]
 
 
+@torch.no_grad()
 def curvature(velocity: Velocity, x_0: Tensor, steps: int = 256, progress: Progress = None) -> Curvature:
     """The integral of s over the path, pixel by pixel, in one pass of Euler steps from x_0, (B, ...).
 
@@ -96,6 +97,7 @@ def curvature(velocity: Velocity, x_0: Tensor, steps: int = 256, progress: Progr
     return Curvature(x_0, x_1, (mean_square - mean.square()).clamp(min=0))
 
 
+@torch.no_grad()
 def straightness(
     velocity: Velocity, x_0: Tensor, steps: int = 256, most_curved: int = 0, progress: Progress = None
 ) -> Straightness:

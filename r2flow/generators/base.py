@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
-from r2flow.flow.solvers import TORCHDIFFEQ, usual_grid
-from r2flow.flow.solvers.solution import finite
+from r2flow.flow.solvers import TORCHDIFFEQ, adapts, check_method, usual_grid
+from r2flow.flow.solvers.solution import finite, wide
 from r2flow.flow.stochastic import SDE
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
@@ -90,8 +90,7 @@ class Sampler:
         Raises:
             InputError: an unknown option, or a value of the wrong type.
         """
-        # An option of earlier development versions, which did nothing on trained flows.
-        known: dict[str, Any] = {key: value for key, value in options.items() if key != "straight_first"}
+        known = dict(options)
         check_options("sampler", cls, known)
         grid = known.get("grid", "uniform")
         if grid == "quadratic":  # its name in version 0.1.0
@@ -114,7 +113,7 @@ class Sampler:
         given = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in options.items() if v is not None}
         own = vars(self)  # the range of a number is judged with the method that takes it
         odd = {k: v for k, v in given.items() if isinstance(v, tuple) or type(v) is not type(own.get(k))}
-        odd |= {k: v for k, v in given.items() if k == "precision"}
+        odd |= {k: v for k, v in given.items() if k in ("precision", "finish", "doubt")}
         check_options("sampler", type(self), odd)
         if self.fewer and "method" not in given and given.get("steps", self.steps) < self.steps:
             given["method"] = self.fewer
@@ -164,6 +163,35 @@ def _kind(method: str) -> str:
     return JUMP if name in WAYS else name
 
 
+def takes_tolerance(method: str) -> bool:
+    """Whether a generator's method is an adaptive solver; what is no solver is none.
+
+    Raises:
+        InputError: torchdiffeq has no such method.
+    """
+    if method.startswith(TORCHDIFFEQ):
+        check_method(method)
+    return adapts(method)
+
+
+def check_control(method: str, given: Mapping[str, Any], called: str = "{}") -> None:
+    """Check what is given to say how exact a method shall be; None counts as left out.
+
+    Args:
+        given: Options of a sampler, by name.
+        called: What an option is called where it was given, as `--{}`.
+
+    Raises:
+        InputError: a tolerance for fixed steps, or a number of steps for an adaptive solver.
+    """
+    steps, tolerance = called.format("steps"), called.format("tolerance")
+    adaptive = takes_tolerance(method)
+    if adaptive and given.get("steps") is not None:
+        raise InputError(f"{steps} is for a solver of fixed steps, and {method} chooses its own; give {tolerance}.")
+    if not adaptive and given.get("tolerance") is not None:
+        raise InputError(f"{tolerance} is for an adaptive solver, as dopri5, and {method} is none; give {steps}.")
+
+
 def usual_steps(method: str) -> Mapping[str, Any]:
     """Its usual `grid` and `finish`; of `sde` and `chord` what was best, or nearly so, of the package's models."""
     if _kind(method) == SDE:
@@ -196,7 +224,7 @@ class Generated:
                 kept from an earlier step, does not tell.
         """
         counted = torch.full((len(x),), evaluations, dtype=torch.int64, device=x.device)
-        x = x if x.dtype == torch.float64 else x.float()
+        x = wide(x)
         return cls(x, counted, finite(x) if converged is None else converged)
 
 

@@ -224,6 +224,7 @@ class Regression(ConditionalFlow):
     """
 
     trusts = False
+    has_paths = False
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space, backbone)

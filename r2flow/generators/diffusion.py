@@ -13,7 +13,7 @@ from r2flow.diffusion.objectives import PREDICTIONS
 from r2flow.diffusion.sampling import DDIM, DDPM, eta_of, walk
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution
-from r2flow.flow.solvers.solution import finite
+from r2flow.flow.solvers.solution import finite, wide
 from r2flow.generators.base import Condition, Generated, Progress, Sampler
 from r2flow.generators.flow import UNTOLD, NetworkFlow
 from r2flow.lidar.space import ModelSpace
@@ -108,7 +108,7 @@ class Diffusion(NetworkFlow):
             raise InputError(UNTOLD)
         if eta and draws is None:
             raise InputError(f"{how.method} draws further noise: give draws.")
-        z, steps = noise.to(self.device), count(1)
+        z, steps = wide(noise.to(self.device)), count(1)
 
         def drawn() -> Tensor:
             assert draws is not None

@@ -21,7 +21,7 @@ from r2flow.flow.solvers import (
     solve,
 )
 from r2flow.flow.solvers.grids import build_grid
-from r2flow.flow.solvers.solution import finite, stepped
+from r2flow.flow.solvers.solution import finite, stepped, wide
 from r2flow.flow.stochastic import SDE, churn_of, sde
 from r2flow.generators.base import WAYS, Condition, Generated, Generator, Progress, Sampler, parts_of
 from r2flow.lidar.region import Region
@@ -39,6 +39,7 @@ class Flow(Generator):
     """
 
     other_samplers: ClassVar[tuple[str, ...]] = (SDE,)
+    has_paths: ClassVar[bool] = True  # whether it is the ODE of its velocity that takes noise to scans
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         """v(t, x), (B, C, H, W), at times t of shape () or (B,)."""
@@ -117,8 +118,7 @@ class Flow(Generator):
     ) -> Generated:
         if draws is None:
             raise InputError(f"{how.method} draws further noise: give draws.")
-        noise = noise.to(self.device)
-        noise = noise if noise.dtype == torch.float64 else noise.float()
+        noise = wide(noise.to(self.device))
         x, times = noise, self._stochastic_times(how)
         field, alive = self.field(condition), finite(x)
 
@@ -169,8 +169,7 @@ class Flow(Generator):
         Raises:
             InputError: a method that the table does not have, or one that the measurement or the draws do not suit.
         """
-        x_0 = noise.to(self.device)
-        x_0 = x_0 if x_0.dtype == torch.float64 else x_0.float()
+        x_0 = wide(noise.to(self.device))
         left = (~measured.known).flatten(1).any(1).nonzero()[:, 0]
         evaluations = torch.zeros(len(x_0), dtype=torch.int64, device=x_0.device)
         x = measured.y.to(x_0)
@@ -216,6 +215,11 @@ class Flow(Generator):
         self._times(sampler)
         if sampler.levels and not (method and method.corrects):
             raise InputError(f"only a predictor-corrector says how many steps a scan needs, not {sampler.method}.")
+        if len(sampler.limits) != max(len(sampler.levels) - 1, 0) or min(sampler.levels, default=1) < 1:
+            raise InputError(
+                f"levels are numbers of steps, with a limit for each but the last; found levels {list(sampler.levels)} "
+                f"and limits {list(sampler.limits)}. r2flow calibrate measures them."
+            )
         if adapts(sampler.method) and sampler.grid != "uniform":
             raise InputError(f"a time grid is for a solver of fixed steps; {sampler.method} chooses its own.")
 
@@ -417,6 +421,6 @@ def as_flow(generator: Generator, what: str) -> Flow:
     Raises:
         InputError: it follows no velocity, which `what` needs.
     """
-    if not isinstance(generator, Flow):
+    if not (isinstance(generator, Flow) and generator.has_paths):
         raise InputError(f"{what} needs the velocity of a flow, which a {type(generator).__name__} does not have.")
     return generator

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -11,7 +12,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.solvers import Solution
-from r2flow.flow.solvers.solution import finite, stepped
+from r2flow.flow.solvers.solution import finite, stepped, wide
 from r2flow.flow.stochastic import ahead, back, churn_of
 from r2flow.generators.base import CHORD, JUMP, RENOISE, WAYS, Condition, Generated, Progress, Sampler
 from r2flow.generators.flow import UNTOLD, Conditioned, RectifiedFlow
@@ -77,7 +78,9 @@ class FlowMap(RectifiedFlow):
         how = sampler or self.sampler
         if how.method not in QUIET:
             return super().solve(x, t_0, t_1, sampler=how, condition=condition, progress=progress, **options)
-        given = [name for name, value in options.items() if value is not None]
+        if t_0 == t_1 or not len(x):  # no jump to take
+            return super().solve(x, t_0, t_1, sampler=replace(how, method="euler"), condition=condition)
+        given = [name for name, value in options.items() if value]
         if given:
             raise InputError(f"jumps have no {', '.join(given)}; leave that out, or give a solver, as --solver adams3.")
         end = self._jumps(x, self._times(how, t_0, t_1), condition, progress, chord=how.method == CHORD)
@@ -111,7 +114,7 @@ class FlowMap(RectifiedFlow):
         draws: Draws | None = None,
         chord: bool = False,
     ) -> Generated:
-        x, u = x.to(self.device), self.map(condition)
+        x, u = wide(x.to(self.device)), self.map(condition)
         alive = finite(x)
         for n, (t, s) in enumerate(pairwise(times.tolist()), start=1):
             r = ahead(t, s, churn)

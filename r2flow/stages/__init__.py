@@ -7,8 +7,8 @@ from typing import Any
 from r2flow.data.augment import Augmentation
 from r2flow.errors import InputError
 from r2flow.flow.posterior import completes
-from r2flow.flow.solvers import TORCHDIFFEQ, adapts, check_method
 from r2flow.generators import Generator, Sampler
+from r2flow.generators.base import check_control
 from r2flow.registry import Registry, check_options
 from r2flow.stages.base import Stage
 from r2flow.stages.conditional import Conditional, LearnConditionalMap, Regress
@@ -56,7 +56,11 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
 
     The config's `sampler`, where it has one, becomes the generator's.
     """
-    options = {"batch_size": config["data"]["batch_size"], "seed": config["seed"], **config["stage"]}
+    of_run = {"batch_size": config["data"]["batch_size"], "seed": config["seed"]}
+    for name, where in (("batch_size", "data.batch_size"), ("seed", "seed")):
+        if name in config["stage"]:
+            raise InputError(f"stage.{name} is the run's: leave it out, and give {where}.")
+    options = {**config["stage"], **of_run}
     options.pop("init", None)  # the generator has its weights already
     stage: Stage = STAGES.build(options, generator)
     stage.config = dict(config)
@@ -77,7 +81,7 @@ def _sampler(generator: Generator, wanted: Mapping[str, Any]) -> Sampler:
     found = own.changed(**wanted)
     if own.fixed and replace(found, precision=own.precision) != own:
         raise InputError(
-            f"this flow learns {own.steps} steps of {own.method} and is run by these alone: leave sampler.* out; in a "
+            f"this stage trains for one sampler alone, {own.method} with steps {own.steps}: leave sampler.* out; in a "
             "chain give it to one link, as chain.rf1.sampler.steps=32."
         )
     if completes(found.method):
@@ -85,12 +89,7 @@ def _sampler(generator: Generator, wanted: Mapping[str, Any]) -> Sampler:
             f"sampler.method={found.method} completes a scan of which a part is known; give it to r2flow complete by "
             "--solver."
         )
-    if found.method.startswith(TORCHDIFFEQ):
-        check_method(found.method)
-    useless = "steps" if adapts(found.method) else "tolerance"
-    if useless in wanted:
-        kind = "of fixed steps" if useless == "steps" else "that adapts its steps, as dopri5"
-        raise InputError(f"sampler.{useless} is for a solver {kind}, and {found.method} is none; leave it out.")
+    check_control(found.method, wanted, "sampler.{}")
     generator.check_sampler(found)
     if found.fewer is not None:
         generator.check_sampler(found.changed(method=found.fewer))

@@ -112,3 +112,20 @@ def test_the_average_is_float32_whatever_the_weights_are():
         module.weight.fill_(1 + 2**-7)
     ema._average_model.update_parameters(module)
     assert ema._average_model.module.weight.item() == pytest.approx(1 + 0.005 * 2**-7, abs=1e-7)
+
+
+@pytest.mark.parametrize(("warmup", "steps"), [(0, 1), (3, 2), (3, 6), (3, 10), (20, 15)])
+def test_a_run_that_ends_before_its_average_begins_has_the_weights_that_it_learned(tmp_path, warmup: int, steps: int):
+    """Until then the average is that of the last copy; behind the warm-up it moves by half."""
+    watch = Watch(ema := EMA(0.5, every=10, warmup_steps=warmup))
+    values = [float(n) for n in range(1, steps + 1)]
+    trainer([ema, watch], steps, tmp_path).fit(Scripted(values), torch.utils.data.DataLoader(torch.zeros(steps)))
+    copied = [values[n - n % 10] for n in range(steps - 1)]
+    assert watch.trace == list(zip(values, [*copied, values[-1]], strict=True))
+
+
+def test_a_longer_run_is_averaged_as_ever(tmp_path):
+    watch = Watch(ema := EMA(0.5, every=10, warmup_steps=3))
+    values = [float(n) for n in range(1, 13)]
+    trainer([ema, watch], 12, tmp_path).fit(Scripted(values), torch.utils.data.DataLoader(torch.zeros(12)))
+    assert [average for _, average in watch.trace] == [1.0] * 10 + [6.0] * 2

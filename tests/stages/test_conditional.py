@@ -14,7 +14,15 @@ from r2flow.data.loader import FlowDataset
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
 from r2flow.flow.problems import Gaussian
-from r2flow.generators import ConditionalFlow, ConditionalMap, Regression, Sampler, build_generator, condition_of
+from r2flow.generators import (
+    ConditionalFlow,
+    ConditionalMap,
+    Regression,
+    Sampler,
+    as_flow,
+    build_generator,
+    condition_of,
+)
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.noise import Draws
 from r2flow.stages import build_stage
@@ -436,3 +444,10 @@ def test_told_nothing_a_conditional_map_is_a_plain_one(jumps):
         assert torch.equal(jumps.mean_velocity(t, x, s), jumps.untold().mean_velocity(t, x, s))
     x_0 = Draws(0, range(2)).start((2, 8, 32))
     assert torch.equal(jumps.generate(x_0).x, jumps.untold().generate(x_0).x)
+
+
+def test_the_twin_is_followed_by_no_velocity():
+    """Its network has learned one time alone: what asks for paths refuses it."""
+    twin = built("regression")
+    with pytest.raises(InputError, match="curvature needs the velocity of a flow, which a Regression does not have"):
+        as_flow(twin, "curvature")

@@ -1,5 +1,6 @@
 """Values of the wrong kind or out of their range, key by key: one line, exit code 2, nothing written."""
 
+import re
 from itertools import pairwise
 from pathlib import Path
 
@@ -72,8 +73,8 @@ REFUSED = {
     "trainer.gradient_clip_val=nan": "gradient_clip_val must be a finite number of at least 0",
     "stage.time={name: u_shaped, a: 800}": "a must be a finite number above 0 and at most 80",
     "sampler.method=mmps": "completes a scan of which a part is known; give it to r2flow complete by --solver",
-    "sampler.tolerance=0.1": "sampler.tolerance is for a solver that adapts its steps, as dopri5, and adams3 is none",
-    "sampler={method: dopri5, steps: 4}": "sampler.steps is for a solver of fixed steps, and dopri5 is none",
+    "sampler.tolerance=0.1": "sampler.tolerance is for an adaptive solver, as dopri5, and adams3 is none; give",
+    "sampler={method: dopri5, steps: 4}": "sampler.steps is for a solver of fixed steps, and dopri5 chooses its own",
     "trainer.overfit_batches=1": "overfit_batches must be a finite number 0 (data.scenes or data.drives",
     "+callbacks.half_life_ema={half_life: 4, rampup: 1}": "one average of its weights, found callbacks.ema and",
     "trainer.limit_train_batches=0": "limit_train_batches must be null",
@@ -109,6 +110,27 @@ def test_a_wrong_value_is_refused(tmp_path: Path, argument: str, words: str):
 def test_files_have_no_scenes(tmp_path: Path):
     with pytest.raises(InputError, match=r"no simulated scenes: leave data\.scenes out"):
         check(compose(["data=folder", f"data.root={tmp_path}", "data.scenes=5"]))
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        (["data=mixed", "data.parts=[{name: simulated}]", "data.split=train"], "has its own: leave data.split"),
+        (["data.pairs.num=5"], "data.pairs.num are of data=pairs, found data=simulated"),
+        (["+stage.batch_size=9"], "stage.batch_size is the run's: leave it out, and give data.batch_size"),
+        (["+stage.seed=5"], "stage.seed is the run's: leave it out, and give seed"),
+        (["+sampler.levels=[2, 4]"], "levels are numbers of steps, with a limit for each but the last"),
+    ],
+)
+def test_what_would_be_passed_over_is_refused(asked: list[str], words: str):
+    with pytest.raises(InputError, match=re.escape(words)):
+        check(compose(["data=simulated", "backbone=hdit_tiny", *asked]), asked)
+
+
+def test_pairs_are_no_scans_in_files(tmp_path: Path):
+    config = compose(["stage=reflow", "data=pairs", "stage.init=street", f"run_dir={tmp_path}", "data.drives=[1]"])
+    with pytest.raises(InputError, match=r"pairs are drawn, not read: leave data\.drives out"):
+        check(config)
 
 
 def test_a_named_choice_has_options_of_its_own():

@@ -23,7 +23,7 @@ from r2flow.flow.solvers.external import (
 from r2flow.flow.solvers.fixed import FixedStep, euler, heun2, heun3, midpoint, rk4, solve_fixed
 from r2flow.flow.solvers.grids import build_grid, extended, halved, named_grid, uniform
 from r2flow.flow.solvers.multistep import adams
-from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite
+from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite, wide
 from r2flow.flow.solvers.step_size import Limits
 from r2flow.flow.stochastic import churn_of
 from r2flow.registry import Registry, did_you_mean
@@ -109,7 +109,7 @@ def solve(
     """
     check_method(method)
     _check_numbers(t_0, t_1, steps, tolerance, finish, max_evaluations, max_step)
-    x = x if x.dtype == torch.float64 else x.float()
+    x = wide(x)
     if t_0 == t_1 or not len(x):
         return _at_rest(x, global_error, knots)
     times = build_grid(grid, t_0, t_1 - math.copysign(finish, t_1 - t_0) if finish else t_1, steps)

@@ -154,6 +154,11 @@ def finite(x: Tensor) -> Tensor:
     return torch.isfinite(x).flatten(1).all(1)
 
 
+def wide(x: Tensor) -> Tensor:
+    """x in float32 at least: states of fewer digits lose a flow's small steps."""
+    return x if x.dtype == torch.float64 else x.float()
+
+
 def stepped(x: Tensor, following: Tensor, alive: Tensor) -> tuple[Tensor, Tensor]:
     """The states after a step, (B, ...), and which are finite still, (B,); one that is not stays in its last state."""
     alive = alive & finite(following)
