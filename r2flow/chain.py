@@ -16,7 +16,7 @@ from r2flow.checkpoints import checkpoints_of, step_of
 from r2flow.composing import override
 from r2flow.config import flatten, key_of, rule
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, read_json
 from r2flow.runs import read_config
 from r2flow.signals import LATER, code_of, listening
 
@@ -119,7 +119,7 @@ def has_ended(run: Path) -> bool:
 def is_finished(link: Link) -> bool:
     """Whether a link came to its end under the same command, and has not lost its checkpoint since."""
     try:
-        record = json.loads((link.run_dir / RECORD).read_text(encoding="utf-8"))
+        record = read_json(link.run_dir / RECORD)
     except (OSError, ValueError):
         return False
     return bool(record == _record(link)) and has_ended(link.run_dir)
@@ -140,7 +140,7 @@ def record_report(links: Sequence[Link], out: Path) -> None:
 def is_reported(links: Sequence[Link], out: Path) -> bool:
     """Whether the report on just these links is there."""
     try:
-        return bool(json.loads((out / RECORD).read_text(encoding="utf-8")) == [_record(link) for link in links])
+        return bool(read_json(out / RECORD) == [_record(link) for link in links])
     except (OSError, ValueError):
         return False
 

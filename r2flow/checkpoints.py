@@ -7,7 +7,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from r2flow.completion import complete
 from r2flow.config import learned
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, parse_json
 from r2flow.generators import Budget, Generator, RectifiedFlow, Sampler, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
@@ -134,12 +134,15 @@ def find_checkpoint(path: str | Path) -> Path:
             return find_model(name)
         if not found:
             runs = sorted(str(one.parent) for one in path.glob(f"*/{FOLDER}") if checkpoints_of(one.parent))
-            hint = f"It holds runs: give {' or '.join(runs[:8])}." if runs else "Has a run been started there?"
+            hint = f"Give a run folder, a .ckpt, a .safetensors or a model ({', '.join(MODELS)})."
+            hint = f"It holds runs: give {' or '.join(runs[:8])}." if runs else hint
             raise InputError(f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt). {hint}")
         return found[0]
     if not path.is_file():
         if name in MODELS:
             return find_model(name)
+        if path.exists():  # a pipe would be waited for
+            raise InputError(f"{path} is not a regular file. Give a checkpoint file or a run folder.")
         known = f"a model ({', '.join(MODELS)})"
         hint = did_you_mean(name, [*MODELS])
         raise InputError(f"no checkpoint at {path}. Give a checkpoint file, a run folder or {known}.{hint}")
@@ -236,6 +239,20 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
     """
     path = find_checkpoint(path)
     content = read_safetensors(path) if path.suffix == ".safetensors" else _read(path)
+    try:
+        found = _built(content, path, averaged)
+    except InputError as error:
+        raise type(error)(str(error) if str(path) in str(error) else f"{path}: {error}") from None
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        reason = (str(error).splitlines() or [""])[0][:160]
+        raise InputError(
+            f"{path} is no checkpoint of r2flow, or a damaged one: what it holds cannot be used "
+            f"({type(error).__name__}: {reason})."
+        ) from None
+    return replace(found, generator=found.generator.to(device))
+
+
+def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
     sampler: Mapping[str, Any] | None = None
     published = format_of(content)
     if published is not None:
@@ -243,10 +260,13 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
         config, weights, step, sampler, kind = made.config, made.weights, made.step, made.sampler, "published"
     elif isinstance(content, dict) and "config" in content and "state_dict" in content:
         content = _renamed(content)
+        state = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
+        for key, entry in (("config", content["config"]), ("state_dict", state)):
+            if not isinstance(entry, Mapping):
+                raise InputError(f"its '{key}' has no named values. Is it of another program?")
         config, step, kind = dict(content["config"]), int(content.get("global_step", 0)), "r2flow"
         if "data" in config:
             config["data"] = upgraded(config["data"])
-        state = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
         weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
         sampler = content.get("sampler") or _sampler_of_stage(config.get("stage") or {})
     elif isinstance(content, dict):
@@ -270,7 +290,7 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
         made.finish(generator, config)
     measured = () if published is not None else content.get("accuracy") or ()
     accuracy = tuple(Budget.of(one) for one in measured)
-    return Checkpoint(generator.eval().requires_grad_(False).to(device), config, step, path, kind, accuracy)
+    return Checkpoint(generator.eval().requires_grad_(False), config, step, path, kind, accuracy)
 
 
 SPARE = 2**28  # elements of buffers that a checkpoint does not hold, and of what is computed on the way
@@ -333,17 +353,19 @@ def read_safetensors(path: Path) -> dict[str, Any]:
             kept = file.metadata() or {}
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if NOTES in kept:
-            notes, prefix = json.loads(kept[NOTES]), PREFIX
+            notes, prefix = parse_json(kept[NOTES]), PREFIX
             whole = notes.pop("digest", None) == _digest(notes, weights)
         else:  # 0.1.0 held the backbone alone, and said so under several keys
-            notes, prefix = {key: json.loads(kept[key]) for key in ("config", "step")}, PREFIX + BACKBONE
+            notes, prefix = {key: parse_json(kept[key]) for key in ("config", "step")}, PREFIX + BACKBONE
             whole = True
         config, step, sampler = notes["config"], int(notes["step"]), notes.get("sampler")
         accuracy = notes.get("accuracy")
     except KeyError as error:
         raise InputError(f"{path} holds weights but no r2flow config (no {error} in its metadata).") from None
-    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
+    except (SafetensorError, OSError, ValueError) as error:
         raise InputError(f"{path} is not a safetensors file, or a damaged one: {error}.") from None
+    except (TypeError, AttributeError):
+        raise InputError(f"{path} holds weights, and notes that are not r2flow's.") from None
     if not whole:
         raise InputError(_damaged(path, "its weights and config"))
     state = {prefix + name: value for name, value in weights.items()}
@@ -453,3 +475,8 @@ def check_weights(model: nn.Module, weights: Mapping[str, Tensor], path: Path) -
                 f"the weights in {path} do not fit its config: '{name}' has shape {tuple(weights[name].shape)}, "
                 f"the config makes it {tuple(value.shape)}."
             )
+        there = weights[name]
+        if there.layout != torch.strided or there.is_meta or there.is_complex():
+            raise InputError(f"the weights in {path} are no plain numbers: '{name}' is {there.layout}, {there.dtype}.")
+        if value.is_floating_point() != there.is_floating_point():
+            raise InputError(f"the weights in {path} do not fit: '{name}' is {there.dtype}, the model's {value.dtype}.")

@@ -146,11 +146,12 @@ def complete(
         raise InputError(f"needs at least one answer and a batch of at least one; found {num} and {batch_size}.")
     if keep not in KEEP:
         raise InputError(f"keep must be {', '.join(KEEP[:-1])} or {KEEP[-1]}, found {keep!r}.")
+    images = torch.as_tensor(images)
     _check_values(generator.space.sensor, images)
     images = images.detach().float().cpu()
     if state is None:
         state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.UNKNOWN)).to(torch.uint8)
-    state = state.cpu()
+    state = torch.as_tensor(state).cpu()
     if keep != "exact":
         state = torch.where(state == Ray.UNKNOWN, state, torch.tensor(int(Ray.DOUBTFUL), dtype=state.dtype))
     condition = condition_of(generator.space, images, state)

@@ -180,7 +180,10 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
         try:
             parsed = parser.parse_override(text)
         except HydraException:
-            raise InputError(f"{text} cannot be read: give KEY=VALUE, brackets and quotes closed.") from None
+            raise InputError(
+                f"{text} cannot be read: give KEY=VALUE, brackets and quotes closed, and quotes around spaces, as "
+                "'KEY=\"a value\"'."
+            ) from None
         key, value = parsed.key_or_group, parsed.value()
         if not key:
             raise InputError(f"{text} names no key: give KEY=VALUE.")
@@ -206,7 +209,8 @@ def explain(error: Exception) -> str:
     if unknown:
         within = re.search(r"full_key: (\S+)", str(error.__cause__))  # of a group's value, the key in it
         key = max(unknown[1], within[1] if within else "", key=len)
-        return f"the config has no key '{key}'.{did_you_mean(key, known_keys())} See --cfg job for all of them."
+        own_group = [known for known in known_keys() if not key.startswith(f"{known}.")]  # which says nothing new
+        return f"the config has no key '{key}'.{did_you_mean(key, own_group)} See --cfg job for all of them."
     missing = re.search(r"Missing mandatory value.*full_key: (\S+)", text, re.DOTALL)
     if missing:
         return f"{missing[1]} has no default: give {missing[1]}=VALUE."
@@ -218,6 +222,10 @@ def explain(error: Exception) -> str:
         known = choices(group)
         own = f" One of yours is found by --config-dir FOLDER, in FOLDER/{group}/NAME.yaml."
         return f"no {group} config named '{name}'; known: {', '.join(known)}.{did_you_mean(name, known) or own}"
+    several = re.search(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)
+    if several:
+        key, values = several.groups()
+        return f"{key}={values} is several values: for a sweep add -m, for a list give {key}=[{values}]."
     return " ".join(lines[:2])
 
 

@@ -2,8 +2,10 @@
 
 import errno
 import io
+import os
 import sys
 from importlib.util import find_spec
+from pathlib import Path
 
 
 class InputError(ValueError):
@@ -41,6 +43,11 @@ def explain_mistake(error: InputError | OSError) -> str:
     if isinstance(error, OSError):
         if error.errno not in MENDABLE:
             raise error
+        if error.errno in (errno.ENOTDIR, errno.EEXIST) and error.filename:
+            named = Path(os.fsdecode(error.filename))
+            file = next((path for path in (named, *named.parents) if path.exists() and not path.is_dir()), None)
+            if file is not None:
+                return one_line(f"{file} is a file, not a folder; give another name.")
         where = f"{error.filename}: " if error.filename else ""
         return one_line(f"{where}{error.strerror or error}")
     text = str(error)

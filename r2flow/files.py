@@ -1,6 +1,7 @@
 """Output files: a reader finds the old file or the whole new one, and devices, pipes and links stay what they are."""
 
 import errno
+import json
 import os
 import shutil
 import stat
@@ -72,6 +73,28 @@ def _temporary(name: str, folder: Path | None) -> tuple[int, str]:
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
     return tempfile.mkstemp(".part", f".{name}.", folder)
+
+
+def parse_json(text: str) -> Any:
+    """What a text of JSON says.
+
+    Raises:
+        ValueError: it is none, or nested too deeply to be one that was written here.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def read_json(path: Path) -> Any:
+    """What a file of JSON says.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is none; see `parse_json`.
+    """
+    return parse_json(path.read_text(encoding="utf-8"))
 
 
 def refuse_unreadable(path: Path, largest: int, what: str = "file") -> None:

@@ -7,6 +7,7 @@ import torch
 
 from r2flow.backbones import HDiT, Pyramid
 from r2flow.backbones.base import CommonOptions
+from r2flow.backbones.encodings import position_name
 from r2flow.checkpoints import Checkpoint, as_parent, weights_hash
 from r2flow.errors import InputError
 from r2flow.generators import Generator, RectifiedFlow, build_generator
@@ -97,6 +98,7 @@ def widened(checkpoint: Checkpoint, detail: tuple[int, int] | None = None, posit
             )
         backbone["detail"] = list(detail)
     if position is not None:
+        position = position_name(position, "learnable")
         inner, options = (network.inner, backbone["inner"]) if isinstance(network, Pyramid) else (network, backbone)
         if not isinstance(inner, HDiT) or inner.spatial_pe is not None:
             raise InputError(f"{checkpoint.path} holds no hdit without a position; it keeps its own.")

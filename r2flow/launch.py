@@ -219,7 +219,7 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], failed: list[str]) 
     if code in (130, 143):
         raise Stopped(code, "the sweep stopped; the same command goes on there")
     if code:
-        failed.append(" ".join(given))
+        failed.append(str(run_dir))
         raise JobFailed(failed[-1])  # Hydra runs the other jobs first
 
 

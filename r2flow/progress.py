@@ -27,7 +27,7 @@ class Bar:
     """
 
     def __init__(self, doing: str, total: int, unit: str = "", shown: bool | None = None, lines: bool = False) -> None:
-        drawn = not lines and (sys.stderr.isatty() if shown is None else shown)
+        drawn = not lines and (sys.stderr is not None and sys.stderr.isatty() if shown is None else shown)
         self._progress = Progress(
             TextColumn(doing), BarColumn(), MofNCompleteColumn(), TextColumn(unit), _Rate(), TimeRemainingColumn(),
             TextColumn("{task.fields[note]}"),

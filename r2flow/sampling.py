@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any, Protocol
 
 import torch
@@ -74,8 +75,8 @@ def sample(
             it cannot be cut to.
     """
     generator = source if isinstance(source, Generator) else source.generator
-    if num < 1 or batch_size < 1:
-        raise InputError(f"needs at least one scan and a batch of at least one; found {num} and {batch_size}.")
+    if not (isinstance(num, Integral) and isinstance(batch_size, Integral) and num >= 1 and batch_size >= 1):
+        raise InputError(f"needs at least one scan and a batch of at least one; found {num!r} and {batch_size!r}.")
     how = (sampler or generator.sampler).changed(**changes)
     check_control(how.method, changes)
     generator.check_sampler(how)

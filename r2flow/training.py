@@ -41,6 +41,7 @@ from r2flow.plugins import made_with
 from r2flow.registry import Bound, Count, Natural, NonNegative, Positive, check_options
 from r2flow.reports.training import finish, read_curves
 from r2flow.runs import check_run, open_run, read_config, run_lock
+from r2flow.simulator.folder import MANIFEST
 from r2flow.stages import build_stage, check_roll
 from r2flow.stages.base import Stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
@@ -200,6 +201,7 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
     with made_with(parent.config if parent else {}, "the run that it starts from"):
         config = with_scales(inherit(config, asked, parent), asked)
     check_options("data", DataOptions, config["data"])
+    _refuse_cache(config["data"], asked)
     drawn = sorted(key for key in map(key_of, asked) if f"{key}.".startswith("data.pairs."))
     if drawn and config["data"]["name"] != PAIRS:
         raise InputError(f"{', '.join(drawn)} are of data=pairs, found data={config['data']['name']}: leave them out.")
@@ -207,6 +209,23 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
         if scans is not None:
             _refuse_unread(key, scans)
     return config
+
+
+def _refuse_cache(data: Mapping[str, Any], asked: Sequence[str]) -> None:
+    """Refuse a `data.root` that holds nothing, where nobody said that simulated scans are to be kept in it.
+
+    Raises:
+        InputError: rather a folder of scans that was mistyped.
+    """
+    said = {key_of(one) for one in asked}
+    if data["name"] != SIMULATED or "data.root" not in said or "data" in said or data["root"] is None:
+        return
+    root = Path(str(data["root"])).expanduser()
+    if not (root / MANIFEST).is_file():
+        raise InputError(
+            f"data.root={root} holds no simulated scans. For scans of yours add data=folder (or data=kitti_raw, ...); "
+            "to keep simulated scans there add data=simulated."
+        )
 
 
 def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
@@ -222,7 +241,7 @@ def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
     elif name == PAIRS:
         what, unread = "pairs are drawn, not read", every - {"root", *READING}
     elif name == MIXED:
-        what, unread = "each of data.parts has its own", {"root", "split", "drives"}
+        what, unread = "each of data.parts has its own", {"split", "drives"}
     elif name is not None and isinstance(SOURCES[name], Layout | Prepared):
         what, unread = "scans in files are no simulated scenes", {"scenes"}
     else:

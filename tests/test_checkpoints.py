@@ -189,6 +189,45 @@ def test_missing_files_and_other_torch_files(tmp_path: Path):
         load_checkpoint(tmp_path / "weights.pt")
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [
+        *({"config": value} for value in (None, [], "x", {}, {**CONFIG, "sensor": "x"}, {**CONFIG, "backbone": None})),
+        *({"config": {**CONFIG, "data": value}} for value in (None, 5)),
+        *({"state_dict": value} for value in (None, {"generator.backbone.x": 3}, {1: torch.zeros(1)}, {})),
+        *({"global_step": value} for value in ("abc", None)),
+        *({"sampler": value} for value in ([1], "x", {"steps": {}})),
+        *({"accuracy": value} for value in (3, [1])),
+    ],
+    ids=str,
+)
+def test_entries_of_another_kind_are_refused_in_one_line(saved, changed: dict):
+    """As {config, state_dict} of another program has them."""
+    path, _ = saved
+    torch.save({**torch.load(path, weights_only=True), **changed}, path)
+    with pytest.raises(InputError) as refused:
+        load_checkpoint(path)
+    assert str(path) in str(refused.value)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("kind", [torch.int8, torch.complex64, "sparse"])
+def test_weights_that_are_no_plain_numbers_are_refused(saved, kind):
+    path, averaged = saved
+    name = max(averaged, key=lambda one: averaged[one].numel())
+    value = averaged[name].to_sparse() if kind == "sparse" else averaged[name].to(kind)
+    torch.save({**torch.load(path, weights_only=True), "state_dict": {**averaged, name: value}}, path)
+    with pytest.raises(InputError, match=name.removeprefix("generator.")):
+        load_checkpoint(path)
+
+
+def test_notes_that_are_nested_without_end_are_refused(saved, tmp_path: Path):
+    path = tmp_path / "deep.safetensors"
+    safetensors.torch.save_file({"x": torch.zeros(1)}, path, metadata={"r2flow": "[" * 100_000})
+    with pytest.raises(InputError, match="is not a safetensors file, or a damaged one: it is nested too deeply"):
+        load_checkpoint(path)
+
+
 def test_weights_that_do_not_fit_name_the_first(saved):
     path, averaged = saved
     name = next(iter(averaged))

@@ -206,7 +206,7 @@ class TestBadInput:
     def test_a_place_that_cannot_be_written(self, r2flow, scan, tmp_path):
         (tmp_path / "file").write_text("in the way")
         out = tmp_path / "file" / "views"
-        self.check(r2flow("show", scan, "--out", out), out, str(tmp_path / "file"), "Not a directory")
+        self.check(r2flow("show", scan, "--out", out), out, str(tmp_path / "file"), "is a file, not a folder")
 
     def test_a_scan_that_does_not_unfold(self, r2flow, tmp_path):
         write_scan(tmp_path / "one.bin", 3)

@@ -96,7 +96,7 @@ def test_simulated_scans_are_prepared_by_number_and_seed(r2flow, tmp_path):  # n
         (["folders", "ROOT", "--out", "OUT"], "no data set named 'folders'"),
         (["folder", "ROOT", "--out", "OUT", "--reflectance-levels", "300"], "must lie in [1, 256]"),
         (["folder", "ROOT", "--out", "OUT", "--on-bad-scan", "ignore"], "must be one of error, skip; found 'ignore'"),
-        (["folder", "ROOT", "--out", "FILE/below"], "Not a directory"),
+        (["folder", "ROOT", "--out", "FILE/below"], "is a file, not a folder; give another name."),
         (["--check", "ROOT"], "holds no prepared scans (no manifest.json); make them: r2flow prepare."),
     ],
 )

@@ -53,7 +53,8 @@ class KnownOptions:
     ] = "exact"
     surfaces: SurfacesOption = None
     reflectance_scale: Annotated[
-        float | None, typer.Option(min=1e-6, help="Value in the files that means full reflectance; found if left out.")
+        float | None,
+        typer.Option(min=1e-6, max=1e9, help="Value in the files that means full reflectance; found if left out."),
     ] = None
     columns: ColumnsOption = None
 

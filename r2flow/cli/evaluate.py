@@ -73,7 +73,7 @@ class SetOptions:
         None
     )
     generated_scale: Annotated[
-        float | None, typer.Option(min=1e-6, help="--reflectance-scale of the files in GENERATED, if other.")
+        float | None, typer.Option(min=1e-6, max=1e9, help="--reflectance-scale of the files in GENERATED, if other.")
     ] = None
 
 

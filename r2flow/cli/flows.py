@@ -115,20 +115,18 @@ def sample(
         )
     else:
         sampler = sampler_within(loaded, error)
-    formats = format.split(",") if format else formats_of(loaded, part.channels)
+    formats = [*dict.fromkeys(map(str.strip, format.split(",")))] if format else formats_of(loaded, part.channels)
     region = part.region(loaded)
     write_samples(loaded, out, draw.num, draw.seed, sampler, formats, pictures, draw.batch_size, region, part.channels)
     seen = f", pictures in {out / 'samples.png'}" if pictures else ""
     seen += f", in 3-D in {out / 'samples.html'}" if pictures and part.channels != "reflectance" else ""
-    print(f"{draw.num} scans ({', '.join(formats)}) in {out}{seen}")
+    print(f"{draw.num} scan{'s' * (draw.num != 1)} ({', '.join(formats)}) in {out}{seen}")
 
 
 @app.command(epilog="Example: r2flow calibrate -c runs/NAME")
 def calibrate(
     checkpoint: CheckpointOption,
-    steps: Annotated[
-        int, typer.Option(min=1, help="Steps that the grid shall suit; the flow's own from then on.")
-    ] = 16,
+    steps: Annotated[int, typer.Option(min=1, help="Steps to fit the grid to; the flow's own from then on.")] = 16,
     solver: Annotated[str, typer.Option(help="adams2, adams3 or adams4; the flow's own from then on.")] = "adams3",
     num: Annotated[int, typer.Option(min=1, help="Scans to measure on.")] = 4,
     device: DeviceOption = "auto",
@@ -166,6 +164,8 @@ def info(
     from r2flow.reports.contents import card as card_of
     from r2flow.reports.contents import describe, print_contents
 
+    if card and json:
+        raise InputError("--card and --json are two forms of one answer; give one of them.")
     contents = describe(checkpoint)
     if card:
         print(card_of(contents))
@@ -219,8 +219,8 @@ def grow(
     """Put a trained flow's network inside a larger one, to go on learning from what it knows.
 
     With --size convolutions at a higher resolution surround it: the means of what it draws are the images of the
-    trained flow. Below them is noise, until it has learned more. With --detail and --position alone it draws the same
-    scans, and can learn more.
+    trained flow. What is finer than these means is noise until it is trained. With --detail and --position alone it
+    draws the same scans, and can learn more.
     """
     from r2flow.checkpoints import load_checkpoint, save_checkpoint
     from r2flow.growing import grown, widened

@@ -83,15 +83,14 @@ class SolverOptions:
         str | None,
         typer.Option(
             help="adams2-4, euler, midpoint, heun2-3, rk4, ab2; adaptive: dopri5, bosh3, auto, torchdiffeq:NAME; with "
-            "fresh noise on the way, where no ODE is needed: sde, sde:C, and of flow maps renoise:C; theirs too: "
-            "jump, chord. "
+            "fresh noise on the way: sde, sde:C; of flow maps alone: jump, chord, renoise, renoise:C. "
             "Other systems have their own (docs/systems.md), and so has completion (docs/completion.md)."
         ),
     ] = None
     steps: Annotated[int | None, typer.Option(min=1, help="Steps from noise to data, of a solver of fixed steps.")] = (
         None
     )
-    tolerance: Annotated[float | None, typer.Option(help="Of an adaptive solver.")] = None
+    tolerance: Annotated[float | None, typer.Option(help="Largest error of a step, of an adaptive solver.")] = None
 
     def change(self, sampler: "Sampler", **more: Any) -> "Sampler":
         """A sampler with what was asked for, and `more` of its settings.
@@ -110,7 +109,7 @@ class SolverOptions:
 class DrawOptions:
     """Which scans are drawn, and on what device."""
 
-    num: Annotated[int, typer.Option(min=1, help="Scans.")] = 4
+    num: Annotated[int, typer.Option(min=1, help="How many scans.")] = 4
     seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0
     batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1
     device: DeviceOption = "auto"

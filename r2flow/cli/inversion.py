@@ -16,7 +16,7 @@ class ScanOptions:
 
     reflectance_scale: Annotated[
         float | None,
-        typer.Option(min=1e-6, help="Value in the files that means full reflectance; the training's if left out."),
+        typer.Option(min=1e-6, max=1e9, help="Value in the files that means full reflectance; else the training's."),
     ] = None
     batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1
     device: DeviceOption = "auto"

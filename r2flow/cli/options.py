@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 CheckpointOption = Annotated[
     Path, typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model.", show_default=False)
 ]
-DeviceOption = Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...")]
+DeviceOption = Annotated[str, typer.Option(help="Where to compute: auto, cpu, cuda, cuda:1, ...")]
 PrecisionOption = Annotated[
     str | None, typer.Option(help="Of the network: 32-true or, faster where there is bfloat16, bf16-mixed.")
 ]
@@ -38,13 +38,20 @@ SETS = "a folder of scans, samples, a run, prepared shards, NAME:FOLDER, simulat
 SensorChoice = Annotated[
     str | None, typer.Option(help="Name of the sensor; that of the flow or the scans, or hdl64e, if left out.")
 ]
-ProjectionChoice = Annotated[str | None, typer.Option(help="spherical or unfolding; theirs, or spherical.")]
+ProjectionChoice = Annotated[
+    str | None, typer.Option(help="spherical or unfolding; that of the flow or the scans, or spherical, if left out.")
+]
 ConventionChoice = Annotated[
-    str | None, typer.Option(help="centre, or reference for the published models'; theirs, or centre.")
+    str | None,
+    typer.Option(
+        help="centre, or reference for the published models'; that of the flow or the scans, or centre, if left out."
+    ),
 ]
 ScaleChoice = Annotated[
     float | None,
-    typer.Option(min=1e-6, help="Value in scan files that means full reflectance; the sensor's, else their usual one."),
+    typer.Option(
+        min=1e-6, max=1e9, help="Value in scan files that means full reflectance; the sensor's, else their usual one."
+    ),
 ]
 
 ColumnsOption = Annotated[

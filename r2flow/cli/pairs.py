@@ -104,4 +104,5 @@ def pairs(
         print(f"{store.folder}: other processes have still to make about {lacking * batch_size} of {num} pairs")
     else:
         size = sum(store.shard_path(shard).stat().st_size for shard in store.shards(num) if store.is_sealed(shard, num))
-        print(f"{store.folder}: all {num} pairs, {len(store.shards(num))} shards, {size / 2**20:.0f} MiB")
+        shards = len(store.shards(num))
+        print(f"{store.folder}: all {num} pairs, {shards} shard{'s' * (shards != 1)}, {size / 2**20:.0f} MiB")

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from r2flow.reports.views import View
 
 PictureScale = Annotated[
-    float | None, typer.Option(min=1e-6, help="Value in the file that means full reflectance; guessed if left out.")
+    float | None,
+    typer.Option(min=1e-6, max=1e9, help="Value in the file that means full reflectance; guessed if left out."),
 ]
 
 

@@ -5,6 +5,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -56,6 +57,9 @@ def run() -> None:
 
 
 def _run() -> None:
+    for name in ("stdout", "stderr"):  # None where it was closed, as in a daemon
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 (to the end)
     print_any_name()
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", force=True)
     try:
@@ -83,9 +87,23 @@ def _run() -> None:
         print(f"error: the memory has no room{more}; give {_less_at_once(sys.argv)}.", file=sys.stderr)
         sys.exit(2)
     except USAGE_ERROR as error:
-        print(f"error: {one_line(error.format_message()) or 'no verb is given.'} See --help.", file=sys.stderr)
+        print(f"error: {_usage(error.format_message())} See --help.", file=sys.stderr)
         sys.exit(2)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _usage(message: str) -> str:
+    """What typer says of a wrong option, with the value that was found."""
+    said = one_line(message).rstrip(".") or "no verb is given"
+    wrong = re.fullmatch(r"Invalid value for ('.*'): Input should be (.*?)(, unable to .*)?", said)
+    if not wrong:
+        return f"{said}."
+    names = re.findall(r"--?[\w-]+", wrong[1])
+    words = iter(sys.argv[1:])
+    values = [next(words, "") if word in names else word.partition("=")[2]
+              for word in words if word.partition("=")[0] in names]  # fmt: skip
+    found = f", found {', '.join(values)}" if names and values else ""
+    return f"{' or '.join(names) or wrong[1]} must be {wrong[2]}{found}."
 
 
 def _less_at_once(arguments: Sequence[str]) -> str:

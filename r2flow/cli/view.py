@@ -89,6 +89,8 @@ def view(
     flows = [one for one in what if is_checkpoint(one)]
     if not flows and (drawn.steps or drawn.times):
         raise InputError("--steps and --times are of a run, a checkpoint or a model; found none.")
+    if not flows and (drawn.seed or drawn.device != "auto"):
+        raise InputError("--seed and --device are of a run, a checkpoint or a model that is drawn from; found none.")
     of_files = (sensor, size, reflectance_scale, columns)
     if len(flows) == len(what) and (projection != "spherical" or any(one is not None for one in of_files)):
         raise InputError(

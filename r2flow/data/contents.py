@@ -8,7 +8,7 @@ from pathlib import Path
 from stat import S_ISREG
 
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, read_json
 
 RECORD = "files.json"  # in the folder of the run or of the shards
 FORMAT = "r2flow files 1"
@@ -47,7 +47,7 @@ def refuse_changed(folder: Path, files: Mapping[str, str | Path], since: str, ad
         InputError: a file is another one now.
     """
     try:
-        noted = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        noted = read_json(folder / RECORD)
         by, there = noted["by"], dict(noted["files"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False

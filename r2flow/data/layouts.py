@@ -96,7 +96,9 @@ class Layout(SourceKind):
         name, split, root = options.name, options.split, Path(options.folder).expanduser()
         self.chosen([], split, None)  # a split that is not known is refused before anything is looked for
         if not root.is_dir():
-            raise InputError(f"{root} is not a folder. Give the folder of your {name} scans (data.root=FOLDER).")
+            raise InputError(
+                f"{root} is not a folder. Give the folder of {name} scans (data.root=FOLDER; in a verb {name}:FOLDER)."
+            )
         held = [drive for drive in self.find(root) if drive.scans]
         if not held:
             where = (self.find.__doc__ or "").splitlines()[0]

@@ -34,7 +34,7 @@ from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, warn_of_other_sensor
 from r2flow.data.store import MANIFEST
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, read_json
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.registry import Registry, check_options, did_you_mean
 
@@ -227,10 +227,10 @@ def _noted(folder: Path) -> Reading | None:
     if not path.is_file():
         return None
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         return Reading(_sensor(content["sensor"]), content["projection"], content["convention"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} cannot be read ({error}); delete it and give --sensor and --size.") from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"{path} is damaged; delete it and give --sensor and --size.") from None
 
 
 def _sensor(described: Mapping[str, Any]) -> Sensor:
@@ -245,8 +245,8 @@ def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
         return
     there, here = (f"{one.name} {one.shape[0]}x{one.shape[1]}" for one in (own.sensor, sensor))
     raise InputError(
-        f"{folder} holds images of {there} (its {SAMPLES} says so), not of {here}: leave --sensor and --size out, and "
-        "name no scans of another sensor or size beside them."
+        f"{folder} holds images of {there} (its {SAMPLES} says so), not of {here}: give no other --sensor or --size, "
+        "no scans of another one beside them, and for a model of another one point clouds (.ply, .bin)."
     )
 
 
@@ -260,7 +260,7 @@ def refuse_parts(spec: str | Path) -> None:
     if options.name != FOLDER:
         return
     folder = Path(options.folder)
-    if _noted(folder) is not None and json.loads((folder / SAMPLES).read_text(encoding="utf-8")).get("region"):
+    if _noted(folder) is not None and read_json(folder / SAMPLES).get("region"):
         raise InputError(
             f"{spec} holds a part of each scan alone (its {SAMPLES} says so) and cannot be judged beside whole scans: "
             "sample without --sector and --rows."

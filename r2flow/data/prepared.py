@@ -31,7 +31,7 @@ from r2flow.data.quantise import RangeCodes, ReflectanceCodes
 from r2flow.data.sources import ScanSource
 from r2flow.data.store import MANIFEST, Damaged, difference, shard_count, shard_items
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, read_json
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 
@@ -165,7 +165,7 @@ def read_manifest(folder: Path, finished: bool = False) -> Manifest:
     path = folder / MANIFEST
     damaged = InputError(f"{path} is damaged. Delete its folder and prepare the scans again.")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         found = content["format"]
     except FileNotFoundError:
         raise InputError(f"{folder} holds no prepared scans (no {MANIFEST}); make them: r2flow prepare.") from None

@@ -40,7 +40,7 @@ from r2flow.data.reading import Reading, lacks_reflectance, range_image, stored_
 from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, spread, warn_of_other_sensor
 from r2flow.data.store import MANIFEST, clear_leftovers, refuse_other, shard_bytes, warn_damaged
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, read_json
 from r2flow.lidar.sensors import Sensor
 from r2flow.signals import end_with_parent
 
@@ -334,7 +334,7 @@ class Preparation:
         if self.finished:
             return self.finished[shard]
         with suppress(OSError, ValueError, TypeError, KeyError):
-            note = json.loads(self._note(shard).read_text(encoding="utf-8"))
+            note = read_json(self._note(shard))
             if note["recipe"] == self.recipe.digest and note["checksum"] == checksum(note["shard"]):
                 return ShardEntry.of(note["shard"])
         return None
@@ -405,7 +405,8 @@ class Preparation:
                     raise InputError(f"{self.making} was changed meanwhile; the same command goes on.")
                 if not any(entry.scans for entry in shards):
                     raise InputError(
-                        f"all {self.recipe.scans} scans were left out as unusable; see the warnings above."
+                        f"all {self.recipe.scans} scans were left out as unusable; the warnings above say why. Mend "
+                        f"them, and remove {self.folder} before it is used again."
                     )
                 write_manifest(self.folder, Manifest(self.recipe, self.plan.drives, shards))
             with suppress(OSError):  # another process may have removed the folder, or opened a lock in it

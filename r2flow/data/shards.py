@@ -25,7 +25,7 @@ from r2flow.data.store import (
     warn_damaged,
 )
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, read_json
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 
@@ -124,7 +124,7 @@ class PairStore:
         if not path.is_file():
             return
         try:
-            found = dict(json.loads(path.read_text(encoding="utf-8"))["recipe"])
+            found = dict(read_json(path)["recipe"])
         except (ValueError, KeyError, TypeError):
             raise InputError(f"{path} is damaged. Delete it: the shards beside it know their recipe.") from None
         then = {f.name: f.default for f in fields(PairRecipe) if f.default is not MISSING and f.name not in found}

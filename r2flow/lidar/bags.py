@@ -16,6 +16,7 @@ from r2flow.lidar.scan_files.fields import PointField, column_points, find_roles
 from r2flow.lidar.scan_files.points import Points
 from r2flow.lidar.scan_files.tables import INSTALL
 
+REINDEX = "ros2 bag reindex FOLDER"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of a PointField's datatype
 
@@ -51,7 +52,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     if not (path.is_dir() or path.is_file()):
         raise InputError(f"{path} is not a recording: give a .mcap, .db3 or .bag file, or the folder of a ROS 2 bag.")
     if path.is_dir() and not (path / "metadata.yaml").is_file():
-        raise InputError(f"{path} is no ROS 2 bag (no metadata.yaml); give the .mcap or .db3 file in it.")
+        raise InputError(f"{path} is no ROS 2 bag (no metadata.yaml); give the .mcap in it, or for a .db3 {REINDEX}.")
     if path.suffix.lower() == ".bag" and path.is_file():
         store = get_typestore(Stores.ROS1_NOETIC)
         kind: Any = Reader1
@@ -61,6 +62,8 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
         kind, deserialize = Reader2, store.deserialize_cdr
         if path.suffix.lower() == ".db3" and path.is_file():  # a part of a bag, whose folder says its topics
             path = path.parent
+            if not (path / "metadata.yaml").is_file():
+                raise InputError(f"{path} has no metadata.yaml, which says what its .db3 holds; make it: {REINDEX}.")
     try:
         with kind(path) as reader:
             yield reader, deserialize

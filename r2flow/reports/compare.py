@@ -20,6 +20,7 @@ from r2flow.backbones.cost import count_macs, count_parameters
 from r2flow.checkpoints import checkpoints_of, step_of
 from r2flow.config import flatten
 from r2flow.errors import InputError
+from r2flow.files import read_json
 from r2flow.generators import RectifiedFlow, build_generator
 from r2flow.reports.backbones import latency
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
@@ -85,7 +86,7 @@ class Group:
 def find_runs(paths: Sequence[Path]) -> list[Path]:
     """Run folders: those given, and for a folder of runs (a chain's, a sweep's, a sweep's of chains) those in it.
 
-    Paths that are neither are skipped where there are others, as in `runs/sweep/*`; folders with a warning.
+    Paths that are neither are skipped with a warning where there are others, as in `runs/sweep/*`.
 
     Raises:
         InputError: a path that does not exist, or not one of them a run.
@@ -101,8 +102,7 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     if others and not found:
         raise InputError(f"{others[0]} is no run: it has no {CONFIG}. Give folders that train.py has written.")
     for path in others:
-        if path.is_dir():
-            log.warning("%s holds no run and is skipped.", path)
+        log.warning("%s holds no run and is skipped.", path)
     return list(dict.fromkeys(found))
 
 
@@ -213,7 +213,7 @@ def read_fidelity(path: Path) -> dict[str, float]:
         return {}
     newest = max(files, key=lambda file: file.stat().st_mtime)
     try:
-        return {line: float(value) for line, value in json.loads(newest.read_text("utf-8"))["sets"]["other"].items()}
+        return {line: float(value) for line, value in read_json(newest)["sets"]["other"].items()}
     except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(f"{newest} is no result of 'r2flow report fidelity'; remove it or make it again.") from None
 

@@ -17,7 +17,7 @@ from r2flow.completion import Completed, complete
 from r2flow.data.opening import SAMPLES, write_samples_note
 from r2flow.data.partial import PartialScan
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, read_json
 from r2flow.generators import Sampler
 from r2flow.lidar.known import Mask, Ray
 from r2flow.lidar.projection import image_to_points
@@ -186,7 +186,7 @@ def _refuse_others(
             raise InputError(f"{foreign} is there and no answer of this command; give another --out.")
         return {}
     try:
-        there = json.loads(note.read_text(encoding="utf-8")).get("completion")
+        there = read_json(note).get("completion")
     except (ValueError, AttributeError):
         there = None
     ours = _flat(json.loads(json.dumps(settings)))

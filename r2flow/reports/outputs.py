@@ -1,6 +1,5 @@
 """Generated scans as files and pictures."""
 
-import json
 import logging
 import re
 import shlex
@@ -17,7 +16,7 @@ from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.data.opening import SAMPLES, samples_note, write_samples_note
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import reading_of_flow
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, read_json
 from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.region import Region
@@ -150,7 +149,7 @@ def _former(out: Path, about: Mapping[str, Any], num: int, replace: bool) -> dic
     """
     names, note = sorted(file.name for file in out.glob("*")), out / SAMPLES
     try:
-        found = json.loads(note.read_text(encoding="utf-8")) if note.is_file() else {}
+        found = read_json(note) if note.is_file() else {}
     except ValueError:
         found = {}
     there: dict[str, Any] = found if isinstance(found, dict) else {}

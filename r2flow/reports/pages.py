@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 import r2flow
-from r2flow.errors import InputError, printable
+from r2flow.errors import InputError, explain_mistake, printable
 from r2flow.files import atomic_write
 from r2flow.reports.pictures import take_names_as_they_are
 from r2flow.reports.tables import Row
@@ -94,7 +94,7 @@ def prepare_folder(out: str | Path) -> Path:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{out} cannot be a folder to write to: {error.strerror or error}.") from None
+        raise InputError(explain_mistake(error)) from None
     if not os.access(out, os.W_OK):
         raise InputError(f"{out} cannot be written to; give another --out.")
     return out

@@ -32,7 +32,8 @@ def make_and_tell(
     if made.pairs:
         unusable = f", {made.unusable} did not converge and are left out" if made.unusable else ""
         rate, cost = made.pairs / made.seconds, made.evaluations / made.pairs
-        print(f"{who}{made.pairs} pairs, {rate:.2f} pairs/s, {cost:.1f} evaluations a pair{unusable}", flush=True)
+        drawn = f"{who}{made.pairs} pairs drawn in whole batches"
+        print(f"{drawn}, {rate:.2f} pairs/s, {cost:.1f} evaluations a pair{unusable}", flush=True)
     return made
 
 

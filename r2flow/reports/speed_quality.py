@@ -1,6 +1,5 @@
 """Distance to real scans against evaluations and seconds: the paper's figure 6."""
 
-import json
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
@@ -15,6 +14,7 @@ from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.evaluation.measuring import Gathered, Work, measure, point_key
 from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
+from r2flow.files import read_json
 from r2flow.flow.solvers import adapts
 from r2flow.generators import Sampler
 from r2flow.metrics.base import ScanMetric
@@ -160,7 +160,7 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     if not path.is_file():
         return []
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         rows = [*content["rows"], *content["other_points"]]
         return [{k: math.nan if v is None and "/" in k else v for k, v in row.items()} for row in rows if "key" in row]
     except (ValueError, KeyError, TypeError, AttributeError):

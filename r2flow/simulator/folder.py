@@ -14,7 +14,7 @@ import numpy as np
 
 from r2flow import noise
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, sole_use
+from r2flow.files import atomic_write, read_json, sole_use
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import FIRM_ENDINGS, write_points
 from r2flow.lidar.sensors import Sensor
@@ -187,7 +187,7 @@ def _note(sensor: Sensor, seed: int) -> dict[str, Any]:
 
 def _read_note(path: Path) -> dict[str, Any]:
     try:
-        note = json.loads(path.read_text("utf-8"))
+        note = read_json(path)
     except ValueError:
         note = None
     if not isinstance(note, dict):

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock, Timeout
 
 from r2flow.data import contents, preparing
 from r2flow.data.datamodule import ScanDataModule
@@ -355,9 +356,20 @@ def test_settings_by_which_nothing_was_made_can_be_mended_in_the_same_folder(clo
     assert files(make(tmp_path / "out", right)) == files(make(tmp_path / "one", right))
 
 
+def is_locked(path: Path) -> bool:
+    """Whether another process holds a lock; a look takes it for a moment."""
+    lock = FileLock(path, timeout=0)
+    try:
+        lock.acquire()
+    except (Timeout, FileNotFoundError):
+        return path.exists()
+    lock.release()
+    return False
+
+
 def test_a_folder_in_which_another_process_makes_its_first_shard_is_not_taken_from_it(clouds: Path, tmp_path: Path):
     slow = in_process(tmp_path, plan_of(clouds), seconds=30)
-    wait_until((tmp_path / "making" / "000000.lock").exists)
+    wait_until(lambda: is_locked(tmp_path / "making" / "000000.lock"))
     with pytest.raises(InputError, match=r"holds other scans: convention is centre there, reference here"):
         make(tmp_path, plan_of(clouds, convention="reference"))
     os.kill(slow, signal.SIGKILL)
@@ -505,7 +517,7 @@ def test_who_waits_takes_over_from_who_is_killed(clouds: Path, tmp_path: Path):
     plan = plan_of(clouds, shard_scans=10)
     one = files(make(tmp_path / "one", plan))
     slow = in_process(tmp_path / "two", plan, seconds=30)
-    wait_until((tmp_path / "two" / "making" / "000000.lock").exists)
+    wait_until(lambda: is_locked(tmp_path / "two" / "making" / "000000.lock"))
     other = in_process(tmp_path / "two", plan)
     time.sleep(0.05)
     os.kill(slow, signal.SIGKILL)

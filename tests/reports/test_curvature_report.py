@@ -151,7 +151,7 @@ def test_bad_input_is_one_line(r2flow, saved, tmp_path):  # noqa: F811
     for arguments, words in (
         ((tmp_path / "none", "-o", tmp_path / "o"), "no checkpoint"),
         ((saved[0], "-o", tmp_path / "o", "--steps", 0), "--steps"),
-        ((saved[0], "-o", saved[0] / "o"), "cannot be a folder"),
+        ((saved[0], "-o", saved[0] / "o"), "is a file, not a folder"),
     ):
         code, _, err = r2flow("report", "curvature", "-c", *arguments)
         assert code == 2

@@ -94,7 +94,7 @@ def test_styles_differ_without_colour():
 
 def test_a_folder_that_cannot_be_one_is_refused_before_anything_is_measured(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(InputError, match=r"file/reports cannot be a folder"):
+    with pytest.raises(InputError, match=r"file is a file, not a folder; give another name"):
         prepare_folder(tmp_path / "file" / "reports")
     assert prepare_folder(tmp_path / "a" / "b").is_dir()
 
