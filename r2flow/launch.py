@@ -75,7 +75,9 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
             for group in REGISTRIES if plugins else ():
                 add_choices(group)
             arguments = _checked_arguments(arguments)
-            _run_hydra(arguments, functools.partial(_job, arguments, command, failed))
+            _run_hydra(arguments, functools.partial(_job, arguments, command, failed, os.getpid()))
+            if failed:
+                raise JobFailed(failed[0])
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except Stopped as stop:
@@ -177,8 +179,15 @@ def job_folder(arguments: Sequence[str], overrides: str) -> str:
     return f"{readable}-{hashlib.sha256(os.fsencode(overrides)).hexdigest()[:6]}"
 
 
-def _job(arguments: Sequence[str], command: Sequence[str], failed: list[str], config: DictConfig) -> None:
-    """What Hydra runs. Of the exceptions only `Exception` is caught by it: SystemExit says the code."""
+def _job(
+    arguments: Sequence[str], command: Sequence[str], failed: list[str], launcher: int, config: DictConfig
+) -> None:
+    """What Hydra runs. Of the exceptions only `Exception` is caught by it: SystemExit says the code.
+
+    Args:
+        failed: Where the folders of a sweep's jobs are noted that ended badly.
+        launcher: The process in which that list is read.
+    """
     try:
         given = list(HydraConfig.get().overrides.task)
         # Of the command line, not of the overrides: a file can have a sweeper add some of these.
@@ -187,6 +196,8 @@ def _job(arguments: Sequence[str], command: Sequence[str], failed: list[str], co
             raise InputError(f"plug-ins are named on the command line, never in a file: give {named}.")
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             _sweep_job(command, given, failed)
+            if failed and os.getpid() != launcher:
+                raise JobFailed(failed[-1])  # a launcher elsewhere hears exceptions alone, after all jobs
             return
         settings = plain(config)
         check_keys(settings)
@@ -220,7 +231,6 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], failed: list[str]) 
         raise Stopped(code, "the sweep stopped; the same command goes on there")
     if code:
         failed.append(str(run_dir))
-        raise JobFailed(failed[-1])  # Hydra runs the other jobs first
 
 
 def _fit(settings: dict[str, Any], given: Sequence[str]) -> int:

@@ -553,3 +553,8 @@ def test_a_way_of_no_length_and_no_scans_need_no_jump(grown):
 def test_jumps_of_half_precision_noise_are_taken_in_float32(grown):
     x_0 = Draws(0, range(2)).start(grown.noise_shape).bfloat16()
     assert torch.equal(grown.generate(x_0).x, grown.generate(x_0.float()).x)
+
+
+def test_jumps_take_no_number(grown):
+    with pytest.raises(InputError, match="jump takes no number, found jump:2; renoise:C does"):
+        grown.check_sampler(Sampler("jump:2", 2))

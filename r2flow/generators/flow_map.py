@@ -131,6 +131,9 @@ class FlowMap(RectifiedFlow):
         return super().draws_noise(sampler) or (sampler.method not in QUIET and _churn(sampler) is not None)
 
     def check_sampler(self, sampler: Sampler) -> None:
+        name, colon, _ = sampler.method.partition(":")
+        if colon and name in QUIET:
+            raise InputError(f"{name} takes no number, found {sampler.method}; renoise:C does.")
         if _churn(sampler) is None:
             super().check_sampler(sampler)
             return
