@@ -21,7 +21,7 @@ class Augmentation:
         InputError: a share outside [0, 1).
     """
 
-    flip: bool = False  # mirror every other scan: azimuth -> -azimuth, exact as bins lie symmetrically about ahead
+    flip: bool = False  # mirror half of the images: azimuth -> -azimuth, exact as bins lie symmetrically about ahead
     roll: bool = False  # turn each about the sensor by a whole number of columns, drawn uniformly: exact on the ring
     beam_dropout: float = 0.0  # share of the rows that lose all their returns
     ray_dropout: float = 0.0  # share of the returns that are lost one by one

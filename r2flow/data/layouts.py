@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
@@ -249,7 +250,14 @@ def _numbers(name: str) -> set[int]:
     return {int(digits)} if digits.isdecimal() else set()
 
 
+def _in_order(name: str) -> list[tuple[int, str]]:
+    """By the numbers in a name: 2.bin comes before 10.bin."""
+    return [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"([0-9]+)", name)]
+
+
 def _files(folder: Path, endings: tuple[str, ...]) -> tuple[str, ...]:
     """The files of a folder by their endings, in order; hidden ones (macOS leaves ._NAME beside NAME) are none."""
-    names = sorted(n for n in os.listdir(folder) if n.lower().endswith(endings) and not n.startswith("."))
+    names = sorted(
+        (n for n in os.listdir(folder) if n.lower().endswith(endings) and not n.startswith(".")), key=_in_order
+    )
     return tuple(os.path.join(folder, name) for name in names)

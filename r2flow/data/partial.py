@@ -197,6 +197,8 @@ def _described(spec: str, elevations: np.ndarray, name: str, target: Sensor) -> 
 
 def _read_same(path: Path, reading: Reading, scale: float) -> Partial:
     points = read_points(path, reading.columns)
+    if reading.projection == "unfolding":
+        points = points.with_lost_rays()
     strength = _strength(path, points, scale, strict=True)
     seen = points_of_same(points, reading.sensor, reading.projection, reading.convention, strength)
     return _shown(path, points, reading.sensor, seen)

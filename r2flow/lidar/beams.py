@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from r2flow.lidar.scan_files import Points
 from r2flow.lidar.unfolding import elevations_of, median_of_seen, rings_from_order, scatter_of
 
 FEWEST, MOST = 4, 256  # beams of a sensor
+SAME = 2e-3  # degrees; two returns of one ray are no farther apart
 TIGHT = 0.1  # scatter (`scatter_of`) below which each column is one laser
 BANDWIDTHS = np.geomspace(0.015, 2.0, 50)  # degrees
 BIN = 0.005  # degrees
@@ -65,13 +66,21 @@ def find_beams(scans: Sequence[Points]) -> Beams:
         NoBeamsError: the points lie on no beams at all.
         InputError: no beams can be told apart.
     """
-    scans = [scan.with_lost_rays() for scan in scans]
+    whole = [scan.with_lost_rays() for scan in scans]
+    found = _found(whole)
+    pairs = zip(found.of_point, scans, strict=True)
+    return replace(found, of_point=[row if len(row) == len(scan.xyz) else row[scan.kept] for row, scan in pairs])
+
+
+def _found(scans: Sequence[Points]) -> Beams:
+    """`find_beams` with all rows of the files, lost rays at the origin."""
     elevations = [elevations_of(scan.xyz) for scan in scans]
     if all(scan.ring is not None for scan in scans):
         lasers = [np.asarray(scan.ring, dtype=np.int64) for scan in scans]
         return _by_laser(elevations, lasers, RINGS)
     if count := _lasers_of_firings(elevations):
-        return _by_laser(elevations, [np.arange(len(e)) % count for e in elevations], FIRINGS)
+        table = _single_returns(elevations, count)
+        return _by_laser(elevations, [table[np.arange(len(e)) % count] for e in elevations], FIRINGS)
     if (rings := _rings(scans, elevations)) is not None:
         by_ring = _by_laser(elevations, rings, RING_AFTER_RING)
         peaks = _by_elevation(elevations, RING_AFTER_RING)
@@ -161,6 +170,14 @@ def _lasers_of_firings(elevations: list[np.ndarray]) -> int | None:
     # Half the lasers fit too where the others see only sky, but then a few returns are far from the medians.
     fitting = [count for count, distance in distances.items() if distance <= 1.5 * min(distances.values()) + 1e-3]
     return min(fitting, default=None)
+
+
+def _single_returns(elevations: list[np.ndarray], count: int) -> np.ndarray:
+    """Laser of each of the `count` points of a firing: of two returns of each ray, stored one after the other, one."""
+    each = np.arange(count)
+    middle = median_of_seen(np.concatenate([_some(e.reshape(-1, count)) for e in elevations]))
+    twice = count % 2 == 0 and bool(np.nanmax(np.abs(middle[::2] - middle[1::2]), initial=0) < SAME)
+    return each // 2 if twice and count // 2 >= FEWEST else each
 
 
 def _divisors(number: int) -> list[int]:

@@ -5,7 +5,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from r2flow.errors import InputError
@@ -172,26 +171,6 @@ def unproject(r: Tensor, rays: Tensor) -> Tensor:
     return r * direction
 
 
-def resized_rays(rays: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Rays for images of another shape: the angle of the linearly interpolated sines and cosines.
-
-    Angles themselves cannot be interpolated where azimuth jumps from -pi to pi. Columns are a ring, the edge rows are
-    repeated.
-
-    Args:
-        rays: Elevation and azimuth in radians, (2, H, W).
-        shape: Rows and columns (H', W').
-
-    Returns:
-        (2, H', W').
-    """
-    parts = torch.cat([rays.sin(), rays.cos()])[None]
-    thrice = torch.cat([parts, parts, parts], dim=3)
-    resized = F.interpolate(thrice, size=(shape[0], 3 * shape[1]), mode="bilinear", align_corners=False)
-    sines, cosines = resized[0, :, :, shape[1] : 2 * shape[1]].split(2)
-    return torch.atan2(sines, cosines)
-
-
 def image_to_points(
     image: np.ndarray, rays: Tensor, measured: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -212,6 +191,6 @@ def image_to_points(
     reflectance = image[1] if len(image) > 1 else np.zeros_like(image[0])
     columns = image.shape[-1]
     # Azimuth falls with w from +180 degrees: read backwards from the middle, it rises from 0.
-    order = np.roll(np.arange(columns)[::-1], columns // 2)
+    order = np.roll(np.arange(columns)[::-1], (columns + 1) // 2)
     xyz, reflectance, returned = xyz[..., order], reflectance[..., order], image[0][..., order] > 0
     return np.ascontiguousarray(xyz[:, returned].T), np.ascontiguousarray(reflectance[returned])

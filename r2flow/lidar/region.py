@@ -8,8 +8,6 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 
-Rectangle = tuple[int, int]
-
 # Degrees beside a sector that `r2flow sample` generates with it. On the demo's 1-RF a sector of 90 degrees is 0.065
 # from the whole scan in model space without a margin, 0.015 with this one, 0.006 with 45 degrees.
 MARGIN = 11.25

@@ -166,7 +166,8 @@ def points_of_same(
     near = project_indices(points.xyz, close, projection, convention, points.ring)[0]
     state.ravel()[near[image[0].ravel()[near] == 0]] = Ray.UNKNOWN
     returned = points.xyz[:, :2].any(axis=1)
-    state[:, _blind(_azimuth(points.xyz[returned]), target.shape[1], 3 * 360 / target.shape[1])] = Ray.UNKNOWN
+    blind = _blind(_azimuth(points.xyz[returned]), target.shape[1], 3 * 360 / target.shape[1])
+    state[blind & (image[0] == 0)] = Ray.UNKNOWN
     return Partial(image if reflectance is not None else image[:1], state, _spread(target, hit, points.xyz[chosen]))
 
 

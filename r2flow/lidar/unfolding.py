@@ -61,7 +61,7 @@ def rings_from_order(xyz: np.ndarray) -> np.ndarray:
 def rows_from_field(xyz: np.ndarray, ring: np.ndarray, sensor: Sensor) -> np.ndarray:
     """The rows of a file's own ring numbers, (N,) int64: counted from 0 or 1, from the top, the bottom or by laser."""
     rows = sensor.shape[0]
-    if len(ring) and ring.min() > 0 and ring.max() == rows:
+    if len(ring) and ring.min() > 0 and (ring.max() == rows or _from_one(xyz, ring, sensor)):
         ring = ring - 1
     lasers = int(ring.max(initial=0)) + 1
     if not rows / 2 <= lasers <= rows:
@@ -69,18 +69,39 @@ def rows_from_field(xyz: np.ndarray, ring: np.ndarray, sensor: Sensor) -> np.nda
             f"the scan has ring numbers up to {lasers - 1}, but sensor '{sensor.name}' has {rows} rows. Is it this "
             "sensor's? If so, use the spherical projection, which finds rows by elevation."
         )
-    elevation = elevations_of(xyz)
-    seen = np.isfinite(elevation)
-    count = np.bincount(ring[seen], minlength=rows)
-    total = np.bincount(ring[seen], elevation[seen], minlength=rows)
-    with np.errstate(invalid="ignore"):
-        order, share = best_order(total / count, sensor)
+    order, share = best_order(_means(xyz, ring, rows), sensor)
     if share < SURE:
         raise InputError(
             f"the scan's ring numbers follow neither the elevations of its points nor the firing order of sensor "
             f"'{sensor.name}'. Give the sensor its `firing`, or use the spherical projection."
         )
     return order[ring]
+
+
+def _means(xyz: np.ndarray, ring: np.ndarray, rows: int) -> np.ndarray:
+    """Mean elevation of each ring in degrees, (H,); NaN for one without returns."""
+    elevation = elevations_of(xyz)
+    seen = np.isfinite(elevation)
+    count = np.bincount(ring[seen], minlength=rows)
+    total = np.bincount(ring[seen], elevation[seen], minlength=rows)
+    with np.errstate(invalid="ignore"):
+        return total / count
+
+
+def _from_one(xyz: np.ndarray, ring: np.ndarray, sensor: Sensor) -> bool:
+    """Whether rings are counted from 1 where neither the first nor the last one returned: by the elevations alone."""
+    rows = sensor.shape[0]
+    if ring.max() > rows:
+        return False
+    means = _means(xyz, ring, rows + 1)
+    from_0, from_1 = (_misfit(part, best_order(part, sensor)[0], sensor) for part in (means[:-1], means[1:]))
+    return from_1 < from_0 / 2
+
+
+def _misfit(elevation: np.ndarray, order: np.ndarray, sensor: Sensor) -> float:
+    """Median distance in degrees of lasers from the rows that an order gives them; infinite without a return."""
+    apart = np.abs(elevation - np.asarray(sensor.elevations)[order])
+    return float(np.nanmedian(apart)) if np.isfinite(apart).any() else np.inf
 
 
 def rows_from_firings(xyz: np.ndarray, sensor: Sensor) -> np.ndarray | None:
@@ -129,7 +150,8 @@ def median_of_seen(values: np.ndarray) -> np.ndarray:
 def best_order(elevation: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, float]:
     """Row of each laser in the order that fits their elevations best, and how well it fits.
 
-    The orders are from the top row down, from the bottom up and the sensor's own firing order.
+    The orders are from the top row down, from the bottom up and the sensor's own firing order. Where several fit
+    equally, as with a single laser that returned, the one whose rows lie nearest to the elevations.
 
     Args:
         elevation: Elevation of laser 0, 1, ..., (H,); NaN for one without returns.
@@ -146,5 +168,5 @@ def best_order(elevation: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, float
         falling = elevation[np.argsort(order)]
         steps = np.diff(falling[np.isfinite(falling)])
         shares.append(float((steps < 0).mean()) if len(steps) else 1.0)
-    best = int(np.argmax(shares))
+    best = max(range(len(orders)), key=lambda n: (shares[n], -_misfit(elevation, orders[n], sensor)))
     return orders[best].astype(np.int64), shares[best]

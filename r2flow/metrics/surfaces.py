@@ -55,9 +55,9 @@ def bridged(x: np.ndarray, known: np.ndarray, gap: int = GAP) -> np.ndarray:
     gap = min(gap, width - 1)
     turn = np.arange(-gap - 1, width + gap + 1) % width  # the ring closes
     wide, held = x[..., turn], known[..., turn]
-    place = np.arange(len(turn))
-    before = np.maximum.accumulate(np.where(held, place, -width), axis=-1)
-    after = np.minimum.accumulate(np.where(held, place, 3 * width)[..., ::-1], axis=-1)[..., ::-1]
+    place, nowhere = np.arange(len(turn)), 2 * len(turn)
+    before = np.maximum.accumulate(np.where(held, place, -nowhere), axis=-1)
+    after = np.minimum.accumulate(np.where(held, place, nowhere)[..., ::-1], axis=-1)[..., ::-1]
     short = after - before - 1 <= gap
     low, high = (np.take_along_axis(wide, np.where(short, end, 0), -1) for end in (before, after))
     mean = np.where(short, (low + high) / 2, np.nan)

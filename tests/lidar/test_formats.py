@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from r2flow.errors import InputError
-from r2flow.lidar.scan_files import ELSEWHERE, read_points
+from r2flow.lidar.scan_files import ELSEWHERE, NoPointsError, read_points, write_points
 
 DRAW = np.random.default_rng(3)
 XYZ = np.round(DRAW.standard_normal((500, 3)) * [20, 20, 2], 3)
@@ -220,3 +220,46 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
         with pytest.raises(InputError, match=words) as caught:
             read_points(tmp_path / "a.txt")
         assert "\n" not in str(caught.value)
+
+
+def test_a_table_may_have_units_and_gaps(tmp_path: Path):
+    """VeloView's numbers of lasers, a sign of degrees in the header, and no numbers in the row of a lost ray."""
+    table = zip(XYZ, INTENSITY, RING, strict=True)
+    rows = "\n".join(f"{x:.3f},{y:.3f},{z:.3f},{strength},{ring},0" for (x, y, z), strength, ring in table)
+    head = "Points:0,Points:1,Points:2,intensity,laser_id,azimuth \u00b0\n,,,,3,\n"
+    (tmp_path / "a.csv").write_text(head + rows + "\n", encoding="utf-8")
+    points = read_points(tmp_path / "a.csv")
+    same(points, RING)
+    assert points.dropped == 1
+
+
+def test_an_intensity_that_nobody_measured_leaves_the_reflectivity(tmp_path: Path):
+    kinds = [(name, "f4") for name in ("x", "y", "z", "intensity", "reflectivity")]
+    table = np.zeros(500, kinds)
+    for name, column in zip("xyz", F4.T, strict=True):
+        table[name] = column
+    np.save(tmp_path / "none.npy", table)
+    same(read_points(tmp_path / "none.npy"), intensity=np.zeros(500))
+    table["reflectivity"] = INTENSITY
+    np.save(tmp_path / "one.npy", table)
+    same(read_points(tmp_path / "one.npy"))
+    table["intensity"] = 7
+    np.save(tmp_path / "both.npy", table)
+    same(read_points(tmp_path / "both.npy"), intensity=np.full(500, 7))
+
+
+@pytest.mark.parametrize("kind", ["S3", "(2,)f4", "(1,)f4", "c8"])
+@pytest.mark.parametrize("name", ["x", "intensity", "ring"])
+def test_fields_that_hold_no_numbers_are_refused(tmp_path: Path, name: str, kind: str):
+    table = np.zeros(4, [(one, kind if one == name else "f4") for one in ("x", "y", "z", "intensity", "ring")])
+    np.save(tmp_path / "a.npy", table)
+    with pytest.raises(InputError, match="in the place of one number for"):
+        read_points(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("ending", ["bin", "pcd", "ply"])
+def test_a_scan_without_a_point_is_one(tmp_path: Path, ending: str):
+    """As r2flow writes them; what may be empty, as a generated scan, is told from what is damaged."""
+    write_points(tmp_path / f"a.{ending}", np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
+    with pytest.raises(NoPointsError):
+        read_points(tmp_path / f"a.{ending}")

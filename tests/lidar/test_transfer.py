@@ -165,6 +165,13 @@ def test_a_scan_of_the_same_sensor_is_measured_everywhere_but_where_it_was_cut()
     assert (np.delete(seen.state, 3, axis=0)[:, 130:] == Ray.RETURN).all()
 
 
+def test_at_the_edge_of_a_cut_sector_a_return_is_one():
+    lost = np.zeros((32, 2000), bool)
+    lost[:, 1003:] = True
+    seen = points_of_same(wall(fired(TARGET.elevations, 2000), lost), TARGET)
+    assert (seen.state[seen.image[0] > 0] == Ray.RETURN).all()
+
+
 def test_what_is_behind_a_near_return_of_the_same_sensor_was_not_measured():
     near, away = 100, (30, 200)  # columns, of 0.5 m and of 10 m; the others came back empty
     e = np.deg2rad(np.asarray(TARGET.elevations))[:, None]

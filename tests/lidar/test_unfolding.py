@@ -4,8 +4,9 @@ import pytest
 from r2flow.data.reading import read_projected
 from r2flow.errors import InputError
 from r2flow.lidar.beams import find_beams
-from r2flow.lidar.projection import project
-from r2flow.lidar.scan_files import read_points
+from r2flow.lidar.calibration import steps_of_a_turn
+from r2flow.lidar.projection import image_to_points, project
+from r2flow.lidar.scan_files import Points, read_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 
 FIRED = ["hdl32e", "vlp16", "vlp32c", "os1_64", "pandar64"]
@@ -112,3 +113,54 @@ def test_lost_rays_of_whole_firings_may_be_nan(tmp_path):
     found = read_projected(tmp_path / "0.npy", sensor, "unfolding", reflectance=False)
     np.testing.assert_allclose(found.image[0], image, rtol=1e-6)
     assert find_beams([read_points(tmp_path / "0.npy")]).firing is not None
+
+
+@pytest.mark.parametrize("missing", [[0], [31], [0, 31], [0, 1, 2, 30, 31]])
+@pytest.mark.parametrize("how", ["top", "bottom", "firing"])
+@pytest.mark.parametrize("first", [0, 1])
+def test_ring_numbers_keep_their_rows_whichever_rings_returned(how, first, missing):
+    sensor = SENSORS["vlp32c"].resized(columns=48)
+    firings, image = cloud(sensor)
+    laser, ring = packet_order(sensor, how), np.tile(np.arange(32), 48)
+    kept = ~np.isin(ring, missing)
+    again = project(firings[:, laser].reshape(-1, 3)[kept], None, sensor, "unfolding", ring=ring[kept] + first)
+    image[laser[missing]] = 0
+    np.testing.assert_allclose(again[0], image, rtol=1e-6)
+
+
+def test_a_single_ring_lies_where_it_looks():
+    sensor = SENSORS["hdl32e"].resized(columns=48)
+    firings, image = cloud(sensor)
+    again = project(firings[:, 0], None, sensor, "unfolding", ring=np.full(48, 31))  # counted from the lowest up
+    np.testing.assert_allclose(again[0, 0], image[0], rtol=1e-6)
+    assert not again[0, 1:].any()
+
+
+@pytest.mark.parametrize("columns", [48, 63, 64, 255])
+def test_points_of_an_image_of_any_width_unfold_to_it(columns):
+    sensor = SENSORS["vlp16"].resized(columns=columns)
+    image = cloud(sensor, 5)[1][None]
+    xyz, _ = image_to_points(image, sensor.rays())
+    np.testing.assert_allclose(project(xyz, None, sensor, "unfolding")[0], image[0], rtol=1e-6)
+
+
+def test_lost_rays_leave_every_point_its_beam(tmp_path):
+    """Without ring numbers, in no order: rows of NaN are dropped, and are not counted."""
+    sensor = SENSORS["vlp16"].resized(columns=480)
+    firings, _ = cloud(sensor)
+    row = np.tile(np.arange(16), 480)
+    mixed = np.random.default_rng(2).permutation(len(row))
+    xyz = firings.reshape(-1, 3)[mixed]
+    lost = ~xyz.any(axis=1)
+    xyz[lost] = np.nan
+    np.save(tmp_path / "0.npy", xyz)
+    scan = read_points(tmp_path / "0.npy")
+    beams = find_beams([scan])
+    np.testing.assert_array_equal(beams.of_point[0], row[mixed][~lost])
+    assert steps_of_a_turn([scan], beams) > 0
+
+
+def test_two_returns_of_each_ray_are_of_one_beam():
+    firings, _ = cloud(SENSORS["vlp16"].resized(columns=480))
+    points = Points(np.repeat(firings.reshape(-1, 3), 2, axis=0))
+    assert len(find_beams([points]).elevations) == 16

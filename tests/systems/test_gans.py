@@ -25,7 +25,7 @@ from r2flow.checkpoints import load_checkpoint, read_checkpoint
 from r2flow.errors import InputError
 from r2flow.generators import DustyV1, Sampler, build_generator
 from r2flow.lidar.encoding import Encoding
-from r2flow.lidar.projection import resized_rays, unproject
+from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import SENSORS
 from r2flow.noise import Draws
 from r2flow.published.plain import inert
@@ -39,6 +39,26 @@ NETWORKS = [
 ]  # fmt: skip
 PUBLISHED = ["vanilla", "dusty1", "dusty2"]
 SYSTEMS = ["vanilla_gan", "dusty1", "dusty2"]
+
+
+def resized_rays(rays: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Rays for images of another shape: the angle of the linearly interpolated sines and cosines.
+
+    Angles themselves cannot be interpolated where azimuth jumps from -pi to pi. Columns are a ring, the edge rows are
+    repeated.
+
+    Args:
+        rays: Elevation and azimuth in radians, (2, H, W).
+        shape: Rows and columns (H', W').
+
+    Returns:
+        (2, H', W').
+    """
+    parts = torch.cat([rays.sin(), rays.cos()])[None]
+    thrice = torch.cat([parts, parts, parts], dim=3)
+    resized = nn.functional.interpolate(thrice, size=(shape[0], 3 * shape[1]), mode="bilinear", align_corners=False)
+    sines, cosines = resized[0, :, :, shape[1] : 2 * shape[1]].split(2)
+    return torch.atan2(sines, cosines)
 
 
 @pytest.fixture(scope="session")

@@ -119,6 +119,7 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
         xyz float32 (N, 3) in metres, reflectance float32 (N,) as stored or None, ring uint16 (N,) or None.
 
     Raises:
+        NoPointsError: the file is whole, and has no point.
         InputError: the file is missing, of an unknown format, damaged, without a finite point, or holds values that no
             LiDAR measures. The message names the file.
     """
@@ -126,6 +127,8 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     check_columns(columns)
     reader = _READERS[_ending(path, _READERS)]
     try:
+        if reader in (read_kitti, read_nuscenes) and path.is_file() and path.stat().st_size == 0:
+            raise NoPointsError(f"{path} is empty (0 bytes): rows of floats without one; fetch or write it again.")
         refuse_unreadable(path, LARGEST_FILE, "scan file")
         return reader(path, columns)
     except OSError as error:

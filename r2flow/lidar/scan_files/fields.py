@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from r2flow.errors import InputError
-from r2flow.lidar.scan_files.points import Points, checked_points
+from r2flow.lidar.scan_files.points import NoPointsError, Points, checked_points
 
 # The first name that a file has is taken: Ouster writes both an intensity and a calibrated reflectivity.
 ROLES: Mapping[str, tuple[str, ...]] = {
-    "x": ("x", "points_m_xyz:0"),  # VeloView's
-    "y": ("y", "points_m_xyz:1"),
-    "z": ("z", "points_m_xyz:2"),
+    "x": ("x", "points_m_xyz:0", "points:0"),  # VeloView's
+    "y": ("y", "points_m_xyz:1", "points:1"),
+    "z": ("z", "points_m_xyz:2", "points:2"),
     "reflectance": ("intensity", "reflectance", "reflectivity", "remission", "i"),
-    "ring": ("ring", "laser_number"),  # Argoverse's
+    "ring": ("ring", "laser_number", "laser_id"),  # Argoverse's and VeloView's
 }
 
 MOST_COLUMNS = 64  # of a file without names
@@ -72,15 +72,18 @@ def point_count(path: Path, count: int) -> int:
     """`count` itself.
 
     Raises:
-        InputError: it is 0.
+        NoPointsError: it is 0.
     """
     if not count:
-        raise InputError(f"{path} declares 0 points; leave it out, or fetch it again.")
+        raise NoPointsError(f"{path} declares 0 points; leave it out, or fetch it again.")
     return count
 
 
 def find_roles(path: Path, fields: Sequence[PointField]) -> dict[str, int]:
     """Which field holds x, y, z and, where present, reflectance and ring.
+
+    Other fields that may hold the reflectance are `reflectance N`, with N their number: `column_points` takes one where
+    the first is 0 throughout, as an intensity that nobody measured.
 
     Names are compared without case and without CloudCompare's prefix `scalar_`.
 
@@ -97,6 +100,9 @@ def find_roles(path: Path, fields: Sequence[PointField]) -> dict[str, int]:
         if names.count(name) > 1 or fields[index].count != 1:
             raise InputError(f"{path} declares {fields[index].name!r} more than once; one number a point is needed.")
         roles[role] = index
+        if role == "reflectance":
+            others = [names.index(alias) for alias in aliases if alias != name and names.count(alias) == 1]
+            roles |= {f"{role} {n}": n for n in others if fields[n].count == 1}
     missing = [role for role in ("x", "y", "z") if role not in roles]
     if missing:
         found = " ".join(", ".join(field.name for field in fields)[:120].split()) or "none"
@@ -198,7 +204,17 @@ def text_lines(path: Path, payload: bytes) -> list[str]:
 
 
 def column_points(path: Path, columns: Mapping[str, np.ndarray], layout: str | None = None) -> Points:
-    """Points from columns by role, checked; see `checked_points`."""
+    """Points from columns by role, checked; see `checked_points`.
+
+    Raises:
+        InputError: a column that does not hold one number a point.
+    """
+    columns = {role: np.asarray(column) for role, column in columns.items()}
+    for role, column in columns.items():
+        if column.ndim != 1 or column.dtype.kind not in "fiub":
+            raise InputError(f"{path} holds {column.dtype} {column.shape[1:]} in the place of one number for {role}.")
+    strengths = [column for role, column in columns.items() if role.startswith("reflectance")]
+    strength = next((column for column in strengths if column.any()), strengths[0] if strengths else None)
     with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, and so dropped
         xyz = np.stack([np.asarray(columns[axis], dtype=np.float32) for axis in ("x", "y", "z")], axis=1)
-    return checked_points(path, xyz, columns.get("reflectance"), columns.get("ring"), layout)
+    return checked_points(path, xyz, strength, columns.get("ring"), layout)

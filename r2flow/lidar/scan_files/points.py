@@ -74,7 +74,7 @@ def checked_points(
             finite or reflectance is negative.
 
     Raises:
-        NoPointsError: no point.
+        NoPointsError: no point, or rays without return alone.
         InputError: no finite point, or values that no LiDAR measures.
     """
     if not len(xyz):
@@ -118,7 +118,7 @@ def _all_finite(values: np.ndarray) -> bool:
 
 def _refuse_implausible(path: Path, xyz: np.ndarray, layout: str | None) -> None:
     if not xyz.any():
-        raise InputError(f"{path} holds {len(xyz)} points, all at (0, 0, 0): no ray returned. Is it whole?")
+        raise NoPointsError(f"{path} holds {len(xyz)} points, all at (0, 0, 0): no ray returned. Is it whole?")
     # A wrong layout is wrong everywhere, so that some thousand rows show it; all of them would take as long as reading.
     size = np.abs(xyz[:: max(1, len(xyz) // SAMPLE)])
     largest = np.maximum(np.maximum(size[:, 0], size[:, 1]), size[:, 2])

@@ -5,6 +5,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 
@@ -32,7 +33,10 @@ TABLES = ("points", "xyz", "point_cloud", "pointcloud", "cloud", "pts", "lidar",
 
 def read_text(path: Path, columns: Columns = None) -> Points:
     """One point a line, numbers apart by commas, semicolons, tabs or spaces; names in the first line are read."""
-    lines = text_lines(path, path.read_bytes().removeprefix(b"\xef\xbb\xbf"))
+    head, end, body = path.read_bytes().removeprefix(b"\xef\xbb\xbf").partition(b"\n")
+    with suppress(UnicodeDecodeError):  # a unit among the names, as degrees
+        head = head.decode("utf-8").encode("ascii", "replace")
+    lines = text_lines(path, head + end + body)
     lines = [line for line in lines if line.lstrip()[0] not in "#/" or _is_header(line)]
     if not lines:
         raise InputError(f"{path} holds no line of numbers.")
@@ -47,7 +51,7 @@ def read_text(path: Path, columns: Columns = None) -> Points:
     roles = named_roles(path, names)
     point_count(path, len(lines))
     apart = _apart(lines[0])
-    numbers = [line.replace(apart, " ") for line in lines]
+    numbers = [_filled(line, apart).replace(apart, " ") for line in lines]
     fields = [PointField(name, np.dtype("<f8")) for name in names]
     return column_points(path, text_columns(path, numbers, fields, roles))
 
@@ -60,6 +64,13 @@ def _is_header(line: str) -> bool:
 def _apart(line: str) -> str:
     """What stands between two numbers."""
     return next((mark for mark in ";\t," if mark in line), " ")
+
+
+def _filled(line: str, apart: str) -> str:
+    """A line with nan in the place of a number that is missing, as tables write a ray without return."""
+    if apart == " " or not (apart + apart in line or line[0] == apart or line.rstrip("\r ")[-1] == apart):
+        return line
+    return apart.join(word.strip() or "nan" for word in line.split(apart))
 
 
 def _words(line: str) -> list[str]:
@@ -188,8 +199,8 @@ def read_las(path: Path, columns: Columns = None) -> Points:
             raise InputError(f"{path}: .laz files need lazrs: {INSTALL}.") from None
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path} is not a readable LAS file ({reason[:120]}). Is it damaged?") from None
-    if not roles["reflectance"].any():
-        del roles["reflectance"]  # LAS has a field for it whether or not a sensor measured it
+    for role in [role for role in roles if role.startswith("reflectance") and not roles[role].any()]:
+        del roles[role]  # LAS has a field for it whether or not a sensor measured it
     return column_points(path, roles)
 
 
