@@ -25,7 +25,7 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):  # noqa: F811
     code, said, _ = r2flow("pairs", "-c", path, *QUICK)
     assert code == 0
     folder = path.parent.parent / "pairs"
-    for words in ("12 pairs", "pairs/s", "2.0 evaluations a pair", f"{folder}: all 10 pairs, 1 shards"):
+    for words in ("12 pairs", "pairs/s", "2.0 evaluations a pair", f"{folder}: all 10 pairs, 1 shard"):
         assert words in said
     flow = load_checkpoint(path)
     options = {"num": 10, "method": "euler", "steps": 2, "batch_size": 4}

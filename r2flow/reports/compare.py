@@ -102,7 +102,8 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     if others and not found:
         raise InputError(f"{others[0]} is no run: it has no {CONFIG}. Give folders that train.py has written.")
     for path in others:
-        log.warning("%s holds no run and is skipped.", path)
+        if path.suffix not in (".yaml", ".log"):  # which lie in a sweep's folder
+            log.warning("%s holds no run and is skipped.", path)
     return list(dict.fromkeys(found))
 
 
