@@ -29,7 +29,8 @@ class Stopping(L.Callback):
     pairs drawn there is nothing to save, and the end is at once.
 
     Lightning's own ways end a run with exit code 0, or save from within the signal handler, in the middle of a step, to
-    a file that a resumption passes over; so its handlers are replaced when training starts.
+    a file that a resumption passes over; so its handlers are replaced when training starts. A validation
+    that is due at the step at which a run is stopped is left out: its curves lack a point, its weights are the same.
 
     Args:
         run_dir: The run's folder.

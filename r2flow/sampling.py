@@ -136,5 +136,7 @@ def batches(num: int, batch_size: int) -> int:
 
 
 def evaluated_region(generator: Generator, region: Region) -> Region:
-    """The region and its margin, rounded outward to what the generator can be cut to."""
+    """The region and its margin, rounded outward to what the generator can be cut to; of the whole image, the image."""
+    if region.share == 1:  # which every generator makes
+        return Region(region.shape, 0, region.shape[0], 0, region.shape[1])
     return region.widened().rounded(generator.unit)

@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from r2flow.checkpoints import Checkpoint
+from r2flow.composing import compose
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import sampled_set
 from r2flow.generators import Field, Sampler, build_generator
@@ -284,6 +285,16 @@ def test_the_region_that_is_all_changes_nothing():
     assert torch.equal(part.images, whole.images)
 
 
+def test_what_makes_whole_images_alone_makes_the_region_that_is_all():
+    size = ["sensor.rows=16", "sensor.columns=32", "encoding.reflectance=true"]
+    gan = build_generator(compose(["experiment=vanilla_gan_small", "generator.base_channels=4", *size])).eval()
+    (part,) = sample(gan, 1, region=region((16, 32)))
+    (whole,) = sample(gan, 1)
+    assert torch.equal(part.images, whole.images)
+    with pytest.raises(InputError, match="whole images"):
+        next(sample(gan, 1, region=region((16, 32), rows=(0, 7))))
+
+
 def test_a_part_of_nothing_is_refused():
     with pytest.raises(InputError, match="needs columns"):
         network().generator.part(Region((8, 64), 0, 8, 0, 0))
@@ -342,6 +353,7 @@ def test_another_method_does_not_take_over_the_grid_of_the_former_one():
         ({"grid": ("a", "b")}, "grid must be a word or a list"),
         ({"steps": 1.5}, "steps must be a whole number of at least 1, found 1.5"),
         ({"steps": True}, "steps must be a whole number"),
+        ({"steps": 10**7}, "a sampler takes 1 to 1,000,000 steps, found 10,000,000"),
         ({"tolerance": "x"}, "tolerance must be a finite number"),
         ({"method": 3}, "method must be a word"),
         ({"method": "sde", "finish": 1.5}, "finish must be a finite number in [0, 1), found 1.5"),

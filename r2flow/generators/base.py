@@ -131,8 +131,8 @@ class Sampler:
         elif "steps" in given and "grid" not in given and not isinstance(self.grid, str):
             given["grid"] = "uniform"  # the times were those of another number of steps
         found = replace(self, **given)
-        if found.steps < 1:
-            raise InputError(f"a sampler needs at least 1 step, found {found.steps}.")
+        if not 1 <= found.steps <= MOST_STEPS:
+            raise InputError(f"a sampler takes 1 to {MOST_STEPS:,} steps, found {found.steps:,}.")
         return found
 
     @property
@@ -154,6 +154,7 @@ class Sampler:
         return {key: value for key, value in found.items() if (key, value) not in YOUNGER}
 
 
+MOST_STEPS = 10**6  # more are a slip of the finger
 YOUNGER = ("precision", "32-true"), ("fewer", None)  # what files without these keys mean by it
 
 
