@@ -110,6 +110,7 @@ def draw(
     """
     draws = Draws(seed, numbers)
     noise = draws.start(generator.noise_shape)
+    region = None if region is None or region.share == 1 else region
     seen = None if region is None else evaluated_region(generator, region)
     if seen is not None:
         whole = generator.space.shape[1:]
