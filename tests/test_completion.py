@@ -228,7 +228,7 @@ def test_a_flow_without_a_condition_says_what_completes_with_it():
         ({"state": torch.full((1, 8, 64), int(Ray.RETURN))}, "a ray with a return must have a range above 0"),
         ({"keep": "all"}, "keep must be exact, blend or mend"),
         ({"num": 0}, "at least one answer"),
-        ({"steps": 0}, "at least 1 step"),
+        ({"steps": 0}, "1 to 1,000,000 steps, found 0"),
     ],
 )
 def test_what_fits_nothing_is_refused(changed, message):

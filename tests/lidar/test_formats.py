@@ -231,6 +231,8 @@ def test_a_table_may_have_units_and_gaps(tmp_path: Path):
     points = read_points(tmp_path / "a.csv")
     same(points, RING)
     assert points.dropped == 1
+    (tmp_path / "b.csv").write_text("x,y,z,intensity\n" + "".join(f"{x},{y},{z},7,\n" for x, y, z in F4))
+    same(read_points(tmp_path / "b.csv"), intensity=np.full(500, 7))
 
 
 def test_an_intensity_that_nobody_measured_leaves_the_reflectivity(tmp_path: Path):

@@ -51,7 +51,7 @@ def read_text(path: Path, columns: Columns = None) -> Points:
     roles = named_roles(path, names)
     point_count(path, len(lines))
     apart = _apart(lines[0])
-    numbers = [_filled(line, apart).replace(apart, " ") for line in lines]
+    numbers = [_filled(line, apart, len(names)).replace(apart, " ") for line in lines]
     fields = [PointField(name, np.dtype("<f8")) for name in names]
     return column_points(path, text_columns(path, numbers, fields, roles))
 
@@ -66,11 +66,17 @@ def _apart(line: str) -> str:
     return next((mark for mark in ";\t," if mark in line), " ")
 
 
-def _filled(line: str, apart: str) -> str:
-    """A line with nan in the place of a number that is missing, as tables write a ray without return."""
+def _filled(line: str, apart: str, count: int) -> str:
+    """A line with nan in the place of a number that is missing, as tables write a ray without return.
+
+    Args:
+        count: Numbers of a line; one more separator at its end separates nothing.
+    """
     if apart == " " or not (apart + apart in line or line[0] == apart or line.rstrip("\r ")[-1] == apart):
         return line
-    return apart.join(word.strip() or "nan" for word in line.split(apart))
+    words = [word.strip() for word in line.split(apart)]
+    words = words[:-1] if len(words) == count + 1 and not words[-1] else words
+    return apart.join(word or "nan" for word in words)
 
 
 def _words(line: str) -> list[str]:
