@@ -91,7 +91,8 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
             continue
         if group in keys and inherited(group, config) == "unless_given":
             continue
-        config[group] = _with_own(there, config[group], group, keys, config)
+        single = [key for key in keys if key != group]  # a group that is named must agree, and changes nothing
+        config[group] = _with_own(there, config[group], group, single, config)
     config["generator"] = generator_of(config, parent)
     config["parent"] = as_parent(parent.config, parent.path, parent.step, parent.weights)
     data = config["data"]
