@@ -34,7 +34,7 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """
     path = Path(path)
     is_stream = _is_stream(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     target = Path(os.path.realpath(path))
     temporary = None
     try:
@@ -65,13 +65,27 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
                 os.unlink(temporary)
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder where there is none, also where another process removes it at this moment.
+
+    Raises:
+        FileExistsError: it is a file, or a link to nothing.
+    """
+    while True:
+        try:
+            return path.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            if os.path.lexists(path) and not path.is_dir():
+                raise
+
+
 def _temporary(name: str, folder: Path | None) -> tuple[int, str]:
     """An open temporary file in a folder, which another process that is done with it may have removed meanwhile."""
     for _ in range(20):
         with suppress(FileNotFoundError):
             return tempfile.mkstemp(".part", f".{name}.", folder)
         if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
     return tempfile.mkstemp(".part", f".{name}.", folder)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from r2flow.errors import InputError, explain_mistake
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, make_folder
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
@@ -173,3 +173,27 @@ def test_a_read_only_folder_is_an_error_with_the_file_s_own_name(tmp_path, monke
     with pytest.raises(PermissionError) as raised, atomic_write(tmp_path / "out.json"):
         pass
     assert explain_mistake(raised.value) == f"{tmp_path / 'out.json'}: Permission denied"
+
+
+def test_a_folder_that_another_process_removes_meanwhile_is_made_again(tmp_path, monkeypatch):
+    """os.mkdir finds it there, and a look behind it does not."""
+    real, calls = os.mkdir, []
+
+    def raced(path, *rest):
+        calls.append(path)
+        if len(calls) == 1:
+            raise FileExistsError(errno.EEXIST, "File exists", str(path))
+        real(path, *rest)
+
+    monkeypatch.setattr(os, "mkdir", raced)
+    make_folder(tmp_path / "made")
+    assert (tmp_path / "made").is_dir()
+    assert len(calls) == 2
+
+
+@pytest.mark.parametrize("kind", ["file", "link"])
+def test_what_is_no_folder_is_none(tmp_path, kind):
+    path = tmp_path / "taken"
+    path.touch() if kind == "file" else path.symlink_to(tmp_path / "nothing")
+    with pytest.raises(FileExistsError):
+        make_folder(path)

@@ -40,7 +40,7 @@ from r2flow.data.reading import Reading, lacks_reflectance, range_image, stored_
 from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, spread, warn_of_other_sensor
 from r2flow.data.store import MANIFEST, clear_leftovers, refuse_other, shard_bytes, warn_damaged
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, read_json
+from r2flow.files import atomic_write, make_folder, read_json
 from r2flow.lidar.sensors import Sensor
 from r2flow.signals import end_with_parent
 
@@ -288,7 +288,7 @@ class Preparation:
         """Hold a lock, which the system releases when this process ends, however it ends; whether it is held here."""
         lock = FileLock(self.making / f"{name}.lock", timeout=-1 if wait else 0)
         while not lock.is_locked:
-            self.making.mkdir(parents=True, exist_ok=True)
+            make_folder(self.making)
             try:
                 lock.acquire()
             except Timeout:
