@@ -243,16 +243,17 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
         found = _built(content, path, averaged)
     except InputError as error:
         raise type(error)(str(error) if str(path) in str(error) else f"{path}: {error}") from None
-    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+    except (AttributeError, LookupError, TypeError, ValueError) as error:  # entries of another kind than ours
         reason = (str(error).splitlines() or [""])[0][:160]
         raise InputError(
-            f"{path} is no checkpoint of r2flow, or a damaged one: what it holds cannot be used "
-            f"({type(error).__name__}: {reason})."
-        ) from None
+            f"{path} cannot be used: what it holds is of another kind than r2flow writes ({type(error).__name__}: "
+            f"{reason}). Is it of another program, or damaged?"
+        ) from error
     return replace(found, generator=found.generator.to(device))
 
 
 def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
+    """What a file holds, as a generator on the CPU; see `load_checkpoint`."""
     sampler: Mapping[str, Any] | None = None
     published = format_of(content)
     if published is not None:

@@ -209,8 +209,8 @@ def explain(error: Exception) -> str:
     if unknown:
         within = re.search(r"full_key: (\S+)", str(error.__cause__))  # of a group's value, the key in it
         key = max(unknown[1], within[1] if within else "", key=len)
-        own_group = [known for known in known_keys() if not key.startswith(f"{known}.")]  # which says nothing new
-        return f"the config has no key '{key}'.{did_you_mean(key, own_group)} See --cfg job for all of them."
+        others = [known for known in known_keys() if not key.startswith(f"{known}.")]  # its own group says nothing new
+        return f"the config has no key '{key}'.{did_you_mean(key, others)} See --cfg job for all of them."
     missing = re.search(r"Missing mandatory value.*full_key: (\S+)", text, re.DOTALL)
     if missing:
         return f"{missing[1]} has no default: give {missing[1]}=VALUE."

@@ -71,8 +71,9 @@ def sample(
         changes: Single settings of the sampler: steps, method, tolerance, grid, precision.
 
     Raises:
-        InputError: num or batch_size below 1, a sampler or a channel that the generator does not have, a region that
-            it cannot be cut to.
+        InputError: num or batch_size below 1, a sampler or a channel that the generator does not have, steps of an
+            adaptive solver or a tolerance of another one, a condition of another number of scans, a region that the
+            generator cannot be cut to.
     """
     generator = source if isinstance(source, Generator) else source.generator
     if not (isinstance(num, Integral) and isinstance(batch_size, Integral) and num >= 1 and batch_size >= 1):
@@ -110,8 +111,7 @@ def draw(
     """
     draws = Draws(seed, numbers)
     noise = draws.start(generator.noise_shape)
-    region = None if region is None or region.share == 1 else region
-    seen = None if region is None else evaluated_region(generator, region)
+    seen = None if region is None or region.share == 1 else evaluated_region(generator, region)
     if seen is not None:
         whole = generator.space.shape[1:]
         generator, noise = generator.part(seen), seen.crop(noise)

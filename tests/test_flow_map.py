@@ -538,7 +538,7 @@ def test_jumps_that_are_kept_are_those_of_a_map():
     """A rectified flow has none to keep, and without a run to start from there are none at all."""
     config = compose(["experiment=finetune_map", "data=simulated", "backbone=hdit_tiny"])
     for wrong in ({}, {"generator": {"name": "rectified_flow"}}):
-        with pytest.raises(InputError, match=r"stage\.init is none: give a map, as stage\.init=street"):
+        with pytest.raises(InputError, match=r"keeps the jumps of a flow map: give one, as stage\.init=street"):
             check(config, parent=Parent({**config, **wrong}, Path("rf1")))
     check(config, parent=Parent({**config, "generator": {"name": "flow_map"}}, Path("map")))
 

@@ -1,3 +1,5 @@
+import sys
+
 import pytest
 
 from r2flow.progress import Bar, track
@@ -49,3 +51,8 @@ def test_several_processes_write_lines_on_a_terminal_too(capsys, monkeypatch):
             now += 40.0
             bar.set(done)
     assert capsys.readouterr() == ("", "process 2 of 8: drawing 32/64 pairs  0.40/s  1:20 left\n")
+
+
+def test_work_goes_on_where_standard_error_was_closed(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", None)
+    assert list(track([1, 2], "reading")) == [1, 2]

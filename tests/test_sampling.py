@@ -401,3 +401,13 @@ def test_seeds_of_numpy_are_those_of_python():
     assert torch.equal(flow().sample(1, np.uint8(3), steps=1), flow().sample(1, 3, steps=1))
     with pytest.raises(InputError, match=r"a seed must lie in \[0, 2\^64\), found -1"):
         flow().sample(1, -1, steps=1)
+
+
+@pytest.mark.parametrize("method", ["ddim:0", "ddpm"])
+def test_a_diffusion_walks_noise_of_half_precision_in_float32(method):
+    size = ["sensor.rows=16", "sensor.columns=32", "encoding.reflectance=true", "backbone.base_channels=8"]
+    walker = build_generator(compose(["experiment=r2dm_small", "+generator.name=diffusion", *size])).eval()
+    draws = Draws(0, range(2))
+    noise, how = draws.start(walker.noise_shape).bfloat16(), Sampler(method, 4)
+    half, full = (walker.generate(one, sampler=how, draws=draws).x for one in (noise, noise.float()))
+    assert torch.equal(half, full)

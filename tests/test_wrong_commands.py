@@ -127,6 +127,14 @@ info bad.ckpt
 info scans/000000.bin
 info run run # extra argument
 info run --jsn
+info run --json --card # --card and --json are two forms of one answer
+sample -c run -o out --num 1e9 # --num must be a valid integer, found 1e9
+sample -c run -o out --num=0 # --num must be greater than or equal to 1, found 0
+sample -c run -o out --steps 10000000 # a sampler takes 1 to 1,000,000 steps, found 10,000,000
+sample -c run -o out --solver jump:2 # jump:2 is for flow maps
+view scans --seed 3 -o v.html # --seed and --device are of a run
+view scans --device cpu -o v.html # --seed and --device are of a run
+project scans/000000.bin -o out.npy --reflectance-scale inf # found inf
 convert # Missing
 convert run # Missing
 convert run out # give .safetensors

@@ -130,8 +130,8 @@ def complete(
         "several measured points in a pixel it keeps the nearest"
     )
     job = Job(
-        answers.num, answers.seed, known.keep, mask, known.fill_gaps, answers.batch_size, known.surfaces,
-        answers.pictures,
+        num=answers.num, seed=answers.seed, keep=known.keep, mask=mask, fill_gaps=known.fill_gaps,
+        batch_size=answers.batch_size, on_surfaces=known.surfaces, pictures=answers.pictures,
     )  # fmt: skip
     about = {
         "mask": known.mask and mask_identity(known.mask), "from": known.source, "surfaces": known.surfaces,

@@ -99,10 +99,11 @@ def _usage(message: str) -> str:
     if not wrong:
         return f"{said}."
     names = re.findall(r"--?[\w-]+", wrong[1])
-    words = iter(sys.argv[1:])
-    values = [next(words, "") if word in names else word.partition("=")[2]
-              for word in words if word.partition("=")[0] in names]  # fmt: skip
-    found = f", found {', '.join(values)}" if names and values else ""
+    words = [word.partition("=") for word in sys.argv[1:]]
+    after = [*sys.argv[2:], ""]
+    values = [value if equals else other for (word, equals, value), other in zip(words, after, strict=True)
+              if word in names]  # fmt: skip
+    found = f", found {', '.join(values)}" if values else ""
     return f"{' or '.join(names) or wrong[1]} must be {wrong[2]}{found}."
 
 

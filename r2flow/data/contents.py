@@ -49,7 +49,7 @@ def refuse_changed(folder: Path, files: Mapping[str, str | Path], since: str, ad
     try:
         noted = read_json(folder / RECORD)
         by, there = noted["by"], dict(noted["files"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError):
         return False
     for name, path in files.items():
         if name in there and there[name] != _stamp(path, by):

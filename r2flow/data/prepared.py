@@ -171,7 +171,7 @@ def read_manifest(folder: Path, finished: bool = False) -> Manifest:
         raise InputError(f"{folder} holds no prepared scans (no {MANIFEST}); make them: r2flow prepare.") from None
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError):
         raise damaged from None
     if found != FORMAT:
         raise InputError(f"{path} is of the format {found!r}, not {FORMAT!r}; prepare the scans again.")

@@ -25,7 +25,7 @@ from r2flow.data.store import (
     warn_damaged,
 )
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, read_json
+from r2flow.files import atomic_write, parse_json, read_json
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 
@@ -278,7 +278,7 @@ class PairStore:
             raise FileNotFoundError(path)
         try:
             with safe_open(path, framework="numpy") as file:
-                notes: dict[str, Any] = json.loads((file.metadata() or {})["pairs"])
+                notes: dict[str, Any] = parse_json((file.metadata() or {})["pairs"])
                 recipe, *_ = (notes[key] for key in ("recipe", "first", "usable", "sha256"))
                 if recipe != self.recipe.digest:
                     raise InputError(

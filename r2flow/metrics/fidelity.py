@@ -21,7 +21,7 @@ from r2flow.metrics.surfaces import bridged, drop_rate, normals
 
 GRADIENTS = np.concatenate([[0], np.geomspace(0.01, 80, 24)])  # metres
 STEPS, SECTORS = np.array([-20, -6, -2, -0.6, -0.2, -0.05, -0.02, 0.02, 0.05, 0.2, 0.6, 2, 6, 20]), 8  # metres
-RUNS = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 256, 512, 1025, 2**16 + 1])  # pixels
+RUNS = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 256, 512, 1025, 2**14 + 1])  # pixels
 REFLECTANCES = np.linspace(0, 1.0001, 26)
 INCIDENCES = np.cos(np.linspace(np.pi / 2, 0, 11))  # cosines, in steps of 9 degrees
 DENSITIES = np.array([0.5, 1.5, 2.5, 4.5, 8.5, 16.5, 32.5, 64.5, 128.5, 256.5, np.inf])  # points

@@ -103,8 +103,8 @@ class LearnFlowMap(Reflow):
     def check_parent(self, jumps: bool) -> None:
         if self._goes_on and not jumps:
             raise InputError(
-                "on scans alone stage.objective=knots keeps the jumps of a flow map, and stage.init is none: give a "
-                "map, as stage.init=street; to go on from another flow experiment=finetune."
+                "on scans alone stage.objective=knots keeps the jumps of a flow map: give one, as stage.init=street; "
+                "to go on from another flow give experiment=finetune."
             )
 
     def on_fit_start(self) -> None:

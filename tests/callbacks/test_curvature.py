@@ -1,5 +1,6 @@
 import csv
 import math
+from types import SimpleNamespace
 
 import lightning as L
 import pytest
@@ -9,6 +10,7 @@ from torch import nn
 
 from r2flow.callbacks.curvature import Curvature
 from r2flow.callbacks.ema import EMA
+from r2flow.callbacks.periodic import Periodic
 from r2flow.generators import Field
 from r2flow.noise import standard_normal
 from r2flow.reports.training import read_curves
@@ -111,3 +113,19 @@ def test_a_step_of_several_batches_is_measured_once(tmp_path):
 def test_it_can_be_left_out(tmp_path):
     fit(tmp_path, [Curvature(seed=0, every=0)], steps=2)
     assert read_curves(tmp_path, ("curvature/s",)) == {}
+
+
+def test_a_resumed_run_does_not_look_again_at_the_step_that_it_goes_on_from():
+    """Under accumulation a batch of the next step ends before the step does."""
+
+    class Counted(Periodic):
+        def act(self, trainer, pl_module):
+            looked.append(trainer.global_step)
+
+    looked: list[int] = []
+    trainer = SimpleNamespace(global_step=4, max_steps=8, is_global_zero=True, callbacks=[])
+    counted, module = Counted(every=2), nn.Module()
+    counted.on_train_start(trainer, module)
+    for trainer.global_step in (4, 5, 5, 6, 6):
+        counted.on_train_batch_end(trainer, module, None, None, 0)
+    assert looked == [6]

@@ -150,3 +150,10 @@ def test_linked_folders_are_looked_into_and_circles_end(tmp_path: Path):
     assert [(drive.name, len(drive.scans)) for drive in find_drives("folder", tmp_path / "scans")] == [
         ("here", 1), ("linked/deep", 1),
     ]  # fmt: skip
+
+
+def test_scans_are_in_the_order_of_their_numbers(tmp_path: Path):
+    for name in ("10", "9", "100", "1", "scan_2", "scan_10"):
+        write_scan(tmp_path / f"{name}.bin", 1)
+    (drive,) = find_drives("folder", tmp_path)
+    assert [Path(scan).stem for scan in drive.scans] == ["1", "9", "10", "100", "scan_2", "scan_10"]

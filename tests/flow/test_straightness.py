@@ -131,3 +131,15 @@ def test_a_path_that_is_not_finite_is_not_the_most_curved():
     of_scene = found.pixels // X_0[0].numel()
     assert 1 not in of_scene.tolist()
     assert found.trajectories.isfinite().all()
+
+
+def test_a_network_that_can_learn_is_followed_too():
+    """Nothing is kept for a gradient, and the figures are those of a network that cannot."""
+    layer = torch.nn.Linear(8, 8, dtype=torch.float64)
+    for measure in (curvature, straightness):
+        found = measure(lambda t, x: layer(x), X_0, 4)
+        with torch.no_grad():
+            again = measure(lambda t, x: layer(x), X_0, 4)
+        one, other = (getattr(each, "curvature", each).total for each in (found, again))
+        assert torch.equal(one, other)
+        assert not one.requires_grad

@@ -107,6 +107,9 @@ def test_recordings_without_clouds_or_damaged_are_one_line(r2flow, tmp_path: Pat
     whole = record(tmp_path / "text", "MCAP", kind="text")
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(record(tmp_path / "drive", "MCAP").read_bytes()[:300])
+    lone = tmp_path / "lone" / "part.db3"
+    lone.parent.mkdir()
+    lone.write_bytes(record(tmp_path / "bag", "SQLITE3").read_bytes())
     other = tmp_path / "other.bag"
     other.write_bytes(b"#ROSBAG V2.0\n" + bytes(400))
     for path, words in (
@@ -115,6 +118,8 @@ def test_recordings_without_clouds_or_damaged_are_one_line(r2flow, tmp_path: Pat
         (other, "not a readable recording"),
         (tmp_path / "missing.mcap", "is not a recording"),
         (tmp_path, "no metadata.yaml"),
+        (lone.parent, "for a .db3 ros2 bag reindex"),
+        (lone, "has no metadata.yaml, which says what its .db3 holds; make it: ros2 bag reindex"),
     ):
         code, _, error = r2flow("unpack", path, "--out", tmp_path / "out")
         assert (code, error.count("\n")) == (2, 1)

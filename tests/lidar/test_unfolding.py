@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from r2flow.data.reading import read_projected
+from r2flow.data.partial import open_partial
+from r2flow.data.reading import Reading, read_projected
 from r2flow.errors import InputError
 from r2flow.lidar.beams import find_beams
 from r2flow.lidar.calibration import steps_of_a_turn
@@ -157,10 +158,21 @@ def test_lost_rays_leave_every_point_its_beam(tmp_path):
     scan = read_points(tmp_path / "0.npy")
     beams = find_beams([scan])
     np.testing.assert_array_equal(beams.of_point[0], row[mixed][~lost])
-    assert steps_of_a_turn([scan], beams) > 0
+    assert steps_of_a_turn([scan], beams) == pytest.approx(480, rel=1e-3)
 
 
 def test_two_returns_of_each_ray_are_of_one_beam():
     firings, _ = cloud(SENSORS["vlp16"].resized(columns=480))
     points = Points(np.repeat(firings.reshape(-1, 3), 2, axis=0))
     assert len(find_beams([points]).elevations) == 16
+
+
+def test_what_training_reads_can_be_completed(tmp_path):
+    """Whole firings whose lost rays are NaN, as a model of unfolded scans has learned them."""
+    sensor = SENSORS["vlp16"].resized(columns=48)
+    firings, image = cloud(sensor)
+    xyz = firings.reshape(-1, 3)
+    xyz[~xyz.any(axis=1)] = np.nan
+    np.save(tmp_path / "0.npy", xyz)
+    (scan,), _ = open_partial([str(tmp_path / "0.npy")], Reading(sensor, "unfolding"), sensor)
+    np.testing.assert_allclose(scan.read().image[0], image, rtol=1e-6)

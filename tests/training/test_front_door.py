@@ -127,6 +127,25 @@ def test_what_would_be_passed_over_is_refused(asked: list[str], words: str):
         check(compose(["data=simulated", "backbone=hdit_tiny", *asked]), asked)
 
 
+def test_a_folder_that_holds_no_simulated_scans_is_a_slip_where_none_were_asked_for(tmp_path: Path):
+    """As a mistyped folder of scans; where simulated scans are kept already, or are to be, it is none."""
+    root, tiny = f"data.root={tmp_path / 'typo'}", "backbone=hdit_tiny"
+    with pytest.raises(InputError, match=r"typo holds no simulated scans\. For scans of yours add data=folder"):
+        check(compose([root, tiny]), [root, tiny])
+    assert not (tmp_path / "typo").exists()
+    named = [root, tiny, "data=simulated"]
+    assert check(compose(named), named)["data"]["name"] == "simulated"
+    (tmp_path / "typo").mkdir()
+    (tmp_path / "typo" / "simulated.json").touch()
+    assert check(compose([root, tiny]), [root, tiny])["data"]["name"] == "simulated"
+
+
+def test_several_values_without_a_sweep_are_one_line(tmp_path: Path):
+    done = in_process(tmp_path, ["seed=1,2"], check=False)
+    said = "error: seed=1,2 is several values: for a sweep add -m, for a list give seed=[1,2].\n"
+    assert (done.returncode, done.stderr) == (2, said)
+
+
 def test_pairs_are_no_scans_in_files(tmp_path: Path):
     config = compose(["stage=reflow", "data=pairs", "stage.init=street", f"run_dir={tmp_path}", "data.drives=[1]"])
     with pytest.raises(InputError, match=r"pairs are drawn, not read: leave data\.drives out"):

@@ -26,7 +26,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, refuse_unreadable
+from r2flow.files import atomic_write, parse_json, refuse_unreadable
 from r2flow.hashing import state_hash
 from r2flow.metrics.extractors import extractor_class
 from r2flow.metrics.extractors.base import Extractor
@@ -360,7 +360,7 @@ def read_safetensors(
     """
     try:
         with safe_open(path, framework="pt") as file:
-            noted = json.loads((file.metadata() or {}).get(notes, "{}"))
+            noted = parse_json((file.metadata() or {}).get(notes, "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys() if with_tensors}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError):
         raise InputError(f"{path} is not a safetensors file, or a damaged one.") from None

@@ -12,7 +12,7 @@ import numpy as np
 from r2flow.checkpoints import Checkpoint
 from r2flow.evaluation.measuring import Gathered, Work, measure, point_key
 from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, parse_json
 from r2flow.generators import Sampler
 from r2flow.metrics.base import ScanMetric, Side
 from r2flow.metrics.birds_eye import BINS
@@ -119,7 +119,7 @@ def _read(path: Path) -> Cell | None:
         return None
     try:
         with safe_open(path, framework="numpy") as file:
-            row = json.loads((file.metadata() or {})["row"])
+            row = parse_json((file.metadata() or {})["row"])
             return Cell(row, file.get_tensor("birds_eye"), file.get_tensor("images"))
     except (SafetensorError, OSError, KeyError, ValueError):
         return None
