@@ -36,7 +36,8 @@ def project(
     min_range punches a hole into the pixel behind it.
 
     Args:
-        xyz: Points in metres, (N, 3), sensor frame: x ahead, y left, z up.
+        xyz: Points in metres, (N, 3), sensor frame: x ahead, y left, z up. One that is not finite is a ray without
+            return.
         reflectance: (N,), or None where the scan has none.
         sensor: Rows, columns and range limits.
         ring: Ring number of each point, (N,), counted from 0 or 1, that rises or falls with elevation or is the
@@ -79,11 +80,16 @@ def project_indices(
     xyz = np.asarray(xyz, dtype=np.float32)
     rows, columns = sensor.shape
     r = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
-    row = _rows(xyz, r, sensor, projection, convention, ring)
+    finite = np.isfinite(r)
+    known = xyz
+    if not finite.all():  # rays without a return, which unfolding counts as fired and no pixel keeps
+        known, r = np.where(finite[:, None], xyz, np.float32(0)), np.where(finite, r, np.float32(0))
+    row = _rows(xyz if projection == "unfolding" else known, r, sensor, projection, convention, ring)
     pixel = row * columns
-    pixel += _columns(xyz, columns)
-    within = (r >= sensor.min_range) & (r <= sensor.max_range)
+    pixel += _columns(known, columns)
+    within = finite & (r >= sensor.min_range) & (r <= sensor.max_range)
     if convention == "reference":
+        pixel[~finite] = rows * columns
         hit, chosen = _nearest_by_sorting(pixel, r)
         hit, chosen = hit[within[chosen]], chosen[within[chosen]]
     else:

@@ -68,6 +68,19 @@ def test_a_return_too_near_does_not_hide_what_is_behind_it():
     assert project(points, np.ones(2), HDL64E, convention="reference")[0].max() == 0
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("convention", ["centre", "reference"])
+@pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf])
+def test_points_that_are_not_finite_are_no_returns(convention, lost):
+    """Neither in their own pixel nor in one that another point falls into, as the one at azimuth and elevation 0."""
+    xyz = np.array([[10, 0, 0], [3, -4, 0.1], [-8, 1, -1]], dtype=np.float32)
+    with_lost = np.concatenate([xyz, [[lost, 0, 0], [1, lost, 2], [lost, lost, lost]]]).astype(np.float32)
+    sensor = SENSORS["hdl64e"]
+    alone, beside = (project(p, None, sensor, convention=convention) for p in (xyz, with_lost))
+    assert (alone[0] > 0).sum() == 3
+    np.testing.assert_array_equal(beside, alone)
+
+
 def test_points_out_of_view_are_dropped_not_clamped():
     points = np.array([point(10, 8, 0), point(10, -40, 0)])
     assert project(points, np.ones(2), HDL64E)[0].max() == 0
