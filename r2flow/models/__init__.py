@@ -37,7 +37,7 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes in any number of evaluations, learned from simulated scans",
-        "d8499b97a39197071e24256c6dc2a065bfa80870b90865360c584d34ddf01cee",
+        "3100aee15a37efdc3df27ec0e3c368cf542f364fd159a6d1eace9d70d8eeaacf",
     ),
     street_full=Model(
         "street scenes at 64 x 1024, learned from simulated scans",
