@@ -47,8 +47,9 @@ def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
         if not config["trainer"][key]:
             wanted.pop(name, None)
     built: list[Callback] = []
-    for name, entry in CALLBACKS.items():
+    for name, known in CALLBACKS.items():
         if name in wanted:
+            entry = known if isinstance(known, Entry) else Entry(known)  # a class alone, as of a plug-in
             given = entry.given(config)
             check_options(f"callbacks.{name}", entry.constructor, wanted[name], given=len(given))
             made = entry.constructor(*given, **wanted[name])

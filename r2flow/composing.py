@@ -181,8 +181,8 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
             parsed = parser.parse_override(text)
         except HydraException:
             raise InputError(
-                f"{text} cannot be read: give KEY=VALUE, brackets and quotes closed, and quotes around spaces, as "
-                "'KEY=\"a value\"'."
+                f"{text} cannot be read: give KEY=VALUE, brackets and quotes closed, and quotes around spaces and "
+                "=, as 'KEY=\"a value\"'."
             ) from None
         key, value = parsed.key_or_group, parsed.value()
         if not key:

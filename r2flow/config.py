@@ -6,8 +6,10 @@ run, nothing is inherited, and every link is concerned.
 """
 
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 
@@ -128,3 +130,11 @@ def learned(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
             groups = isinstance(value, Sequence) and value and all(isinstance(one, Mapping) for one in value)
             found[key] = [learned(one, f"{prefix}{key}.{n}.") for n, one in enumerate(value)] if groups else value
     return found
+
+
+def as_override(key: str, path: str | Path) -> str:
+    """KEY=PATH as a shell and then Hydra's grammar read it back; to the latter a space or a = needs quotes."""
+    text = str(path)
+    if not re.fullmatch(r"[\w./~-]+", text):
+        text = '"' + re.sub(r'(\\*)"', r'\1\1\\"', text) + '"'
+    return shlex.quote(f"{key}={text}")

@@ -189,9 +189,11 @@ def _within(key: str, groups: Iterable[str]) -> bool:
 
 def _another_config(run: str | Path, differing: list[str]) -> str:
     more = f" (and {len(differing) - 3} more)" if len(differing) > 3 else ""
+    length = all(one.startswith("trainer.max_steps=") for one in differing)
+    changed = f", change it in {Path(run, CONFIG)} too" if length else ""
     return (
         f"{run} holds a run of another config: {'; '.join(differing[:3])}{more}. "
-        "Give the same command to go on with it, or name=OTHER for a new one."
+        f"Give the same command to go on with it{changed}, or name=OTHER for a new one."
     )
 
 

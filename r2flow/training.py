@@ -25,7 +25,7 @@ from r2flow.callbacks import build_callbacks, build_loggers, log_config, log_fig
 from r2flow.callbacks.stopping import Stopping
 from r2flow.checkpoints import Allowance, checkpoints_of, step_of
 from r2flow.composing import check_keys, compose
-from r2flow.config import key_of
+from r2flow.config import as_override, key_of
 from r2flow.data.contents import check_contents, record_contents
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import SOURCES, Layout, Prepared, resolve_reflectance
@@ -346,7 +346,8 @@ def _fit_in_folder(run: Run) -> int:
     last = open_run(run.folder, run.config, run.stage.state_dict())
     if last is not None and step_of(last) >= run.trainer.max_steps:
         if run.trainer.is_global_zero:
-            print(f"finished before, at step {step_of(last)}; to learn more: stage.init={run.folder} name=OTHER")
+            further = as_override("stage.init", run.folder)
+            print(f"finished before, at step {step_of(last)}; to learn more: {further} name=OTHER")
         return step_of(last)  # nothing is left to do, nor pairs to make
     if run.trainer.is_global_zero and run.data.files:
         (record_contents if last is None else check_contents)(run.folder, run.data.files)

@@ -1,16 +1,18 @@
 """The rules of config keys, and whether conf/ and the constructors say the same keys."""
 
 import inspect
+import shlex
 from collections.abc import Callable
 from typing import Any
 
 import lightning as L
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from r2flow.backbones import BACKBONES
 from r2flow.callbacks import CALLBACKS
 from r2flow.composing import CONF, choices, compose
-from r2flow.config import RULES, Key, flatten, key_of, rule
+from r2flow.config import RULES, Key, as_override, flatten, key_of, rule
 from r2flow.data.augment import Augmentation
 from r2flow.data.options import DataOptions, PairOptions
 from r2flow.registry import options_of
@@ -107,3 +109,14 @@ def test_the_groups_of_conf_are_groups_of_the_default_config():
     config = compose([])
     assert folders == {key for key in config if choices(key)}
     assert all(isinstance(config[group], dict) for group in folders)
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["runs/rf1", "runs/sweep/seed=1-5b990e", "my runs/a", "~/it's", 'a "b" c', "a\\b=c", "über,1", "a{b}[c]", "${x}"],
+)
+def test_an_override_that_is_printed_is_read_back(path: str):
+    (text,) = shlex.split(as_override("stage.init", path))
+    parsed = OverridesParser.create().parse_override(text)
+    value = parsed.value()
+    assert (parsed.key_or_group, getattr(value, "text", value)) == ("stage.init", path)

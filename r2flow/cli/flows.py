@@ -20,6 +20,7 @@ from r2flow.cli.options import (
     choose_device,
     rows_and_columns,
 )
+from r2flow.config import as_override
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -245,7 +246,7 @@ def grow(
         said = f"{', '.join([*more, *([f'position {position}'] if position else [])])}; it draws the same scans"
     save_checkpoint(larger, out)
     print(f"{out}: {said}. Now train it:")
-    print(f"  r2flow train experiment=finetune stage.init={out} data.root=FOLDER")
+    print(f"  r2flow train experiment=finetune {as_override('stage.init', out)} data.root=FOLDER")
 
 
 @app.command(epilog="Example: r2flow backbones --size 64x1024")

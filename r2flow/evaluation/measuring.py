@@ -135,7 +135,8 @@ def measure(
     for name, metric in metrics.items():
         real = gathered.statistics[name]
         figures = {key: float(value) for key, value in metric.compute().items()}
-        remarks = [*metric.remarks(), *_remarks(real, len(generated), figures)]
+        remarks = metric.remarks()
+        remarks += _remarks(real, len(generated), {k: v for k, v in figures.items() if not _explained(k, remarks)})
         if unsolved:
             remarks.append(f"{unsolved} of {len(generated)} scans are not solved to the tolerance.")
         sizes = {
@@ -209,6 +210,11 @@ def _remarks(real: Statistics, generated: int, figures: Mapping[str, float]) -> 
     said = [f"a single {whose} scan is no distribution." for total, whose in sides if total == 1]
     lost = [name for name, value in figures.items() if math.isnan(value)]
     return [*said, f"no figure for {', '.join(lost)}."] if lost else said
+
+
+def _explained(name: str, remarks: Sequence[str]) -> bool:
+    """Whether a metric has said itself why a figure is missing."""
+    return any(said.startswith(f"{name}: no figure: ") for said in remarks)
 
 
 def _sum_over_processes(count: int, work: Work) -> int:

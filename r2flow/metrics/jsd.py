@@ -68,10 +68,14 @@ class JSDExtrapolated(JSD):
     def figures(self) -> tuple[dict[str, float], list[str]]:
         values, remarks = super().figures()
         value = values[self.name]
+        counts = " and ".join(str(self.count(side)) for side in SIDES)
         if np.isnan(value) and all(self.given(side) for side in SIDES):
-            remarks.append(f"{self.name}: too few scans with a return to part each set into halves.")
+            remarks.append(
+                f"{self.name}: no figure: one half of a set has no scan with a return; halves are the scans with an "
+                "even and with an odd number of returns."
+            )
         elif value == 0:
-            remarks.append(f"{self.name}: 0 is a distance too small for so few scans to tell.")
+            remarks.append(f"{self.name}: 0 is a distance too small for {counts} scans to tell.")
         return values, remarks
 
 

@@ -212,6 +212,7 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
         axes.set_yticks(range(len(comparisons)), [one.name for one in comparisons] if place % columns == 0 else [])
         axes.set(xlabel=said, ylim=(len(comparisons) - 0.5, -0.5))
         axes.set_xlim(min(0.0, axes.get_xlim()[0]), axes.get_xlim()[1] * 1.05)
+        axes.locator_params(axis="x", nbins=4)
         axes.grid(True, axis="x", color="0.88", lw=0.6)
         axes.tick_params(labelsize=8)
     return figure

@@ -331,7 +331,8 @@ def _distances(found: Neighbours) -> Figure:
             d = np.sort(one.distances(way))
             look: dict[str, Any] = {key: style[key] for key in ("linestyle", "color")}
             axes.step(d, np.arange(1, len(d) + 1) / len(d), where="post", **look, lw=1.6, label=f"{name} ({len(d)})")
-        axes.set(xlabel=words, ylabel="" if place else "share of the scans", ylim=(0, 1.02))
+        axes.set(xlabel=f"{words}: RMS of log-range, model space", ylim=(0, 1.02))
+        axes.set_ylabel("" if place else "share of the scans")
         axes.set_xlim(left=0)
         axes.grid(True, color="0.88", lw=0.6)
     axes.legend(fontsize=8, frameon=False)

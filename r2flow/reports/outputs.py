@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint, weights_hash
+from r2flow.config import as_override
 from r2flow.data.opening import SAMPLES, samples_note, write_samples_note
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import reading_of_flow
@@ -277,7 +278,7 @@ def _what_to_train(run: Path, config: Mapping[str, Any] | None) -> str:
         return "r2flow train data=kitti_raw data.root=FOLDER backbone=hdit_small"
     experiment = {"rectify": "reflow", "reflow": "distill"}.get(stage.get("name"))
     if experiment is not None:
-        return f"r2flow train experiment={experiment} stage.init={shlex.quote(str(run))}"
+        return f"r2flow train experiment={experiment} {as_override('stage.init', run)}"
     return f"r2flow evaluate REAL {shlex.quote(str(run))}"
 
 

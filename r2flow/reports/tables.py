@@ -40,8 +40,10 @@ def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
         grid.add_row(*map(Text, line))
     console = Console()
     # A terminal that is too narrow wraps the lines.
-    console.width = max(console.width, Measurement.get(console, console.options.update(width=500), grid).maximum)
-    console.print(grid, crop=False)
+    console.width = max(console.width, Measurement.get(console, console.options.update(width=10**5), grid).maximum)
+    with console.capture() as drawn:
+        console.print(grid, crop=False)
+    print("\n".join(line.rstrip() for line in drawn.get().splitlines()))  # no cell is as wide as the widest one
 
 
 def shown(value: Any) -> str:

@@ -1,8 +1,11 @@
 import importlib
 import sys
 
+import lightning as L
 import pytest
 
+from r2flow.callbacks import CALLBACKS, build_callbacks
+from r2flow.composing import compose
 from tests.conftest import ROOT
 
 
@@ -11,3 +14,16 @@ def test_a_second_copy_is_refused(monkeypatch):
     with pytest.raises(ImportError, match="import r2flow.callbacks"):
         importlib.import_module("callbacks")
     assert "callbacks" not in sys.modules
+
+
+def test_a_class_alone_is_a_callback_of_the_table(monkeypatch):
+    """As a plug-in adds it."""
+
+    class Say(L.Callback):
+        def __init__(self, every: int) -> None:
+            self.every = every
+
+    monkeypatch.setattr(CALLBACKS, "_entries", dict(CALLBACKS._entries))
+    CALLBACKS.add("say", Say)
+    built = build_callbacks(compose(["data=simulated", "backbone=hdit_tiny", "+callbacks.say.every=2"]))
+    assert [one.every for one in built if isinstance(one, Say)] == [2]

@@ -208,6 +208,12 @@ def test_another_config_in_the_same_folder_is_refused(train: Run, copied: Path):
     assert (copied / "config.yaml").read_text() == before
 
 
+def test_another_length_of_a_begun_run_has_a_place(train: Run, copied: Path):
+    done = train("name=copied", "trainer.max_steps=5000", check=False)
+    assert done.returncode == 2
+    assert "go on with it, change it in runs/copied/config.yaml too, or name=OTHER for a new one." in done.stderr
+
+
 def test_a_folder_that_now_holds_other_scans_is_refused(train: Run, copied: Path, scans: Path, tmp_path: Path):
     other = tmp_path / "other"
     shutil.copytree(scans, other)
