@@ -9,8 +9,8 @@ from torch import Tensor
 
 from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
-from r2flow.generators import Sampler, as_flow
-from r2flow.generators.base import Progress
+from r2flow.generators import FlowMap, Sampler, as_flow
+from r2flow.generators.base import CHORD, JUMP, Progress
 
 TIGHT = Sampler("dopri5", tolerance=1e-5)
 
@@ -45,8 +45,10 @@ def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, pro
         progress: Called after every network evaluation.
 
     Raises:
-        InputError: a generator without an ODE, images of another shape, or a solver that cannot be used.
+        InputError: a generator without an ODE, images of another shape, a solver that cannot be used, or jumps of a
+            flow map that has learned none back in time.
     """
+    _check_way_back(checkpoint, sampler)
     encoding, flow = checkpoint.encoding, as_flow(checkpoint.generator, "inversion")
     if images.ndim != 4 or images.shape[2:] != checkpoint.sensor.shape:
         raise InputError(f"the model's images are {checkpoint.sensor.shape}, found {tuple(images.shape[2:])}.")
@@ -57,6 +59,14 @@ def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, pro
     again = flow.solve(x_0, sampler=sampler, progress=progress)
     evaluations, converged = there.evaluations + again.evaluations, there.converged & again.converged
     return Inversion(x_1, x_0, again.x.cpu(), evaluations, converged)
+
+
+def _check_way_back(checkpoint: Checkpoint, sampler: Sampler) -> None:
+    jumps = (checkpoint.config.get("stage") or {}).get("jumps") or {}
+    if sampler.method in (JUMP, CHORD) and isinstance(checkpoint.generator, FlowMap) and not jumps.get("backward"):
+        raise InputError(
+            "this flow map has learned no jumps back in time (stage.jumps.backward); give a solver, as --solver adams3."
+        )
 
 
 def round_trip(checkpoint: Checkpoint, inversion: Inversion) -> dict[str, Tensor]:

@@ -12,6 +12,8 @@ import torch
 from r2flow.checkpoints import load_checkpoint
 from r2flow.data.opening import SAMPLES
 from r2flow.errors import InputError
+from r2flow.generators import Sampler
+from r2flow.inversion import invert
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
@@ -263,3 +265,10 @@ def test_a_real_scan_goes_there_and_back(r2flow, run, shared, tmp_path):  # noqa
     (row,) = json.loads((tmp_path / "o" / "invert.json").read_text())["rows"]
     assert row["rms"] < 1e-2
     assert torch.from_numpy(np.load(tmp_path / "o" / f"{scan.stem}.x_0.npy")).isfinite().all()
+
+
+@pytest.mark.parametrize("method", ["jump", "chord"])
+def test_jumps_back_that_a_map_has_not_learned_are_refused(method):
+    street = load_checkpoint("street")
+    with pytest.raises(InputError, match="has learned no jumps back in time"):
+        invert(street, torch.zeros(1, 2, 32, 256), Sampler(method, 2))

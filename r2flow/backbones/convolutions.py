@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Unpack, cast
+from typing import Annotated, Any, Unpack, cast
 
 import torch
 import torch.nn.functional as F
@@ -13,7 +13,7 @@ from r2flow.backbones.base import Backbone, CommonOptions, integers
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, position_name
 from r2flow.backbones.layers import ExactBuffers, ExactLinear, at_least_float32, wrapped, zero_initialised
 from r2flow.errors import InputError
-from r2flow.registry import Count, Portion, Positive
+from r2flow.registry import Bound, Count, Portion, Positive
 
 GROUPS = 8
 EPS = 1e-6
@@ -223,7 +223,7 @@ class UNet(Backbone):
     def __init__(
         self,
         rays: Tensor,
-        base_channels: Count = 64,
+        base_channels: Annotated[int, Bound("of at least 4 that is even", lambda n: n >= 4 and n % 2 == 0)] = 64,
         channel_multiplier: Sequence[int] = (1, 2, 4, 8),
         num_residual_blocks: int | Sequence[int] = (3, 3, 3, 3),
         num_heads: int = 8,

@@ -1,7 +1,7 @@
 """A network for large images: one for small images inside, convolutions at full resolution around it."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Unpack
+from typing import Annotated, Any, Unpack
 
 import torch
 import torch.nn.functional as F
@@ -14,7 +14,7 @@ from r2flow.backbones.encodings import mean_rays
 from r2flow.backbones.hdit import time_embedding
 from r2flow.backbones.layers import ExactLinear, zero_initialised
 from r2flow.errors import InputError
-from r2flow.registry import Count, Positive
+from r2flow.registry import Bound, Positive
 
 ANY_SIZE = 2, 256, 1024  # of rays: a network is built for it to learn what its sizes are multiples of
 
@@ -63,7 +63,7 @@ class Pyramid(Backbone):
         factor: Sequence[int] = (2, 4),
         coarse: Sequence[int] = (3, 64),
         detail: Sequence[int] = (2, 16),
-        time_channels: Count = 64,
+        time_channels: Annotated[int, Bound("of at least 2", lambda n: n >= 2)] = 64,
         below_std: Positive = 0.23,
         ring: bool = True,
         **common: Unpack[CommonOptions],

@@ -99,8 +99,8 @@ class Measurement:
         return self.exact(x + variance * self.pull(x, variance))
 
     def exact(self, x: Tensor) -> Tensor:
-        """x with the known values as they were given."""
-        return torch.where(self.known, self.y, x)
+        """x with the known values as they were given; through `forward` none of its values is one of y's."""
+        return x if self.forward is not None else torch.where(self.known, self.y, x)
 
     def on_path(self, t: Tensor, x: Tensor, e: Tensor) -> Tensor:
         """x_t with its measured values replaced by t y + sqrt((1 - t)^2 - (t sigma)^2) e.

@@ -4,11 +4,12 @@ import pytest
 import torch
 from reference_cases import assert_gradients, load_case
 
-from r2flow.backbones import Backbone, build_backbone
+from r2flow.backbones import BACKBONES, Backbone, build_backbone
 from r2flow.backbones.adm_unet import ADMBlock
 from r2flow.backbones.convolutions import BlockOptions, Resample, SinusoidalTime
 from r2flow.backbones.efficient_unet import Level
 from r2flow.errors import InputError
+from r2flow.registry import check_options
 
 CASES = {"eff_16x64_polar": "efficient_unet", "adm_16x64_fourier": "adm_unet"}
 
@@ -112,3 +113,11 @@ def test_gradcheck_of_a_block(block):
 def test_options_that_cannot_work_say_why(name, options, message):
     with pytest.raises(InputError, match=message), torch.device("meta"):
         build_backbone({"name": name, **options}, torch.zeros(2, 16, 64), 2)
+
+
+@pytest.mark.parametrize(("name", "key", "value"), [
+    ("adm_unet", "base_channels", 2), ("efficient_unet", "base_channels", 9), ("pyramid", "time_channels", 1),
+])  # fmt: skip
+def test_widths_without_a_time_embedding_are_refused(name, key, value):
+    with pytest.raises(InputError, match=rf"{key} must be .* of at least (4 that is even|2), found {value}"):
+        check_options("backbone", BACKBONES[name], {key: value})

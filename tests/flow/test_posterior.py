@@ -432,3 +432,23 @@ def test_what_does_not_fit_is_said_in_one_line():
     blurred = Case(torch.ones(WIDTH), 0.1, blur=True).measurement(torch.zeros(1, WIDTH).double())
     with pytest.raises(InputError, match="for masks alone; for another measurement give flowdps, pnp, ot_ode, mmps"):
         flow.given(x_0.double(), blurred, sampler=Sampler("replace", 2))
+
+
+@pytest.mark.parametrize("method", ["mmps", "ot_ode", "flowdps"])
+def test_a_measurement_may_have_another_shape_than_the_scan(method):
+    """Means of neighbouring columns of x ~ N(0, I), nearly exact: the answer has these means."""
+
+    def down(x: Tensor) -> Tensor:
+        return x.unflatten(-1, (-1, 2)).mean(-1)
+
+    def velocity(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+        return (2 * t - 1) / (t**2 + (1 - t) ** 2) * x
+
+    draw = torch.Generator().manual_seed(0)
+    y = torch.randn(2, 1, 4, 4, generator=draw)
+    known = Measurement(y, torch.ones_like(y), torch.tensor(0.01), down, lambda z: z.repeat_interleave(2, -1) / 2)
+    times, x_0 = torch.linspace(0, 1, 33), torch.randn(2, 1, 4, 8, generator=draw)
+    x = sample_posterior(velocity, x_0, known, method, times, lambda n: torch.randn(x_0.shape, generator=draw))
+    assert x.shape == x_0.shape
+    if method == "mmps":  # the others are exact for masks alone
+        assert (down(x) - y).abs().max() < 0.1
