@@ -1,4 +1,5 @@
-"""Scans completed from what is known of them: answer a of scan i is a function of (seed, i, a), whatever the batch.
+"""Scans completed from what is known of them: answer a of scan i is a function of (seed, i, a), in any
+batch but for the network's rounding.
 
 for found in complete(checkpoint, images, state, num=8):
     found.images, found.spread

@@ -9,8 +9,9 @@ from typing import Any
 
 from torch import Tensor
 
-from r2flow.checkpoints import load_checkpoint, save_checkpoint
-from r2flow.errors import require
+from r2flow import load
+from r2flow.checkpoints import save_checkpoint
+from r2flow.errors import InputError, require
 
 require("r2flow.hub", "hub", "huggingface_hub")
 
@@ -37,17 +38,17 @@ class HubFlow(  # type: ignore[call-arg, unused-ignore]  # where the extra is no
     """A trained generator with `save_pretrained(folder)`, `from_pretrained(folder or name)`, `push_to_hub(name)`.
 
     Args:
-        name: As for `r2flow.load`: a run folder, a checkpoint or a model.
+        name, device: As for `r2flow.load`.
 
     Attributes:
         checkpoint: What `r2flow.load` gives.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, no such device, or an option that `from_pretrained` does not know.
     """
 
-    def __init__(self, name: str | Path) -> None:
-        self.checkpoint = load_checkpoint(name)
+    def __init__(self, name: str | Path, device: str = "cpu") -> None:
+        self.checkpoint = load(name, device)
         self._hub_mixin_config = None  # it would be `name`; the config is in the weights' file
 
     def sample(self, num: int = 1, seed: int = 0, **how: Any) -> Tensor:
@@ -58,8 +59,15 @@ class HubFlow(  # type: ignore[call-arg, unused-ignore]  # where the extra is no
         save_checkpoint(self.checkpoint, save_directory / FILE)
 
     @classmethod
-    def _from_pretrained(cls, *, model_id: str, **where: Any) -> "HubFlow":
-        if Path(model_id).is_dir():
-            return cls(Path(model_id, FILE))
+    def _from_pretrained(cls, *, model_id: str, device: str = "cpu", **where: Any) -> "HubFlow":
         known = ("revision", "cache_dir", "force_download", "local_files_only", "token")
-        return cls(hf_hub_download(model_id, FILE, **{key: where[key] for key in known if key in where}))
+        odd = [
+            key for key in where if key not in (*known, "proxies", "resume_download")
+        ]  # those two its mixin may give
+        if odd:
+            raise InputError(
+                f"HubFlow.from_pretrained does not know {', '.join(odd)}; it takes device, {', '.join(known)}."
+            )
+        if Path(model_id).is_dir():
+            return cls(Path(model_id, FILE), device)
+        return cls(hf_hub_download(model_id, FILE, **{key: where[key] for key in known if key in where}), device)

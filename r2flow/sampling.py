@@ -1,4 +1,4 @@
-"""Scans drawn from a generator: scan i is a function of (seed, i), whatever the batch."""
+"""Scans drawn from a generator: scan i is a function of (seed, i), in any batch but for the network's rounding."""
 
 import math
 import time

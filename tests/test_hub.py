@@ -42,3 +42,15 @@ def test_nothing_in_such_a_folder_is_unpickled(tmp_path):
     (tmp_path / FILE).write_bytes(pickle.dumps(Trap()))
     with pytest.raises(InputError, match="not a safetensors file"):
         HubFlow.from_pretrained(str(tmp_path))
+
+
+def test_what_from_pretrained_does_not_know_is_refused(tmp_path):
+    pytest.importorskip("huggingface_hub")
+    from r2flow.hub import HubFlow
+
+    HubFlow("street").save_pretrained(tmp_path)
+    with pytest.raises(InputError, match="does not know stepps; it takes device, revision"):
+        HubFlow.from_pretrained(str(tmp_path), stepps=3)
+    with pytest.raises(InputError, match="device must be auto, cpu"):
+        HubFlow.from_pretrained(str(tmp_path), device="gpu")
+    assert HubFlow.from_pretrained(str(tmp_path), device="auto").checkpoint.generator.space.sensor.name

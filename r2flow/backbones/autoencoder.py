@@ -263,12 +263,13 @@ class Autoencoder(nn.Module):
         dropout: Portion = 0.0,
     ) -> None:
         super().__init__()
-        self.strides = [(int(rows), int(columns)) for rows, columns in strides]
-        unknown = [list(stride) for stride in self.strides if stride not in DOWN]
-        if unknown or len(multipliers) != len(self.strides) + 1:
+        given = [tuple(stride) for stride in strides]
+        self.strides = [(int(rows), int(columns)) for rows, columns in (s for s in given if s in DOWN)]
+        levels = max(len(multipliers), 1)
+        if self.strides != given or len(given) != levels - 1:
             raise InputError(
-                f"an autoencoder of {len(multipliers)} levels needs {len(multipliers) - 1} strides, each [1, 2] or "
-                f"[2, 2]; found {[list(stride) for stride in self.strides]}."
+                f"an autoencoder of {levels} levels needs {levels - 1} strides, each [1, 2] or [2, 2]; found "
+                f"{[list(stride) for stride in given]}."
             )
         widths = [width * multiplier for multiplier in integers("multipliers", multipliers, len(multipliers))]
         self.mask, self.code_channels = mask, code_channels

@@ -261,6 +261,6 @@ def integers(name: str, values: int | Sequence[int], count: int) -> tuple[int, .
         InputError: another number of values, or one below 1.
     """
     found = (int(values),) * count if isinstance(values, int) else tuple(int(value) for value in values)
-    if len(found) != count or min(found) < 1:
-        raise InputError(f"{name} must be {count} integers of at least 1, found {list(found)}.")
+    if len(found) != count or not found or min(found) < 1:
+        raise InputError(f"{name} must be {count or 1} integers of at least 1, found {list(found)}.")
     return found

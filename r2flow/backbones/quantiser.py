@@ -56,10 +56,11 @@ class Quantiser(nn.Module):
     @torch.no_grad()
     def nearest(self, vectors: Tensor) -> Tensor:
         """The index of the code nearest to each vector, (N, C) to (N,)."""
-        codes = self.embedding.weight
+        codes = self.embedding.weight.float()
         lengths = codes.square().sum(1)
-        parts = [
-            (part.square().sum(1, keepdim=True) + lengths - 2 * part @ codes.T).argmin(1)
-            for part in vectors.split(AT_ONCE)
-        ]
+        with torch.autocast(vectors.device.type, enabled=False):  # a difference of large numbers: it needs the digits
+            parts = [
+                (part.square().sum(1, keepdim=True) + lengths - 2 * part @ codes.T).argmin(1)
+                for part in vectors.float().split(AT_ONCE)
+            ]
         return torch.cat(parts)

@@ -14,6 +14,8 @@ from r2flow.registry import Positive, Registry
 
 LogSNR = Callable[[Tensor], Tensor]
 
+FARTHEST = 20  # |lambda| to which the tangent in float32 leaves an error of at most 0.005
+
 
 class Cosine:
     """lambda(t) = -2 ln tan(a + t (b - a)), a = atan e^(-highest / 2), b = atan e^(-lowest / 2).
@@ -26,12 +28,15 @@ class Cosine:
         highest: lambda(0).
 
     Raises:
-        InputError: lowest is not below highest.
+        InputError: lowest is not below highest, or one is beyond `FARTHEST`.
     """
 
     def __init__(self, lowest: float = -15.0, highest: float = 15.0) -> None:
-        if lowest >= highest:
-            raise InputError(f"a log-SNR schedule falls from highest to lowest; found {highest:g} and {lowest:g}.")
+        if not -FARTHEST <= lowest < highest <= FARTHEST:
+            raise InputError(
+                f"a log-SNR schedule falls from highest to lowest, both within {FARTHEST} of 0; found {highest:g} and "
+                f"{lowest:g}."
+            )
         self.start, self.end = (math.atan(math.exp(-one / 2)) for one in (highest, lowest))
 
     def __call__(self, t: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from dataclasses import replace as changed
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -31,6 +32,7 @@ from r2flow.registry import Registry
 Linear = Callable[[Tensor], Tensor]
 
 GROWN = 10.0  # of |y - A x_1hat|^2: docs/completion.md
+POWERS = 20  # steps of the power iteration to |A|^2
 EARLIEST = 0.1  # time before which `mmps` takes the flow's Jacobian of this time: at t = 0 it is divided by 0
 
 
@@ -64,6 +66,24 @@ class Measurement:
         """That of some of the scans, indices (N,)."""
         sigma = self.sigma[scans] if self.sigma.ndim else self.sigma
         return Measurement(self.y[scans], self.mask[scans], sigma, self.forward, self.adjoint)
+
+    def copied(self) -> "Measurement":
+        """The same with copies of its tensors."""
+        return changed(self, y=self.y.clone(), mask=self.mask.clone(), sigma=self.sigma.clone())
+
+    def squared_norm(self, x: Tensor) -> Tensor:
+        """|A|^2, the largest factor by which A^T A makes a scan longer, of each scan, (B, 1, ...).
+
+        1 for a mask; of any other A by `POWERS` steps of power iteration from x, (B, ...).
+        """
+        if self.forward is None:
+            return torch.ones(())
+        found = torch.zeros(())
+        for _ in range(POWERS):
+            longer = self.transposed(self.apply(x))
+            found = _dot(longer, longer).sqrt()
+            x = longer / found.clamp(min=torch.finfo(x.dtype).tiny)
+        return found
 
     def apply(self, x: Tensor) -> Tensor:
         """A x."""
@@ -179,12 +199,13 @@ def flowdps(u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, no
 def pnp(u: MeanVelocity, x: Tensor, measured: Measurement, times: Tensor, noise: Noise, repeats: int = 5) -> Tensor:
     """The flow as a denoiser in a descent on |A x - y|^2 / 2 (Martin et al. 2025, PnP-Flow, algorithm 3).
 
-    z = x - (1 - t)^a A^T (A x - y), then x = mean of D_t(t z + (1 - t) e) over `repeats` draws of e, with
-    D_t(x) = x + (1 - t) u and a = 1/2. It looks for one good x_1 and does not sample; sigma does not enter.
-    `repeats` evaluations a step.
+    z = x - (1 - t)^a A^T (A x - y) / L, then x = mean of D_t(t z + (1 - t) e) over `repeats` draws of e, with
+    D_t(x) = x + (1 - t) u, a = 1/2 and L = max(1, |A|^2): the paper's A have |A| = 1, and from |A|^2 = 2 on a step of
+    L = 1 leads away. It looks for one good x_1 and does not sample; sigma does not enter. `repeats` evaluations a step.
     """
+    largest = measured.squared_norm(x).clamp(min=1)
     for j, t in enumerate(times[:-1]):
-        z = x + (1 - t).sqrt() * measured.transposed(measured.residual(x))
+        z = x + (1 - t).sqrt() / largest * measured.transposed(measured.residual(x))
         found = [t * z + (1 - t) * noise(j * repeats + k) for k in range(1, repeats + 1)]
         x = sum((jump(u, t, y, torch.ones_like(t)) for y in found), torch.zeros_like(x)) / repeats
     return x
@@ -395,6 +416,9 @@ def sample_posterior(
     Raises:
         InputError: no such method, one that needs noise or a mask and has none.
     """
+    if torch.is_inference_mode_enabled():  # products with a Jacobian need tensors that autograd may keep
+        with torch.inference_mode(False), torch.no_grad():
+            return sample_posterior(u, x_0.clone(), measured.copied(), method, times.clone(), noise)
     chosen = parse_method(method)
     if chosen.method.masks and measured.forward is not None:
         others = ", ".join(name for name, one in METHODS.items() if not one.masks)

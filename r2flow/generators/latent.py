@@ -1,7 +1,7 @@
 """Generators in a smaller space than the image's: LiDM's autoencoder, and the diffusion of its latents."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,10 @@ from r2flow.errors import InputError
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
-from r2flow.registry import Count, Positive, check_options
+from r2flow.registry import Bound, check_options
+
+Steps = Annotated[int, Bound("of at least 2", lambda n: n >= 2)]
+Share = Annotated[float, Bound("in (0, 1)", lambda x: 0 < x < 1)]
 
 
 def build_autoencoder(space: ModelSpace, options: Mapping[str, Any] | None) -> Autoencoder:
@@ -71,9 +74,9 @@ class LatentDiffusion(Generator):
         backbone: Mapping[str, Any],
         autoencoder: Mapping[str, Any] | None = None,
         unet: Mapping[str, Any] | None = None,
-        beta_first: Positive = 0.0015,
-        beta_last: Positive = 0.0195,
-        diffusion_steps: Count = 1000,
+        beta_first: Share = 0.0015,
+        beta_last: Share = 0.0195,
+        diffusion_steps: Steps = 1000,
     ) -> None:
         super().__init__(space)
         self.sampler = Sampler("ddim:1", 50)

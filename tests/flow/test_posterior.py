@@ -452,3 +452,42 @@ def test_a_measurement_may_have_another_shape_than_the_scan(method):
     assert x.shape == x_0.shape
     if method == "mmps":  # the others are exact for masks alone
         assert (down(x) - y).abs().max() < 0.1
+
+
+@pytest.mark.parametrize("scale", [0.5, 3.0])
+def test_pnp_comes_to_the_known_scan_for_any_length_of_the_measurement(scale):
+    """x_1 ~ N(0, 1) and A = c with an orthogonal matrix before it, nearly exact: the answer is A^-1 y."""
+    draw = torch.Generator().manual_seed(0)
+    turn = torch.linalg.qr(torch.randn(8, 8, generator=draw)).Q
+    x_0, y = torch.randn(3, 8, generator=draw), torch.randn(3, 8, generator=draw)
+    known = Measurement(
+        y, torch.ones_like(y), torch.tensor(0.01), lambda x: scale * x @ turn.T, lambda d: scale * d @ turn
+    )
+    torch.testing.assert_close(known.squared_norm(x_0), torch.full((3, 1), scale**2))
+
+    def velocity(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+        return (2 * t - 1) / (t**2 + (1 - t) ** 2) * x
+
+    times = torch.linspace(0, 1, 129)
+    x = sample_posterior(velocity, x_0, known, "pnp:2", times, lambda n: torch.randn(x_0.shape, generator=draw))
+    error = (x - y @ turn / scale).square().mean().sqrt()
+    assert error < 0.2 * (y / scale).square().mean().sqrt()
+
+
+@pytest.mark.parametrize("method", ALL)
+def test_inference_mode_gives_the_same_answers(method):
+    draw = torch.Generator().manual_seed(0)
+    x_0, y = torch.randn(2, 8, generator=draw), torch.randn(2, 8, generator=draw)
+    noise = torch.randn(64, 2, 8, generator=draw)
+    network = torch.nn.Linear(8, 8)
+    mask = torch.tensor([1.0, 0, 1, 0, 1, 0, 1, 0]).expand(2, 8)
+
+    def answers() -> Tensor:
+        known = Measurement(y + 0, mask + 0, torch.tensor(0.1))
+        times = torch.linspace(0, 1, 5)
+        return sample_posterior(lambda t, x, s: network(x), x_0 + 0, known, method, times, noise.__getitem__)
+
+    with torch.no_grad():
+        expected = answers()
+    with torch.inference_mode():
+        assert torch.equal(answers(), expected)

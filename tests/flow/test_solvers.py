@@ -29,6 +29,15 @@ FIXED = [name for name, entry in SOLVERS.items() if isinstance(entry, FixedStep)
 ADAPTIVE = [name for name, entry in SOLVERS.items() if isinstance(entry, EmbeddedMethod)]
 
 
+@pytest.mark.parametrize("method", [*SOLVERS, "torchdiffeq:dopri5"])
+def test_a_state_may_be_one_number_of_each_scene(method):
+    column = solve(logistic, X_0, method=method, steps=16, global_error=True)
+    found = solve(logistic, X_0[:, 0], method=method, steps=16, global_error=True)
+    assert torch.equal(found.x, column.x[:, 0])
+    assert torch.equal(found.global_error, column.global_error)
+    torch.testing.assert_close(found.x, logistic_solution(X_0[:, 0], 1), rtol=0, atol=0.02)
+
+
 @pytest.mark.parametrize("method", FIXED)
 def test_halving_the_step_shrinks_the_error_by_the_order(method):
     def error(steps):

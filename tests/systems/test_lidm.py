@@ -119,6 +119,16 @@ def test_quantiser_and_gradients_are_the_published(shared: Path, name: str):
     assert_near(quantiser.embedding.weight.grad, expected["grad_codebook"], 1e-6)
 
 
+def test_the_nearest_code_is_the_nearest_under_autocast():
+    draw = torch.Generator().manual_seed(0)
+    quantiser, vectors = Quantiser(512, 8), torch.randn(2000, 8, generator=draw)
+    with torch.no_grad():
+        quantiser.embedding.weight.copy_(torch.randn(512, 8, generator=draw))
+    expected = torch.cdist(vectors.double(), quantiser.embedding.weight.detach().double()).argmin(1)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(quantiser.nearest(vectors), expected)
+
+
 def test_unet_and_gradients_are_the_published(shared: Path):
     case = load_case(shared, "lidm_unet_8x16.pt")
     model = unet_of(case["cfg"])
@@ -479,6 +489,11 @@ def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():
         ({"autoencoder": {"multipliers": [1], "strides": []}, "unet": {"multipliers": [1] * 5}}, "cannot be halved 4"),
         ({"unet": {"position": "polar"}, "autoencoder": SMALL_AUTOENCODER}, "no position named 'polar'"),
         ({"unet": {"wdith": 3}, "autoencoder": SMALL_AUTOENCODER}, "generator.unet has no option 'wdith'"),
+        ({"unet": {"multipliers": []}, "autoencoder": SMALL_AUTOENCODER}, "multipliers must be 1 integers"),
+        ({"autoencoder": {"multipliers": [], "strides": []}}, "multipliers must be 1 integers"),
+        ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1]]}}, r"each \[1, 2\] or \[2, 2\]; found \[\[1\]\]"),
+        ({"diffusion_steps": 1}, "diffusion_steps must be a whole number of at least 2"),
+        ({"beta_last": 2.0}, r"beta_last must be a finite number in \(0, 1\)"),
     ],
 )
 def test_sizes_that_cannot_work_are_one_line(change: dict[str, Any], said: str):

@@ -1,6 +1,7 @@
 """R2DM against the published implementation: network, schedules, objective, samplers, RePaint, data, checkpoint."""
 
 import json
+import math
 import re
 import shutil
 from itertools import pairwise
@@ -543,3 +544,26 @@ def test_a_run_goes_on_bit_by_bit_and_is_sampled_as_its_config_says(tmp_path):
     image = np.load(whole / "samples" / "000000.npy")
     assert image.shape == (2, 8, 32)
     assert np.isfinite(image).all()
+
+
+@pytest.mark.parametrize("farthest", [5.0, 15.0, 20.0])
+def test_a_cosine_schedule_has_its_digits_up_to_its_ends(farthest):
+    """2 ln cot of the angle in float64, at times of float32."""
+    t = torch.linspace(0, 1, 33)
+    expected = torch.tensor([_cosine_log_snr(float(one), farthest) for one in t], dtype=torch.float64)
+    torch.testing.assert_close(Cosine(-farthest, farthest)(t).double(), expected, rtol=0, atol=0.005)
+
+
+def _cosine_log_snr(t: float, farthest: float) -> float:
+    """lambda(t) from highest = farthest to lowest = -farthest, where both ends leave the same angle, q."""
+    q = math.atan(math.exp(-farthest / 2))
+    sine, cosine = (math.sin(q + share * (math.pi / 2 - 2 * q)) for share in (t, 1 - t))
+    return 2 * (math.log(cosine) - math.log(sine))
+
+
+@pytest.mark.parametrize(
+    "ends", [{"lowest": -2000.0}, {"highest": 21.0}, {"lowest": 3.0, "highest": 2.0}, {"lowest": math.nan}]
+)
+def test_a_cosine_schedule_whose_ends_are_no_numbers_is_one_line(ends):
+    with pytest.raises(InputError, match="falls from highest to lowest, both within 20 of 0; found"):
+        Cosine(**ends)

@@ -23,7 +23,7 @@ from r2flow.flow.solvers.external import (
 from r2flow.flow.solvers.fixed import FixedStep, euler, heun2, heun3, midpoint, rk4, solve_fixed
 from r2flow.flow.solvers.grids import build_grid, extended, halved, named_grid, uniform
 from r2flow.flow.solvers.multistep import adams
-from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite, wide
+from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite, flat, wide
 from r2flow.flow.solvers.step_size import Limits
 from r2flow.flow.stochastic import churn_of
 from r2flow.registry import Registry, did_you_mean
@@ -75,8 +75,9 @@ def solve(
     """Solve dx/dt = v(t, x) from x at t_0 to t_1, forward or backward in time.
 
     The state and t stay in float32 (float64 when x is) whatever the network computes in; the memory does not grow with
-    the number of steps. Our own methods evaluate v only between t_0 and t_1, and with the adaptive ones a scene's
-    result does not depend on the others. A scene that cannot be solved is flagged; no exception is raised.
+    the number of steps. Our own methods evaluate v only between t_0 and t_1. A scene has its own steps, so that its
+    result depends on the others only as far as v's rounding does. A scene that cannot be solved is flagged; no
+    exception is raised.
 
     Args:
         velocity: v(t, x) with t of shape () in a fixed-step method, (B,) in an adaptive one, where B shrinks as scenes
@@ -194,7 +195,7 @@ def _with_global_error(solution: Solution, run: _Run, velocity: Velocity, x: Ten
         own = select(scenes) if len(scenes) < len(x) and select is not None else velocity
         here = scenes.to(x.device)
         second = run.tighter(by).solve(own, x[here])
-        rms = (solution.x[here] - second.x).detach().double().square().flatten(1).mean(1).sqrt().cpu()
+        rms = flat((solution.x[here] - second.x).detach().double().square()).mean(1).sqrt().cpu()
         if not adapts(run.method):
             rms = rms / (1 - 2.0 ** -_order(run.method))  # with h and h/2 the solutions differ by (1 - 2^-p) e_h
         error[scenes] = torch.where(second.converged & solution.converged[scenes], rms, math.inf)

@@ -38,7 +38,7 @@ def attainable(limits: Limits, dtype: torch.dtype) -> float:
 def advance(
     v: Evaluations, x: Tensor, t_0: float, t_1: float, method: EmbeddedMethod, limits: Limits
 ) -> tuple[Solution, np.ndarray]:
-    """Solve every scene of x, (B, ...), from t_0 to t_1; its result does not depend on the others.
+    """Solve every scene of x, (B, ...), from t_0 to t_1, each by its own steps.
 
     Returns:
         The solution, and the time that each scene has reached, (B,).

@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.flow.solvers.solution import flat
+
 # The error of a step is (mean |e|^6)^(1/6) over a scene's elements. In a scene of dropped and measured pixels, few
 # elements turn towards one or the other in any one step. A root mean square hides their error; the maximum would let a
 # single element set the step.
@@ -19,7 +21,7 @@ def norms(*values: Tensor) -> np.ndarray:
     Summed in float64 and rounded to float32: the order of summation may depend on the size of the batch, and a scene's
     steps must not. The rounding removes the difference in nearly all cases.
     """
-    sums = [torch.linalg.vector_norm(value.flatten(1), dim=1, dtype=torch.float64) for value in values]
+    sums = [torch.linalg.vector_norm(flat(value), dim=1, dtype=torch.float64) for value in values]
     count = max(values[0][0].numel(), 1)
     with np.errstate(over="ignore"):
         return (torch.stack(sums).cpu().numpy() / math.sqrt(count)).astype(np.float32).astype(np.float64)

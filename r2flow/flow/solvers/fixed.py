@@ -8,7 +8,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
-from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite, stepped
+from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite, flat, stepped
 
 Step = Callable[[Velocity, Tensor, Tensor, Tensor], Tensor]
 
@@ -102,5 +102,5 @@ def solve_fixed(
         solution = replace(solution, knots=torch.stack(kept, 1))
     if not method.corrects:
         return solution
-    correction = step.correction.double().square().flatten(1).mean(1).sqrt().cpu()  # type: ignore[attr-defined]
+    correction = flat(step.correction.double().square()).mean(1).sqrt().cpu()  # type: ignore[attr-defined]
     return replace(solution, correction=correction)

@@ -1,5 +1,6 @@
 """The arguments and results that all solvers share."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -151,7 +152,12 @@ def _own_types(velocity: Velocity) -> set[torch.dtype]:
 
 def finite(x: Tensor) -> Tensor:
     """Which scenes of x, (B, ...), hold no NaN and no infinity, (B,) bool."""
-    return torch.isfinite(x).flatten(1).all(1)
+    return flat(torch.isfinite(x)).all(1)
+
+
+def flat(x: Tensor) -> Tensor:
+    """x, (B, ...), as (B, N); N = 1 of (B,), and B may be 0."""
+    return x.reshape(len(x), math.prod(x.shape[1:]))
 
 
 def wide(x: Tensor) -> Tensor:
