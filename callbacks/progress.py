@@ -30,6 +30,8 @@ class Progress(RichProgressBar):
         super().on_train_start(trainer, pl_module)
         self._begin = (time.monotonic(), trainer.global_step)
         self._last_line = time.monotonic()
+        if not self._watched and trainer.is_global_zero:  # of a large network the first step takes minutes on a CPU
+            print(f"step {trainer.global_step}/{trainer.max_steps}  begins", flush=True)
 
     def _rate(self, trainer: L.Trainer) -> float:
         """Optimiser steps a second since the run (re)started."""

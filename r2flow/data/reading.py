@@ -179,7 +179,10 @@ def range_image(path: Path, shape: tuple[int, int] | None = None) -> np.ndarray 
     array = read_range_image(path)
     if array is not None and shape is not None and array.shape[1:] != shape:
         found, wanted = ("x".join(map(str, one)) for one in (array.shape[1:], shape))
-        raise InputError(f"{path} is a range image of {found}, the sensor's is {wanted}; give --size {found}.")
+        raise InputError(
+            f"{path} is a range image of {found}, the sensor's is {wanted}; give --size {found}, or its points "
+            "(.bin, .ply, .pcd), which take any size."
+        )
     return array
 
 

@@ -30,7 +30,7 @@ from r2flow.runs import CONFIG, contradictions, read_config
 
 log = logging.getLogger(__name__)
 
-LOSSES = ("train/loss", "val/loss")
+LOSSES = {"train/loss": "training loss", "val/loss": "validation loss"}  # as logged, and titled
 STRAIGHTNESS = "curvature/s_normalised"
 
 # Column -> heading: what is averaged over seeds, and what must be the same for all of them.
@@ -50,7 +50,13 @@ FIXED = {
     "steps": "steps",
     "images": "images",
 }
-DRAWN = ("train_loss", "val_best", "straightness", "gmac", "seconds")  # the figure's lower panels
+DRAWN = {  # the figure's lower panels
+    "train_loss": "training loss, last tenth",
+    "val_best": "validation loss, best",
+    "straightness": "s / length^2",
+    "gmac": "GMAC of an evaluation",
+    "seconds": "training, s",
+}
 
 
 @dataclass(frozen=True)
@@ -335,26 +341,33 @@ def compare_page(groups: Sequence[Group], command: str, device: str = "cpu") -> 
 
 
 def compare_figure(groups: Sequence[Group]) -> Figure:
-    """Learning curves above, a panel of points for each figure below."""
-    panels = [column for column in DRAWN if any(group.values(column) for group in groups)]
-    below_height = 0.9 + 0.26 * len(groups)
-    figure = blank_figure(11, 3.6 + below_height)
-    grid = figure.add_gridspec(2, 1, height_ratios=(3.6, below_height))
-    above, below = grid[0].subgridspec(1, 2), grid[1].subgridspec(1, max(len(panels), 1))
+    """Learning curves above, a panel of points for each figure in which the groups differ below."""
     styled = [(STYLES[index % len(STYLES)], group) for index, group in enumerate(groups)]
-    for place, (name, title) in enumerate(zip(LOSSES, ("training loss", "validation loss"), strict=True)):
-        axes = figure.add_subplot(above[place])
+    curves = [name for name in LOSSES if any(name in run.curves for group in groups for run in group.runs)]
+    panels = [column for column in DRAWN if len({value for group in groups for value in group.values(column)}) > 1]
+    heights = {"curves": 3.6 if curves else 0.0, "panels": 0.9 + 0.26 * len(groups) if panels else 0.0}
+    figure = blank_figure(11, max(sum(heights.values()), 1.0))
+    if not curves and not panels:
+        figure.text(0.5, 0.5, "no losses were logged, and no figure differs", ha="center", va="center")
+        return figure
+    columns = {part: number for part, number in (("curves", len(curves)), ("panels", len(panels))) if number}
+    rows = figure.add_gridspec(len(columns), 1, height_ratios=[heights[part] for part in columns])
+    cells = {part: rows[place].subgridspec(1, columns[part]) for place, part in enumerate(columns)}
+    for place, name in enumerate(curves):
+        axes = figure.add_subplot(cells["curves"][place])
         _draw_curves(axes, styled, name)
-        axes.set(title=title, xlabel="optimiser step")
+        axes.set(title=LOSSES[name], xlabel="optimiser step")
     first = None
     for place, column in enumerate(panels):
-        axes = figure.add_subplot(below[place], sharey=first)
+        axes = figure.add_subplot(cells["panels"][place], sharey=first)
         _draw_points(axes, styled, column)
-        axes.set_title({**MEASURED, **FIXED}[column], fontsize=9)
+        axes.set_title(DRAWN[column], fontsize=9)
         axes.set_yticks(range(len(groups)), [group.label for group in groups], fontsize=8)
         axes.set_ylim(len(groups) - 0.5, -0.5)
         axes.tick_params(labelleft=first is None, labelsize=8)
         first = first or axes
+    if panels and any(len(group.runs) > 1 for group in groups):
+        figure.supxlabel("large: mean of the seeds; bar: their standard deviation; small: each seed", fontsize=8)
     return figure
 
 
@@ -362,18 +375,13 @@ def _draw_curves(axes: Any, styled: Sequence[tuple[dict[str, Any], Group]], name
     """Every run's curve in its group's style; many points as their running mean over a twentieth of the run."""
     drawn = []
     for style, group in styled:
-        for number, run in enumerate(group.runs):
-            if name not in run.curves:
-                continue
+        for number, run in enumerate([run for run in group.runs if name in run.curves]):
             steps, values = smooth(*run.curves[name])
             drawn.append(values)
             axes.plot(
                 steps, values, **style, markersize=4, markevery=max(len(steps) // 8, 1), linewidth=1.1,
                 label=group.label if number == 0 else None,
             )  # fmt: skip
-    if not drawn:
-        axes.text(0.5, 0.5, "not logged", ha="center", va="center", transform=axes.transAxes)
-        return
     axes.grid(alpha=0.25)
     every = np.concatenate(drawn)
     if (every > 0).all() and every.max() > 4 * every.min():
@@ -403,4 +411,6 @@ def _draw_points(axes: Any, styled: Sequence[tuple[dict[str, Any], Group]], colu
             axes.plot(values, [row] * len(values), "|", color=style["color"], markersize=9, alpha=0.6)
     axes.grid(axis="x", alpha=0.25)
     axes.margins(x=0.15)
+    if all(value >= 0 for _, group in styled for value in group.values(column)):
+        axes.set_xlim(left=max(axes.get_xlim()[0], 0))
     axes.locator_params(axis="x", nbins=4)

@@ -159,7 +159,7 @@ def markdown(result: Mapping[str, Any], name: str = "other") -> str:
     if "nearest" in result:
         near = zip(_named(result["nearest"], name), result["nearest"].values(), strict=True)
         rows = [[key, f"{median:.3f}", f"{least:.3f}"] for key, (median, least) in near]
-        parts.append(table(rows, ["distance to the nearest training scan", "median", "least"]))
+        parts.append(table(rows, ["distance to the nearest training scan (RMS in model space)", "median", "least"]))
     sizes = ", ".join(f"{count} {key}" for key, count in result["sizes"].items() if count)
     return "\n\n".join([*parts, f"Scans: {sizes}."])
 

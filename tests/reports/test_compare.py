@@ -20,6 +20,7 @@ from r2flow.errors import InputError
 from r2flow.reports.compare import (
     Group,
     cell,
+    compare_figure,
     compare_page,
     find_runs,
     group_runs,
@@ -232,6 +233,25 @@ def test_the_page_is_written_with_its_picture(tmp_path):
     assert rows[0]["val_best"] is None
     assert rows[1]["val_best"] == 0.4
     assert Image.open(written["compare.png"]).size[0] > 900
+
+
+def titles_of(folder: Path) -> list[str]:
+    return [axes.get_title() for axes in compare_figure(group_runs(read_runs([folder]))).axes]
+
+
+def test_the_picture_has_no_panel_of_what_was_not_logged_or_is_equal(tmp_path):
+    make_run(tmp_path / "runs" / "a", curvature=[0.1])
+    make_run(tmp_path / "runs" / "b", curvature=[0.1])
+    assert titles_of(tmp_path / "runs") == []
+    make_run(tmp_path / "runs" / "c", train=[2.0, 1.0], curvature=[0.2])
+    assert titles_of(tmp_path / "runs") == ["training loss", "s / length^2"]
+
+
+def test_a_spread_larger_than_its_mean_does_not_reach_below_zero(tmp_path):
+    for seed, straightness in enumerate((0.01, 0.01, 0.9)):
+        make_run(tmp_path / f"{seed}", {"seed": seed}, curvature=[straightness])
+    (axes,) = compare_figure(group_runs(read_runs([tmp_path]))).axes
+    assert axes.get_xlim()[0] == 0
 
 
 @pytest.mark.parametrize("kind", ["missing", "empty", "file", "other yaml", "broken panel"])
