@@ -7,7 +7,7 @@ from typing import Any
 
 from r2flow.checkpoints import Checkpoint, as_parent, load_checkpoint, weights_hash
 from r2flow.config import flatten, groups_of, key_of, rule
-from r2flow.data.opening import scale_of_folder
+from r2flow.data.opening import made_here, scale_of_folder
 from r2flow.data.options import FOLDER, MIXED, SIMULATED, PairOptions, SourceOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
@@ -150,8 +150,14 @@ def with_scales(config: dict[str, Any], asked: Sequence[str]) -> dict[str, Any]:
     if data.get("scans") is not None:
         data["scans"] = told(data["scans"])
     held = data.get("validation") or {}
-    if data["name"] != FOLDER and held.get("data") is not None:
-        data["validation"] = {**held, "data": told(held["data"])}
+    other = held.get("data")
+    # What was said of the run's own folder holds for another of real scans; r2flow writes reflectances of [0, 1].
+    if (
+        isinstance(other, Mapping)
+        and other.get("root") is not None
+        and (data["name"] != FOLDER or not said or made_here(str(other["root"])))
+    ):
+        data["validation"] = {**held, "data": told({"name": data["name"], **other})}
     return config
 
 

@@ -1,17 +1,21 @@
 """r2flow complete: as a user types it."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from r2flow.data.opening import open_scans
+from r2flow.data.partial import open_partial
 from r2flow.data.preparing import Preparation, plan_files
-from r2flow.lidar.known import parse_mask
+from r2flow.data.reading import Reading
+from r2flow.lidar.known import Ray, parse_mask
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
+from r2flow.lidar.transfer import image_through
 from r2flow.noise import generator
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.test_cli import r2flow  # noqa: F401  a fixture
@@ -395,3 +399,22 @@ def test_real_scans_of_other_sensors_are_completed(r2flow, shared, run, tmp_path
     assert code == 0
     assert beams in said
     assert "1 scans completed" in said
+
+
+@pytest.mark.parametrize(("rows", "columns", "named"), [(4, 64, True), (8, 32, True), (4, 32, True), (8, 32, False)])
+def test_points_of_a_coarser_sensor_leave_as_much_open_as_its_image(
+    tmp_path: Path, rows: int, columns: int, named: bool
+):
+    """The same rays as points and as a range image: between them nothing was measured."""
+    sensor, target = SENSORS["os1_64"].resized(rows, columns), SENSORS["os1_64"].resized(8, 64)
+    # beams a little off the middle, where no row of the target ends
+    sensor = replace(sensor, elevations=tuple(e + 0.2 for e in sensor.elevations))
+    image = np.stack([np.full(sensor.shape, 9.0), np.full(sensor.shape, 0.5)]).astype(np.float32)
+    image[:, :, 3::5] = 0
+    write_points(tmp_path / "points" / "0.ply", *image_to_points(image, sensor.rays()))
+    ((scan,), (said,)) = open_partial([str(tmp_path / "points")], Reading(target), sensor if named else None)
+    expected = image_through(image, sensor, target)
+    found = scan.read()
+    for ray in Ray:
+        assert abs(int((found.state == ray).sum()) - int((expected.state == ray).sum())) <= rows * columns // 50
+    assert ("32 rays a turn" in said) == (columns == 32)

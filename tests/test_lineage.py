@@ -192,6 +192,28 @@ def test_full_reflectance_in_the_folders_of_a_mixture_and_of_those_held_out_is_t
     assert with_scales({"sensor": OWN, "data": pairs}, [])["data"]["scans"]["reflectance_scale"] == 0.012
 
 
+@pytest.mark.parametrize(
+    ("held", "said", "expected"),
+    [
+        ("simulated", 255.0, 1.0),
+        ("simulated", 1.0, 1.0),
+        ("real", 255.0, None),
+        ("real", 1.0, 0.012),
+        ("drives", 1.0, 1.0),
+    ],
+)
+def test_full_reflectance_in_a_folder_held_out_beside_a_folder(tmp_path: Path, held, said, expected):
+    """`None` is the run's own: what was said of one folder of real scans holds for the other."""
+    for name in ("simulated", "real", "drives/a"):
+        (tmp_path / name).mkdir(parents=True)
+        if name != "real":
+            (tmp_path / name / "simulated.json").touch()
+    data = {"name": "folder", "root": "scans", "reflectance_scale": said}
+    data["validation"] = {"data": {"root": str(tmp_path / held)}}
+    found = with_scales({"sensor": OWN, "data": data}, [])["data"]
+    assert found["validation"]["data"].get("reflectance_scale") == expected
+
+
 def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Path):
     there = Parent({**CONFIG, "data": {"name": "folder", "projection": "unfolding", "convention": "reference"}}, parent)
     files = {"name": "folder", "root": "scans", "projection": "spherical", "convention": "centre"}

@@ -224,7 +224,8 @@ def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:
     chosen = {
         path[: len(path) - len(scan_ending(path))]: path for path in sorted(paths, key=lambda p: p.endswith(".npy"))
     }
-    return paths if len(chosen) == len(paths) else tuple(sorted(chosen.values()))
+    kept = set(chosen.values())
+    return tuple(path for path in paths if path in kept)
 
 
 def spans_of(drives: Sequence[Drive]) -> list[range]:

@@ -68,7 +68,8 @@ def refuse_shared_scans(parts: Sequence[ScanSource]) -> None:
         if shared := own & before:
             raise InputError(
                 f"data.parts[{number}] has {len(shared)} scans that a part before it has too, as {min(shared)}: they "
-                "would count twice, and what one part holds out the other would train on. Name each drive in one part."
+                "would count twice, and what one part holds out the other would train on. Name each drive, or seed of "
+                "simulated scenes, in one part."
             )
         before |= own
 

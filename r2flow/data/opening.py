@@ -215,11 +215,16 @@ def usual_scale(spec: str | Path, sensor: Sensor) -> float:
 
 def scale_of_folder(root: str | Path, of_sensor: float | None) -> float:
     """The same in a folder of scan files: its sensor's, but 1 in samples and simulated scans of r2flow."""
+    return 1.0 if made_here(root) else of_sensor or 1.0
+
+
+def made_here(root: str | Path) -> bool:
+    """Whether a folder, or one in it, holds samples or simulated scans of r2flow."""
     from r2flow.simulator.folder import MANIFEST
 
     folder = Path(root).expanduser()
-    ours = any((folder / note).is_file() for note in (SAMPLES, MANIFEST))
-    return 1.0 if ours else of_sensor or 1.0
+    inner = [place for place in folder.iterdir() if place.is_dir()] if folder.is_dir() else []
+    return any((place / note).is_file() for place in (folder, *inner) for note in (SAMPLES, MANIFEST))
 
 
 def _noted(folder: Path) -> Reading | None:

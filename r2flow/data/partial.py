@@ -5,6 +5,7 @@ scans[0].read()         image, state, xyz
 """
 
 import hashlib
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ import numpy as np
 
 from r2flow.data.opening import SAMPLES, SOURCES, open_scans, own_reading, parse, usual_scale
 from r2flow.data.options import PREPARED, SIMULATED
-from r2flow.data.reading import Reading, nothing_in_view
+from r2flow.data.reading import Reading, naming, nothing_in_view
 from r2flow.data.sources import LOOKED_AT, ScanSource, spread
 from r2flow.errors import InputError
 from r2flow.lidar.calibration import reflectance_of
@@ -33,6 +34,7 @@ from r2flow.lidar.transfer import (
     rows_of,
 )
 
+FEWER = 0.9  # of the columns: a turn of fewer rays leaves pixels between them
 FEW = 4  # simulated scans, where nobody says how many
 
 
@@ -129,15 +131,18 @@ def _files(
     if points := [path for path in paths if path not in images]:
         some = [read_points(points[number], reading.columns) for number in spread(len(points), LOOKED_AT)]
         doubt = None if source else other_sensor(some, target)
-        if _same_view(source, target) if source else doubt is None:
+        same = _same_view(source, target) if source else doubt is None
+        fired = firing_of(some, source or target) if same else _firing(spec, some, source)
+        if same and fired.steps >= FEWER * target.columns:
             full = scale or (1.0 if noted else usual_scale(spec, source or target))
             by_points = partial(_read_same, reading=reading, scale=full)
         else:
-            fired, strength = _firing(spec, some, source), reflectance_of(some)
-            full = scale or (source and source.reflectance_scale) or (strength.scale if strength else 1.0)
+            strength = reflectance_of(some)
+            known = 1.0 if noted else source and source.reflectance_scale
+            full = scale or known or (strength.scale if strength else 1.0)
             by_points = partial(_read_other, reading=reading, fired=fired, scale=full, strict=scale is not None)
             name = source.name if source else (doubt and doubt.name) or "a sensor"
-            said.append(_described(spec, fired.elevations, name, target))
+            said.append(_described(spec, fired.elevations, name, target, fired.steps))
     elif source and not _same_image(source, target):
         said.append(_described(spec, np.asarray(source.elevations), source.name, target))
     return [
@@ -176,7 +181,7 @@ def _firing(spec: str, some: list[Points], source: Sensor | None) -> Fired:
         raise InputError(f"{spec}: the sensor of the scans is not known, name it by --from: {error}") from None
 
 
-def _described(spec: str, elevations: np.ndarray, name: str, target: Sensor) -> str:
+def _described(spec: str, elevations: np.ndarray, name: str, target: Sensor, steps: float = math.inf) -> str:
     """In a line: the sensor, how many rows it measures, what is left out.
 
     Raises:
@@ -192,7 +197,8 @@ def _described(spec: str, elevations: np.ndarray, name: str, target: Sensor) -> 
         )
     measured = f"{len(set(rows[rows >= 0]))} of the {target.shape[0]} rows of {target.name} are measured"
     beyond = f"{int((rows < 0).sum())} beams look past its view and are left out"
-    return f"{spec}: {beams}; {measured}" + (f", {beyond}" if (rows < 0).any() else "")
+    turn = f", in the columns that its {steps:.0f} rays a turn meet" if steps < FEWER * target.columns else ""
+    return f"{spec}: {beams}; {measured}{turn}" + (f", {beyond}" if (rows < 0).any() else "")
 
 
 def _read_same(path: Path, reading: Reading, scale: float) -> Partial:
@@ -200,13 +206,16 @@ def _read_same(path: Path, reading: Reading, scale: float) -> Partial:
     if reading.projection == "unfolding":
         points = points.with_lost_rays()
     strength = _strength(path, points, scale, strict=True)
-    seen = points_of_same(points, reading.sensor, reading.projection, reading.convention, strength)
+    with naming(path):
+        seen = points_of_same(points, reading.sensor, reading.projection, reading.convention, strength)
     return _shown(path, points, reading.sensor, seen)
 
 
 def _read_other(path: Path, reading: Reading, fired: Fired, scale: float, strict: bool) -> Partial:
     points = read_points(path, reading.columns)
-    seen = points_through(points, fired, reading.sensor, _strength(path, points, scale, strict))
+    strength = _strength(path, points, scale, strict)
+    with naming(path):
+        seen = points_through(points, fired, reading.sensor, strength)
     return _shown(path, points, reading.sensor, seen)
 
 
@@ -273,6 +282,8 @@ def _strength(path: Path, points: Points, scale: float, strict: bool) -> np.ndar
 
 
 def _same_view(source: Sensor, target: Sensor) -> bool:
+    if source.shape[0] < target.shape[0]:
+        return False
     try:
         return bool(np.allclose(source.resized(target.shape[0]).elevations, target.elevations, atol=1e-3))
     except InputError:

@@ -337,7 +337,13 @@ class PreparedScans(ScanSource):
 
     def places(self) -> set[str]:
         real = os.path.realpath(self.folder)
-        return {os.path.join(real, name) for name in self.names}
+        return {os.path.join(real, name) for name in self.names} | super().places()
+
+    def simulated_scenes(self) -> dict[int, Sequence[int]]:
+        recipe = self.manifest.recipe
+        if recipe.seed is None:
+            return {}
+        return {recipe.seed: [int(name.rpartition(" ")[2]) for name in self.names]}
 
     def __getitem__(self, index: int) -> np.ndarray:
         return self._looked_up(index, self._values)

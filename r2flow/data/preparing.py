@@ -99,7 +99,7 @@ def plan_simulated(
     """The first `num` scenes of the simulator under a seed."""
     drives = (Drive(SIMULATED, tuple(f"scene {scene}" for scene in range(num))),)
     source = SimulatedScans(sensor, seed, range(num))
-    known = levels or find_levels(source[0][1])
+    known = find_levels(source[0][1]) if levels is None else levels
     return _plan(SIMULATED, drives, source, Reading(sensor), known, shard_scans, simulator.REVISION, seed)
 
 

@@ -2,7 +2,8 @@
 
 import logging
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -112,11 +113,21 @@ def read_projected(
     if projection == "unfolding":
         points = points.with_lost_rays()
     scaled = _scaled_reflectance(path, points, reflectance_scale) if reflectance else None
-    pixels, chosen, kept = project_indices(points.xyz, sensor, projection, convention, points.ring)
+    with naming(path):
+        pixels, chosen, kept = project_indices(points.xyz, sensor, projection, convention, points.ring)
     image = image_of(sensor, pixels, kept, None if scaled is None else scaled[chosen])
     if not image[0].any():
         raise nothing_in_view(path, points, sensor)
     return Projected(image if reflectance else image[:1], points, pixels, chosen)
+
+
+@contextmanager
+def naming(path: str | Path) -> Iterator[None]:
+    """Puts a file's name before what is wrong with its scan."""
+    try:
+        yield
+    except InputError as error:
+        raise type(error)(f"{path}: {error}") from None
 
 
 def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPointsError:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -92,9 +93,17 @@ class ScanSource(ABC):
         """All that decides what the images are; None where nobody knows, and nothing of them is worth keeping."""
         return None
 
+    def simulated_scenes(self) -> dict[int, Sequence[int]]:
+        """The numbers of the simulated scenes among them, by the seed."""
+        return {}
+
     def places(self) -> set[str]:
-        """Where the scans lie, by which two sources are known to share some; empty where they lie nowhere."""
-        return set()
+        """Where the scans lie, and which scenes they are, by which two sources are known to share some."""
+        return {
+            f"scene {number} of simulator seed {seed}"
+            for seed, some in self.simulated_scenes().items()
+            for number in some
+        }
 
     def files(self) -> dict[str, str | Path]:
         """The files that decide what the images are, by names that do not depend on where they lie."""
@@ -186,9 +195,19 @@ class ScanFiles(ScanSource):
                     some.append(hashlib.file_digest(file, "sha256").hexdigest())
         return hashlib.sha256(json.dumps([stats, some]).encode()).hexdigest()
 
+    def simulated_scenes(self) -> dict[int, Sequence[int]]:
+        from r2flow.simulator.folder import simulated_seed
+
+        found: dict[int, list[int]] = {}
+        for folder, paths in groupby(map(Path, self.paths), lambda path: path.parent):
+            seed = simulated_seed(folder)
+            if seed is not None:
+                found.setdefault(seed, []).extend(int(path.stem) for path in paths if path.stem.isdecimal())
+        return dict(found)
+
     def places(self) -> set[str]:
         real = os.path.realpath(self.root)  # once for all of them: on a network disk it takes its time
-        return {os.path.join(real, name) for name in self.names}
+        return {os.path.join(real, name) for name in self.names} | super().places()
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -253,6 +272,9 @@ class SimulatedScans(ScanSource):
     def subset(self, indices: Sequence[int]) -> "SimulatedScans":
         scenes = [self.scenes[i] for i in indices]
         return SimulatedScans(self.sensor, self.seed, scenes, self.reflectance, self.folder)
+
+    def simulated_scenes(self) -> dict[int, Sequence[int]]:
+        return {self.seed: self.scenes}
 
     def about(self) -> dict[str, Any]:
         return {"kind": "simulated", "seed": self.seed, "scenes": len(self), "reflectance": self.reflectance}

@@ -13,6 +13,7 @@ from r2flow.lidar.scan_files import Points
 from r2flow.lidar.sensors import SENSORS, Sensor
 
 FEWEST_RETURNS = 200
+MOST_UNDER = 0.08  # of the returns 3 to 20 m away that lie 0.4 m under a ground: docs/sensor.md
 COLUMNS = 64  # an image's width is a multiple of it, so that every backbone can halve it
 FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # values in use for it
 
@@ -147,21 +148,38 @@ def steps_of_a_turn(scans: Sequence[Points], beams: Beams) -> float:
 
 
 def _height(xyz: np.ndarray) -> tuple[float | None, float]:
-    """Height above the ground, a plane fitted to the most frequent height 3 to 20 m away, and its share of returns."""
+    """Height above the ground, and the share of returns on it.
+
+    The ground is a plane through the most frequent height of the returns 3 to 20 m away under which few of them lie:
+    beams close to the horizon meet more hedges and cars than ground.
+    """
     distance = np.hypot(xyz[:, 0], xyz[:, 1])
-    around = xyz[(distance > 3) & (distance < 20) & (xyz[:, 2] < -0.2)].astype(np.float64)
-    if len(around) < FEWEST_RETURNS / 4:
-        return None, 0.0
-    counts, edges = np.histogram(around[:, 2], np.arange(-6, 0.1, 0.1))
-    plane = np.array([0.0, 0.0, edges[np.argmax(np.convolve(counts, np.ones(3), "same"))] + 0.05])
-    design = np.column_stack([around[:, 0], around[:, 1], np.ones(len(around))])
-    for within in (0.3, 0.2, 0.15, 0.15):
-        on = np.abs(around[:, 2] - design @ plane) < within
-        if on.sum() < FEWEST_RETURNS / 4:
+    near = xyz[(distance > 3) & (distance < 20)].astype(np.float64)
+    counts, edges = np.histogram(near[:, 2], np.arange(-6, -0.1, 0.1))
+    often = np.convolve(counts, np.ones(3), "same")
+    while often.any():
+        peak = int(np.argmax(often))
+        plane = _plane(near[near[:, 2] < -0.2], edges[peak] + 0.05)
+        if plane is None:
             return None, 0.0
-        plane = np.linalg.lstsq(design[on], around[on, 2], rcond=None)[0]
-    height, share = -plane[2] / math.sqrt(1 + plane[0] ** 2 + plane[1] ** 2), on.sum() / len(xyz)
-    return (float(height), float(share)) if height > 0.1 and share > 0.03 else (None, float(share))
+        under = float((near[:, 2] < near[:, :2] @ plane[:2] + plane[2] - 0.4).mean())
+        if under < MOST_UNDER:
+            on = np.abs(near[:, 2] - near[:, :2] @ plane[:2] - plane[2]) < 0.15
+            height, share = -plane[2] / math.hypot(1, *plane[:2]), float(on.sum() / len(xyz))
+            return (float(height), share) if height > 0.1 and share > 0.03 else (None, share)
+        often[max(peak - 1, 0) :] = 0
+    return None, 0.0
+
+
+def _plane(xyz: np.ndarray, z: float) -> np.ndarray | None:
+    """(a, b, c) of z = a x + b y + c by least squares about a height; None where too few points lie there."""
+    plane, design = np.array([0.0, 0.0, z]), np.column_stack([xyz[:, :2], np.ones(len(xyz))])
+    for within in (0.3, 0.2, 0.15, 0.15):
+        on = np.abs(xyz[:, 2] - design @ plane) < within
+        if on.sum() < FEWEST_RETURNS / 4:
+            return None
+        plane = np.linalg.lstsq(design[on], xyz[on, 2], rcond=None)[0]
+    return plane
 
 
 def reflectance_of(scans: Sequence[Points]) -> Reflectance | None:

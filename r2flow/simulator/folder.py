@@ -180,6 +180,15 @@ def _write_batch(folder: SimulatedFolder, indices: Sequence[int]) -> int:
     return len(indices)
 
 
+def simulated_seed(folder: Path) -> int | None:
+    """The seed of the simulated scans in a folder; None where it holds none, or its note is damaged."""
+    try:
+        seed = read_json(folder / MANIFEST)["seed"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+    return seed if isinstance(seed, int) else None
+
+
 def _note(sensor: Sensor, seed: int) -> dict[str, Any]:
     described = json.loads(json.dumps(sensor.described()))  # tuples as lists, as they come back
     return {"simulator": REVISION, "seed": seed, "sensor": described}

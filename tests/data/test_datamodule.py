@@ -8,12 +8,13 @@ import torch
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import resolve_reflectance
 from r2flow.data.prepared import PreparedScans
-from r2flow.data.preparing import Preparation, plan_files
+from r2flow.data.preparing import Preparation, plan_files, plan_simulated
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
+from r2flow.simulator.folder import SimulatedFolder, write_folder
 from tests.data.conftest import write_scan
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
@@ -343,3 +344,34 @@ def test_the_index_of_a_whole_data_set_is_small(tmp_path: Path, monkeypatch):
         assert tracemalloc.get_traced_memory()[1] < 100 << 20
     finally:
         tracemalloc.stop()
+
+
+def simulated_in(form: str, folder: Path, num: int, seed: int) -> dict[str, str]:
+    """Scenes 0 to num - 1 of a seed as they lie on a disk."""
+    if form == "prepared":
+        work = Preparation(folder, plan_simulated(num, seed, SENSOR))
+        work.make(work.begin())
+    else:
+        write_folder(SimulatedFolder(folder, SENSOR, seed, ("npy",)), range(num), 1)
+    return {"name": form, "root": str(folder)}
+
+
+@pytest.mark.parametrize("form", ["prepared", "folder"])
+def test_scenes_are_held_out_behind_those_that_lie_on_a_disk(tmp_path: Path, form: str):
+    for seed, first in ((0, 5), (1, 0)):
+        stored = simulated_in(form, tmp_path / str(seed), 5, seed)
+        data = module(**stored, validation={"data": {"name": "simulated", "scenes": 3}})
+        assert list(data.validation_source.names) == [f"scene {number}" for number in range(first, first + 3)]
+
+
+@pytest.mark.parametrize("form", ["prepared", "folder"])
+def test_a_mixture_takes_no_scene_twice(tmp_path: Path, form: str):
+    stored = simulated_in(form, tmp_path / "a", 4, 0)
+    with pytest.raises(InputError, match=r"4 scans that a part before it has too, as scene 0 of simulator seed 0"):
+        module(name="mixed", parts=[stored, {"name": "simulated", "scenes": 20}])
+
+
+def test_what_does_not_unfold_is_named(tmp_path: Path):
+    write_scan(tmp_path / "one.bin", 1)
+    with pytest.raises(InputError, match=r"one\.bin: the scan unfolds into"):
+        module(name="folder", root=str(tmp_path), projection="unfolding")

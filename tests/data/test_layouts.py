@@ -157,3 +157,11 @@ def test_scans_are_in_the_order_of_their_numbers(tmp_path: Path):
         write_scan(tmp_path / f"{name}.bin", 1)
     (drive,) = find_drives("folder", tmp_path)
     assert [Path(scan).stem for scan in drive.scans] == ["1", "9", "10", "100", "scan_2", "scan_10"]
+
+
+def test_a_drive_s_order_stays_where_a_scan_is_there_in_two_formats(tmp_path: Path):
+    for number in range(1, 13):
+        write_scan(tmp_path / f"{number}.bin", number)
+    (tmp_path / "7.ply").touch()
+    (drive,) = find_drives("folder", tmp_path)
+    assert [int(Path(path).stem) for path in drive.scans] == list(range(1, 13))

@@ -9,6 +9,7 @@ from r2flow.lidar.calibration import estimate_sensor
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import Points, read_points
 from r2flow.lidar.sensors import HDL64E_RINGS, SENSORS, Sensor
+from r2flow.simulator import simulate
 
 HEIGHT, WALL = 1.6, 25.0
 STORED = {
@@ -179,3 +180,11 @@ def test_real_scans_whose_order_was_lost_are_refused_not_guessed(shared):
     shuffled = np.random.default_rng(0).permutation(len(points.xyz))
     with pytest.raises(InputError, match="beams cannot be told apart"):
         estimate_sensor([Points(points.xyz[shuffled])])
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_the_height_of_simulated_scans_is_found(name):
+    """Beams close to the horizon meet more hedges and cars than ground."""
+    sensor = SENSORS[name].resized(columns=256)
+    scans = [Points(*image_to_points(simulate(sensor, 3, index).image, sensor.rays())) for index in range(8)]
+    assert estimate_sensor(scans).height == pytest.approx(sensor.height, abs=0.2)

@@ -265,3 +265,16 @@ def test_a_scan_without_a_point_is_one(tmp_path: Path, ending: str):
     write_points(tmp_path / f"a.{ending}", np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
     with pytest.raises(NoPointsError):
         read_points(tmp_path / f"a.{ending}")
+
+
+@pytest.mark.parametrize("words", ["t x y z intensity", "#time x y z intensity", "intensity y x z"])
+def test_a_comment_with_a_name_for_each_number_names_the_columns(tmp_path: Path, words: str):
+    columns = {"x": XYZ[:, 0], "y": XYZ[:, 1], "z": XYZ[:, 2], "intensity": INTENSITY}
+    table = np.column_stack([columns.get(name, np.full(len(XYZ), 0.5)) for name in words.strip("#").split()])
+    np.savetxt(tmp_path / "a.txt", table, fmt="%.3f", header=words)
+    same(read_points(tmp_path / "a.txt"))
+
+
+def test_a_comment_that_only_speaks_of_columns_names_none(tmp_path: Path):
+    np.savetxt(tmp_path / "a.txt", TABLE, fmt="%.3f", header="here are x y z in metres")
+    same(read_points(tmp_path / "a.txt"))

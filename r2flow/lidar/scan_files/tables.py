@@ -39,7 +39,8 @@ def read_text(path: Path, columns: Columns = None) -> Points:
         if not head.isascii():
             content = head.decode("utf-8").encode("ascii", "replace") + content[len(head) :]
     lines = text_lines(path, content)
-    lines = [line for line in lines if line.lstrip()[0] not in "#/" or _is_header(line)]
+    width = next((len(_words(line)) for line in lines if line.lstrip()[0] not in "#/"), 0)
+    lines = [line for line in lines if line.lstrip()[0] not in "#/" or _is_header(line, width)]
     if not lines:
         raise InputError(f"{path} holds no line of numbers.")
     words = _words(lines[0])
@@ -68,9 +69,16 @@ def read_text(path: Path, columns: Columns = None) -> Points:
     return column_points(path, found)
 
 
-def _is_header(line: str) -> bool:
-    """Whether a comment holds the names of the columns, which CloudCompare writes behind //."""
-    return re.match(r'[\s#/]*"?x\b', line.lower()) is not None
+def _is_header(line: str, width: int) -> bool:
+    """Whether a comment holds the names of the columns, which CloudCompare writes behind // and numpy behind #.
+
+    Args:
+        width: How many numbers the lines have.
+    """
+    if re.match(r'[\s#/]*"?x\b', line.lower()):
+        return True
+    names = [word.lower() for word in _words(line)]
+    return len(names) == width and {"x", "y", "z"} <= set(names)
 
 
 def _apart(line: str) -> str:
