@@ -23,6 +23,7 @@ from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.errors import InputError, require
 from r2flow.files import atomic_write
 from r2flow.generators import USUAL, RectifiedFlow, Regression, Sampler
+from r2flow.lidar.planes import flattened
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
@@ -39,11 +40,13 @@ class Tableau(NamedTuple):
         times: t_j, (E,).
         second: s_j, (E,); None for a network of one time.
         states: a, (E + 1, E + 1) float64; its last row makes x_1.
+        flatten: `Sampler.flattens`.
     """
 
     times: list[float]
     second: list[float] | None
     states: Tensor
+    flatten: float = 0.0
 
 
 class _Recorder(nn.Module):
@@ -87,21 +90,28 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
         raise InputError(f"{sampler.method} cannot be exported, {problem!r}: give another --solver.") from None
     times, states, second = zip(*recorder.calls, strict=True)
     rows = torch.stack([*states, x_1]).reshape(-1, count + 1)[:, : len(times) + 1]  # a `finish` takes fewer than count
-    return Tableau([float(t) for t in times], [float(s) for s in second] if flow.second_time else None, rows)
+    others = [float(s) for s in second] if flow.second_time else None
+    return Tableau([float(t) for t in times], others, rows, sampler.flattens)
 
 
 class Decoded(nn.Module):
-    """x_1 in model space to range in metres and reflectance, (B, 2 or 1, H, W), and points in metres, (B, 3, H, W)."""
+    """x_1 in model space to range in metres and reflectance, (B, 2 or 1, H, W), and points in metres, (B, 3, H, W).
+
+    Args:
+        flatten: `Sampler.flattens`.
+    """
 
     rays: Tensor
 
-    def __init__(self, space: ModelSpace) -> None:
+    def __init__(self, space: ModelSpace, flatten: float = 0.0) -> None:
         super().__init__()
-        self.space = space
+        self.space, self.flatten = space, flatten
         self.register_buffer("rays", space.sensor.rays())
 
     def forward(self, x_1: Tensor) -> tuple[Tensor, Tensor]:
         scan = self.space.decode(x_1)
+        if self.flatten:
+            scan = flattened(scan, self.rays, self.flatten)
         return scan, unproject(scan[:, :1], self.rays)
 
 
@@ -110,7 +120,7 @@ class Scans(nn.Module):
 
     def __init__(self, flow: RectifiedFlow, how: Tableau) -> None:
         super().__init__()
-        self.network, self.decoded, self.how = flow.backbone, Decoded(flow.space), how
+        self.network, self.decoded, self.how = flow.backbone, Decoded(flow.space, how.flatten), how
 
     def forward(self, noise: Tensor) -> tuple[Tensor, Tensor]:
         *states, last = self.how.states.tolist()
@@ -228,7 +238,7 @@ def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any])
     program, any_batch = _traced(flow.backbone, _network_inputs(flow, (2,) if how is None else ()))
     network = to_onnx(program, ["t", "x", "s"][: 2 + flow.backbone.second_time], ["v"])
     if how is not None:
-        decoded, any_too = _traced(Decoded(flow.space), _noise(flow))
+        decoded, any_too = _traced(Decoded(flow.space, how.flatten), _noise(flow))
         any_batch = any_batch and any_too
         network = sampler_graph(
             network, to_onnx(decoded, ["x_1"], ["scan", "points"]), how.times, how.second, how.states.numpy()
@@ -310,7 +320,8 @@ def compare(checkpoint: Checkpoint, exported: Exported, sampler: Sampler | None 
     """
     flow = checkpoint.generator
     noise = Draws(0, range(num if exported.any_batch else 1)).start(flow.noise_shape)
-    mine = flow.space.decode(flow.generate(noise, sampler=sampler).x)
+    x_1 = flow.generate(noise, sampler=sampler).x
+    mine, _ = Decoded(flow.space, (sampler or flow.sampler).flattens)(x_1)
     theirs = run(exported.path, noise)["scan"]
     one, other = mine[:, 0] > 0, theirs[:, 0] > 0
     both = one & other

@@ -50,6 +50,10 @@ class JobFailed(RuntimeError):
     """A job of a sweep ended badly; its own lines have said why."""
 
 
+class JobUnfinished(JobFailed):
+    """A job of a sweep stopped before its end, as it was asked to."""
+
+
 def main(arguments: Sequence[str], command: Sequence[str]) -> int:
     """Compose a command line's config and do what it says: a run, a chain of runs or a sweep.
 
@@ -62,6 +66,7 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints mistakes itself, over many lines, and exits with 1
     failed: list[str] = []
+    unfinished: list[str] = []
     print_any_name()
     try:
         # SLURM signals every process of a job: a run answers, a chain waits for it.
@@ -75,9 +80,11 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
             for group in REGISTRIES if plugins else ():
                 add_choices(group)
             arguments = _checked_arguments(arguments)
-            _run_hydra(arguments, functools.partial(_job, arguments, command, failed, os.getpid()))
+            _run_hydra(arguments, functools.partial(_job, arguments, command, failed, unfinished, os.getpid()))
             if failed:
                 raise JobFailed(failed[0])
+            if unfinished:
+                raise JobUnfinished(unfinished[0])
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except Stopped as stop:
@@ -87,6 +94,10 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
     except KeyboardInterrupt:  # Ctrl-C where nobody listens: in a library's thread
         print("stopped", flush=True)
         return 130
+    except JobUnfinished as error:
+        names = unfinished or [f"{error}, the first of them"]
+        print(f"{len(unfinished) or 'some'} of the sweep's jobs go on with the same command: {'; '.join(names)}")
+        return LATER
     except JobFailed as error:
         names = failed or [f"{error}, the first of them"]  # of other processes only the first is heard
         print(f"error: {len(failed) or 'some'} of the sweep's jobs failed: {'; '.join(names)}", file=sys.stderr)
@@ -180,13 +191,19 @@ def job_folder(arguments: Sequence[str], overrides: str) -> str:
 
 
 def _job(
-    arguments: Sequence[str], command: Sequence[str], failed: list[str], launcher: int, config: DictConfig
+    arguments: Sequence[str],
+    command: Sequence[str],
+    failed: list[str],
+    unfinished: list[str],
+    launcher: int,
+    config: DictConfig,
 ) -> None:
     """What Hydra runs. Of the exceptions only `Exception` is caught by it: SystemExit says the code.
 
     Args:
         failed: Where the folders of a sweep's jobs are noted that ended badly.
-        launcher: The process in which that list is read.
+        unfinished: The same of jobs that `trainer.max_time` ended.
+        launcher: The process in which these lists are read.
     """
     try:
         given = list(HydraConfig.get().overrides.task)
@@ -195,9 +212,12 @@ def _job(
             named = " ".join(f"--plugin {name}" for name in config["plugins"])
             raise InputError(f"plug-ins are named on the command line, never in a file: give {named}.")
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            _sweep_job(command, given, failed)
-            if failed and os.getpid() != launcher:
-                raise JobFailed(failed[-1])  # a launcher elsewhere hears exceptions alone, after all jobs
+            _sweep_job(command, given, failed, unfinished)
+            if os.getpid() != launcher:  # a launcher elsewhere hears exceptions alone, after all jobs
+                if failed:
+                    raise JobFailed(failed[-1])
+                if unfinished:
+                    raise JobUnfinished(unfinished[-1])
             return
         settings = plain(config)
         check_keys(settings)
@@ -220,7 +240,7 @@ def _restart(command: Sequence[str]) -> list[str]:
     return [*command, *(part for folder in _config_folders() for part in ("--config-dir", folder))]
 
 
-def _sweep_job(command: Sequence[str], given: Sequence[str], failed: list[str]) -> None:
+def _sweep_job(command: Sequence[str], given: Sequence[str], failed: list[str], unfinished: list[str]) -> None:
     """One job of a sweep, as its own process: its failure or its DDP relaunch touches no other job."""
     from r2flow.chain import run_process
 
@@ -229,7 +249,9 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], failed: list[str]) 
     code = run_process([*_restart(command), *given, override("run_dir", str(run_dir))])
     if code in (130, 143):
         raise Stopped(code, "the sweep stopped; the same command goes on there")
-    if code:
+    if code == LATER:
+        unfinished.append(str(run_dir))
+    elif code:
         failed.append(str(run_dir))
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.generators import Condition, Generator, Sampler
 from r2flow.generators.base import Progress, check_control
+from r2flow.lidar.planes import flattened
 from r2flow.lidar.region import Region
 from r2flow.noise import Draws
 
@@ -109,11 +110,11 @@ def draw(
 
     See `sample` for the others.
     """
-    draws = Draws(seed, numbers)
+    draws, space, how = Draws(seed, numbers), generator.space, sampler or generator.sampler
     noise = draws.start(generator.noise_shape)
     seen = None if region is None or region.share == 1 else evaluated_region(generator, region)
     if seen is not None:
-        whole = generator.space.shape[1:]
+        whole = space.shape[1:]
         generator, noise = generator.part(seen), seen.crop(noise)
         if condition is not None:  # what is known of each pixel
             condition = {n: seen.crop(value) if value.shape[-2:] == whole else value for n, value in condition.items()}
@@ -121,13 +122,17 @@ def draw(
     if condition is not None:
         condition = {name: value.to(generator.device) for name, value in condition.items()}
     start = time.perf_counter()
-    with (sampler or generator.sampler).autocast(generator.device):
+    with how.autocast(generator.device):
         made = generator.generate(noise, condition, sampler=sampler, draws=draws, progress=progress)
     x_1 = made.x.cpu()  # which also waits for a GPU
     seconds = time.perf_counter() - start
     images = generator.space.decode(x_1, channels)
+    if seen is not None:
+        images = seen.place(images)
+    if how.flattens and channels != "reflectance":
+        images = flattened(images, space.rays, how.flattens)
     if region is not None and seen is not None:
-        images = region.place(region.crop(seen.place(images)))
+        images = region.place(region.crop(images))
     return Samples(images, numbers[0], made.evaluations.cpu(), made.converged.cpu(), seconds)
 
 

@@ -75,7 +75,7 @@ class SampleOptions:
 class TrainerRanges:
     """Values of Lightning's Trainer with which a run can come to its end, where Lightning itself takes others."""
 
-    max_steps: Count
+    max_steps: Annotated[int, Bound("of 1 to 10^15", lambda n: 1 <= n <= 10**15)]
     min_steps: Natural | None
     max_epochs: Annotated[int, Bound("other than 0", lambda n: n != 0)] | None
     max_time: str | Mapping[str, Any] | None
@@ -83,7 +83,10 @@ class TrainerRanges:
     overfit_batches: Annotated[float, Bound("0 (data.scenes or data.drives choose few scans)", lambda n: n == 0)]
     limit_train_batches: Annotated[None, Bound("(trainer.max_steps is the length of a run)", lambda n: True)]
     val_check_interval: Positive | str | Mapping[str, Any] | None
-    check_val_every_n_epoch: Count | None
+    check_val_every_n_epoch: Annotated[
+        None, Bound("(a run is one epoch: give trainer.val_check_interval)", lambda n: True)
+    ]
+    use_distributed_sampler: Annotated[bool, Bound("false (each device is given its own scans)", lambda n: not n)]
     log_every_n_steps: Count
     accumulate_grad_batches: Count
     gradient_clip_val: NonNegative | None
@@ -336,7 +339,8 @@ def fit(run: Run) -> Result:
             if run.trainer.is_global_zero:
                 device = run.trainer.strategy.root_device
                 drawn_on = str(device) if device.type == "cuda" else "cpu"
-                finish(run.folder, run.config["samples"], run.config["seed"], drawn_on, run.trainer.max_steps)
+                finish(run.folder, run.config["samples"], run.config["seed"], drawn_on, run.trainer.max_steps,
+                       kept=bool(run.trainer.checkpoint_callbacks))  # fmt: skip
                 log_figures(run.trainer.loggers, run.folder, step)
     return _result(run, step, finished=step >= run.trainer.max_steps)
 

@@ -167,6 +167,19 @@ def test_an_exported_sampler_gives_the_same_scans(name, kind, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", ["pt2", "onnx"])
+def test_an_exported_step_is_flattened_as_the_flow_s(kind, tmp_path):
+    if kind == "onnx":
+        pytest.importorskip("onnxscript")
+        pytest.importorskip("onnxruntime")
+    checkpoint, once = flow("efficient_unet"), Sampler("euler", 1, flatten=0.05)
+    written = export(checkpoint, tmp_path / f"flow.{kind}", once)
+    assert written.any_batch
+    assert compare(checkpoint, written, once, 3).metres < 1e-3
+    assert compare(checkpoint, written, replace(once, flatten=0.0), 3).metres > 1e-2
+
+
+@pytest.mark.slow
 def test_points_and_notes_come_with_the_scan(tmp_path):
     checkpoint = flow("efficient_unet")
     export(checkpoint, tmp_path / "flow.pt2", SHORT)

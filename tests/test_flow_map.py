@@ -216,8 +216,8 @@ OWN = Sampler("adams3", 16, grid="power:1.75", fewer="chord")
 @pytest.mark.parametrize(
     ("asked", "expected"),
     [
-        ({"steps": 2}, ("chord", 2, "power:5")),
-        ({"steps": 15}, ("chord", 15, "power:5")),
+        ({"steps": 2}, ("chord", 2, "late:32")),
+        ({"steps": 15}, ("chord", 15, "late:32")),
         ({"steps": 2, "grid": "power:3"}, ("chord", 2, "power:3")),
         ({"steps": 16}, ("adams3", 16, "power:1.75")),
         ({"steps": 32}, ("adams3", 32, "power:1.75")),
@@ -234,13 +234,13 @@ def test_fewer_steps_alone_go_over_to_the_method_for_these(asked, expected):
 
 def test_pairs_by_chord_have_the_grid_that_it_is_drawn_on():
     drawn = OWN.changed(steps=2)
-    assert PairOptions(method="chord", steps=2).recipe((2, 8, 64)).grid == drawn.grid == "power:5"
+    assert PairOptions(method="chord", steps=2).recipe((2, 8, 64)).grid == drawn.grid == "late:32"
 
 
 def test_a_map_drawn_as_a_flow_draws_two_steps_by_jumps(grown):
     grown.sampler, x_0 = OWN, Draws(0, range(2)).start(grown.noise_shape)
     few = grown.generate(x_0, sampler=OWN.changed(steps=2))
-    assert torch.equal(few.x, grown.generate(x_0, sampler=Sampler("chord", 2, grid="power:5")).x)
+    assert torch.equal(few.x, grown.generate(x_0, sampler=Sampler("chord", 2, grid="late:32")).x)
     assert few.evaluations.tolist() == [2, 2]
     assert grown.in_steps(2) == OWN.changed(steps=2)
 

@@ -7,6 +7,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import SolverOptions, grouped
+from r2flow.cli.options import FlattenOption
 from r2flow.errors import InputError
 
 
@@ -17,7 +18,10 @@ def export(
     solver: SolverOptions,
     to: Annotated[str, typer.Option(help="onnx for onnxruntime and its like, or pt2 for torch.")] = "onnx",
     what: Annotated[str, typer.Option(help="sampler: noise in, scan out; or network: v(t, x) alone.")] = "sampler",
-    grid: Annotated[str | None, typer.Option(help="Where the steps fall: uniform, power:P or power-start:P.")] = None,
+    grid: Annotated[
+        str | None, typer.Option(help="Where the steps fall: uniform, power:P, power-start:P or late:K.")
+    ] = None,
+    flatten: FlattenOption = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="File to write; NAME.onnx or NAME.pt2 if left out.")
     ] = None,
@@ -34,10 +38,10 @@ def export(
     if what not in ("sampler", "network"):
         raise InputError(f"--what must be sampler or network, found {what!r}.")
     network = what == "network"
-    if network and (solver != SolverOptions() or grid):
-        raise InputError("--what network has no sampler: leave solver, steps, tolerance and grid out.")
+    if network and (solver != SolverOptions() or grid or flatten is not None):
+        raise InputError("--what network has no sampler: leave solver, steps, tolerance, grid and flatten out.")
     loaded = load_checkpoint(checkpoint)
-    sampler: Sampler = solver.change(writing.flow_of(loaded).sampler, grid=grid)
+    sampler: Sampler = solver.change(writing.flow_of(loaded).sampler, grid=grid, flatten=flatten)
     if out is None:
         out = Path(f"{checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name}.{to}")
     elif out.suffix != f".{to}":

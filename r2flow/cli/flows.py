@@ -12,6 +12,7 @@ from r2flow.cli.groups import DrawOptions, SolverOptions, grouped
 from r2flow.cli.options import (
     CheckpointOption,
     DeviceOption,
+    FlattenOption,
     OutOption,
     PrecisionOption,
     SensorOption,
@@ -87,8 +88,10 @@ def sample(
         typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model; street if left out."),
     ] = None,
     grid: Annotated[
-        str | None, typer.Option(help="Where fixed steps fall: uniform, power:P or power-start:P, as power:1.75.")
+        str | None,
+        typer.Option(help="Where fixed steps fall: uniform, power:P, power-start:P or late:K, as power:1.75."),
     ] = None,
+    flatten: FlattenOption = None,
     precision: PrecisionOption = None,
     error: Annotated[
         str | None, typer.Option(help="Largest error of a scan, as 0.05m of range or 0.002 in model space.")
@@ -109,10 +112,11 @@ def sample(
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
     loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(draw.device))
     if error is None:
-        sampler = solver.change(loaded.generator.sampler, grid=grid, precision=precision)
-    elif solver != SolverOptions() or grid or precision:
+        sampler = solver.change(loaded.generator.sampler, grid=grid, precision=precision, flatten=flatten)
+    elif solver != SolverOptions() or grid or precision or flatten is not None:
         raise InputError(
-            "--error says how many steps each scan takes: leave solver, steps, tolerance, grid and precision out."
+            "--error says how many steps each scan takes: leave solver, steps, tolerance, grid, flatten and precision "
+            "out."
         )
     else:
         sampler = sampler_within(loaded, error)

@@ -88,7 +88,7 @@ def completion(
     import numpy as np
 
     from r2flow.checkpoints import load_checkpoint
-    from r2flow.cli.output import command, finish
+    from r2flow.cli.output import command, finish, numbers
     from r2flow.flow.posterior import methods_in
     from r2flow.progress import Bar
     from r2flow.reports.completion import TASKS, completion_page, completion_rows, given_by, pictured, ways_of
@@ -96,7 +96,7 @@ def completion(
     from r2flow.reports.pages import prepare_folder
 
     first = load_checkpoint(checkpoint, choose_device(device))
-    counts = [int(one) for one in steps.split(",")] if steps else []
+    counts = numbers("steps", steps, int) if steps else []
     ways = ways_of(first, Path(checkpoint).stem, methods_in(solvers) if solvers else [], counts)
     for other in also or []:
         ways += ways_of(load_checkpoint(other, choose_device(device)), Path(other).stem)

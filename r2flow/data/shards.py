@@ -28,8 +28,10 @@ from r2flow.errors import InputError
 from r2flow.files import atomic_write, parse_json, read_json
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
+from r2flow.lidar.scan_files import FIRM_ENDINGS
 
 ELSEWHERE = "data.root=FOLDER (r2flow pairs --out FOLDER)"  # how another folder is given
+FORMAT = "r2flow pairs 1"
 STALE = 3600  # seconds after which a temporary file has no writer any more
 
 
@@ -99,6 +101,10 @@ class Block(NamedTuple):
         return digest.hexdigest()
 
 
+def _inside(folder: Path) -> Iterator[Path]:
+    return folder.iterdir() if folder.is_dir() else iter(())
+
+
 class _Unwanted(Exception):
     """What was about to be written is there already."""
 
@@ -122,9 +128,21 @@ class PairStore:
     def _check_manifest(self) -> None:
         path = self.folder / MANIFEST
         if not path.is_file():
+            scan = next((one for one in _inside(self.folder) if one.name.endswith(FIRM_ENDINGS)), None)
+            if scan is not None:
+                raise InputError(
+                    f"{self.folder} holds scans ({scan.name}), and pairs are kept in a folder of their own: give "
+                    f"another by {ELSEWHERE}."
+                )
             return
         try:
-            found = dict(read_json(path)["recipe"])
+            content = read_json(path)
+            if content["format"] != FORMAT:
+                raise InputError(
+                    f"{self.folder} is of the format {content['format']!r}, and pairs are kept in a folder of their "
+                    f"own: give another by {ELSEWHERE}."
+                )
+            found = dict(content["recipe"])
         except (ValueError, KeyError, TypeError):
             raise InputError(f"{path} is damaged. Delete it: the shards beside it know their recipe.") from None
         then = {f.name: f.default for f in fields(PairRecipe) if f.default is not MISSING and f.name not in found}
@@ -132,7 +150,7 @@ class PairStore:
 
     def begin(self) -> None:
         """Write the manifest where there is none, and clear away what killed writers left."""
-        content = {"format": "r2flow pairs 1", "recipe": self.recipe.describe(), "digest": self.recipe.digest}
+        content = {"format": FORMAT, "recipe": self.recipe.describe(), "digest": self.recipe.digest}
         try:
             if not (self.folder / MANIFEST).is_file():
                 with atomic_write(self.folder / MANIFEST, "w") as file:

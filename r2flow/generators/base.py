@@ -69,6 +69,8 @@ class Sampler:
         precision: Of the network, as `trainer.precision`: `bf16-mixed` computes its products in bfloat16, by
             `torch.autocast`. States and steps stay as they are.
         fewer: Method in fewer steps than `steps`, where another is better there; a flow map may have `chord`.
+        flatten: How rough, in log-range, a single step leaves surfaces: in one step returns are moved to the planes
+            that they lie on (`r2flow.lidar.planes.flattened`). Only images are, no state. 0: they stay.
     """
 
     method: str = "euler"
@@ -82,6 +84,7 @@ class Sampler:
     doubt: Positive = 0.2
     precision: Precision = "32-true"
     fewer: str | None = None
+    flatten: Portion = 0.0
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> Self:
@@ -113,7 +116,7 @@ class Sampler:
         given = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in options.items() if v is not None}
         own = vars(self)  # the range of a number is judged with the method that takes it
         odd = {k: v for k, v in given.items() if isinstance(v, tuple) or type(v) is not type(own.get(k))}
-        odd |= {k: v for k, v in given.items() if k in ("precision", "finish", "doubt")}
+        odd |= {k: v for k, v in given.items() if k in ("precision", "finish", "doubt", "flatten")}
         check_options("sampler", type(self), odd)
         if self.fewer and "method" not in given and given.get("steps", self.steps) < self.steps:
             given["method"] = self.fewer
@@ -136,6 +139,11 @@ class Sampler:
         return found
 
     @property
+    def flattens(self) -> float:
+        """`flatten` of a single step, else 0."""
+        return self.flatten if self.steps == 1 else 0.0
+
+    @property
     def times(self) -> str | Tensor:
         """The grid as solvers take it: by name, or its times in float64."""
         return self.grid if isinstance(self.grid, str) else torch.tensor(self.grid, dtype=torch.float64)
@@ -149,13 +157,13 @@ class Sampler:
         return ", ".join(f"{key} {value}" for key, value in asdict(self).items() if value != getattr(other, key))
 
     def asdict(self) -> dict[str, Any]:
-        """Plain values, as a config or a checkpoint holds them; `precision` and `fewer`, younger keys, if given."""
+        """Plain values, as a config or a checkpoint holds them; those that are younger than this format if given."""
         found = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
         return {key: value for key, value in found.items() if (key, value) not in YOUNGER}
 
 
 MOST_STEPS = 10**6  # more are a slip of the finger
-YOUNGER = ("precision", "32-true"), ("fewer", None)  # what files without these keys mean by it
+YOUNGER = ("precision", "32-true"), ("fewer", None), ("flatten", 0.0)  # what files without these keys mean by it
 
 
 def _kind(method: str) -> str:
@@ -198,7 +206,7 @@ def usual_steps(method: str) -> Mapping[str, Any]:
     if _kind(method) == SDE:
         return {"grid": "power:2.5", "finish": 1 / 128}
     if method == CHORD:
-        return {"grid": "power:5", "finish": 0.0}
+        return {"grid": "late:32", "finish": 0.0}
     return {"grid": usual_grid(method), "finish": 0.0}
 
 

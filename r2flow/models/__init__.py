@@ -37,7 +37,7 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes in any number of evaluations, learned from simulated scans",
-        "3100aee15a37efdc3df27ec0e3c368cf542f364fd159a6d1eace9d70d8eeaacf",
+        "e67a73b3a8574f51772b5166aac72ba136360a733808558aaf649a9fdad3b7af",
     ),
     street_full=Model(
         "street scenes at 64 x 1024, learned from simulated scans",

@@ -118,23 +118,27 @@ def _protocol(comparisons: Sequence[Comparison]) -> str:
 
 def _table(comparisons: Sequence[Comparison]) -> tuple[list[str], list[list[str]]]:
     """Headings and lines, numbers as the field prints them: comparisons or figures down, whichever are more."""
-    cells: dict[str, dict[str, str]] = {}
+    cells: dict[str, dict[tuple[str, str], str]] = {}  # by kind and name: a judged set may be called "noise"
     for row in rows_of(comparisons):
         factor = heading(row["metric"], row["figure"])[1]
         text = "none" if math.isnan(row["value"]) else f"{row['printed']:#.4g}"
         if row["low"] is not None and text != "none":
             text += f" [{row['low'] * factor:#.3g}, {row['high'] * factor:#.3g}]"
-        cells.setdefault(row["printed_as"], {})[row["comparison"]] = text
+        cells.setdefault(row["printed_as"], {})[row["kind"], row["comparison"]] = text
     sizes = [f"({len(one.generated)} : {len(one.real)})" for one in comparisons]
-    names = [one.name if one.kind == "judged" else f"{one.kind}: {one.name}" for one in comparisons]
+    names = list(map(_named, comparisons))
     if len(comparisons) >= len(cells):
         lines = [
-            [name, size, *(own.get(one.name, "") for own in cells.values())]
+            [name, size, *(own.get((one.kind, one.name), "") for own in cells.values())]
             for name, size, one in zip(names, sizes, comparisons, strict=True)
         ]
         return ["set", "its scans : real", *cells], lines
     columns = ["", *(f"{name} {size}" for name, size in zip(names, sizes, strict=True))]
-    return columns, [[said, *(own.get(one.name, "") for one in comparisons)] for said, own in cells.items()]
+    return columns, [[said, *(own.get((one.kind, one.name), "") for one in comparisons)] for said, own in cells.items()]
+
+
+def _named(one: Comparison) -> str:
+    return one.name if one.kind == "judged" else f"{one.kind}: {one.name}"
 
 
 def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
@@ -150,7 +154,7 @@ def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
     for one in comparisons:
         for measured in one.measured:
             for remark in measured.remarks:
-                found.setdefault(remark, {}).setdefault(one.name, []).append(measured.metric)
+                found.setdefault(remark, {}).setdefault(_named(one), []).append(measured.metric)
     for remark, where in found.items():
         metrics = list(dict.fromkeys(name for names in where.values() for name in names))
         about = [] if len(where) == len(comparisons) else [", ".join(where)]
@@ -209,7 +213,7 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
             axes.plot([value], [row], marker=style["marker"], color=style["color"], ms=7, ls="")
             if math.isnan(value):
                 axes.text(0.02, row, "none", transform=axes.get_yaxis_transform(), fontsize=8, va="center")
-        axes.set_yticks(range(len(comparisons)), [one.name for one in comparisons] if place % columns == 0 else [])
+        axes.set_yticks(range(len(comparisons)), list(map(_named, comparisons)) if place % columns == 0 else [])
         axes.set(xlabel=said, ylim=(len(comparisons) - 0.5, -0.5))
         axes.set_xlim(min(0.0, axes.get_xlim()[0]), axes.get_xlim()[1] * 1.05)
         axes.locator_params(axis="x", nbins=4)

@@ -1,6 +1,7 @@
 """The end of a training: its loss curve, its samples, and its files."""
 
 import csv
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,8 @@ import numpy as np
 
 from r2flow.checkpoints import checkpoints_of, find_checkpoint, load_checkpoint
 from r2flow.reports.outputs import what_next, write_samples
+
+log = logging.getLogger(__name__)
 
 Curve = tuple[np.ndarray, np.ndarray]
 
@@ -20,13 +23,19 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
     """
     values: dict[str, dict[int, float]] = {name: {} for name in names}
     folders = Path(run, "metrics").glob("version_*/metrics.csv")
-    for path in sorted(folders, key=lambda p: int(p.parent.name.split("_")[1])):
-        with path.open(newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file):
-                for name in names:
-                    if row.get(name):
-                        # Lightning logs the number of the step that was being taken.
+    numbered = {int(number): path for path in folders if (number := path.parent.name.split("_")[1]).isdecimal()}
+    for _, path in sorted(numbered.items()):
+        damaged = 0
+        lines = path.read_text(encoding="utf-8", errors="replace").replace("\0", "").splitlines()
+        for row in csv.DictReader(lines):
+            for name in names:
+                if row.get(name):
+                    try:  # Lightning logs the number of the step that was being taken.
                         values[name][int(row["step"]) + 1] = float(row[name])
+                    except (TypeError, ValueError):  # what a power cut leaves
+                        damaged += 1
+        if damaged:
+            log.warning("%s: left out %d values that are no numbers", path, damaged)
     return {
         name: (np.array(sorted(points)), np.array([points[step] for step in sorted(points)]))
         for name, points in values.items()
@@ -34,8 +43,14 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
     }
 
 
-def finish(run: str | Path, samples: Mapping[str, Any], seed: int, device: str, max_steps: int) -> None:
-    """Draw the loss curve and a few scans of a run; print its files and the commands that come next."""
+def finish(
+    run: str | Path, samples: Mapping[str, Any], seed: int, device: str, max_steps: int, kept: bool = True
+) -> None:
+    """Draw the loss curve and a few scans of a run; print its files and the commands that come next.
+
+    Args:
+        kept: Whether the run keeps checkpoints.
+    """
     from r2flow.reports.pictures import loss_figure, save_figure
 
     run = Path(run)
@@ -43,6 +58,9 @@ def finish(run: str | Path, samples: Mapping[str, Any], seed: int, device: str, 
     if curves:
         save_figure(loss_figure(curves), run / "loss.png")
     if not checkpoints_of(run):
+        if kept:
+            print("stopped before a checkpoint was kept: the same command starts it again")
+            return
         print("no checkpoint was kept, as configured" + (f"; loss curve: {run / 'loss.png'}" if curves else ""))
         return
     path = find_checkpoint(run)

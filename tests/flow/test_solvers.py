@@ -112,9 +112,13 @@ def test_a_power_grid_is_denser_towards_one_end_and_the_same_backward():
         "power:2": 1 - torch.tensor([1, 9 / 16, 1 / 4, 1 / 16, 0], dtype=torch.float64),
         "power-start:3": torch.tensor([0, 1 / 64, 1 / 8, 27 / 64, 1], dtype=torch.float64),
         "power:1": torch.tensor([0, 0.25, 0.5, 0.75, 1], dtype=torch.float64),
+        # 1 - t = 2^(2/3) / 16, 1 / 16 and 2^(-2/3) / 16
+        "late:16": 1 - torch.tensor([1, 0.09921256574801247, 0.0625, 0.03937253280921478, 0], dtype=torch.float64),
     }.items():
         torch.testing.assert_close(named_grid(name)(0.0, 1.0, 4), times)
         torch.testing.assert_close(named_grid(name)(1.0, 0.0, 4), times.flip(0))
+    for steps, times in {1: [0, 1], 2: [0, 31 / 32, 1]}.items():
+        torch.testing.assert_close(named_grid("late:32")(0.0, 1.0, steps), torch.tensor(times, dtype=torch.float64))
     # A part of the way: equal steps of (1 - t)^(1/2) from .8 to .4.
     torch.testing.assert_close(
         named_grid("power:2")(0.36, 0.84, 2), torch.tensor([0.36, 0.64, 0.84], dtype=torch.float64)
@@ -182,8 +186,19 @@ def test_the_evaluations_of_the_estimate_are_counted_apart():
 
 
 def test_an_unknown_or_wrong_grid_is_refused():
-    for grid in ("quadratic", "power", "power:0.5", "power:nan", "power:11", "power-start:", "start-power:2"):
-        with pytest.raises(InputError, match=f"uniform, power:P or power-start:P with P from 1 to 10; found '{grid}'"):
+    for grid in (
+        "quadratic",
+        "power",
+        "power:0.5",
+        "power:nan",
+        "power:11",
+        "power-start:",
+        "start-power:2",
+        "late",
+        "late:3",
+        "late:inf",
+    ):
+        with pytest.raises(InputError, match=f"P from 1 to 10, or late:K with K from 4 to 1e6; found '{grid}'"):
             solve(logistic, X_0, grid=grid)
     with pytest.raises(InputError, match="must be \\(N \\+ 1,\\) times that run in one direction"):
         solve(logistic, X_0, grid=torch.tensor([0.0, 0.6, 0.5, 1.0]))

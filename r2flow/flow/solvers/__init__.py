@@ -91,8 +91,9 @@ def solve(
             at t_1. Tolerances below `LEAST_TOLERANCE` of the state's or the velocity's type are raised to it, with a
             warning.
         progress: Called after every evaluation.
-        grid: Time grid of a fixed-step method: `uniform`, `power:P` (t = 1 - (1 - u)^P), `power-start:P` (t = u^P) or
-            the times themselves, (N + 1,) from t_0 to where `finish` begins.
+        grid: Time grid of a fixed-step method: `uniform`, `power:P` (t = 1 - (1 - u)^P), `power-start:P` (t = u^P),
+            `late:K` (`r2flow.flow.solvers.grids.late`) or the times themselves, (N + 1,) from t_0 to where `finish`
+            begins.
         finish: Length of the last part of the interval, which one Euler step takes: 1e-3 avoids a velocity that is
             singular at t_1.
         max_evaluations: Budget of a scene in an adaptive method.
