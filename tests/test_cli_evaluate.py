@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -354,3 +355,18 @@ def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):  # noqa: F
     assert (code, "Scans: 12 real, 2 other" in said) == (0, True)
     assert r2flow("invert", run, "-c", run, "-o", tmp_path / "noise", "--solver", "euler", "--steps", 2)[0] == 0
     assert {path.name for path in (tmp_path / "noise").glob("*.npy")} == {"000000.x_0.npy", "000001.x_0.npy"}
+
+
+def test_a_judged_set_may_have_the_name_of_a_control(r2flow, real, generated, tmp_path):  # noqa: F811
+    shutil.copytree(generated, tmp_path / "noise")
+    sets = real, tmp_path / "noise", generated
+    code, said, _ = r2flow("evaluate", *sets, *QUICK, "--no-floor", "--json", tmp_path / "e.json")
+    assert code == 0
+    of = {}
+    for one in json.loads((tmp_path / "e.json").read_text())["comparisons"]:
+        (jsd,) = (metric["printed"]["JSD x 10^2"] for metric in one["metrics"] if metric["metric"] == "jsd")
+        of[one["kind"], one["comparison"]] = jsd
+    lines = {line.split("  ")[0]: line for line in said.splitlines()}
+    assert f"{of['judged', 'noise']:#.4g}" in lines["noise"]
+    assert f"{of['control', 'noise']:#.4g}" in lines["control: noise"]
+    assert of["judged", "noise"] != of["control", "noise"]

@@ -16,9 +16,9 @@ import numpy as np
 
 from r2flow.data.opening import SAMPLES, SOURCES, open_scans, own_reading, parse, usual_scale
 from r2flow.data.options import PREPARED, SIMULATED
-from r2flow.data.reading import Reading, naming, nothing_in_view
+from r2flow.data.reading import Reading, nothing_in_view
 from r2flow.data.sources import LOOKED_AT, ScanSource, spread
-from r2flow.errors import InputError
+from r2flow.errors import InputError, naming
 from r2flow.lidar.calibration import reflectance_of
 from r2flow.lidar.recognition import other_sensor
 from r2flow.lidar.scan_files import Points, read_numbers, read_points, read_range_image, scan_ending

@@ -2,15 +2,14 @@
 
 import logging
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, naming
 from r2flow.lidar.labels import labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, image_of, project_indices
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
@@ -119,15 +118,6 @@ def read_projected(
     if not image[0].any():
         raise nothing_in_view(path, points, sensor)
     return Projected(image if reflectance else image[:1], points, pixels, chosen)
-
-
-@contextmanager
-def naming(path: str | Path) -> Iterator[None]:
-    """Puts a file's name before what is wrong with its scan."""
-    try:
-        yield
-    except InputError as error:
-        raise type(error)(f"{path}: {error}") from None
 
 
 def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPointsError:

@@ -137,14 +137,14 @@ class PairStore:
             return
         try:
             content = read_json(path)
-            if content["format"] != FORMAT:
-                raise InputError(
-                    f"{self.folder} is of the format {content['format']!r}, and pairs are kept in a folder of their "
-                    f"own: give another by {ELSEWHERE}."
-                )
-            found = dict(content["recipe"])
-        except (ValueError, KeyError, TypeError):
+            kind, found = content.get("format", FORMAT), dict(content["recipe"])
+        except (ValueError, KeyError, TypeError, AttributeError):
             raise InputError(f"{path} is damaged. Delete it: the shards beside it know their recipe.") from None
+        if kind != FORMAT:
+            raise InputError(
+                f"{self.folder} is of the format {kind!r}, and pairs are kept in a folder of their own: give another "
+                f"by {ELSEWHERE}."
+            )
         then = {f.name: f.default for f in fields(PairRecipe) if f.default is not MISSING and f.name not in found}
         refuse_other(self.folder, "pairs", found | then, asdict(self.recipe), ELSEWHERE)
 

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from r2flow.backbones.cost import count_macs, count_parameters
 from r2flow.checkpoints import checkpoints_of, step_of
 from r2flow.config import flatten
-from r2flow.errors import InputError
+from r2flow.errors import InputError, naming
 from r2flow.files import read_json
 from r2flow.generators import RectifiedFlow, build_generator
 from r2flow.reports.backbones import latency
@@ -145,7 +145,8 @@ def read_runs(paths: Sequence[Path], repeats: int = 0, device: str = "cpu") -> l
         config = _config_of(path)
         architecture = json.dumps([config.get(key) for key in ("sensor", "encoding", "backbone")], sort_keys=True)
         if architecture not in costs:
-            costs[architecture] = cost(config, repeats, device)
+            with naming(path):
+                costs[architecture] = cost(config, repeats, device)
         curves = read_curves(path, (*LOSSES, STRAIGHTNESS))
         values = {**costs[architecture], **_read_values(path, config, curves)}
         runs.append(ComparedRun(label, config, values, curves, read_fidelity(path)))

@@ -194,9 +194,12 @@ def stability_page(rows: Sequence[Row], probe: Sequence[Row] = (), seed: int = 0
     """The report: how many failures say so, the probe of the jet, every cell."""
     total = summary(rows)
     silent = f" Silent: {'; '.join(total['silent'])}." if total["silent"] else ""
+    share = (
+        f"**{total['covered']} of these ({total['share']:.0%}) say so**" if total["failed"] else "those that do say so"
+    )
     text = [
         f"Of {total['cells']} cells, {total['failed']} of an adaptive solver have an error of more than {FAILS_AT:g} "
-        f"times the tolerance (the narrow jet apart); **{total['covered']} of these ({total['share']:.0%}) say so**: "
+        f"times the tolerance (the narrow jet apart); {share}: "
         f"they are flagged, or their global estimate is within a factor of {HONEST_WITHIN:g} of the true error. "
         f"{total['by_missing_estimate']} of them count only because the tighter solution did not converge, so that "
         f"there is no estimate.{silent} The narrow jet is the known exception: {total['silent_jets']} of its cells "

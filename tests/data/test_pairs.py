@@ -395,3 +395,14 @@ def test_a_pair_takes_two_bytes_an_element(tmp_path: Path):
     make_pairs(store, grow, 400)
     size = sum(len(data) for data in files(tmp_path).values())
     assert size < 400 * (2 * np.prod(SHAPE) + 4) * 1.1
+
+
+def test_pairs_are_not_kept_among_scans_or_in_another_store(tmp_path: Path):
+    (tmp_path / "000000.bin").touch()
+    with pytest.raises(InputError, match=r"holds scans \(000000.bin\), and pairs are kept in a folder of their own"):
+        store_in(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["000000.bin"]
+    (tmp_path / "prepared").mkdir()
+    (tmp_path / "prepared" / "manifest.json").write_text('{"format": "r2flow scans 1", "recipe": {}}')
+    with pytest.raises(InputError, match="is of the format 'r2flow scans 1', and pairs are kept in a folder of their"):
+        store_in(tmp_path / "prepared")

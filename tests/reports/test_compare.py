@@ -31,6 +31,7 @@ from r2flow.reports.compare import (
     smooth,
 )
 from r2flow.reports.pages import write_page
+from r2flow.reports.training import read_curves
 
 CONFIG: dict[str, Any] = {
     "name": "small",
@@ -281,3 +282,22 @@ def test_a_broken_config_is_no_run(tmp_path):
     (tmp_path / "config.yaml").write_text("stage: [unclosed\n")
     with pytest.raises(InputError, match=r"config.yaml is damaged"):
         read_runs([tmp_path])
+
+
+def test_a_log_that_a_power_cut_has_damaged_is_read_as_far_as_it_goes(tmp_path, caplog):
+    run = make_run(tmp_path / "run", train=[2.0, 1.0, 0.5], checkpoint=3)
+    log = run / "metrics" / "version_0" / "metrics.csv"
+    log.write_bytes(log.read_bytes() + b"3,0.2" + b"\0" * 40 + b"\n4,0.x\n")
+    (run / "metrics" / "version_x").mkdir()
+    (run / "metrics" / "version_x" / "metrics.csv").touch()
+    steps, values = read_curves(run)["train/loss"]
+    assert list(values[:3]) == [2.0, 1.0, 0.5]
+    assert list(steps[:3]) == [1, 2, 3]
+    assert f"{log}: left out 1 values" in caplog.text
+
+
+def test_a_config_that_says_too_little_is_named(tmp_path):
+    make_run(tmp_path / "run")
+    (tmp_path / "run" / "config.yaml").write_text("stage: {name: rectify}\nbackbone: {name: hdit}\ndata: {}\n")
+    with pytest.raises(InputError, match=r"run: the config has no 'sensor'"):
+        read_runs([tmp_path / "run"])

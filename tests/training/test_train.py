@@ -14,6 +14,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint, step_of
 from r2flow.reports.outputs import what_next
+from r2flow.signals import LATER
 from tests.training.conftest import Run, hold_at, let_go, start, tiny, wait_for
 
 
@@ -236,6 +237,18 @@ def test_a_sweep_runs_every_job_and_reports_the_failed(train: Run, tmp_path: Pat
     finished = {path.parent.name for path in (tmp_path / "runs" / "sweep").glob("*/samples")}
     assert len(finished) == 1
     assert "mse" in finished.pop()
+
+
+def test_a_sweep_whose_jobs_reach_their_time_goes_on_with_the_same_command(train: Run, tmp_path: Path):
+    job = "seed=1,2", "trainer.max_time=00:00:00:00", "trainer.max_steps=3", "samples.num=0"
+    done = train(*job, check=False, flags=("-m",))
+    assert done.returncode == LATER
+    assert "2 of the sweep's jobs go on with the same command: " in done.stdout
+    assert "failed" not in done.stdout + done.stderr
+    assert "stopped before a checkpoint was kept: the same command starts it again" in done.stdout
+    mixed = train(*job, "stage.loss=mse,nonsense", check=False, flags=("-m",))
+    assert mixed.returncode == 2
+    assert "2 of the sweep's jobs failed" in mixed.stderr
 
 
 @pytest.mark.parametrize("option", ["run_dir=here", "run_dir=a,b", "name=here"])
