@@ -50,7 +50,7 @@ sample -c run -o out --steps 0
 sample -c run -o out --steps a
 sample -c run -o out --solver nope
 sample -c run -o out --precision 16-mixed # precision must be '32-true' or 'bf16-mixed'
-sample -c run -o out --error 0.1m --precision bf16-mixed # leave solver, steps, tolerance, grid and precision out
+sample -c run -o out --error 0.1m --precision bf16-mixed # leave solver, steps, tolerance, grid, flatten and precision out
 pairs -c run --precision bf16 # precision must be '32-true' or 'bf16-mixed'
 evaluate simulated:1 run --precision half # precision must be '32-true' or 'bf16-mixed'
 complete scans -c run -o out --precision half # precision must be '32-true' or 'bf16-mixed'
@@ -101,6 +101,11 @@ sample -c run -o out --solver dopri5 --grid power:2
 sample -c run -o out --grid power:0
 sample -c run -o out --grid power:10 --steps 64 # 64 steps do not fit under power:10 in double precision
 sample -c run -o out --grid power:3 --steps 1000000 # fewer steps or a smaller power
+sample -c run -o out --grid late:2
+sample -c run -o out --flatten nan
+sample -c run -o out --flatten 1 --steps 1
+sample -c run -o out --flatten 0.02 --steps 3 # --flatten is for a single step
+sample -c run -o out --error 0.1m --flatten 0.1 # leave solver
 sample -c run -o out --error 0.05m # measure them
 sample -c run -o out --error nope
 sample -c run -o out --error 0.05m --steps 4 # leave solver
