@@ -50,7 +50,7 @@ sample -c run -o out --steps 0
 sample -c run -o out --steps a
 sample -c run -o out --solver nope
 sample -c run -o out --precision 16-mixed # precision must be '32-true' or 'bf16-mixed'
-sample -c run -o out --error 0.1m --precision bf16-mixed # leave solver, steps, tolerance, grid, flatten and precision out
+sample -c run -o out --error 0.1m --precision bf16-mixed # leave solver, steps, tolerance, grid, flatten
 pairs -c run --precision bf16 # precision must be '32-true' or 'bf16-mixed'
 evaluate simulated:1 run --precision half # precision must be '32-true' or 'bf16-mixed'
 complete scans -c run -o out --precision half # precision must be '32-true' or 'bf16-mixed'
