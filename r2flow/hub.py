@@ -61,9 +61,8 @@ class HubFlow(  # type: ignore[call-arg, unused-ignore]  # where the extra is no
     @classmethod
     def _from_pretrained(cls, *, model_id: str, device: str = "cpu", **where: Any) -> "HubFlow":
         known = ("revision", "cache_dir", "force_download", "local_files_only", "token")
-        odd = [
-            key for key in where if key not in (*known, "proxies", "resume_download")
-        ]  # those two its mixin may give
+        older = "proxies", "resume_download"  # what the mixin of older versions gives
+        odd = [key for key in where if key not in (*known, *older)]
         if odd:
             raise InputError(
                 f"HubFlow.from_pretrained does not know {', '.join(odd)}; it takes device, {', '.join(known)}."

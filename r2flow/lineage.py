@@ -151,13 +151,14 @@ def with_scales(config: dict[str, Any], asked: Sequence[str]) -> dict[str, Any]:
         data["scans"] = told(data["scans"])
     held = data.get("validation") or {}
     other = held.get("data")
-    # What was said of the run's own folder holds for another of real scans; r2flow writes reflectances of [0, 1].
-    if (
-        isinstance(other, Mapping)
-        and other.get("root") is not None
-        and (data["name"] != FOLDER or not said or made_here(str(other["root"])))
-    ):
-        data["validation"] = {**held, "data": told({"name": data["name"], **other})}
+    if data["name"] != FOLDER:
+        if other is not None:
+            data["validation"] = {**held, "data": told(other)}
+    elif isinstance(other, Mapping) and other.get("root") is not None and (not said or made_here(str(other["root"]))):
+        # What was said of the run's own folder holds for another of real scans; r2flow writes reflectances of [0, 1].
+        scale = told({"name": FOLDER, **other}).get("reflectance_scale")
+        if scale not in (None, other.get("reflectance_scale", data.get("reflectance_scale", 1.0))):
+            data["validation"] = {**held, "data": {**other, "reflectance_scale": scale}}
     return config
 
 

@@ -197,13 +197,13 @@ def test_full_reflectance_in_the_folders_of_a_mixture_and_of_those_held_out_is_t
     [
         ("simulated", 255.0, 1.0),
         ("simulated", 1.0, 1.0),
-        ("real", 255.0, None),
+        ("real", 255.0, 255.0),
         ("real", 1.0, 0.012),
         ("drives", 1.0, 1.0),
     ],
 )
 def test_full_reflectance_in_a_folder_held_out_beside_a_folder(tmp_path: Path, held, said, expected):
-    """`None` is the run's own: what was said of one folder of real scans holds for the other."""
+    """What was said of one folder of real scans holds for the other; what was right stays as it is."""
     for name in ("simulated", "real", "drives/a"):
         (tmp_path / name).mkdir(parents=True)
         if name != "real":
@@ -211,7 +211,9 @@ def test_full_reflectance_in_a_folder_held_out_beside_a_folder(tmp_path: Path, h
     data = {"name": "folder", "root": "scans", "reflectance_scale": said}
     data["validation"] = {"data": {"root": str(tmp_path / held)}}
     found = with_scales({"sensor": OWN, "data": data}, [])["data"]
-    assert found["validation"]["data"].get("reflectance_scale") == expected
+    other = found["validation"]["data"]
+    assert other.get("reflectance_scale", found["reflectance_scale"]) == expected
+    assert (other == {"root": str(tmp_path / held)}) == (expected == found["reflectance_scale"])
 
 
 def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Path):

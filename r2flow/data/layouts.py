@@ -238,7 +238,8 @@ def named_drive(drives: list[Drive], name: str) -> Drive:
     """The drive of a name, or of a number in its name; none and several are refused."""
     matches = [d for d in drives if name == d.name or (name.isdecimal() and int(name) in _numbers(d.name))]
     if len(matches) != 1:
-        known = ", ".join(d.name for d in drives) if drives[0].name != "." else "none, its scans lie in one folder"
+        names = [drive.name for drive in drives]
+        known = "none, its scans lie in one folder" if names == ["."] else ", ".join(names)
         problem = "no drive" if not matches else f"{len(matches)} drives"
         raise InputError(f"{problem} named {name!r}; known: {known}.")
     return matches[0]

@@ -9,6 +9,7 @@
 
 import json
 import logging
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -223,8 +224,11 @@ def made_here(root: str | Path) -> bool:
     from r2flow.simulator.folder import MANIFEST
 
     folder = Path(root).expanduser()
-    inner = [place for place in folder.iterdir() if place.is_dir()] if folder.is_dir() else []
-    return any((place / note).is_file() for place in (folder, *inner) for note in (SAMPLES, MANIFEST))
+    if not folder.is_dir():
+        return False
+    with os.scandir(folder) as entries:  # which knows a folder without asking the disk about each file
+        places = [folder, *(Path(entry.path) for entry in entries if entry.is_dir())]
+    return any((place / note).is_file() for place in places for note in (SAMPLES, MANIFEST))
 
 
 def _noted(folder: Path) -> Reading | None:

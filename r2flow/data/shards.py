@@ -101,10 +101,6 @@ class Block(NamedTuple):
         return digest.hexdigest()
 
 
-def _inside(folder: Path) -> Iterator[Path]:
-    return folder.iterdir() if folder.is_dir() else iter(())
-
-
 class _Unwanted(Exception):
     """What was about to be written is there already."""
 
@@ -128,7 +124,7 @@ class PairStore:
     def _check_manifest(self) -> None:
         path = self.folder / MANIFEST
         if not path.is_file():
-            scan = next((one for one in _inside(self.folder) if one.name.endswith(FIRM_ENDINGS)), None)
+            scan = next((one for one in self.folder.glob("*") if one.name.endswith(FIRM_ENDINGS)), None)
             if scan is not None:
                 raise InputError(
                     f"{self.folder} holds scans ({scan.name}), and pairs are kept in a folder of their own: give "

@@ -12,7 +12,8 @@ def flattened(images: Tensor, rays: Tensor, sigma: float) -> Tensor:
     """Scans whose returns lie on the planes through their neighbours, (B, 2 or 1, H, W) as they were given.
 
     Along a plane 1 / (r cos e) is linear in tan e and, over a few columns, in the azimuth. Of each return with range r
-    it becomes what the plane has there that fits its window by least squares, with the weights
+    it becomes what the plane has there that fits its window by least squares, with the weights of a bilateral filter
+    (Tomasi and Manduchi 1998, bilateral filtering for gray and color images)
 
         exp(-log(r_n / r)^2 / (2 sigma^2)) exp(-(i^2 + j^2) / (2 REACH^2))
 
