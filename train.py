@@ -18,6 +18,6 @@ from r2flow.signals import heard_from_the_first_import
 
 if __name__ == "__main__":
     with heard_from_the_first_import():
-        from r2flow.launch import main
+        from r2flow.runs.launch import main
 
         sys.exit(main(sys.argv[1:], [sys.executable, str(Path(__file__).resolve())]))

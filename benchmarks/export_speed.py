@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 import r2flow
-from r2flow.export import compare, export
+from r2flow.model.export import compare, export
 from r2flow.noise import Draws
 
 

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.opening import open_scans
 from r2flow.evaluation.sets import reading_of_flow
 from r2flow.files import atomic_write
 from r2flow.metrics.fidelity import controls, distances, nearest, panel
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.reports.pages import STYLES, Page, blank_figure, picture, prepare_folder, write_page
 from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.tables import table

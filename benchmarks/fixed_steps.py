@@ -17,10 +17,10 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from r2flow.checkpoints import load_checkpoint
 from r2flow.flow.problems import PROBLEMS
 from r2flow.flow.solvers import Velocity, named_grid, solve
 from r2flow.inversion import rms
+from r2flow.model.checkpoint import load_checkpoint
 from r2flow.noise import Draws
 
 

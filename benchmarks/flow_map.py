@@ -67,7 +67,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from r2flow.checkpoints import load_checkpoint
 from r2flow.files import atomic_write
 from r2flow.flow.losses import pseudo_huber
 from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, jump
@@ -79,9 +78,10 @@ from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.metrics import METRICS
 from r2flow.metrics.fidelity import distances, panel
 from r2flow.metrics.scans import Scans
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.sampling import sample
 from r2flow.noise import Draws
 from r2flow.reports.tables import table
-from r2flow.sampling import sample
 from r2flow.simulator import simulate
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.checkpoints import large_matrices, load_checkpoint
 from r2flow.generators import Flow, as_flow
 from r2flow.metrics.fidelity import distances, panel
+from r2flow.model.checkpoint import large_matrices, load_checkpoint
+from r2flow.model.sampling import sample
 from r2flow.noise import Draws
 from r2flow.reports.tables import print_table
-from r2flow.sampling import sample
 
 TIMES = (0.0, 0.5, 0.9, 0.98)
 

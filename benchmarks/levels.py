@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from r2flow.accuracy import STEPS
-from r2flow.checkpoints import load_checkpoint
 from r2flow.errors import InputError
 from r2flow.flow.problems import Gaussian, Mixed, RayDrop, Straight, TwoModes
 from r2flow.flow.solvers import solve
 from r2flow.generators import Budget, Field, Flow, Sampler, levels
 from r2flow.inversion import rms
+from r2flow.model.checkpoint import load_checkpoint
 from r2flow.noise import Draws
 
 

@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.checkpoints import load_checkpoint
 from r2flow.flow.solvers.grids import build_grid
 from r2flow.flow.stochastic import CHURN, sde
 from r2flow.generators import Flow, as_flow
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.fidelity import distances, panel
+from r2flow.model.checkpoint import load_checkpoint
 from r2flow.noise import Draws
 from r2flow.progress import track
 from r2flow.reports.tables import print_table

@@ -21,12 +21,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.flow.solvers import Velocity, solve
 from r2flow.flow.straightness import curvature
 from r2flow.generators import Field
 from r2flow.metrics.fidelity import controls, distances, panel
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.noise import Draws
 from r2flow.reports.pages import Page, write_page
 from r2flow.reports.tables import table

@@ -22,9 +22,9 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from r2flow.checkpoints import load_checkpoint
 from r2flow.flow.problems import Gaussian, Problem, RayDrop, TwoModes
 from r2flow.flow.solvers import Velocity, solve
+from r2flow.model.checkpoint import load_checkpoint
 from r2flow.noise import Draws, standard_normal
 from r2flow.reports.tables import table
 

@@ -45,7 +45,6 @@ import torch
 from damage import CHOOSING, HIDDEN, KINDS, damaged
 from torch import Tensor
 
-from r2flow.checkpoints import load_checkpoint
 from r2flow.data.reading import Reading
 from r2flow.data.sources import SimulatedScans
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -57,12 +56,13 @@ from r2flow.metrics.fidelity import controls
 from r2flow.metrics.frechet import distance_from_roots
 from r2flow.metrics.kid import cubic_mmd
 from r2flow.metrics.scans import Scans
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.sampling import sample
 from r2flow.models import find_model
 from r2flow.noise import generator
 from r2flow.reports.fidelity import load_scans
 from r2flow.reports.pages import Page, prepare_folder, write_page
 from r2flow.reports.tables import table
-from r2flow.sampling import sample
 
 SENSOR = SENSORS["hdl64e"]
 SEEDS = {"choosing": 1701, "hidden": 1702}

@@ -22,15 +22,15 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from r2flow.checkpoints import load_checkpoint
 from r2flow.files import atomic_write
 from r2flow.flow.path import interpolate
 from r2flow.lidar.sensors import build_sensor
 from r2flow.metrics.fidelity import distances, panel
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.sampling import sample
 from r2flow.noise import standard_normal
 from r2flow.reports.pages import STYLES, blank_figure, few_log_ticks
 from r2flow.reports.tables import table
-from r2flow.sampling import sample
 from r2flow.simulator import simulate
 
 ROOT = Path(__file__).resolve().parents[1]

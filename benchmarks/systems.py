@@ -45,16 +45,16 @@ import lightning as L
 import numpy as np
 import torch
 
-from r2flow.checkpoints import load_checkpoint
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import build_sensor
 from r2flow.metrics.fidelity import controls, distances, panel
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.sampling import sample
 from r2flow.reports.pictures import FOREGROUND, dark_figure, draw_birds_eye, draw_range, save_figure
 from r2flow.reports.tables import table
 from r2flow.reports.verdicts import HOLDS, all_above_0, interval
-from r2flow.sampling import sample
 from r2flow.simulator import simulate
 from r2flow.training import build, compose, fit
 

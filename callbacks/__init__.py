@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 
-from r2flow.checkpoints import FOLDER
 from r2flow.errors import InputError
-from r2flow.lineage import drawn_by
+from r2flow.model.checkpoint import FOLDER
 from r2flow.registry import Count, Registry, check_options
+from r2flow.runs.lineage import drawn_by
 
 from .curvature import Curvature
 from .ema import EMA, HalfLifeEMA

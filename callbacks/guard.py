@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 
-from r2flow.checkpoints import checkpoints_of
 from r2flow.errors import InputError
+from r2flow.model.checkpoint import checkpoints_of
 from r2flow.registry import Count, NonNegative
 from r2flow.signals import outlive_parent
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import lightning as L
 
 from r2flow.generators import Generator
+from r2flow.model.sampling import draw
 from r2flow.registry import Count, Natural
-from r2flow.sampling import draw
 
 from .loggers import log_picture
 from .periodic import Periodic

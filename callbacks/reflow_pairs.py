@@ -2,8 +2,8 @@
 
 import lightning as L
 
-from r2flow.checkpoints import load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
+from r2flow.model.checkpoint import load_checkpoint
 from r2flow.reports.pairs import make_and_tell, wait_for_others
 
 

@@ -14,8 +14,8 @@ import lightning as L
 from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch.utilities import rank_zero_only
 
-from r2flow.checkpoints import FOLDER, checkpoints_of
 from r2flow.errors import InputError
+from r2flow.model.checkpoint import FOLDER, checkpoints_of
 from r2flow.registry import Count
 from r2flow.signals import LATER, STOPPING, Stopped, code_of, listening, outlive_parent
 

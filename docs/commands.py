@@ -15,9 +15,9 @@ import typer
 from hydra.errors import HydraException
 
 from r2flow.cli.verbs import USAGE_ERROR, app
-from r2flow.composing import CONF, compose, explain
 from r2flow.errors import InputError
 from r2flow.plugins import take_plugins
+from r2flow.runs.composing import CONF, compose, explain
 
 DOCS = Path(__file__).resolve().parent
 BLOCK = re.compile(r"^```sh\n(.*?)^```", re.M | re.S)

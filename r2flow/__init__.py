@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     import torch
 
-    from r2flow.checkpoints import Checkpoint
+    from r2flow.model.checkpoint import Checkpoint
 
 __version__ = "0.2.0"
 
@@ -36,9 +36,9 @@ def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoin
     Raises:
         InputError: there is none, or no such device.
     """
-    from r2flow.checkpoints import load_checkpoint  # takes as long as torch
     from r2flow.devices import choose_device
     from r2flow.errors import InputError
+    from r2flow.model.checkpoint import load_checkpoint  # takes as long as torch
 
     if not isinstance(name, str | os.PathLike):
         raise InputError(f"a model has a name, a run folder or a file; found {name!r}.")

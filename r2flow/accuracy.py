@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import torch
 
-from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
 from r2flow.flow.solvers import SOLVERS, FixedStep, check_method, fixed_step
 from r2flow.generators import Budget, FlowMap, Sampler, as_flow, levels
 from r2flow.generators.base import Progress
 from r2flow.inversion import metres_apart, rms
+from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import Draws
 
 GRIDS = ("uniform", *(f"power:{p}" for p in (1.25, 1.5, 1.75, 2, 2.5, 3)), "power-start:1.5", "power-start:2")
@@ -27,7 +27,7 @@ def calibrate(
     Of `GRIDS` the one is taken whose median error of an element, against a tight solution, is least in this number of
     steps. A mean would be that of rays at edges and of scans that come to another end: long steps near t = 1, where
     surfaces become smooth, hardly count in it (docs/models/street.md). The scans are other ones than those of
-    `r2flow.sampling.sample`.
+    `r2flow.model.sampling.sample`.
 
     Args:
         method: A predictor-corrector: adams2, adams3 or adams4.

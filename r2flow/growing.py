@@ -8,9 +8,9 @@ import torch
 from r2flow.backbones import HDiT, Pyramid
 from r2flow.backbones.base import CommonOptions
 from r2flow.backbones.encodings import position_name
-from r2flow.checkpoints import Checkpoint, as_parent, weights_hash
 from r2flow.errors import InputError
 from r2flow.generators import Generator, RectifiedFlow, build_generator
+from r2flow.model.checkpoint import Checkpoint, as_parent, weights_hash
 from r2flow.noise import seed_torch
 from r2flow.registry import options_of
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
 from r2flow.generators import FlowMap, Sampler, as_flow
 from r2flow.generators.base import CHORD, JUMP, Progress
+from r2flow.model.checkpoint import Checkpoint
 
 TIGHT = Sampler("dopri5", tolerance=1e-5)
 

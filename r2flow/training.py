@@ -23,8 +23,6 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from r2flow.callbacks import build_callbacks, build_loggers, log_config, log_figures
 from r2flow.callbacks.stopping import Stopping
-from r2flow.checkpoints import Allowance, checkpoints_of, step_of
-from r2flow.composing import check_keys, compose
 from r2flow.config import as_override, key_of
 from r2flow.data.contents import check_contents, record_contents
 from r2flow.data.datamodule import ScanDataModule
@@ -35,12 +33,14 @@ from r2flow.errors import InputError
 from r2flow.flow.solvers import check_method
 from r2flow.generators import GENERATORS, Flow, FlowMap, Generator, build_generator
 from r2flow.generators.base import WAYS
-from r2flow.lineage import READING, Parent, find_parent, inherit, with_scales
+from r2flow.model.checkpoint import Allowance, checkpoints_of, step_of
 from r2flow.noise import seed_torch
 from r2flow.plugins import made_with
 from r2flow.registry import Bound, Count, Natural, NonNegative, Positive, check_options
 from r2flow.reports.training import finish, read_curves
-from r2flow.runs import check_run, open_run, read_config, run_lock
+from r2flow.runs.composing import check_keys, compose
+from r2flow.runs.folder import check_run, open_run, read_config, run_lock
+from r2flow.runs.lineage import READING, Parent, find_parent, inherit, with_scales
 from r2flow.simulator.folder import MANIFEST
 from r2flow.stages import build_stage, check_roll
 from r2flow.stages.base import Stage

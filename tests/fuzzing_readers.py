@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from r2flow.checkpoints import load_checkpoint
 from r2flow.data.contents import check_contents
 from r2flow.data.opening import open_prepared, own_reading
 from r2flow.data.prepared import check_prepared
@@ -17,7 +16,8 @@ from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensor_files import read_sensor
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.extractors.weights import read_published
-from r2flow.runs import read_config
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.runs.folder import read_config
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from r2flow.accuracy import GRIDS, STEPS, calibrate, evaluations_of_calibration, sampler_within
-from r2flow.checkpoints import Checkpoint, keep_sampler, load_checkpoint, save_checkpoint
 from r2flow.errors import InputError
 from r2flow.flow.problems import Gaussian, Mixed, Straight, TwoModes
 from r2flow.flow.solvers import solve
 from r2flow.generators import Budget, Field, Sampler, build_generator, levels
+from r2flow.model.checkpoint import Checkpoint, keep_sampler, load_checkpoint, save_checkpoint
 from r2flow.noise import Draws
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 from tests.test_sampling import GaussianFlow, M, S, flow

@@ -10,9 +10,9 @@ import pytest
 import safetensors.torch
 import torch
 
-from r2flow.checkpoints import Checkpoint, checkpoints_of, load_checkpoint, save_checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.generators import Sampler, build_generator
+from r2flow.model.checkpoint import Checkpoint, checkpoints_of, load_checkpoint, save_checkpoint, weights_hash
 from r2flow.stages import build_stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 
@@ -309,8 +309,8 @@ def test_an_unfolding_checkpoint_brings_its_ring_angles(shared, tmp_path: Path):
 def test_loading_and_sampling_import_nothing_that_they_do_not_need(saved):
     code = f"""
 import sys
-from r2flow.checkpoints import load_checkpoint
-from r2flow.sampling import sample
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.sampling import sample
 
 (made,) = sample(load_checkpoint({str(saved[0])!r}), num=1, steps=2)
 assert made.images.shape == (1, 2, 8, 64)

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from r2flow import cli, load
-from r2flow.checkpoints import load_checkpoint
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS
+from r2flow.model.checkpoint import load_checkpoint
 from tests.data.conftest import write_scan
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
 
@@ -230,7 +230,7 @@ def test_too_much_at_once_is_one_line(r2flow, monkeypatch, tmp_path, error, word
     def full(*_, **__):
         raise error
 
-    monkeypatch.setattr("r2flow.checkpoints.load_checkpoint", full)
+    monkeypatch.setattr("r2flow.model.checkpoint.load_checkpoint", full)
     for more, instead in ((("--batch-size", 4), "a smaller --batch-size"), ((), "smaller batches or images")):
         code, _, said = r2flow("sample", "-o", tmp_path, *more)
         assert code == 2
@@ -243,7 +243,7 @@ def test_another_error_of_torch_keeps_its_traceback(r2flow, monkeypatch, tmp_pat
     def broken(*_, **__):
         raise RuntimeError("shapes do not match")
 
-    monkeypatch.setattr("r2flow.checkpoints.load_checkpoint", broken)
+    monkeypatch.setattr("r2flow.model.checkpoint.load_checkpoint", broken)
     with pytest.raises(RuntimeError, match="shapes"):
         r2flow("sample", "-o", tmp_path)
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.checkpoints import Checkpoint, save_checkpoint
 from r2flow.data.opening import open_scans
 from r2flow.generators import Sampler, build_generator
 from r2flow.lidar.projection import image_to_points
@@ -22,6 +21,7 @@ from r2flow.metrics import METRICS
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.sums import SumMetric
+from r2flow.model.checkpoint import Checkpoint, save_checkpoint
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_evaluation import SENSOR, folder, generated, images, real  # noqa: F401  fixtures

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.checkpoints import load_checkpoint
 from r2flow.data.opening import SAMPLES
 from r2flow.errors import InputError
 from r2flow.generators import Sampler
@@ -17,6 +16,7 @@ from r2flow.inversion import invert
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
+from r2flow.model.checkpoint import load_checkpoint
 from r2flow.reports.savings import scan_rows
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.test_cli import r2flow  # noqa: F401  a fixture
@@ -245,7 +245,9 @@ def test_what_is_not_asked_for_is_not_imported():
     shown = "print([m for m in ({}) if m in sys.modules]); "
     code = "import r2flow.flow.solvers, r2flow.flow.problems, r2flow.lidar.region, r2flow.backbones, sys; "
     code += shown.format("'lightning', 'matplotlib', 'torchdiffeq', 'r2flow.simulator'")
-    code += "import r2flow.sampling, r2flow.reports.inversion, r2flow.reports.interpolation, r2flow.reports.savings; "
+    code += (
+        "import r2flow.model.sampling, r2flow.reports.inversion, r2flow.reports.interpolation, r2flow.reports.savings; "
+    )
     code += shown.format("'r2flow.simulator', 'tensorboard', 'torchdiffeq', 'plotly', 'natten'")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split("\n") == ["[]", "[]", ""]

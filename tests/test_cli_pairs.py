@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from r2flow.checkpoints import load_checkpoint, weights_hash
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairSource
 from r2flow.data.shards import PairStore
-from r2flow.lineage import pairs_of
+from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.reports.pairs import place
+from r2flow.runs.lineage import pairs_of
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 
@@ -37,7 +37,7 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):  # noqa: F811
 
 
 def test_an_unfinished_run_draws_no_pairs(r2flow, saved):  # noqa: F811
-    from r2flow.checkpoints import read_checkpoint
+    from r2flow.model.checkpoint import read_checkpoint
     from r2flow.stages.checkpointing import AtomicCheckpointIO
 
     path, _ = saved

@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from r2flow.checkpoints import Checkpoint
-from r2flow.completion import ANSWER, ROUGH, SURE, TAILS, complete, completing, settled, spread_of
 from r2flow.errors import InputError
 from r2flow.generators import Generator, Sampler, build_generator
 from r2flow.lidar.known import Ray, parse_mask, ray_states
+from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.completion import ANSWER, ROUGH, SURE, TAILS, complete, completing, settled, spread_of
 from r2flow.noise import Draws, generator
 from tests.test_checkpoints import CONFIG
 

@@ -11,11 +11,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from r2flow.backbones import BACKBONES
 from r2flow.callbacks import CALLBACKS
-from r2flow.composing import CONF, choices, compose
 from r2flow.config import RULES, Key, as_override, flatten, key_of, rule
 from r2flow.data.augment import Augmentation
 from r2flow.data.options import DataOptions, PairOptions
 from r2flow.registry import options_of
+from r2flow.runs.composing import CONF, choices, compose
 from r2flow.stages import STAGES
 
 CONFIG = compose()

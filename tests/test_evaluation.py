@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.checkpoints import Checkpoint
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
 from r2flow.errors import InputError
@@ -25,6 +24,7 @@ from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.jsd import JSD
 from r2flow.metrics.mmd import MMD
+from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import standard_normal
 from tests.data.conftest import kitti_360  # noqa: F401  a fixture
 from tests.test_sampling import flow as without_config

@@ -12,10 +12,10 @@ import torch
 
 from r2flow import __version__, cli
 from r2flow.backbones import BACKBONES
-from r2flow.checkpoints import Checkpoint, save_checkpoint
 from r2flow.errors import InputError
-from r2flow.export import NOTES, compare, export, tableau
 from r2flow.generators import Sampler, build_generator
+from r2flow.model.checkpoint import Checkpoint, save_checkpoint
+from r2flow.model.export import NOTES, compare, export, tableau
 from r2flow.noise import Draws
 from tests.conftest import ROOT
 

@@ -17,8 +17,8 @@ from r2flow.flow.path import interpolate
 from r2flow.flow.problems import Gaussian
 from r2flow.generators import Field, FlowMap, RectifiedFlow, Sampler, build_generator
 from r2flow.lidar.region import Region
-from r2flow.lineage import Parent, generator_of
 from r2flow.noise import Draws, standard_normal
+from r2flow.runs.lineage import Parent, generator_of
 from r2flow.stages import build_stage
 from r2flow.stages.flow_map import LearnFlowMap, paths_of
 from r2flow.training import check, compose

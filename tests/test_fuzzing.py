@@ -15,7 +15,6 @@ import pytest
 import torch
 import yaml
 
-from r2flow.checkpoints import load_checkpoint, save_checkpoint
 from r2flow.data.contents import RECORD, record_contents
 from r2flow.data.opening import samples_note, write_samples_note
 from r2flow.data.preparing import Preparation, plan_files
@@ -24,6 +23,7 @@ from r2flow.data.shards import Block, PairRecipe, PairStore
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensor_files import write_sensor
 from r2flow.lidar.sensors import SENSORS
+from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 from tests.lidar.test_scan_files_damage import PCD_OF_4, TEXT, compressed, ply_ascii
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from r2flow.checkpoints import Checkpoint, load_checkpoint, save_checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.flow.maps import jump
 from r2flow.generators import FlowMap, Sampler, build_generator
 from r2flow.generators.budgets import Budget
 from r2flow.growing import grown, widened
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, weights_hash
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 

@@ -17,7 +17,7 @@ def test_torch_hub_gives_the_model_of_the_package():
 
 def test_a_folder_for_the_hub_holds_the_flow_and_nothing_else(tmp_path):
     pytest.importorskip("huggingface_hub")
-    from r2flow.hub import HubFlow
+    from r2flow.model.hub import HubFlow
 
     HubFlow("street").save_pretrained(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"README.md", "model.safetensors"}
@@ -33,7 +33,7 @@ class Trap:
 
 def test_nothing_in_such_a_folder_is_unpickled(tmp_path):
     pytest.importorskip("huggingface_hub")
-    from r2flow.hub import FILE, HubFlow
+    from r2flow.model.hub import FILE, HubFlow
 
     for name in ("pytorch_model.bin", "model.pt", "step-00000001.ckpt"):
         (tmp_path / name).write_bytes(pickle.dumps(Trap()))
@@ -46,7 +46,7 @@ def test_nothing_in_such_a_folder_is_unpickled(tmp_path):
 
 def test_what_from_pretrained_does_not_know_is_refused(tmp_path):
     pytest.importorskip("huggingface_hub")
-    from r2flow.hub import HubFlow
+    from r2flow.model.hub import HubFlow
 
     HubFlow("street").save_pretrained(tmp_path)
     with pytest.raises(InputError, match="does not know stepps; it takes device, revision"):

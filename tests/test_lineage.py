@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from r2flow.checkpoints import load_checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
-from r2flow.lineage import Parent, drawn_by, find_parent, inherit, with_scales
+from r2flow.model.checkpoint import load_checkpoint, weights_hash
+from r2flow.runs.lineage import Parent, drawn_by, find_parent, inherit, with_scales
 from r2flow.stages import build_stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from r2flow.checkpoints import find_checkpoint, load_checkpoint, save_checkpoint
 from r2flow.config import learned
 from r2flow.data.pairs import default_folder
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import is_checkpoint
+from r2flow.model.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint
 from r2flow.models import MODELS, SHIPPED, Model, add_model, find_model, model_file, name_of
 from r2flow.reports.contents import card, describe
 from tests.test_checkpoints import saved  # noqa: F401  a fixture

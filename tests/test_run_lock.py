@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from r2flow.errors import InputError
-from r2flow.runs import run_lock
+from r2flow.runs.folder import run_lock
 
 HOLD = """
 import sys, time
-from r2flow.runs import run_lock
+from r2flow.runs.folder import run_lock
 with run_lock(sys.argv[1]):
     print("held", flush=True)
     time.sleep(60)

@@ -9,8 +9,6 @@ import pytest
 import torch
 from torch import nn
 
-from r2flow.checkpoints import Checkpoint
-from r2flow.composing import compose
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import sampled_set
 from r2flow.generators import Field, Sampler, build_generator
@@ -20,9 +18,11 @@ from r2flow.lidar.planes import flattened
 from r2flow.lidar.region import Region, region
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
+from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.sampling import draw, evaluated_region, sample
 from r2flow.noise import Draws
 from r2flow.reports.outputs import write_samples
-from r2flow.sampling import draw, evaluated_region, sample
+from r2flow.runs.composing import compose
 from tests.test_checkpoints import CONFIG
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)

@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 import yaml
 
-import r2flow.chain
+import r2flow.runs.chain
 import r2flow.training
 from r2flow import cli
-from r2flow.checkpoints import load_checkpoint, save_checkpoint
 from r2flow.generators import build_generator
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
+from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 from r2flow.stages import build_stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.test_checkpoints import CONFIG
@@ -816,7 +816,7 @@ def refused(place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
         raise AssertionError("it would train")
 
     monkeypatch.setattr(r2flow.training, "fit", ready)
-    monkeypatch.setattr(r2flow.chain, "run_process", lambda command: pytest.fail("it would start a run"))
+    monkeypatch.setattr(r2flow.runs.chain, "run_process", lambda command: pytest.fail("it would start a run"))
 
     def check(line: str) -> None:
         command, _, words = line.partition(" # ")

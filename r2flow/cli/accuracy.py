@@ -34,12 +34,12 @@ def curvature(
     most_curved: Annotated[int, typer.Option(min=1, help="Pixels whose paths are drawn.")] = 200,
 ) -> None:
     """How straight trained flows are: s(t), and the paths of the most curved pixels (the paper's figure 8)."""
-    from r2flow.checkpoints import load_checkpoint
     from r2flow.generators import as_flow
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.model.sampling import batches
     from r2flow.progress import Bar
     from r2flow.reports.curvature import curvature_page, measure_paths
     from r2flow.reports.pages import prepare_folder
-    from r2flow.sampling import batches
 
     where = choose_device(draw.device)
     loaded = {str(path): load_checkpoint(path, where) for path in dict.fromkeys(checkpoints)}
@@ -85,9 +85,9 @@ def work_precision(
     checkpoint: OptionalCheckpoint = None,
 ) -> None:
     """Error of every solver against evaluations and time, on exact problems and on a checkpoint."""
-    from r2flow.checkpoints import load_checkpoint
     from r2flow.flow.solvers import check_tolerance
     from r2flow.generators import as_flow
+    from r2flow.model.checkpoint import load_checkpoint
     from r2flow.noise import Draws
     from r2flow.progress import Bar
     from r2flow.reports import work_precision as measuring
@@ -167,9 +167,9 @@ def savings(
     device: DeviceOption = "auto",
 ) -> None:
     """What a scan need not cost: own steps, leaving early, regions, single channels."""
-    from r2flow.checkpoints import load_checkpoint
     from r2flow.flow.solvers import check_tolerance
     from r2flow.generators import as_flow
+    from r2flow.model.checkpoint import load_checkpoint
     from r2flow.progress import Bar
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.savings import evaluations_of_page, savings_page

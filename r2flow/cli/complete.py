@@ -22,7 +22,7 @@ from r2flow.cli.options import (
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
-    from r2flow.checkpoints import Checkpoint
+    from r2flow.model.checkpoint import Checkpoint
 
 
 @dataclass(frozen=True)
@@ -95,11 +95,11 @@ def complete(
 
     import numpy as np
 
-    from r2flow.checkpoints import load_checkpoint
-    from r2flow.completion import KEEP, completing
     from r2flow.data.partial import open_partial
     from r2flow.evaluation.sets import reading_of_flow
     from r2flow.lidar.known import mask_identity, parse_mask
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.model.completion import KEEP, completing
     from r2flow.models import DEFAULT, MODELS, find_model
     from r2flow.reports.completed import WRITTEN, Job, answer_ending, write_completed
 

@@ -16,7 +16,6 @@ from r2flow.cli.options import SETS, OutOption, PrecisionOption, choose_device, 
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
-    from r2flow.checkpoints import Checkpoint
     from r2flow.data.reading import Reading
     from r2flow.data.sets import ScanSet
     from r2flow.evaluation.measuring import Work
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from r2flow.evaluation.protocols import Rules
     from r2flow.evaluation.statistics import Cache
     from r2flow.metrics.base import ScanMetric
+    from r2flow.model.checkpoint import Checkpoint
     from r2flow.reports.speed_quality import Drawing
 
 log = logging.getLogger(__name__)
@@ -382,7 +382,7 @@ def _is_flow(text: str | None) -> bool:
 
 
 def _load_flows(paths: list[Path], device: str) -> "dict[str, Checkpoint]":
-    from r2flow.checkpoints import load_checkpoint
+    from r2flow.model.checkpoint import load_checkpoint
 
     flows = {str(path): load_checkpoint(path, device) for path in dict.fromkeys(paths)}
     sensors = {(flow.sensor.shape, flow.sensor.elevations) for flow in flows.values()}

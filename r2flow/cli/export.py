@@ -30,9 +30,9 @@ def export(
 
     The number of steps is fixed by the file. The file is run and compared with the flow.
     """
-    from r2flow import export as writing
-    from r2flow.checkpoints import load_checkpoint
     from r2flow.generators import Sampler
+    from r2flow.model import export as writing
+    from r2flow.model.checkpoint import load_checkpoint
 
     writing.FORMATS[to]
     if what not in ("sampler", "network"):

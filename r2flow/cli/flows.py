@@ -25,8 +25,8 @@ from r2flow.config import as_override
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
-    from r2flow.checkpoints import Checkpoint
     from r2flow.lidar.region import Region
+    from r2flow.model.checkpoint import Checkpoint
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class RegionOptions:
     def region(self, checkpoint: "Checkpoint") -> "Region | None":
         """The region of --sector and --rows; prints what is generated for it."""
         from r2flow.lidar.region import MARGIN, region
-        from r2flow.sampling import evaluated_region
+        from r2flow.model.sampling import evaluated_region
 
         if self.sector is None and self.margin is not None:
             raise InputError("--margin is for a --sector; found none.")
@@ -104,7 +104,7 @@ def sample(
     Solver, steps and tolerance are the generator's own if left out.
     """
     from r2flow.accuracy import sampler_within
-    from r2flow.checkpoints import load_checkpoint
+    from r2flow.model.checkpoint import load_checkpoint
     from r2flow.models import DEFAULT, MODELS, find_model
     from r2flow.reports.outputs import formats_of, write_samples
 
@@ -139,7 +139,7 @@ def calibrate(
     """Find the time grid that suits a flow, measure its errors, and keep both in the checkpoint."""
     from r2flow.accuracy import calibrate as measure
     from r2flow.accuracy import check_calibrates, check_predictor_corrector, evaluations_of_calibration
-    from r2flow.checkpoints import keep_sampler, load_checkpoint
+    from r2flow.model.checkpoint import keep_sampler, load_checkpoint
     from r2flow.models import MODELS
     from r2flow.progress import Bar
     from r2flow.reports.tables import print_table
@@ -194,7 +194,7 @@ def convert(
     """
     import hashlib
 
-    from r2flow.checkpoints import load_checkpoint, save_checkpoint
+    from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 
     found = load_checkpoint(checkpoint)
     _keep_source(found, out)
@@ -227,8 +227,8 @@ def grow(
     trained flow. What is finer than these means is noise until it is trained. With --detail and --position alone it
     draws the same scans, and can learn more.
     """
-    from r2flow.checkpoints import load_checkpoint, save_checkpoint
     from r2flow.growing import grown, widened
+    from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 
     if out.suffix != ".safetensors":
         raise InputError(f"{out}: give a .safetensors, which holds a flow and its config.")

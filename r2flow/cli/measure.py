@@ -87,9 +87,9 @@ def completion(
     """Hide a part of scans and complete them, by models and by plain interpolation: errors against evaluations."""
     import numpy as np
 
-    from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.output import command, finish, numbers
     from r2flow.flow.posterior import methods_in
+    from r2flow.model.checkpoint import load_checkpoint
     from r2flow.progress import Bar
     from r2flow.reports.completion import TASKS, completion_page, completion_rows, given_by, pictured, ways_of
     from r2flow.reports.inversion import real_scans

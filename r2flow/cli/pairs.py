@@ -76,13 +76,13 @@ def pairs(
     SLURM array, with the settings of `data.pairs`. The solver is adams3 in 32 steps if left out; --solver dopri5 is the
     paper's; --solver chord or renoise gives a flow map's first jump as its later ones correct it.
     """
-    from r2flow.checkpoints import load_checkpoint, weights_hash
     from r2flow.data.options import PairOptions
     from r2flow.data.pairs import default_folder
     from r2flow.data.shards import PairStore
     from r2flow.generators.base import check_control
-    from r2flow.lineage import check_finished, pairs_of
+    from r2flow.model.checkpoint import load_checkpoint, weights_hash
     from r2flow.reports.pairs import make_and_tell
+    from r2flow.runs.lineage import check_finished, pairs_of
 
     rank, ranks, where = share.place()
     flow = load_checkpoint(checkpoint)

@@ -87,10 +87,10 @@ def paper(
 
 def real_set(text: str, split: str | None, run: Path, protocol: str | None = None) -> "ScanSet":
     """The real scans as a run's flow sees them; those that may be compared as in the paper, projected as there."""
-    from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.evaluate import reading_of
     from r2flow.data.opening import open_scans
     from r2flow.evaluation.protocols import PAPER
+    from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.paper.report import not_as_printed
 
     reading = reading_of([text], [load_checkpoint(run)])

@@ -14,6 +14,6 @@ from r2flow.cli.app import app
 )
 def train(context: typer.Context) -> int:
     """Train a flow: keys and choices of the config as KEY=VALUE; --help lists the choices, --cfg job every key."""
-    from r2flow.launch import main
+    from r2flow.runs.launch import main
 
     return main(context.args, [sys.executable, "-m", "r2flow.cli", "train"])

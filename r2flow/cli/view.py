@@ -125,8 +125,8 @@ def view(
 
 
 def _drawn(name: str, num: int, how: GeneratorOptions) -> "tuple[Sequence[Panel], list[str]]":
-    from r2flow.checkpoints import load_checkpoint
     from r2flow.cli.output import numbers
+    from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.view.panels import sample_panels, way_panels
 
     steps = numbers("steps", how.steps, int) if how.steps else []

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from r2flow.checkpoints import Checkpoint, checkpoints_of, weights_hash
 from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
 from r2flow.generators import Sampler
+from r2flow.model.checkpoint import Checkpoint, checkpoints_of, weights_hash
+from r2flow.model.sampling import draw
 from r2flow.models import MODELS
-from r2flow.sampling import draw
 
 __all__ = ["SampledScans", "ScanSet", "fixed_choice", "is_checkpoint", "reading_of_flow", "sampled_set"]
 

@@ -11,20 +11,20 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.files import atomic_write
 from r2flow.flow.straightness import curvature
 from r2flow.generators import Flow
 from r2flow.metrics.fidelity import distances, panel
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint
+from r2flow.model.sampling import sample
 from r2flow.noise import Draws
 from r2flow.progress import track
 from r2flow.reports.outputs import draw_pages, what_next, write_scan
 from r2flow.reports.pages import Page, write_page
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, dark_figure, draw_range
 from r2flow.reports.tables import print_table, table
-from r2flow.runs import read_config
-from r2flow.sampling import sample
+from r2flow.runs.folder import read_config
 
 MANY = 32  # steps that are taken for the limit of many
 

@@ -17,16 +17,16 @@ import yaml
 from matplotlib.figure import Figure
 
 from r2flow.backbones.cost import count_macs, count_parameters
-from r2flow.checkpoints import checkpoints_of, step_of
 from r2flow.config import flatten
 from r2flow.errors import InputError, naming
 from r2flow.files import read_json
 from r2flow.generators import RectifiedFlow, build_generator
+from r2flow.model.checkpoint import checkpoints_of, step_of
 from r2flow.reports.backbones import latency
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
 from r2flow.reports.tables import print_table, shown, table
 from r2flow.reports.training import Curve, read_curves
-from r2flow.runs import CONFIG, contradictions, read_config
+from r2flow.runs.folder import CONFIG, contradictions, read_config
 
 log = logging.getLogger(__name__)
 

@@ -12,8 +12,6 @@ import numpy as np
 import torch
 
 from r2flow import noise
-from r2flow.checkpoints import Checkpoint, weights_hash
-from r2flow.completion import Completed, complete
 from r2flow.data.opening import SAMPLES, write_samples_note
 from r2flow.data.partial import PartialScan
 from r2flow.errors import InputError
@@ -25,6 +23,8 @@ from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.transfer import Partial
 from r2flow.metrics.completion import errors
+from r2flow.model.checkpoint import Checkpoint, weights_hash
+from r2flow.model.completion import Completed, complete
 from r2flow.reports.outputs import ScanBar, note_of, warn_unsolved
 from r2flow.reports.pictures import completed_figure, save_figure
 from r2flow.reports.view import write_page
@@ -41,10 +41,10 @@ class Job:
 
     Attributes:
         num: Answers to each scan.
-        keep: As in `r2flow.completion.complete`.
+        keep: As in `r2flow.model.completion.complete`.
         mask: Of the measured rays of each scan those that are kept; None for all.
         fill_gaps: Whether rays without a return count as not measured.
-        on_surfaces: As in `r2flow.completion.complete`.
+        on_surfaces: As in `r2flow.model.completion.complete`.
         pictures: How many scans get a picture and a page in 3-D.
     """
 

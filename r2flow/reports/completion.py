@@ -10,8 +10,6 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from r2flow import noise
-from r2flow.checkpoints import Checkpoint
-from r2flow.completion import complete, completing
 from r2flow.errors import InputError
 from r2flow.generators import Regression, Sampler
 from r2flow.generators.base import Progress
@@ -21,6 +19,8 @@ from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.completion import UNITS, errors, spread_errors
 from r2flow.metrics.fidelity import PANEL, distances, panel
+from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.completion import complete, completing
 from r2flow.reports.pages import Page
 from r2flow.reports.pictures import completed_figure
 from r2flow.reports.tables import table
@@ -139,7 +139,7 @@ def completion_rows(
         truths: Range images, (2 or 1, H, W).
         answers: To each scan; interpolations have one.
         batch_size: Answers at once.
-        on_surfaces: As in `r2flow.completion.complete`.
+        on_surfaces: As in `r2flow.model.completion.complete`.
     """
     whole = panel(np.stack(truths), sensor)
     for task in tasks:

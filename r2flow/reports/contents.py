@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.backbones import Backbone
-from r2flow.checkpoints import load_checkpoint
 from r2flow.config import flatten
 from r2flow.generators import Sampler
+from r2flow.model.checkpoint import load_checkpoint
 from r2flow.models import MODELS, name_of
 from r2flow.reports.tables import print_table, table
 

@@ -11,10 +11,10 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from r2flow.checkpoints import Checkpoint
 from r2flow.flow.straightness import straightness
 from r2flow.generators import as_flow
 from r2flow.generators.base import Progress
+from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import Draws
 from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.tables import table

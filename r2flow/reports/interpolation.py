@@ -8,12 +8,12 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from r2flow.checkpoints import Checkpoint
 from r2flow.data.sources import spread
 from r2flow.errors import InputError
 from r2flow.generators import Sampler, as_flow
 from r2flow.inversion import TIGHT, interpolate_scans
 from r2flow.lidar.projection import image_to_points
+from r2flow.model.checkpoint import Checkpoint
 from r2flow.reports.inversion import COLUMNS, Real, errors_of
 from r2flow.reports.outputs import ScanBar, warn_unsolved, write_scan
 from r2flow.reports.pages import Page, prepare_folder

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.checkpoints import Checkpoint
 from r2flow.data.opening import open_scans
 from r2flow.evaluation.sets import reading_of_flow
 from r2flow.files import atomic_write
 from r2flow.generators import Sampler, as_flow
 from r2flow.inversion import TIGHT, Inversion, invert, round_trip
+from r2flow.model.checkpoint import Checkpoint
 from r2flow.reports.outputs import ScanBar
 from r2flow.reports.pages import Page, prepare_folder
 from r2flow.reports.pictures import contact_sheet

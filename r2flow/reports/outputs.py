@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.config import as_override
 from r2flow.data.opening import SAMPLES, samples_note, write_samples_note
 from r2flow.errors import InputError
@@ -22,9 +21,10 @@ from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.region import Region
 from r2flow.lidar.scan_files import FIRM_ENDINGS, write_points
+from r2flow.model.checkpoint import Checkpoint, weights_hash
+from r2flow.model.sampling import batches, draw
 from r2flow.progress import Bar, track
 from r2flow.reports.view import most_images, write_page
-from r2flow.sampling import batches, draw
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ def write_samples(
         formats: All that fit if left out. `ply` and `bin` are points in metres with reflectance, `npy` the range image,
             float32 (2 or 1, H, W) in metres and reflectance; reflectance alone is `NNNNNN.reflectance.npy`.
         pictures: How many scans get a page of their own; the contact sheet shows at most 8 of them.
-        region, channels: See `r2flow.sampling.sample`. Files are of the sensor's shape, 0 outside the region.
+        region, channels: See `r2flow.model.sampling.sample`. Files are of the sensor's shape, 0 outside the region.
         replace: Whether more samples of other settings than `num` are replaced.
 
     Returns:

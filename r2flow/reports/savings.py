@@ -12,19 +12,19 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from r2flow.checkpoints import Checkpoint
 from r2flow.errors import InputError
 from r2flow.flow.problems import PROBLEMS, Mixed
 from r2flow.generators import Field, Flow, Sampler, as_flow
 from r2flow.generators.base import Progress
 from r2flow.inversion import metres_apart, rms
 from r2flow.lidar.region import Region, region
+from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.sampling import evaluated_region
 from r2flow.noise import Draws
 from r2flow.reports.outputs import write_scan
 from r2flow.reports.pages import Page, blank_figure
 from r2flow.reports.tables import shown, table
 from r2flow.reports.timing import timed
-from r2flow.sampling import evaluated_region
 
 Row = dict[str, Any]
 

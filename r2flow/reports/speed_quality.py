@@ -10,7 +10,6 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.evaluation.measuring import Gathered, Work, measure, point_key
 from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
@@ -18,6 +17,7 @@ from r2flow.files import read_json
 from r2flow.flow.solvers import adapts
 from r2flow.generators import Sampler
 from r2flow.metrics.base import ScanMetric
+from r2flow.model.checkpoint import Checkpoint, weights_hash
 from r2flow.reports.evaluation import heading
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
 from r2flow.reports.tables import shown, table

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from r2flow.checkpoints import checkpoints_of, find_checkpoint, load_checkpoint
+from r2flow.model.checkpoint import checkpoints_of, find_checkpoint, load_checkpoint
 from r2flow.reports.outputs import what_next, write_samples
 
 log = logging.getLogger(__name__)

@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 
-from r2flow.checkpoints import read_checkpoint
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
+from r2flow.model.checkpoint import read_checkpoint
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):

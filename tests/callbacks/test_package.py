@@ -5,7 +5,7 @@ import lightning as L
 import pytest
 
 from r2flow.callbacks import CALLBACKS, build_callbacks
-from r2flow.composing import compose
+from r2flow.runs.composing import compose
 from tests.conftest import ROOT
 
 

@@ -15,8 +15,8 @@ from hydra.core.config_store import ConfigStore
 from r2flow import cli, plugins
 from r2flow.backbones import BACKBONES
 from r2flow.callbacks import CALLBACKS
-from r2flow.composing import REGISTRIES
 from r2flow.generators import GENERATORS
+from r2flow.runs.composing import REGISTRIES
 from r2flow.stages import STAGES
 from tests.training.conftest import Done
 

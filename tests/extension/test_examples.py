@@ -5,14 +5,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from r2flow.checkpoints import load_checkpoint
 from r2flow.errors import InputError
 from r2flow.generators import GENERATORS, Sampler
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.sampling import sample
 from r2flow.noise import Draws
-from r2flow.sampling import sample
 from tests.extension.conftest import BACKBONE, COMPLETION, DDPM, GAN, loaded
 
 M, S = 0.1, 0.2  # x_1 ~ N(M, S^2) in every pixel

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint
+from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint
 from r2flow.training import compose
 from tests.extension.conftest import (
     BACKBONE,

@@ -10,15 +10,15 @@ from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.export import tableau
 from r2flow.flow.posterior import methods_in
 from r2flow.flow.solvers import check_method, named_grid
 from r2flow.flow.stochastic import ahead, back, churn_of, sde, sde_step
 from r2flow.generators import USUAL, Field, Sampler, build_generator
 from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.region import Region
+from r2flow.model.export import tableau
+from r2flow.model.sampling import draw
 from r2flow.noise import Draws
-from r2flow.sampling import draw
 
 STD = 0.4  # of x_1 ~ N(0, STD^2), where everything is linear
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.checkpoints import Checkpoint
 from r2flow.cli import main
 from r2flow.errors import InputError
 from r2flow.generators import Generated, build_generator
 from r2flow.lidar.interpolation import OPPONENTS, guess
 from r2flow.lidar.known import Ray
 from r2flow.metrics.completion import errors
+from r2flow.model.checkpoint import Checkpoint
 from r2flow.reports.completion import Way, completion_rows, given_by, ways_of
 from tests.stages.test_conditional import CONFIG
 

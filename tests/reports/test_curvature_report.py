@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch import nn
 
-from r2flow.checkpoints import Checkpoint
 from r2flow.generators import Field
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
+from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import Draws
 from r2flow.reports.curvature import (
     Paths,

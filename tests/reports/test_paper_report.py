@@ -8,12 +8,11 @@ import pytest
 import torch
 import yaml
 
-from r2flow.checkpoints import load_checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.evaluation.protocols import R2FLOW
 from r2flow.generators import build_generator
-from r2flow.lineage import Parent
 from r2flow.metrics.birds_eye import js_distance
+from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.reports.paper import cells
 from r2flow.reports.paper.figures import marginals, marginals_apart
 from r2flow.reports.paper.page import from_above, remarks_of
@@ -21,6 +20,7 @@ from r2flow.reports.paper.report import held_out
 from r2flow.reports.paper.subjects import find_subjects
 from r2flow.reports.paper.tables import beside, differences, over_seeds, same_architecture
 from r2flow.reports.speed_quality import BETWEEN
+from r2flow.runs.lineage import Parent
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from r2flow.training import check, compose
 from tests.test_cli import r2flow  # noqa: F401  a fixture
@@ -105,7 +105,7 @@ def test_runs_without_a_first_flow_or_of_two_sensors_are_refused(chains, tmp_pat
     other = make_run(tmp_path / "other", {"name": "rectify"})
     config = load_checkpoint(other).config
     path = other / "checkpoints" / "step-00000007.ckpt"
-    from r2flow.checkpoints import read_checkpoint
+    from r2flow.model.checkpoint import read_checkpoint
 
     content = {**read_checkpoint(path), "config": {**config, "sensor": {**config["sensor"], "max_range": 70.0}}}
     AtomicCheckpointIO().save_checkpoint(content, path)

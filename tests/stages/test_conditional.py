@@ -9,7 +9,6 @@ from scipy.stats import norm
 
 from r2flow import noise
 from r2flow.backbones import Pyramid
-from r2flow.completion import complete
 from r2flow.data.loader import FlowDataset
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
@@ -24,6 +23,7 @@ from r2flow.generators import (
     condition_of,
 )
 from r2flow.lidar.known import Ray, parse_mask, ray_states
+from r2flow.model.completion import complete
 from r2flow.noise import Draws
 from r2flow.stages import build_stage
 from r2flow.stages.conditional import Conditional, LearnConditionalMap, Regress, Tasks

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from r2flow.checkpoints import checkpoints_of, read_checkpoint
+from r2flow.model.checkpoint import checkpoints_of, read_checkpoint
 from tests.systems.test_gans import assert_equal
 from tests.training.conftest import hold_at, in_process, let_go, start, wait_for
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from r2flow.checkpoints import checkpoints_of, load_checkpoint
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
-from r2flow.lineage import Parent
+from r2flow.model.checkpoint import checkpoints_of, load_checkpoint
+from r2flow.runs.lineage import Parent
 from r2flow.training import build, check, compose, fit
 
 TINY = [

@@ -10,13 +10,13 @@ from published_cases import assert_near, assert_norms, load_case
 
 from r2flow.backbones.refinenet import InstanceNormPlus, RefineNet
 from r2flow.callbacks.ema import DECAYS
-from r2flow.checkpoints import load_checkpoint
 from r2flow.diffusion.langevin import annealed_langevin, noise_levels, score_loss, step_sizes, toward
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import project_indices
 from r2flow.lidar.sensors import build_sensor
+from r2flow.model.checkpoint import load_checkpoint
 from r2flow.noise import Draws
 
 TINY = {

@@ -17,7 +17,6 @@ from r2flow.backbones.latent_unet import LatentUNet
 from r2flow.backbones.patch_discriminator import PatchDiscriminator
 from r2flow.backbones.quantiser import Quantiser
 from r2flow.callbacks.ema import DECAYS
-from r2flow.checkpoints import load_checkpoint
 from r2flow.cli import main
 from r2flow.diffusion.ddim import (
     Tables,
@@ -34,10 +33,11 @@ from r2flow.generators import LatentDiffusion, build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import project, unproject
 from r2flow.lidar.sensors import build_sensor
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.sampling import sample
 from r2flow.noise import Draws
 from r2flow.published.lidm import _autoencoder, _unet
 from r2flow.registry import options_of
-from r2flow.sampling import sample
 from r2flow.stages.latent import returns
 
 SMALL_AUTOENCODER = {"width": 32, "multipliers": [1, 1], "strides": [[2, 2]], "blocks": 1, "codes": 16}

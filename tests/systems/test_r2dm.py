@@ -16,7 +16,6 @@ from torch import Tensor
 
 from r2flow.backbones import Backbone, build_backbone
 from r2flow.callbacks.ema import ema_decay
-from r2flow.checkpoints import checkpoints_of, load_checkpoint
 from r2flow.cli.verbs import app
 from r2flow.diffusion.discrete import BETAS, tables
 from r2flow.diffusion.log_snr import SCHEDULES, Cosine, alpha_sigma, log_snr_of, straight_time
@@ -29,6 +28,7 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.region import Region
 from r2flow.lidar.sensors import SENSORS
+from r2flow.model.checkpoint import checkpoints_of, load_checkpoint
 from r2flow.noise import Draws
 from r2flow.reports.outputs import write_samples
 from r2flow.stages import build_stage

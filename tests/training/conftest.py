@@ -18,10 +18,10 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.launch import main
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
+from r2flow.runs.launch import main
 from r2flow.signals import LATER
 from r2flow.training import build, compose, fit
 
@@ -106,7 +106,7 @@ def in_process(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
 
 
 def link_in_process(command: Sequence[str]) -> int:
-    """In place of `r2flow.chain.run_process`: a link without a process of its own."""
+    """In place of `r2flow.runs.chain.run_process`: a link without a process of its own."""
     overrides = command[len(COMMAND) :]
     try:
         return 0 if fit(build(compose(overrides), overrides)).finished else LATER
@@ -122,7 +122,7 @@ def run_train(cwd: Path, scans: Path, *overrides: str, check: bool = True, flags
 
 def run_links(cwd: Path, arguments: Sequence[str], check: bool = True) -> Done:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("r2flow.chain.run_process", link_in_process)
+        patch.setattr("r2flow.runs.chain.run_process", link_in_process)
         return in_process(cwd, arguments, check)
 
 

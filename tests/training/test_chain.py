@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from r2flow import launch
-from r2flow.chain import Link, is_finished, links_of
-from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
-from r2flow.composing import compose, override
 from r2flow.errors import InputError
+from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, weights_hash
 from r2flow.models import find_model
+from r2flow.runs import launch
+from r2flow.runs.chain import Link, is_finished, links_of
+from r2flow.runs.composing import compose, override
 from r2flow.training import build
 from tests.training.conftest import (
     TINY,
@@ -54,7 +54,7 @@ def test_a_preview_is_drawn_once_and_before_the_chain(tmp_path: Path, monkeypatc
     monkeypatch.setattr(launch, "_check_links", lambda links: None)
     monkeypatch.setattr(launch, "_restart", lambda command: command)
     monkeypatch.setattr("r2flow.reports.outputs.write_samples", write_samples)
-    monkeypatch.setattr("r2flow.chain.run_chain", run_chain)
+    monkeypatch.setattr("r2flow.runs.chain.run_chain", run_chain)
     settings = compose(["experiment=demo", f"run_dir={tmp_path}"])
     for _ in range(2):
         assert launch._chain(settings, [], []) == 2
@@ -267,7 +267,7 @@ def test_every_link_of_the_paper_s_chain_is_built_before_the_first_one_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     ran: list[list[str]] = []
-    monkeypatch.setattr("r2flow.chain.run_process", lambda command: ran.append(command) or 2)
+    monkeypatch.setattr("r2flow.runs.chain.run_process", lambda command: ran.append(command) or 2)
     command = ["experiment=r2flow", "data.root=/nowhere", "data.augment.flip=true", "trainer.accelerator=cpu"]
     assert in_process(tmp_path, command, check=False).returncode == 2
     (first,) = ran  # the later ones have been built, and are not refused for the flip

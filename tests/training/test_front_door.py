@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from r2flow.composing import compose
 from r2flow.errors import InputError
-from r2flow.runs import CONFIG, RESUMED, open_run, read_config
+from r2flow.runs.composing import compose
+from r2flow.runs.folder import CONFIG, RESUMED, open_run, read_config
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from r2flow.training import check
 from tests.training.conftest import in_process

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from r2flow.checkpoints import checkpoints_of
+from r2flow.model.checkpoint import checkpoints_of
 from tests.data.conftest import write_scan
 from tests.killing import wait_until
 from tests.test_checkpoints import saved  # noqa: F401  a fixture

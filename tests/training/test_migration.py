@@ -10,7 +10,7 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from r2flow.checkpoints import checkpoints_of, read_checkpoint
+from r2flow.model.checkpoint import checkpoints_of, read_checkpoint
 from r2flow.training import Result, build, compose, fit
 from tests.conftest import ROOT
 from tests.training.conftest import run_links

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.checkpoints import checkpoints_of, load_checkpoint
 from r2flow.lidar.scan_files import read_points, write_points
-from r2flow.runs import read_config
+from r2flow.model.checkpoint import checkpoints_of, load_checkpoint
+from r2flow.runs.folder import read_config
 from tests.training.conftest import Run
 
 

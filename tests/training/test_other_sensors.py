@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from r2flow.checkpoints import load_checkpoint
 from r2flow.lidar.sensor_files import write_sensor
 from r2flow.lidar.sensors import Sensor
+from r2flow.model.checkpoint import load_checkpoint
 from tests.training.conftest import TINY, in_process
 
 CASES = {

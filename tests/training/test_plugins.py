@@ -12,12 +12,12 @@ import pytest
 from hydra.core.config_store import ConfigStore
 
 from r2flow import plugins
-from r2flow.checkpoints import checkpoints_of
-from r2flow.composing import REGISTRIES, choices, compose
 from r2flow.errors import InputError
+from r2flow.model.checkpoint import checkpoints_of
 from r2flow.plugins import load_plugins, made_with, take_plugins
 from r2flow.registry import Registry
-from r2flow.runs import read_config, write_config
+from r2flow.runs.composing import REGISTRIES, choices, compose
+from r2flow.runs.folder import read_config, write_config
 from r2flow.stages import STAGES
 from r2flow.training import build
 from tests.training.conftest import Run, in_process, tiny

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from r2flow.callbacks.stopping import slurm_job
-from r2flow.checkpoints import checkpoints_of, read_checkpoint
+from r2flow.model.checkpoint import checkpoints_of, read_checkpoint
 from r2flow.signals import LATER
 from tests.training.conftest import ROOT, TINY, Run, hold_at, in_process, start, tiny, wait_for
 from tests.training.test_train import assert_bit_equal, weights

@@ -12,7 +12,7 @@ import torch
 import yaml
 from hydra.core.global_hydra import GlobalHydra
 
-from r2flow.checkpoints import checkpoints_of, load_checkpoint, read_checkpoint, step_of
+from r2flow.model.checkpoint import checkpoints_of, load_checkpoint, read_checkpoint, step_of
 from r2flow.reports.outputs import what_next
 from r2flow.signals import LATER
 from tests.training.conftest import Run, hold_at, let_go, start, tiny, wait_for

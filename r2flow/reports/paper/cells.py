@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from r2flow.checkpoints import Checkpoint
 from r2flow.evaluation.measuring import Gathered, Work, measure, point_key
 from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
 from r2flow.files import atomic_write, parse_json
@@ -17,9 +16,10 @@ from r2flow.generators import Sampler
 from r2flow.metrics.base import ScanMetric, Side
 from r2flow.metrics.birds_eye import BINS
 from r2flow.metrics.jsd import JSD
+from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.sampling import sample
 from r2flow.reports.paper.subjects import PaperRun
 from r2flow.reports.speed_quality import BETWEEN
-from r2flow.sampling import sample
 
 SHOWN = 2  # scans of each generator that are drawn
 SEED = 0  # of their noise, the same for every generator

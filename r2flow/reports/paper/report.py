@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from r2flow import simulator
-from r2flow.checkpoints import Checkpoint, load_checkpoint
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.errors import InputError
 from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
@@ -20,6 +19,7 @@ from r2flow.evaluation.statistics import Cache
 from r2flow.generators import Sampler
 from r2flow.inversion import Interpolation, interpolate_scans
 from r2flow.metrics.base import ScanMetric
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.reports.compare import cost
 from r2flow.reports.curvature import measure_paths
 from r2flow.reports.pages import Page
@@ -28,7 +28,7 @@ from r2flow.reports.paper.figures import marginals_apart
 from r2flow.reports.paper.page import PaperResults, paper_page
 from r2flow.reports.paper.subjects import PaperRun
 from r2flow.reports.paper.tables import SIZE
-from r2flow.runs import read_config
+from r2flow.runs.folder import read_config
 
 FRAMES = 6  # of figure 3, as in the paper: both ends' round trips and four between
 

@@ -7,10 +7,10 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from r2flow.checkpoints import load_checkpoint, weights_hash
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import is_checkpoint
 from r2flow.lidar.sensors import Sensor
+from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.reports.compare import find_runs, labels
 
 log = logging.getLogger(__name__)

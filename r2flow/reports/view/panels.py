@@ -11,16 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.checkpoints import Checkpoint
 from r2flow.data.sets import ScanSet
 from r2flow.errors import InputError
 from r2flow.generators import as_flow
 from r2flow.generators.flow import ode_sampler
+from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.sampling import sample
 from r2flow.noise import Draws
 from r2flow.reports.outputs import ScanBar, warn_unsolved
 from r2flow.reports.view import write_page
 from r2flow.reports.views import View
-from r2flow.sampling import sample
 
 
 @dataclass(frozen=True)

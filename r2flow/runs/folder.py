@@ -12,11 +12,11 @@ import yaml
 from filelock import FileLock, Timeout
 from torch import Tensor
 
-from r2flow.checkpoints import FOLDER, checkpoints_of, read_checkpoint, step_of
 from r2flow.config import flatten, rule
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
+from r2flow.model.checkpoint import FOLDER, checkpoints_of, read_checkpoint, step_of
 
 log = logging.getLogger(__name__)
 

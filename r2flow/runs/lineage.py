@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from r2flow.checkpoints import Checkpoint, as_parent, load_checkpoint, weights_hash
 from r2flow.config import flatten, groups_of, key_of, rule
 from r2flow.data.opening import made_here, scale_of_folder
 from r2flow.data.options import FOLDER, MIXED, SIMULATED, PairOptions, SourceOptions
@@ -13,6 +12,7 @@ from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
 from r2flow.errors import InputError
 from r2flow.generators import GENERATORS
+from r2flow.model.checkpoint import Checkpoint, as_parent, load_checkpoint, weights_hash
 from r2flow.models import name_of
 from r2flow.registry import check_options, options_of
 from r2flow.stages import STAGES

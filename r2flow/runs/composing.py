@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from r2flow.errors import InputError
 from r2flow.registry import Bound, check_options, did_you_mean, options_of
 
-CONF = Path(__file__).resolve().parent / "conf"
+CONF = Path(__file__).resolve().parents[1] / "conf"
 
 # What has a Hydra group: its registry, and what a config does not say because the run does.
 REGISTRIES = {

@@ -24,7 +24,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from r2flow import __version__
-from r2flow.composing import (
+from r2flow.config import key_of
+from r2flow.errors import InputError, explain_mistake, one_line, print_any_name
+from r2flow.plugins import load_plugins, take_plugins
+from r2flow.runs.composing import (
     CONF,
     REGISTRIES,
     add_choice,
@@ -36,9 +39,6 @@ from r2flow.composing import (
     override,
     plain,
 )
-from r2flow.config import key_of
-from r2flow.errors import InputError, explain_mistake, one_line, print_any_name
-from r2flow.plugins import load_plugins, take_plugins
 from r2flow.signals import LATER, Stopped, listening, stop_at_once
 
 log = logging.getLogger("r2flow")
@@ -128,7 +128,7 @@ def _forgotten_plugins(arguments: Sequence[str]) -> str:
     run = given.get("run_dir") or f"runs/{given.get('name')}"
     if "plugins" in given or not Path(run, "config.yaml").is_file():
         return ""
-    from r2flow.runs import read_config
+    from r2flow.runs.folder import read_config
 
     names = " ".join(f"--plugin {name}" for name in (read_config(run) or {}).get("plugins") or ())
     return f" {run} was made with {names}: give it again." if names else ""
@@ -242,7 +242,7 @@ def _restart(command: Sequence[str]) -> list[str]:
 
 def _sweep_job(command: Sequence[str], given: Sequence[str], failed: list[str], unfinished: list[str]) -> None:
     """One job of a sweep, as its own process: its failure or its DDP relaunch touches no other job."""
-    from r2flow.chain import run_process
+    from r2flow.runs.chain import run_process
 
     run_dir = HydraConfig.get().runtime.output_dir
     log.info("job %s: %s", HydraConfig.get().job.num, " ".join(given))
@@ -264,7 +264,7 @@ def _fit(settings: dict[str, Any], given: Sequence[str]) -> int:
 
 def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str]) -> int:
     """The runs that a config's `chain` names, and the report on them."""
-    from r2flow.chain import is_finished, is_reported, links_of, record_report, run_chain
+    from r2flow.runs.chain import is_finished, is_reported, links_of, record_report, run_chain
 
     if settings["trainer"]["fast_dev_run"]:
         raise InputError("a chain's links start from the runs before them, and trainer.fast_dev_run leaves none.")
@@ -295,7 +295,7 @@ def _chain(settings: dict[str, Any], given: Sequence[str], command: Sequence[str
 
 def _preview(model: str, out: Path) -> None:
     """Draw scans of a trained model, to look at while a chain trains."""
-    from r2flow.checkpoints import load_checkpoint
+    from r2flow.model.checkpoint import load_checkpoint
     from r2flow.models import find_model
     from r2flow.reports.outputs import write_samples
 
@@ -317,8 +317,8 @@ def _check_links(links: Sequence[Any]) -> None:
             configs[link.name] = compose(link.overrides, folders)
         except (HydraException, OmegaConfBaseException) as error:
             raise InputError(f"chain.{link.name}: {explain(error)}") from None
-    from r2flow.checkpoints import FOLDER
-    from r2flow.lineage import Parent
+    from r2flow.model.checkpoint import FOLDER
+    from r2flow.runs.lineage import Parent
     from r2flow.training import check
 
     for link in links:

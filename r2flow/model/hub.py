@@ -10,10 +10,10 @@ from typing import Any
 from torch import Tensor
 
 from r2flow import load
-from r2flow.checkpoints import save_checkpoint
 from r2flow.errors import InputError, require
+from r2flow.model.checkpoint import save_checkpoint
 
-require("r2flow.hub", "hub", "huggingface_hub")
+require("r2flow.model.hub", "hub", "huggingface_hub")
 
 from huggingface_hub import ModelHubMixin, hf_hub_download  # noqa: E402
 
@@ -25,7 +25,7 @@ CARD = """---
 A generator of LiDAR scans, made with r2flow.
 
 ```python
-from r2flow.hub import HubFlow
+from r2flow.model.hub import HubFlow
 
 scans = HubFlow.from_pretrained("{{ repo_id | default('FOLDER', true) }}").sample(4)  # range in metres and reflectance
 ```

@@ -19,13 +19,13 @@ import torch
 from torch import Tensor, nn
 
 from r2flow import __version__
-from r2flow.checkpoints import Checkpoint, weights_hash
 from r2flow.errors import InputError, require
 from r2flow.files import atomic_write
 from r2flow.generators import USUAL, RectifiedFlow, Regression, Sampler
 from r2flow.lidar.planes import flattened
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.space import ModelSpace
+from r2flow.model.checkpoint import Checkpoint, weights_hash
 from r2flow.noise import Draws
 from r2flow.registry import Registry
 
@@ -233,7 +233,7 @@ def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any])
     size = sum(value.numel() * value.element_size() for value in flow.state_dict().values())
     if size > LARGEST:
         raise InputError(f"an .onnx holds at most 2 GiB, and these weights are {size:,} bytes: use --to pt2.")
-    from r2flow.onnx_graphs import sampler_graph, to_onnx
+    from r2flow.model.onnx_graphs import sampler_graph, to_onnx
 
     program, any_batch = _traced(flow.backbone, _network_inputs(flow, (2,) if how is None else ()))
     network = to_onnx(program, ["t", "x", "s"][: 2 + flow.backbone.second_time], ["v"])

@@ -42,7 +42,7 @@ def sampler_graph(
     Args:
         network: `t` () and `x`, perhaps `s` (), to `v`.
         decoded: `x_1` to `scan` and `points`.
-        times, second, states: As of `r2flow.export.Tableau`.
+        times, second, states: As of `r2flow.model.export.Tableau`.
     """
     network = compose.add_prefix(network, "network.", rename_inputs=False, rename_outputs=False)
     decoded = compose.add_prefix(decoded, "decoded.", rename_inputs=False, rename_outputs=False)

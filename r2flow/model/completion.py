@@ -23,7 +23,7 @@ from r2flow.lidar.encoding import LIMIT_TOLERANCE
 from r2flow.lidar.interpolation import surfaces
 from r2flow.lidar.known import Ray
 from r2flow.lidar.sensors import Sensor
-from r2flow.sampling import HasGenerator, Samples, draw
+from r2flow.model.sampling import HasGenerator, Samples, draw
 
 KEEP = ("exact", "blend", "mend")
 CONFIRMED = 0.2  # of its range: nearer an answer confirms a doubtful return; docs/completion.md
@@ -117,7 +117,7 @@ def complete(
     """Complete scans of which a part is known, scan by scan.
 
     A scan of which everything is known costs no evaluation. One of which nothing is known is drawn as
-    `r2flow.sampling.sample` draws it: answer 0 of scan i is sample i of the seed.
+    `r2flow.model.sampling.sample` draws it: answer 0 of scan i is sample i of the seed.
 
     Args:
         source: A checkpoint or its generator.

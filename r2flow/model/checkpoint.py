@@ -16,7 +16,6 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from r2flow.completion import complete
 from r2flow.config import learned
 from r2flow.data.augment import upgraded
 from r2flow.errors import InputError
@@ -25,12 +24,13 @@ from r2flow.generators import Budget, Generator, RectifiedFlow, Sampler, build_g
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
+from r2flow.model.completion import complete
+from r2flow.model.sampling import sample
 from r2flow.models import MODELS, find_model
 from r2flow.plugins import made_with
 from r2flow.published import FORMATS, format_of, published_cfg
 from r2flow.published.plain import inert, plain
 from r2flow.registry import did_you_mean
-from r2flow.sampling import sample
 
 FOLDER = "checkpoints"
 PREFIX = "generator."  # of the generator's weights in a LightningModule
@@ -84,7 +84,7 @@ class Checkpoint:
         """Scans 0 to num - 1 of a seed: range in metres and reflectance, (num, 2 or 1, H, W), 0 without a return.
 
         Args:
-            how: Options of `r2flow.sampling.sample`: steps, method, batch_size, region, ...
+            how: Options of `r2flow.model.sampling.sample`: steps, method, batch_size, region, ...
         """
         return torch.cat([drawn.images for drawn in sample(self, num, seed, **how)])
 
@@ -93,8 +93,8 @@ class Checkpoint:
 
         Args:
             images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W).
-            state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); see `r2flow.completion.complete`.
-            how: Options of `r2flow.completion.complete`: keep, steps, batch_size, ...
+            state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); see `r2flow.model.completion.complete`.
+            how: Options of `r2flow.model.completion.complete`: keep, steps, batch_size, ...
         """
         return torch.stack([found.images for found in complete(self, images, state, num, seed, **how)])
 

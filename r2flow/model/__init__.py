@@ -1,0 +1,1 @@
+"""Trained models: checkpoints, and what is done with them."""

@@ -1,0 +1,1 @@
+"""Runs: their configs, their folders, and chains of them."""
