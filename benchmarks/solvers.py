@@ -22,7 +22,6 @@ from r2flow.flow.solvers import Velocity, solve
 from r2flow.generators import Field
 from r2flow.lidar.sensors import build_sensor
 from r2flow.noise import standard_normal
-from r2flow.reports.savings import one_state
 
 
 def noise(scenes: int, elements: int, seed: int) -> Tensor:
@@ -33,6 +32,22 @@ def noise(scenes: int, elements: int, seed: int) -> Tensor:
 def errors(x: Tensor, exact: Tensor) -> Tensor:
     """Root mean square over the elements of each scene."""
     return (x.double() - exact).square().mean(1).sqrt()
+
+
+def one_state(flow: Field, x: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+    """torchdiffeq's dopri5 as it is usually called: one step and one error norm for the whole batch."""
+    import torchdiffeq
+
+    calls, velocity = 0, flow.field()
+
+    def counted(t: Tensor, state: Tensor) -> Tensor:
+        nonlocal calls
+        calls += 1
+        return velocity(t, state).to(state.dtype)
+
+    span = torch.tensor([0.0, 1.0], dtype=x.dtype, device=x.device)
+    end = torchdiffeq.odeint(counted, x, span, rtol=tolerance, atol=tolerance, method="dopri5")[-1]
+    return end, torch.full((len(x),), calls)
 
 
 def mixed_batch(name: str, last: list[Problem], seeds: int, elements: int) -> None:

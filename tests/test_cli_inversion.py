@@ -1,4 +1,4 @@
-"""r2flow invert, interpolate, sample of a part, report savings: as a user types them."""
+"""r2flow invert, interpolate, sample of a part: as a user types them."""
 
 import json
 import subprocess
@@ -17,10 +17,9 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint
-from r2flow.reports.savings import scan_rows
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.test_cli import r2flow  # noqa: F401  a fixture
-from tests.test_sampling import Lost, flow, network, scans
+from tests.test_sampling import network, scans
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
 
@@ -158,19 +157,7 @@ def test_a_calibrated_flow_is_sampled_to_an_error(r2flow, run, tmp_path):  # noq
     assert note["levels"][0] <= 8
 
 
-def test_savings_of_exact_problems_need_no_checkpoint(r2flow, tmp_path):  # noqa: F811
-    code, said, _ = r2flow("report", "savings", "--out", tmp_path)
-    assert code == 0
-    assert "8 straight, 4 smooth, 3 two modes, 1 ray-drop" in said
-    assert {path.suffix for path in tmp_path.glob("savings*")} == {".png", ".csv", ".json", ".md"}
-
-
-def test_savings_need_a_flow_that_can_be_solved():
-    with pytest.raises(InputError, match="does not solve scan 1 of this flow"):
-        scan_rows(flow(Lost()), 2, 1e-3, seed=0)
-
-
-@pytest.mark.parametrize("verb", ["invert", "interpolate", "calibrate", "report savings"])
+@pytest.mark.parametrize("verb", ["invert", "interpolate", "calibrate"])
 def test_every_verb_has_help_with_an_example(r2flow, verb):  # noqa: F811
     code, said, _ = r2flow(*verb.split(), "--help")
     assert code == 0
@@ -203,7 +190,6 @@ class TestBadInput:
         self.check(r2flow("invert", files[0], *with_run, "--tolerance", 0), out, "must be positive")
         self.check(r2flow("interpolate", *files, *with_run, "--frames", 1), out, "--frames")
         self.check(r2flow("interpolate", files[0], tmp_path / "no.ply", *with_run), out, "no.ply")
-        self.check(r2flow("report", "savings", "-c", tmp_path / "none", "-o", out), out, "no checkpoint")
 
     def test_of_grids_and_errors(self, r2flow, run, tmp_path):  # noqa: F811
         out = tmp_path / "o"
@@ -221,7 +207,6 @@ class TestBadInput:
     def test_of_seeds_and_tolerances(self, r2flow, run, files, tmp_path):  # noqa: F811
         out = tmp_path / "o"
         self.check(r2flow("sample", "-c", run, "-o", out, "--seed", 2**64), out, "[0, 2^64)", str(2**64))
-        self.check(r2flow("report", "savings", "--tolerance", "inf", "-o", out), out, "positive and finite")
         self.check(r2flow("invert", *files, "-c", run, "-o", out, "--tolerance", "inf"), out, "positive and finite")
         code, _, err = r2flow("report", "stability", "--problems", "straight", "--seed", 2**64, "-o", out)
         assert (code, err.splitlines()[-1]) == (2, f"error: a seed must lie in [0, 2^64), found {2**64}.")
@@ -245,9 +230,7 @@ def test_what_is_not_asked_for_is_not_imported():
     shown = "print([m for m in ({}) if m in sys.modules]); "
     code = "import r2flow.flow.solvers, r2flow.flow.problems, r2flow.lidar.region, r2flow.backbones, sys; "
     code += shown.format("'lightning', 'matplotlib', 'torchdiffeq', 'r2flow.simulator'")
-    code += (
-        "import r2flow.model.sampling, r2flow.reports.inversion, r2flow.reports.interpolation, r2flow.reports.savings; "
-    )
+    code += "import r2flow.model.sampling, r2flow.reports.inversion, r2flow.reports.interpolation; "
     code += shown.format("'r2flow.simulator', 'tensorboard', 'torchdiffeq', 'plotly', 'natten'")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split("\n") == ["[]", "[]", ""]

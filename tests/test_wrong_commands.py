@@ -456,25 +456,13 @@ report stability -o out --scenes 0
 report stability -o out --seed -1
 report stability -o out --max-evaluations 0
 report stability -o file.txt
-report savings -c nowhere
-report savings -o file.txt
-report savings --num 0
-report savings --steps 0
-report savings --tolerance 0
-report savings --tolerance nan
-report savings -c run -o out --device nope
 report paper # Missing
 report paper run # Missing
 report paper nowhere -o out
-report paper empty -o out
-report paper run -o out --num 1
-report paper run -o out --steps 0
-report paper run -o out --curved -1
-report paper run -o out --tolerance -1
-report paper run -o out --metrics nope
+report paper run -o out --num 0
+report paper run -o out --results nowhere
 report paper run -o out --real nowhere
 report paper run -o file.txt
-report paper run -o out --bootstrap -1
 sample -c run -o out --format '' # an argument is empty
 sample -c run -o '' # an argument is empty
 evaluate scans scans --metrics '' # an argument is empty

@@ -169,7 +169,7 @@ class Backbone(ExactBuffers):
 
         The part has its own rays, and no wrap where the turn is cut. What a pixel sees beyond the cut is gone:
         neighbourhoods are moved inside, convolutions find zeros, global attention and group norms know the part
-        alone. The field is therefore another one, near the cut most of all (`r2flow report savings` measures it).
+        alone. The field is therefore another one, near the cut most of all.
 
         Args:
             rows: Numbers of neighbouring rows, ascending.

@@ -11,7 +11,7 @@ import typer
 
 from r2flow.cli.app import report
 from r2flow.cli.groups import DrawOptions, grouped
-from r2flow.cli.options import DeviceOption, OutOption, choose_device
+from r2flow.cli.options import OutOption, choose_device
 from r2flow.cli.output import command, finish, numbers
 from r2flow.errors import InputError
 
@@ -154,34 +154,6 @@ def stability(
         probe = measuring.jet_probe(seed=seed) if any(row["problem"] == measuring.JET for row in rows) else []
     page = measuring.stability_page(rows, probe, seed, command())
     finish(page, out, page.text[:1])
-
-
-@report.command(epilog="Example: r2flow report savings -c runs/NAME --out reports")
-def savings(
-    checkpoint: OptionalCheckpoint = None,
-    out: OutOption = Path("reports"),
-    num: Annotated[int, typer.Option(min=1, help="Scans of the checkpoint's flow.")] = 4,
-    steps: Annotated[int, typer.Option(min=1, help="AB2 steps of the regions.")] = 16,
-    tolerance: Annotated[float, typer.Option(help="Of the checkpoint's adaptive solutions.")] = 1e-3,
-    seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0,
-    device: DeviceOption = "auto",
-) -> None:
-    """What a scan need not cost: own steps, leaving early, regions, single channels."""
-    from r2flow.flow.solvers import check_tolerance
-    from r2flow.generators import as_flow
-    from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.progress import Bar
-    from r2flow.reports.pages import prepare_folder
-    from r2flow.reports.savings import evaluations_of_page, savings_page
-
-    check_tolerance(tolerance)
-    loaded = None if checkpoint is None else load_checkpoint(checkpoint, choose_device(device))
-    if loaded is not None:
-        as_flow(loaded.generator, "a savings report")
-    prepare_folder(out)
-    with Bar("measuring", evaluations_of_page(num, steps) if loaded else 0, "evaluations") as advance:
-        page = savings_page(loaded, num, steps, tolerance, seed, command(), advance)
-    finish(page, out, page.text)
 
 
 def _problems(named: str | None) -> list[str]:

@@ -41,8 +41,7 @@ class RegionOptions:
         typer.Option(
             min=0,
             max=180,
-            help="Degrees on either side of --sector that are generated and cut off; 11.25 if left out. What that "
-            "changes depends on the model: r2flow report savings.",
+            help="Degrees on either side of --sector that are generated and cut off; 11.25 if left out.",
         ),
     ] = None
     rows: Annotated[str | None, typer.Option(help="Rows of the image, as 0-31 for the upper half of 64.")] = None

@@ -23,7 +23,7 @@ from r2flow.cli.options import (
     choose_device,
 )
 from r2flow.cli.scans import PictureScale, views_to_draw
-from r2flow.errors import InputError, require
+from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.reports.view.panels import Panel
@@ -66,7 +66,6 @@ def view(
         ),
     ] = None,
     sequence: Annotated[bool, typer.Option("--sequence", help="Scans one after another, on a slider.")] = False,
-    rerun: Annotated[Path | None, typer.Option(help="Write an .rrd for rerun.io instead of a page.")] = None,
     sensor: SensorChoice = None,
     size: SizeOption = None,
     projection: ProjectionOption = "spherical",
@@ -82,10 +81,6 @@ def view(
 
     if out is not None and out.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--out must be a file that ends in .html, found {out}.")
-    if rerun is not None:
-        if out is not None or rerun.suffix != ".rrd":
-            raise InputError(f"--rerun names a file that ends in .rrd and takes the place of --out; found {rerun}.")
-        require("--rerun", "rerun", "rerun")
     flows = [one for one in what if is_checkpoint(one)]
     if not flows and (drawn.steps or drawn.times):
         raise InputError("--steps and --times are of a run, a checkpoint or a model; found none.")
@@ -112,11 +107,6 @@ def view(
                 together, frames = in_turn(found, one)
                 found = [together]
         panels += found
-    if rerun is not None:
-        from r2flow.reports.view.rerun import write_rerun
-
-        print(write_rerun(rerun, panels))
-        return
     title = ", ".join(Path(one).name or one for one in what)
     path = write_panels(out or Path(mkdtemp(prefix="r2flow-"), "view.html"), panels, frames, title)
     print(path)

@@ -213,7 +213,7 @@ def speed_quality_page(
         ],
         "other_points": [row for row in done if row["key"] not in keys],
     }
-    drawn = {NAME: _figure(rows, names)} if figures and names else {}
+    drawn = {NAME: speed_quality_figure(rows, names)} if figures and names else {}
     seeds = {"sampled scans": drawing.seed}
     return Page(NAME, "Quality against speed", text, rows, drawn, command, seeds, curve.device, more)
 
@@ -238,7 +238,7 @@ def _remarks(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return ["\n".join(lines)] if lines else []
 
 
-def _figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Figure:
+def speed_quality_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Figure:
     """Each metric's first figure against evaluations (above) and seconds (below), a line for each flow."""
     first: dict[str, str] = {}
     for name in names:

@@ -129,7 +129,6 @@ CANNOT = {
         ["SCAN", "SCAN", "-c", "RUN", "-o", "OUT"], "interpolation needs the velocity of a flow, which a ToyGenerator"
     ),
     "report curvature": (["-c", "RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
-    "report savings": (["-c", "RUN", "-o", "OUT"], "a savings report needs the velocity of a flow, which a ToyG"),
     "report work-precision": (["-c", "RUN", "-o", "OUT"], "a work-precision report needs the velocity of a flow"),
     "calibrate": (["-c", "RUN"], "a time grid needs the velocity of a flow, which a ToyGenerator"),
     "convert": (["RUN", "OUT.pth"], "the published format cannot hold a ToyGenerator; convert to .safetensors"),

@@ -3,10 +3,6 @@
 import base64
 import hashlib
 import json
-import os
-import re
-import subprocess
-import sys
 import zlib
 from html.parser import HTMLParser
 
@@ -218,30 +214,6 @@ class TestTheVerb:
         code, said, _ = r2flow("view", tmp_path / "a.npy")
         assert code == 0
         assert opened == ([f"file://{said.strip()}"] if screen else [])
-
-
-@pytest.mark.slow
-def test_a_recording_is_one_that_rerun_reads_with_every_frame(tmp_path):
-    pytest.importorskip("rerun", reason="needs the extra rerun")
-    from r2flow.reports.view.panels import Panel
-    from r2flow.reports.view.rerun import write_rerun
-
-    images = np.stack([simulate(SENSOR, 0, scene).image for scene in range(2)])
-    path = write_rerun(tmp_path / "scans.rrd", [Panel("drive", images, RAYS)])
-    command = [sys.executable, "-m", "rerun", "rrd", "print", str(path)]
-    said = subprocess.run(
-        command, capture_output=True, text=True, check=True, env={**os.environ, "HOME": str(tmp_path)}
-    )
-    for what in ("points", "range"):
-        rows = re.findall(rf"with (\d+) rows .* - /drive/{what} ", said.stdout)
-        assert sum(map(int, rows)) == 2
-
-
-@pytest.mark.parametrize("given", [["--rerun", "scans.txt"], ["--rerun", "a.rrd", "--out", "b.html"]])
-def test_a_recording_takes_the_place_of_a_page(r2flow, given):  # noqa: F811
-    code, _, said = r2flow("view", "simulated:0", *given)
-    assert code == 2
-    assert "takes the place of --out" in said
 
 
 def test_the_way_of_a_model_that_draws_noise_is_that_of_its_ode(r2flow, tmp_path):  # noqa: F811

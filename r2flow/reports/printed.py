@@ -17,8 +17,6 @@ COLUMNS = {
     "mmd": ("MMD x 10^4", 1e4),
 }
 
-PAPER_KIND = "hdit with APE"  # the network of its chains
-
 
 class Printed(NamedTuple):
     """A row of table I: the role is "1-RF", ... for the paper's own flows, None for others, which their method names.

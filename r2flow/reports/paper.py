@@ -1,0 +1,252 @@
+"""The paper's tables I and II and figures 3 and 5 to 8 from runs: the printed numbers next to evaluated ones."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from r2flow.data.sets import ScanSet
+from r2flow.generators import Flow
+from r2flow.inversion import interpolate_scans
+from r2flow.lidar.projection import image_to_points
+from r2flow.metrics.birds_eye import EXTENT, birds_eye_histogram, js_distance
+from r2flow.model.checkpoint import Checkpoint, weights_hash
+from r2flow.model.sampling import sample
+from r2flow.progress import track
+from r2flow.reports.compare import cost
+from r2flow.reports.curvature import curvature_figure, curvature_text, measure_paths, trajectories_figure
+from r2flow.reports.interpolation import interpolation_figure
+from r2flow.reports.pages import Page, blank_figure
+from r2flow.reports.pictures import contact_sheet
+from r2flow.reports.printed import COLUMNS, TABLE_I, TABLE_II, Architecture
+from r2flow.reports.speed_quality import speed_quality_figure
+from r2flow.reports.tables import Row, table
+
+FRAMES = 6  # of figure 3, as in the paper: both ends' round trips and four between
+MANY = 16  # evaluations; the evaluated row with the most, at least this many, stands next to the paper's 256
+
+# The paper's names of other systems, by the name of the generator.
+SYSTEMS = {
+    "vanilla_gan": "Vanilla GAN", "dusty1": "DUSty v1", "dusty2": "DUSty v2", "score": "LiDARGen",
+    "latent_diffusion": "LiDM", "diffusion": "R2DM",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PaperRun:
+    """A generator and its role: "1-RF", "2-RF", "2-TD"; for another system its method's name in table I."""
+
+    role: str
+    label: str
+    checkpoint: Checkpoint
+
+
+def role_of(checkpoint: Checkpoint, label: str) -> str:
+    """The row of table I that a checkpoint belongs to, from its config; its label where the config does not say it."""
+    config = checkpoint.config
+    options, stage = config.get("generator") or {}, config.get("stage") or {}
+    if system := SYSTEMS.get(options.get("name", "")):
+        if system == "LiDM" and (options.get("unet") or {}).get("position") == "learnable":
+            system = "LiDM + APE"
+        return system if checkpoint.encoding.reflectance else f"{system}, range"
+    if stage.get("name") == "distill":
+        return f"{stage['steps']}-TD"
+    return {"rectify": "1-RF", "reflow": "2-RF"}.get(stage.get("name", ""), label)
+
+
+def paper_page(
+    runs: Sequence[PaperRun],
+    rows: Sequence[Row],
+    real: ScanSet | None = None,
+    num: int = 16,
+    paths: int = 4,
+    steps: int = 256,
+    repeats: int = 3,
+    command: str = "",
+    device: str = "cpu",
+) -> Page:
+    """The page, still to be written.
+
+    Args:
+        rows: Of `speed_quality.json` files (`r2flow evaluate REAL -c RUN ... --out FOLDER`).
+        real: Scans for figures 3, 5 and 7; None leaves figure 3 out.
+        num: Scans of each generator in figures 5 and 7.
+        paths: Scans whose paths figure 8 follows, in `steps` Euler steps; 0 leaves it out.
+        repeats: Timed evaluations of each network for table II.
+    """
+    roles = {weights_hash(run.checkpoint): run.role for run in runs}
+    evaluated = [{**row, "role": roles[row["weights"]]} for row in rows if row["weights"] in roles]
+    architectures = architecture_rows(runs, evaluated, repeats, device)
+    text = ["## Table I: methods and metrics", table_i(evaluated)]
+    if architectures:
+        text += ["## Table II: velocity estimators", table(architectures, ARCHITECTURES)]
+    figures: dict[str, Figure] = {}
+    flows = [run for run in runs if isinstance(run.checkpoint.generator, Flow)]
+    if real is not None and len(real) > 1 and flows and flows[0].role not in SYSTEMS.values():
+        figures["figure_3"] = between_figure(flows[0].checkpoint, real)
+    drawn = {run.label: _drawn(run.checkpoint, num) for run in track(runs, "sampling", "generators")}
+    truth = None if real is None else np.stack([real.spread(num).source[i] for i in range(min(num, len(real)))])
+    figures["figure_5"] = birds_eye_figure(
+        {run.label: _from_above(drawn[run.label], run.checkpoint) for run in runs},
+        None if truth is None else _from_above(truth, runs[0].checkpoint),
+    )
+    names = [name for name in dict.fromkeys(key for row in evaluated for key in row) if name in _figures(evaluated)]
+    if names:
+        figures["figure_6"] = speed_quality_figure([{**row, "flow": row["role"]} for row in evaluated], names)
+    figures["figure_7"] = scans_figure(runs, drawn, truth)
+    if paths and flows:
+        straight = [
+            measure_paths(run.checkpoint, run.label, paths, steps, batch_size=paths)
+            for run in track([run for run in flows if not run.checkpoint.generator.sampler.fixed], "following paths")
+        ]
+        if straight:
+            figures |= {"figure_8a": curvature_figure(straight), "figure_8b": trajectories_figure(straight)}
+            text += ["## Figure 8: straightness", *curvature_text(straight)]
+    text.insert(0, f"{len(runs)} generators: {', '.join(f'{run.label} ({run.role})' for run in runs)}.")
+    return Page(
+        "paper", "The paper's tables and figures", text, evaluated, figures, command, {"sampled scans": 0}, device,
+        {"architectures": architectures},
+    )  # fmt: skip
+
+
+def read_results(files: Sequence[Path]) -> list[dict[str, Any]]:
+    """The rows of `speed_quality.json` files."""
+    return [row for file in files for row in json.loads(file.read_text(encoding="utf-8"))["rows"]]
+
+
+def _figures(rows: Sequence[Row]) -> list[str]:
+    """The columns METRIC/METRIC of the metrics that table I has."""
+    return [f"{name}/{name}" for name in COLUMNS if any(f"{name}/{name}" in row for row in rows)]
+
+
+def table_i(rows: Sequence[Row]) -> str:
+    """Table I as printed, and below each printed row the evaluated ones: equal evaluations, or both at least `MANY`.
+
+    Evaluated rows without a printed one come last.
+    """
+    lines: list[dict[str, Any]] = []
+    placed: list[Row] = []
+    for printed in TABLE_I:
+        role, count = printed.role or printed.method, printed.evaluations
+        line: dict[str, Any] = {"method": role, "of": "paper", "evaluations": count}
+        lines.append(line | dict(zip(COLUMNS, printed.figures, strict=True)))
+        same = [row for row in rows if row["role"] == role]
+        most = max((row["evaluations"] for row in same), default=0)
+        near = [row for row in same if row["evaluations"] in ((count, most) if min(count, most) >= MANY else (count,))]
+        lines += map(_evaluated, near)
+        placed += near
+    lines += [_evaluated(row) for row in rows if row not in placed]
+    headings = {name: heading for name, (heading, _) in COLUMNS.items()}
+    return table(lines, {"method": "method", "of": "figures of", "evaluations": "NFE", **headings})
+
+
+def _evaluated(row: Row) -> dict[str, Any]:
+    """The columns of table I that a row of an evaluation has, scaled as the paper prints them."""
+    found = {name: row.get(f"{name}/{name}") for name in COLUMNS}
+    scaled = {name: None if value is None else value * COLUMNS[name][1] for name, value in found.items()}
+    return {"method": row["role"], "of": row["flow"], "evaluations": row["evaluations"], **scaled}
+
+
+ARCHITECTURES = {
+    "backbone": "backbone", "parameters": "parameters", "gmac": "GMAC", "gmac_printed": "paper",
+    "latency_ms": "ms an evaluation", "latency_printed": "paper", "frd": "FRD", "frd_printed": "paper",
+}  # fmt: skip
+
+
+def architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], repeats: int, device: str) -> list[dict[str, Any]]:
+    """Table II: a row for each 1-RF, with the printed row of the network of as many parameters."""
+    found = []
+    for run in runs:
+        if run.role != "1-RF":
+            continue
+        config = run.checkpoint.config
+        row = {"backbone": config["backbone"]["name"], **cost(config, repeats, device)}
+        printed = same_architecture(row["parameters"])
+        row |= {"gmac_printed": printed and printed.gmac, "latency_printed": printed and printed.latency_ms}
+        own = [one for one in rows if one["weights"] == weights_hash(run.checkpoint) and "frd/frd" in one]
+        best = max(own, key=lambda one: one["evaluations"], default={})
+        found.append(row | {"frd": best.get("frd/frd"), "frd_printed": printed and printed.frd})
+    return found
+
+
+def same_architecture(parameters: int) -> Architecture | None:
+    """The row of table II with this number of parameters, to the digits that are printed (its 125.5 M are 125.2 M)."""
+    return next((one for one in TABLE_II.values() if abs(parameters - one.parameters) < 4e-3 * one.parameters), None)
+
+
+def between_figure(checkpoint: Checkpoint, real: ScanSet) -> Figure:
+    """Figure 3: from one real scan to another, far apart in the set, through the noise."""
+    ends = np.stack([real.source[index] for index in (len(real) // 4, 3 * len(real) // 4)])
+    found = interpolate_scans(checkpoint, torch.from_numpy(ends), FRAMES)
+    frames = found.images.nan_to_num(0.0).numpy()
+    return interpolation_figure(ends, frames, found.weights.tolist(), checkpoint.sensor.rays(), ("first", "last"))
+
+
+def _drawn(checkpoint: Checkpoint, num: int) -> np.ndarray:
+    return np.concatenate([one.images.nan_to_num(0.0).numpy() for one in sample(checkpoint, num)])
+
+
+def _from_above(images: np.ndarray, checkpoint: Checkpoint) -> np.ndarray:
+    """The bird's-eye histogram of scans, (100, 100)."""
+    rays = checkpoint.sensor.rays()
+    return np.sum([birds_eye_histogram(image_to_points(image, rays)[0]) for image in images], axis=0)
+
+
+def marginals(birds_eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How many points lie at each x, (100,), and at each y, of a bird's-eye histogram (100, 100)."""
+    return birds_eye.sum(1), birds_eye.sum(0)
+
+
+def marginals_apart(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean Jensen-Shannon distance of two histograms' marginals."""
+    return float(np.mean([js_distance(x, y) for x, y in zip(marginals(a), marginals(b), strict=True)]))
+
+
+def birds_eye_figure(made: Mapping[str, np.ndarray], real: np.ndarray | None) -> Figure:
+    """Figure 5: where points lie from above, (100, 100) each, and their marginals with the real scans' dotted."""
+    shown = {**made, **({} if real is None else {"real scans": real})}
+    figure = blank_figure(2.75 * len(shown) + 0.5, 3.6)
+    figure.set_layout_engine("none")
+    outer = figure.add_gridspec(1, len(shown), left=0.5 / figure.get_figwidth(), right=0.99, bottom=0.13, top=0.86)
+    centres = (np.arange(100) + 0.5) / 100 * 2 * EXTENT - EXTENT
+    for place, (name, counts) in enumerate(shown.items()):
+        grid = outer[place].subgridspec(2, 2, height_ratios=(1, 3.2), width_ratios=(3.2, 1), hspace=0.03, wspace=0.03)
+        axes = figure.add_subplot(grid[1, 0])
+        share = counts / max(counts.sum(), 1)
+        # Ahead is up and left is left, as in every other picture from above.
+        axes.imshow(np.log10(share[::-1, ::-1] + 1e-7), extent=(EXTENT, -EXTENT, -EXTENT, EXTENT), cmap="magma",
+                    vmin=-6, vmax=-2, aspect="auto")  # fmt: skip
+        axes.set(xlabel="y, m", ylabel="x, m" if place == 0 else "", xticks=(60, 0, -60), yticks=(-60, 0, 60))
+        axes.tick_params(labelsize=7, labelleft=place == 0)
+        above, beside = figure.add_subplot(grid[0, 0], sharex=axes), figure.add_subplot(grid[1, 1], sharey=axes)
+        for histogram, style in ((counts, {"color": "#1f6fb4", "ls": "-"}), (real, {"color": "0.2", "ls": ":"})):
+            if histogram is not None:
+                along_x, along_y = (m / max(m.sum(), 1) for m in marginals(histogram))
+                above.plot(centres, along_y, lw=0.9, **style)
+                beside.plot(along_x, centres, lw=0.9, **style)
+        for panel in (above, beside):
+            panel.tick_params(labelbottom=False, labelleft=False, bottom=False, left=False)
+            panel.spines[:].set_visible(False)
+        apart = "" if real is None or counts is real else f"marginals apart {marginals_apart(counts, real):.3f}"
+        above.set_title(f"{name}\n{apart}", fontsize=8)
+    return figure
+
+
+def scans_figure(runs: Sequence[PaperRun], drawn: Mapping[str, np.ndarray], real: np.ndarray | None) -> Figure:
+    """Figure 7: a real scan and the first scan of each generator."""
+    images = ([] if real is None else [real[0]]) + [drawn[run.label][0] for run in runs]
+    titles = ([] if real is None else ["real"]) + [f"{run.role}, {_nfe(run.checkpoint)}" for run in runs]
+    channels = min(map(len, images))
+    return contact_sheet([image[:channels] for image in images], runs[0].checkpoint.sensor.rays(), titles)
+
+
+def _nfe(checkpoint: Checkpoint) -> str:
+    generator = checkpoint.generator
+    count = generator.evaluations_of(generator.sampler)
+    return f"NFE {count}" if count and math.isfinite(count) else "adaptive steps"
