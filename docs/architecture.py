@@ -23,7 +23,7 @@ ROOMS = {
     "checkpoints": (
         6,
         1,
-        ("checkpoints", "published", "sampling", "completion", "growing"),
+        ("model", "growing"),
         "a generator on disk; its scans",
     ),
     "data": (7, 1, ("data",), "data sets, pairs, batches"),
@@ -31,7 +31,7 @@ ROOMS = {
     "simulator": (8, 1, ("simulator",), "street scenes, ray-cast"),
     "generators": (8, 2, ("generators",), "noise in, scan out"),
     "lidar": (9, 0, ("lidar",), "sensors, range images, files"),
-    "flow": (10, 1, ("flow", "diffusion", "adversarial"), "path, times, losses, solvers"),
+    "flow": (10, 1, ("flow",), "path, times, losses, solvers"),
     "backbones": (9, 2, ("backbones",), "networks v(t, x)"),
 }
 # What all rooms stand on; lines to it would cover the others.

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import importlib
 import inspect
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -40,6 +41,16 @@ class UnknownName(InputError):
     """A registry has no entry of this name."""
 
 
+class _Lazy(NamedTuple):
+    module: str
+    name: str
+
+
+def lazy(place: str) -> Any:
+    """An entry `module:name` that a registry imports when it is asked for it."""
+    return _Lazy(*place.split(":"))
+
+
 class Registry(Generic[T]):
     """Named values of one kind.
 
@@ -63,7 +74,10 @@ class Registry(Generic[T]):
             known = ", ".join(sorted(self._entries))
             hint = did_you_mean(str(name), self._entries)
             raise UnknownName(f"no {self.kind} named {name!r}; known: {known}.{hint}")
-        return self._entries[name]
+        entry = self._entries[name]
+        if isinstance(entry, _Lazy):
+            entry = self._entries[name] = getattr(importlib.import_module(entry.module), entry.name)
+        return entry
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._entries)
@@ -77,7 +91,7 @@ class Registry(Generic[T]):
         return len(self._entries)
 
     def items(self) -> Iterator[tuple[str, T]]:
-        return iter(self._entries.items())
+        return ((name, self[name]) for name in self._entries)
 
     def add(self, name: str, entry: T) -> None:
         """Add an entry.

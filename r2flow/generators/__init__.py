@@ -9,20 +9,15 @@ from r2flow.errors import InputError
 from r2flow.generators.base import Condition, Generated, Generator, Sampler
 from r2flow.generators.budgets import Budget, levels
 from r2flow.generators.conditional import ConditionalFlow, ConditionalMap, Regression, condition_of
-from r2flow.generators.diffusion import Diffusion
 from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
 from r2flow.generators.flow_map import FlowMap
-from r2flow.generators.gan import DustyV1, DustyV2, Gan, VanillaGan
-from r2flow.generators.latent import LatentDiffusion, VQAutoencoder
-from r2flow.generators.score import ScoreModel
 from r2flow.lidar.space import build_space
-from r2flow.registry import Registry
+from r2flow.registry import Registry, lazy
 
 __all__ = [
-    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "ConditionalMap", "Diffusion", "DustyV1",
-    "DustyV2", "Field", "Flow", "FlowMap", "Gan", "Generated", "Generator", "LatentDiffusion", "RectifiedFlow",
-    "Regression", "Sampler", "ScoreModel", "VQAutoencoder", "VanillaGan", "as_flow",
-    "build_generator", "condition_of", "levels",
+    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "ConditionalMap", "Field", "Flow", "FlowMap",
+    "Generated", "Generator", "RectifiedFlow", "Regression", "Sampler", "as_flow", "build_generator", "condition_of",
+    "levels",
 ]  # fmt: skip
 
 GENERATORS: Registry[type[Generator]] = Registry(
@@ -32,13 +27,13 @@ GENERATORS: Registry[type[Generator]] = Registry(
     conditional_flow=ConditionalFlow,
     conditional_map=ConditionalMap,
     regression=Regression,
-    diffusion=Diffusion,
-    vanilla_gan=VanillaGan,
-    dusty1=DustyV1,
-    dusty2=DustyV2,
-    score=ScoreModel,
-    vq_autoencoder=VQAutoencoder,
-    latent_diffusion=LatentDiffusion,
+    diffusion=lazy("r2flow.systems.diffusion.generator:Diffusion"),
+    vanilla_gan=lazy("r2flow.systems.gan.generator:VanillaGan"),
+    dusty1=lazy("r2flow.systems.gan.generator:DustyV1"),
+    dusty2=lazy("r2flow.systems.gan.generator:DustyV2"),
+    score=lazy("r2flow.systems.score.generator:ScoreModel"),
+    vq_autoencoder=lazy("r2flow.systems.latent.generator:VQAutoencoder"),
+    latent_diffusion=lazy("r2flow.systems.latent.generator:LatentDiffusion"),
 )
 
 

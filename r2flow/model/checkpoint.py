@@ -25,11 +25,10 @@ from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.completion import complete
+from r2flow.model.published import FORMATS, format_of, inert, plain, published_cfg
 from r2flow.model.sampling import sample
 from r2flow.models import MODELS, find_model
 from r2flow.plugins import made_with
-from r2flow.published import FORMATS, format_of, published_cfg
-from r2flow.published.plain import inert, plain
 from r2flow.registry import did_you_mean
 
 FOLDER = "checkpoints"
@@ -271,7 +270,7 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
         weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
         sampler = content.get("sampler") or _sampler_of_stage(config.get("stage") or {})
     elif isinstance(content, dict):
-        systems = ", ".join(one.system for one in FORMATS)
+        systems = ", ".join(one.system for _, one in FORMATS.items())
         raise InputError(
             f"{path} is a torch file but not a checkpoint of a generator: it has neither 'config' and 'state_dict' "
             f"(ours) nor the layout of a published one ({systems}); found {', '.join(map(repr, list(content)[:6]))}."

@@ -9,16 +9,12 @@ from r2flow.errors import InputError
 from r2flow.flow.posterior import completes
 from r2flow.generators import Generator, Sampler
 from r2flow.generators.base import check_control
-from r2flow.registry import Registry, check_options
+from r2flow.registry import Registry, check_options, lazy
 from r2flow.stages.base import Stage
 from r2flow.stages.conditional import Conditional, LearnConditionalMap, Regress
-from r2flow.stages.diffusion import LearnDiffusion
 from r2flow.stages.flow_map import LearnFlowMap
-from r2flow.stages.gan import LearnGan
-from r2flow.stages.latent import LearnAutoencoder, LearnLatentDiffusion
 from r2flow.stages.rectify import Rectify
 from r2flow.stages.reflow import Distill, Reflow
-from r2flow.stages.score import MatchScore
 
 STAGES: Registry[type[Stage]] = Registry(
     "stage",
@@ -29,11 +25,11 @@ STAGES: Registry[type[Stage]] = Registry(
     conditional=Conditional,
     conditional_map=LearnConditionalMap,
     regress=Regress,
-    diffusion=LearnDiffusion,
-    gan=LearnGan,
-    score_matching=MatchScore,
-    autoencoder=LearnAutoencoder,
-    latent_diffusion=LearnLatentDiffusion,
+    diffusion=lazy("r2flow.systems.diffusion.stage:LearnDiffusion"),
+    gan=lazy("r2flow.systems.gan.stage:LearnGan"),
+    score_matching=lazy("r2flow.systems.score.stage:MatchScore"),
+    autoencoder=lazy("r2flow.systems.latent.stage:LearnAutoencoder"),
+    latent_diffusion=lazy("r2flow.systems.latent.stage:LearnLatentDiffusion"),
 )
 
 

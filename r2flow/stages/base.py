@@ -11,12 +11,12 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from r2flow.adversarial.processes import average_gradients
 from r2flow.data.loader import Further
 from r2flow.errors import InputError
 from r2flow.flow.times import golden_sequence
 from r2flow.generators import Generator
 from r2flow.noise import seed_torch
+from r2flow.processes import average_gradients
 from r2flow.registry import Count, Natural, NonNegative, Portion
 from r2flow.stages.muon import Muon
 

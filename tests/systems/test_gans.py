@@ -15,22 +15,22 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from r2flow.adversarial import rules
-from r2flow.adversarial.augment import TRANSFORMATIONS, AdaptiveAugment, Draw, affine, colour, coloured, transformed
-from r2flow.adversarial.losses import discriminator_loss, generator_loss, r1
-from r2flow.adversarial.masks import logistic, straight_through_mask
-from r2flow.backbones import dcgan, style_gan
 from r2flow.callbacks import HalfLifeEMA
 from r2flow.errors import InputError
-from r2flow.generators import DustyV1, Sampler, build_generator
+from r2flow.generators import Sampler, build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint, read_checkpoint
+from r2flow.model.published import inert
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws
-from r2flow.published.plain import inert
 from r2flow.stages import build_stage
+from r2flow.systems.gan import dcgan, rules, style_gan
+from r2flow.systems.gan.augment import TRANSFORMATIONS, AdaptiveAugment, Draw, affine, colour, coloured, transformed
+from r2flow.systems.gan.generator import DustyV1
+from r2flow.systems.gan.losses import discriminator_loss, generator_loss, r1
+from r2flow.systems.gan.masks import logistic, straight_through_mask
 from r2flow.training import build, compose, fit
 from tests.conftest import ROOT
 

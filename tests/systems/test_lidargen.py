@@ -8,9 +8,7 @@ import pytest
 import torch
 from published_cases import assert_near, assert_norms, load_case
 
-from r2flow.backbones.refinenet import InstanceNormPlus, RefineNet
 from r2flow.callbacks.ema import DECAYS
-from r2flow.diffusion.langevin import annealed_langevin, noise_levels, score_loss, step_sizes, toward
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
@@ -18,6 +16,8 @@ from r2flow.lidar.projection import project_indices
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.noise import Draws
+from r2flow.systems.score.langevin import annealed_langevin, noise_levels, score_loss, step_sizes, toward
+from r2flow.systems.score.refinenet import InstanceNormPlus, RefineNet
 
 TINY = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 16, "min_range": 0.5, "max_range": 63.0},

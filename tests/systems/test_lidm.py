@@ -11,14 +11,19 @@ import torch.nn.functional as F
 import yaml
 from published_cases import assert_near, assert_norms, load_case
 
-from r2flow.adversarial.hinge import adaptive_weight, adversarial_factor, hinge_loss, reconstruction_loss
-from r2flow.backbones.autoencoder import Autoencoder
-from r2flow.backbones.latent_unet import LatentUNet
-from r2flow.backbones.patch_discriminator import PatchDiscriminator
-from r2flow.backbones.quantiser import Quantiser
 from r2flow.callbacks.ema import DECAYS
 from r2flow.cli import main
-from r2flow.diffusion.ddim import (
+from r2flow.errors import InputError
+from r2flow.generators import build_generator
+from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.projection import project, unproject
+from r2flow.lidar.sensors import build_sensor
+from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.sampling import sample
+from r2flow.noise import Draws
+from r2flow.registry import options_of
+from r2flow.systems.latent.autoencoder import Autoencoder
+from r2flow.systems.latent.ddim import (
     Tables,
     ancestral_step,
     ddim,
@@ -28,17 +33,13 @@ from r2flow.diffusion.ddim import (
     square_root_linear,
     tables,
 )
-from r2flow.errors import InputError
-from r2flow.generators import LatentDiffusion, build_generator
-from r2flow.lidar.encoding import Encoding
-from r2flow.lidar.projection import project, unproject
-from r2flow.lidar.sensors import build_sensor
-from r2flow.model.checkpoint import load_checkpoint
-from r2flow.model.sampling import sample
-from r2flow.noise import Draws
-from r2flow.published.lidm import _autoencoder, _unet
-from r2flow.registry import options_of
-from r2flow.stages.latent import returns
+from r2flow.systems.latent.generator import LatentDiffusion
+from r2flow.systems.latent.hinge import adaptive_weight, adversarial_factor, hinge_loss, reconstruction_loss
+from r2flow.systems.latent.patch_discriminator import PatchDiscriminator
+from r2flow.systems.latent.published import _autoencoder, _unet
+from r2flow.systems.latent.quantiser import Quantiser
+from r2flow.systems.latent.stage import returns
+from r2flow.systems.latent.unet import LatentUNet
 
 SMALL_AUTOENCODER = {"width": 32, "multipliers": [1, 1], "strides": [[2, 2]], "blocks": 1, "codes": 16}
 SMALL_UNET = {"width": 32, "multipliers": [1, 2], "blocks": 1, "attention": [2]}

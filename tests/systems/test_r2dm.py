@@ -17,12 +17,8 @@ from torch import Tensor
 from r2flow.backbones import Backbone, build_backbone
 from r2flow.callbacks.ema import ema_decay
 from r2flow.cli.verbs import app
-from r2flow.diffusion.discrete import BETAS, tables
-from r2flow.diffusion.log_snr import SCHEDULES, Cosine, alpha_sigma, log_snr_of, straight_time
-from r2flow.diffusion.objectives import ERRORS, PREDICTIONS, mean_errors, weighted_mean
-from r2flow.diffusion.sampling import eta_of, forward_step, noised, repaint, step, walk
 from r2flow.errors import InputError
-from r2flow.generators import Diffusion, Sampler, build_generator
+from r2flow.generators import Sampler, build_generator
 from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import unproject
@@ -33,6 +29,10 @@ from r2flow.noise import Draws
 from r2flow.reports.outputs import write_samples
 from r2flow.stages import build_stage
 from r2flow.stages.base import learning_rate_factor
+from r2flow.systems.diffusion.generator import Diffusion
+from r2flow.systems.diffusion.log_snr import SCHEDULES, Cosine, alpha_sigma, log_snr_of, straight_time
+from r2flow.systems.diffusion.objectives import ERRORS, PREDICTIONS, mean_errors, weighted_mean
+from r2flow.systems.diffusion.sampling import eta_of, forward_step, noised, repaint, step, walk
 from r2flow.training import build, compose, fit
 
 CONFIG: dict[str, Any] = {
@@ -104,14 +104,6 @@ def test_loss_weights_are_the_published(shared):
         for kind, gamma in (("minsnr", 5.0), ("plain", None)):
             expected = case["loss_weight_cosine"][f"{theirs}_{kind}"]
             torch.testing.assert_close(PREDICTIONS[name].weight(log_snr, gamma), expected, rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize("name", BETAS)
-def test_tables_of_discrete_steps_are_the_published(shared, name):
-    expected = load_case(shared, "r2dm_schedules.pt")["discrete_40_steps"][name]
-    found = tables(BETAS[name](40))
-    for key in found._fields:
-        assert_near(getattr(found, key), expected[key], 1e-6)
 
 
 def test_learning_rate_and_average_are_the_published(shared):

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 from r2flow.backbones.base import integers
 from r2flow.backbones.convolutions import GroupNorm
 from r2flow.backbones.layers import wrapped
-from r2flow.backbones.quantiser import Quantised, Quantiser
 from r2flow.errors import InputError
 from r2flow.registry import Count, NonNegative, Portion
+from r2flow.systems.latent.quantiser import Quantised, Quantiser
 
 GROUPS = 32
 Size = tuple[int, int]

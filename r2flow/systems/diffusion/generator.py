@@ -8,9 +8,6 @@ import torch
 from torch import Tensor
 
 from r2flow.backbones import Pyramid
-from r2flow.diffusion.log_snr import SCHEDULES, alpha_sigma, for_images, log_snr_of, straight_time
-from r2flow.diffusion.objectives import PREDICTIONS
-from r2flow.diffusion.sampling import DDIM, DDPM, eta_of, walk
 from r2flow.errors import InputError
 from r2flow.flow.solvers import Solution
 from r2flow.flow.solvers.solution import finite, wide
@@ -19,6 +16,9 @@ from r2flow.generators.flow import UNTOLD, NetworkFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import Positive
+from r2flow.systems.diffusion.log_snr import SCHEDULES, alpha_sigma, for_images, log_snr_of, straight_time
+from r2flow.systems.diffusion.objectives import PREDICTIONS
+from r2flow.systems.diffusion.sampling import DDIM, DDPM, eta_of, walk
 
 
 class Diffusion(NetworkFlow):
@@ -39,8 +39,8 @@ class Diffusion(NetworkFlow):
     Args:
         space: The images it makes.
         backbone: Name and options, as in conf/backbone.
-        prediction: What y is, a name in `r2flow.diffusion.objectives.PREDICTIONS`.
-        schedule: Name and options of a log-SNR schedule in `r2flow.diffusion.log_snr.SCHEDULES`.
+        prediction: What y is, a name in `r2flow.systems.diffusion.objectives.PREDICTIONS`.
+        schedule: Name and options of a log-SNR schedule in `r2flow.systems.diffusion.log_snr.SCHEDULES`.
         clip: Expected data are clamped to [-clip, clip] whenever scans are made; null leaves them as they are.
     """
 

@@ -12,11 +12,11 @@ from typing import Any
 import yaml
 from torch import Tensor
 
-from r2flow.backbones.autoencoder import UP
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import ShiftedLog
 from r2flow.lidar.sensors import build_sensor
-from r2flow.published.format import Format, Published
+from r2flow.model.published import Format, Published
+from r2flow.systems.latent.autoencoder import UP
 
 UNET, AUTOENCODER, AVERAGE = "model.diffusion_model.", "first_stage_model.", "model_ema."
 FIRST, CODES = "encoder.conv_in.weight", "quantize.embedding.weight"

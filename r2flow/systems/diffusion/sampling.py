@@ -9,8 +9,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from r2flow.diffusion.log_snr import alpha_sigma, for_images
 from r2flow.errors import InputError
+from r2flow.systems.diffusion.log_snr import alpha_sigma, for_images
 
 Denoise = Callable[[Tensor, Tensor], Tensor]  # x of (z, log-SNR), the latter of shape ()
 Noise = Callable[[], Tensor]  # the next draw of N(0, I), in the shape of z

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.generators import Generator
-from r2flow.generators.gan import DROPPED
-from r2flow.published.format import Format, Published
+from r2flow.model.published import Format, Published
+from r2flow.systems.gan.generator import DROPPED
 
 GENERATORS = {"vanilla": "vanilla_gan", "dusty_v1": "dusty1", "dusty_v2": "dusty2"}
 NETWORK = "network."  # of the network in our generator

@@ -4,12 +4,13 @@ from typing import Any
 
 from torch import Tensor
 
-from r2flow.diffusion.objectives import ERRORS, mean_errors, weighted_mean
-from r2flow.diffusion.sampling import noised
 from r2flow.errors import InputError
-from r2flow.generators import Diffusion, Generator
+from r2flow.generators import Generator
 from r2flow.registry import Positive
 from r2flow.stages.base import Batch, SingleLoss
+from r2flow.systems.diffusion.generator import Diffusion
+from r2flow.systems.diffusion.objectives import ERRORS, mean_errors, weighted_mean
+from r2flow.systems.diffusion.sampling import noised
 
 
 class LearnDiffusion(SingleLoss):
@@ -17,11 +18,11 @@ class LearnDiffusion(SingleLoss):
 
     Args:
         generator: A diffusion.
-        loss: Name in `r2flow.diffusion.objectives.ERRORS`.
+        loss: Name in `r2flow.systems.diffusion.objectives.ERRORS`.
         min_snr: gamma of the weight min(SNR, gamma) on the error of the expected data; None for the SNR itself, which
             is equal weights of the noise's error.
         paired: Whether a sample's error has its own weight; False as published, see
-            `r2flow.diffusion.objectives.weighted_mean`.
+            `r2flow.systems.diffusion.objectives.weighted_mean`.
         options: Those of `Stage`.
 
     Raises:

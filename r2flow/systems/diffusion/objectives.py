@@ -6,8 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from r2flow.diffusion.log_snr import alpha_sigma, for_images
 from r2flow.registry import Registry
+from r2flow.systems.diffusion.log_snr import alpha_sigma, for_images
 
 Coefficients = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 

@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.adversarial.processes import summed
 from r2flow.errors import InputError
+from r2flow.processes import summed
 from r2flow.registry import Natural, NonNegative, Portion, did_you_mean
 
 # Low-pass filter of the wavelet sym6 (Daubechies 1992), which images are doubled and halved with.

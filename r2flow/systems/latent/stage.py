@@ -6,15 +6,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2flow.adversarial.hinge import adaptive_weight, adversarial_factor, hinge_loss, reconstruction_loss
-from r2flow.adversarial.processes import averaged
-from r2flow.backbones.patch_discriminator import PatchDiscriminator
-from r2flow.diffusion.ddim import noise_loss
 from r2flow.errors import InputError
-from r2flow.generators import Generator, LatentDiffusion, VQAutoencoder
+from r2flow.generators import Generator
 from r2flow.lidar.encoding import Encoding
+from r2flow.processes import averaged
 from r2flow.registry import Natural, NonNegative, check_options
 from r2flow.stages.base import Batch, SingleLoss, Stage
+from r2flow.systems.latent.ddim import noise_loss
+from r2flow.systems.latent.generator import LatentDiffusion, VQAutoencoder
+from r2flow.systems.latent.hinge import adaptive_weight, adversarial_factor, hinge_loss, reconstruction_loss
+from r2flow.systems.latent.patch_discriminator import PatchDiscriminator
 
 LEAST = 1 / 255  # metres: what is nearer is no return
 
@@ -29,7 +30,7 @@ class LearnAutoencoder(Stage):
     """Reconstruction, codebook and a patch discriminator: R + f w A + c Q for the autoencoder, f H for the latter.
 
     R is the mean absolute error, A the discriminator's verdict, w `adaptive_weight`, Q the quantiser's loss, H the
-    hinge loss and f `adversarial_factor`, all of `r2flow.adversarial.hinge` (Esser et al. 2021).
+    hinge loss and f `adversarial_factor`, all of `r2flow.systems.latent.hinge` (Esser et al. 2021).
 
     Args:
         generator: A `VQAutoencoder`.

@@ -7,14 +7,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2flow.backbones import dcgan, style_gan
-from r2flow.backbones.equalised import LatentGenerator
 from r2flow.errors import InputError
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import Count, Positive
+from r2flow.systems.gan import dcgan, style_gan
+from r2flow.systems.gan.layers import LatentGenerator
 
 DIRECT, TRUNCATE = "direct", "truncate:"
 DROPPED = -1.0  # a dropped ray in model space
@@ -111,7 +111,7 @@ def truncation_of(sampler: Sampler) -> float:
 
 
 class VanillaGan(Gan):
-    """A convolutional GAN whose image says itself which rays are dropped: `r2flow.backbones.dcgan`.
+    """A convolutional GAN whose image says itself which rays are dropped: `r2flow.systems.gan.dcgan`.
 
     Args:
         space: The images it makes.
@@ -171,7 +171,7 @@ class DustyV1(Gan):
 
 
 class DustyV2(Gan):
-    """A style-based GAN that makes each pixel of its ray's angles: `r2flow.backbones.style_gan`.
+    """A style-based GAN that makes each pixel of its ray's angles: `r2flow.systems.gan.style_gan`.
 
     Args:
         code: Width of w; null for `latent`.

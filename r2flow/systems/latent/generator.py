@@ -6,15 +6,15 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
-from r2flow.backbones.autoencoder import Autoencoder
-from r2flow.backbones.latent_unet import LatentUNet
-from r2flow.diffusion.ddim import ddim, ddim_walk, square_root_linear, tables
-from r2flow.diffusion.sampling import DDPM, eta_of
 from r2flow.errors import InputError
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import Bound, check_options
+from r2flow.systems.diffusion.sampling import DDPM, eta_of
+from r2flow.systems.latent.autoencoder import Autoencoder
+from r2flow.systems.latent.ddim import ddim, ddim_walk, square_root_linear, tables
+from r2flow.systems.latent.unet import LatentUNet
 
 Steps = Annotated[int, Bound("of at least 2", lambda n: n >= 2)]
 Share = Annotated[float, Bound("in (0, 1)", lambda x: 0 < x < 1)]
@@ -32,7 +32,7 @@ class VQAutoencoder(Generator):
     Args:
         space: The images that it learns.
         backbone: Not used.
-        autoencoder: Options of `r2flow.backbones.autoencoder.Autoencoder`.
+        autoencoder: Options of `r2flow.systems.latent.autoencoder.Autoencoder`.
     """
 
     draws = False
@@ -55,14 +55,14 @@ class LatentDiffusion(Generator):
     """eps(z_t, t) by a U-Net on an autoencoder's latents, sampled by DDIM and decoded: LiDM (Ran et al. 2024).
 
     Latents become codes when they are decoded, not before. The sampler `ddim:ETA` takes every (N // steps)-th of the
-    diffusion's N steps, `r2flow.diffusion.ddim.ddim_walk`.
+    diffusion's N steps, `r2flow.systems.latent.ddim.ddim_walk`.
 
     Args:
         space: The images it makes.
         backbone: Not used.
-        autoencoder: Options of `r2flow.backbones.autoencoder.Autoencoder`.
-        unet: Options of `r2flow.backbones.latent_unet.LatentUNet`; `position: learnable` is LiDM + APE.
-        beta_first, beta_last: Of `r2flow.diffusion.ddim.square_root_linear`.
+        autoencoder: Options of `r2flow.systems.latent.autoencoder.Autoencoder`.
+        unet: Options of `r2flow.systems.latent.unet.LatentUNet`; `position: learnable` is LiDM + APE.
+        beta_first, beta_last: Of `r2flow.systems.latent.ddim.square_root_linear`.
         diffusion_steps: N.
     """
 

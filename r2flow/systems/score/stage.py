@@ -5,15 +5,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2flow.diffusion.langevin import score_loss
 from r2flow.errors import InputError
-from r2flow.generators import Generator, ScoreModel
+from r2flow.generators import Generator
 from r2flow.registry import NonNegative
 from r2flow.stages.base import Batch, SingleLoss
+from r2flow.systems.score.generator import ScoreModel
+from r2flow.systems.score.langevin import score_loss
 
 
 class MatchScore(SingleLoss):
-    """Denoising score matching at all noise levels alike (`r2flow.diffusion.langevin.score_loss`).
+    """Denoising score matching at all noise levels alike (`r2flow.systems.score.langevin.score_loss`).
 
     Args:
         generator: A `ScoreModel`.

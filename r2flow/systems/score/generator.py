@@ -6,14 +6,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2flow.backbones.refinenet import RefineNet
-from r2flow.diffusion.langevin import annealed_langevin, noise_levels, toward
 from r2flow.errors import InputError
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, parts_of
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import Count, Positive
+from r2flow.systems.score.langevin import annealed_langevin, noise_levels, toward
+from r2flow.systems.score.refinenet import RefineNet
 
 LANGEVIN = "langevin"
 
@@ -28,11 +28,11 @@ class ScoreModel(Generator):
     Args:
         space: The images it makes.
         backbone: Not used: the network is a `RefineNet`.
-        rate: Of `r2flow.diffusion.langevin.step_sizes`.
+        rate: Of `r2flow.systems.score.langevin.step_sizes`.
         denoise: Whether the last level's noise is taken off at the end.
         pull: Strength of the pull to known pixels, a step.
         width: The network's, see `RefineNet`.
-        sigma_first, sigma_last, levels, spacing: The noise levels, see `r2flow.diffusion.langevin.noise_levels`.
+        sigma_first, sigma_last, levels, spacing: The noise levels, see `r2flow.systems.score.langevin.noise_levels`.
 
     Raises:
         InputError: an odd height or width, noise levels that rise, an unknown spacing.

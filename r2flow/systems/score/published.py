@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.published.format import Format, Published
+from r2flow.model.published import Format, Published
 
 NETWORK = "network."  # in the generator
 WRAPPED = "module."  # by torch's DataParallel

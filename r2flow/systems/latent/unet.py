@@ -11,12 +11,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.autoencoder import CircularConv2d
 from r2flow.backbones.base import integers
 from r2flow.backbones.convolutions import GroupNorm, zero_convolution
 from r2flow.backbones.layers import ExactLinear, at_least_float32
 from r2flow.errors import InputError
 from r2flow.registry import Count, Portion
+from r2flow.systems.latent.autoencoder import CircularConv2d
 
 GROUPS, EPS = 32, 1e-5
 POSITIONS = "none", "learnable"

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.errors import InputError
-from r2flow.published.flows import BACKBONE, backbone_of, follow_rings
-from r2flow.published.format import Format, Published
+from r2flow.model.published import BACKBONE, Format, Published, backbone_of, follow_rings
 
 RANGES = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric"}
 PREDICTIONS = {"eps": "eps", "v": "v", "x_0": "x"}

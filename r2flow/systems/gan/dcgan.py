@@ -5,7 +5,10 @@ from itertools import pairwise
 
 from torch import Tensor, nn
 
-from r2flow.backbones.equalised import (
+from r2flow.backbones.layers import at_least_float32
+from r2flow.errors import InputError
+from r2flow.registry import Count
+from r2flow.systems.gan.layers import (
     IMAGE,
     BiasedLeakyReLU,
     BlurBoth,
@@ -16,9 +19,6 @@ from r2flow.backbones.equalised import (
     check_shape,
     outputs,
 )
-from r2flow.backbones.layers import at_least_float32
-from r2flow.errors import InputError
-from r2flow.registry import Count
 
 
 def _first_map(what: str, shape: tuple[int, int], doublings: int) -> tuple[int, int]:

@@ -8,9 +8,11 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from r2flow.adversarial.processes import averaged
 from r2flow.backbones.convolutions import Resample
-from r2flow.backbones.equalised import (
+from r2flow.backbones.layers import ExactBuffers, at_least_float32
+from r2flow.processes import averaged
+from r2flow.registry import Count
+from r2flow.systems.gan.layers import (
     IMAGE,
     BiasedLeakyReLU,
     BlurBoth,
@@ -22,8 +24,6 @@ from r2flow.backbones.equalised import (
     check_shape,
     outputs,
 )
-from r2flow.backbones.layers import ExactBuffers, at_least_float32
-from r2flow.registry import Count
 
 WINDOW = (1.0, 3.0, 3.0, 1.0)
 FREQUENCIES = 256

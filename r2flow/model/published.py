@@ -1,9 +1,12 @@
-"""The published R2Flow checkpoints: a dict of cfg, weights, optimizer, lr_scheduler and num_images."""
+"""Published checkpoints, read as ours are: a reader for each system, found in `FORMATS`, and that of R2Flow itself.
 
-from collections.abc import Mapping
-from dataclasses import replace
+R2Flow's files are a dict of cfg, weights, optimizer, lr_scheduler and num_images.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -12,8 +15,7 @@ from r2flow.backbones import BACKBONES
 from r2flow.errors import InputError
 from r2flow.generators import Generator
 from r2flow.lidar.sensors import Sensor, build_sensor
-from r2flow.published.format import Format, Published
-from r2flow.registry import did_you_mean, options_of
+from r2flow.registry import Registry, did_you_mean, lazy, options_of
 
 ARCHITECTURES = {
     "nat_hdit": "hdit",
@@ -24,6 +26,45 @@ ARCHITECTURES = {
 THEIR_POSITIONS = {"learnable": "learnable_embedding", "polar": "polar_coordinates", "none": None}
 BACKBONE = "backbone."  # of a flow's network in the generator
 UNSAID = {"patch": [1, 4], "window": [3, 9], "ring": True}
+
+
+@dataclass(frozen=True)
+class Published:
+    """A generator of a published file in our terms.
+
+    Attributes:
+        config: `r2flow.generators.build_generator` makes the generator of it; the file's own config under `published`.
+        weights: Of that generator, by our names.
+        step: Optimiser steps taken.
+        sampler: Options of its `Sampler`, as published; None for 32 Euler steps.
+        finish: Called with the generator, which has its weights, and the config.
+    """
+
+    config: dict[str, Any]
+    weights: dict[str, Tensor]
+    step: int = 0
+    sampler: Mapping[str, Any] | None = None
+    finish: Callable[[Generator, Mapping[str, Any]], None] | None = None
+
+
+class Read(Protocol):
+    """Raises `InputError` for a file of this format that lacks or garbles a part."""
+
+    def __call__(self, content: Any, path: Path, averaged: bool = True) -> Published: ...
+
+
+class Format(NamedTuple):
+    """A published layout of checkpoint files.
+
+    Attributes:
+        system: Whose it is.
+        holds: Whether the content of a torch file is of this format.
+        read: The generator in it, with its averaged weights or, on demand, the raw ones.
+    """
+
+    system: str
+    holds: Callable[[Any], bool]
+    read: Read
 
 
 def holds(content: Any) -> bool:
@@ -167,4 +208,57 @@ def published_rings(sensor: Sensor, coords: Tensor) -> Sensor:
     return replace(sensor, elevations=tuple(elevations.tolist()))
 
 
+class Inert:
+    """What stands for an object of a class that is only looked at: it keeps what the pickle says of it."""
+
+    def __init__(self, *arguments: Any) -> None:
+        """Nothing is done with the arguments."""
+
+
+# The classes that a pickled DictConfig names. `weights_only` refuses every other.
+NAMES = (
+    "omegaconf.dictconfig.DictConfig",
+    "omegaconf.listconfig.ListConfig",
+    *(f"omegaconf.base.{name}" for name in ("Metadata", "ContainerMetadata")),
+    *(f"omegaconf.nodes.{name}Node" for name in ("Any", "Boolean", "Float", "Integer", "String")),
+    "typing.Any",
+    "collections.defaultdict",
+    *(f"builtins.{name}" for name in ("bool", "dict", "float", "int", "list", "str")),
+)
+CONTENT, VALUE = "_content", "_val"
+
+
+def inert() -> Any:
+    """While it is entered, `torch.load(weights_only=True)` takes the classes in `NAMES`, each as `Inert`."""
+    return torch.serialization.safe_globals([(Inert, name) for name in NAMES])
+
+
+def plain(value: Any) -> Any:
+    """The plain value of an `Inert` config or of one of its nodes; anything else as it is."""
+    if not isinstance(value, Inert):
+        return value
+    kept = vars(value)
+    if VALUE in kept:
+        return kept[VALUE]
+    content = kept.get(CONTENT)
+    if isinstance(content, dict):
+        return {key: plain(one) for key, one in content.items()}
+    return [plain(one) for one in content] if isinstance(content, list) else content
+
+
 FORMAT = Format("R2Flow", holds, read)
+
+FORMATS: Registry[Format] = Registry(
+    "published format",
+    r2flow=FORMAT,
+    r2dm=lazy("r2flow.systems.diffusion.published:FORMAT"),
+    dusty=lazy("r2flow.systems.gan.published:FORMAT"),
+    lidargen=lazy("r2flow.systems.score.published:FORMAT"),
+    lidm=lazy("r2flow.systems.latent.published:DIFFUSION"),
+    lidm_autoencoder=lazy("r2flow.systems.latent.published:FIRST_STAGE"),
+)
+
+
+def format_of(content: Any) -> Format | None:
+    """The published format of a torch file's content; None for another one."""
+    return next((one for _, one in FORMATS.items() if one.holds(content)), None)
