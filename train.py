@@ -14,9 +14,11 @@ The same command again goes on from the run's last checkpoint. `--cfg job` shows
 import sys
 from pathlib import Path
 
+from r2flow.memory import prepare_process
 from r2flow.signals import heard_from_the_first_import
 
 if __name__ == "__main__":
+    prepare_process()
     with heard_from_the_first_import():
         from r2flow.runs.launch import main
 

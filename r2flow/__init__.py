@@ -10,13 +10,6 @@ Notation everywhere: `t = 0` is noise and `t = 1` is data; `x_0 ~ N(0, I)`, `x_1
 import os
 from typing import TYPE_CHECKING
 
-from r2flow.memory import keep_freed_memory
-
-keep_freed_memory()
-# Read when torch is loaded: threads that wait for one another spin less before they sleep. An idle machine loses no
-# time by that (3.98 s, 4.03 s); beside another program `r2flow sample` took 1.4 to 2.5 times as long.
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-
 if TYPE_CHECKING:
     from pathlib import Path
 

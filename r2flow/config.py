@@ -5,6 +5,7 @@ that is not in `RULES` follows the group that it is in; where no group around it
 run, nothing is inherited, and every link is concerned.
 """
 
+import json
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
@@ -116,6 +117,18 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield from flatten(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
+
+
+def check_tree(config: Mapping[str, Any]) -> None:
+    """Refuse a config that contains itself, as an anchor of YAML or a pickle can have it.
+
+    Raises:
+        ValueError: it does, or it is nested too deeply to be one.
+    """
+    try:
+        json.dumps(config, skipkeys=True, default=str)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
 
 
 def learned(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

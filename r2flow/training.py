@@ -9,7 +9,6 @@ The same command again, and the same config, go on from the last checkpoint.
 """
 
 import logging
-import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -33,7 +32,7 @@ from r2flow.errors import InputError
 from r2flow.flow.solvers import check_method
 from r2flow.generators import GENERATORS, Flow, FlowMap, Generator, build_generator
 from r2flow.generators.base import WAYS
-from r2flow.model.checkpoint import Allowance, checkpoints_of, step_of
+from r2flow.model.checkpoint import checkpoints_of, step_of
 from r2flow.noise import seed_torch
 from r2flow.plugins import made_with
 from r2flow.registry import Bound, Count, Natural, NonNegative, Positive, check_options
@@ -154,8 +153,7 @@ def _build(config: Mapping[str, Any], asked: Sequence[str]) -> Run:
     config = _checked(config, asked, parent)
     config["encoding"]["reflectance"] = resolve_reflectance(config["encoding"].get("reflectance", AUTO), config["data"])
     seed_torch(config["seed"], "weights")
-    with _memory():
-        generator = build_generator(config)
+    generator = build_generator(config)
     if checkpoint is not None:
         generator.start_from(checkpoint.generator)
     return _assembled(config, generator, parent)
@@ -180,21 +178,11 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
     config = _checked(config, asked, parent)
     if config["encoding"].get("reflectance", AUTO) == AUTO:
         config["encoding"]["reflectance"] = True  # the scans will tell
-    with torch.device("meta"), _memory():
+    with torch.device("meta"):
         generator = build_generator(config)
     run = _assembled(config, generator, parent)
     check_run(run.folder, config)
     return config
-
-
-def _memory() -> Allowance:
-    """Refuses weights of more than a quarter of this machine's memory: training takes five times their size."""
-    try:
-        size = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError):  # not every system says it
-        size = 1 << 50
-    refused = f"the backbone's weights are more than a quarter of this machine's {size >> 30} GiB; make it smaller."
-    return Allowance(size // 16, refused)
 
 
 def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:

@@ -16,7 +16,7 @@ CONFIG = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 64},
     "encoding": {"format": "logscale", "reflectance": False},
     "backbone": {"name": "hdit", "base_channels": 8, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
-    "data": {"name": "simulated", "batch_size": 4, "flip": True},
+    "data": {"name": "simulated", "batch_size": 4},
     "stage": {"name": "rectify"},
     "seed": 0,
 }
@@ -24,7 +24,7 @@ CONFIG = {
 
 @pytest.fixture
 def parent(tmp_path: Path) -> Path:
-    """A checkpoint of range alone, from before `data.augment` had a group of its own."""
+    """A checkpoint of range alone."""
     stage = build_stage(CONFIG, build_generator(CONFIG))
     path = tmp_path / "parent.ckpt"
     AtomicCheckpointIO().save_checkpoint({"state_dict": stage.state_dict(), "config": CONFIG, "global_step": 7}, path)
@@ -51,11 +51,6 @@ def test_auto_is_what_the_parent_is(parent: Path, asked: list[str]):
 def test_a_channel_that_the_parent_lacks_is_refused(parent: Path):
     with pytest.raises(InputError, match="reflectance is True here, but False in"):
         completed(child(parent, True), ["encoding.reflectance=true"])
-
-
-def test_a_checkpoint_of_before_is_read_in_todays_keys(parent: Path):
-    assert load_checkpoint(parent).config["data"]["augment"]["flip"] is True
-    assert "flip" not in load_checkpoint(parent).config["data"]
 
 
 def sized(config: dict, rows: int, columns: int, **backbone) -> dict:

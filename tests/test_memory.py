@@ -10,8 +10,9 @@ import pytest
 BLOCK, TIMES = 64 << 20, 8
 PROGRAM = f"""
 import ctypes, resource
-import r2flow
+from r2flow.memory import prepare_process
 
+prepare_process()
 libc = ctypes.CDLL(None)
 libc.malloc.restype, libc.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
 libc.memset.argtypes, libc.free.argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t], [ctypes.c_void_p]

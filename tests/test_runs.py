@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.runs.folder import RESUMED, contradictions, open_run, read_config, write_config
+from r2flow.runs.folder import RESUMED, contradictions, open_run, read_config
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 
 CONFIG = {"seed": 0, "data": {"root": "a", "batch_size": 4}, "trainer": {"devices": 1, "max_steps": 10}}
@@ -41,36 +41,6 @@ def test_the_same_config_goes_on_from_the_newest_whole_checkpoint(tmp_path: Path
     assert open_run(tmp_path, CONFIG) == older
 
 
-@pytest.mark.parametrize(
-    ("then", "now"),
-    [
-        ({"name": "distill", "steps": 2}, {"name": "distill", "steps": 2, "grid": "uniform"}),
-        (
-            {"name": "flow_map", "jumps": {"share": 0.5}},
-            {"name": "flow_map", "jumps": {"share": 0.5, "grid": "uniform", "ends": 0.0}},
-        ),
-    ],
-)
-def test_a_run_from_before_steps_had_a_grid_goes_on(tmp_path: Path, then: dict, now: dict):
-    write_config(tmp_path, {**CONFIG, "stage": then})
-    kept = read_config(tmp_path)
-    assert kept is not None
-    assert contradictions(kept, {**CONFIG, "stage": now}) == []
-
-
-def test_a_run_from_before_pairs_had_a_precision_goes_on(tmp_path: Path):
-    data = {"name": "pairs", "pairs": {"num": 4}}
-    write_config(tmp_path, {**CONFIG, "data": data})
-    kept = read_config(tmp_path)
-    assert kept is not None
-    pairs = {"num": 4, "precision": "32-true"}
-    assert contradictions(kept, {**CONFIG, "data": {**data, "pairs": pairs}}) == []
-    pairs["precision"] = "bf16-mixed"
-    assert contradictions(kept, {**CONFIG, "data": {**data, "pairs": pairs}}) == [
-        "data.pairs.precision=32-true there, bf16-mixed here"
-    ]
-
-
 def test_where_it_computes_may_change_and_what_may_not(tmp_path: Path):
     assert contradictions(CONFIG, changed(trainer__devices=4, data__root="moved")) == []
     assert contradictions(CONFIG, changed(seed=1)) == ["seed=0 there, 1 here"]
@@ -105,16 +75,6 @@ def test_each_part_of_a_mixture_may_move_and_must_stay_what_it_is():
 
     assert contradictions(parts("b", 1), parts("moved", 1)) == []
     assert contradictions(parts("b", 1), parts("b", 2)) == ["data.parts.1.weight=1 there, 2 here"]
-
-
-def test_a_run_begun_before_augmentation_had_a_group_goes_on(tmp_path: Path):
-    write_config(tmp_path, {"data": {"name": "folder", "flip": True}})
-    off = {"roll": False, "beam_dropout": 0.0, "ray_dropout": 0.0}
-    old = read_config(tmp_path)
-    assert contradictions(old, {"data": {"name": "folder", "parts": None, "augment": {"flip": True, **off}}}) == []
-    assert contradictions(old, {"data": {"name": "folder", "augment": {"flip": False, **off}}}) == [
-        "data.augment.flip=True there, False here"
-    ]
 
 
 def test_a_folder_in_which_nothing_was_learned_is_free(tmp_path: Path):

@@ -1,8 +1,6 @@
 """Changes to training scans, drawn for each image of a run: mirrored, turned, with returns taken away."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -49,11 +47,3 @@ class Augmentation:
         if self.ray_dropout:  # drawn last: it alone takes a number for each pixel
             image = image * (draw.random((rows, columns), dtype=np.float32) >= self.ray_dropout).astype(image.dtype)
         return np.ascontiguousarray(image)
-
-
-def upgraded(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The `data` of a config in today's keys: those written before `data.augment` have `flip` in its place."""
-    if "flip" not in data:
-        return dict(data)
-    kept = {key: value for key, value in data.items() if key != "flip"}
-    return {**kept, "augment": asdict(Augmentation(flip=bool(data["flip"])))}

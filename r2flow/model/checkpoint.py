@@ -1,12 +1,11 @@
 """A trained generator on disk, whatever its family: written whole, checked when read, no code from it run."""
 
 import json
-import math
 import pickle
 import re
 import warnings
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.overrides import TorchFunctionMode
 
-from r2flow.config import learned
-from r2flow.data.augment import upgraded
+from r2flow.config import check_tree, learned
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, parse_json
 from r2flow.generators import Budget, Generator, RectifiedFlow, Sampler, build_generator
@@ -157,17 +154,22 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
     content = _read(path, map_location)
     if not isinstance(content, dict):
         raise InputError(_not_a_checkpoint(path))
-    return _renamed(content)
+    return content
 
 
 def _read(path: str | Path, map_location: Any = "cpu") -> Any:
     """What a torch file holds, ours or a published one, which may be a list."""
     if not Path(path).is_file():  # a pipe would be waited for
         raise InputError(f"no checkpoint at {path}. Give a checkpoint file or a run folder.")
-    _check_sums(path)
+    _refuse_unpacking(path)
     try:
         with warnings.catch_warnings(action="ignore"), inert():  # warnings of torch's, on bytes that are no checkpoint
             content = torch.load(path, map_location=map_location, weights_only=True)
+            if not isinstance(content, dict):
+                return content
+            content = {key: plain(value) for key, value in content.items()}
+            check_tree(content.get("config"))
+            return content
     except pickle.UnpicklingError as error:
         if "Unsupported global" in str(error) or "Unsupported class" in str(error):
             name = re.search(r"GLOBAL (\S+)", str(error))
@@ -181,44 +183,22 @@ def _read(path: str | Path, map_location: Any = "cpu") -> Any:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
     except Exception:  # torch's reader raises nearly anything on bytes that are none of its own
         raise InputError(_not_a_checkpoint(path)) from None
-    return {key: plain(value) for key, value in content.items()} if isinstance(content, dict) else content
 
 
-def _check_sums(path: str | Path) -> None:
-    """Hold every entry of a torch file, which is a zip archive, to its CRC-32: torch.load itself does not.
+def _refuse_unpacking(path: str | Path) -> None:
+    """Refuse a zip archive that holds more than its own bytes: torch writes storages as they are.
 
     Raises:
-        InputError: an entry that is not what was written.
+        InputError: an entry is compressed.
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            if not any(entry.CRC for entry in archive.infolist()):
-                return  # written without them (`torch.serialization.set_crc32_options(False)`)
-            broken = archive.testzip()
-    except zipfile.BadZipFile as error:
-        if "CRC" in str(error):
-            raise InputError(_damaged(path, "an entry of it")) from None
-        return  # no archive: torch's older format, or no checkpoint at all, as torch.load will tell
-    except OSError:
-        return  # said by torch.load
-    except Exception:  # zlib's and zipfile's own, on a directory that is damaged
-        raise InputError(_not_a_checkpoint(path)) from None
-    if broken is not None:
-        raise InputError(_damaged(path, broken))
-
-
-def _damaged(path: str | Path, what: str) -> str:
-    return f"{path} is damaged: the checksum of {what} does not fit. Take another checkpoint, or copy it again."
-
-
-def _renamed(content: dict[str, Any]) -> dict[str, Any]:
-    """A checkpoint of 0.1.0 in today's names: the backbone was the LightningModule's `velocity`."""
-    if "pytorch-lightning_version" not in content:
-        return content
-    for key in ("state_dict", "current_model_state"):
-        if key in content:
-            content[key] = {re.sub(r"^velocity\.", PREFIX + BACKBONE, name): v for name, v in content[key].items()}
-    return content
+            entries = archive.infolist()
+    except Exception:  # torch's older format, or damaged: torch.load says which
+        return
+    packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
+    if packed or sum(entry.file_size for entry in entries) > Path(path).stat().st_size:
+        raise InputError(f"{path} holds compressed tensors, which torch never writes. Ask its author for another file.")
 
 
 def _not_a_checkpoint(path: str | Path) -> str:
@@ -242,7 +222,7 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
         found = _built(content, path, averaged)
     except InputError as error:
         raise type(error)(str(error) if str(path) in str(error) else f"{path}: {error}") from None
-    except (AttributeError, LookupError, TypeError, ValueError) as error:  # entries of another kind than ours
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
         reason = (str(error).splitlines() or [""])[0][:160]
         raise InputError(
             f"{path} cannot be used: what it holds is of another kind than r2flow writes ({type(error).__name__}: "
@@ -259,16 +239,16 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
         made = published.read(content, path, averaged)
         config, weights, step, sampler, kind = made.config, made.weights, made.step, made.sampler, "published"
     elif isinstance(content, dict) and "config" in content and "state_dict" in content:
-        content = _renamed(content)
         state = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
-        for key, entry in (("config", content["config"]), ("state_dict", state)):
+        config, groups = content["config"], ("sensor", "encoding", "backbone", "data", "stage", "trainer")
+        entries = {"config": config, "state_dict": state}
+        entries |= {key: config.get(key) or {} for key in groups if isinstance(config, Mapping)}
+        for key, entry in entries.items():
             if not isinstance(entry, Mapping):
                 raise InputError(f"its '{key}' has no named values. Is it of another program?")
         config, step, kind = dict(content["config"]), int(content.get("global_step", 0)), "r2flow"
-        if "data" in config:
-            config["data"] = upgraded(config["data"])
         weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
-        sampler = content.get("sampler") or _sampler_of_stage(config.get("stage") or {})
+        sampler = content.get("sampler")
     elif isinstance(content, dict):
         systems = ", ".join(one.system for _, one in FORMATS.items())
         raise InputError(
@@ -277,11 +257,7 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
         )
     else:
         raise InputError(_not_a_checkpoint(path))
-    held = sum(value.numel() for value in weights.values())
-    refused = (
-        f"the weights in {path} do not fit its config: they are {held:,} numbers, and the config asks for far more."
-    )
-    with made_with(config, str(path)), Allowance(2 * held + SPARE, refused):
+    with made_with(config, str(path)):
         generator = build_generator(config)
     check_weights(generator, weights, path)
     generator.load_state_dict(weights)
@@ -291,38 +267,6 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
     measured = () if published is not None else content.get("accuracy") or ()
     accuracy = tuple(Budget.of(one) for one in measured)
     return Checkpoint(generator.eval().requires_grad_(False), config, step, path, kind, accuracy)
-
-
-SPARE = 2**28  # elements of buffers that a checkpoint does not hold, and of what is computed on the way
-
-
-class Allowance(TorchFunctionMode):
-    """Refuses to make tensors of more than so many `elements` in all, with the line `refused`, before it takes memory.
-
-    The meta device would do the same, but its first use imports torch's compiler and sympy, which takes as long as
-    `import torch`.
-    """
-
-    FACTORIES = frozenset({torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.linspace})
-
-    def __init__(self, elements: int, refused: str) -> None:
-        super().__init__()
-        self.left, self.refused = elements, refused
-
-    def __torch_function__(
-        self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
-    ) -> Any:
-        if func in self.FACTORIES:
-            sizes = [part for arg in args for part in (arg if isinstance(arg, (tuple, list)) else (arg,))]
-            self.left -= math.prod(max(size, 1) for size in sizes if isinstance(size, int))
-            if self.left < 0:
-                raise InputError(self.refused)
-        return func(*args, **(kwargs or {}))
-
-
-def _sampler_of_stage(stage: Mapping[str, Any]) -> dict[str, Any] | None:
-    """What 0.1.0 did not write down: a k-TD flow takes k Euler steps."""
-    return {"method": "euler", "steps": int(stage["steps"]), "fixed": True} if stage.get("name") == "distill" else None
 
 
 def weights_hash(checkpoint: Checkpoint) -> str:
@@ -352,23 +296,19 @@ def read_safetensors(path: Path) -> dict[str, Any]:
         with safe_open(path, framework="pt") as file:
             kept = file.metadata() or {}
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        if NOTES in kept:
-            notes, prefix = parse_json(kept[NOTES]), PREFIX
-            whole = notes.pop("digest", None) == _digest(notes, weights)
-        else:  # 0.1.0 held the backbone alone, and said so under several keys
-            notes, prefix = {key: parse_json(kept[key]) for key in ("config", "step")}, PREFIX + BACKBONE
-            whole = True
+        notes = parse_json(kept[NOTES])
+        whole = notes.pop("digest", None) == _digest(notes, weights)
         config, step, sampler = notes["config"], int(notes["step"]), notes.get("sampler")
         accuracy = notes.get("accuracy")
     except KeyError as error:
         raise InputError(f"{path} holds weights but no r2flow config (no {error} in its metadata).") from None
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, OverflowError, ValueError) as error:
         raise InputError(f"{path} is not a safetensors file, or a damaged one: {error}.") from None
     except (TypeError, AttributeError):
         raise InputError(f"{path} holds weights, and notes that are not r2flow's.") from None
     if not whole:
-        raise InputError(_damaged(path, "its weights and config"))
-    state = {prefix + name: value for name, value in weights.items()}
+        raise InputError(f"{path} is damaged: its checksum does not fit. Copy it again, or take another checkpoint.")
+    state = {PREFIX + name: value for name, value in weights.items()}
     return {"config": config, "global_step": step, "state_dict": state, "sampler": sampler, "accuracy": accuracy}
 
 

@@ -12,8 +12,7 @@ import yaml
 from filelock import FileLock, Timeout
 from torch import Tensor
 
-from r2flow.config import flatten, rule
-from r2flow.data.augment import upgraded
+from r2flow.config import check_tree, flatten, rule
 from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.model.checkpoint import FOLDER, checkpoints_of, read_checkpoint, step_of
@@ -25,8 +24,7 @@ CONFIG = "config.yaml"
 
 def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """The keys, with both values, in which a command departs from the run that it would go on with."""
-    then = {"generator": {"name": "rectified_flow"}}  # of a run of 0.1.0, which knew no other
-    before, now = (dict(flatten({**then, **config})) for config in (old, new))
+    before, now = dict(flatten(old)), dict(flatten(new))
     unused = "" if "pairs" in (before.get("data.name"), now.get("data.name")) else "data.pairs."
     return [
         f"{key}={before.get(key)} there, {now.get(key)} here"
@@ -66,39 +64,13 @@ def read_config(run: str | Path) -> dict[str, Any] | None:
     path = Path(run, CONFIG)
     kept = (content.get("config") for _, content in _whole(run))
     config = _read_yaml(path) if path.is_file() else next((one for one in kept if isinstance(one, dict)), None)
-    if not config:
-        return None
-    return _in_todays_keys(config)
-
-
-def _in_todays_keys(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A config with what its keys were before they could be chosen."""
-    found = dict(config)
-    if "data" in found:
-        found["data"] = upgraded(found["data"])
-        if isinstance(found["data"].get("pairs"), Mapping):
-            found["data"]["pairs"] = {"precision": "32-true", **found["data"]["pairs"]}
-    callbacks = found.get("callbacks")
-    if isinstance(callbacks, Mapping) and isinstance(callbacks.get("ema"), Mapping):
-        found["callbacks"] = {**callbacks, "ema": {"rule": "power", **callbacks["ema"]}}
-    stage = found.get("stage")
-    if isinstance(stage, Mapping) and stage.get("name") == "distill":
-        found["stage"] = {"grid": "uniform", **stage}
-    if isinstance(stage, Mapping) and isinstance(stage.get("jumps"), Mapping):
-        jumps = {"grid": "uniform", "ends": 0.0, **stage["jumps"]}
-        found["stage"] = {"end_loss": None, "ends_from": None, **stage, "jumps": jumps}
-    return found
-
-
-MOST_ALIASES = 20  # a few lines of aliases of aliases stand for billions of values
+    return config or None
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
-        if sum(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)) > MOST_ALIASES:
-            raise ValueError("it repeats itself by aliases")
-        config = yaml.safe_load(text)
+        config = yaml.safe_load(path.read_text(encoding="utf-8"))
+        check_tree(config)
         groups = [key for key in ("stage", "data", "trainer") if not isinstance(config.get(key, {}), Mapping)]
         if groups:
             raise ValueError(f"its {groups[0]} is no group of keys")

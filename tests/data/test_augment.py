@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.data.augment import Augmentation, upgraded
+from r2flow.data.augment import Augmentation
 from r2flow.data.loader import FlowDataset
 from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
@@ -109,9 +109,3 @@ def test_off_by_default():
     assert all(Augmentation(**{kind: value}) for kind, value in KINDS.items())
     with pytest.raises(InputError, match=r"beam_dropout must lie in \[0, 1\), found 1"):
         Augmentation(beam_dropout=1)
-
-
-def test_a_config_of_before_is_read():
-    assert upgraded({"name": "folder", "flip": True}) == {"name": "folder", "augment": {**{
-        "flip": True, "roll": False, "beam_dropout": 0.0, "ray_dropout": 0.0}}}  # fmt: skip
-    assert upgraded({"name": "folder"}) == {"name": "folder"}
