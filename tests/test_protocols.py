@@ -137,7 +137,7 @@ def test_several_sets_stand_in_one_table_with_floor_and_controls(
         "generated": "judged", "other": "judged", "real halves": "floor", "generated, as many": "floor",
         "other, as many": "floor", **dict.fromkeys(("noise", "flat ground", "mean scan", "shuffled pixels"), "control"),
     }  # fmt: skip
-    assert {"jsd", "mmd_lidm", "beams", "kid_embedded"} <= {one["metric"] for one in content[0]["metrics"]}
+    assert {"jsd", "mmd_lidm", "kid_handcrafted"} <= {one["metric"] for one in content[0]["metrics"]}
     (jsd,) = (one for one in content[0]["metrics"] if one["metric"] == "jsd")
     assert jsd["figures"]["jsd"] == figure(measured[0], generated, PAPER)
 
@@ -153,7 +153,7 @@ def test_a_scan_of_another_scale_is_named_in_one_line(r2flow, measured, generate
     scan = np.load(generated / "000004.npy")
     change(scan)
     np.save(generated / "000004.npy", scan)
-    options = ("--metrics", "beams", "--size", "8x64", "--workers", 0, "--no-cache")
+    options = ("--metrics", "frechet_handcrafted", "--size", "8x64", "--workers", 0, "--no-cache")
     code, _, error = r2flow("evaluate", measured[0], generated, *options)
     assert code == 2
     (line,) = (line for line in error.splitlines() if not line.startswith("WARNING"))

@@ -40,8 +40,6 @@ METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     mmd_unbiased=_lazily("mmd:MMDUnbiased"),
     jsd_lidm=_lazily("lidm:JSDLiDM"),
     mmd_lidm=_lazily("lidm:MMDLiDM"),
-    beams=_lazily("beams:BeamHistograms"),
-    drop_rate=_lazily("beams:DropRate"),
 )
 
 

@@ -111,7 +111,7 @@ def test_fewer_scans_than_dimensions_is_exact_and_said(scans_of, summary):
 @pytest.mark.parametrize(
     ("network", "name"),
     [("rangenet53", "frd"), ("rangenet21", "frid"), ("pointnet", "fpd"), ("spvcnn", "fpvd"), ("minkowskinet", "fsvd"),
-     ("embedded", "frechet_embedded")],
+     ("handcrafted", "frechet_handcrafted")],
 )  # fmt: skip
 def test_the_network_gives_the_name_and_random_weights_never_the_fields(network, name, summary):
     metric = FrechetDistance(network)

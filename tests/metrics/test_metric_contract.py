@@ -175,10 +175,10 @@ def test_a_network_runs_once_for_all_metrics_of_it(summary, sets, monkeypatch):
     ran = []
     features = type(summary).features
     monkeypatch.setattr(type(summary), "features", lambda self, scans: ran.append(self) or features(self, scans))
-    metrics = [METRICS[name]() for name in ("frechet_embedded", "manifold_embedded", "kid_embedded", "frid")]
+    metrics = [METRICS[name]() for name in ("frechet_handcrafted", "manifold_handcrafted", "kid_handcrafted", "frid")]
     for metric in metrics:
         metric.update(sets["real"], real=True)
-    assert [network.name for network in ran] == ["embedded", "rangenet21"]
+    assert [network.name for network in ran] == ["handcrafted", "rangenet21"]
 
 
 def test_features_of_a_deleted_network_are_not_taken_for_those_of_another(summary, sets):

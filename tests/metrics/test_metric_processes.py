@@ -16,7 +16,7 @@ from r2flow.metrics.manifold import Manifold
 from r2flow.metrics.scans import Scans
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
-PLAIN = ("jsd", "mmd", "jsd_lidm", "mmd_lidm", "beams", "drop_rate")
+PLAIN = ("jsd", "mmd", "jsd_lidm", "mmd_lidm")
 
 
 def images(seed, n):
@@ -29,7 +29,7 @@ def images(seed, n):
 
 def measure(rank, ranks, folder):
     """Figures, remarks and intervals of all metrics, of two generated sets one after the other."""
-    network = extractor_class("embedded").random()
+    network = extractor_class("handcrafted").trained()
     metrics = [METRICS[name](keep=True, folder=folder / name) for name in PLAIN]
     metrics += [FrechetDistance(network, keep=True, folder=folder), Manifold(network, folder=folder)]
     found = []

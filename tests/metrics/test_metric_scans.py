@@ -38,7 +38,7 @@ def test_values_that_no_scan_has_are_refused_with_the_first_such_scan(change, sa
         Scans(made, SMALL)
     with pytest.raises(InputError, match=f"^scan b.npy: .*{said}"):
         Scans(made, SMALL, names=["a.npy", "b.npy", "c.npy"])
-    metric = METRICS["beams"](sensor=SMALL)
+    metric = METRICS["jsd"](sensor=SMALL)
     metric.update(images(), real=True)
     with pytest.raises(InputError, match=f"^scan 4: .*{said}"):
         metric.update(made, real=True)

@@ -30,8 +30,6 @@ EXTRACTORS = Extractors(
     "extractor",
     handcrafted="handcrafted:Handcrafted",
     handcrafted_range="handcrafted:HandcraftedRange",
-    embedded="embedded:Embedded",
-    embedded_range="embedded:EmbeddedRange",
     rangenet53="rangenet:RangeNet53",
     rangenet21="rangenet:RangeNet21",
     pointnet="pointnet:PointNet",
