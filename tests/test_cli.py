@@ -1,5 +1,6 @@
 """r2flow VERB as a user types it."""
 
+import hashlib
 import json
 import subprocess
 import sys
@@ -121,18 +122,15 @@ def test_info_says_what_is_in_a_checkpoint(r2flow, saved):  # noqa: F811
     assert json.loads(said)["step"] == 7
 
 
-def test_convert_writes_the_averaged_weights_in_both_formats(r2flow, saved, tmp_path):  # noqa: F811
+def test_export_writes_the_averaged_weights(r2flow, saved, tmp_path):  # noqa: F811
     path, averaged = saved
-    ours, published, again = tmp_path / "a.safetensors", tmp_path / "b.pth", tmp_path / "c.safetensors"
-    for source, out in ((path.parent.parent, ours), (ours, published), (published, again)):
-        code, said, _ = r2flow("convert", source, out)
-        assert code == 0
-        assert said.startswith(f"{out}: ")
-        for name, value in load_checkpoint(out).generator.state_dict().items():
-            assert torch.equal(value, averaged[f"generator.{name}"])
-    code, _, err = r2flow("convert", path, tmp_path / "d.onnx")
-    assert code == 2
-    assert "give .safetensors for our format or .pth for the published one" in err
+    out = tmp_path / "a.safetensors"
+    code, said, _ = r2flow("export", path.parent.parent, "--to", "safetensors", "--out", out)
+    assert code == 0
+    assert hashlib.sha256(out.read_bytes()).hexdigest() in said
+    for name, value in load_checkpoint(out).generator.state_dict().items():
+        assert torch.equal(value, averaged[f"generator.{name}"])
+    assert r2flow("export", out, "--to", "safetensors", "--out", out)[0] == 2
 
 
 def verbs() -> list[str]:
@@ -272,15 +270,14 @@ def test_importing_r2flow_loads_neither_lightning_nor_matplotlib():
     assert done.stdout.strip() == "[]"
 
 
-def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_bins(r2flow, saved, tmp_path):  # noqa: F811
-    published, out = tmp_path / "published.pth", tmp_path / "out"
-    assert r2flow("convert", saved[0].parent.parent, published)[0] == 0
+def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_bins(r2flow, saved, shared, tmp_path):  # noqa: F811
+    published, out = shared / "oracle" / "published_format.pth", tmp_path / "out"
     drawn = ("--num", 1, "--steps", 1, "--pictures", 0, "--out", out)
     code, _, error = r2flow("sample", "-c", published, *drawn, "--format", "npy,ply")
     assert code == 0
     assert error.count("points are written along rays through their middles") == 1
     assert json.loads((out / "scans.json").read_text())["rays"] == "centre"
-    h, w, image = 8, 64, np.load(out / "000000.npy")
+    h, w, image = 16, 192, np.load(out / "000000.npy")
     xyz = read_points(out / "000000.ply").xyz
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
     column = w * (1 - azimuth / np.pi) / 2 - 0.5

@@ -108,10 +108,9 @@ def write_stores(folder: Path, beside: Path) -> None:
 
 def write_weights(folder: Path, beside: Path, run: Path) -> None:
     loaded = load_checkpoint(run)
-    model, published = beside / "model.safetensors", beside / "published.pth"
-    for path in (model, published):
-        save_checkpoint(loaded, path)
-    keep(folder, "checkpoint", run, model, published)
+    model = beside / "model.safetensors"
+    save_checkpoint(loaded, model)
+    keep(folder, "checkpoint", run, model)
     weights = beside / "weights.pth"
     torch.save({"fc.weight": torch.randn(16, 16), "fc.bias": torch.randn(16)}, weights)
     torch.save({"fc.weight": torch.randn(16, 16)}, beside / "legacy.pth", _use_new_zipfile_serialization=False)

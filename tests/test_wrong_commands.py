@@ -140,16 +140,9 @@ sample -c run -o out --solver jump:2 # jump:2 is for flow maps
 view scans --seed 3 -o v.html # --seed and --device are of a run
 view scans --device cpu -o v.html # --seed and --device are of a run
 project scans/000000.bin -o out.npy --reflectance-scale inf # found inf
-convert # Missing
-convert run # Missing
-convert run out # give .safetensors
-convert run out.onnx
-convert run empty
-convert nowhere out.pth
-convert bad.ckpt out.pth
-convert flow.safetensors ./flow.safetensors --half # flow.safetensors would be replaced
+export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
+export run --to onnx --half # --half
 grow flow.safetensors flow.safetensors --size 16x256 # give another name
-convert run file.txt/a.pth
 backbones --only nope
 backbones --size 64
 backbones --size 0x0

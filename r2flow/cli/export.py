@@ -1,5 +1,6 @@
-"""A flow for programs that have no r2flow: `r2flow export`."""
+"""A generator as one file: `r2flow export`."""
 
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated
 
@@ -16,25 +17,38 @@ from r2flow.errors import InputError
 def export(
     checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file, a run folder or a model.")],
     solver: SolverOptions,
-    to: Annotated[str, typer.Option(help="onnx for onnxruntime and its like, or pt2 for torch.")] = "onnx",
+    to: Annotated[
+        str, typer.Option(help="onnx for onnxruntime and its like, pt2 for torch, or safetensors for r2flow.")
+    ] = "onnx",
     what: Annotated[str, typer.Option(help="sampler: noise in, scan out; or network: v(t, x) alone.")] = "sampler",
     grid: Annotated[
         str | None, typer.Option(help="Where the steps fall: uniform, power:P, power-start:P or late:K.")
     ] = None,
     flatten: FlattenOption = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File to write; NAME.onnx or NAME.pt2 if left out.")
-    ] = None,
+    half: Annotated[
+        bool, typer.Option("--half", help="Large weights of a .safetensors in float16: half the size.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write; NAME.onnx, ... if left out.")] = None,
 ) -> None:
     """Write a flow as one file that runs without r2flow: noise in, range in metres, reflectance and points out.
 
-    The number of steps is fixed by the file. The file is run and compared with the flow.
+    The number of steps is fixed by the file. The file is run and compared with the flow. With --to safetensors: the
+    averaged weights, config and sampler of any generator, to share; the same bytes each time.
     """
     from r2flow.generators import Sampler
     from r2flow.model import export as writing
     from r2flow.model.checkpoint import load_checkpoint
 
+    if out is None:
+        out = Path(f"{checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name}.{to}")
+    elif out.suffix != f".{to}":
+        raise InputError(f"--to {to} writes a .{to}, found --out {out}.")
+    if to == "safetensors":
+        _write_weights(checkpoint, out, half, solver == SolverOptions() and not grid and flatten is None)
+        return
     writing.FORMATS[to]
+    if half:
+        raise InputError("--half is for --to safetensors.")
     if what not in ("sampler", "network"):
         raise InputError(f"--what must be sampler or network, found {what!r}.")
     network = what == "network"
@@ -42,10 +56,6 @@ def export(
         raise InputError("--what network has no sampler: leave solver, steps, tolerance, grid and flatten out.")
     loaded = load_checkpoint(checkpoint)
     sampler: Sampler = solver.change(writing.flow_of(loaded).sampler, grid=grid, flatten=flatten)
-    if out is None:
-        out = Path(f"{checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name}.{to}")
-    elif out.suffix != f".{to}":
-        raise InputError(f"--to {to} writes a .{to}, found --out {out}.")
     written = writing.export(loaded, out, sampler, network)
     size = f"{out.stat().st_size / 1e6:.1f} MB"
     batch = "any batch" if written.any_batch else "one scan at a time, torch could not free its batch"
@@ -62,3 +72,15 @@ def export(
         f"compared with the flow: range within {1000 * apart.metres:.2g} mm, reflectance within "
         f"{apart.reflectance:.2g}, {apart.rays} rays dropped by one alone"
     )
+
+
+def _write_weights(checkpoint: Path, out: Path, half: bool, as_is: bool) -> None:
+    from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
+
+    if not as_is:
+        raise InputError("--to safetensors keeps the generator's own sampler: leave the sampler's options out.")
+    loaded = load_checkpoint(checkpoint)
+    if out.exists() and out.samefile(loaded.path):
+        raise InputError(f"{out} would be replaced by what is made of it; give another name.")
+    save_checkpoint(loaded, out, half)
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, SHA-256 {sha256(out.read_bytes()).hexdigest()}")

@@ -147,7 +147,7 @@ def calibrate(
     loaded = load_checkpoint(checkpoint, choose_device(device))
     check_calibrates(loaded)
     if str(checkpoint) in MODELS:
-        copy = f"r2flow convert {checkpoint} {checkpoint}.safetensors"
+        copy = f"r2flow export {checkpoint} --to safetensors"
         raise InputError(f"the model {checkpoint} stays as it is; make a copy and give that: {copy}.")
     with Bar("measuring", evaluations_of_calibration(steps), "evaluations") as advance:
         found = measure(loaded, steps, solver, num, advance)
@@ -177,29 +177,6 @@ def info(
         print(to_json(contents, indent=2))
     else:
         print_contents(contents)
-
-
-@app.command(epilog="Example: r2flow convert r2flow-kitti360-1rf.pth 1rf.safetensors")
-def convert(
-    checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file of any format, a run folder or a model.")],
-    out: Annotated[Path, typer.Argument(help="What to write: .safetensors (ours) or .pth (the published format).")],
-    half: Annotated[
-        bool, typer.Option("--half", help="Large weights in float16: a .safetensors of half the size.")
-    ] = False,
-) -> None:
-    """Write a generator's averaged weights and config as one file, the weights bit-equal but for --half.
-
-    A .safetensors is the same, byte for byte, whenever it is written, and names no folder of this machine.
-    """
-    import hashlib
-
-    from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
-
-    found = load_checkpoint(checkpoint)
-    _keep_source(found, out)
-    save_checkpoint(found, out, half)
-    written = out.read_bytes()
-    print(f"{out}: {len(written) / 1e6:.1f} MB, SHA-256 {hashlib.sha256(written).hexdigest()}")
 
 
 def _keep_source(checkpoint: "Checkpoint", out: Path) -> None:

@@ -22,7 +22,7 @@ from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.completion import complete
-from r2flow.model.published import FORMATS, format_of, inert, plain, published_cfg
+from r2flow.model.published import FORMATS, format_of, inert, plain
 from r2flow.model.sampling import sample
 from r2flow.models import MODELS, find_model
 from r2flow.plugins import made_with
@@ -317,50 +317,37 @@ def _digest(notes: Mapping[str, Any], weights: Mapping[str, Tensor]) -> str:
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False) -> None:
-    """Write a generator with its config: `.safetensors` in our format, `.pth` in the published one, weights bit-equal.
+    """Write a generator with its config as a `.safetensors`.
 
-    A `.safetensors` is the same, byte for byte, whenever and wherever it is written, and names no folder of this
-    machine: of its config it holds what was learned (`r2flow.config.learned`).
+    The bytes are a function of the generator alone: of its config the file holds what was learned
+    (`r2flow.config.learned`), and no folder of this machine.
 
     Args:
-        half: Round large matrices to float16, which halves a `.safetensors`.
+        half: Round large matrices to float16, which halves the file.
 
     Raises:
-        InputError: another ending, or a generator or a config that the published format cannot say.
+        InputError: another ending.
     """
-    path = Path(path)
-    if path.suffix == ".safetensors":
-        from safetensors.torch import save
+    from safetensors.torch import save
 
-        weights = _plain(checkpoint.generator)
-        if half:
-            large = large_matrices(checkpoint.generator)
-            weights = {name: value.half() if name in large else value for name, value in weights.items()}
-        notes = {
-            "config": learned(checkpoint.config),
-            "step": checkpoint.step,
-            "sampler": checkpoint.generator.sampler.asdict(),
-        }
-        if checkpoint.accuracy:
-            notes["accuracy"] = [budget.asdict() for budget in checkpoint.accuracy]
-        # Several keys of metadata come in no fixed order.
-        data = save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})})
-        with atomic_write(path) as file:
-            file.write(data)
-    elif path.suffix == ".pth":
-        if half:
-            raise InputError(f"{path}: half precision is for .safetensors; the published format is float32.")
-        if type(checkpoint.generator) is not RectifiedFlow:
-            what = type(checkpoint.generator).__name__
-            raise InputError(f"{path}: the published format cannot hold a {what}; convert to .safetensors instead.")
-        weights = _plain(checkpoint.model)
-        cfg = published_cfg(checkpoint.config)
-        images = checkpoint.step * int(cfg.get("training", {}).get("batch_size", 1))
-        content = {"cfg": cfg, "weights": weights, "optimizer": {}, "lr_scheduler": {}, "num_images": images}
-        with atomic_write(path) as file:
-            torch.save(content, file)
-    else:
-        raise InputError(f"{path}: give .safetensors for our format or .pth for the published one.")
+    path = Path(path)
+    if path.suffix != ".safetensors":
+        raise InputError(f"{path}: a checkpoint is written as a .safetensors.")
+    weights = {name: value.detach().cpu().contiguous() for name, value in checkpoint.generator.state_dict().items()}
+    if half:
+        large = large_matrices(checkpoint.generator)
+        weights = {name: value.half() if name in large else value for name, value in weights.items()}
+    notes = {
+        "config": learned(checkpoint.config),
+        "step": checkpoint.step,
+        "sampler": checkpoint.generator.sampler.asdict(),
+    }
+    if checkpoint.accuracy:
+        notes["accuracy"] = [budget.asdict() for budget in checkpoint.accuracy]
+    # Under one key: several keys of metadata come in no fixed order.
+    data = save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})})
+    with atomic_write(path) as file:
+        file.write(data)
 
 
 def keep_sampler(checkpoint: Checkpoint) -> None:
@@ -371,8 +358,7 @@ def keep_sampler(checkpoint: Checkpoint) -> None:
     """
     path = checkpoint.path
     if checkpoint.format == "published":
-        own = path.with_suffix(".safetensors")
-        raise InputError(f"{path} has no place for a sampler; give a copy that has: r2flow convert {path} {own}.")
+        raise InputError(f"{path} has no place for a sampler; export it to a safetensors first.")
     if path.suffix == ".safetensors":
         from safetensors import safe_open
 
@@ -390,10 +376,6 @@ def keep_sampler(checkpoint: Checkpoint) -> None:
 def large_matrices(module: nn.Module) -> set[str]:
     """Names of the parameters that half precision rounds."""
     return {name for name, value in module.named_parameters() if value.ndim > 1 and value.numel() > SMALL}
-
-
-def _plain(module: nn.Module) -> dict[str, Tensor]:
-    return {name: value.detach().cpu().contiguous() for name, value in module.state_dict().items()}
 
 
 def check_weights(model: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:

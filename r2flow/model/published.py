@@ -11,11 +11,10 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from r2flow.backbones import BACKBONES
 from r2flow.errors import InputError
 from r2flow.generators import Generator
-from r2flow.lidar.sensors import Sensor, build_sensor
-from r2flow.registry import Registry, did_you_mean, lazy, options_of
+from r2flow.lidar.sensors import Sensor
+from r2flow.registry import Registry, did_you_mean, lazy
 
 ARCHITECTURES = {
     "nat_hdit": "hdit",
@@ -25,7 +24,6 @@ ARCHITECTURES = {
 }
 THEIR_POSITIONS = {"learnable": "learnable_embedding", "polar": "polar_coordinates", "none": None}
 BACKBONE = "backbone."  # of a flow's network in the generator
-UNSAID = {"patch": [1, 4], "window": [3, 9], "ring": True}
 
 
 @dataclass(frozen=True)
@@ -140,52 +138,6 @@ def backbone_of(model: Mapping[str, Any], path: Path) -> dict[str, Any]:
         "groups": model.get("gn_num_groups", 8),
         "eps": model.get("gn_eps", 1e-6),
         "num_heads": heads if isinstance(heads, int) else list(heads)[-1],
-    }
-
-
-def published_cfg(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The `cfg` of a published checkpoint for a config of ours: its own where it came from one, else a translation.
-
-    Raises:
-        InputError: something that the published format cannot say.
-    """
-    if "published" in config:
-        return dict(config["published"])
-    sensor, encoding, backbone = (dict(config[key]) for key in ("sensor", "encoding", "backbone"))
-    name = backbone["name"]
-    unsaid = [key for key, theirs in UNSAID.items() if backbone.get(key, theirs) != theirs]
-    if sensor["name"] != "hdl64e" or name not in ARCHITECTURES.values() or unsaid:
-        what = ", ".join(unsaid) or f"sensor {sensor['name']!r} with backbone {name!r}"
-        raise InputError(f"the published format cannot say {what}; convert to .safetensors instead.")
-    built = build_sensor(sensor["name"], sensor.get("rows"), sensor.get("columns"))
-    rows, columns = built.shape
-    defaults = {key: list(v) if isinstance(v, tuple) else v for key, v in options_of(BACKBONES[name], given=1).items()}
-    backbone = {**defaults, **backbone}
-    position, data = backbone["position"], config.get("data") or {}  # a grown network has learned from none yet
-    architecture = next(theirs for theirs, ours in ARCHITECTURES.items() if ours == name)
-    return {
-        "data": {
-            "dataset": data.get("name", "kitti_360"),
-            "data_format": encoding["format"],
-            "train_reflectance": encoding["reflectance"],
-            "min_depth": sensor.get("min_range") or built.min_range,
-            "max_depth": sensor.get("max_range") or built.max_range,
-            "projection": f"{data.get('projection', 'spherical')}-{columns}",
-            "resolution": [rows, columns],
-        },
-        "model": {
-            "architecture": architecture,
-            "base_channels": backbone["base_channels"],
-            "temb_channels": backbone["time_channels"] or 4 * backbone["base_channels"],
-            "channel_multiplier": backbone.get("channel_multiplier", [1, 2, 4, 8]),
-            "num_residual_blocks": backbone.get("depths") or backbone["num_residual_blocks"],
-            "attn_num_heads": backbone["num_heads"],
-            "coords_encoding": THEIR_POSITIONS.get(position, position),
-            "dropout": backbone["dropout"],
-            "gn_num_groups": backbone.get("groups", 8),
-            "gn_eps": backbone.get("eps", 1e-6),
-        },
-        "training": {"batch_size": data.get("batch_size", 8)},
     }
 
 

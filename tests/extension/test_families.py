@@ -101,7 +101,9 @@ def test_samples_are_measured(trained: tuple[Family, Path], tmp_path: Path):
 
 def test_weights_travel_as_safetensors(trained: tuple[Family, Path], tmp_path: Path):
     family, run = trained
-    assert r2flow("convert", family.plugin, run, tmp_path / "it.safetensors").returncode == 0
+    assert (
+        r2flow("export", family.plugin, run, "--to", "safetensors", "-o", tmp_path / "it.safetensors").returncode == 0
+    )
     with loaded(family):
         there, here = load_checkpoint(run).generator, load_checkpoint(tmp_path / "it.safetensors").generator
     assert here.sampler == there.sampler
@@ -131,7 +133,7 @@ CANNOT = {
     "report curvature": (["-c", "RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
     "report work-precision": (["-c", "RUN", "-o", "OUT"], "a work-precision report needs the velocity of a flow"),
     "calibrate": (["-c", "RUN"], "a time grid needs the velocity of a flow, which a ToyGenerator"),
-    "convert": (["RUN", "OUT.pth"], "the published format cannot hold a ToyGenerator; convert to .safetensors"),
+    "export": (["RUN", "-o", "OUT.onnx"], "only flows can be exported"),
     "pairs": (["-c", "RUN"], "a ToyGenerator can be run in one way only, direct with 1 step; found method adams3"),
     "sample": (["-c", "RUN", "--steps", "4", "-o", "OUT"], "a ToyGenerator can be run in one way only"),
 }  # fmt: skip
