@@ -36,7 +36,7 @@ def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: P
     assert (code, error) == (0, "")
     printed = " ".join(printed.split())
     for words in (
-        "8, lasers known from the files",
+        "beams 8:",
         "128 steps a turn",
         "reflectance_scale=255",
         "1.50 m above",
@@ -79,7 +79,7 @@ def test_errors_are_one_line(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
     (tmp_path / "folder.yaml").mkdir()
     (tmp_path / "wrong.yaml").write_text("name: mine\nelevations: [1, 2]\n")
     for arguments, words in (
-        ([tmp_path / "one.bin"], "1 returns in all are too few"),
+        ([tmp_path / "one.bin"], "too few"),
         ([tmp_path / "text.bin"], "is text"),
         ([tmp_path / "notes.txt"], "no field x, y, z; it has: text"),
         ([tmp_path / "empty"], "holds no scan"),
@@ -170,7 +170,8 @@ def test_a_sensor_s_file_is_replaced_only_when_asked(r2flow, scans: Path, tmp_pa
     out = tmp_path / "mine.yaml"
     out.write_text("mine by hand")
     code, _, error = r2flow("sensor", scans, "--out", out)
-    assert (code, error) == (2, f"error: {out} is there already; give another --out, or --overwrite to replace it.\n")
+    assert code == 2
+    assert "--overwrite" in error
     assert out.read_text() == "mine by hand"
     assert r2flow("sensor", scans, "--out", out, "--overwrite")[0] == 0
     assert read_sensor(out).reflectance_scale == 255

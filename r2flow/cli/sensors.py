@@ -2,17 +2,13 @@
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.options import ColumnsOption, named_columns
 from r2flow.errors import InputError
-
-if TYPE_CHECKING:
-    from r2flow.lidar.beams import Beams
-    from r2flow.lidar.calibration import Estimate
 
 
 @app.command(epilog="Example: r2flow sensor my/scans --out conf/sensor/mine.yaml")
@@ -28,83 +24,42 @@ def sensor(
 
     The YAML is a sensor for the verbs (--sensor mine.yaml) and, in conf/sensor/, for train.py (sensor=mine).
     """
-    from r2flow.lidar.calibration import estimate_sensor
+    from r2flow.lidar.beams import estimate_sensor, nearest_sensor
     from r2flow.lidar.scan_files import read_points
     from r2flow.lidar.sensor_files import ENDINGS, write_sensor
     from r2flow.lidar.sensors import SENSORS
     from r2flow.progress import track
+    from r2flow.reports.tables import print_table
     from r2flow.reports.views import scans_of
 
     if out is not None and (out.suffix.lower() not in ENDINGS or out.is_dir()):
         raise InputError(f"--out must be a .yaml file, as --sensor expects; found {out}.")
     if out is not None and out.exists() and not overwrite:
-        raise InputError(f"{out} is there already; give another --out, or --overwrite to replace it.")
-    name = name or _name_of(out)
+        raise InputError(f"{out} exists; give another --out, or --overwrite to replace it.")
+    if name is None:
+        name = re.sub(r"\W", "_", out.stem, flags=re.ASCII) if out is not None else "mine"
+        name = f"my_{name}" if name in SENSORS or not name[:1].isalpha() else name
     if name in SENSORS or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise InputError(f"--name must be letters, digits and _, and not that of a built-in sensor; found {name!r}.")
-    named = named_columns(columns)
     paths = [path for scan in scans for path in scans_of(scan, most)]
-    points = [read_points(path, named) for path in track(paths, "reading", "scans", least=16)]
-    estimate = estimate_sensor(points)
-    found = estimate.sensor(name)
-    _print(estimate)
-    if out is not None:
-        comment = (
-            f"Estimated from {estimate.scans} scan(s) with {estimate.returns:,} returns, stored {estimate.beams.order}."
-        )
-        write_sensor(found, out, f"{comment}\nBeams: {_sureness(estimate.beams)}.")
-        print(out)
-
-
-def _name_of(out: Path | None) -> str:
-    """A sensor's name from that of its file."""
-    from r2flow.lidar.sensors import SENSORS
-
-    name = re.sub(r"\W", "_", out.stem, flags=re.ASCII) if out is not None else "mine"
-    return f"my_{name}" if name in SENSORS or not name[:1].isalpha() else name
-
-
-def _print(estimate: "Estimate") -> None:
-    from r2flow.reports.tables import print_table
-
-    beams, (near, far) = estimate.beams, estimate.ranges
-    rows: list[tuple[str, str]] = []
-    e, middle = beams.elevations, len(beams.elevations) // 2
-    shown = [*e[:2], None, *e[middle - 1 : middle + 1], None, *e[-2:]]
-    rows.append(("beams", f"{len(e)}, {_sureness(beams)}"))
-    rows.append(("elevations", " ".join("..." if one is None else f"{one:+.2f}" for one in shown) + " degrees"))
-    if (known := estimate.nearest_known()) is not None:
-        rows.append(("", f"nearest built-in sensor: {known[0]}, median distance {known[1]:.2f} degrees"))
-    rows.append(("resolution", f"{estimate.steps:,.0f} steps a turn; images of {estimate.columns} columns"))
-    rows.append(("range", f"{near:.2f} to {far:.2f} m"))
-    if estimate.near_share > 0.05:
-        share = f"{estimate.near_share:.0%} of the returns lie within 1 m"
-        rows.append(("", f"{share}; if that is the vehicle itself, raise min_range in the YAML"))
-    if estimate.height is None:
-        rows.append(("height", "no ground found; 1.73 m, the default, is used"))
-    else:
-        rows.append(
-            (
-                "height",
-                f"{estimate.height:.2f} m above the ground, which {estimate.ground_share:.0%} of the returns are on",
-            )
-        )
-    if (found := estimate.reflectance) is None:
-        rows.append(("reflectance", "none: encoding.reflectance=false"))
-    else:
-        values = f"{found.levels} values up to {found.highest:.4g}"
-        rows.append(("reflectance", f"{values}: reflectance_scale={found.scale:g}"))
-    rows.append(("storage", beams.order))
+    points = [read_points(path, named_columns(columns)) for path in track(paths, "reading", "scans", least=16)]
+    mine, beams, steps = estimate_sensor(points, name)
+    e, middle = mine.elevations, len(mine.elevations) // 2
+    shown = " ... ".join(f"{a:+.2f} {b:+.2f}" for a, b in (e[:2], e[middle - 1 : middle + 1], e[-2:]))
+    nearest, distance = nearest_sensor(beams.elevations)
+    scale = "none: encoding.reflectance=false"
+    if mine.reflectance_scale is not None:
+        scale = f"reflectance_scale={mine.reflectance_scale:g}"
+    rows = [
+        ("beams", f"{len(e)}: {beams.order}"),
+        ("elevations", f"{shown} degrees"),
+        ("nearest sensor", f"{nearest}, its beams {distance:.2f} degrees away" if nearest else "none of the built-in"),
+        ("resolution", f"{steps:,.0f} steps a turn; images of {mine.columns} columns"),
+        ("range", f"{mine.min_range:g} to {mine.max_range:g} m; raise min_range if the vehicle itself is seen"),
+        ("height", f"{mine.height:.2f} m above the ground"),
+        ("reflectance", scale),
+    ]
     print_table(rows, ("", ""))
-
-
-def _sureness(beams: "Beams") -> str:
-    """How the beams were found and how exactly, in words."""
-    worst = int(beams.residuals.argmax())
-    spread = (
-        f"median residual {sorted(beams.residuals)[len(beams.residuals) // 2]:.3f} degrees, "
-        f"worst {beams.residuals[worst]:.3f} (row {worst})"
-    )
-    if beams.stable is None:
-        return f"lasers known from the files; {spread}"
-    return f"from elevations alone, the same number over a {beams.stable:.1f}-fold range of bandwidths; {spread}"
+    if out is not None:
+        write_sensor(mine, out, f"Estimated from {len(points)} scan(s), stored {beams.order}.")
+        print(out)

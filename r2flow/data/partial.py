@@ -19,8 +19,7 @@ from r2flow.data.options import PREPARED, SIMULATED
 from r2flow.data.reading import Reading, nothing_in_view
 from r2flow.data.sources import LOOKED_AT, ScanSource, spread
 from r2flow.errors import InputError, naming
-from r2flow.lidar.calibration import reflectance_of
-from r2flow.lidar.recognition import other_sensor
+from r2flow.lidar.beams import full_reflectance, other_sensor
 from r2flow.lidar.scan_files import Points, read_numbers, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.transfer import (
@@ -137,9 +136,8 @@ def _files(
             full = scale or (1.0 if noted else usual_scale(spec, source or target))
             by_points = partial(_read_same, reading=reading, scale=full)
         else:
-            strength = reflectance_of(some)
             known = 1.0 if noted else source and source.reflectance_scale
-            full = scale or known or (strength.scale if strength else 1.0)
+            full = scale or known or full_reflectance(some) or 1.0
             by_points = partial(_read_other, reading=reading, fired=fired, scale=full, strict=scale is not None)
             name = source.name if source else (doubt and doubt.name) or "a sensor"
             said.append(_described(spec, fired.elevations, name, target, fired.steps))

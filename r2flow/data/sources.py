@@ -20,8 +20,8 @@ from torch import Tensor
 
 from r2flow.data.reading import Reading, range_image, read_image, read_points_image
 from r2flow.errors import InputError
+from r2flow.lidar.beams import other_sensor
 from r2flow.lidar.encoding import Encoding
-from r2flow.lidar.recognition import other_sensor
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import Sensor
 

@@ -1,33 +1,41 @@
-"""The beams of a sensor, found in its scans."""
+"""A sensor told by its scans: beams, azimuth steps, limits, height, reflectance, and which of `SENSORS` it is."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import Points
+from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.unfolding import elevations_of, median_of_seen, rings_from_order, scatter_of
 
 FEWEST, MOST = 4, 256  # beams of a sensor
-SAME = 2e-3  # degrees; two returns of one ray are no farther apart
+FEWEST_RETURNS = 200  # of an estimate
 TIGHT = 0.1  # scatter (`scatter_of`) below which each column is one laser
 BANDWIDTHS = np.geomspace(0.015, 2.0, 50)  # degrees
 BIN = 0.005  # degrees
 FAINT = 0.02  # share of the median peak's height below which a peak is no beam
 STABLE = 1.5  # range of bandwidths, as a factor, over which the number of peaks must be constant
-
-SCATTERED = (
-    0.3  # median gap between elevations over their mean gap, above which no beams are there; see `_is_scattered`
-)
-CROWDED = 20  # points of a sector, on average, from which on its gaps tell something
+SCATTERED = 0.3  # median gap between elevations over their mean gap, above which no beams are there: `_is_scattered`
+CROWDED = 20  # mean number of points in a sector from which its gaps are compared
+COLUMNS = 64  # an image's width is a multiple of it, so that every backbone can halve it
+FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # values in use for it
+IN_VIEW = 0.9  # share of the returns in a sensor's own view; the real scans at hand have 0.967 or more
+OFF = 1.5  # degrees by `_distance`, above which beams are those of another sensor
+BEATEN = 0.5  # degrees from which on a sensor does not fit if another one is twice as near
 
 RINGS = "a ring number at each point"
 FIRINGS = "firing after firing, rays without return kept"
 RING_AFTER_RING = "ring after ring"
-LOSSY_FIRINGS = "firing after firing, rays without return left out"
-UNORDERED = "in no order"
+UNORDERED = "beams told by elevation alone"
+
+
+class NoBeamsError(InputError):
+    """Scans of a sensor without beams."""
 
 
 @dataclass(frozen=True)
@@ -36,27 +44,172 @@ class Beams:
 
     Attributes:
         elevations: Median elevation of each in degrees, the top one first, (H,).
-        residuals: Median distance of its points from that, in degrees, (H,).
-        counts: Points of each, (H,).
+        of_point: Row of each point of each scan; -1 for a ray without return.
         order: How the scans are stored: `RINGS`, `FIRINGS`, ...
         firing: Row of laser 0, 1, ... of ring numbers or whole firings; None where lasers are counted from the top or
             from the bottom.
-        stable: Where the beams are peaks of the elevations: the factor by which the bandwidth can change without
-            changing their number; None where the files say which laser fired each point.
-        of_point: Row of each point of each scan; -1 for a ray without return.
     """
 
     elevations: np.ndarray
-    residuals: np.ndarray
-    counts: np.ndarray
-    order: str
-    firing: tuple[int, ...] | None
-    stable: float | None
     of_point: list[np.ndarray]
+    order: str = UNORDERED
+    firing: tuple[int, ...] | None = None
 
 
-class NoBeamsError(InputError):
-    """Scans of a sensor without beams."""
+class Estimate(NamedTuple):
+    """A sensor estimated from its scans, its beams, and its azimuth steps of a full turn, not rounded."""
+
+    sensor: Sensor
+    beams: Beams
+    steps: float
+
+
+class Doubt(NamedTuple):
+    """What speaks against a sensor, in words; the built-in sensor that the scans fit; whether they have no beams."""
+
+    seen: str
+    name: str | None
+    hopeless: bool = False
+
+
+def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
+    """What in some scans speaks against a sensor; None where they may be of it, or are too few to tell.
+
+    The beams of the scans are compared with the sensor's. Where there are none, or where a user's own sensor has
+    another number of rows (which may be a choice), the share of the returns in its view decides.
+    """
+    elevation = np.concatenate([elevations_of(scan.xyz) for scan in scans])
+    elevation = elevation[np.isfinite(elevation)]
+    if len(elevation) < 5 * FEWEST_RETURNS:
+        return None
+    try:
+        beams = find_beams(scans).elevations
+    except NoBeamsError as error:
+        return Doubt(str(error), None, hopeless=True)
+    except InputError:
+        beams = None
+    edges = sensor.row_edges
+    share = float(((elevation <= edges[0]) & (elevation >= edges[-1])).mean())
+    seen = f"{share:.0%} of the returns lie in its view"
+    if beams is None:
+        return None if share >= IN_VIEW else Doubt(seen, None)
+    name, near = nearest_sensor(beams)
+    distance = 0.0
+    if sensor.name in SENSORS or len(beams) == len(sensor.elevations):
+        tables = [sensor.elevations]  # a built-in sensor at another size is the same sensor
+        tables += [known.elevations for other, known in SENSORS.items() if _family(other) == _family(sensor.name)]
+        distance = min(_distance(beams, np.asarray(table)) for table in tables)
+    if share >= IN_VIEW and distance < OFF and not (distance > BEATEN and near < distance / 2):
+        return None
+    return Doubt(f"they have {len(beams)} beams from {beams[0]:+.1f} to {beams[-1]:+.1f} degrees, {seen}", name)
+
+
+def nearest_sensor(elevations: np.ndarray) -> tuple[str | None, float]:
+    """The built-in sensor of beams at these elevations in degrees, and their distance; None where none is near."""
+    distance, name = min((_distance(elevations, np.asarray(s.elevations)), name) for name, s in SENSORS.items())
+    return (_family(name) if distance < OFF else None), distance
+
+
+def _family(name: str) -> str:
+    return name.removesuffix("_rings")
+
+
+def _distance(beams: np.ndarray, table: np.ndarray) -> float:
+    """Distance of beams from those of a table in degrees: the 80th percentile over the beams, paired in their order.
+
+    The first pair is the one that gives the smallest result, since a scan may be cut and rings above the horizon may
+    see only sky. Where beams are missing in between, later pairs are wrong: there the median distance from the nearest
+    beam decides, for tables whose beams are far apart.
+    """
+    longer, shorter = (table, beams) if len(table) >= len(beams) else (beams, table)
+    if len(longer) > 1.05 * len(table) + 1:
+        return math.inf
+    shifts = range(len(longer) - len(shorter) + 1)
+    paired = min(float(np.quantile(np.abs(longer[s : s + len(shorter)] - shorter), 0.8)) for s in shifts)
+    gap = float(np.median(-np.diff(table)))
+    spanned = np.count_nonzero((table <= beams[0] + gap / 2) & (table >= beams[-1] - gap / 2))
+    nearest = float(np.median(np.abs(beams[:, None] - table).min(axis=1)))
+    return min(paired, nearest) if nearest <= gap / 10 and len(beams) >= 0.75 * spanned else paired
+
+
+def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
+    """A sensor by its scans, which are in its own frame; range limits without one return in ten thousand, rounded.
+
+    Raises:
+        InputError: fewer than 200 returns, or no beams in them.
+    """
+    xyz = np.concatenate([scan.xyz[scan.xyz.any(axis=1)] for scan in scans])
+    if len(xyz) < FEWEST_RETURNS:
+        raise InputError(f"{len(xyz)} returns are too few for an estimate: give scans with at least {FEWEST_RETURNS}.")
+    beams = find_beams(scans)
+    steps = steps_of_a_turn(scans, beams)
+    elevations = beams.elevations.round(3).tolist()
+    for row, (above, below) in enumerate(pairwise(elevations)):  # equal after rounding
+        if below >= above:
+            elevations[row + 1] = round(above - 1e-3, 3)
+    near, far = np.quantile(np.linalg.norm(xyz, axis=1), [1e-4, 1 - 1e-4])
+    sensor = Sensor(
+        name,
+        tuple(elevations),
+        max(int((steps + 0.5) // COLUMNS), 1) * COLUMNS,
+        max(math.floor(near * 10) / 10, 0.1),
+        float(math.ceil(far)),
+        _height(xyz),
+        beams.firing,
+        full_reflectance(scans),
+    )
+    return Estimate(sensor, beams, steps)
+
+
+def _height(xyz: np.ndarray) -> float:
+    """Height above the ground: the lowest frequent height of returns 3 to 20 m away; the default where there is none.
+
+    The most frequent height may be that of hedges and cars, where beams are close to the horizon.
+    """
+    distance = np.hypot(xyz[:, 0], xyz[:, 1])
+    z = xyz[(distance > 3) & (distance < 20) & (xyz[:, 2] < -0.2), 2]
+    counts, edges = np.histogram(z, np.arange(-6, -0.1, 0.1))
+    often = np.convolve(counts, np.ones(3), "same")
+    if often.max() < FEWEST_RETURNS / 4:
+        return Sensor.height
+    ground = edges[np.argmax(often > 0.7 * often.max())] + 0.05
+    return round(-float(np.median(z[np.abs(z - ground) < 0.3])), 2)
+
+
+def steps_of_a_turn(scans: Sequence[Points], beams: Beams) -> float:
+    """Azimuth steps of a full turn, 360 / step.
+
+    The first estimate is the 30th percentile of the gaps between neighbouring returns of one beam, since most rays next
+    to a return have one too; then the sum of all gaps of up to three steps divided by the number of steps in them.
+    """
+    gaps = []
+    for scan, row in zip(scans, beams.of_point, strict=True):
+        azimuth = np.rad2deg(np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]).astype(np.float64))
+        order = np.lexsort((azimuth, row))
+        order = order[row[order] >= 0]
+        gaps.append(np.diff(azimuth[order])[np.diff(row[order]) == 0])
+    gap = np.concatenate(gaps)
+    apart = gap[gap > 1e-2]  # two returns of one ray lie at one azimuth
+    if not len(apart):
+        raise InputError("no beam returned at two azimuths in these scans. Are they whole?")
+    step = float(np.quantile(apart, 0.3))
+    for _ in range(3):
+        near = gap[gap < 3.5 * step]
+        step = float(near.sum() / (near / step).round().sum())
+    return 360 / step
+
+
+def full_reflectance(scans: Sequence[Points]) -> float | None:
+    """The value of full reflectance; None where a file has no reflectance, or only one value."""
+    if any(scan.reflectance is None for scan in scans):
+        return None
+    values = np.concatenate([scan.reflectance for scan in scans])
+    highest = float(values.max())
+    if highest <= max(0.0, float(values.min())):
+        return None
+    if highest >= 0.1:  # else the values would fill less than a tenth of the scale
+        return next((full for full in FULL_REFLECTANCE if highest <= full * (1 + 1e-3)), highest)
+    return float(f"{highest:.1g}") if float(f"{highest:.1g}") >= highest else float(f"{highest * 1.05:.2g}")
 
 
 def find_beams(scans: Sequence[Points]) -> Beams:
@@ -66,55 +219,50 @@ def find_beams(scans: Sequence[Points]) -> Beams:
         NoBeamsError: the points lie on no beams at all.
         InputError: no beams can be told apart.
     """
-    whole = [scan.with_lost_rays() for scan in scans]
-    found = _found(whole)
-    pairs = zip(found.of_point, scans, strict=True)
-    return replace(found, of_point=[row if len(row) == len(scan.xyz) else row[scan.kept] for row, scan in pairs])
+    beams = _beams([scan.with_lost_rays() for scan in scans])
+    pairs = zip(beams.of_point, scans, strict=True)
+    return replace(beams, of_point=[row if len(row) == len(scan.xyz) else row[scan.kept] for row, scan in pairs])
 
 
-def _found(scans: Sequence[Points]) -> Beams:
+def _beams(scans: Sequence[Points]) -> Beams:
     """`find_beams` with all rows of the files, lost rays at the origin."""
     elevations = [elevations_of(scan.xyz) for scan in scans]
     if all(scan.ring is not None for scan in scans):
-        lasers = [np.asarray(scan.ring, dtype=np.int64) for scan in scans]
-        return _by_laser(elevations, lasers, RINGS)
+        return _by_laser(elevations, [np.asarray(scan.ring, dtype=np.int64) for scan in scans], RINGS)
     if count := _lasers_of_firings(elevations):
-        table = _single_returns(elevations, count)
-        return _by_laser(elevations, [table[np.arange(len(e)) % count] for e in elevations], FIRINGS)
+        return _by_laser(elevations, [np.arange(len(e)) % count for e in elevations], FIRINGS)
+    peaks = _by_elevation(elevations)
     if (rings := _rings(scans, elevations)) is not None:
-        by_ring = _by_laser(elevations, rings, RING_AFTER_RING)
-        peaks = _by_elevation(elevations, RING_AFTER_RING)
+        beams = _by_laser(elevations, rings, RING_AFTER_RING)
         # A ring with few returns may be taken as part of the next; exact elevations separate the two.
-        return peaks if peaks is not None and len(peaks.counts) > len(by_ring.counts) else by_ring
-    found = _by_elevation(elevations, LOSSY_FIRINGS if _is_swept(scans) else UNORDERED)
-    if found is None and all(map(_is_scattered, scans)):
+        more = peaks is not None and len(peaks.elevations) > len(beams.elevations)
+        return replace(peaks, order=RING_AFTER_RING) if more else beams
+    if peaks is None and all(map(_is_scattered, scans)):
         raise NoBeamsError(
             "their points lie on no beams, as those of a Livox or another scanner whose pattern does not repeat, or of "
             "several scans in one file: they are no rows of a range image, which a spinning LiDAR makes"
         )
-    if found is None:
+    if peaks is None:
         raise InputError(
             "the beams cannot be told apart: the files have no ring numbers, the points are in no known order, and "
             "their elevations form no peaks. Are they scans of one sensor, in its own frame? If so, use a built-in one."
         )
-    return found
+    return peaks
 
 
 def _is_scattered(scan: Points) -> bool:
     """Whether elevations are spread evenly within sectors of one degree of azimuth.
 
-    Points on beams leave many small gaps between sorted elevations and a few wide ones: the median gap is a small part
-    of the mean (0.06 and less in real scans, whatever their order). Points that were drawn at random have ln 2 of it,
-    and patterns of scanners without beams 0.4 and more.
+    The median gap between sorted elevations is 0.06 of the mean gap or less in real scans, whatever their order, ln 2
+    for points drawn at random, and 0.4 or more for scanners without beams.
     """
     elevation = elevations_of(scan.xyz)
     seen = np.isfinite(elevation)
     elevation, sector = elevation[seen], np.degrees(np.arctan2(scan.xyz[seen, 1], scan.xyz[seen, 0])).astype(np.int64)
-    if len(elevation) < CROWDED * max(len(np.unique(sector)), 1):
-        return False
     order = np.lexsort((elevation, sector))
     gaps = np.diff(elevation[order])[np.diff(sector[order]) == 0]
-    return bool(np.median(gaps) > SCATTERED * gaps.mean())
+    crowded = len(elevation) >= CROWDED * max(len(np.unique(sector)), 1)
+    return crowded and bool(np.median(gaps) > SCATTERED * gaps.mean())
 
 
 def _by_laser(elevations: list[np.ndarray], lasers: list[np.ndarray], order: str) -> Beams:
@@ -123,69 +271,34 @@ def _by_laser(elevations: list[np.ndarray], lasers: list[np.ndarray], order: str
     seen = np.flatnonzero(np.isfinite(together) & (laser >= 0))
     seen = seen[np.argsort(laser[seen], kind="stable")]
     known, starts = np.unique(laser[seen], return_index=True)
-    middles = np.array([np.median(together[part]) for part in np.split(seen, starts[1:])])
     if not FEWEST <= len(known) <= MOST:
         raise InputError(f"the scans name {len(known)} lasers, not {FEWEST} to {MOST}. Are they of a spinning LiDAR?")
+    middles = np.array([np.median(together[part]) for part in np.split(seen, starts[1:])])
     row = np.argsort(np.argsort(-middles, kind="stable"), kind="stable")
     table = np.full(int(laser.max()) + 1, -1)
     table[known] = row
-    upwards = (row == np.arange(len(row))).all() or (row == np.arange(len(row))[::-1]).all()
+    sorted_rows = len(set(np.diff(row))) == 1  # from the top or from the bottom
     first = min(known[0], 1) if order == RINGS else 0  # files count their rings from 0 or from 1
-    whole = order in (RINGS, FIRINGS) and len(known) == laser.max() - first + 1
-    firing = tuple(row.tolist()) if whole and not upwards else None
-    of_point = [
-        np.where(np.isfinite(e) & (one >= 0), table[np.maximum(one, 0)], -1)
-        for e, one in zip(elevations, lasers, strict=True)
-    ]
-    return _measured(elevations, of_point, len(known), order, firing=firing)
-
-
-def _measured(
-    elevations: list[np.ndarray],
-    of_point: list[np.ndarray],
-    rows: int,
-    order: str,
-    firing: tuple[int, ...] | None = None,
-    stable: float | None = None,
-) -> Beams:
-    """The beams from the elevation and the row of each point of each scan."""
-    elevation, row = np.concatenate(elevations), np.concatenate(of_point)
-    middles, residuals, counts = np.zeros(rows), np.zeros(rows), np.bincount(row[row >= 0], minlength=rows)
-    by_row = np.argsort(row, kind="stable")[np.count_nonzero(row < 0) :]
-    for beam, points in enumerate(np.split(by_row, np.cumsum(counts)[:-1])):
-        if len(points):
-            middles[beam] = np.median(elevation[points])
-            residuals[beam] = np.median(np.abs(elevation[points] - middles[beam]))
-    return Beams(middles, residuals, counts, order, firing, stable, of_point)
+    whole = order != RING_AFTER_RING and len(known) == laser.max() - first + 1
+    pairs = zip(elevations, lasers, strict=True)
+    of_point = [np.where(np.isfinite(e) & (one >= 0), table[np.maximum(one, 0)], -1) for e, one in pairs]
+    firing = tuple(row.tolist()) if whole and not sorted_rows else None
+    return Beams(np.sort(middles)[::-1], of_point, order, firing)
 
 
 def _lasers_of_firings(elevations: list[np.ndarray]) -> int | None:
     """Lasers of files that hold whole firings: the smallest period of the elevations; None where there is none."""
-    distances = {}
-    for count in _divisors(math.gcd(*(len(e) for e in elevations))):
-        tables = [_some(e.reshape(-1, count)) for e in elevations]
+    points, distances = math.gcd(*(len(e) for e in elevations)), {}
+    for count in range(FEWEST, MOST + 1):
+        if points % count or points // count < 8:
+            continue
+        tables = [e.reshape(-1, count) for e in elevations]
+        tables = [table[np.linspace(0, len(table) - 1, min(len(table), 256)).astype(np.int64)] for table in tables]
         if all(scatter_of(table)[1] < TIGHT for table in tables):
-            table = np.concatenate(tables)
-            distances[count] = float(np.nanmean(np.abs(table - median_of_seen(table))))
+            together = np.concatenate(tables)
+            distances[count] = float(np.nanmean(np.abs(together - median_of_seen(together))))
     # Half the lasers fit too where the others see only sky, but then a few returns are far from the medians.
-    fitting = [count for count, distance in distances.items() if distance <= 1.5 * min(distances.values()) + 1e-3]
-    return min(fitting, default=None)
-
-
-def _single_returns(elevations: list[np.ndarray], count: int) -> np.ndarray:
-    """Laser of each of the `count` points of a firing: of two returns of each ray, stored one after the other, one."""
-    each = np.arange(count)
-    middle = median_of_seen(np.concatenate([_some(e.reshape(-1, count)) for e in elevations]))
-    twice = count % 2 == 0 and bool(np.nanmax(np.abs(middle[::2] - middle[1::2]), initial=0) < SAME)
-    return each // 2 if twice and count // 2 >= FEWEST else each
-
-
-def _divisors(number: int) -> list[int]:
-    return [count for count in range(FEWEST, MOST + 1) if number % count == 0 and number // count >= 8]
-
-
-def _some(table: np.ndarray) -> np.ndarray:
-    return table[np.linspace(0, len(table) - 1, min(len(table), 256)).astype(np.int64)]
+    return next((count for count, d in distances.items() if d <= 1.5 * min(distances.values()) + 1e-3), None)
 
 
 def _rings(scans: Sequence[Points], elevations: list[np.ndarray]) -> list[np.ndarray] | None:
@@ -196,57 +309,44 @@ def _rings(scans: Sequence[Points], elevations: list[np.ndarray]) -> list[np.nda
         count = int(ring.max(initial=-1)) + 1
         if not FEWEST <= count <= MOST:
             return None
-        seen = np.flatnonzero(ring >= 0)
-        middles = np.array(
-            [np.median(elevation[part]) for part in np.split(seen, np.flatnonzero(np.diff(ring[seen])) + 1)]
-        )
-        about = np.abs(elevation[seen] - middles[ring[seen]])
-        overall = np.median(np.abs(elevation[seen] - np.median(elevation[seen])))
-        if np.median(about) > TIGHT * overall:
-            return None
+        seen = elevation[ring >= 0]
+        starts = np.flatnonzero(np.diff(ring[ring >= 0])) + 1
+        middles = np.array([np.median(part) for part in np.split(seen, starts)])
         falls = np.mean(np.diff(middles) < 0)
-        if 0.1 < falls < 0.9:
+        spread = np.median(np.abs(seen - middles[ring[ring >= 0]]))
+        if spread > TIGHT * np.median(np.abs(seen - np.median(seen))) or 0.1 < falls < 0.9:
             return None
         # Counted from the bottom, since rings that see only sky are missing at the top.
         rings.append(np.where(ring < 0, -1, count - 1 - ring if falls >= 0.9 else ring))
     return rings
 
 
-def _is_swept(scans: Sequence[Points]) -> bool:
-    """Whether points follow each other closely in azimuth."""
-    steps = []
-    for scan in scans:
-        azimuth = np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0])[np.abs(scan.xyz[:, :2]).sum(1) > 0]
-        steps.append(np.abs((np.diff(azimuth) + np.pi) % (2 * np.pi) - np.pi))
-    return float(np.median(np.concatenate(steps))) < math.radians(10)
-
-
-def _by_elevation(elevations: list[np.ndarray], order: str) -> Beams | None:
+def _by_elevation(elevations: list[np.ndarray]) -> Beams | None:
     """Beams as peaks of the density of elevations, at bandwidths where their number is most stable; None without."""
-    together = np.concatenate(elevations)
-    seen = together[np.isfinite(together)]
+    seen = np.concatenate(elevations)
+    seen = seen[np.isfinite(seen)]
     low, high = np.quantile(seen, [1e-4, 1 - 1e-4])
     edges = np.arange(low - 3, high + 3 + BIN, BIN)
     size = 2 << len(edges).bit_length()  # other sizes can take many times as long to transform
     density = np.fft.rfft(np.histogram(seen, edges)[0], size)
     frequency = np.fft.rfftfreq(size, BIN)
-    found = []
+    peaks_of = []
     for bandwidth in BANDWIDTHS:
         smooth = np.fft.irfft(density * np.exp(-2 * (np.pi * bandwidth * frequency) ** 2))[: len(edges) - 1]
         peaks = np.flatnonzero((smooth[1:-1] > smooth[:-2]) & (smooth[1:-1] >= smooth[2:])) + 1
         heights = smooth[peaks]
         # Returns from the vehicle itself have any elevation, few of each.
         peaks = peaks[heights > FAINT * np.median(heights[heights > 0.01 * heights.max()])]
-        found.append(edges[peaks] + BIN / 2)
-    numbers = np.array([len(peaks) for peaks in found])
+        peaks_of.append(edges[peaks] + BIN / 2)
+    numbers = np.array([len(peaks) for peaks in peaks_of])
     starts = np.flatnonzero(np.diff(numbers, prepend=-1))
     runs = [(end - start, start) for start, end in zip(starts, [*starts[1:], len(numbers)], strict=True)]
-    runs = [(length, start) for length, start in runs if FEWEST <= numbers[start] <= MOST]
-    length, start = max(runs, default=(1, 0))
-    stable = float(BANDWIDTHS[start + length - 1] / BANDWIDTHS[start])
-    if stable < STABLE:
+    length, start = max(((length, s) for length, s in runs if FEWEST <= numbers[s] <= MOST), default=(1, 0))
+    if BANDWIDTHS[start + length - 1] < STABLE * BANDWIDTHS[start]:
         return None
-    peaks = found[start + (length - 1) // 2][::-1]
+    peaks = peaks_of[start + (length - 1) // 2][::-1]
     edges = (peaks[:-1] + peaks[1:]) / 2
     of_point = [np.where(np.isfinite(e), np.searchsorted(-edges, -np.nan_to_num(e)), -1) for e in elevations]
-    return _measured(elevations, of_point, len(peaks), order, stable=stable)
+    together, row = np.concatenate(elevations), np.concatenate(of_point)
+    medians = [np.median(together[row == beam]) if (row == beam).any() else peaks[beam] for beam in range(len(peaks))]
+    return Beams(np.array(medians), of_point)

@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from r2flow.errors import InputError
-from r2flow.lidar.beams import Beams, find_beams
-from r2flow.lidar.calibration import steps_of_a_turn
+from r2flow.lidar.beams import Beams, find_beams, steps_of_a_turn
 from r2flow.lidar.known import Ray
 from r2flow.lidar.projection import Convention, Projection, image_of, project_indices
 from r2flow.lidar.scan_files import Points
@@ -63,9 +62,8 @@ def firing_of(scans: list[Points], sensor: Sensor | None = None) -> Fired:
         return Fired(beams.elevations, steps_of_a_turn(scans, beams))
     elevations = np.asarray(sensor.elevations)
     of_point = [beams_of(scan.xyz, elevations) for scan in scans]
-    unused = np.zeros(len(elevations))
     try:
-        steps = steps_of_a_turn(scans, Beams(elevations, unused, unused, "", None, None, of_point))
+        steps = steps_of_a_turn(scans, Beams(elevations, of_point))
     except InputError:  # too few points to tell
         steps = float(sensor.columns)
     return Fired(elevations, steps)

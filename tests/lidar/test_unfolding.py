@@ -4,10 +4,9 @@ import pytest
 from r2flow.data.partial import open_partial
 from r2flow.data.reading import Reading, read_projected
 from r2flow.errors import InputError
-from r2flow.lidar.beams import find_beams
-from r2flow.lidar.calibration import steps_of_a_turn
+from r2flow.lidar.beams import find_beams, steps_of_a_turn
 from r2flow.lidar.projection import image_to_points, project
-from r2flow.lidar.scan_files import Points, read_points
+from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 
 FIRED = ["hdl32e", "vlp16", "vlp32c", "os1_64", "pandar64"]
@@ -159,12 +158,6 @@ def test_lost_rays_leave_every_point_its_beam(tmp_path):
     beams = find_beams([scan])
     np.testing.assert_array_equal(beams.of_point[0], row[mixed][~lost])
     assert steps_of_a_turn([scan], beams) == pytest.approx(480, rel=1e-3)
-
-
-def test_two_returns_of_each_ray_are_of_one_beam():
-    firings, _ = cloud(SENSORS["vlp16"].resized(columns=480))
-    points = Points(np.repeat(firings.reshape(-1, 3), 2, axis=0))
-    assert len(find_beams([points]).elevations) == 16
 
 
 def test_what_training_reads_can_be_completed(tmp_path):
