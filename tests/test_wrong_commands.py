@@ -423,32 +423,18 @@ report curvature -c run -o out --num 0
 report curvature -c run -o out --most-curved 0
 report curvature -c run -o file.txt
 report curvature -c run -o out --device nope
-report work-precision # Missing
-report work-precision -c nowhere -o out
-report work-precision -o out --solvers nope
-report work-precision -o out --budgets 0
-report work-precision -o out --budgets a
-report work-precision -o out --budgets '' # an argument is empty
-report work-precision -o out --tolerances -1
-report work-precision -o out --tolerances nan
-report work-precision -o out --problems nope
-report work-precision -o out --problems none
-report work-precision -o out --problem-scenes 0
-report work-precision -o out --repeats 0
-report work-precision -o file.txt
-report work-precision -c run -o out --reference-steps 0
-report work-precision -c run -o out --reference-tolerance 0
-report work-precision -c run -o out --reference-tolerance nan
-report stability # Missing
-report stability -o out --problems nope
-report stability -o out --problems none
-report stability -o out --solvers nope
-report stability -o out --tolerances 0
-report stability -o out --steps 0
-report stability -o out --scenes 0
-report stability -o out --seed -1
-report stability -o out --max-evaluations 0
-report stability -o file.txt
+report solvers # Missing
+report solvers -c nowhere -o out
+report solvers -o out --solvers nope
+report solvers -o out --budgets 0
+report solvers -o out --budgets a
+report solvers -o out --budgets '' # an argument is empty
+report solvers -o out --tolerances -1
+report solvers -o out --tolerances nan
+report solvers -o out --problems nope
+report solvers -o out --problems none # nothing to measure
+report solvers -o out --repeats 0
+report solvers -o file.txt
 report paper # Missing
 report paper run # Missing
 report paper nowhere -o out

@@ -12,7 +12,6 @@ import typer
 
 from r2flow import __version__
 from r2flow.cli import (  # noqa: F401 (each enters its verbs)
-    accuracy,
     compare,
     complete,
     evaluate,
@@ -26,6 +25,7 @@ from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     scans,
     sensors,
     simulate,
+    solvers,
     train,
     unpack,
     view,

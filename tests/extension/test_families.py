@@ -131,7 +131,7 @@ CANNOT = {
         ["SCAN", "SCAN", "-c", "RUN", "-o", "OUT"], "interpolation needs the velocity of a flow, which a ToyGenerator"
     ),
     "report curvature": (["-c", "RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
-    "report work-precision": (["-c", "RUN", "-o", "OUT"], "a work-precision report needs the velocity of a flow"),
+    "report solvers": (["-c", "RUN", "-o", "OUT"], "report solvers needs the velocity of a flow"),
     "calibrate": (["-c", "RUN"], "a time grid needs the velocity of a flow, which a ToyGenerator"),
     "export": (["RUN", "-o", "OUT.onnx"], "only flows can be exported"),
     "pairs": (["-c", "RUN"], "a ToyGenerator can be run in one way only, direct with 1 step; found method adams3"),

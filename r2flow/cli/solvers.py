@@ -1,0 +1,127 @@
+"""`r2flow report solvers` and `r2flow report curvature`: accuracy and straightness of flows."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from r2flow.cli.app import report
+from r2flow.cli.groups import DrawOptions, grouped
+from r2flow.cli.options import OutOption, choose_device
+from r2flow.cli.output import command, finish, numbers
+from r2flow.errors import InputError
+
+
+@report.command(epilog="Example: r2flow report curvature -c runs/1rf -c runs/2rf --out reports")
+@grouped
+def curvature(
+    checkpoints: Annotated[
+        list[Path], typer.Option("--checkpoint", "-c", help="A checkpoint, a run or a model; may be repeated.")
+    ],
+    out: OutOption,
+    draw: DrawOptions,
+    steps: Annotated[int, typer.Option(min=1, help="Euler steps of a path.")] = 256,
+    most_curved: Annotated[int, typer.Option(min=1, help="Pixels whose paths are drawn.")] = 200,
+) -> None:
+    """How straight trained flows are: s(t), and the paths of the most curved pixels (the paper's figure 8)."""
+    from r2flow.generators import as_flow
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.model.sampling import batches
+    from r2flow.progress import Bar
+    from r2flow.reports.curvature import curvature_page, measure_paths
+    from r2flow.reports.pages import prepare_folder
+
+    where = choose_device(draw.device)
+    loaded = {str(path): load_checkpoint(path, where) for path in dict.fromkeys(checkpoints)}
+    for checkpoint in loaded.values():
+        as_flow(checkpoint.generator, "curvature")
+    prepare_folder(out)
+    with Bar("measuring", len(loaded) * batches(draw.num, draw.batch_size) * 2 * steps, "evaluations") as advance:
+        flows = [
+            measure_paths(checkpoint, label, draw.num, steps, draw.seed, draw.batch_size, most_curved, advance)
+            for label, checkpoint in loaded.items()
+        ]
+    page = curvature_page(flows, draw.seed, command(), where)
+    finish(page, out, page.text)
+
+
+@dataclass(frozen=True)
+class SolversOptions:
+    """What is compared, and on which exact problems."""
+
+    solvers: Annotated[str | None, typer.Option(help="Solvers, separated by commas; all of ours if left out.")] = None
+    budgets: Annotated[str, typer.Option(help="Evaluations of the fixed-step solvers.")] = "4,8,16,32,64"
+    tolerances: Annotated[str, typer.Option(help="Of the adaptive solvers.")] = "1e-2,1e-3,1e-4,1e-5"
+    problems: Annotated[str | None, typer.Option(help="Exact problems by name; all if left out, or none.")] = None
+    repeats: Annotated[int, typer.Option(min=1, help="The most timed solutions of a scan.")] = 5
+
+
+@report.command(epilog="Example: r2flow report solvers -c runs/NAME --out reports")
+@grouped
+def solvers(
+    out: OutOption,
+    draw: DrawOptions,
+    options: SolversOptions,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option("--checkpoint", "-c", help="A checkpoint, a run or a model; exact problems alone if left out."),
+    ] = None,
+) -> None:
+    """Error against run time of every solver: exact problems, stiff and extreme ones too, and a trained flow.
+
+    The page names the sampler that reaches a wanted error, as a command.
+    """
+    from r2flow.flow.problems import PROBLEMS
+    from r2flow.flow.solvers import check_method
+    from r2flow.generators import as_flow
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.progress import Bar
+    from r2flow.reports import solvers as measuring
+    from r2flow.reports.pages import prepare_folder
+
+    where = choose_device(draw.device)
+    methods = options.solvers.split(",") if options.solvers else list(measuring.METHODS)
+    for method in methods:
+        check_method(method)
+    problems = [] if options.problems == "none" else options.problems.split(",") if options.problems else list(PROBLEMS)
+    for problem in problems:
+        PROBLEMS[problem]
+    budgets, tolerances = numbers("budgets", options.budgets, int), numbers("tolerances", options.tolerances)
+    chosen = measuring.configurations(methods, budgets, tolerances)
+    if not chosen or not (problems or checkpoint):
+        raise InputError("nothing to measure: give a checkpoint, more --budgets, or leave --problems none out.")
+    loaded = None if checkpoint is None else load_checkpoint(checkpoint, where)
+    if loaded is not None:
+        as_flow(loaded.generator, "report solvers")
+    prepare_folder(out)
+    subjects, flow = measuring.problem_subjects(problems), None
+    with only_errors():
+        if loaded is not None:
+            with Bar("measuring", draw.num * 512, "reference evaluations") as advance:
+                name = str(checkpoint)
+                flow = measuring.checkpoint_subject(
+                    loaded, name, draw.num, draw.seed, draw.batch_size, progress=advance
+                )
+        everything = [*subjects, flow] if flow else subjects
+        with Bar("measuring", len(everything) * len(chosen), "solutions") as advance:
+            rows = measuring.measure(everything, chosen, options.repeats, advance)
+        with Bar("judging", 0, "solutions") as advance:
+            verdicts = measuring.judge(problems, methods, progress=advance)
+    page = measuring.solvers_page(rows, verdicts, flow, budgets, {"scans": draw.seed}, command(), where)
+    finish(page, out, page.text[: -(2 + 3 * bool(verdicts))])  # without the long tables
+
+
+@contextmanager
+def only_errors() -> Iterator[None]:
+    """No warnings about scans that a solver gave up on: the report counts them."""
+    log = logging.getLogger("r2flow.flow")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(level)

@@ -1,0 +1,216 @@
+"""r2flow report solvers: rows against closed forms, the choice among them, and verdicts on failures."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.errors import InputError
+from r2flow.flow.problems import PROBLEMS
+from r2flow.flow.solvers import SOLVERS
+from r2flow.generators import Field
+from r2flow.inversion import metres_apart
+from r2flow.reports.solvers import (
+    JET,
+    PRECISIONS,
+    Configuration,
+    Subject,
+    best_within,
+    cheapest,
+    checkpoint_subject,
+    configurations,
+    judge,
+    measure,
+    problem_subjects,
+    problems_table,
+    reached,
+    solvers_page,
+    verdicts_text,
+)
+from tests.test_checkpoints import saved  # noqa: F401  a fixture
+from tests.test_cli import r2flow  # noqa: F401  a fixture
+
+
+def test_steps_fit_the_budgets():
+    chosen = configurations(["euler", "rk4", "dopri5", "torchdiffeq:dopri5"], [3, 4, 9], [1e-2, 1e-4])
+    assert [(c.method, c.steps, c.tolerance) for c in chosen] == [
+        ("euler", 3, None), ("euler", 4, None), ("euler", 9, None), ("rk4", 1, None), ("rk4", 2, None),
+        ("dopri5", None, 1e-2), ("dopri5", None, 1e-4),
+        ("torchdiffeq:dopri5", None, 1e-2), ("torchdiffeq:dopri5", None, 1e-4),
+    ]  # fmt: skip
+    assert [c.label for c in chosen][2:6] == ["euler, 9 steps", "rk4, 1 step", "rk4, 2 steps", "dopri5, 1e-02"]
+
+
+def test_a_row_is_what_the_solver_did():
+    # x' = x by Euler: (1 + 1/n)^n x_0, off by (e - (1 + 1/n)^n) |x_0|, in closed form.
+    x_0 = torch.randn(21, 6, dtype=torch.float64)
+    subject = Subject("growth", lambda t, x: x, x_0, math.e * x_0, batch_size=5)
+    rows = measure([subject], [Configuration("euler", 1), Configuration("euler", 10)], repeats=2)
+    norms = x_0.square().mean(1).sqrt().numpy()
+    for row, n in zip(rows, (1, 10), strict=True):
+        errors = (math.e - (1 + 1 / n) ** n) * norms
+        assert (row["evaluations"], row["scans"], row["converged"]) == (n, 21, 21)
+        assert row["error"] == pytest.approx(np.median(errors))
+        assert row["error_worst"] == pytest.approx(errors.max())
+        assert 0 < row["seconds"] < 1
+
+
+def test_a_lost_scan_is_no_solution():
+    # Euler on x' = x^2 from 1e200 overflows in float64 after some steps; the other scan is solved.
+    x_0 = torch.tensor([[0.1], [1e200]], dtype=torch.float64)
+    (row,) = measure([Subject("blow-up", lambda t, x: x * x, x_0, x_0 / (1 - x_0), 2)], [Configuration("euler", 8)], 1)
+    assert row["converged"] == 1
+    assert reached(row) == math.inf
+    assert best_within([row], 100) is None
+
+
+def test_metres_are_taken_where_both_return():
+    image = torch.tensor([[[[10.0, 20.0, 0.0, 5.0]], [[0.1, 0.1, 0.0, 0.1]]]])
+    other = torch.tensor([[[[13.0, 24.0, 7.0, 0.0]], [[0.1, 0.1, 0.1, 0.0]]]])
+    median, rms, dropped = metres_apart(image, other)
+    assert rms.tolist() == [pytest.approx(math.sqrt((9 + 16) / 2))]
+    assert median.tolist() == [3.0]
+    assert dropped.tolist() == [0.5]
+    median, rms, dropped = metres_apart(torch.zeros(1, 1, 1, 2), torch.ones(1, 1, 1, 2))
+    assert rms.isnan().all()
+    assert median.isnan().all()
+    assert dropped.tolist() == [1.0]
+
+
+class Trained:
+    """An exact problem in the place of a checkpoint."""
+
+    encoding = None
+
+    def __init__(self, problem) -> None:
+        self.generator = Field(problem, (16,))
+
+
+@pytest.mark.parametrize("name", ["gaussian", "two_modes", "rotating"])
+def test_the_least_measurable_error_is_above_the_true_error_of_the_reference(name):
+    problem = PROBLEMS[name]()
+    found = checkpoint_subject(Trained(problem), name, num=3, steps=32, tolerance=1e-6)
+    true = (found.x_1 - problem.solution(found.x_0, 1.0)).square().mean(1).sqrt()
+    assert found.x_1.dtype == torch.float64
+    assert true.max() < found.floor < 1e-2
+
+
+def test_without_a_reference_no_error_can_be_measured():
+    found = checkpoint_subject(Trained(lambda t, x: 9 * x**2), "blow-up", num=2, steps=32, tolerance=1e-4)
+    assert found.floor == math.inf
+    assert best_within(measure([found], configurations(["euler"], [4], []), 1), 4) is None
+
+
+def row(method: str, evaluations: float, error: float, metres: float = 1.0, floor: float = 0.0, **more) -> dict:
+    return {
+        "problem": "p", "method": method, "label": method, "evaluations": evaluations, "seconds": 1.0, "error": error,
+        "range_rms_m": metres, "scans": 2, "converged": 2, "floor": floor, "length": 10.0, **more,
+    }  # fmt: skip
+
+
+def test_the_table_names_the_best_within_each_budget():
+    rows = [row("a", 4, 0.1), row("b", 4, 0.2), row("a", 8, 0.05), row("b", 8, 0.01), row("lost", 2, math.inf)]
+    lines = problems_table(rows, [8, 4, 2]).splitlines()
+    assert lines[0] == "| problem | within 2 | within 4 | within 8 |"
+    assert lines[2] == "| p | none | a 0.1 | b 0.01 |"
+
+
+def test_an_error_below_what_can_be_measured_does_not_win():
+    rows = [row("cheap", 8, 2e-5, floor=1e-4), row("dear", 16, 1e-6, floor=1e-4)]
+    assert best_within(rows, 16)["method"] == "cheap"
+
+
+def test_the_cheapest_solver_within_an_error_of_the_range():
+    rows = [
+        row("euler", 4, 1e-1, 3.0), row("adams3", 16, 1e-3, 0.03), row("heun3", 16, 2e-3, 0.05),
+        row("lost", 2, 1e-5, 0.001, converged=1), row("rk4", 32, 1e-5, 1e-4),
+    ]  # fmt: skip
+    assert cheapest(rows, 0.05)["method"] == "adams3"
+    assert cheapest(rows, 0.01)["method"] == "rk4"
+    assert cheapest(rows, 1e-5) is None
+
+
+def test_the_exact_problems_are_reported_with_what_was_not_solved():
+    subjects = problem_subjects(["straight", "stiff_1e4"], scans=3, elements=4)
+    rows = measure(subjects, configurations(["euler", "midpoint", "dopri5"], [4, 8], [1e-3]), repeats=1)
+    straight = {r["label"]: r for r in rows if r["problem"] == "straight"}
+    assert straight["euler, 4 steps"]["error"] < 1e-12
+    assert "| stiff_1e4 | none |" in problems_table(rows, [4, 8])  # explicit steps of 1/4 end farther than x_0
+    page = solvers_page(rows, [], None, [4, 8], {}, "r2flow report solvers")
+    assert set(page.figures) == {"solvers_problems"}
+
+
+def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
+    out = tmp_path / "reports"
+    code, said, _ = r2flow(
+        "report", "solvers", "-c", saved[0], "-o", out, "--num", 2, "--solvers", "euler,heun2,dopri5",
+        "--budgets", "2,4", "--tolerances", "1e-2", "--problems", "gaussian,rotating", "--repeats", 1,
+    )  # fmt: skip
+    assert code == 0
+    figures = {"solvers.png", "solvers_problems.png", "solvers_estimates.png"}
+    assert {path.name for path in out.iterdir()} == figures | {f"solvers.{end}" for end in ("csv", "json", "md")}
+    assert f"**{saved[0]}**, 2 scans, against its own tight solution" in said
+    with (out / "solvers.csv").open() as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    assert len(rows) == 3 * 5  # two problems and the checkpoint; two steps of two methods and one tolerance
+    of_checkpoint = [row for row in rows if row["problem"] == str(saved[0])]
+    assert all(float(row["drop_differs"]) <= 1 for row in of_checkpoint)
+    verdicts = json.loads((out / "solvers.json").read_text())["verdicts"]
+    assert len(verdicts) == 2 * len(PRECISIONS) * 2  # two problems, dopri5 at two tolerances
+
+
+def test_bad_input_is_one_line(r2flow, tmp_path):  # noqa: F811
+    out = tmp_path / "o"
+    for arguments, words in (
+        (("--solvers", "eulr"), "'euler'"),
+        (("--budgets", "4,x"), "--budgets"),
+        (("--tolerances", "-1"), "--tolerances"),
+        (("--budgets", "1", "--solvers", "rk4"), "--budgets"),
+        (("--problems", "none"), "nothing to measure"),
+        (("--problems", "gausian"), "'gaussian'"),
+        (("-c", tmp_path / "none"), "no checkpoint"),
+    ):
+        code, _, err = r2flow("report", "solvers", *arguments, "-o", out)
+        assert code == 2
+        assert words in err
+        assert len(err.splitlines()) == 1
+        assert not out.exists()
+
+
+def test_unknown_problems_are_refused():
+    with pytest.raises(InputError, match="gaussian"):
+        problem_subjects(["gausian"])
+
+
+@pytest.fixture(scope="module")
+def verdicts():
+    alone = [name for name in SOLVERS if name not in ("auto", "exprb43")]  # auto: stiff scans take it seconds here
+    rows = judge(list(PROBLEMS), alone, scans=4, elements=32, max_evaluations=1000)
+    return rows + judge(["stiff_1e4", "gaussian"], ["auto"], [1e-3], scans=4, elements=32, max_evaluations=1000)
+
+
+@pytest.mark.slow  # every problem by every solver takes minutes on a busy machine
+def test_only_failures_on_the_jet_are_silent(verdicts):
+    silent = {row["problem"] for row in verdicts if row["verdict"] == "silent"}
+    assert silent == {JET}
+    assert sum(row["verdict"] != "accurate" for row in verdicts) > 40
+    assert "; 0 of these are silent" in verdicts_text(verdicts)
+    json.dumps(verdicts, allow_nan=False)
+
+
+@pytest.mark.slow
+def test_smooth_problems_are_solved_without_a_flag(verdicts):
+    for row in verdicts:
+        if row["problem"] in ("straight", "gaussian", "two_modes", "rotating"):
+            assert row["stiff"] == 0
+            assert row["converged"] == 1
+
+
+def test_a_stiff_problem_is_flagged_and_a_smooth_one_accurate():
+    rows = judge(["gaussian", "stiff_1e6"], ["dopri5"], [1e-3], scans=2, elements=8, max_evaluations=200)
+    found = {(row["problem"], row["precision"]): row["verdict"] for row in rows}
+    assert found["gaussian", "float64"] == "accurate"
+    assert found["stiff_1e6", "float64"] == "flagged"
