@@ -84,9 +84,9 @@ def _step(
     with torch.no_grad():
         scale = torch.maximum(x.abs(), y.abs()).mul_(tolerance).add_(tolerance)
         error = weighted(method.error, k).mul_(expand_time(h, x)).div_(scale)
-        powers, dk, dy = norms(powered(error), k[-1] - k[-2], y - before)
+        powers, dk, dy, whole = norms(powered(error), k[-1] - k[-2], y - before, scale)
     size = unpowered(powers)
-    good = control.within(size, dk, dy)
+    good = control.within(size, dk, dy, whole / tolerance)
     good = inspect(v, control, Tried(method, x, y, k, h, scale), good)
     accepted = control.judge(good, size, dk, dy, v.counts[control.scenes])
     if control.doubtful.any():

@@ -39,7 +39,7 @@ def unpowered(norm: np.ndarray) -> np.ndarray:
 
 
 def weighted(weights: Sequence[float | Tensor], k: Sequence[Tensor]) -> Tensor:
-    """sum_i weights_i k_i, always a new tensor: a stage may be a buffer that the network writes to again."""
+    """sum_i weights_i k_i, always a new tensor."""
     terms = [(w, stage) for w, stage in zip(weights, k, strict=True) if isinstance(w, Tensor) or w]
     total = terms[0][1] * terms[0][0]
     for weight, stage in terms[1:]:

@@ -20,7 +20,7 @@ from r2flow.flow.path import expand_time
 from r2flow.flow.solvers.batched import norms, powered, rows, unpowered, weighted
 from r2flow.flow.solvers.embedded import EmbeddedMethod
 from r2flow.flow.solvers.solution import Evaluations
-from r2flow.flow.solvers.step_size import REMEMBERED, StepController
+from r2flow.flow.solvers.step_size import REMEMBERED, SHRINK, StepController
 
 UNSEEN = 0.15  # longest part of the interval between two evaluations
 OFF_CENTRE = 0.5 - 1 / math.sqrt(5)  # of a probe in its part of a gap, so that no regular pattern escapes
@@ -28,6 +28,7 @@ OFF_CENTRE = 0.5 - 1 / math.sqrt(5)  # of a probe in its part of a gap, so that 
 # is compared once in an accepted step; bisected; bisected in a step that is rejected for the first time.
 COMPARED, BISECTED, FROM_REST, REJECTED = (100.0, 2.5), (40.0, 12.0), (10.0, 1e3), (40.0, 1e5)
 EVEN = 0.25  # share of a change that lies in the other half of its bracket: less is a jump
+POLE = 4.0  # growth of a change while its bracket shrinks: a jump's stays, a pole's has no bound
 CROSSING = 0.2  # error that the crossing of a jump may add, in tolerances
 
 
@@ -77,6 +78,7 @@ class _Bracket:
     Attributes:
         trend: Change of v over the step, the median over its stages, of every element.
         most: Largest change of any half.
+        whole: Change over the first bracket.
     """
 
     left: float
@@ -86,6 +88,7 @@ class _Bracket:
     change: float
     trend: Tensor
     most: float = 0.0
+    whole: float = math.inf
 
     @classmethod
     def first(cls, step: Tried, also: dict[float, Tensor]) -> "_Bracket":
@@ -97,18 +100,18 @@ class _Bracket:
         changes = step.changes(*(after - before for (_, before), (_, after) in pairwise(values)))[:, 0]
         begin = int((changes >= changes.max() / 2).argmax())
         (left, before), (right, after) = values[begin : begin + 2]
-        return cls(left, right, before[0], after[0], changes[begin], trend[0])
+        return cls(left, right, before[0], after[0], changes[begin], trend[0], whole=changes[begin])
 
     @property
     def middle(self) -> float:
         return (self.left + self.right) / 2
 
     def halve(self, found: Tensor, first: float, second: float) -> bool:
-        """Go on with the half that holds the jump; False where v changes in both alike, and so does not jump."""
+        """Continue in the half that holds the jump; False where v does not jump: it changes in both, or has a pole."""
         most, middle = max(first, second), self.middle
         smooth = min(first, second) > EVEN * most and self.change > 1.2 * most  # less: there and back, a pulse
         self.most = max(self.most, most)
-        if smooth or not self.most / 2 <= most < math.inf:
+        if smooth or self.most > POLE * self.whole or not self.most / 2 <= most < math.inf:
             return False
         if first >= most / 2:
             self.right, self.after, self.change = middle, found, first
@@ -180,7 +183,10 @@ def _locate(
             if not bracket.halve(found[row], *changes[:, row]):
                 if not held[place]:
                     control.shorten(place, max(bracket.left, bracket.right - bracket.left))
-            elif bracket.error() <= CROSSING or bracket.right - bracket.left <= least[place]:
+            elif bracket.right - bracket.left <= least[place] and bracket.error() > CROSSING:
+                control.shorten(place, SHRINK)  # a pole: no step across it is within the tolerance, however short
+                held[place] = False
+            elif bracket.error() <= CROSSING:
                 control.stop_at(place, bracket.left, bracket.right)
                 held[place] = False
             else:

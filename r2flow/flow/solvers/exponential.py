@@ -97,6 +97,10 @@ class _Scene:
             f = self.velocity(self.t, self.u)
             self.tolerance = attainable(self.limits, self.v.precision)
             self.roundoff = torch.finfo(self.v.precision).eps
+            # Differences of a velocity with noise (dropout, sampling inside the network) say nothing of J.
+            again = self.velocity(self.t, self.u)
+            if _rms(again - f) > math.sqrt(self.roundoff) * _rms(f):
+                return False
             h = self._first_step(f)
             while self.t != self.t_end and f.isfinite().all():
                 krylov = _Krylov(partial(self.product, f), torch.cat([f, f.new_ones(1)]))
@@ -136,7 +140,10 @@ class _Scene:
         """J times a vector: a difference of v, forward in time, so that no time beyond the interval is needed."""
         ahead = float(way[-1]) * self.direction
         scale = (1 + _rms(self.u)) * math.sqrt(len(self.u))
-        step = math.sqrt(self.roundoff) / math.hypot(float(torch.linalg.vector_norm(way[:-1])) / scale, ahead)
+        length = math.hypot(float(torch.linalg.vector_norm(way[:-1])) / scale, ahead)
+        if not length:
+            return torch.zeros_like(way)
+        step = math.sqrt(self.roundoff) / length
         step = math.copysign(min(step, abs(self.t_end - self.t) / max(abs(ahead), 1e-300)), ahead)
         moved = self.velocity(self.t + step * float(way[-1]), self.u + step * way[:-1])
         return torch.cat([(moved - f) / step, f.new_zeros(1)])

@@ -113,7 +113,7 @@ class Evaluations:
         self.precision = self.coarsest(v, x)
         if self._progress is not None:
             self._progress()
-        return v.to(x.dtype)
+        return v.to(x.dtype, copy=True)  # a runtime may write each output into the same buffer
 
     def some(self, places: np.ndarray, t: Tensor, x: Tensor) -> Tensor:
         """v of some of the scenes that the state holds now."""

@@ -14,6 +14,9 @@ SHRINK = 0.2  # smallest factor between one step size and the next
 MEMORY = 0.04  # beta of the PI controller, the weight of the previous error: steadier steps at a stability limit
 REMEMBERED = 3  # steps for which a rejection raises the suspicion of a jump
 STIFF_AFTER, SMOOTH_AFTER = 15, 6  # Hairer: stiff after 15 such steps without 6 others in a row between them
+# Eigenvalues near the imaginary axis limit steps at a smaller |h lambda|, where accuracy can limit them as well: a
+# scene is handed over after more such steps, but not called stiff otherwise.
+OSCILLATING, OSCILLATING_AFTER = 1.0, 200
 
 
 class Limits(NamedTuple):
@@ -58,6 +61,7 @@ class StepController:
         self.reached, self.h, self.grow = np.zeros(of), np.full(of, self.length), np.full(of, method.grow)
         self.last_error = np.full(of, 1e-4)  # dopri5.f
         self.stiff_run, self.smooth_run = np.zeros(of, int), np.zeros(of, int)
+        self.oscillating_run, self.calm_run = np.zeros(of, int), np.zeros(of, int)
         self.arrived, self.leaving = np.zeros(of, bool), np.zeros(of, bool)
         self.accepted, self.rejected = np.zeros(of, int), np.zeros(of, int)
         self.stiff, self.converged, self.times = np.zeros(of, bool), np.zeros(of, bool), np.full(of, t_0)
@@ -112,9 +116,14 @@ class StepController:
         stages = self.time(np.where(self.nodes == 1, self.following, self.reached + self.nodes * h))
         return np.concatenate([stages, self.direction * h[None]])
 
-    def within(self, error: np.ndarray, dk: np.ndarray, dy: np.ndarray) -> np.ndarray:
-        """Whose step is finite and within the tolerance, (B,) bool."""
-        good: np.ndarray = (error <= 1) & np.isfinite(dk) & np.isfinite(dy)
+    def within(self, error: np.ndarray, dk: np.ndarray, dy: np.ndarray, size: np.ndarray) -> np.ndarray:
+        """Whose step is finite and within the tolerance, (B,) bool.
+
+        Stages that are further apart than the state's size 1 + |x| lie about a pole: the error estimate means nothing.
+        """
+        apart = ~(dy <= size)
+        self.factor[apart] = SHRINK
+        good: np.ndarray = (error <= 1) & np.isfinite(dk) & ~apart
         return good
 
     def rougher(self, least: float, by: float) -> np.ndarray:
@@ -206,10 +215,15 @@ class StepController:
         """
         with np.errstate(invalid="ignore", over="ignore"):
             touching = good & (self.h * dk > self.method.stability * dy)
+            oscillating = good & (self.h * dk > OSCILLATING * dy)
         self.stiff_run += touching
         self.smooth_run = np.where(touching, 0, self.smooth_run + (good & ~touching))
         self.stiff_run = np.where(self.smooth_run >= SMOOTH_AFTER, 0, self.stiff_run)
         seeming = self.stiff_run >= STIFF_AFTER
+        if self.limits.until_stiff:
+            self.calm_run = np.where(oscillating, 0, self.calm_run + (good & ~oscillating))
+            self.oscillating_run = np.where(self.calm_run >= SMOOTH_AFTER, 0, self.oscillating_run + oscillating)
+            self.stiff[self.places] |= self.oscillating_run >= OSCILLATING_AFTER
         if self.method.same_time:
             self.stiff[self.places] |= seeming
         else:
@@ -232,8 +246,9 @@ class StepController:
         self.converged[self.places] |= self.arrived
         self.times[self.places] = self.time(self.reached)
         for name in (
-            "scenes", "places", "reached", "h", "grow", "last_error", "stiff_run", "smooth_run", "arrived", "leaving",
-            "begin", "end", "resume", "crossing", "rough", "troubled", "factor", "doubtful",
+            "scenes", "places", "reached", "h", "grow", "last_error", "stiff_run", "smooth_run", "oscillating_run",
+            "calm_run", "arrived", "leaving", "begin", "end", "resume", "crossing", "rough", "troubled",
+            "factor", "doubtful",
         ):  # fmt: skip
             setattr(self, name, getattr(self, name)[rest])
 
