@@ -822,7 +822,3 @@ def test_a_wrong_verb_or_option_is_refused(refused, line: str):
 @pytest.mark.parametrize("line", commands(TRAIN))
 def test_a_wrong_config_is_refused(refused, line: str):
     refused(f"train {line}")
-
-
-def test_there_are_at_least_three_hundred_kinds():
-    assert len({*commands(VERBS), *commands(TRAIN)}) >= 300

@@ -22,7 +22,6 @@ ARCHITECTURES = {
     "adm_unet": "adm_unet",
     "efficient_unet": "efficient_unet",
 }
-THEIR_POSITIONS = {"learnable": "learnable_embedding", "polar": "polar_coordinates", "none": None}
 BACKBONE = "backbone."  # of a flow's network in the generator
 
 
