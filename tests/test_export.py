@@ -65,9 +65,8 @@ def test_a_sampler_is_its_butcher_tableau(sampler, times, states):
     torch.testing.assert_close(found.states, torch.tensor(states, dtype=torch.float64))
 
 
-@pytest.mark.parametrize("kind", ["flow_map", "conditional_map"])
-def test_jumps_have_two_times(kind):
-    found = tableau(flow("efficient_unet", kind).generator.untold(), Sampler("jump", 2))
+def test_jumps_have_two_times():
+    found = tableau(flow("efficient_unet", "flow_map").generator, Sampler("jump", 2))
     assert found.times == [0, 0.5]
     assert found.second == [0.5, 1]
     torch.testing.assert_close(found.states, torch.tensor([[1, 0, 0], [1, 0.5, 0], [1, 0.5, 0.5]]).double())
@@ -221,7 +220,7 @@ def test_a_flow_map_goes_through_the_loop_and_the_page_s_program_runs(tmp_path, 
     pytest.importorskip("onnxscript")
     pytest.importorskip("onnxruntime")
     monkeypatch.chdir(tmp_path)
-    checkpoint, sampler = flow("efficient_unet", "conditional_map"), Sampler("jump", 3)
+    checkpoint, sampler = flow("efficient_unet", "flow_map"), Sampler("jump", 3)
     apart = compare(checkpoint, export(checkpoint, "street.onnx", sampler), sampler)
     assert apart.metres < 1e-3
     assert apart.rays == 0

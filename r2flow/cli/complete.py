@@ -44,14 +44,7 @@ class KnownOptions:
         bool,
         typer.Option("--fill-gaps", help="Take rays without a return as not measured, as in a thinned scan."),
     ] = False
-    keep: Annotated[
-        str,
-        typer.Option(
-            help="exact: measured rays come back as they are. mend: where the answer contradicts one, it is replaced. "
-            "blend: all are the answer's."
-        ),
-    ] = "exact"
-    surfaces: SurfacesOption = None
+    surfaces: SurfacesOption = True
     reflectance_scale: Annotated[
         float | None,
         typer.Option(min=1e-6, max=1e9, help="Value in the files that means full reflectance; found if left out."),
@@ -87,9 +80,9 @@ def complete(
     ] = None,
     precision: PrecisionOption = None,
 ) -> None:
-    """Complete scans: from fewer beams to more, from a part to the whole, from a bad measurement to a good one.
+    """Complete scans: from fewer beams to more, from a part to the whole.
 
-    Answers are files of the scan's own format. The same command goes on where it stopped.
+    Answers are files of the scan's own format. The same command resumes where it stopped.
     """
     from dataclasses import replace
 
@@ -99,12 +92,10 @@ def complete(
     from r2flow.evaluation.sets import reading_of_flow
     from r2flow.lidar.known import mask_identity, parse_mask
     from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.model.completion import KEEP, completing
+    from r2flow.model.completion import completing
     from r2flow.models import DEFAULT, MODELS, find_model
     from r2flow.reports.completed import WRITTEN, Job, answer_ending, write_completed
 
-    if known.keep not in KEEP:
-        raise InputError(f"--keep must be {', '.join(KEEP[:-1])} or {KEEP[-1]}, found {known.keep!r}.")
     if checkpoint is None:
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
     mask = None if known.mask is None else parse_mask(known.mask)
@@ -113,9 +104,6 @@ def complete(
     _check_target(loaded, known.target)
     reading = replace(reading_of_flow(loaded), columns=named_columns(known.columns))
     scans, said = open_partial(what, reading, source, known.reflectance_scale, answers.scans)
-    doubtful = known.keep != "exact"
-    if doubtful and not loaded.generator.told:
-        print("this model was not trained on faulty measurements and mends them badly: give one of stage=conditional")
     sampler = completing(loaded.generator, solver.change(completing(loaded.generator), precision=precision))
     for line in said:
         print(line)
@@ -129,19 +117,15 @@ def complete(
         f"an answer has one point in a pixel of the model's image, {rows}x{columns}: {rows * columns} at most; of "
         "several measured points in a pixel it keeps the nearest"
     )
-    job = Job(
-        num=answers.num, seed=answers.seed, keep=known.keep, mask=mask, fill_gaps=known.fill_gaps,
-        batch_size=answers.batch_size, on_surfaces=known.surfaces, pictures=answers.pictures,
-    )  # fmt: skip
+    job = Job(answers.num, answers.seed, mask, known.fill_gaps, answers.batch_size, known.surfaces, answers.pictures)
     about = {
-        "mask": known.mask and mask_identity(known.mask), "from": known.source, "surfaces": known.surfaces,
-        "fill_gaps": known.fill_gaps or None,
+        "mask": known.mask and mask_identity(known.mask), "from": known.source,
         "reflectance_scale": known.reflectance_scale, "columns": known.columns,
     }  # fmt: skip
-    found = write_completed(loaded, scans, out, job, sampler, about)
-    there = len(scans) - len(found)
-    print(f"{len(found)} scans completed in {out}" + (f", {there} were there already" if there else ""))
-    errors = [error for error in found.values() if error is not None]
+    done = write_completed(loaded, scans, out, job, sampler, about)
+    skipped = len(scans) - len(done)
+    print(f"{len(done)} scans completed in {out}" + (f", {skipped} were there already" if skipped else ""))
+    errors = [error for error in done.values() if error is not None]
     if errors:
         off = [error["mae_m"] for error in errors if not np.isnan(error["mae_m"])]
         apart = f"MAE {np.mean(off):.2f} m where both return" if off else "no hidden ray returns in both"

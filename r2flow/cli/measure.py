@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -69,17 +69,15 @@ def completion(
     checkpoint: CheckpointOption = Path("street"),
     also: Annotated[list[str] | None, typer.Option(help="More models, one each time.")] = None,
     tasks: Annotated[
-        str | None, typer.Option(help="Masks (rows:4) and faults (rain), a space between them; five masks if left out.")
+        str | None, typer.Option(help="Masks, as rows:4, a space between them; five masks if left out.")
     ] = None,
-    solvers: Annotated[
-        str | None, typer.Option(help="Ways to run the first model, with or without steps: flowdps/32,mmps.")
-    ] = None,
-    steps: Annotated[str | None, typer.Option(help="Numbers of steps of the first model, as 8,16,64.")] = None,
+    solvers: Annotated[str | None, typer.Option(help="Methods for the models, as mmps,replace.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps of each method.")] = None,
     num: Annotated[int, typer.Option(min=1, help="The most scans of a set, evenly spread over it.")] = 16,
     answers: Annotated[int, typer.Option(min=1, help="Answers to each scan; 19 give intervals of 90 %.")] = 8,
     seed: Annotated[int, typer.Option(min=0, help="Of the noise. What is hidden of a scan does not depend on it.")] = 0,
     batch_size: Annotated[int, typer.Option(min=1, help="Answers at once.")] = 4,
-    surfaces: SurfacesOption = None,
+    surfaces: SurfacesOption = True,
     reflectance_scale: ScaleChoice = None,
     device: DeviceOption = "auto",
     out: OutOption = Path("reports"),
@@ -87,35 +85,36 @@ def completion(
     """Hide a part of scans and complete them, by models and by plain interpolation: errors against evaluations."""
     import numpy as np
 
-    from r2flow.cli.output import command, finish, numbers
+    from r2flow.cli.output import command, finish
     from r2flow.flow.posterior import methods_in
     from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.model.completion import completing
     from r2flow.progress import Bar
-    from r2flow.reports.completion import TASKS, completion_page, completion_rows, given_by, pictured, ways_of
+    from r2flow.reports.completion import TASKS, Way, completion_page, completion_rows, measured_by, pictured
     from r2flow.reports.inversion import real_scans
     from r2flow.reports.pages import prepare_folder
 
-    first = load_checkpoint(checkpoint, choose_device(device))
-    counts = numbers("steps", steps, int) if steps else []
-    ways = ways_of(first, Path(checkpoint).stem, methods_in(solvers) if solvers else [], counts)
-    for other in also or []:
-        ways += ways_of(load_checkpoint(other, choose_device(device)), Path(other).stem)
-    named = tasks.split() if tasks else list(TASKS)
-    for task in named:
-        given_by(task, np.zeros((2, *first.sensor.shape), dtype=np.float32), first.sensor, 0)
+    loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in (checkpoint, *(also or []))}
+    ways = [
+        Way(name, one, completing(one.generator, method=method, steps=steps))
+        for name, one in loaded.items()
+        for method in (methods_in(solvers) if solvers else [None])
+    ]
+    first = ways[0].checkpoint
+    masks = tasks.split() if tasks else list(TASKS)
+    for task in masks:
+        measured_by(task, first.sensor, 0)
     scans = real_scans(first, [real], reflectance_scale, num)
     truths = [np.asarray(scan.image) for scan in scans if scan.image[0].any()]
     if not truths:
         raise InputError(f"{real}: no scan has a return, so there is nothing to hide.")
     prepare_folder(out)
-    rows, shown = [], []
-    cost = [way.checkpoint.generator.evaluations_of(way.sampler) for way in ways for _ in named]
-    with Bar("completing", -(-len(truths) * answers // batch_size) * sum(cost), "evaluations") as advance:
-        options: dict[str, Any] = {"on_surfaces": surfaces, "progress": advance}
-        for row, images in completion_rows(truths, first.sensor, ways, named, answers, seed, batch_size, **options):
-            rows.append(row)
-            shown.append((row, images[0]))
+    cost = sum(way.checkpoint.generator.evaluations_of(way.sampler) for way in ways) * len(masks)
+    with Bar("completing", len(truths) * -(-answers // batch_size) * cost, "evaluations") as advance:
+        shown = list(
+            completion_rows(truths, first.sensor, ways, masks, answers, seed, batch_size, surfaces, progress=advance)
+        )
     figure = pictured(truths[0], shown, first.sensor)
     about = f"{len(truths)} scans of {real}, {answers} answers to each."
-    page = completion_page(rows, figure, about, seed, command(), str(choose_device(device)))
+    page = completion_page([row for row, _ in shown], figure, about, seed, command(), str(choose_device(device)))
     finish(page, out, page.text[1:])

@@ -32,11 +32,8 @@ SizeOption = Annotated[str | None, typer.Option(help="Rows x columns, as 64x1024
 ProjectionOption = Annotated[str, typer.Option(help="spherical or unfolding.")]
 ConventionOption = Annotated[str, typer.Option(help="centre, or reference for the published models'.")]
 SurfacesOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--surfaces/--no-surfaces",
-        help="Whether answers are moved to the surfaces that measured returns lie on; a regression's are not.",
-    ),
+    bool,
+    typer.Option("--surfaces/--no-surfaces", help="Move answers to the surfaces that measured returns lie on."),
 ]
 SETS = "a folder of scans, samples, a run, prepared shards, NAME:FOLDER, simulated:SEED"
 SensorChoice = Annotated[

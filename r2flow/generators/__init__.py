@@ -8,15 +8,15 @@ import torch
 from r2flow.errors import InputError
 from r2flow.generators.base import Condition, Generated, Generator, Sampler
 from r2flow.generators.budgets import Budget, levels
-from r2flow.generators.conditional import ConditionalFlow, ConditionalMap, Regression, condition_of
+from r2flow.generators.conditional import ConditionalFlow, condition_of
 from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
 from r2flow.generators.flow_map import FlowMap
 from r2flow.lidar.space import build_space
 from r2flow.registry import Registry, lazy
 
 __all__ = [
-    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "ConditionalMap", "Field", "Flow", "FlowMap",
-    "Generated", "Generator", "RectifiedFlow", "Regression", "Sampler", "as_flow", "build_generator", "condition_of",
+    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "Field", "Flow", "FlowMap",
+    "Generated", "Generator", "RectifiedFlow", "Sampler", "as_flow", "build_generator", "condition_of",
     "levels",
 ]  # fmt: skip
 
@@ -25,8 +25,6 @@ GENERATORS: Registry[type[Generator]] = Registry(
     rectified_flow=RectifiedFlow,
     flow_map=FlowMap,
     conditional_flow=ConditionalFlow,
-    conditional_map=ConditionalMap,
-    regression=Regression,
     diffusion=lazy("r2flow.systems.diffusion.generator:Diffusion"),
     vanilla_gan=lazy("r2flow.systems.gan.generator:VanillaGan"),
     dusty1=lazy("r2flow.systems.gan.generator:DustyV1"),

@@ -24,7 +24,7 @@ Progress = Callable[[], None] | None
 
 Precision = Literal["32-true", "bf16-mixed"]  # words of Lightning's trainer
 
-IMAGE, KNOWN, DOUBTFUL = "image", "known", "doubtful"  # the names of what is known of a part of a scan
+IMAGE, KNOWN = "image", "known"  # the names of what is known of a part of a scan
 LOGIT, SIGMA = "logit", "sigma"  # and of what a conditional flow finds of these once (`r2flow.generators.conditional`)
 
 JUMP, CHORD, RENOISE = WAYS = "jump", "chord", "renoise"  # of a flow map, on the same steps
@@ -32,20 +32,20 @@ JUMP, CHORD, RENOISE = WAYS = "jump", "chord", "renoise"  # of a flow map, on th
 WHOLE_ONLY = "a {} makes whole images and no part of one; leave the region out."
 
 
-def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`image`, `known` and `doubtful` of a condition, as `x` is in type and place; zeros where nothing is known.
+def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor]:
+    """`image` and `known` of a condition, as `x` is in type and place; zeros where nothing is known.
 
     Raises:
         InputError: a condition of other names or shapes.
     """
     if condition is None:
-        return (torch.zeros_like(x),) * 3
-    if condition.keys() - {LOGIT, SIGMA} != {IMAGE, KNOWN, DOUBTFUL}:
-        raise InputError(f"this generator is told '{IMAGE}', '{KNOWN}' and '{DOUBTFUL}', found {', '.join(condition)}.")
-    image, known, doubtful = (condition[name].to(x) for name in (IMAGE, KNOWN, DOUBTFUL))
-    if image.shape != x.shape or known.shape != x.shape or doubtful.shape != x.shape:
-        raise InputError(f"what is known must be {tuple(x.shape)} as the scans are, found {tuple(image.shape)}.")
-    return image, known, doubtful
+        return torch.zeros_like(x), torch.zeros_like(x)
+    if condition.keys() - {LOGIT, SIGMA} != {IMAGE, KNOWN}:
+        raise InputError(f"the condition must have the keys '{IMAGE}' and '{KNOWN}', got {', '.join(condition)}.")
+    image, known = (condition[name].to(x) for name in (IMAGE, KNOWN))
+    if image.shape != x.shape or known.shape != x.shape:
+        raise InputError(f"the condition must be {tuple(x.shape)} as the scans are, found {tuple(image.shape)}.")
+    return image, known
 
 
 @dataclass(frozen=True)

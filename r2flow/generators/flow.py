@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from r2flow.backbones import build_backbone
 from r2flow.errors import InputError
-from r2flow.flow.posterior import METHODS, Measurement, completes, parse_method, sample_posterior
+from r2flow.flow.posterior import METHODS, completes, parse_method, sample_posterior
 from r2flow.flow.solvers import (
     Solution,
     Velocity,
@@ -39,7 +39,6 @@ class Flow(Generator):
     """
 
     other_samplers: ClassVar[tuple[str, ...]] = (SDE,)
-    has_paths: ClassVar[bool] = True  # whether it is the ODE of its velocity that takes noise to scans
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         """v(t, x), (B, C, H, W), at times t of shape () or (B,)."""
@@ -93,10 +92,7 @@ class Flow(Generator):
         if completes(how.method):
             if condition is None:
                 raise InputError(f"{how.method} completes a scan of which a part is known; give what is known.")
-            noise = noise.to(self.device)
-            image, known, doubtful = parts_of(condition, noise)
-            measured = Measurement(image, (known + doubtful > 0).to(noise), how.doubt * doubtful)
-            return self.given(noise, measured, sampler=how, draws=draws, progress=progress)
+            return self._completed(noise, condition, how, draws, progress)
         churn = churn_of(how.method)
         if churn is not None:
             return self._stochastic(noise, condition, how, churn, draws, progress)
@@ -151,44 +147,25 @@ class Flow(Generator):
         return draws.step(self.noise_shape, j)
 
     @torch.no_grad()
-    def given(
-        self,
-        noise: Tensor,
-        measured: Measurement,
-        *,
-        sampler: Sampler,
-        draws: Draws | None = None,
-        progress: Progress = None,
+    def _completed(
+        self, noise: Tensor, condition: Condition, how: Sampler, draws: Draws | None, progress: Progress
     ) -> Generated:
-        """x_1 given a measurement, by a method of `r2flow.flow.posterior`; of a known scan, the scan for nothing.
-
-        Args:
-            noise: (B, *noise_shape).
-            measured: Of each scan; a mask or any other linear measurement.
-
-        Raises:
-            InputError: a method that the table does not have, or one that the measurement or the draws do not suit.
-        """
+        """x_1 given a part of it, by a method of `r2flow.flow.posterior`."""
         x_0 = wide(noise.to(self.device))
-        left = (~measured.known).flatten(1).any(1).nonzero()[:, 0]
-        evaluations = torch.zeros(len(x_0), dtype=torch.int64, device=x_0.device)
-        x = measured.y.to(x_0)
-        if len(left):
+        image, known = parts_of(condition, x_0)
 
-            def u(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
-                found = self.mean_velocity(t, x, s).to(x)
-                if progress is not None:
-                    progress()
-                    if found.requires_grad:
-                        found.register_hook(lambda _: progress())  # each product with the Jacobian
-                return found
+        def u(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+            velocity = self.mean_velocity(t, x, s).to(x)
+            if progress is not None:
+                progress()
+                if velocity.requires_grad:
+                    velocity.register_hook(lambda _: progress())  # each product with the Jacobian
+            return velocity
 
-            further = None if draws is None else lambda j: self.further_noise(draws, j).to(x_0)[left]
-            times = self._times(sampler)
-            made = sample_posterior(u, x_0[left], measured.select(left), sampler.method, times, further)
-            x = made if len(left) == len(x_0) else x.index_copy(0, left, made)
-            evaluations[left] = parse_method(sampler.method).evaluations(len(times) - 1)
-        return Generated(x, evaluations, finite(x))
+        further = None if draws is None else lambda j: self.further_noise(draws, j).to(x_0)
+        times = self._times(how)
+        x = sample_posterior(u, x_0, image, known > 0, how.method, times, further)
+        return Generated.after(x, parse_method(how.method).evaluations(len(times) - 1))
 
     def _times(self, sampler: Sampler, t_0: float = 0.0, t_1: float = 1.0) -> Tensor:
         return build_grid(sampler.times, t_0, t_1, sampler.steps)
@@ -421,6 +398,6 @@ def as_flow(generator: Generator, what: str) -> Flow:
     Raises:
         InputError: it follows no velocity, which `what` needs.
     """
-    if not (isinstance(generator, Flow) and generator.has_paths):
+    if not isinstance(generator, Flow):
         raise InputError(f"{what} needs the velocity of a flow, which a {type(generator).__name__} does not have.")
     return generator

@@ -25,7 +25,6 @@ class Ray(IntEnum):
     UNKNOWN = 0  # not measured
     RETURN = 1  # measured, with a return
     EMPTY = 2  # measured, and nothing came back
-    DOUBTFUL = 3  # measured, with or without a return, but not trusted
 
 
 def ray_states(images: Tensor, measured: Tensor | None = None) -> Tensor:

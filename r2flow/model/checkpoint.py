@@ -62,7 +62,7 @@ class Checkpoint:
         Raises:
             InputError: the generator is no rectified flow.
         """
-        if not (isinstance(self.generator, RectifiedFlow) and self.generator.has_paths):
+        if not isinstance(self.generator, RectifiedFlow):
             raise InputError(f"{self.path} holds a {type(self.generator).__name__}, which has no network v(t, x).")
         return self.generator.untold().backbone
 

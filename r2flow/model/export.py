@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from r2flow import __version__
 from r2flow.errors import InputError, require
 from r2flow.files import atomic_write
-from r2flow.generators import USUAL, RectifiedFlow, Regression, Sampler
+from r2flow.generators import USUAL, RectifiedFlow, Sampler
 from r2flow.lidar.planes import flattened
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.space import ModelSpace
@@ -145,10 +145,6 @@ def flow_of(checkpoint: Checkpoint) -> RectifiedFlow:
         InputError: it holds another generator.
     """
     flow = checkpoint.generator
-    if isinstance(flow, Regression):
-        raise InputError(
-            f"{checkpoint.path} holds a regression, which has no way from noise to a scan: use it with r2flow complete."
-        )
     if not isinstance(flow, RectifiedFlow):
         raise InputError(f"only flows can be exported, and {checkpoint.path} holds a {type(flow).__name__}.")
     return flow

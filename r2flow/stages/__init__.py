@@ -11,7 +11,7 @@ from r2flow.generators import Generator, Sampler
 from r2flow.generators.base import check_control
 from r2flow.registry import Registry, check_options, lazy
 from r2flow.stages.base import Stage
-from r2flow.stages.conditional import Conditional, LearnConditionalMap, Regress
+from r2flow.stages.conditional import Conditional
 from r2flow.stages.flow_map import LearnFlowMap
 from r2flow.stages.rectify import Rectify
 from r2flow.stages.reflow import Distill, Reflow
@@ -23,8 +23,6 @@ STAGES: Registry[type[Stage]] = Registry(
     distill=Distill,
     flow_map=LearnFlowMap,
     conditional=Conditional,
-    conditional_map=LearnConditionalMap,
-    regress=Regress,
     diffusion=lazy("r2flow.systems.diffusion.stage:LearnDiffusion"),
     gan=lazy("r2flow.systems.gan.stage:LearnGan"),
     score_matching=lazy("r2flow.systems.score.stage:MatchScore"),

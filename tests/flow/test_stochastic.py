@@ -182,14 +182,14 @@ def test_another_method_starts_from_its_usual_steps_and_another_number_of_the_sa
     assert (timed.finish, timed.steps) == (0.0, 2)
 
 
-@pytest.mark.parametrize("method", ["mmps", "repaint:2", "flowdps"])
+@pytest.mark.parametrize("method", ["mmps", "repaint:2"])
 def test_a_part_is_completed_with_the_noise_of_the_whole(method):
     flow = build_generator(CONFIG).eval()
     region, who = Region((8, 32), 0, 8, 8, 16), Draws(5, [0])
     x_0 = who.start(flow.noise_shape)
     known = torch.zeros_like(x_0)
     known[:, :, ::2] = 1
-    told = {"image": 0.3 * known, "known": known, "doubtful": torch.zeros_like(x_0)}
+    told = {"image": 0.3 * known, "known": known}
     whole = flow.generate(x_0, told, sampler=Sampler(method, 3), draws=who).x
     cut = {name: region.crop(value) for name, value in told.items()}
     part = flow.part(region).generate(region.crop(x_0), cut, sampler=Sampler(method, 3), draws=who).x
@@ -200,7 +200,7 @@ def test_a_method_asks_for_draws_where_it_needs_them():
     flow, x_0 = normal(), torch.ones(1, 2, 8, 32)
     known = torch.zeros_like(x_0)
     known[:, :, ::2] = 1
-    told = {"image": 0.3 * known, "known": known, "doubtful": torch.zeros_like(x_0)}
+    told = {"image": 0.3 * known, "known": known}
     assert flow.generate(x_0, told, sampler=Sampler("mmps:1,0", 2)).converged.all()
     with pytest.raises(InputError, match="mmps:1 draws further noise: give draws"):
         flow.generate(x_0, told, sampler=Sampler("mmps:1", 3))
@@ -213,7 +213,7 @@ def test_what_is_known_arrives_as_it_was_given():
     x_0 = who.start(flow.noise_shape)
     known = torch.zeros_like(x_0)
     known[:, :, ::2] = 1
-    told = {"image": x_0.roll(1, 3) * known, "known": known, "doubtful": torch.zeros_like(x_0)}
+    told = {"image": x_0.roll(1, 3) * known, "known": known}
     made = flow.generate(x_0, told, sampler=Sampler("sde", 6), draws=who)
     assert made.converged.all()
     assert torch.equal(made.x[known > 0], told["image"][known > 0])

@@ -1,4 +1,4 @@
-"""States of rays, masks, faults and interpolation."""
+"""States of rays, masks and interpolation."""
 
 import math
 
@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.lidar.faults import FAULTS, nearest_filled
-from r2flow.lidar.interpolation import OPPONENTS, guess, interpolated, interpolated_both_ways, surfaces
+from r2flow.lidar.interpolation import INTERPOLATIONS, interpolated, interpolated_both_ways, surfaces
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.lidar.sensors import SENSORS
 
@@ -112,11 +111,11 @@ def ground() -> np.ndarray:
     return image
 
 
-@pytest.mark.parametrize("name", OPPONENTS)
+@pytest.mark.parametrize("name", INTERPOLATIONS)
 def test_interpolation_keeps_what_is_measured_and_fills_the_rest(name):
     image = ground()
     measured = parse_mask("points:0.3")(SHAPE, draws())
-    found = OPPONENTS[name](np.where(measured, image, 7), measured)
+    found = INTERPOLATIONS[name](np.where(measured, image, 7), measured)
     assert (found[:, measured] == image[:, measured]).all()
     assert ((found[0] > 0) == (image[0] > 0)).mean() > 0.9
     assert np.allclose(found[1][found[0] > 0], 0.25)
@@ -130,62 +129,37 @@ def test_the_inverse_of_range_is_nearly_linear_on_the_ground():
     hidden[15] = False  # beyond the last known row
     # 1 / r = sin(-e) / h: the mean of two neighbours' is cos(step) of it, so that the range is 1 / cos(step) too long.
     step = np.deg2rad(28 / 16)
-    direct, inverse = (interpolated(image, measured, "linear", way)[0] for way in (False, True))
+    direct, inverse = (interpolated(image, measured, rule)[0] for rule in ("linear", "inverse"))
     assert inverse[hidden] == pytest.approx(image[0][hidden] / np.cos(step), rel=1e-5)
     assert np.abs(inverse - image[0])[hidden].max() < 0.05 * np.abs(direct - image[0])[hidden].max()
 
 
-@pytest.mark.parametrize("mask", ["rows:4", "rows:3,2", "random:0.3", "points:0.1", "points:0.005", "sector:150,-150"])
-def test_the_guess_is_the_linear_interpolation_of_the_inverse(mask):
+@pytest.mark.parametrize("rule", ["linear", "inverse"])
+def test_interpolation_follows_columns_and_then_the_ring(rule):
+    """Against numpy.interp, where every ray returns: between the known rows of a column, else around its row."""
     random = draws(3)
     image = np.stack([random.uniform(2, 80, SHAPE), random.random(SHAPE)]).astype(np.float32)
-    image[:, random.random(SHAPE) < 0.3] = 0
-    measured = parse_mask(mask)(SHAPE, draws(4))
-    expected = interpolated(image, measured, "linear", inverse=True)
-    assert np.allclose(guess(image, measured), expected, rtol=1e-5, atol=1e-5)
+    measured = parse_mask("random:0.5+sector:150,-150")(SHAPE, draws(4))
+    expected = image.astype(np.float64) * measured
+    if rule == "inverse":
+        expected[0] = np.where(measured, 1 / image[0], 0)
+    rows = np.flatnonzero(measured.any(1))
+    inner, columns = np.arange(rows[0], rows[-1] + 1), np.flatnonzero(measured.any(0))
+    for channel in expected:
+        for w in columns:
+            channel[inner, w] = np.interp(inner, rows, channel[rows, w])
+        for h in inner:
+            channel[h] = np.interp(np.arange(64), columns, channel[h, columns], period=64)
+    if rule == "inverse":
+        expected[0, inner] = 1 / expected[0, inner]
+    found = interpolated(image, measured, rule)
+    assert np.allclose(found[:, inner], expected[:, inner], rtol=1e-5, atol=1e-5)
+    assert (found[:, : rows[0]] == found[:, rows[:1]]).all()  # rows beyond the known ones are the nearest one's
+    assert (found[:, rows[-1] :] == found[:, rows[-1:]]).all()
 
 
 def test_nothing_is_guessed_from_nothing():
-    assert not guess(ground(), np.zeros(SHAPE, dtype=bool)).any()
-
-
-def test_a_row_is_filled_from_its_nearest_neighbours_around_the_ring():
-    image = np.arange(8, dtype=np.float32)[None, None]
-    known = np.array([[False, True, False, False, False, False, True, False]])
-    assert nearest_filled(image, known)[0, 0].tolist() == [1, 1, 1, 1, 6, 6, 6, 6]
-
-
-@pytest.mark.parametrize("name", FAULTS)
-def test_faults_make_possible_scans(name):
-    image = ground()
-    found = FAULTS[name](image, SENSOR, 1.0, draws())
-    assert found.shape == image.shape
-    assert found.dtype == np.float32
-    r = found[0][found[0] > 0]
-    assert r.min() >= SENSOR.min_range
-    assert r.max() <= SENSOR.max_range
-    assert found[1].min() >= 0
-    assert found[1].max() <= 1
-    if name not in ("clean",):
-        assert (found != image).any()
-
-
-def test_faults_have_the_rates_that_they_say():
-    image = np.repeat(np.repeat(ground()[:, 10:11], 16, axis=1), 16, axis=2)  # one range everywhere
-    for name, most in (("rain", 0.1), ("crosstalk", 0.05), ("lost", 0.5)):
-        changed = (FAULTS[name](image, SENSOR, 1.0, draws())[0] != image[0]).mean()
-        spread = 4 * math.sqrt(most * (1 - most) / image[0].size)
-        # a drop behind the surface is not seen: P(1.45 + Exp(5) > r) of them are lost
-        seen = 1 - math.exp(-(image[0, 0, 0] - 1.45) / 5) if name == "rain" else 1
-        assert abs(changed - most * seen) < spread, name
-    noisy = FAULTS["noise"](image, SENSOR, 1.0, draws())[0] - image[0]
-    assert abs(noisy.std() - 0.5) < 0.5 * 4 / math.sqrt(2 * noisy.size)
-
-
-def test_a_clean_scan_has_lost_nothing_where_its_row_has_a_return():
-    image = ground()
-    image[:, 10, ::3] = 0
-    assert (FAULTS["clean"](image, SENSOR, 0.0, draws()) == ground()).all()
+    assert not interpolated(ground(), np.zeros(SHAPE, dtype=bool)).any()
 
 
 def test_between_the_rings_of_a_plane_surfaces_are_as_far_as_the_curve_bends():
@@ -239,7 +213,7 @@ def test_both_ways_the_ring_of_the_ground_is_exact():
     image = ground()
     measured = parse_mask("points:0.3")(SHAPE, draws())
     hidden = ~measured & (image[0] > 0)
-    one, both = interpolated(image, measured, "linear", inverse=True), interpolated_both_ways(image, measured)
+    one, both = interpolated(image, measured), interpolated_both_ways(image, measured)
     said = np.isfinite(surfaces(image[0], measured)[1]) & hidden & (one[0] > 0)
     assert said.sum() > 0.8 * hidden.sum()
     assert np.abs(both[0] - image[0])[said].max() < 1e-4 < np.abs(one[0] - image[0])[said].max()

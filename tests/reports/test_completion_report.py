@@ -9,12 +9,11 @@ import torch
 
 from r2flow.cli import main
 from r2flow.errors import InputError
-from r2flow.generators import Generated, build_generator
-from r2flow.lidar.interpolation import OPPONENTS, guess
-from r2flow.lidar.known import Ray
+from r2flow.generators import Generated, Sampler, build_generator
+from r2flow.lidar.interpolation import INTERPOLATIONS, interpolated
 from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.reports.completion import Way, completion_rows, given_by, ways_of
+from r2flow.reports.completion import Way, completion_rows, measured_by
 from tests.stages.test_conditional import CONFIG
 
 
@@ -34,24 +33,25 @@ def truths() -> list[np.ndarray]:
 
 def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(checkpoint, truths, monkeypatch):
     sensor, encoding, by = checkpoint.sensor, checkpoint.encoding, 0.0
-    stacked = torch.from_numpy(np.stack(truths))
+    scan = iter(torch.from_numpy(np.stack([*truths, *truths])))
 
     def answer(noise, condition, **_):
-        moved = torch.where(stacked[:, :1] > 0, (stacked[:, :1] + by).clamp(max=79.9), 0)
-        return Generated.after(encoding.encode(torch.cat([moved, stacked[:, 1:]], 1)), 7)
+        truth = next(scan)[None]
+        moved = torch.where(truth[:, :1] > 0, (truth[:, :1] + by).clamp(max=79.9), 0)
+        return Generated.after(encoding.encode(torch.cat([moved, truth[:, 1:]], 1)), 7)
 
     monkeypatch.setattr(checkpoint.generator, "generate", answer)
-    ways = [Way("truth", checkpoint, {"method": "euler", "steps": 7})]
-    options = {"tasks": ["rows:4"], "answers": 1, "batch_size": 3}
+    ways = [Way("truth", checkpoint, Sampler("euler", 7))]
+    options = {"tasks": ["rows:4"], "num": 1, "on_surfaces": False}
     *plain, (row, _) = completion_rows(truths, sensor, ways, **options)
-    assert [one["method"] for one, _ in plain] == list(OPPONENTS)
+    assert [one["method"] for one, _ in plain] == list(INTERPOLATIONS)
     assert row["evaluations"] == 7
     assert row["mae_m"] == pytest.approx(0, abs=1e-4)
     assert (row["drop_wrong"], row["panel"]) == (0, pytest.approx(0, abs=1e-3))
     by = 0.5
     row, _ = list(completion_rows(truths, sensor, ways, **options))[-1]
     assert row["mae_m"] == pytest.approx(0.5, abs=1e-3)
-    hidden = [given_by("rows:4", x, sensor, i).asked for i, x in enumerate(truths)]
+    hidden = [~measured_by("rows:4", sensor, i) for i in range(3)]
     shares = np.mean([(x[0] > 0)[h].sum() / x[0].size for x, h in zip(truths, hidden, strict=True)])
     assert row["mae_all_m"] == pytest.approx(0.5 * shares, rel=1e-3)  # all pixels, known ones without error
 
@@ -60,43 +60,22 @@ def test_interpolations_are_judged_as_any_answer(checkpoint, truths):
     rows = {row["method"]: row for row, _ in completion_rows(truths, checkpoint.sensor, [], ["points:0.3"])}
     expected = []
     for number, truth in enumerate(truths):
-        given = given_by("points:0.3", truth, checkpoint.sensor, number)
-        known = np.where(given.asked, 0, truth[0])
-        assert (given.image[0] == known).all()
-        expected.append(errors(truth, guess(truth, ~given.asked), given.asked, checkpoint.sensor)["mae_m"])
+        mask = measured_by("points:0.3", checkpoint.sensor, number)
+        expected.append(errors(truth, interpolated(truth, mask), ~mask, checkpoint.sensor)["mae_m"])
     assert rows["linear, 1/r"]["mae_m"] == pytest.approx(np.mean(expected), rel=1e-4)
 
 
-def test_a_fault_gives_a_measurement_that_nobody_trusts(checkpoint, truths):
-    given = given_by("lost", truths[0], checkpoint.sensor, 0)
-    assert (given.state == Ray.DOUBTFUL).all()
-    assert given.asked.all()
-    assert 0 < ((truths[0][0] > 0) & (given.image[0] == 0)).mean() < 0.4
-    names = [row["method"] for row, _ in completion_rows(truths, checkpoint.sensor, [], ["lost"])]
-    assert names == ["as it is"]
-
-
-def test_what_is_hidden_depends_on_the_scan_s_number_alone(checkpoint, truths):
-    one, again, other = (given_by("points:0.5", truths[0], checkpoint.sensor, i).asked for i in (0, 0, 1))
+def test_what_is_hidden_depends_on_the_scan_s_number_alone(checkpoint):
+    one, again, other = (measured_by("points:0.5", checkpoint.sensor, i) for i in (0, 0, 1))
     assert (one == again).all()
     assert (one != other).any()
 
 
 @pytest.mark.parametrize("task", ["rows:1", "points:0", "rain:2", "nothing"])
-def test_a_task_that_is_none_is_one_line(checkpoint, truths, task):
+def test_a_task_that_is_none_is_one_line(checkpoint, task):
     with pytest.raises(InputError) as caught:
-        given_by(task, truths[0], checkpoint.sensor, 0)
+        measured_by(task, checkpoint.sensor, 0)
     assert "\n" not in str(caught.value)
-
-
-def test_a_model_is_run_by_every_solver_and_number_of_steps(checkpoint):
-    names = [way.name for way in ways_of(checkpoint, "street", ["euler", "midpoint"], [2, 4])]
-    assert names == ["street, euler 2", "street, euler 4", "street, midpoint 2", "street, midpoint 4"]
-    assert [way.name for way in ways_of(checkpoint, "street")] == ["street, adams3 16"]
-    own = ways_of(checkpoint, "street", ["euler/3", "midpoint"], [5])
-    assert [way.name for way in own] == ["street, euler 3", "street, midpoint 5"]
-    with pytest.raises(InputError, match="behind a slash"):
-        ways_of(checkpoint, "street", ["euler/x"])
 
 
 def test_the_verb_writes_a_page_with_its_picture(checkpoint, tmp_path: Path, monkeypatch):
@@ -104,7 +83,7 @@ def test_the_verb_writes_a_page_with_its_picture(checkpoint, tmp_path: Path, mon
     out = tmp_path / "out"
     monkeypatch.setattr("sys.argv", [
         "r2flow", "report", "completion", "simulated:3", "-c", str(tmp_path / "model.safetensors"), "--num", "2",
-        "--answers", "2", "--solvers", "euler/1,mmps:1,0/1", "--tasks", "rows:4 rain", "--out", str(out),
+        "--answers", "2", "--solvers", "euler,mmps:1,0", "--steps", "1", "--tasks", "rows:4 rows:2", "--out", str(out),
     ])  # fmt: skip
     with pytest.raises(SystemExit) as ended:
         main()
@@ -112,5 +91,5 @@ def test_the_verb_writes_a_page_with_its_picture(checkpoint, tmp_path: Path, mon
     assert (out / "completion.png").stat().st_size > 10_000
     rows = json.loads((out / "completion.json").read_text())["rows"]
     ways = "model, euler 1", "model, mmps:1,0 1"
-    assert [row["method"] for row in rows] == [*OPPONENTS, *ways, "as it is", *ways]
+    assert [row["method"] for row in rows] == [*INTERPOLATIONS, *ways, *INTERPOLATIONS, *ways]
     assert "coverage" in (out / "completion.md").read_text()

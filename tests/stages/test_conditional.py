@@ -13,20 +13,11 @@ from r2flow.data.loader import FlowDataset
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
 from r2flow.flow.problems import Gaussian
-from r2flow.generators import (
-    ConditionalFlow,
-    ConditionalMap,
-    Regression,
-    Sampler,
-    as_flow,
-    build_generator,
-    condition_of,
-)
+from r2flow.generators import ConditionalFlow, Sampler, build_generator, condition_of
 from r2flow.lidar.known import Ray, parse_mask, ray_states
-from r2flow.model.completion import complete
 from r2flow.noise import Draws
 from r2flow.stages import build_stage
-from r2flow.stages.conditional import Conditional, LearnConditionalMap, Regress, Tasks
+from r2flow.stages.conditional import Conditional, Tasks
 
 CONFIG = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
@@ -65,12 +56,11 @@ def measured(images: torch.Tensor, text: str = "rows:4") -> torch.Tensor:
     return ray_states(images, mask)
 
 
-@pytest.mark.parametrize("name", ["conditional_flow", "conditional_map", "regression"])
 @pytest.mark.parametrize("stage", ["rectify", "reflow"])
-def test_a_stage_that_tells_nothing_refuses_a_generator_that_is_told(name, stage):
+def test_a_stage_that_tells_nothing_refuses_a_generator_that_is_told(stage):
     config = {"data": {"name": "simulated", "batch_size": 4}, "seed": 0, "stage": {"name": stage}}
     with pytest.raises(InputError, match=r"is told a part of each scan.*stage=conditional"):
-        build_stage({**CONFIG, **config}, built(name))
+        build_stage({**CONFIG, **config}, built("conditional_flow"))
 
 
 def test_known_values_are_encoded_and_the_rest_is_a_guess(flow, scans):
@@ -78,7 +68,6 @@ def test_known_values_are_encoded_and_the_rest_is_a_guess(flow, scans):
     told = condition_of(flow.space, scans, state)
     known = (state != Ray.UNKNOWN)[:, None].expand_as(scans)
     assert torch.equal(told["known"] > 0, known)
-    assert not told["doubtful"].any()
     assert torch.equal(told["image"][known], flow.space.encoding.encode(scans)[known])
     other = scans.clone()
     other[~known] = 33.0 / 80  # what lies where nobody measured is not read
@@ -175,7 +164,7 @@ def test_it_starts_as_the_flow_that_it_starts_from(backbone, scans):
     with torch.no_grad():
         expected, unknown = parent.velocity(t, x), told["known"] == 0
         assert torch.allclose(child.velocity(t, x), expected, atol=1e-6)
-        logit, sigma = child.trust(torch.cat([told[name] for name in ("image", "known", "doubtful")], dim=1))
+        logit, sigma = child.trust(torch.cat([told[name] for name in ("image", "known")], dim=1))
         mixed = torch.empty_like(x)
         for index in np.ndindex(*x.shape):  # value by value: a Gaussian about the guess, or what the network says
             guess, std, p = float(told["image"][index]), float(sigma[index]), float(logit[index].sigmoid())
@@ -235,20 +224,20 @@ def test_what_is_known_is_a_function_of_seed_and_number_and_in_validation_of_the
     assert seeds_differ is not all(same(told(1, k), told(2, k)) for k in range(7, 14))
 
 
-def test_tasks_have_the_shares_that_they_say(flow, scans):
-    tasks, count = Tasks(nothing=0.3, faulty=0.2, silent=0.25), 600
+def test_tasks_have_the_shares_that_they_say(flow, scans, monkeypatch):
+    half = np.arange(8)[:, None] % 2 == np.zeros(32)
+    monkeypatch.setattr("r2flow.stages.conditional._measured", lambda *_: half)
+    tasks, count = Tasks(nothing=0.3, silent=0.25), 600
     x_1 = flow.space.encoding.encode(scans)
     told = [tasks(flow.space, x_1[0], noise.generator(0, "condition", k)) for k in range(count)]
-    nothing = sum(not (one["known"].any() or one["doubtful"].any()) for one in told) / count
-    faulty = sum(bool(one["doubtful"].any()) for one in told) / count
+    nothing = sum(not one["known"].any() for one in told) / count
     assert abs(nothing - 0.3) < 4 * math.sqrt(0.3 * 0.7 / count)
-    assert abs(faulty - 0.7 * 0.2) < 4 * math.sqrt(0.14 * 0.86 / count)
     returned = scans[0, 0] > 0
     silent = [
         one for one in told
         if one["known"][0][returned].any() and not one["known"][1][returned].any()
     ]  # fmt: skip
-    assert abs(len(silent) / count - 0.25 * 0.56) < 4 * math.sqrt(0.14 * 0.86 / count)
+    assert abs(len(silent) / count - 0.25 * 0.7) < 4 * math.sqrt(0.175 * 0.825 / count)
 
 
 def test_nothing_is_learned_of_what_is_known(flow, scans):
@@ -257,41 +246,6 @@ def test_nothing_is_learned_of_what_is_known(flow, scans):
     state = ray_states(scans)
     stage.condition = lambda _: condition_of(flow.space, scans, state)  # type: ignore[method-assign]
     assert stage.regression_loss(batch, torch.tensor([0.0, 0.5, 0.99])) < 1e-6
-
-
-def test_the_twin_learns_medians():
-    """Of values that are 0.5 in two scans of three and 1.0 in one, mean absolute error wants 0.5."""
-    generator = built("regression")
-    stage = stage_of(Regress, generator, nothing=0.0, faulty=0.0, silent=0.0)
-    x_1 = torch.full((3, 2, 8, 32), 0.5)
-    x_1[2] = 1.0
-    batch = {"x_1": x_1, "x_0": torch.zeros_like(x_1), "u": torch.rand(3), "k": torch.arange(3)}
-    stage.condition = lambda _: None  # type: ignore[method-assign]
-    optimizer = torch.optim.Adam(generator.parameters(), lr=3e-3)
-    for step in range(120):
-        for group in optimizer.param_groups:
-            group["lr"] = 3e-3 * (1 - step / 120)
-        optimizer.zero_grad()
-        stage.training_step(batch, 0).backward()
-        optimizer.step()
-    found = generator.generate(torch.zeros(1, 2, 8, 32)).x
-    assert found.mean() == pytest.approx(0.5, abs=0.05)
-
-
-def test_the_twin_has_no_times():
-    with pytest.raises(InputError, match="no times between noise and scan"):
-        Regress(built("regression"), time={"name": "uniform"})
-
-
-def test_the_twin_has_one_way_to_be_run_and_ignores_the_noise(scans):
-    generator = built("regression")
-    assert isinstance(generator, Regression)
-    told = condition_of(generator.space, scans, measured(scans))
-    one, other = (generator.generate(torch.full((3, 2, 8, 32), value), told) for value in (0.0, 1.0))
-    assert torch.equal(one.x, other.x)
-    assert one.evaluations.tolist() == [1, 1, 1]
-    with pytest.raises(InputError, match="one way only"):
-        generator.check_sampler(Sampler("euler", 4))
 
 
 def test_told_nothing_it_is_a_plain_flow(flow):
@@ -307,147 +261,3 @@ def test_a_plain_flow_that_starts_from_it_forgets_the_condition(flow):
     x, t = torch.randn(2, 2, 8, 32), torch.tensor([0.2, 0.7])
     with torch.no_grad():
         assert torch.allclose(plain.velocity(t, x), flow.velocity(t, x), atol=1e-6)
-
-
-@pytest.fixture(scope="module")
-def jumps() -> ConditionalMap:
-    return built("conditional_map")
-
-
-@pytest.mark.parametrize("method", ["jump", "renoise", "adams3"])
-def test_known_values_arrive_by_jumps_as_given(jumps, scans, method):
-    told = condition_of(jumps.space, scans, measured(scans))
-    known = told["known"] > 0
-    x_0, draws = Draws(0, range(3)).start((2, 8, 32)), Draws(0, range(3))
-    made = jumps.generate(x_0, told, sampler=Sampler(method, 3, grid="power:3"), draws=draws)
-    assert torch.equal(made.x[known], told["image"][known])
-    assert made.x.isfinite().all()
-    half = jumps.solve(x_0, 0.0, 0.5, sampler=Sampler("jump", 2), condition=told).x
-    assert torch.allclose(half[known], ((x_0 + told["image"]) / 2)[known], atol=1e-5)
-
-
-def test_a_jump_is_that_of_the_guess_or_the_network_s(jumps, scans):
-    told = condition_of(jumps.space, scans, measured(scans))
-    parts = [told[name] for name in ("image", "known", "doubtful")]
-    x = torch.randn(3, 2, 8, 32, generator=torch.Generator().manual_seed(2))
-    t, s = torch.tensor([0.0, 0.5, 0.7]), torch.tensor([1.0, 0.9, 0.3])
-    with torch.no_grad():
-        found = jumps.mean_velocity(t, x, s, told)
-        network = jumps.backbone(t, torch.cat([x, *parts], 1), s)
-        logit, sigma = jumps.trust(torch.cat(parts, 1))
-        assert torch.allclose(jumps.mean_velocity(t, x, t, told), jumps.velocity(t, x, told), atol=1e-5)
-        # to itself it is the velocity that the flow's own formula has
-        flow = built("conditional_flow")
-        flow.load_state_dict({k: v for k, v in jumps.state_dict().items() if k in flow.state_dict()})
-        assert torch.allclose(flow.velocity(t, x, told), jumps.velocity(t, x, told), atol=1e-5)
-    expected = torch.empty_like(x)
-    for index in np.ndindex(*x.shape):
-        guess, std, p = float(told["image"][index]), float(sigma[index]), float(logit[index].sigmoid())
-        begin, end, value = float(t[index[0]]), float(s[index[0]]), float(x[index])
-        spread = [math.hypot(at * std, 1 - at) for at in (begin, end)]
-        about = (end * guess + spread[1] / spread[0] * (value - begin * guess) - value) / (end - begin)
-        near = p * norm.pdf(value, begin * guess, spread[0])
-        far = (1 - p) * norm.pdf(value, 0, math.hypot(begin * 0.5, 1 - begin))
-        expected[index] = (near * about + far * float(network[index])) / (near + far)
-    unknown = told["known"] == 0
-    assert torch.allclose(found[unknown], expected[unknown], atol=1e-4)
-
-
-def test_a_conditional_map_starts_as_euler_s_steps_of_the_flow_that_it_starts_from(flow, scans):
-    child = build_generator({**CONFIG, "generator": {"name": "conditional_map"}}).eval()
-    child.start_from(flow)
-    told = condition_of(flow.space, scans, measured(scans))
-    x, t = torch.randn(3, 2, 8, 32), torch.tensor([0.1, 0.5, 0.9])
-    with torch.no_grad():
-        assert torch.allclose(child.velocity(t, x, told), flow.velocity(t, x, told), atol=1e-6)
-        v = flow.backbone(t, torch.cat([x, *told.values()], 1))
-        u = child.backbone(t, torch.cat([x, *told.values()], 1), torch.ones(3))
-        assert torch.allclose(u, v, atol=1e-6)
-
-
-def test_its_jumps_are_learned_from_its_parent_as_it_was(flow, scans):
-    generator = build_generator({**CONFIG, "generator": {"name": "conditional_map"}})
-    generator.start_from(flow)
-    stage = stage_of(LearnConditionalMap, generator)
-    names = [name for name, _ in stage.named_parameters()]
-    assert all(name.startswith("generator.") for name in names)  # the parent is no part of what learns
-    batch = {**batch_of(scans, flow.space), **condition_of(flow.space, scans, measured(scans))}
-    t, s = torch.zeros(3), torch.ones(3)
-    stage.jumps = lambda _: (t, s)  # type: ignore[assignment]
-    stage._trainer = type("Trainer", (), {"max_steps": 4, "global_step": 0})()
-    stage._parent[0].velocity = None  # type: ignore[assignment]  # it is asked as a map, s = t
-    aims = []
-    stage.loss = lambda found, target: aims.append(target) or found.flatten(1).mean(1)  # type: ignore[assignment]
-    stage.train()
-    for _ in range(2):
-        stage.regression_loss(batch, batch["u"])
-        with torch.no_grad():
-            for weight in generator.parameters():
-                weight.add_(0.3)  # it has learned
-    assert torch.equal(aims[0], aims[1])
-    steps = flow.solve(
-        batch["x_0"], sampler=Sampler("midpoint", 256, grid="power:1.5"), condition=stage.condition(batch)
-    )
-    exact = steps.x - batch["x_0"]
-    assert float((aims[0] - exact).square().mean().sqrt()) < 0.02 * float(exact.square().mean().sqrt())
-
-
-def test_it_learns_on_scans_and_from_a_parent(flow):
-    generator = build_generator({**CONFIG, "generator": {"name": "conditional_map"}})
-    config = {"stage": {"name": "conditional_map"}, "data": {"name": "simulated", "batch_size": 4}, "seed": 0}
-    with pytest.raises(InputError, match=r"give stage\.init=RUN"):
-        build_stage(config, generator)
-    with pytest.raises(InputError, match="learns from scans, and data=pairs has none"):
-        build_stage({**config, "data": {"name": "pairs", "batch_size": 4}}, generator)
-    begun = {**config, "stage": {"name": "conditional_map", "init": "RUN"}}
-    with pytest.raises(InputError, match="this one is of stage=regress"):
-        build_stage({**begun, "parent": {"stage": "regress"}}, generator)
-    with pytest.raises(InputError, match="learns on scans: give stage.objective=solved, found knots"):
-        LearnConditionalMap(generator, objective="knots")
-    with pytest.raises(InputError, match="which a ConditionalFlow does not have"):
-        LearnConditionalMap(flow)
-    plain = build_generator({**CONFIG, "generator": {"name": "flow_map"}})
-    with pytest.raises(InputError, match="which a FlowMap is not told"):
-        LearnConditionalMap(plain)
-
-
-def test_on_scans_the_validation_loss_is_that_of_velocities(jumps, scans):
-    """The end of a path from independent noise is not the scan: against it a right map would be the worse one."""
-    stage = stage_of(LearnConditionalMap, jumps, nothing=0.5).eval()
-    stage.on_pairs = False
-    batch = {**batch_of(scans, jumps.space), **condition_of(jumps.space, scans, measured(scans))}
-    asked = []
-    stage.loss = lambda found, target: asked.append(target) or found.flatten(1).mean(1)  # type: ignore[assignment]
-    jumps_before = jumps.mean_velocity
-    times = []
-    stage.generator.mean_velocity = lambda t, x, s, y: times.append((t, s)) or jumps_before(t, x, s, y)  # type: ignore[method-assign]
-    try:
-        stage.regression_loss(batch, batch["u"])
-    finally:
-        del stage.generator.mean_velocity
-    assert all(torch.equal(t, s) for t, s in times)
-    assert torch.equal(asked[0], batch["x_1"] - batch["x_0"])
-
-
-def test_a_conditional_map_completes_by_its_own_jumps(jumps, scans):
-    (found, *_) = complete(jumps, scans, measured(scans))
-    assert found.evaluations.tolist() == [4]
-    (found, *_) = complete(jumps, scans, measured(scans), steps=2)
-    assert found.evaluations.tolist() == [2]
-
-
-def test_told_nothing_a_conditional_map_is_a_plain_one(jumps):
-    x, t, s = torch.randn(2, 2, 8, 32), torch.tensor([0.2, 0.7]), torch.tensor([0.5, 1.0])
-    nothing = {name: torch.zeros(2, 2, 8, 32) for name in ("image", "known", "doubtful")}
-    with torch.no_grad():
-        assert torch.allclose(jumps.mean_velocity(t, x, s), jumps.mean_velocity(t, x, s, nothing), atol=1e-6)
-        assert torch.equal(jumps.mean_velocity(t, x, s), jumps.untold().mean_velocity(t, x, s))
-    x_0 = Draws(0, range(2)).start((2, 8, 32))
-    assert torch.equal(jumps.generate(x_0).x, jumps.untold().generate(x_0).x)
-
-
-def test_the_twin_is_followed_by_no_velocity():
-    """Its network has learned one time alone: what asks for paths refuses it."""
-    twin = built("regression")
-    with pytest.raises(InputError, match="curvature needs the velocity of a flow, which a Regression does not have"):
-        as_flow(twin, "curvature")

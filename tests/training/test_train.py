@@ -178,21 +178,6 @@ def test_a_moved_run_goes_on(train: Run, alone: tuple[Path, str], copied: Path):
     assert_bit_equal(alone[0], moved)
 
 
-def test_a_conditional_map_resumes_with_the_parent_that_it_began_with(train: Run, tmp_path: Path):
-    train("name=told", "stage=conditional", "trainer.max_steps=2", "samples.num=0")
-    options = ["stage=conditional_map", "stage.init=runs/told", "trainer.max_steps=6", "samples.num=0"]
-    train("name=whole", *options)
-    shutil.copytree(tmp_path / "runs/whole", tmp_path / "runs/cut")
-    checkpoints_of(tmp_path / "runs/cut")[0].unlink()
-    train("name=cut", *options)
-    assert_bit_equal(tmp_path / "runs/whole", tmp_path / "runs/cut")
-    train("name=plain", "trainer.max_steps=2", "samples.num=0")
-    refused = train("name=odd", *options[:1], "stage.init=runs/plain", *options[2:], check=False)
-    assert refused.returncode == 2
-    assert "of stage=conditional; this one is of stage=rectify" in refused.stderr
-    assert not (tmp_path / "runs/odd").exists()
-
-
 def test_another_sampler_for_a_finished_run_is_refused(train: Run, copied: Path):
     before = (copied / "config.yaml").read_text()
     done = train("name=copied", "sampler.method=euler", check=False)

@@ -92,8 +92,8 @@ class ScoreModel(Generator):
     def _pulled(self, condition: Condition | None, x: Tensor) -> Callable[[Tensor], Tensor] | None:
         if condition is None:
             return None
-        image, known, doubtful = parts_of(condition, x)
-        return toward((image + 1) / 2, known + doubtful, self.pull)
+        image, known = parts_of(condition, x)
+        return toward((image + 1) / 2, known, self.pull)
 
     def check_sampler(self, sampler: Sampler) -> None:
         plain = Sampler(LANGEVIN, sampler.steps)
