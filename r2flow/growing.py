@@ -1,13 +1,11 @@
 """Larger networks out of trained ones: what they have learned goes on inside."""
 
-import copy
 from typing import Any
 
 import torch
 
-from r2flow.backbones import HDiT, Pyramid
+from r2flow.backbones import Pyramid
 from r2flow.backbones.base import CommonOptions
-from r2flow.backbones.encodings import position_name
 from r2flow.errors import InputError
 from r2flow.generators import Generator, RectifiedFlow, build_generator
 from r2flow.model.checkpoint import Checkpoint, as_parent, weights_hash
@@ -67,65 +65,6 @@ def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Che
     assert isinstance(larger.backbone, Pyramid)
     larger.backbone.inner.load_state_dict(inner.state_dict())
     return Checkpoint(larger.eval(), config)
-
-
-def widened(checkpoint: Checkpoint, detail: tuple[int, int] | None = None, position: str | None = None) -> Checkpoint:
-    """The same generator in a network that can learn more. It draws the same scans.
-
-    Args:
-        checkpoint: Of an HDiT or a pyramid around one, whatever it generates.
-        detail: Blocks and channels at full resolution (`Detail`), at least as many as it has; None for its own.
-        position: A position encoding for an HDiT that has none, which makes all directions alike: where the own car
-            stands and where the street runs it can learn with one alone.
-
-    Raises:
-        InputError: another network, one that has more already, or a position already.
-    """
-    _refuse_rings(checkpoint)
-    network = getattr(checkpoint.generator, "backbone", None)
-    if not isinstance(network, HDiT | Pyramid):
-        raise InputError(
-            f"{checkpoint.path} holds a network of the kind {checkpoint.config['backbone']['name']}; hdit and pyramid "
-            "have convolutions at full resolution."
-        )
-    backbone = copy.deepcopy(checkpoint.config["backbone"])
-    if detail is not None:
-        (blocks, channels), before = detail, network.detail and network.detail.size
-        if before and (blocks < before[0] or channels < before[1]):
-            raise InputError(
-                f"{checkpoint.path} has {before[0]} blocks of {before[1]} channels at full resolution and cannot "
-                f"shrink to {blocks} of {channels}."
-            )
-        backbone["detail"] = list(detail)
-    if position is not None:
-        position = position_name(position, "learnable")
-        inner, options = (network.inner, backbone["inner"]) if isinstance(network, Pyramid) else (network, backbone)
-        if not isinstance(inner, HDiT) or inner.spatial_pe is not None:
-            raise InputError(f"{checkpoint.path} holds no hdit without a position; it keeps its own.")
-        options["position"] = position
-    config = {
-        **{key: checkpoint.config[key] for key in ("sensor", "encoding")},
-        **_reading(checkpoint),
-        "generator": checkpoint.config.get("generator") or {"name": "rectified_flow"},
-        "backbone": backbone,
-        "parent": as_parent(checkpoint.config, checkpoint.path, checkpoint.step, weights_hash(checkpoint)),
-    }
-    wider = _fresh(config)
-    grown = wider.get_submodule("backbone")
-    assert isinstance(grown, HDiT | Pyramid)
-    if position is not None:
-        hdit = grown.inner if isinstance(grown, Pyramid) else grown
-        assert isinstance(hdit, HDiT)
-        hdit.start_without_position()
-    kept = checkpoint.generator.state_dict()
-    if detail is not None:
-        kept = {name: weight for name, weight in kept.items() if not name.startswith("backbone.detail.")}
-    wider.load_state_dict({**wider.state_dict(), **kept})
-    if detail is not None and network.detail is not None:
-        assert grown.detail is not None
-        grown.detail.take_over(network.detail)
-    wider.sampler = checkpoint.generator.sampler
-    return Checkpoint(wider.eval(), config, accuracy=checkpoint.accuracy)
 
 
 def _fresh(config: dict[str, Any]) -> Generator:

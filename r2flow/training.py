@@ -255,7 +255,6 @@ def _assembled(config: dict[str, Any], generator: Generator, parent: Parent | No
             check_method(data.pairs.method)
     check_roll(data.augment, generator)
     stage = build_stage(config, generator)
-    stage.check_parent(jumps)
     data.further = stage.further
     trainer = _build_trainer(config, stage)
     data.check_run(trainer.world_size, trainer.accumulate_grad_batches, trainer.max_steps)

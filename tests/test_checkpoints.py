@@ -182,7 +182,6 @@ def test_missing_files_and_other_torch_files(tmp_path: Path):
         *({"state_dict": value} for value in (None, {"generator.backbone.x": 3}, {1: torch.zeros(1)}, {})),
         *({"global_step": value} for value in ("abc", None, math.inf, math.nan)),
         *({"sampler": value} for value in ([1], "x", {"steps": {}})),
-        *({"accuracy": value} for value in (3, [1])),
     ],
     ids=str,
 )

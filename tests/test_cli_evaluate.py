@@ -351,8 +351,6 @@ def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):  # noqa: F
     assert sorted(path.name for path in (tmp_path / "views").iterdir()) == ["000000.png", "000001.png"]
     code, said, _ = r2flow("report", "fidelity", real, run)
     assert (code, "Scans: 12 real, 2 other" in said) == (0, True)
-    assert r2flow("invert", run, "-c", run, "-o", tmp_path / "noise", "--solver", "euler", "--steps", 2)[0] == 0
-    assert {path.name for path in (tmp_path / "noise").glob("*.npy")} == {"000000.x_0.npy", "000001.x_0.npy"}
 
 
 def test_a_judged_set_may_have_the_name_of_a_control(r2flow, real, generated, tmp_path):  # noqa: F811

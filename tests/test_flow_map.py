@@ -21,7 +21,6 @@ from r2flow.noise import Draws, standard_normal
 from r2flow.runs.lineage import Parent, generator_of
 from r2flow.stages import build_stage
 from r2flow.stages.flow_map import LearnFlowMap, paths_of
-from r2flow.training import check, compose
 
 CONFIG = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
@@ -343,8 +342,6 @@ def test_pairs_by_the_chord_are_its_samples(exact, tmp_path: Path):
 def test_a_map_s_own_pairs_need_no_knots(method):
     data = {**DATA, "pairs": {"method": method}}
     assert stage(data, objective="knots").objective is OBJECTIVES["knots"]
-    with pytest.raises(InputError, match=r"data\.pairs\.knots=7"):
-        stage(data, objective="corrected")
 
 
 @pytest.mark.parametrize("ranks", [2, 3])
@@ -418,57 +415,6 @@ def test_with_scans_beside_the_pairs_velocities_are_those_of_the_scans_and_jumps
         torch.testing.assert_close(aims[0][row], slope[row])
 
 
-def test_from_a_time_on_jumps_to_the_end_are_those_of_the_scans(monkeypatch):
-    noise, scan = torch.randn(2, 4, 2, 8, 32, generator=torch.Generator().manual_seed(1)).unbind(0)
-    batch = batch_of(noise=noise, scan=scan)
-    learned = stage({**DATA, "scans": {"name": "simulated"}}, objective="knots", ends_from=0.5).train()
-    learned._trainer = type("Trainer", (), {"max_steps": 2, "global_step": 2})()
-    monkeypatch.setattr(LearnFlowMap, "global_step", 2, raising=False)
-    t, s = torch.tensor([0.0, 0.25, 0.75, 0.75]), torch.tensor([1.0, 1.0, 1.0, 0.9])
-    learned.jumps = lambda u: (t, s)  # type: ignore[assignment]
-    of_pairs, of_scans = batch["x_1"] - batch["x_0"], scan - noise
-    for training, expected in ((True, [*of_pairs[:2], of_scans[2], of_pairs[3]]), (False, of_pairs)):
-        aims: list[torch.Tensor] = []
-        learned.end_loss = lambda found, target, aims=aims: aims.append(target) or found.flatten(1).mean(1)
-        learned.train(training).regression_loss(batch, batch["u"])
-        torch.testing.assert_close(aims[0], torch.stack([*expected]))
-
-
-def test_on_scans_alone_a_map_goes_on_with_velocities_and_late_ends(monkeypatch):
-    """What scans and independent noise do not tell, jumps from early times and to earlier ones, become velocities."""
-    learned = stage({"name": "simulated", "batch_size": 4}, objective="knots", ends_from=0.5).train()
-    learned._trainer = type("Trainer", (), {"max_steps": 2, "global_step": 2})()
-    monkeypatch.setattr(LearnFlowMap, "global_step", 2, raising=False)
-    t, s = torch.tensor([0.0, 0.3, 0.75, 0.6]), torch.tensor([1.0, 0.3, 1.0, 0.8])
-    learned.jumps = lambda u: (t, s)  # type: ignore[assignment]
-    asked: list[torch.Tensor] = []
-    monkeypatch.setattr(
-        learned.generator, "mean_velocity", lambda t, x, s: asked.extend((x, s)) or torch.zeros_like(x), raising=False
-    )
-    aims: list[torch.Tensor] = []
-    learned.loss = lambda found, target: aims.append(target) or found.flatten(1).mean(1)  # type: ignore[assignment]
-    batch = batch_of()
-    learned.regression_loss(batch, batch["u"])
-    x_t, v = interpolate(batch["x_0"], batch["x_1"], t)
-    torch.testing.assert_close(aims[0], v)
-    torch.testing.assert_close(asked[0], x_t)
-    assert asked[1].tolist() == torch.tensor([0.0, 0.3, 1.0, 0.6]).tolist()
-    with pytest.raises(InputError, match=r"of a map on scans alone stage\.ends_from=0\.5"):
-        stage({"name": "simulated", "batch_size": 4}, objective="knots")
-
-
-def test_jumps_to_the_end_have_a_loss_of_their_own(monkeypatch):
-    """Of an estimate of 0: mean absolute values of the ends' targets, mean squares of all others'."""
-    batch = batch_of()
-    learned = stage(objective="knots", loss="mse", end_loss="absolute").eval()
-    t, s = torch.tensor([0.0, 0.3, 0.5, 1.0]), torch.tensor([1.0, 0.3, 0.75, 1.0])
-    learned.jumps = lambda u: (t, s)  # type: ignore[assignment]
-    monkeypatch.setattr(learned.generator, "mean_velocity", lambda t, x, s: torch.zeros_like(x), raising=False)
-    slope = (batch["x_1"] - batch["x_0"]).flatten(1)
-    expected = (slope[0].abs().mean() + slope[1:].square().mean(1).sum()) / 4
-    torch.testing.assert_close(learned.regression_loss(batch, batch["u"]), expected)
-
-
 def test_scans_beside_pairs_are_for_objectives_on_the_parents_own_paths():
     scans = {"name": "simulated", "scenes": 4}
     assert stage({**DATA, "scans": scans}, objective="knots").objective is not None
@@ -508,7 +454,7 @@ def test_a_batch_of_pairs_with_scans_beside_is_a_function_of_its_number(tmp_path
 
 def test_a_stage_of_jumps_says_what_it_lacks():
     with pytest.raises(InputError, match=r"data\.pairs\.knots=7"):
-        stage({**DATA, "pairs": {"knots": 0}}, objective="corrected")
+        stage({**DATA, "pairs": {"knots": 0}}, objective="knots")
     with pytest.raises(InputError, match=r"leave stage\.time out"):
         stage(time={"name": "uniform"})
     with pytest.raises(InputError, match="'step'"):
@@ -532,15 +478,6 @@ def test_the_stage_s_options_are_those_of_its_config():
     text = (Path(__file__).parent.parent / "conf/stage/flow_map.yaml").read_text(encoding="utf-8")
     options = {key: value for key, value in yaml.safe_load(text).items() if key not in ("defaults", "init")}
     assert stage(**{key: value for key, value in options.items() if key != "name"}).jumps.steps
-
-
-def test_jumps_that_are_kept_are_those_of_a_map():
-    """A rectified flow has none to keep, and without a run to start from there are none at all."""
-    config = compose(["experiment=finetune_map", "data=simulated", "backbone=hdit_tiny"])
-    for wrong in ({}, {"generator": {"name": "rectified_flow"}}):
-        with pytest.raises(InputError, match=r"keeps the jumps of a flow map: give one, as stage\.init=street"):
-            check(config, parent=Parent({**config, **wrong}, Path("rf1")))
-    check(config, parent=Parent({**config, "generator": {"name": "flow_map"}}, Path("map")))
 
 
 def test_a_way_of_no_length_and_no_scans_need_no_jump(grown):

@@ -14,7 +14,6 @@ from r2flow.evaluation.sets import sampled_set
 from r2flow.generators import Field, Sampler, build_generator
 from r2flow.inversion import interpolate_scans, invert, round_trip, slerp
 from r2flow.lidar.encoding import Encoding
-from r2flow.lidar.planes import flattened
 from r2flow.lidar.region import Region, region
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
@@ -333,8 +332,6 @@ def test_grids_and_tolerances_are_refused_where_they_do_not_fit():
         next(sample(flow(), 1, method="dopri5", tolerance=math.inf))
     with pytest.raises(InputError, match="uniform, power:P or power-start:P"):
         next(sample(flow(), 1, grid="quadratic"))
-    with pytest.raises(InputError, match="only a predictor-corrector says how many steps a scan needs, not euler"):
-        next(sample(flow(), 1, method="euler", levels=(4, 8), limits=(0.1,)))
 
 
 def test_another_method_does_not_take_over_the_grid_of_the_former_one():
@@ -412,29 +409,3 @@ def test_a_diffusion_walks_noise_of_half_precision_in_float32(method):
     noise, how = draws.start(walker.noise_shape).bfloat16(), Sampler(method, 4)
     half, full = (walker.generate(one, sampler=how, draws=draws).x for one in (noise, noise.float()))
     assert torch.equal(half, full)
-
-
-def test_a_single_step_is_flattened_and_others_are_not():
-    checkpoint = network()
-    plain, found = ({n: checkpoint.sample(2, steps=n, flatten=f) for n in (1, 2)} for f in (0.0, 0.05))
-    assert torch.equal(found[1], flattened(plain[1], checkpoint.generator.space.rays, 0.05))
-    assert not torch.equal(found[1], plain[1])
-    assert torch.equal(found[2], plain[2])
-    reflectance = [one.images for one in sample(checkpoint, 2, steps=1, flatten=0.05, channels="reflectance")]
-    assert torch.equal(torch.cat(reflectance), plain[1][:, 1:])
-
-
-def test_a_flattened_region_is_flattened_under_all_that_was_evaluated():
-    checkpoint, wanted = network(), region(SENSOR.shape, (-30, 40), (2, 5))
-    how = {"steps": 1, "batch_size": 2, "seed": 9}
-    (plain,) = sample(checkpoint, 2, region=evaluated_region(checkpoint.generator, wanted), **how)
-    (found,) = sample(checkpoint, 2, region=wanted, flatten=0.05, **how)
-    expected = flattened(plain.images, checkpoint.generator.space.rays, 0.05)
-    torch.testing.assert_close(found.images, wanted.place(wanted.crop(expected)))
-
-
-def test_a_file_without_flatten_leaves_surfaces_as_they_are():
-    assert "flatten" not in Sampler("euler", 1).asdict()
-    assert Sampler.of({"method": "euler", "steps": 1}).flattens == 0
-    with pytest.raises(InputError, match=r"flatten must be a finite number in \[0, 1\), found -0.1"):
-        Sampler().changed(flatten=-0.1)

@@ -50,7 +50,6 @@ sample -c run -o out --steps 0
 sample -c run -o out --steps a
 sample -c run -o out --solver nope
 sample -c run -o out --precision 16-mixed # precision must be '32-true' or 'bf16-mixed'
-sample -c run -o out --error 0.1m --precision bf16-mixed # leave solver, steps, tolerance, grid, flatten
 pairs -c run --precision bf16 # precision must be '32-true' or 'bf16-mixed'
 evaluate simulated:1 run --precision half # precision must be '32-true' or 'bf16-mixed'
 complete scans -c run -o out --precision half # precision must be '32-true' or 'bf16-mixed'
@@ -101,14 +100,6 @@ sample -c run -o out --solver dopri5 --grid power:2
 sample -c run -o out --grid power:0
 sample -c run -o out --grid power:10 --steps 64 # 64 steps do not fit under power:10 in double precision
 sample -c run -o out --grid power:3 --steps 1000000 # fewer steps or a smaller power
-sample -c run -o out --grid late:2
-sample -c run -o out --flatten nan
-sample -c run -o out --flatten 1 --steps 1
-sample -c run -o out --flatten 0.02 --steps 3 # --flatten is for a single step
-sample -c run -o out --error 0.1m --flatten 0.1 # leave solver
-sample -c run -o out --error 0.05m # measure them
-sample -c run -o out --error nope
-sample -c run -o out --error 0.05m --steps 4 # leave solver
 sample -c run -o out --margin 10 --solver nope
 sample -c run -o out --plugin nope
 sample -c run -o out --plugin plugin.py
@@ -116,15 +107,6 @@ sample -c run -o out --plugin empty
 sample -c run -o out extra
 sample -c run -c run -o out -o # '-o' requires an argument
 sample -c '' -o out # an argument is empty
-calibrate # Missing
-calibrate -c run --steps 0
-calibrate -c run --steps a
-calibrate -c run --solver dopri5
-calibrate -c run --solver nope
-calibrate -c run --num 0
-calibrate -c nowhere
-calibrate -c bad.ckpt
-calibrate -c street # has learned its steps
 info # Missing
 info nowhere
 info empty
@@ -142,7 +124,6 @@ view scans --device cpu -o v.html # --seed and --device are of a run
 project scans/000000.bin -o out.npy --reflectance-scale inf # found inf
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
 export run --to onnx --half # --half
-grow flow.safetensors flow.safetensors --size 16x256 # give another name
 backbones --only nope
 backbones --size 64
 backbones --size 0x0
@@ -202,25 +183,6 @@ simulate -o out --workers 0
 simulate -o file.txt --num 1 --size 8x64
 simulate -o scans --num 1 --size 8x64 # holds scans already
 simulate -o file.txt/a --num 1 --size 8x64
-invert # Missing
-invert scans # Missing
-invert scans -c run # Missing
-invert nowhere -c run -o out
-invert empty -c run -o out
-invert bad.bin -c run -o out
-invert file.txt -c run -o out
-invert scans -c nowhere -o out
-invert scans -c run -o out --num 0
-invert scans -c run -o out --solver nope
-invert scans -c run -o out --solver bosh3 --steps 0
-invert scans -c run -o out --tolerance 0
-invert scans -c run -o out --steps 4 # dopri5 chooses its own
-invert scans -c run -o out --reflectance-scale 0
-invert scans -c run -o out --reflectance-scale nan
-invert scans -c run -o out --batch-size 0
-invert scans -c run -o file.txt
-invert simulated:x -c run -o out
-invert nope:x -c run -o out
 interpolate scans/000000.bin -c run -o out # Missing
 interpolate scans/000000.bin nowhere.bin -c run -o out
 interpolate scans/000000.bin bad.bin -c run -o out

@@ -8,7 +8,6 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import SolverOptions, grouped
-from r2flow.cli.options import FlattenOption
 from r2flow.errors import InputError
 
 
@@ -24,7 +23,6 @@ def export(
     grid: Annotated[
         str | None, typer.Option(help="Where the steps fall: uniform, power:P, power-start:P or late:K.")
     ] = None,
-    flatten: FlattenOption = None,
     half: Annotated[
         bool, typer.Option("--half", help="Large weights of a .safetensors in float16: half the size.")
     ] = False,
@@ -52,10 +50,10 @@ def export(
     if what not in ("sampler", "network"):
         raise InputError(f"--what must be sampler or network, found {what!r}.")
     network = what == "network"
-    if network and (solver != SolverOptions() or grid or flatten is not None):
-        raise InputError("--what network has no sampler: leave solver, steps, tolerance, grid and flatten out.")
+    if network and (solver != SolverOptions() or grid):
+        raise InputError("--what network has no sampler: leave solver, steps, tolerance and grid out.")
     loaded = load_checkpoint(checkpoint)
-    sampler: Sampler = solver.change(writing.flow_of(loaded).sampler, grid=grid, flatten=flatten)
+    sampler: Sampler = solver.change(writing.flow_of(loaded).sampler, grid=grid)
     written = writing.export(loaded, out, sampler, network)
     size = f"{out.stat().st_size / 1e6:.1f} MB"
     batch = "any batch" if written.any_batch else "one scan at a time, torch could not free its batch"

@@ -10,18 +10,14 @@ import typer
 from r2flow.cli.app import app
 from r2flow.cli.groups import DrawOptions, SolverOptions, grouped
 from r2flow.cli.options import (
-    CheckpointOption,
     DeviceOption,
-    FlattenOption,
     OutOption,
     PrecisionOption,
     SensorOption,
     SizeOption,
     build_sized,
     choose_device,
-    rows_and_columns,
 )
-from r2flow.config import as_override
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -90,11 +86,7 @@ def sample(
         str | None,
         typer.Option(help="Where fixed steps fall: uniform, power:P, power-start:P or late:K, as power:1.75."),
     ] = None,
-    flatten: FlattenOption = None,
     precision: PrecisionOption = None,
-    error: Annotated[
-        str | None, typer.Option(help="Largest error of a scan, as 0.05m of range or 0.002 in model space.")
-    ] = None,
     format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture.")] = 8,
 ) -> None:
@@ -102,7 +94,6 @@ def sample(
 
     Solver, steps and tolerance are the generator's own if left out.
     """
-    from r2flow.accuracy import sampler_within
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.models import DEFAULT, MODELS, find_model
     from r2flow.reports.outputs import formats_of, write_samples
@@ -110,52 +101,13 @@ def sample(
     if checkpoint is None:
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
     loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(draw.device))
-    if error is None:
-        sampler = solver.change(loaded.generator.sampler, grid=grid, precision=precision, flatten=flatten)
-    elif solver != SolverOptions() or grid or precision or flatten is not None:
-        raise InputError(
-            "--error says how many steps each scan takes: leave solver, steps, tolerance, grid, flatten and precision "
-            "out."
-        )
-    else:
-        sampler = sampler_within(loaded, error)
+    sampler = solver.change(loaded.generator.sampler, grid=grid, precision=precision)
     formats = [*dict.fromkeys(map(str.strip, format.split(",")))] if format else formats_of(loaded, part.channels)
     region = part.region(loaded)
     write_samples(loaded, out, draw.num, draw.seed, sampler, formats, pictures, draw.batch_size, region, part.channels)
     seen = f", pictures in {out / 'samples.png'}" if pictures else ""
     seen += f", in 3-D in {out / 'samples.html'}" if pictures and part.channels != "reflectance" else ""
     print(f"{draw.num} scan{'s' * (draw.num != 1)} ({', '.join(formats)}) in {out}{seen}")
-
-
-@app.command(epilog="Example: r2flow calibrate -c runs/NAME")
-def calibrate(
-    checkpoint: CheckpointOption,
-    steps: Annotated[int, typer.Option(min=1, help="Steps to fit the grid to; the flow's own from then on.")] = 16,
-    solver: Annotated[str, typer.Option(help="adams2, adams3 or adams4; the flow's own from then on.")] = "adams3",
-    num: Annotated[int, typer.Option(min=1, help="Scans to measure on.")] = 4,
-    device: DeviceOption = "auto",
-) -> None:
-    """Find the time grid that suits a flow, measure its errors, and keep both in the checkpoint."""
-    from r2flow.accuracy import calibrate as measure
-    from r2flow.accuracy import check_calibrates, check_predictor_corrector, evaluations_of_calibration
-    from r2flow.model.checkpoint import keep_sampler, load_checkpoint
-    from r2flow.models import MODELS
-    from r2flow.progress import Bar
-    from r2flow.reports.tables import print_table
-
-    check_predictor_corrector(solver)
-    loaded = load_checkpoint(checkpoint, choose_device(device))
-    check_calibrates(loaded)
-    if str(checkpoint) in MODELS:
-        copy = f"r2flow export {checkpoint} --to safetensors"
-        raise InputError(f"the model {checkpoint} stays as it is; make a copy and give that: {copy}.")
-    with Bar("measuring", evaluations_of_calibration(steps), "evaluations") as advance:
-        found = measure(loaded, steps, solver, num, advance)
-    keep_sampler(found)
-    rows = [{"steps": b.steps, "error": max(b.errors), "metres": max(b.metres)} for b in found.accuracy]
-    print_table(rows, {"steps": "steps", "error": "error, worst scan", "metres": "range, RMS m"})
-    sampler = found.generator.sampler
-    print(f"{sampler.method}, {sampler.steps} steps, grid {sampler.grid}: from now on the sampler of {found.path}")
 
 
 @app.command(epilog="Example: r2flow info runs/simulated-hdit_tiny")
@@ -182,51 +134,6 @@ def info(
 def _keep_source(checkpoint: "Checkpoint", out: Path) -> None:
     if out.exists() and out.samefile(checkpoint.path):
         raise InputError(f"{out} would be replaced by what is made of it; give another name.")
-
-
-@app.command(epilog="Example: r2flow grow street larger.safetensors --size 64x1024")
-def grow(
-    checkpoint: Annotated[Path, typer.Argument(help="A flow: a checkpoint file, a run folder or a model.")],
-    out: Annotated[Path, typer.Argument(help="What to write, a .safetensors.")],
-    size: Annotated[str | None, typer.Option(help="Rows x columns of the larger images, as 64x1024.")] = None,
-    detail: Annotated[
-        str | None, typer.Option(help="Blocks and channels of the convolutions at full resolution, as 6,48.")
-    ] = None,
-    position: Annotated[
-        str | None,
-        typer.Option(help="A position encoding for a network that has none, as fourier_features: where is ahead."),
-    ] = None,
-) -> None:
-    """Put a trained flow's network inside a larger one, to go on learning from what it knows.
-
-    With --size convolutions at a higher resolution surround it: the means of what it draws are the images of the
-    trained flow. What is finer than these means is noise until it is trained. With --detail and --position alone it
-    draws the same scans, and can learn more.
-    """
-    from r2flow.growing import grown, widened
-    from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
-
-    if out.suffix != ".safetensors":
-        raise InputError(f"{out}: give a .safetensors, which holds a flow and its config.")
-    if size is None and detail is None and position is None:
-        raise InputError("nothing to grow: give --size, as 64x1024, --detail, as 6,48, or --position.")
-    if size is not None and position is not None:
-        raise InputError("--size and --position are two steps: grow one, and what that wrote by the other.")
-    path = detail and _pair("--detail", detail, ",", int, "blocks and channels, as 6,48")
-    found = load_checkpoint(checkpoint)
-    _keep_source(found, out)
-    before = "x".join(map(str, found.sensor.shape))
-    if size is not None:
-        options = {"detail": list(path)} if path else {}
-        larger = grown(found, found.sensor.resized(*rows_and_columns(size)).shape, **options)
-        said = f"images of {'x'.join(map(str, larger.sensor.shape))} by a network for {before}"
-    else:
-        larger = widened(found, path or None, position)
-        more = [f"{path[0]} blocks of {path[1]} channels at full resolution"] if path else []
-        said = f"{', '.join([*more, *([f'position {position}'] if position else [])])}; it draws the same scans"
-    save_checkpoint(larger, out)
-    print(f"{out}: {said}. Now train it:")
-    print(f"  r2flow train experiment=finetune {as_override('stage.init', out)} data.root=FOLDER")
 
 
 @app.command(epilog="Example: r2flow backbones --size 64x1024")

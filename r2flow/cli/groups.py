@@ -96,17 +96,12 @@ class SolverOptions:
         """A sampler with what was asked for, and `more` of its settings.
 
         Raises:
-            InputError: a tolerance for fixed steps, a number of steps for an adaptive solver, or `flatten` in several.
+            InputError: a tolerance for fixed steps, or a number of steps for an adaptive solver.
         """
-        from r2flow.errors import InputError
         from r2flow.generators.base import check_control
 
         found = sampler.changed(method=self.solver, steps=self.steps, tolerance=self.tolerance, **more)
         check_control(found.method, {"steps": self.steps, "tolerance": self.tolerance}, "--{}")
-        if more.get("flatten") and found.steps != 1:
-            raise InputError(
-                f"--flatten is for a single step, and more smooth by themselves: found {found.steps} steps."
-            )
         return found
 
 

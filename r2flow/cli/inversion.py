@@ -7,7 +7,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import SolverOptions, grouped
-from r2flow.cli.options import SETS, CheckpointOption, DeviceOption, OutOption, choose_device
+from r2flow.cli.options import CheckpointOption, DeviceOption, OutOption, choose_device
 
 
 @dataclass(frozen=True)
@@ -20,34 +20,6 @@ class ScanOptions:
     ] = None
     batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1
     device: DeviceOption = "auto"
-
-
-@app.command(epilog="Example: r2flow invert velodyne/0000000100.bin --checkpoint runs/NAME --out noise")
-@grouped
-def invert(
-    scans: Annotated[list[str], typer.Argument(help=f"Scan files, range images (.npy), or {SETS}.")],
-    checkpoint: CheckpointOption,
-    out: OutOption,
-    solver: SolverOptions,
-    how: ScanOptions,
-    num: Annotated[int, typer.Option(min=1, help="The most scans of a folder, evenly spread over it.")] = 16,
-) -> None:
-    """Carry scans to their noise, and forward again: how far from themselves they end.
-
-    The solver is dopri5 at a tolerance of 1e-5 if left out.
-    """
-    from r2flow.cli.output import command
-    from r2flow.inversion import TIGHT
-    from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.reports.inversion import invert_scans, print_rows, real_scans
-    from r2flow.reports.pages import write_page
-
-    loaded = load_checkpoint(checkpoint, choose_device(how.device))
-    real = real_scans(loaded, scans, how.reflectance_scale, num)
-    page = invert_scans(loaded, real, out, solver.change(TIGHT), how.batch_size, command())
-    written = write_page(page, out)
-    print_rows(page.rows)  # type: ignore[arg-type]
-    print(f"noise in {out}/*.x_0.npy; {', '.join(str(path) for path in written)}")
 
 
 @app.command(epilog="Example: r2flow interpolate 0000000100.bin 0000000250.bin -c runs/NAME --frames 6 --out between")

@@ -22,10 +22,6 @@ DeviceOption = Annotated[str, typer.Option(help="Where to compute: auto, cpu, cu
 PrecisionOption = Annotated[
     str | None, typer.Option(help="Of the network: 32-true or, faster where there is bfloat16, bf16-mixed.")
 ]
-FlattenOption = Annotated[
-    float | None,
-    typer.Option(help="In one step: about how rough it leaves surfaces, in log-range; 0 leaves them. (0.02 in street)"),
-]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", show_default=False)]
 SensorOption = Annotated[str, typer.Option(help="Name of the sensor, or the YAML file of your own (r2flow sensor).")]
 SizeOption = Annotated[str | None, typer.Option(help="Rows x columns, as 64x1024; the sensor's own if left out.")]

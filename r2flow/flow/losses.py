@@ -49,25 +49,10 @@ def absolute(v_t: Tensor, u_t: Tensor) -> Tensor:
     return (v_t.float() - u_t.float()).abs().flatten(1).mean(1)
 
 
-def gradient_matching(v_t: Tensor, u_t: Tensor) -> Tensor:
-    """mean |r| + mean |dr / d row| + mean |dr / d column|, differences between neighbours (Li and Snavely 2018,
-    MegaDepth, section 4.1).
-
-    An error in range counts as often as it changes: a rough surface more than one that is out of place.
-    """
-    r = v_t.float() - u_t.float()
-    loss = absolute(v_t, u_t)
-    for dim in range(2, r.ndim):
-        if r.shape[dim] > 1:
-            loss = loss + r.diff(dim=dim).abs().flatten(1).mean(1)
-    return loss
-
-
 LOSSES: Registry[Loss] = Registry(
     "loss",
     mse=mse,
     pseudo_huber=pseudo_huber,
     pseudo_huber_elementwise=pseudo_huber_elementwise,
     absolute=absolute,
-    gradient_matching=gradient_matching,
 )

@@ -167,22 +167,6 @@ def along_knots(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor
     return Aim(paths.at(t), paths.mean_velocity(t, s))
 
 
-def corrected(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
-    """u(y, t, s) = (x_s - y) / (s - t) from where the map itself arrives, y = X_{r->t}(x_r), r = max(t - (s - t), 0).
-
-    The jump before has errors, and this one learns to mend them; y has no gradient. Where s <= t, as `along_knots`.
-    """
-    x_t, known = paths.at(t), paths.mean_velocity(t, s)
-    after = (s > t) & (t > 0)
-    if not bool(after.any()):
-        return Aim(x_t, known)
-    with torch.no_grad():
-        r = torch.where(after, (2 * t - s).clamp(min=0), t)
-        y = torch.where(expand_time(after, x_t), jump(u, r, paths.at(r), t), x_t)
-    missing = expand_time(torch.where(after, s - t, 1), x_t)
-    return Aim(y, known + (x_t - y) / missing)
-
-
 def consistency(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
     """u(x_t, t, s) = rho v + (1 - rho) u(x_l, l, s), l = t + rho (s - t), x_l = x_t + rho (s - t) v.
 
@@ -200,21 +184,6 @@ def consistency(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor
             later = u(t + ahead, x_t[learned] + expand_time(ahead, v) * v, s)
         target[learned] = share * v + (1 - share) * later
     return Aim(x_t, target)
-
-
-def two_halves(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
-    """u(x_t, t, s) = rho (x_s - x_t) / (s - t) + (1 - rho) [u(x_t, t, m) + u(x_m, m, s)] / 2.
-
-    m = (t + s) / 2 and x_m = X_{t->m}(x_t); the two halves have no gradient (Frans et al. 2024, shortcut models; Guo et
-    al. 2025, SplitMeanFlow).
-    """
-    x_t, known = paths.at(t), paths.mean_velocity(t, s)
-    with torch.no_grad():
-        middle = (t + s) / 2
-        first = u(t, x_t, middle)
-        second = u(middle, x_t + expand_time(middle - t, x_t) * first, s)
-    share = expand_time(rho, known)
-    return Aim(x_t, torch.where(share == 1, known, share * known + (1 - share) * (first + second) / 2))
 
 
 def solved(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
@@ -272,8 +241,6 @@ def _select(u: MeanVelocity, rows: Tensor) -> MeanVelocity:
 OBJECTIVES: Registry[Objective] = Registry(
     "objective of a flow map",
     knots=along_knots,
-    corrected=corrected,
     consistency=consistency,
-    two_halves=two_halves,
     solved=solved,
 )

@@ -106,5 +106,4 @@ TIMES: Registry[Callable[..., TimeDensity]] = Registry(
     logit_normal=LogitNormal,
     late=Late,
     discrete=Discrete,
-    grid=Discrete,  # its name in the configs of version 0.1.0
 )

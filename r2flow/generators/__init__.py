@@ -7,7 +7,6 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.generators.base import Condition, Generated, Generator, Sampler
-from r2flow.generators.budgets import Budget, levels
 from r2flow.generators.conditional import ConditionalFlow, condition_of
 from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
 from r2flow.generators.flow_map import FlowMap
@@ -15,9 +14,8 @@ from r2flow.lidar.space import build_space
 from r2flow.registry import Registry, lazy
 
 __all__ = [
-    "GENERATORS", "USUAL", "Budget", "Condition", "ConditionalFlow", "Field", "Flow", "FlowMap",
+    "GENERATORS", "USUAL", "Condition", "ConditionalFlow", "Field", "Flow", "FlowMap",
     "Generated", "Generator", "RectifiedFlow", "Sampler", "as_flow", "build_generator", "condition_of",
-    "levels",
 ]  # fmt: skip
 
 GENERATORS: Registry[type[Generator]] = Registry(

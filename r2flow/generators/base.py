@@ -60,8 +60,6 @@ class Sampler:
         grid: Where fixed steps fall: a name (`r2flow.flow.solvers.named_grid`), or the times themselves.
         finish: Length of the last part of the way to t = 1, which the last step takes by Euler's rule. That smooths
             what a flow leaves rough that was not trained to the end.
-        levels: Numbers of steps to try on a scan one after the other, instead of `steps` (`r2flow.generators.budgets`).
-        limits: For each of them but the last one the largest correction of a scan that needs no more steps.
         fixed: Whether the generator was trained for this number of steps and is worse at any other.
         doubt: Standard deviation, in model space, of the error of a doubtful value, for a method of
             `r2flow.flow.posterior`. Model space is 2 wide: false returns are further off than a tenth of that, the
@@ -69,8 +67,6 @@ class Sampler:
         precision: Of the network, as `trainer.precision`: `bf16-mixed` computes its products in bfloat16, by
             `torch.autocast`. States and steps stay as they are.
         fewer: Method in fewer steps than `steps`, where another is better there; a flow map may have `chord`.
-        flatten: How rough, in log-range, a single step leaves surfaces: in one step returns are moved to the planes
-            that they lie on (`r2flow.lidar.planes.flattened`). Only images are, no state. 0: they stay.
     """
 
     method: str = "euler"
@@ -78,13 +74,10 @@ class Sampler:
     tolerance: Positive = 1e-5
     grid: str | tuple[float, ...] = "uniform"
     finish: Portion = 0.0
-    levels: tuple[int, ...] = ()
-    limits: tuple[float, ...] = ()
     fixed: bool = False
     doubt: Positive = 0.2
     precision: Precision = "32-true"
     fewer: str | None = None
-    flatten: Portion = 0.0
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> Self:
@@ -96,17 +89,14 @@ class Sampler:
         known = dict(options)
         check_options("sampler", cls, known)
         grid = known.get("grid", "uniform")
-        if grid == "quadratic":  # its name in version 0.1.0
-            grid = "power:2"
         known["grid"] = grid if isinstance(grid, str) else tuple(grid)
-        known |= {key: tuple(known[key]) for key in ("levels", "limits") if key in known}
         return cls(**known)
 
     def changed(self, **options: Any) -> Self:
         """The same with the options that are not None. Given times decide the number of steps.
 
         Fewer steps alone go over to the method `fewer`, if there is one.
-        Another method starts from its usual grid and `finish`, without `levels`: those were the former one's. The same
+        Another method starts from its usual grid and `finish`. The same
         one with other numbers, as `sde:2` for `sde`, keeps them.
 
         Raises:
@@ -116,16 +106,14 @@ class Sampler:
         given = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in options.items() if v is not None}
         own = vars(self)  # the range of a number is judged with the method that takes it
         odd = {k: v for k, v in given.items() if isinstance(v, tuple) or type(v) is not type(own.get(k))}
-        odd |= {k: v for k, v in given.items() if k in ("precision", "finish", "doubt", "flatten")}
+        odd |= {k: v for k, v in given.items() if k in ("precision", "finish", "doubt")}
         check_options("sampler", type(self), odd)
         if self.fewer and "method" not in given and given.get("steps", self.steps) < self.steps:
             given["method"] = self.fewer
         if "method" in given:
             given = {"fewer": None, **given}
         if _kind(given.get("method", self.method)) != _kind(self.method):
-            given = {**usual_steps(given["method"]), "levels": (), "limits": (), **given}
-        if "steps" in given:
-            given = {"levels": (), "limits": (), **given}
+            given = {**usual_steps(given["method"]), **given}
         grid = given.get("grid", "uniform")
         if not isinstance(grid, str):
             given |= {"finish": options.get("finish") or 0.0, "grid": tuple(float(t) for t in grid)}
@@ -137,11 +125,6 @@ class Sampler:
         if not 1 <= found.steps <= MOST_STEPS:
             raise InputError(f"a sampler takes 1 to {MOST_STEPS:,} steps, found {found.steps:,}.")
         return found
-
-    @property
-    def flattens(self) -> float:
-        """`flatten` of a single step, else 0."""
-        return self.flatten if self.steps == 1 else 0.0
 
     @property
     def times(self) -> str | Tensor:
@@ -163,7 +146,7 @@ class Sampler:
 
 
 MOST_STEPS = 10**6  # more are a slip of the finger
-YOUNGER = ("precision", "32-true"), ("fewer", None), ("flatten", 0.0)  # what files without these keys mean by it
+YOUNGER = ("precision", "32-true"), ("fewer", None)  # what files without these keys mean by it
 
 
 def _kind(method: str) -> str:

@@ -1,6 +1,6 @@
 """Generators that follow a velocity: dx/dt = v(t, x) from noise at t = 0 to data at t = 1."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
 from typing import Any, ClassVar, Self
@@ -74,10 +74,7 @@ class Flow(Generator):
             raise InputError(f"{how.method} draws noise on the way: give a solver, as --solver adams3.")
         field, x = self.field(condition), x.to(self.device)
 
-        def by(field: Velocity, x: Tensor, steps: int) -> Solution:
-            return solve(field, x, t_0, t_1, how.method, steps, how.tolerance, progress, grid=how.times, **options)
-
-        return _by_levels(field, x, how, by) if how.levels else by(field, x, how.steps)
+        return solve(field, x, t_0, t_1, how.method, how.steps, how.tolerance, progress, grid=how.times, **options)
 
     def generate(
         self,
@@ -173,13 +170,11 @@ class Flow(Generator):
     def check_sampler(self, sampler: Sampler) -> None:
         if completes(sampler.method):
             parse_method(sampler.method)
-            if sampler.levels or sampler.finish:
-                raise InputError(f"{sampler.method} has neither levels nor a finish; leave them out.")
+            if sampler.finish:
+                raise InputError(f"{sampler.method} has no finish; leave it out.")
             self._times(sampler)
             return
         if churn_of(sampler.method) is not None:
-            if sampler.levels:
-                raise InputError(f"{sampler.method} has no levels; leave them out, or give a solver.")
             self._stochastic_times(sampler)
             return
         if sampler.method.partition(":")[0] in WAYS:
@@ -188,15 +183,7 @@ class Flow(Generator):
             )
         check_method(sampler.method, self.other_samplers)
         check_tolerance(sampler.tolerance)
-        method = fixed_step(sampler.method)
         self._times(sampler)
-        if sampler.levels and not (method and method.corrects):
-            raise InputError(f"only a predictor-corrector says how many steps a scan needs, not {sampler.method}.")
-        if len(sampler.limits) != max(len(sampler.levels) - 1, 0) or min(sampler.levels, default=1) < 1:
-            raise InputError(
-                f"levels are numbers of steps, with a limit for each but the last; found levels {list(sampler.levels)} "
-                f"and limits {list(sampler.limits)}. r2flow calibrate measures them."
-            )
         if adapts(sampler.method) and sampler.grid != "uniform":
             raise InputError(f"a time grid is for a solver of fixed steps; {sampler.method} chooses its own.")
 
@@ -210,7 +197,7 @@ class Flow(Generator):
         if churn_of(sampler.method) is not None:
             return len(self._stochastic_times(sampler)) - 1
         method = fixed_step(sampler.method)
-        return 0 if method is None or sampler.levels else method.cost(sampler.steps)
+        return 0 if method is None else method.cost(sampler.steps)
 
 
 class NetworkFlow(Flow):
@@ -273,7 +260,7 @@ class NetworkFlow(Flow):
                 raise InputError(
                     f"the network to start from has weights for images of {there} ('{sized[0]}'), found {here}: leave "
                     f"sensor out, give sensor.rows={parent.space.shape[1]} sensor.columns={parent.space.shape[2]}, "
-                    "or first grow it to a multiple of its size (r2flow grow)."
+                    "or first grow it to a multiple of its size (r2flow.growing)."
                 )
         self._take(parent, {**new, **theirs})
 
@@ -355,20 +342,6 @@ class Field(Flow):
     @property
     def device(self) -> torch.device:
         return next((p.device for p in self.parameters()), torch.device("cpu"))
-
-
-def _by_levels(field: Velocity, x: Tensor, how: Sampler, by: Callable[[Velocity, Tensor, int], Solution]) -> Solution:
-    """Each scan by the first number of steps at which its correction is small enough; all evaluations are counted."""
-    solution, left = by(field, x, how.levels[0]), torch.arange(len(x))
-    for steps, most in zip(how.levels[1:], how.limits, strict=True):
-        assert solution.correction is not None
-        left = left[~(solution.correction[left] <= most)]
-        if not len(left):
-            break
-        select = getattr(field, "select", None)
-        again = by(select(left) if select else field, x[left.to(x.device)], steps)
-        solution = solution.continued(left, again)
-    return solution
 
 
 class Conditioned:

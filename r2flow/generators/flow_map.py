@@ -137,8 +137,8 @@ class FlowMap(RectifiedFlow):
         if _churn(sampler) is None:
             super().check_sampler(sampler)
             return
-        if sampler.levels or sampler.finish:
-            raise InputError("jumps have neither levels nor a finish; leave them out, or give a solver.")
+        if sampler.finish:
+            raise InputError("jumps have no finish; leave it out, or give a solver.")
         self._times(sampler, 0.0, 1.0)
 
     def evaluations_of(self, sampler: Sampler) -> int:

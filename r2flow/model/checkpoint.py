@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from r2flow.config import check_tree, learned
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, parse_json
-from r2flow.generators import Budget, Generator, RectifiedFlow, Sampler, build_generator
+from r2flow.generators import Generator, RectifiedFlow, Sampler, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
@@ -45,7 +45,6 @@ class Checkpoint:
         step: Optimiser steps taken.
         path: Where it was read from.
         format: `r2flow`, or `published` for the reference implementation's files.
-        accuracy: What its sampler's errors are, where they have been measured (`r2flow.accuracy.calibrate`).
     """
 
     generator: Generator
@@ -53,7 +52,6 @@ class Checkpoint:
     step: int = 0
     path: Path = Path("unsaved")
     format: str = "r2flow"
-    accuracy: tuple[Budget, ...] = ()
 
     @property
     def model(self) -> nn.Module:
@@ -264,9 +262,7 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
     generator.sampler = Sampler.of(sampler or {})  # where none was written down, 32 Euler steps
     if published is not None and made.finish is not None:
         made.finish(generator, config)
-    measured = () if published is not None else content.get("accuracy") or ()
-    accuracy = tuple(Budget.of(one) for one in measured)
-    return Checkpoint(generator.eval().requires_grad_(False), config, step, path, kind, accuracy)
+    return Checkpoint(generator.eval().requires_grad_(False), config, step, path, kind)
 
 
 def weights_hash(checkpoint: Checkpoint) -> str:
@@ -299,7 +295,6 @@ def read_safetensors(path: Path) -> dict[str, Any]:
         notes = parse_json(kept[NOTES])
         whole = notes.pop("digest", None) == _digest(notes, weights)
         config, step, sampler = notes["config"], int(notes["step"]), notes.get("sampler")
-        accuracy = notes.get("accuracy")
     except KeyError as error:
         raise InputError(f"{path} holds weights but no r2flow config (no {error} in its metadata).") from None
     except (SafetensorError, OSError, OverflowError, ValueError) as error:
@@ -309,7 +304,7 @@ def read_safetensors(path: Path) -> dict[str, Any]:
     if not whole:
         raise InputError(f"{path} is damaged: its checksum does not fit. Copy it again, or take another checkpoint.")
     state = {PREFIX + name: value for name, value in weights.items()}
-    return {"config": config, "global_step": step, "state_dict": state, "sampler": sampler, "accuracy": accuracy}
+    return {"config": config, "global_step": step, "state_dict": state, "sampler": sampler}
 
 
 def _digest(notes: Mapping[str, Any], weights: Mapping[str, Tensor]) -> str:
@@ -342,35 +337,10 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
         "step": checkpoint.step,
         "sampler": checkpoint.generator.sampler.asdict(),
     }
-    if checkpoint.accuracy:
-        notes["accuracy"] = [budget.asdict() for budget in checkpoint.accuracy]
     # Under one key: several keys of metadata come in no fixed order.
     data = save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})})
     with atomic_write(path) as file:
         file.write(data)
-
-
-def keep_sampler(checkpoint: Checkpoint) -> None:
-    """Write the generator's sampler and the errors that it has into the file that the checkpoint was read from.
-
-    Raises:
-        InputError: a file of the published format, which has no place for them, or one that cannot be written.
-    """
-    path = checkpoint.path
-    if checkpoint.format == "published":
-        raise InputError(f"{path} has no place for a sampler; export it to a safetensors first.")
-    if path.suffix == ".safetensors":
-        from safetensors import safe_open
-
-        with safe_open(path, framework="pt") as file:
-            half = any(file.get_slice(name).get_dtype() == "F16" for name in file.keys())  # noqa: SIM118
-        save_checkpoint(checkpoint, path, half)
-        return
-    content = torch.load(path, map_location="cpu", weights_only=True)
-    content["sampler"] = checkpoint.generator.sampler.asdict()
-    content["accuracy"] = [budget.asdict() for budget in checkpoint.accuracy]
-    with atomic_write(path) as file:
-        torch.save(content, file)
 
 
 def large_matrices(module: nn.Module) -> set[str]:

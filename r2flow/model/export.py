@@ -22,7 +22,6 @@ from r2flow import __version__
 from r2flow.errors import InputError, require
 from r2flow.files import atomic_write
 from r2flow.generators import USUAL, RectifiedFlow, Sampler
-from r2flow.lidar.planes import flattened
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.space import ModelSpace
 from r2flow.model.checkpoint import Checkpoint, weights_hash
@@ -40,13 +39,11 @@ class Tableau(NamedTuple):
         times: t_j, (E,).
         second: s_j, (E,); None for a network of one time.
         states: a, (E + 1, E + 1) float64; its last row makes x_1.
-        flatten: `Sampler.flattens`.
     """
 
     times: list[float]
     second: list[float] | None
     states: Tensor
-    flatten: float = 0.0
 
 
 class _Recorder(nn.Module):
@@ -73,9 +70,8 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
     flow.check_sampler(sampler)
     count = flow.evaluations_of(sampler)
     if count == 0:
-        found = "one whose steps depend on the scan" if sampler.levels else sampler.method
         raise InputError(
-            f"an exported sampler takes a fixed number of steps by a solver of ours, found {found}: give "
+            f"an exported sampler takes a fixed number of steps by a solver of ours, found {sampler.method}: give "
             f"--solver {USUAL.method} --steps {USUAL.steps}."
         )
     if flow.draws_noise(sampler):
@@ -91,27 +87,21 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
     times, states, second = zip(*recorder.calls, strict=True)
     rows = torch.stack([*states, x_1]).reshape(-1, count + 1)[:, : len(times) + 1]  # a `finish` takes fewer than count
     others = [float(s) for s in second] if flow.second_time else None
-    return Tableau([float(t) for t in times], others, rows, sampler.flattens)
+    return Tableau([float(t) for t in times], others, rows)
 
 
 class Decoded(nn.Module):
-    """x_1 in model space to range in metres and reflectance, (B, 2 or 1, H, W), and points in metres, (B, 3, H, W).
-
-    Args:
-        flatten: `Sampler.flattens`.
-    """
+    """x_1 in model space to range in metres and reflectance, (B, 2 or 1, H, W), and points in metres, (B, 3, H, W)."""
 
     rays: Tensor
 
-    def __init__(self, space: ModelSpace, flatten: float = 0.0) -> None:
+    def __init__(self, space: ModelSpace) -> None:
         super().__init__()
-        self.space, self.flatten = space, flatten
+        self.space = space
         self.register_buffer("rays", space.sensor.rays())
 
     def forward(self, x_1: Tensor) -> tuple[Tensor, Tensor]:
         scan = self.space.decode(x_1)
-        if self.flatten:
-            scan = flattened(scan, self.rays, self.flatten)
         return scan, unproject(scan[:, :1], self.rays)
 
 
@@ -120,7 +110,7 @@ class Scans(nn.Module):
 
     def __init__(self, flow: RectifiedFlow, how: Tableau) -> None:
         super().__init__()
-        self.network, self.decoded, self.how = flow.backbone, Decoded(flow.space, how.flatten), how
+        self.network, self.decoded, self.how = flow.backbone, Decoded(flow.space), how
 
     def forward(self, noise: Tensor) -> tuple[Tensor, Tensor]:
         *states, last = self.how.states.tolist()
@@ -234,7 +224,7 @@ def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any])
     program, any_batch = _traced(flow.backbone, _network_inputs(flow, (2,) if how is None else ()))
     network = to_onnx(program, ["t", "x", "s"][: 2 + flow.backbone.second_time], ["v"])
     if how is not None:
-        decoded, any_too = _traced(Decoded(flow.space, how.flatten), _noise(flow))
+        decoded, any_too = _traced(Decoded(flow.space), _noise(flow))
         any_batch = any_batch and any_too
         network = sampler_graph(
             network, to_onnx(decoded, ["x_1"], ["scan", "points"]), how.times, how.second, how.states.numpy()
@@ -317,7 +307,7 @@ def compare(checkpoint: Checkpoint, exported: Exported, sampler: Sampler | None 
     flow = checkpoint.generator
     noise = Draws(0, range(num if exported.any_batch else 1)).start(flow.noise_shape)
     x_1 = flow.generate(noise, sampler=sampler).x
-    mine, _ = Decoded(flow.space, (sampler or flow.sampler).flattens)(x_1)
+    mine, _ = Decoded(flow.space)(x_1)
     theirs = run(exported.path, noise)["scan"]
     one, other = mine[:, 0] > 0, theirs[:, 0] > 0
     both = one & other

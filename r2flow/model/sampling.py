@@ -13,7 +13,6 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.generators import Condition, Generator, Sampler
 from r2flow.generators.base import Progress, check_control
-from r2flow.lidar.planes import flattened
 from r2flow.lidar.region import Region
 from r2flow.noise import Draws
 
@@ -129,8 +128,6 @@ def draw(
     images = generator.space.decode(x_1, channels)
     if seen is not None:
         images = seen.place(images)
-    if how.flattens and channels != "reflectance":
-        images = flattened(images, space.rays, how.flattens)
     if region is not None and seen is not None:
         images = region.place(region.crop(images))
     return Samples(images, numbers[0], made.evaluations.cpu(), made.converged.cpu(), seconds)

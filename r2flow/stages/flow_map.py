@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.losses import LOSSES
-from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots, corrected, solved
+from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots, solved
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import FlowMap, Generator
 from r2flow.generators.base import CHORD, JUMP, RENOISE, Sampler
-from r2flow.registry import Portion, Positive, check_options
+from r2flow.registry import Positive, check_options
 from r2flow.stages.base import Batch
 from r2flow.stages.reflow import Reflow
 
@@ -22,25 +21,16 @@ from r2flow.stages.reflow import Reflow
 class LearnFlowMap(Reflow):
     """Flow map: regress u(x_t, t, s) onto what an objective of `r2flow.flow.maps` says.
 
-    From a 1-RF or a 2-RF on its pairs, with the inner states of their paths (`data.pairs.knots`) for the objectives
-    `knots` and `corrected`; or on scans, where noise and scan are drawn independently, by `solved`. With scans beside
-    the pairs (`data.scans`) velocities, s = t, are learned from these, as by `Rectify`, and jumps from the pairs.
-    Pairs of a map by its own `chord` or `renoise` have no inner states; by `knots` their jumps are those of straight
-    lines. On scans alone, by `knots` with `ends_from`, a map goes on with velocities and ends from that time on; its
-    other jumps follow as far as they share what is learned.
+    From a 1-RF or a 2-RF on its pairs, with the inner states of their paths (`data.pairs.knots`) for the objective
+    `knots`; or on scans, where noise and scan are drawn independently, by `solved`. With scans next to the pairs
+    (`data.scans`) velocities, s = t, are learned from the scans, as by `Rectify`, and jumps from the pairs. Pairs of a
+    map by its own `chord` or `renoise` have no inner states; by `knots` their jumps are those of straight lines.
 
     Args:
         objective: Name in `r2flow.flow.maps.OBJECTIVES`.
         jumps: Options of `r2flow.flow.maps.JumpTimes`.
         rho: Where the share rho ends that a bootstrapped objective takes from the path: it falls from 1, by equal
             factors, over the run. It is always 1 where s = t and, on pairs, for the jump from 0 to 1.
-        end_loss: Name of the loss of jumps to the end, s = 1, in `r2flow.flow.losses.LOSSES`; None: `loss`, which
-            velocities and all other jumps have. By `absolute` an end that the network cannot know goes to the median of
-            each element, which has edges, and not to the mean, which blurs them; `gradient_matching` is the same with
-            smooth surfaces.
-        ends_from: From this time on jumps to the end, s = 1, are learned from scans, as velocities are, and not from
-            the pairs: there little noise is left, the scan is all but known, and pairs are rougher than scans.
-            None: never.
     """
 
     generator_name = "flow_map"
@@ -53,8 +43,6 @@ class LearnFlowMap(Reflow):
         jumps: Mapping[str, Any] | None = None,
         rho: Positive = 0.01,
         loss: str = "pseudo_huber",
-        end_loss: str | None = None,
-        ends_from: Portion | None = None,
         **options: Any,
     ) -> None:
         if options.pop("time", None) is not None:
@@ -63,7 +51,6 @@ class LearnFlowMap(Reflow):
         if not isinstance(generator, FlowMap):
             raise InputError(f"this stage learns jumps, which a {type(generator).__name__} does not have.")
         self.objective, self.objective_name, self.rho = OBJECTIVES[objective], objective, rho
-        self.end_loss, self.ends_from = LOSSES[end_loss or loss], ends_from
         check_options("stage.jumps", JumpTimes, jumps or {})
         self.jumps = JumpTimes(**(jumps or {}))
         self.on_pairs = True
@@ -74,37 +61,20 @@ class LearnFlowMap(Reflow):
         self.on_pairs = data["name"] == "pairs"
         pairs = (data.get("pairs") or {}) if self.on_pairs else {}
         refined = self.objective is along_knots and pairs.get("method") in (CHORD, RENOISE)
-        if self.objective in (along_knots, corrected) and not (pairs.get("knots") or refined or self._goes_on):
+        if self.objective is along_knots and not (pairs.get("knots") or refined):
             raise InputError(
                 f"stage.objective={self.objective_name} learns from inner states of paths: give data=pairs "
-                "data.pairs.knots=7, or stage.objective=consistency; of a map on scans alone stage.ends_from=0.5."
+                "data.pairs.knots=7, or stage.objective=consistency."
             )
         if self._parent and (self.on_pairs or not self.config.get("stage", {}).get("init")):
             what = "data=DATASET, not pairs" if self.on_pairs else "stage.init=RUN"
             raise InputError(
                 f"stage.objective={self.objective_name} learns on scans, by the paths of an earlier flow: give {what}."
             )
-        if self.ends_from is not None and self.on_pairs and data.get("scans") is None:
-            raise InputError(
-                "stage.ends_from is the time from which jumps to the end are learned from scans: give data.scans "
-                "beside the pairs, as {name: simulated}, or leave it out."
-            )
-        if data.get("scans") is not None and self.objective not in (along_knots, corrected):
+        if data.get("scans") is not None and self.objective is not along_knots:
             raise InputError(
                 f"stage.objective={self.objective_name} learns from straight lines between pairs, whose velocities are "
                 "not those of scans: leave data.scans out, or give stage.objective=knots."
-            )
-
-    @property
-    def _goes_on(self) -> bool:
-        """Whether velocities and late ends alone are learned, on scans, and the other jumps are the parent's."""
-        return self.objective is along_knots and self.ends_from is not None and not self.on_pairs
-
-    def check_parent(self, jumps: bool) -> None:
-        if self._goes_on and not jumps:
-            raise InputError(
-                "on scans alone stage.objective=knots keeps the jumps of a flow map: give one, as stage.init=street; "
-                "to go on from another flow give experiment=finetune."
             )
 
     def on_fit_start(self) -> None:
@@ -117,12 +87,6 @@ class LearnFlowMap(Reflow):
         if not (self.training or self.on_pairs):
             t = s = self.jumps.velocities(u)  # of scans velocities alone are known
         of_scans = t == s
-        if self.training and self.ends_from is not None:
-            of_scans = of_scans | ((s == 1) & (t >= self.ends_from))
-            if self._goes_on:
-                s = torch.where(of_scans, s, t)  # all that a scan and independent noise tell
-                of_scans = torch.ones_like(of_scans)
-        ends = (s == 1) & (t < s)
         paths, u_ts = paths_of(batch), self.generator.map(self.condition(batch))
         if self.training:
             known = of_scans | (self.on_pairs & (s - t == 1))  # the end of independent noise is no scan of the data
@@ -135,8 +99,7 @@ class LearnFlowMap(Reflow):
             x_t, v = interpolate(batch["noise"], batch["scan"], t)
             here = expand_time(of_scans, x_t)
             aim = Aim(torch.where(here, x_t, aim.x_t), torch.where(here, v, aim.target))
-        estimate = u_ts(t, aim.x_t, s)
-        return torch.where(ends, self.end_loss(estimate, aim.target), self.loss(estimate, aim.target)).mean()
+        return self.loss(u_ts(t, aim.x_t, s), aim.target).mean()
 
 
 class _Kept(list[FlowMap]):

@@ -126,7 +126,6 @@ def test_a_flow_is_straightened(family: Family, tmp_path: Path, tmp_path_factory
 
 
 CANNOT = {
-    "invert": (["SCAN", "-c", "RUN", "-o", "OUT"], "inversion needs the velocity of a flow, which a ToyGenerator"),
     "interpolate": (
         ["SCAN", "SCAN", "-c", "RUN", "-o", "OUT"], "interpolation needs the velocity of a flow, which a ToyGenerator"
     ),

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from r2flow.errors import InputError
 from r2flow.flow import maps
 from r2flow.flow.losses import pseudo_huber
-from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, consistency, corrected, jump, solved, two_halves
+from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, consistency, jump, solved
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, Straight
 
@@ -151,29 +151,6 @@ def test_the_exact_map_of_a_straight_flow_is_what_every_objective_asks_for(name,
     x_t, target = OBJECTIVES[name](u, paths, T, S, torch.full_like(T, rho))
     torch.testing.assert_close(x_t, torch.stack([problem.solution(x, t) for x, t in zip(X_0, T, strict=True)]))
     torch.testing.assert_close(target, u(T, x_t, S))
-
-
-@pytest.mark.parametrize("rho", [0.0, 0.4])
-def test_two_halves_ask_for_the_exact_map_of_a_curved_flow(rho):
-    problem = Gaussian()
-    paths = paths_of(problem.solution, torch.linspace(0, 1, 65, dtype=torch.float64))
-    x_t, target = two_halves(exact_map(problem), paths, T, S, torch.where(T == S, 1.0, torch.full_like(T, rho)))
-    torch.testing.assert_close(target, exact_map(problem)(T, x_t, S), rtol=0, atol=1e-5)
-
-
-def test_corrected_jumps_lead_from_where_the_map_arrives_back_to_the_path():
-    paths = paths_of(lambda x, t: x * torch.cos(2 * t) + t)
-
-    def wrong(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
-        return 0.3 * x + 1
-
-    t, s = torch.tensor([0.0, 0.3, 0.75], dtype=torch.float64), torch.tensor([0.5, 0.55, 0.9], dtype=torch.float64)
-    y, target = corrected(wrong, paths, t, s, torch.ones_like(t))
-    before = (2 * t - s).clamp(min=0)
-    arrived = paths.at(before) + expand_time(t - before, X_0) * (0.3 * paths.at(before) + 1)
-    torch.testing.assert_close(y[1:], arrived[1:])
-    torch.testing.assert_close(y[0], X_0[0])  # nothing comes before t = 0
-    torch.testing.assert_close(y + expand_time(s - t, X_0) * target, paths.at(s))
 
 
 def test_consistency_ends_at_both_of_its_limits():

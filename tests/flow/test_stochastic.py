@@ -165,8 +165,6 @@ def test_what_needs_the_ode_says_so():
         tableau(flow, Sampler("sde", 2))
     with pytest.raises(InputError, match="mmps cannot be exported, 'mmps completes a scan"):
         tableau(flow, Sampler("mmps", 2))
-    with pytest.raises(InputError, match="sde has no levels"):
-        flow.check_sampler(Sampler("sde", 2, levels=(2, 4), limits=(0.1,)))
 
 
 def test_another_method_starts_from_its_usual_steps_and_another_number_of_the_same_keeps_them():

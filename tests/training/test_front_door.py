@@ -121,7 +121,6 @@ def test_files_have_no_scenes(tmp_path: Path):
         (["data.pairs.num=5"], "data.pairs.num are of data=pairs, found data=simulated"),
         (["+stage.batch_size=9"], "stage.batch_size is the run's: leave it out, and give data.batch_size"),
         (["+stage.seed=5"], "stage.seed is the run's: leave it out, and give seed"),
-        (["+sampler.levels=[2, 4]"], "levels are numbers of steps, with a limit for each but the last"),
     ],
 )
 def test_what_would_be_passed_over_is_refused(asked: list[str], words: str):

@@ -8,7 +8,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
-from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite, flat, stepped
+from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite, stepped
 
 Step = Callable[[Velocity, Tensor, Tensor, Tensor], Tensor]
 
@@ -23,7 +23,7 @@ class FixedStep(NamedTuple):
         evaluations: Of the velocity, in a step.
         start: Further ones in the first step.
         multistep: Whether `step` makes the step function.
-        corrects: Whether that function has a corrector and sums what it changes in its attribute `correction`.
+        corrects: Whether that function has a corrector.
     """
 
     step: Step | Callable[[Tensor], Step]
@@ -98,9 +98,4 @@ def solve_fixed(
             kept.append(x)
         x, alive = stepped(x, advance(inside, t.to(x), h.to(x), x), alive)
     solution = Solution.build(x, v.counts, len(times) - 1, 0, False, alive.cpu().numpy())
-    if knots:
-        solution = replace(solution, knots=torch.stack(kept, 1))
-    if not method.corrects:
-        return solution
-    correction = flat(step.correction.double().square()).mean(1).sqrt().cpu()  # type: ignore[attr-defined]
-    return replace(solution, correction=correction)
+    return replace(solution, knots=torch.stack(kept, 1)) if knots else solution

@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from functools import partial
 
-import torch
 from torch import Tensor
 
 from r2flow.flow.solvers.fixed import FixedStep
@@ -46,18 +45,16 @@ class _Adams:
         self.taken = 0
         self.velocities: list[Tensor] = []  # at the last times, the newest at the end
         self.corrected: tuple[int, Tensor] | None = None  # a step and its state, from which the next correction starts
-        self.correction: Tensor = torch.zeros(())
 
     def __call__(self, v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
         n = self.taken
         self.velocities = [*self.velocities, v(t, x)][-max(self.predictor, self.corrector) :]
         self.taken += 1
         if self.corrector and self.corrected is None:
-            self.corrected, self.correction = (0, x), torch.zeros_like(x)
+            self.corrected = 0, x
         elif self.corrected is not None and not (self.heun_first and n == 1):
             start, before = self.corrected
-            predicted, x = x, self._moved(before, start, n, self.corrector)
-            self.correction = self.correction + (x - predicted)
+            x = self._moved(before, start, n, self.corrector)
             self.corrected = n, x
         if self.heun_first and n == 0:
             k = self.velocities[0]

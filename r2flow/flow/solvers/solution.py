@@ -29,9 +29,6 @@ class Solution:
         global_error: Estimated root mean square error over a scene's elements, (B,) float64; inf where there is no
             estimate; None when not asked for.
         estimate_evaluations: Those of the evaluations that the estimate took, (B,) int64; None when not asked for.
-        correction: What a corrector has changed in all its steps together, root mean square over a scene's elements,
-            (B,) float64: about the error that the predictor alone would have, and mostly more than the solution's. None
-            for a method without a corrector.
         knots: Inner states that were asked for, (B, K, ...), at the times of `knot_times`; None when not asked for.
     """
 
@@ -43,7 +40,6 @@ class Solution:
     converged: Tensor
     global_error: Tensor | None = None
     estimate_evaluations: Tensor | None = None
-    correction: Tensor | None = None
     knots: Tensor | None = None
 
     @classmethod
@@ -61,17 +57,6 @@ class Solution:
         counts = [torch.from_numpy(np.broadcast_to(n, of).astype(np.int64)) for n in (evaluations, accepted, rejected)]
         flags = [torch.from_numpy(np.broadcast_to(flag, of).astype(bool)) for flag in (stiff, converged)]
         return cls(x, *counts, *flags)
-
-    def continued(self, scenes: Tensor, again: "Solution") -> "Solution":
-        """With these scenes, indices (N,), as they were solved again; evaluations and steps add up."""
-        here = scenes.to(self.x.device)
-        values: dict[str, Tensor | None] = {"x": self.x.index_copy(0, here, again.x)}
-        for name in ("evaluations", "accepted", "rejected"):
-            values[name] = getattr(self, name).index_add(0, scenes, getattr(again, name))
-        for name in ("stiff", "converged", "global_error", "estimate_evaluations", "correction", "knots"):
-            before = getattr(self, name)
-            values[name] = before if before is None else before.index_copy(0, scenes, getattr(again, name))
-        return Solution(**values)  # type: ignore[arg-type]
 
 
 class Evaluations:

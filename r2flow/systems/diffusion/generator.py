@@ -133,8 +133,8 @@ class Diffusion(NetworkFlow):
             except InputError as error:
                 raise InputError(f"a diffusion has ddpm, ddim:ETA and a flow's solvers: {error}") from None
             return
-        if sampler.levels or sampler.finish:
-            raise InputError(f"{sampler.method} has neither levels nor a finish; leave them out, or give a solver.")
+        if sampler.finish:
+            raise InputError(f"{sampler.method} has no finish; leave it out, or give a solver.")
         self._log_snrs(sampler)
 
     def draws_noise(self, sampler: Sampler) -> bool:
