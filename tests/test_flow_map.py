@@ -199,7 +199,7 @@ def test_a_scan_that_leaves_the_numbers_is_flagged_and_keeps_its_last_state(exac
 @pytest.mark.parametrize(
     ("sampler", "said"),
     [
-        (Sampler("jump", 4, finish=0.1), "neither levels nor a finish"),
+        (Sampler("jump", 4, finish=0.1), "no finish"),
         (Sampler("jump", 4, grid=(0.0, 0.5)), "time grid"),
         (Sampler("jumps", 4), "no solver named 'jumps'; known: jump, chord, renoise, sde, ab2, "),
     ],
@@ -420,8 +420,6 @@ def test_scans_beside_pairs_are_for_objectives_on_the_parents_own_paths():
     assert stage({**DATA, "scans": scans}, objective="knots").objective is not None
     with pytest.raises(InputError, match=r"leave data\.scans out, or give stage\.objective=knots"):
         stage({**DATA, "scans": scans})
-    with pytest.raises(InputError, match=r"stage\.ends_from is the time .* give data\.scans"):
-        stage(DATA, objective="knots", ends_from=0.9)
     with pytest.raises(InputError, match=r"stage=reflow learns from pairs alone: leave data\.scans out"):
         build_stage({"stage": {"name": "reflow"}, "data": {**DATA, "scans": scans}, "seed": 0}, parent())
     with pytest.raises(InputError, match=r"data\.scans stand beside pairs, found data=simulated"):

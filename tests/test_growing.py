@@ -63,9 +63,8 @@ def test_the_means_of_a_grown_map_jump_as_the_map_does():
 
 def test_a_grown_map_learns_on_as_a_map(r2flow, tmp_path):  # noqa: F811
     small = flow(generator={"name": "flow_map"})
-    save_checkpoint(small, tmp_path / "map.safetensors")
     out, run = tmp_path / "larger.safetensors", tmp_path / "run"
-    assert r2flow("grow", tmp_path / "map.safetensors", out, "--size", "16x128")[0] == 0
+    save_checkpoint(grown(small, (16, 128)), out)
     said = r2flow(
         *("train", "experiment=flow_map", f"stage.init={out}", f"run_dir={run}", "data.pairs.num=4", "trainer=cpu"),
         *("data.pairs.steps=2", "trainer.max_steps=2", "data.batch_size=2", "samples.num=0", "callbacks.pictures=null"),
