@@ -42,7 +42,7 @@ def export(
     elif out.suffix != f".{to}":
         raise InputError(f"--to {to} writes a .{to}, found --out {out}.")
     if to == "safetensors":
-        _write_weights(checkpoint, out, half, solver == SolverOptions() and not grid and flatten is None)
+        _write_weights(checkpoint, out, half, solver == SolverOptions() and not grid)
         return
     writing.FORMATS[to]
     if half:
