@@ -6,12 +6,12 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.generators import Sampler
-from r2flow.inversion import interpolate_scans, invert
+from r2flow.inversion import interpolate_scans
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
 from r2flow.reports.interpolation import interpolation, interpolation_figure
-from r2flow.reports.inversion import errors_of, invert_scans, print_rows, real_scans, unique_names
+from r2flow.reports.inversion import real_scans, unique_names
 from r2flow.reports.pictures import figure_pixels
 from tests.test_sampling import SENSOR, GaussianFlow, flow, scans
 
@@ -80,24 +80,6 @@ def test_an_end_without_its_noise_is_refused(tmp_path):
         interpolate_scans(flow(), bad, 3, Sampler("rk4", 4))
     with pytest.raises(InputError, match="the first scan cannot be carried to its noise"):
         interpolate_scans(flow(), bad.flip(0), 3)
-
-
-def test_a_scan_that_is_not_solved_is_reported(tmp_path, capsys):
-    images = scans(2)
-    images[0, 0, 0, 0] = torch.nan
-    rows = errors_of(flow(), invert(flow(), images), ["bad", "good"], images)
-    assert [row["converged"] for row in rows] == [False, True]
-    print_rows(rows)
-    assert "not solved, and their noise is NaN: bad." in capsys.readouterr().out
-
-
-def test_inversion_refuses_before_it_writes(tmp_path):
-    np.save(tmp_path / "scan.npy", scans(1)[0].numpy())
-    with pytest.raises(InputError, match="Did you mean 'dopri5'"):
-        invert_scans(flow(), real_scans(flow(), [tmp_path / "scan.npy"]), tmp_path / "o", Sampler("dopri"))
-    with pytest.raises(InputError, match="does not exist"):
-        real_scans(flow(), [tmp_path / "scan.npy", tmp_path / "none.bin"])
-    assert not (tmp_path / "o").exists()
 
 
 def test_a_range_image_is_limited_to_the_range_of_the_sensor(tmp_path):
