@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -19,10 +19,6 @@ from r2flow.cli.options import (
     choose_device,
     named_columns,
 )
-from r2flow.errors import InputError
-
-if TYPE_CHECKING:
-    from r2flow.model.checkpoint import Checkpoint
 
 
 @dataclass(frozen=True)
@@ -32,9 +28,6 @@ class KnownOptions:
     source: Annotated[
         str | None,
         typer.Option("--from", help="Sensor of the scans, by name or YAML; found in the scans if left out."),
-    ] = None
-    target: Annotated[
-        str | None, typer.Option("--to", help="Sensor of the answers; the model's, which it must be.")
     ] = None
     mask: Annotated[
         str | None,
@@ -66,7 +59,7 @@ class AnswerOptions:
     device: DeviceOption = "auto"
 
 
-@app.command(epilog="Example: r2flow complete scan.pcd --from vlp16 --to hdl64e --num 8 --out dense")
+@app.command(epilog="Example: r2flow complete scan.pcd --from vlp16 --num 8 --out dense")
 @grouped
 def complete(
     what: Annotated[list[str], typer.Argument(metavar="SCANS...", help=f"Scan files, range images (.npy), or {SETS}.")],
@@ -94,29 +87,24 @@ def complete(
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.model.completion import completing
     from r2flow.models import DEFAULT, MODELS, find_model
-    from r2flow.reports.completed import WRITTEN, Job, answer_ending, write_completed
+    from r2flow.reports.completed import Job, answer_ending, write_completed
 
     if checkpoint is None:
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
     mask = None if known.mask is None else parse_mask(known.mask)
     source = None if known.source is None else build_sized(known.source, None)
     loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(answers.device))
-    _check_target(loaded, known.target)
     reading = replace(reading_of_flow(loaded), columns=named_columns(known.columns))
     scans, said = open_partial(what, reading, source, known.reflectance_scale, answers.scans)
     sampler = completing(loaded.generator, solver.change(completing(loaded.generator), precision=precision))
     for line in said:
         print(line)
     for ending in sorted({scan.ending for scan in scans if answer_ending(loaded, scan) != scan.ending}):
-        why = "no answer of a model of range alone" if ending in WRITTEN else "read but not written"
-        print(f"{ending} is {why}: answers are .ply ({', '.join(WRITTEN)} are written)")
+        print(f"answers to {ending} are written as .ply")
     if not loaded.encoding.reflectance:
         print("the model is of range alone: answers have no reflectance")
     rows, columns = loaded.sensor.shape
-    print(
-        f"an answer has one point in a pixel of the model's image, {rows}x{columns}: {rows * columns} at most; of "
-        "several measured points in a pixel it keeps the nearest"
-    )
+    print(f"an answer has at most one point in each pixel of the model's image, {rows}x{columns}")
     job = Job(answers.num, answers.seed, mask, known.fill_gaps, answers.batch_size, known.surfaces, answers.pictures)
     about = {
         "mask": known.mask and mask_identity(known.mask), "from": known.source,
@@ -128,23 +116,6 @@ def complete(
     errors = [error for error in done.values() if error is not None]
     if errors:
         off = [error["mae_m"] for error in errors if not np.isnan(error["mae_m"])]
-        apart = f"MAE {np.mean(off):.2f} m where both return" if off else "no hidden ray returns in both"
+        mae = f"MAE {np.mean(off):.2f} m where both return" if off else "no ray returns in both"
         wrong = np.mean([error["drop_wrong"] for error in errors])
-        print(
-            f"to the truth of {len(errors)} scans, on the rays that the mask hid: {apart}; {wrong:.1%} of the rays "
-            "return in one alone"
-        )
-
-
-def _check_target(loaded: "Checkpoint", target: str | None) -> None:
-    """Refuse a sensor that is not the model's."""
-    if target is None:
-        return
-    sensor = loaded.sensor
-    asked = build_sized(target, None)
-    if sensor.elevations not in (asked.elevations, asked.resized(sensor.shape[0]).elevations):
-        size = "x".join(map(str, sensor.shape))
-        raise InputError(
-            f"--to {target}: the model makes images of {sensor.name}, {size}; leave --to out, or give a model of "
-            f"{asked.name} by -c."
-        )
+        print(f"on the hidden rays of {len(errors)} scans: {mae}; {wrong:.1%} of the rays wrong in ray-drop")

@@ -1,6 +1,6 @@
 """Scans of any sensor as what is known of a model's images: for `r2flow complete`.
 
-scans, said = open_partial(["scans"], reading_of_flow(flow))
+scans, lines = open_partial(["scans"], reading_of_flow(flow))
 scans[0].read()         image, state, xyz
 """
 
@@ -36,31 +36,32 @@ from r2flow.lidar.transfer import (
 FEWER = 0.9  # of the columns: a turn of fewer rays leaves pixels between them
 FEW = 4  # simulated scans, where nobody says how many
 
+Opened = tuple[list["PartialScan"], list[str]]  # scans, and lines about their sensors
+
 
 @dataclass(frozen=True)
 class PartialScan:
     """A scan that is read when its turn comes.
 
     Attributes:
-        name: What its answers are called, without an ending: its path below the folder that was named.
+        name: Of its answers, without an ending: its path below the folder that was named.
         ending: Of its file; `.npy` of an image.
         read: What is known of it.
+        content: What tells it from another scan of this name.
         path: Its file; None where it has none of its own.
         image: Whether it is a range image, as its answers are then, or points.
-        content: What it holds, where it has no file and its name does not tell.
     """
 
     name: str
     ending: str
     read: Callable[[], Partial]
+    content: Callable[[], bytes]
     path: Path | None = None
     image: bool = True
-    content: Callable[[], bytes] | None = None
 
     def identity(self) -> str:
-        """What tells its answers from those to another scan of this name: a hash of what it holds."""
-        content = self.path.read_bytes if self.path else self.content
-        return hashlib.sha256(content()).hexdigest()[:16] if content else self.name
+        """A hash of `content`."""
+        return hashlib.sha256(self.content()).hexdigest()[:16]
 
 
 def open_partial(
@@ -69,12 +70,12 @@ def open_partial(
     source: Sensor | None = None,
     scale: float | None = None,
     most: int | None = None,
-) -> tuple[list[PartialScan], list[str]]:
-    """The scans that names stand for (`open_scans`), none of them read yet but for some that tell their sensor.
+) -> Opened:
+    """The scans that names stand for (`open_scans`), read later but for some that tell their sensor.
 
     A scan of the model's own sensor is measured everywhere. Of another sensor's, the rows are measured that its beams
-    look into: those of `source`, else of the sensor that samples and prepared scans name, else the beams that are found
-    in the scans.
+    look into: the beams of `source`, else of the sensor that samples and prepared scans name, else those found in the
+    scans.
 
     Args:
         reading: How the model's training scans became images.
@@ -82,19 +83,17 @@ def open_partial(
         scale: The value in scan files that means full reflectance; the usual one if left out.
         most: The most scans of each name, evenly spread; all of them, and `FEW` simulated ones, if left out.
 
-    Returns:
-        The scans, and a line for each place with scans of another sensor.
-
     Raises:
         InputError: no scan, one that cannot be read, or a sensor that cannot be told.
     """
-    found: list[PartialScan] = []
-    said: list[str] = []
+    scans: list[PartialScan] = []
+    lines: list[str] = []
     groups: dict[tuple[Path, str], list[Path]] = {}  # files that are named one by one, by their folder
     for spec in specs:
         options, file = parse(str(spec))
         if options.name in (SIMULATED, PREPARED):
-            found += _images(str(spec), reading, source, most, said)
+            opened = _images(str(spec), reading, source, most)
+            scans, lines = scans + opened[0], lines + opened[1]
         elif file is not None:
             groups.setdefault((file.parent, ""), []).append(file)
         else:
@@ -102,81 +101,71 @@ def open_partial(
             chosen = [paths[number] for number in spread(len(paths), most or len(paths))]
             groups[Path(options.folder).expanduser(), str(spec)] = chosen
     for (folder, spec), paths in groups.items():
-        found += _files(folder, paths, spec or str(paths[0]), reading, source, scale, said)
-    if not found:
+        opened = _files(folder, paths, spec or str(paths[0]), reading, source, scale)
+        scans, lines = scans + opened[0], lines + opened[1]
+    if not scans:
         raise InputError("no scan is named; give scan files, range images, folders of them or simulated:SEED.")
-    twice = [name for name, count in Counter(scan.name for scan in found).items() if count > 1]
+    twice = [name for name, count in Counter(scan.name for scan in scans).items() if count > 1]
     if twice:
         raise InputError(f"two of the scans are called {twice[0]}, and so would be their answers: complete them apart.")
-    return found, said
+    return scans, lines
 
 
 def _files(
-    folder: Path,
-    paths: list[Path],
-    spec: str,
-    reading: Reading,
-    source: Sensor | None,
-    scale: float | None,
-    said: list[str],
-) -> list[PartialScan]:
+    folder: Path, paths: list[Path], spec: str, reading: Reading, source: Sensor | None, scale: float | None
+) -> Opened:
     """Scan files of one sensor."""
-    target = reading.sensor
+    target, lines = reading.sensor, list[str]()
     noted = own_reading(folder) if (folder / SAMPLES).is_file() else None
     source = source or (noted.sensor if noted else None)
-    images = {path for path in paths if _is_image(path)}
-    read: Callable[[Path], Partial] = partial(_read_image, source=source, target=target)
-    by_points = read
+    images = {path for path in paths if path.suffix.lower() == ".npy" and read_range_image(path) is not None}
+    read_image: Callable[[Path], Partial] = partial(_read_image, source=source, target=target)
+    by_points = read_image
     if points := [path for path in paths if path not in images]:
         some = [read_points(points[number], reading.columns) for number in spread(len(points), LOOKED_AT)]
         doubt = None if source else other_sensor(some, target)
         same = _same_view(source, target) if source else doubt is None
-        fired = firing_of(some, source or target) if same else _firing(spec, some, source)
+        try:
+            fired = firing_of(some, source or (target if same else None))
+        except InputError as error:
+            raise InputError(f"{spec}: the sensor of the scans is not known, name it by --from: {error}") from None
         if same and fired.steps >= FEWER * target.columns:
             full = scale or (1.0 if noted else usual_scale(spec, source or target))
-            by_points = partial(_read_same, reading=reading, scale=full)
+            by_points = partial(_read_points, reading=reading, fired=None, scale=full, strict=True)
         else:
-            known = 1.0 if noted else source and source.reflectance_scale
-            full = scale or known or full_reflectance(some) or 1.0
-            by_points = partial(_read_other, reading=reading, fired=fired, scale=full, strict=scale is not None)
+            full = scale or (1.0 if noted else source and source.reflectance_scale) or full_reflectance(some) or 1.0
+            by_points = partial(_read_points, reading=reading, fired=fired, scale=full, strict=scale is not None)
             name = source.name if source else (doubt and doubt.name) or "a sensor"
-            said.append(_described(spec, fired.elevations, name, target, fired.steps))
+            lines.append(_described(spec, fired.elevations, name, target, fired.steps))
     elif source and not _same_image(source, target):
-        said.append(_described(spec, np.asarray(source.elevations), source.name, target))
-    return [
-        PartialScan(_name(path, folder), _ending(path), partial(read, path), path)
-        if path in images
-        else PartialScan(_name(path, folder), _ending(path), partial(by_points, path), path, image=False)
-        for path in paths
-    ]
+        lines.append(_described(spec, np.asarray(source.elevations), source.name, target))
+
+    def opened(path: Path) -> PartialScan:
+        ending = scan_ending(path.name) or path.suffix
+        below = path.relative_to(folder) if path.is_relative_to(folder) else Path(path.name)
+        name = str(below.with_name(below.name.removesuffix(ending)))
+        read = partial(read_image if path in images else by_points, path)
+        return PartialScan(name, ending, read, path.read_bytes, path, path in images)
+
+    return [opened(path) for path in paths], lines
 
 
-def _images(spec: str, reading: Reading, source: Sensor | None, most: int | None, said: list[str]) -> list[PartialScan]:
+def _images(spec: str, reading: Reading, source: Sensor | None, most: int | None) -> Opened:
     """Simulated and prepared scans, by their numbers in the whole set."""
     target, how = reading.sensor, own_reading(spec)
     simulated = how is None
     how = how or replace(reading, sensor=source or target)
-    opened = open_scans(spec, how, num=(most or FEW) if simulated else None)
-    scans = opened.source
-    if not _same_image(how.sensor, target):
-        said.append(_described(spec, np.asarray(how.sensor.elevations), how.sensor.name, target))
+    scans = open_scans(spec, how, num=(most or FEW) if simulated else None).source
     kind = spec.replace(":", "-") if simulated else Path(spec).name
-    return [
-        PartialScan(
-            f"{kind}-{number:06d}",
-            ".npy",
-            partial(_read_set, scans, number, how.sensor, target),
-            content=None if simulated else partial(_content, scans, number),
-        )
-        for number in spread(len(scans), most or len(scans))
-    ]
 
+    def opened(number: int) -> PartialScan:
+        name = f"{kind}-{number:06d}"
+        content = name.encode if simulated else partial(_content, scans, number)
+        return PartialScan(name, ".npy", partial(_read_set, scans, number, how.sensor, target), content)
 
-def _firing(spec: str, some: list[Points], source: Sensor | None) -> Fired:
-    try:
-        return firing_of(some, source)
-    except InputError as error:
-        raise InputError(f"{spec}: the sensor of the scans is not known, name it by --from: {error}") from None
+    same = _same_image(how.sensor, target)
+    lines = [] if same else [_described(spec, np.asarray(how.sensor.elevations), how.sensor.name, target)]
+    return [opened(number) for number in spread(len(scans), most or len(scans))], lines
 
 
 def _described(spec: str, elevations: np.ndarray, name: str, target: Sensor, steps: float = math.inf) -> str:
@@ -188,70 +177,53 @@ def _described(spec: str, elevations: np.ndarray, name: str, target: Sensor, ste
     rows = rows_of(elevations, target)
     beams = f"{name} with {len(elevations)} beams from {elevations[0]:+.1f} to {elevations[-1]:+.1f} degrees"
     if not (rows >= 0).any():
-        edges = target.row_edges
         raise InputError(
-            f"{spec}: {beams}, none of which looks into the view of the model's sensor {target.name}, {edges[0]:+.1f} "
-            f"to {edges[-1]:+.1f} degrees."
+            f"{spec}: {beams}, and the model's sensor {target.name} sees {target.row_edges[0]:+.1f} to "
+            f"{target.row_edges[-1]:+.1f} degrees."
         )
     measured = f"{len(set(rows[rows >= 0]))} of the {target.shape[0]} rows of {target.name} are measured"
-    beyond = f"{int((rows < 0).sum())} beams look past its view and are left out"
     turn = f", in the columns that its {steps:.0f} rays a turn meet" if steps < FEWER * target.columns else ""
-    return f"{spec}: {beams}; {measured}{turn}" + (f", {beyond}" if (rows < 0).any() else "")
+    beyond = f", {int((rows < 0).sum())} beams look past its view" if (rows < 0).any() else ""
+    return f"{spec}: {beams}; {measured}{turn}{beyond}"
 
 
-def _read_same(path: Path, reading: Reading, scale: float) -> Partial:
-    points = read_points(path, reading.columns)
-    if reading.projection == "unfolding":
+def _read_points(path: Path, reading: Reading, fired: Fired | None, scale: float, strict: bool) -> Partial:
+    """Points of the model's sensor or, with `fired`, of another one."""
+    target, points = reading.sensor, read_points(path, reading.columns)
+    if fired is None and reading.projection == "unfolding":
         points = points.with_lost_rays()
-    strength = _strength(path, points, scale, strict=True)
-    with naming(path):
-        seen = points_of_same(points, reading.sensor, reading.projection, reading.convention, strength)
-    return _shown(path, points, reading.sensor, seen)
-
-
-def _read_other(path: Path, reading: Reading, fired: Fired, scale: float, strict: bool) -> Partial:
-    points = read_points(path, reading.columns)
     strength = _strength(path, points, scale, strict)
     with naming(path):
-        seen = points_through(points, fired, reading.sensor, strength)
-    return _shown(path, points, reading.sensor, seen)
-
-
-def _shown(path: Path, points: Points, target: Sensor, seen: Partial) -> Partial:
+        if fired is None:
+            seen = points_of_same(points, target, reading.projection, reading.convention, strength)
+        else:
+            seen = points_through(points, fired, target, strength)
     if not seen.image[0].any():
         raise nothing_in_view(path, points, target)
     return seen
 
 
 def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
-    image = read_range_image(path)
+    image, stored = read_range_image(path), read_numbers(path)
     assert image is not None
-    stored = read_numbers(path)
-    if not np.isfinite(stored).all():
+    if not (stored >= 0).all() or not (stored[1:] <= 1).all() or not np.isfinite(stored).all():
         raise InputError(
-            f"{path} holds NaN or infinite values: give 0 where nothing came back, and say by --mask FILE.npy what "
-            "was not measured."
+            f"{path} must hold ranges in metres, of 0 or more, and reflectances of [0, 1]. Divide the reflectances by "
+            "what means full reflectance; give 0 for NaN and infinity, and --mask FILE.npy for what was not measured."
         )
-    if stored.min() < 0 or stored[1:].max(initial=0) > 1:
-        found = ", ".join(f"{channel.min():g} to {channel.max():g}" for channel in stored)
-        raise InputError(
-            f"{path} must hold ranges in metres, of 0 or more, and reflectances of [0, 1]; found {found}. Divide the "
-            "reflectances by what means full reflectance."
-        )
-    found = "x".join(map(str, image.shape[1:]))
+    size = "x".join(map(str, image.shape[1:]))
     if source is not None and image.shape[1] == source.shape[0]:
         return _seen(image, source.resized(columns=image.shape[2]), target)
     if source is not None or image.shape[1:] != target.shape:
-        wanted = "x".join(map(str, target.shape))
         advice = f"--from {source.name} has {source.shape[0]} rows" if source else "name its sensor by --from"
-        raise InputError(f"{path} is a range image of {found}, those of the model are {wanted}: {advice}.")
-    r = image[0]
-    if r.any() and not ((r >= target.min_range) & (r <= target.max_range)).any():
+        model = "x".join(map(str, target.shape))
+        raise InputError(f"{path} is a range image of {size}, those of the model are {model}: {advice}.")
+    known = image_of_same(image, target)
+    if image[0].any() and not known.image[0].any():
         raise InputError(
-            f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m, found "
-            f"{r[r > 0].min():g} to {r.max():g}. Are they metres?"
+            f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m. Are they metres?"
         )
-    return image_of_same(image, target)
+    return known
 
 
 def _read_set(scans: ScanSource, number: int, source: Sensor, target: Sensor) -> Partial:
@@ -264,19 +236,6 @@ def _content(scans: ScanSource, number: int) -> bytes:
 
 def _seen(image: np.ndarray, source: Sensor, target: Sensor) -> Partial:
     return image_of_same(image, target) if _same_image(source, target) else image_through(image, source, target)
-
-
-def _strength(path: Path, points: Points, scale: float, strict: bool) -> np.ndarray | None:
-    """Reflectance of [0, 1]; None where a file has none, or 0 throughout."""
-    if points.reflectance is None or not points.reflectance.any():
-        return None
-    scaled = points.reflectance / np.float32(scale)
-    if strict and not (float(scaled.max()) <= 1 + 1e-3 and float(scaled.min()) >= 0):
-        raise InputError(
-            f"{path}: reflectance must lie in [0, {scale:g}], found up to {points.reflectance.max():g}. Say what means "
-            "full reflectance there, often 255: --reflectance-scale 255."
-        )
-    return scaled.clip(0, 1)
 
 
 def _same_view(source: Sensor, target: Sensor) -> bool:
@@ -292,14 +251,14 @@ def _same_image(source: Sensor, target: Sensor) -> bool:
     return source.shape == target.shape and bool(np.allclose(source.elevations, target.elevations, atol=1e-3))
 
 
-def _is_image(path: Path) -> bool:
-    return path.suffix.lower() == ".npy" and read_range_image(path) is not None
-
-
-def _ending(path: Path) -> str:
-    return scan_ending(path.name) or path.suffix
-
-
-def _name(path: Path, folder: Path) -> str:
-    below = path.relative_to(folder) if path.is_relative_to(folder) else Path(path.name)
-    return str(below.with_name(below.name[: len(below.name) - len(_ending(path))]))
+def _strength(path: Path, points: Points, scale: float, strict: bool) -> np.ndarray | None:
+    """Reflectance of [0, 1]; None where a file has none, or 0 throughout."""
+    if points.reflectance is None or not points.reflectance.any():
+        return None
+    scaled = points.reflectance / np.float32(scale)
+    if strict and not (float(scaled.max()) <= 1 + 1e-3 and float(scaled.min()) >= 0):
+        raise InputError(
+            f"{path}: reflectance must lie in [0, {scale:g}], found up to {points.reflectance.max():g}. Say what means "
+            "full reflectance there, often 255: --reflectance-scale 255."
+        )
+    return scaled.clip(0, 1)

@@ -212,7 +212,7 @@ def test_known_pixels_stay_near_their_values():
     draws, shape = Draws(0, [0]), generator.noise_shape
     mask = torch.zeros(1, *shape)
     mask[:, :, ::4] = 1
-    told = {"image": torch.full((1, *shape), 0.5), "known": mask, "doubtful": torch.zeros_like(mask)}
+    told = {"image": torch.full((1, *shape), 0.5), "known": mask}
     made = generator.generate(draws.start(shape), told, draws=draws).x
     known, unknown = (made[:, :, start::4] for start in (0, 2))
     assert (known - 0.5).abs().mean() < (unknown - 0.5).abs().mean()

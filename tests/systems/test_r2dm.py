@@ -421,7 +421,7 @@ def test_a_scan_is_completed_with_a_diffusion_as_with_any_flow(exact):
     image = torch.full_like(noise, 0.25)
     known = torch.zeros_like(noise)
     known[..., ::2] = 1
-    condition = {"image": image * known, "known": known, "doubtful": torch.zeros_like(known)}
+    condition = {"image": image * known, "known": known}
     found = exact.generate(noise, condition, sampler=Sampler("replace", 500), draws=draws).x
     torch.testing.assert_close(found * known, image * known, rtol=0, atol=0)
     torch.testing.assert_close(found[..., 1::2], (exact.mean + exact.std * noise)[..., 1::2], rtol=0, atol=0.01)
