@@ -22,7 +22,7 @@ def compare(
     repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each backbone; 0 leaves them out.")] = 0,
     device: Annotated[str, typer.Option(help="Of these: auto, cpu, cuda, ...")] = "cpu",
 ) -> None:
-    """Set runs side by side: loss, straightness, fidelity, parameters, cost."""
+    """Set runs side by side: loss, straightness, parameters, cost."""
     from r2flow.reports.compare import Group, compare_page, group_runs, print_comparison, read_runs
     from r2flow.reports.pages import prepare_folder, write_page
 

@@ -10,7 +10,6 @@ import r2flow
 from r2flow.errors import InputError
 from r2flow.reports.pages import STYLES, Page, blank_figure, prepare_folder, write_page
 from r2flow.reports.tables import table
-from tests.test_cli import r2flow as verb  # noqa: F401  a fixture
 
 ROWS = [
     {"solver": "euler", "evaluations": 4, "error": 0.5},
@@ -97,38 +96,3 @@ def test_a_folder_that_cannot_be_one_is_refused_before_anything_is_measured(tmp_
     with pytest.raises(InputError, match=r"file is a file, not a folder; give another name"):
         prepare_folder(tmp_path / "file" / "reports")
     assert prepare_folder(tmp_path / "a" / "b").is_dir()
-
-
-@pytest.mark.parametrize("name", ["curvature", "work-precision", "stability"])
-def test_every_report_has_help_with_an_example(verb, name):  # noqa: F811
-    code, said, _ = verb("report", name, "--help")
-    assert code == 0
-    assert f"Example: r2flow report {name}" in " ".join(said.split())
-
-
-def test_stability_is_a_page_like_the_others(verb, tmp_path):  # noqa: F811
-    code, said, _ = verb(
-        "report", "stability", "-o", tmp_path / "s", "--problems", "gaussian", "--solvers", "euler,dopri5",
-        "--tolerances", "1e-2", "--scenes", 2,
-    )  # fmt: skip
-    assert code == 0
-    assert {path.name for path in (tmp_path / "s").iterdir()} == {
-        f"stability.{e}" for e in ("png", "csv", "json", "md")
-    }
-    assert "say so" in said
-    rows = json.loads((tmp_path / "s" / "stability.json").read_text())["rows"]
-    assert {row["solver"] for row in rows} == {"euler", "dopri5"}
-    assert len(rows) == 4 * 2  # precisions and solvers
-
-
-def test_bad_input_to_stability_is_one_line(verb, tmp_path):  # noqa: F811
-    for arguments, words in (
-        (("--problems", "gausian"), "Did you mean 'gaussian'?"),
-        (("--solvers", "eulr"), "Did you mean 'euler'?"),
-        (("--tolerances", "0"), "--tolerances must be positive numbers"),
-    ):
-        code, _, err = verb("report", "stability", *arguments, "-o", tmp_path / "s")
-        assert code == 2
-        assert words in err
-        assert len(err.splitlines()) == 1
-        assert not (tmp_path / "s").exists()
