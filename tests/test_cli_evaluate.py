@@ -176,7 +176,6 @@ def test_a_curve_names_the_solver_where_a_model_has_another_in_fewer_steps(r2flo
     )  # fmt: skip
     assert code == 0, err
     page = (tmp_path / "speed_quality.md").read_text()
-    assert "by chord, adams3; measured" in page
     assert [line.split(" | ")[1:3] for line in page.splitlines() if "map.safetensors | " in line] == [
         ["1", "chord"], ["2", "adams3"],
     ]  # fmt: skip

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -69,13 +70,7 @@ def measure_paths(
 ) -> Paths:
     """s(t) over `steps` Euler steps of scans 0 to num - 1 of a seed, and the most curved paths.
 
-    Takes 2 x steps evaluations a batch; the memory does not grow with `num`.
-
-    Args:
-        progress: Called after every evaluation of a batch.
-
-    Raises:
-        InputError: fewer than one step.
+    Takes 2 x steps evaluations a batch, `progress` after each; the memory does not grow with `num`.
     """
     flow = as_flow(checkpoint.generator, "curvature")
     scans: list[tuple[Tensor, ...]] = []  # s and squared length of each
@@ -102,47 +97,36 @@ def measure_paths(
 
 def curvature_rows(flows: Sequence[Paths]) -> list[dict[str, Any]]:
     """s(t) of every checkpoint and time: mean, least and most over the scans, as it is and over |d|^2."""
-    rows = []
-    for flow in flows:
-        for index, t in enumerate(flow.t):
-            row: dict[str, Any] = {"checkpoint": flow.label, "t": float(t)}
-            for name in ("s", "s_normalised"):
-                values = getattr(flow, name)[:, index]
-                row |= {name: float(values.mean()), f"{name}_least": float(values.min())}
-                row |= {f"{name}_most": float(values.max())}
-            rows.append(row)
-    return rows
+    return [
+        {"checkpoint": flow.label, "t": float(t)}
+        | {
+            f"{name}{end}": float(reduce(getattr(flow, name)[:, index]))
+            for name in ("s", "s_normalised")
+            for end, reduce in (("", np.mean), ("_least", np.min), ("_most", np.max))
+        }
+        for flow in flows
+        for index, t in enumerate(flow.t)
+    ]
 
 
 def summary(flow: Paths) -> dict[str, Any]:
     """One checkpoint in one row."""
     mean = flow.s.mean(0)
-    tenths = [_mean(mean[(flow.t >= k / 10) & (flow.t < (k + 1) / 10)]) for k in range(10)]
-    ends, middle = min(tenths[0], tenths[-1]), float(np.max(tenths[1:-1]))
+    whole = mean.sum() or math.nan
     return {
         "checkpoint": flow.label,
-        "scenes": len(flow.s),
+        "scans": len(flow.s),
         "integral": float(mean.mean()),
         "integral_normalised": float(flow.s_normalised.mean()),
         "t_of_most": float(flow.t[mean.argmax()]),
-        "first_tenth": _share(mean[flow.t < 0.1], mean),
-        "last_tenth": _share(mean[flow.t >= 0.9], mean),
-        "ends_over_middle": ends / middle if middle > 0 else math.nan,
+        "first_tenth": float(mean[flow.t < 0.1].sum() / whole),
+        "last_tenth": float(mean[flow.t >= 0.9].sum() / whole),
         "paths": len(flow.bends),
         "paths_share": len(flow.bends) / flow.elements,
         "paths_dropped": float(flow.dropped.mean()) if len(flow.dropped) else math.nan,
         "dropped_share": flow.dropped_share,
         "dropped_bend": flow.dropped_bend,
     }
-
-
-def _mean(part: np.ndarray) -> float:
-    """Mean; NaN of no steps, as where a path has fewer than ten."""
-    return float(part.mean()) if len(part) else math.nan
-
-
-def _share(part: np.ndarray, whole: np.ndarray) -> float:
-    return float(part.sum() / whole.sum()) if whole.sum() else math.nan
 
 
 COLUMNS = {
@@ -156,13 +140,12 @@ COLUMNS = {
 def curvature_text(flows: Sequence[Paths]) -> list[str]:
     """What s(t) is, and the flows in a table."""
     summaries = [summary(flow) for flow in flows]
-    row = summaries[0]
     about = (
         "s(t) = |(x_1 - x_0) - v(t, x_t)|^2 along the flow's own path (the paper's eq. 5), the mean over "
-        f"{row['scenes']} scans from the same noise and {len(flows[0].t)} Euler steps. It is 0 on a straight path, "
-        "which one step follows exactly. A flow that goes nowhere is straight too: compare int s dt over the squared "
-        f"length |x_1 - x_0|^2. The most curved paths are {row['paths']} ({row['paths_share']:.2%} of all pixels of "
-        "range and reflectance)."
+        f"{summaries[0]['scans']} scans from the same noise and {len(flows[0].t)} Euler steps. It is 0 on a straight "
+        "path, which one step follows exactly. A flow that goes nowhere is straight too: compare int s dt over the "
+        f"squared length |x_1 - x_0|^2. The most curved paths are {summaries[0]['paths_share']:.2%} of all pixels of "
+        "range and reflectance."
     )
     return [about, table(summaries, COLUMNS)]
 
@@ -172,14 +155,12 @@ def curvature_figure(flows: Sequence[Paths]) -> Figure:
     figure = blank_figure(10, 4.2)
     panels = {"s": "s(t) = |(x_1 - x_0) - v_t|²", "s_normalised": "s(t) / |x_1 - x_0|²"}
     for axes, (name, label) in zip(figure.subplots(1, 2), panels.items(), strict=True):
-        for index, flow in enumerate(flows):
-            style, found = STYLES[index % len(STYLES)], getattr(flow, name)
-            every = max(len(flow.t) // 8, 1)
-            # Markers begin at another step for each line, so that lines on top of each other stay apart.
-            marks = (index * every // len(flows), every)
-            axes.plot(flow.t, found.mean(0), **style, ms=5, lw=1.4, markevery=marks, label=flow.label)
-            if len(found) > 1:
-                axes.fill_between(flow.t, found.min(0), found.max(0), color=style["color"], alpha=0.12, lw=0)
+        for flow, style in zip(flows, cycle(STYLES), strict=False):
+            values = getattr(flow, name)
+            axes.plot(
+                flow.t, values.mean(0), **style, ms=5, lw=1.4, markevery=max(len(flow.t) // 8, 1), label=flow.label
+            )
+            axes.fill_between(flow.t, values.min(0), values.max(0), color=style["color"], alpha=0.12, lw=0)
         axes.set(xlabel="t  (0 noise, 1 data)", ylabel=label, xlim=(0, 1))
         if any((getattr(flow, name) > 0).any() for flow in flows):
             axes.set_yscale("log")
@@ -190,28 +171,22 @@ def curvature_figure(flows: Sequence[Paths]) -> Figure:
 
 def trajectories_figure(flows: Sequence[Paths]) -> Figure:
     """The most curved paths, a panel for each checkpoint: the paper's figure 8 (b)."""
-    columns = min(len(flows), 3)
-    rows = math.ceil(len(flows) / columns)
-    figure, titles = blank_figure(1 + 4.2 * columns, 4.2 * rows), short_labels([flow.label for flow in flows])
-    first = None
-    for index, flow in enumerate(flows):
-        axes = first = figure.add_subplot(rows, columns, index + 1, sharey=first)
-        times = np.append(flow.t, 1.0)
-        for dropped, style in ((False, {"color": "0.55", "ls": "-"}), (True, {"color": "#b5301c", "ls": (0, (4, 2))})):
+    figure = blank_figure(1 + 4.2 * len(flows), 4.2)
+    panels = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
+    for axes, flow, title in zip(panels, flows, short_labels([flow.label for flow in flows]), strict=True):
+        for dropped, style in ((False, {"color": "0.55", "ls": "-"}), (True, {"color": "#b5301c", "ls": "--"})):
             chosen = flow.trajectories[flow.dropped == dropped]
             label = f"ray ends {'dropped' if dropped else 'as a return'}: {len(chosen)}"
-            lines = axes.plot(times, chosen.T, lw=0.7, alpha=0.8, **style)
-            if lines:
-                lines[0].set_label(label)
-            axes.scatter(np.ones(len(chosen)), chosen[:, -1], s=9, marker="x" if dropped else "o",
-                         lw=0.7, color=style["color"], clip_on=False, zorder=3)  # fmt: skip
+            for number, values in enumerate(chosen):
+                axes.plot(
+                    np.append(flow.t, 1.0), values, lw=0.7, alpha=0.8, label=label if number == 0 else None, **style
+                )
         axes.set(xlabel="t  (0 noise, 1 data)", xlim=(0, 1))
-        axes.set_title(titles[index], fontsize=9)
-        if index % columns == 0:
-            axes.set_ylabel("value in model space (dotted: -1, ray-drop)")
+        axes.set_title(title, fontsize=9)
         axes.axhline(-1, color="black", lw=0.9, ls=":", zorder=4)
         # below the panel: paths are everywhere in it
         axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False)
+    panels[0].set_ylabel("value in model space (dotted: -1, ray-drop)")
     return figure
 
 
@@ -226,14 +201,8 @@ def short_labels(labels: Sequence[str]) -> list[str]:
 
 def curvature_page(flows: Sequence[Paths], seed: int, command: str, device: str = "cpu") -> Page:
     """The report on one checkpoint or several."""
-    paths = [
-        {"checkpoint": flow.label, "pixel": number, "bend": float(flow.bends[number]),
-         "dropped": bool(flow.dropped[number]), "values": [round(float(v), 3) for v in flow.trajectories[number]]}
-        for flow in flows
-        for number in range(len(flow.bends))
-    ]  # fmt: skip
     figures = {"curvature": curvature_figure(flows), "trajectories": trajectories_figure(flows)}
     return Page(
         "curvature", "How straight the flows are", curvature_text(flows), curvature_rows(flows), figures, command,
-        {"scenes": seed}, device, {"summary": [summary(flow) for flow in flows], "trajectories": paths},
+        {"scans": seed}, device, {"summary": [summary(flow) for flow in flows]},
     )  # fmt: skip

@@ -4,7 +4,7 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import cycle, product
 from pathlib import Path
 from typing import Any
 
@@ -183,39 +183,39 @@ def speed_quality_page(
         figures: False while it is still being measured.
     """
     drawing, keys = curve.drawings[0], {row["key"] for row in rows}
-    solvers = list(dict.fromkeys(row["solver"] for row in rows))
     # METRIC/FIGURE, without the ends of its interval
     names = [n for n in dict.fromkeys(n for row in rows for n in row) if "/" in n and not n.endswith(ENDS)]
     headings = {name: heading(*name.split("/", 1)) for name in names}
-    columns = {"flow": "flow", "steps": "steps"}
-    if len(solvers) > len(curve.drawings):  # a flow may have another in fewer steps
-        columns["solver"] = "solver"
-    columns |= {"evaluations": "evaluations", "seconds": "s a scan"}
+    columns = {
+        "flow": "flow",
+        "steps": "steps",
+        "solver": "solver",
+        "evaluations": "evaluations",
+        "seconds": "s a scan",
+    }
     columns |= {name: said for name, (said, _) in headings.items()}
     printed = [
         {**row, **{n: _shown(row, n, factor) for n, (_, factor) in headings.items() if n in row}} for row in rows
     ]
-    sampled = (
-        f"{drawing.num} scans of seed {drawing.seed} at every point, from the same noise, by "
-        f"{', '.join(solvers)}; measured against {len(curve.real)} scans of {curve.real.label}, "
-        f"under the protocol `{curve.gathered.protocol.name}`. "
-        "Seconds are those of the network and its solver, the median over batches."
+    about = (
+        f"{drawing.num} scans of seed {drawing.seed} at every point, from the same noise, against {len(curve.real)} "
+        f"scans of {curve.real.label}, under the protocol `{curve.gathered.protocol.name}`. Seconds are those of the "
+        "network and its solver, the median over batches."
     )
-    text = [sampled, table(printed, columns), *_remarks(rows)]
+    remarks = dict.fromkeys(remark for row in rows for remark in row["remarks"].split(BETWEEN) if remark)
+    protocol = curve.gathered.protocol.describe()
     more: dict[str, Sequence[Mapping[str, Any]]] = {
         "protocols": [
-            {
-                **curve.gathered.protocol.describe(),
-                **metric.protocol.asdict(),
-                "real_chosen": curve.gathered.rules[name],
-            }
+            {**protocol, **metric.protocol.asdict(), "real_chosen": curve.gathered.rules[name]}
             for name, metric in curve.metrics.items()
         ],
         "other_points": [row for row in done if row["key"] not in keys],
     }
     drawn = {NAME: speed_quality_figure(rows, names)} if figures and names else {}
-    seeds = {"sampled scans": drawing.seed}
-    return Page(NAME, "Quality against speed", text, rows, drawn, command, seeds, curve.device, more)
+    text = [about, table(printed, columns), *(["\n".join(f"- {remark}" for remark in remarks)] if remarks else [])]
+    return Page(
+        NAME, "Quality against speed", text, rows, drawn, command, {"sampled scans": drawing.seed}, curve.device, more
+    )
 
 
 def _shown(row: Mapping[str, Any], name: str, factor: float) -> float | str:
@@ -223,19 +223,6 @@ def _shown(row: Mapping[str, Any], name: str, factor: float) -> float | str:
     low, high = (row.get(f"{name}{end}") for end in ENDS)
     value: float = row[name] * factor
     return value if low is None or high is None else f"{shown(value)} ({shown(low * factor)} to {shown(high * factor)})"
-
-
-def _remarks(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Each remark once, with the points it is about."""
-    found: dict[str, list[str]] = {}
-    for row in rows:
-        for remark in filter(None, row["remarks"].split(BETWEEN)):
-            found.setdefault(remark, []).append(f"{row['flow']} at {row['steps']}")
-    lines = [
-        f"- {'every point' if len(points) == len(rows) else ', '.join(points)}: {remark}"
-        for remark, points in found.items()
-    ]
-    return ["\n".join(lines)] if lines else []
 
 
 def speed_quality_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Figure:
@@ -249,23 +236,15 @@ def speed_quality_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]
     for (line, (x, label)), (column, name) in product(enumerate(AXES), enumerate(first.values())):
         axes = panels[line, column]
         said, factor = heading(*name.split("/", 1))
-        for number, flow in enumerate(flows):
+        for flow, style in zip(flows, cycle(STYLES), strict=False):
             own = sorted((row for row in rows if row["flow"] == flow), key=lambda row: row[x])
-            values = [row.get(name, math.nan) * factor for row in own]
-            style = STYLES[number % len(STYLES)]
-            axes.plot([row[x] for row in own], values, **style, ms=5, lw=1.2, label=flow)
+            at = [row[x] for row in own]
+            axes.plot(at, [row.get(name, math.nan) * factor for row in own], **style, ms=5, lw=1.2, label=flow)
             ends = [[row.get(f"{name}{end}", math.nan) * factor for row in own] for end in ENDS]
-            axes.vlines([row[x] for row in own], *ends, color=style["color"], lw=0.8)
-        axes.set(xscale="log", xlabel=label, ylabel=said)
-        values = [row[name] for row in rows if row.get(name, 0) > 0]
-        if values and max(values) > 20 * min(values):
-            axes.set_yscale("log")
-        if x == "seconds":
-            few_log_ticks(axes.xaxis)
-        else:
-            ticks = sorted({row[x] for row in rows})
-            axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-            axes.set_xticks([], minor=True)
+            axes.vlines(at, *ends, color=style["color"], lw=0.8)
+        positive = all(row[name] > 0 for row in rows if name in row)
+        axes.set(xscale="log", yscale="log" if positive else "linear", xlabel=label, ylabel=said)
+        few_log_ticks(axes.xaxis)
         axes.grid(True, which="major", color="0.88", lw=0.6)
         axes.tick_params(labelsize=8)
     handles, labels = figure.axes[0].get_legend_handles_labels()

@@ -1,6 +1,5 @@
 import json
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from r2flow.lidar.space import ModelSpace
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import Draws
 from r2flow.reports.curvature import (
-    Paths,
     curvature_page,
     curvature_rows,
     measure_paths,
@@ -113,21 +111,13 @@ def test_a_flow_that_goes_nowhere_has_no_normalised_integral():
     assert "| still | 0 | - |" in page.text[1]
 
 
-def test_panels_are_named_by_the_end_of_their_path_and_tell_their_lines_below():
+def test_panels_are_named_by_the_end_of_their_path():
     labels = ["/a/b/runs/x/rf1", "/a/b/runs/x/rf2", "/a/b/runs/y/rf1"]
     assert short_labels(labels) == ["x/rf1", "x/rf2", "y/rf1"]
     assert short_labels(["one/x/rf", "two/x/rf"]) == ["one/x/rf", "two/x/rf"]
     assert short_labels(["rf.ckpt"]) == ["rf.ckpt"]
     figure = trajectories_figure([measure_paths(checkpoint(Falling()), label, 1, STEPS, 0) for label in labels])
-    figure.canvas.draw()
     assert [axes.get_title() for axes in figure.axes] == ["x/rf1", "x/rf2", "y/rf1"]
-    titles = [axes.title.get_window_extent() for axes in figure.axes]
-    assert all(left.x1 < right.x0 for left, right in pairwise(titles))
-    for axes in figure.axes:
-        legend = axes.get_legend().get_window_extent()
-        assert legend.y1 < axes.get_window_extent().y0
-        assert legend.y0 >= 0
-        assert legend.y1 < axes.xaxis.label.get_window_extent().y0
 
 
 def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
@@ -142,7 +132,6 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
     assert str(out / "curvature.md") in said
     content = json.loads((out / "curvature.json").read_text())
     assert len(content["rows"]) == 2 * 4
-    assert len(content["trajectories"]) == 2 * 9
     assert {row["checkpoint"] for row in content["summary"]} == {str(path), str(copy)}
     assert content["origin"]["command"].startswith(f"r2flow report curvature -c {path}")
 
@@ -158,12 +147,3 @@ def test_bad_input_is_one_line(r2flow, saved, tmp_path):  # noqa: F811
         assert words in err
         assert len([line for line in err.splitlines() if not line.startswith("WARNING")]) == 1
         assert not (tmp_path / "o").exists()
-
-
-@pytest.mark.parametrize(("steps", "expected"), [(20, 4 / 5), (25, 4 / 5), (8, math.nan)])
-def test_the_ends_are_compared_with_the_most_curved_tenth_between(steps, expected):
-    t = np.arange(steps) / steps
-    s = np.select([t < 0.1, t >= 0.9, (t >= 0.4) & (t < 0.5)], [4.0, 6.0, 5.0], 1.0)[None]
-    none = np.zeros(0)
-    paths = Paths("by hand", t, s, np.ones(1), 1, none, none, none, 0.1, 0.1)
-    assert summary(paths)["ends_over_middle"] == pytest.approx(expected, nan_ok=True)
