@@ -204,8 +204,9 @@ def test_repaint_is_the_published(shared):
     model = network(case).eval()
     for one in case["cases"].values():
         start, *draws = one["noise"]
+        log_snrs = Cosine()(torch.linspace(1, 0, one["num_steps"] * one["jump_length"] + 1, dtype=torch.float64))
         found = repaint(
-            clean(model), start, case["known"], case["mask"], Cosine(), one["num_steps"], iter(draws).__next__,
+            clean(model), start, case["known"], case["mask"], log_snrs, iter(draws).__next__,
             one["num_resample_steps"], one["jump_length"],
         )  # fmt: skip
         states = torch.stack([start, *found])
@@ -222,12 +223,11 @@ def test_repaint_draws_as_often_as_its_steps_parts_and_repeats_say():
 
     known = torch.ones(1, 1, 2, 2)
     mask = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
-    states = list(repaint(lambda z, _: torch.zeros_like(z), known, known, mask, Cosine(), 3, noise, 2, 4))
+    log_snrs = Cosine()(torch.linspace(1, 0, 13, dtype=torch.float64))
+    states = list(repaint(lambda z, _: torch.zeros_like(z), known, known, mask, log_snrs, noise, 2, 4))
     assert len(states) == 2 + 2 + 1  # the last step is not repeated
     assert len(drawn) == 5 * 4 * 2 + 2 * 4  # known pixels and ancestral step on the way down, one on the way up
     torch.testing.assert_close(states[-1][0, 0], mask, rtol=0, atol=1e-6)
-    with pytest.raises(InputError, match="at least 1; found 3, 0, 1"):
-        next(repaint(lambda z, _: z, known, known, mask, Cosine(), 3, noise, repeats=0))
 
 
 FORMATS = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric"}

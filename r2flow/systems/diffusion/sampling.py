@@ -97,27 +97,25 @@ def walk(denoise: Denoise, z: Tensor, log_snrs: Tensor, eta: float, noise: Noise
 def repaint(
     denoise: Denoise,
     z: Tensor,
+    image: Tensor,
     known: Tensor,
-    mask: Tensor,
-    log_snr: Callable[[Tensor], Tensor],
-    steps: int,
+    log_snrs: Tensor,
     noise: Noise,
     repeats: int = 1,
     jump: int = 1,
 ) -> Iterator[Tensor]:
     """Complete images of which a part is known: that part is noised to each level, the rest is walked (RePaint).
 
-    Each step from t to s goes down in `jump` equal parts, whose known pixels are drawn afresh, then back up to t by
-    forward steps and down again, `repeats` times in all, so that the two parts come to agree (Lugmayr et al. 2022,
-    algorithm 1, with resampling inside each step). The last step is taken once.
+    Each step goes down in `jump` parts, whose known pixels are drawn afresh, then back up by forward steps and down
+    again, `repeats` times in all, so that the two parts come to agree (Lugmayr et al. 2022, algorithm 1, with
+    resampling inside each step). The last step is taken once. Evaluations: jump (repeats (N - 1) + 1).
 
     Args:
         denoise: The expected data behind (z, lambda).
         z: Noise, (B, ...).
-        known: Data, (B, ...).
-        mask: 1 where it is known, 0 elsewhere, in a shape that multiplies it.
-        log_snr: Schedule, of times from 1 (noise) to 0 (data).
-        steps: Equal steps from t = 1 to t = 0.
+        image: Data, (B, ...).
+        known: Where they are known, bool or 0 and 1.
+        log_snrs: Rising, (N jump + 1,) for N steps.
         noise: Asked, in each part of a step, for the known pixels and for the ancestral step, and once in each
             part on the way up.
         repeats: Times that each step is taken.
@@ -125,21 +123,15 @@ def repaint(
 
     Returns:
         The state at the end of each step, repeated ones too; the last is the completed image.
-
-    Raises:
-        InputError: steps, repeats or jump below 1.
     """
-    if min(steps, repeats, jump) < 1:
-        raise InputError(f"RePaint needs steps, repeats and a jump of at least 1; found {steps}, {repeats}, {jump}.")
-    times = torch.linspace(1, 0, steps * jump + 1, dtype=torch.float64)
-    levels = [log_snr(times[n * jump : (n + 1) * jump + 1]) for n in range(steps)]
-    for n, lambdas in enumerate(levels, start=1):
-        for repeat in range(1, repeats + 1):
-            for here, there in pairwise(lambdas):
-                seen = noised(known, there, noise())
-                z = mask * seen + (1 - mask) * step(z, denoise(z, here), here, there, 1.0, noise())
+    for first in range(0, len(log_snrs) - 1, jump):
+        levels = log_snrs[first : first + jump + 1]
+        last = first + jump == len(log_snrs) - 1
+        for repeat in range(1 if last else repeats):
+            if repeat:
+                for here, there in pairwise(levels.flip(0)):
+                    z = forward_step(z, here, there, noise())
+            for here, there in pairwise(levels):
+                seen = noised(image, there, noise())
+                z = torch.where(known > 0, seen, step(z, denoise(z, here), here, there, 1.0, noise()))
             yield z
-            if repeat == repeats or n == steps:
-                break
-            for here, there in pairwise(lambdas.flip(0)):
-                z = forward_step(z, here, there, noise())
