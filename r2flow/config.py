@@ -38,6 +38,7 @@ OF_SCANS = Key(links="scans")
 
 RULES: dict[str, Key] = {
     "experiment": OF_THE_CHAIN,
+    "size": OF_THE_CHAIN,
     "hydra": OF_THE_CHAIN,
     "name": OF_THE_CHAIN,
     "run_dir": OF_THE_CHAIN,

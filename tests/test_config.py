@@ -49,7 +49,7 @@ def test_the_key_of_an_override(override: str, key: str):
 
 
 def test_every_rule_is_of_a_key_that_exists():
-    keys = {key for key, _ in flatten(CONFIG)} | {"experiment", "hydra", "parent.path", "data.parts.*.root"}
+    keys = {key for key, _ in flatten(CONFIG)} | {"experiment", "size", "hydra", "parent.path", "data.parts.*.root"}
     keys |= {"data.validation.data.root", "data.scans.root", *(f"callbacks.{name}" for name in CALLBACKS)}
     keys |= {key for key, _ in flatten(compose(["backbone=pyramid"]))}
     for key in RULES:
@@ -105,7 +105,7 @@ def test_where_conf_and_a_constructor_say_a_default_it_is_the_same(group: str):
 
 
 def test_the_groups_of_conf_are_groups_of_the_default_config():
-    folders = {path.name for path in CONF.iterdir() if path.is_dir()} - {"hydra", "experiment"}
+    folders = {path.name for path in CONF.iterdir() if path.is_dir()} - {"hydra", "experiment", "size"}
     config = compose([])
     assert folders == {key for key in config if choices(key)}
     assert all(isinstance(config[group], dict) for group in folders)

@@ -37,11 +37,11 @@ def endless(network: nn.Module, count: int) -> None:
         ([*TINY, "+generator.name=flow_map"], Sampler("jump", 1)),
         ([*TINY, "+generator.name=flow_map"], Sampler("jump", 3)),
         ([*TINY, "+generator.name=flow_map"], Sampler("renoise:1", 2)),
-        (["experiment=r2dm_small", "+generator.name=diffusion"], Sampler("ddpm", 2)),
-        (["experiment=r2dm_small", "+generator.name=diffusion"], Sampler("ddim:0", 1)),
-        (["experiment=lidargen_small", "generator.levels=2", "generator.width=4"], Sampler("langevin", 1)),
-        (["experiment=vanilla_gan_small", "generator.base_channels=4"], Sampler("direct", 1)),
-        (["experiment=dusty2_small", "generator.base_channels=4"], Sampler("direct", 1)),
+        (["experiment=r2dm", "size=small", "+generator.name=diffusion"], Sampler("ddpm", 2)),
+        (["experiment=r2dm", "size=small", "+generator.name=diffusion"], Sampler("ddim:0", 1)),
+        (["experiment=lidargen", "size=small", "generator.levels=2", "generator.width=4"], Sampler("langevin", 1)),
+        (["experiment=vanilla_gan", "size=small", "generator.base_channels=4"], Sampler("direct", 1)),
+        (["experiment=dusty2", "size=small", "generator.base_channels=4"], Sampler("direct", 1)),
     ],
 )
 def test_a_scan_that_leaves_the_numbers_is_flagged_whatever_is_clamped(words: list[str], sampler: Sampler):

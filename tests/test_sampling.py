@@ -287,7 +287,7 @@ def test_the_region_that_is_all_changes_nothing():
 
 def test_what_makes_whole_images_alone_makes_the_region_that_is_all():
     size = ["sensor.rows=16", "sensor.columns=32", "encoding.reflectance=true"]
-    gan = build_generator(compose(["experiment=vanilla_gan_small", "generator.base_channels=4", *size])).eval()
+    gan = build_generator(compose(["experiment=vanilla_gan", "size=small", "generator.base_channels=4", *size])).eval()
     (part,) = sample(gan, 1, region=region((16, 32)))
     (whole,) = sample(gan, 1)
     assert torch.equal(part.images, whole.images)
@@ -404,7 +404,7 @@ def test_seeds_of_numpy_are_those_of_python():
 @pytest.mark.parametrize("method", ["ddim:0", "ddpm"])
 def test_a_diffusion_walks_noise_of_half_precision_in_float32(method):
     size = ["sensor.rows=16", "sensor.columns=32", "encoding.reflectance=true", "backbone.base_channels=8"]
-    walker = build_generator(compose(["experiment=r2dm_small", "+generator.name=diffusion", *size])).eval()
+    walker = build_generator(compose(["experiment=r2dm", "size=small", "+generator.name=diffusion", *size])).eval()
     draws = Draws(0, range(2))
     noise, how = draws.start(walker.noise_shape).bfloat16(), Sampler(method, 4)
     half, full = (walker.generate(one, sampler=how, draws=draws).x for one in (noise, noise.float()))

@@ -198,6 +198,8 @@ def as_hydra_takes(overrides: Sequence[str]) -> list[str]:
             raise InputError(f"{text}: every run has its {key}; give {key}=VALUE.")
         named = isinstance(value, dict) and "name" in value and "." in key and not key.startswith("chain.")
         found += [f"{key}=null", f"++{text}"] if named and parsed.type == OverrideType.CHANGE else [text]
+    if "size=small" in found and not any(re.match(r"\+?experiment=[^\[]", text) for text in found):
+        raise InputError("size=small is a form of one experiment: give experiment=NAME, such as r2dm.")
     return found
 
 

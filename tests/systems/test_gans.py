@@ -461,11 +461,11 @@ TINY = [
 
 @functools.cache
 def composed(system: str) -> dict[str, Any]:
-    return compose([f"experiment={system}_small", *TINY])
+    return compose([f"experiment={system}", "size=small", *TINY])
 
 
 def tiny(system: str, *more: str) -> dict[str, Any]:
-    return compose([f"experiment={system}_small", *TINY, *more]) if more else copy.deepcopy(composed(system))
+    return compose([f"experiment={system}", "size=small", *TINY, *more]) if more else copy.deepcopy(composed(system))
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
@@ -567,7 +567,7 @@ def test_two_processes_equal_one(tmp_path: Path):
     for name, more in (("one", []), ("two", ["trainer.devices=2", "trainer.strategy=ddp"])):
         options = [*TINY, *RUN, "trainer.max_steps=3", "data.batch_size=8", f"run_dir={tmp_path / name}", *more]
         done = subprocess.run(
-            [sys.executable, str(ROOT / "train.py"), "experiment=dusty2_small", *options],
+            [sys.executable, str(ROOT / "train.py"), "experiment=dusty2", "size=small", *options],
             capture_output=True, text=True, timeout=300, check=False, cwd=tmp_path,
         )  # fmt: skip
         assert done.returncode == 0, done.stdout + done.stderr

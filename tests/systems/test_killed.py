@@ -17,16 +17,16 @@ TINY = [
 ]  # fmt: skip
 FLOW = [*TINY, "callbacks.checkpoint.every=2", "stage.warmup_images=4"]
 FAMILIES = {
-    "diffusion": ["experiment=r2dm_small", *FLOW, "backbone.base_channels=8"],
-    "score": ["experiment=lidargen_small", *FLOW, "generator.width=4", "generator.levels=4"],
-    "latent": ["experiment=lidm_small", *FLOW, "generator.autoencoder.codes=16", "stage.init=first"],
+    "diffusion": ["experiment=r2dm", "size=small", *FLOW, "backbone.base_channels=8"],
+    "score": ["experiment=lidargen", "size=small", *FLOW, "generator.width=4", "generator.levels=4"],
+    "latent": ["experiment=lidm", "size=small", *FLOW, "generator.autoencoder.codes=16", "stage.init=first"],
     "gan": [
-        "experiment=dusty2_small", *TINY, "callbacks.checkpoint.every=2", "generator.base_channels=4",
+        "experiment=dusty2", "size=small", *TINY, "callbacks.checkpoint.every=2", "generator.base_channels=4",
         "stage.discriminator.base_channels=4", "stage.warmup.images=4", "stage.augment.initial=0.5",
         "stage.augment.kimg=0.1", "stage.augment.every=2", "stage.r1_every=2",
     ],
 }  # fmt: skip
-FIRST = ["experiment=lidm_autoencoder_small", *TINY, "trainer.max_steps=3", "generator.autoencoder.codes=16"]
+FIRST = ["experiment=lidm_autoencoder", "size=small", *TINY, "trainer.max_steps=3", "generator.autoencoder.codes=16"]
 
 
 @pytest.mark.slow

@@ -18,11 +18,11 @@ TINY = [
     "trainer.enable_progress_bar=false", "callbacks.checkpoint.every=2", "callbacks.pictures=null", "samples.num=0",
     "stage.warmup_images=0", "loggers=[csv]",
 ]  # fmt: skip
-SCORE = ["experiment=lidargen_small", *TINY, "generator.width=4", "generator.levels=4"]
+SCORE = ["experiment=lidargen", "size=small", *TINY, "generator.width=4", "generator.levels=4"]
 FIRST = [
-    "experiment=lidm_autoencoder_small", *TINY, "generator.autoencoder.codes=16", "stage.adversarial_start=2",
+    "experiment=lidm_autoencoder", "size=small", *TINY, "generator.autoencoder.codes=16", "stage.adversarial_start=2",
 ]  # fmt: skip
-SECOND = ["experiment=lidm_ape_small", *TINY, "generator.autoencoder.codes=16"]
+SECOND = ["experiment=lidm_ape", "size=small", *TINY, "generator.autoencoder.codes=16"]
 FULL = {"lidargen": 29_694_082, "lidm_autoencoder": 15_070_361}
 
 

@@ -510,7 +510,8 @@ def test_what_a_diffusion_cannot_do_is_said(exact):
 
 
 TINY = [
-    "experiment=r2dm_small", "sensor.rows=8", "sensor.columns=32", "backbone.base_channels=8", "backbone.dropout=0.1",
+    "experiment=r2dm", "size=small", "sensor.rows=8", "sensor.columns=32", "backbone.base_channels=8",
+    "backbone.dropout=0.1",
     "backbone.channel_multiplier=[1,2]", "backbone.num_residual_blocks=1", "backbone.time_channels=16",
     "data.scenes=12", "data.batch_size=4", "data.validation.scans=2", "trainer.accelerator=cpu", "trainer.max_steps=4",
     "trainer.val_check_interval=2", "callbacks.checkpoint.every=2", "callbacks.pictures=null", "sampler.steps=2",
