@@ -404,7 +404,7 @@ def test_seeds_of_numpy_are_those_of_python():
 @pytest.mark.parametrize("method", ["ddim:0", "ddpm"])
 def test_a_diffusion_walks_noise_of_half_precision_in_float32(method):
     size = ["sensor.rows=16", "sensor.columns=32", "encoding.reflectance=true", "backbone.base_channels=8"]
-    walker = build_generator(compose(["experiment=r2dm", "size=small", "+generator.name=diffusion", *size])).eval()
+    walker = build_generator(compose(["experiment=r2dm", "size=small", *size])).eval()
     draws = Draws(0, range(2))
     noise, how = draws.start(walker.noise_shape).bfloat16(), Sampler(method, 4)
     half, full = (walker.generate(one, sampler=how, draws=draws).x for one in (noise, noise.float()))
