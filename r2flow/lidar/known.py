@@ -51,8 +51,6 @@ def every_row(step: float, first: float = 0) -> Mask:
         raise InputError(f"rows:STEP,FIRST are whole numbers, STEP of at least 1, found {step:g} and {first:g}.")
 
     def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
-        if first >= shape[0]:
-            raise InputError(f"the mask begins at row {first:g}, and the image has rows 0 to {shape[0] - 1}.")
         measured = np.zeros(shape, dtype=bool)
         measured[int(first) :: int(step)] = True
         return measured
@@ -62,13 +60,13 @@ def every_row(step: float, first: float = 0) -> Mask:
 
 def random_rows(share: float) -> Mask:
     """A random share of the rows."""
-    _check_share("random", share)
+    _check_share(share)
     return lambda shape, draws: np.repeat(_chosen(shape[0], share, draws)[:, None], shape[1], axis=1)
 
 
 def random_points(share: float) -> Mask:
     """A random share of the rays."""
-    _check_share("points", share)
+    _check_share(share)
     return lambda shape, draws: _chosen(math.prod(shape), share, draws).reshape(shape)
 
 
@@ -93,7 +91,7 @@ def parse_mask(text: str) -> Mask:
     """A mask by its text: `NAME:NUMBERS` of `MASKS`, a .npy file, or several joined by +, which must all measure a ray.
 
     Raises:
-        InputError: no such mask, numbers that it does not take, or a file that is no mask.
+        InputError: no such mask, numbers that it does not take, or a file without a mask.
     """
     parts = [_one_mask(part.strip()) for part in text.split("+")]
     return lambda shape, draws: np.logical_and.reduce([part(shape, draws) for part in parts])
@@ -119,29 +117,26 @@ def _one_mask(text: str) -> Mask:
     except InputError:
         raise
     except (ValueError, TypeError):
-        raise InputError(f"the mask {text!r} does not say its numbers: give {FORMS}.") from None
+        raise InputError(f"the mask {text!r} lacks its numbers: give {FORMS}.") from None
 
 
 def _from_file(path: Path) -> Mask:
-    held = read_numbers(path)
-    if held.ndim != 2 or not (held.dtype == bool or (held.dtype.kind in "iuf" and np.isin(held, (0, 1)).all())):
-        raise InputError(
-            f"the mask {path} must be an array (H, W) of true where a ray is measured, or of 0 and 1; found "
-            f"{held.dtype} of shape {held.shape}."
-        )
+    measured = read_numbers(path)
+    if measured.ndim != 2 or not np.isin(measured, (0, 1)).all():
+        raise InputError(f"the mask {path} must be an array (H, W) of booleans, found {measured.dtype} of "
+                         f"{measured.shape}.")  # fmt: skip
 
     def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
-        if held.shape != tuple(shape):
-            raise InputError(f"the mask {path} is of {held.shape[0]} x {held.shape[1]}, the scans are of "
-                             f"{shape[0]} x {shape[1]} rays.")  # fmt: skip
-        return held.astype(bool)
+        if measured.shape != tuple(shape):
+            raise InputError(f"the mask {path} is of {measured.shape}, the scans are of {tuple(shape)} rays.")
+        return measured.astype(bool)
 
     return mask
 
 
-def _check_share(name: str, share: float) -> None:
+def _check_share(share: float) -> None:
     if not 0 <= share <= 1:
-        raise InputError(f"{name}:SHARE is the share that is measured, from 0 to 1, found {share:g}.")
+        raise InputError(f"a share of measured rays lies in [0, 1], found {share:g}.")
 
 
 def _chosen(count: int, share: float, draws: np.random.Generator) -> np.ndarray:

