@@ -54,15 +54,12 @@ def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
         raise InputError(f"the images to complete must be (B, 2 or 1, {h}, {w}), found {tuple(images.shape)}.")
     if state.shape != images[:, 0].shape:
         raise InputError(f"the states of the rays must be {tuple(images[:, 0].shape)}, found {tuple(state.shape)}.")
-    odd = state[~torch.isin(state, torch.tensor(list(map(int, Ray)), device=state.device))]
-    if len(odd):
-        raise InputError(f"the state of a ray must be one of r2flow.lidar.known.Ray, found {odd[0].item():g}.")
-    returned = images[:, 0] > 0
-    if bool((returned & (state == Ray.EMPTY)).any()) or bool((~returned & (state == Ray.RETURN)).any()):
-        raise InputError("a ray with a return must have a range above 0, an empty one the range 0.")
+    returned, seen = images[:, 0] > 0, state != Ray.UNKNOWN
+    if bool((seen & (state != torch.where(returned, int(Ray.RETURN), int(Ray.EMPTY)))).any()):
+        raise InputError("the state of a measured ray is Ray.RETURN where its range is above 0 and Ray.EMPTY where it "
+                         "is 0, and of another ray Ray.UNKNOWN.")  # fmt: skip
     encoding = space.encoding
     silent = encoding.reflectance and images.shape[1] == 1
-    seen = state != Ray.UNKNOWN
     guesses = np.stack([interpolated(x, m) for x, m in zip(images.cpu().numpy(), seen.cpu().numpy(), strict=True)])
     filled = torch.where(seen[:, None], images, torch.from_numpy(guesses).to(images))
     image = encoding.encode(torch.cat([filled, torch.zeros_like(filled)], 1) if silent else filled)

@@ -83,7 +83,7 @@ def test_a_scan_without_reflectance_knows_that_of_its_empty_rays_alone(flow, sca
 
 def test_states_that_contradict_the_image_are_refused(flow, scans):
     for state in (Ray.RETURN, Ray.EMPTY):
-        with pytest.raises(InputError, match="a ray with a return must have a range"):
+        with pytest.raises(InputError, match="the state of a measured ray"):
             condition_of(flow.space, scans, torch.full((3, 8, 32), int(state), dtype=torch.uint8))
     with pytest.raises(InputError, match=r"\(B, 2 or 1, 8, 32\)"):
         condition_of(flow.space, scans[..., :16], measured(scans[..., :16]))
