@@ -2,12 +2,15 @@
 
 import errno
 import io
+import logging
 import os
 import sys
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 
 class InputError(ValueError):
@@ -68,16 +71,46 @@ def explain_mistake(error: InputError | OSError) -> str:
 
 
 def one_line(text: str) -> str:
-    """A text of which a file's name may be part, with whatever that holds, as one line that every terminal takes."""
-    return "\\n".join(printable(text).strip().splitlines())
+    """A text that may hold a file's name, as one line that every terminal takes."""
+    return printable("\\n".join(text.strip().splitlines()))
 
 
 def printable(text: str) -> str:
-    """A text of which a file's name may be part: bytes of it that are no UTF-8 as \\udcff."""
-    return text.encode("utf-8", "backslashreplace").decode()
+    """A text that may hold a file's name, with control characters and bytes that are not UTF-8 escaped."""
+    safe = (c == "\n" or unicodedata.category(c)[0] != "C" for c in text)
+    return "".join(c if plain else c.encode("unicode_escape").decode() for c, plain in zip(text, safe, strict=True))
 
 
-def print_any_name() -> None:
-    """Have standard output take such names, as standard error does."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
+class PlainFormatter(logging.Formatter):
+    """Log lines without control characters of file names."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
+
+
+class _Unbroken(io.FileIO):
+    """A descriptor that takes everything, also after its reader (`| head`) has ended."""
+
+    def write(self, data: Any) -> int | None:
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, self.fileno())
+            os.close(null)
+            return len(data)
+
+
+def open_streams() -> None:
+    """Let standard output and error take any file name, outlive their reader, and exist in a daemon."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (to the end)
+        elif stream is getattr(sys, f"__{name}__"):
+            stream.flush()
+            raw = io.BufferedWriter(_Unbroken(stream.fileno(), "w", closefd=False))
+            lines = name == "stderr" or stream.isatty()
+            setattr(sys, name, io.TextIOWrapper(raw, stream.encoding, "backslashreplace", line_buffering=lines))
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")

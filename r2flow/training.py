@@ -9,6 +9,7 @@ The same command again, and the same config, go on from the last checkpoint.
 """
 
 import logging
+import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -61,6 +62,10 @@ EXPECTED_WARNINGS = (
     "The dirpath has changed from.*",
     "Using ModelCheckpoint with manual optimization.*",
 )
+
+
+# What gloo and NCCL say when the process at the other end has ended.
+PEER_LOST = r"(?i)connection (closed|reset)|remote process exited|gloo.*(timed out|read error|write error)|NCCL"
 
 
 @dataclass(frozen=True)
@@ -346,7 +351,12 @@ def _fit_in_folder(run: Run) -> int:
         log.info("going on from %s", last)
     if run.trainer.is_global_zero:
         log_config(run.trainer.loggers, run.config)
-    run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)
+    try:
+        run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)
+    except RuntimeError as error:
+        if run.trainer.world_size > 1 and re.search(PEER_LOST, str(error)):
+            raise InputError("a process of this run on another device ended; the same command resumes.") from error
+        raise
     return run.trainer.global_step
 
 

@@ -27,9 +27,9 @@ def compare(
     from r2flow.reports.pages import prepare_folder, write_page
 
     where = choose_device(device)
+    found = read_runs(runs, repeats, where)
     if out is not None:
         prepare_folder(out)
-    found = read_runs(runs, repeats, where)
     groups = group_runs(found) if group else [Group(run.label, (run,)) for run in found]
     print_comparison(groups)
     if out is not None:

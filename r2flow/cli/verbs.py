@@ -1,11 +1,9 @@
 """Every verb, and how one is run."""
 
 import logging
-import os
 import re
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import typer
@@ -32,7 +30,7 @@ from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     weights,
 )
 from r2flow.cli.app import app
-from r2flow.errors import InputError, explain_mistake, one_line, print_any_name
+from r2flow.errors import InputError, PlainFormatter, explain_mistake, one_line, open_streams
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.signals import Stopped, listening, stop_at_once
 
@@ -57,11 +55,10 @@ def run() -> None:
 
 
 def _run() -> None:
-    for name in ("stdout", "stderr"):  # None where it was closed, as in a daemon
-        if getattr(sys, name) is None:
-            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 (to the end)
-    print_any_name()
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", force=True)
+    open_streams()
+    handler = logging.StreamHandler()
+    handler.setFormatter(PlainFormatter("%(levelname)s %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     try:
         if "" in sys.argv:
             raise InputError("an argument is empty; is a variable of the shell not set?")
@@ -73,9 +70,6 @@ def _run() -> None:
             print(f"r2flow {__version__}")
             sys.exit(0)
         code = app(arguments, prog_name="r2flow", standalone_mode=False)
-    except BrokenPipeError:  # r2flow ... | head
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
     except (InputError, OSError) as error:
         print(f"error: {explain_mistake(error)}", file=sys.stderr)
         sys.exit(2)

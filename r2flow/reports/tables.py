@@ -5,6 +5,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from r2flow.errors import printable
+
 Row = Mapping[str, Any]
 # By key, with a heading for each in order; or cells in order, with a heading for each.
 Rows = Sequence[Row] | Sequence[Sequence[Any]]
@@ -37,7 +39,7 @@ def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
         right = bool(cells) and all(NUMBER.match(cell) for cell in column)
         grid.add_column(Text(heading), justify="right" if right else "left", no_wrap=True)
     for line in cells:
-        grid.add_row(*map(Text, line))
+        grid.add_row(*(Text(printable(cell)) for cell in line))
     console = Console()
     # A terminal that is too narrow wraps the lines.
     console.width = max(console.width, Measurement.get(console, console.options.update(width=10**5), grid).maximum)

@@ -25,7 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from r2flow import __version__
 from r2flow.config import key_of
-from r2flow.errors import InputError, explain_mistake, one_line, print_any_name
+from r2flow.errors import InputError, explain_mistake, one_line, open_streams
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.runs.composing import (
     CONF,
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints mistakes itself, over many lines, and exits with 1
     failed: list[str] = []
     unfinished: list[str] = []
-    print_any_name()
+    open_streams()
     try:
         # SLURM signals every process of a job: a run answers, a chain waits for it.
         ignored = [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
@@ -104,6 +104,9 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
         return 2
     except (HydraException, OmegaConfBaseException) as error:
         print(f"error: {one_line(explain(error))}{_forgotten_plugins(arguments)}", file=sys.stderr)
+        return 2
+    except RecursionError:
+        print("error: a config contains itself, or is nested too deeply.", file=sys.stderr)
         return 2
     except (InputError, OSError) as error:
         print(f"error: {explain_mistake(error)}", file=sys.stderr)

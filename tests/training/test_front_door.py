@@ -1,7 +1,6 @@
 """Values of the wrong kind or out of their range, key by key: one line, exit code 2, nothing written."""
 
 import re
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -193,10 +192,7 @@ def test_a_folder_is_no_plugin(tmp_path: Path):
     assert "without an __init__.py" in done.stderr
 
 
-BOMB = "a: &a [1, 2]\n" + "".join(f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}]\n" for a, b in pairwise("abcdefghijk"))
-
-
-@pytest.mark.parametrize("text", ["", "- 1", "x", "a: [", "a: \0", "data: 3", "trainer: [1]", BOMB])
+@pytest.mark.parametrize("text", ["", "- 1", "x", "a: [", "a: \0", "data: 3", "trainer: [1]", "a: &a [*a]"])
 def test_a_damaged_config_is_refused_in_one_line(tmp_path: Path, text: str):
     (tmp_path / CONFIG).write_text(text)
     with pytest.raises(InputError, match=r"config\.yaml is damaged \(.*\); remove it") as caught:
