@@ -1,4 +1,4 @@
-"""How fast scans are read, on one core: from .bin files, from prepared shards, and the index of a whole data set.
+"""How fast scans are read, on one core: from .bin files, and from prepared shards.
 
 python benchmarks/data.py
 python benchmarks/data.py --layout kitti_360 --root /data/KITTI-360 --split test
@@ -8,25 +8,18 @@ page cache): a ratio holds on a busy machine, too.
 """
 
 import argparse
-import json
-import subprocess
-import sys
 import tempfile
 import time
-import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from r2flow.data.layouts import Drive
 from r2flow.data.loader import FlowDataset
 from r2flow.data.opening import find_drives, open_prepared
-from r2flow.data.prepared import Manifest, ScanRecipe, ShardEntry, checksum, describe_sensor, shard_name, write_manifest
-from r2flow.data.preparing import Preparation, plan_files
-from r2flow.data.quantise import RangeCodes
-from r2flow.data.reading import read_scan
+from r2flow.data.prepared import plan_files, prepare
+from r2flow.data.reading import Reading, read_scan
 from r2flow.data.sources import spread
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
@@ -35,7 +28,6 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator import simulate
 
 HDL64E = SENSORS["hdl64e"]
-KITTI_360_DRIVES = {0: 11518, 2: 14607, 3: 1400, 4: 9000, 5: 6700, 6: 9900, 7: 3500, 9: 15000, 10: 9481}  # 81,106 scans
 
 
 def by_turns(ways: dict[str, Callable[[int], object]], times: int, pieces: int) -> dict[str, float]:
@@ -105,9 +97,8 @@ def measure_shards(paths: Sequence[Path], folder: Path, times: int) -> None:
     chosen.mkdir()
     for number, path in enumerate(paths):
         (chosen / f"{number:06d}.bin").symlink_to(path.resolve())
-    preparation = Preparation(folder / "prepared", plan_files("folder", chosen, HDL64E))
-    preparation.make(preparation.begin())
-    prepared = open_prepared(folder / "prepared", HDL64E)
+    prepare(folder / "prepared", plan_files("folder", chosen, find_drives("folder", chosen), Reading(HDL64E)))
+    prepared = open_prepared(folder / "prepared", Reading(HDL64E, reflectance=True))
     numbers = range(len(paths))
     arrays = [folder / f"{i}.npy" for i in range(len(paths))]
     for number, path in zip(numbers, arrays, strict=True):
@@ -139,61 +130,6 @@ def show(taken: dict[str, float], against: str) -> None:
         print(f"{name:34s} {ms:8.3f} {1e3 / ms:9.0f} {taken[against] / ms:7.2f}")
 
 
-def write_index(folder: Path) -> int:
-    """The index of all of KITTI-360 at 64 x 1024 with shards that are all hole: their size in bytes."""
-    drives = tuple(
-        Drive(name, tuple(f"data_3d_raw/{name}/velodyne_points/data/{i:010d}.bin" for i in range(scans)))
-        for drive, scans in KITTI_360_DRIVES.items()
-        for name in [f"2013_05_28_drive_{drive:04d}_sync"]
-    )
-    names = [name for drive in drives for name in drive.scans]
-    recipe = ScanRecipe(
-        "0", "kitti_360", len(names), checksum(names), describe_sensor(HDL64E), "spherical", "centre", 1.0, 256,
-        RangeCodes(HDL64E.min_range, HDL64E.max_range).describe(), 512,
-    )  # fmt: skip
-    entries = []
-    for shard in range(recipe.shards):
-        scans = len(recipe.numbers_of(shard))
-        head, size = shard_head(scans)
-        with open(folder / shard_name(shard), "wb") as file:
-            file.write(head)
-            file.truncate(len(head) + size)
-        entries.append(ShardEntry(scans, (), len(head) + size, zlib.crc32(head), "", 6e-4, 0.0))
-    write_manifest(folder, Manifest(recipe, drives, tuple(entries)))
-    return sum(entry.bytes for entry in entries) + sum(p.stat().st_size for p in folder.glob("*.json"))
-
-
-def shard_head(scans: int) -> tuple[bytes, int]:
-    """A shard up to its first tensor, and the bytes of its tensors."""
-    header: dict[str, object] = {"__metadata__": {"scans": "{}"}}
-    end = 0
-    pixels = (scans, *HDL64E.shape)
-    for name, kind, width, shape in (
-        ("crc32", "U32", 4, (scans,)),
-        ("range", "U16", 2, pixels),
-        ("reflectance", "U8", 1, pixels),
-    ):
-        size = width * int(np.prod(shape))
-        header[name] = {"dtype": kind, "shape": shape, "data_offsets": [end, end + size]}
-        end += size
-    text = json.dumps(header).encode()
-    return len(text).to_bytes(8, "little") + text, end
-
-
-OPENING = """
-import logging, sys, time
-from pathlib import Path
-from r2flow.data.opening import open_scans
-def memory():  # of this process, now; the peak is that of the imports
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20
-logging.disable()  # that train and test drives are opened together
-before, start = memory(), time.perf_counter()
-source = open_scans(sys.argv[1]).source
-names = source.names
-print(f"{len(names)} scans: {time.perf_counter() - start:.2f} s, {memory() - before:.0f} MiB")
-"""
-
-
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -215,10 +151,6 @@ def main() -> None:
         paths = [found[i] for i in spread(len(found), options.scans)]
         measure_projection(paths, options.times)
         measure_shards(paths, folder, options.times)
-        (folder / "index").mkdir()
-        size = write_index(folder / "index")
-        print(f"\nindex of KITTI-360 at 64 x 1024, {size / 1e9:.2f} GB with its scans: ", end="", flush=True)
-        subprocess.run([sys.executable, "-c", OPENING, folder / "index"], check=True)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import lightning as L
 
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.model.checkpoint import load_checkpoint
-from r2flow.reports.pairs import make_and_tell, wait_for_others
+from r2flow.reports.pairs import make_and_tell
 
 
 class ReflowPairs(L.Callback):
@@ -23,9 +23,5 @@ class ReflowPairs(L.Callback):
             return
         store, num = data.pair_store, data.pairs.num
         device, flow = trainer.strategy.root_device, load_checkpoint(self.of)
-        made = make_and_tell(store, flow, num, trainer.global_rank, trainer.world_size, device)
-        # Another device is given up only after several times what a batch has taken here.
-        patience = max(120.0, 5 * store.recipe.batch_size * made.seconds / max(made.pairs, 1))
-        # Files, not a barrier: a collective call gives up after half an hour, and a slow rank may take longer.
-        while not wait_for_others(store, num, trainer.global_rank > 0, patience=patience):
-            make_and_tell(store, flow, num, device=device)  # whoever was to make them is not going to
+        # Locks of files, not a barrier: a collective call gives up after half an hour, and a slow rank may take longer.
+        make_and_tell(store, flow, num, trainer.global_rank, trainer.world_size, device, wait=True)

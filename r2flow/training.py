@@ -41,10 +41,10 @@ from r2flow.reports.training import finish, read_curves
 from r2flow.runs.composing import check_keys, compose
 from r2flow.runs.folder import check_run, open_run, read_config, run_lock
 from r2flow.runs.lineage import READING, Parent, find_parent, inherit, with_scales
-from r2flow.simulator.folder import MANIFEST
 from r2flow.stages import build_stage, check_roll
 from r2flow.stages.base import Stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
+from r2flow.store import MANIFEST
 
 __all__ = ["Result", "Run", "build", "check", "compose", "fit"]
 

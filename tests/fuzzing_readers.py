@@ -18,6 +18,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.extractors.weights import read_published
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.runs.folder import read_config
+from r2flow.store import Damaged
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
 
@@ -49,19 +50,19 @@ def in_folder(name: str) -> Callable[[Path], Path]:
 
 def prepared(path: Path) -> bytes:
     folder = in_folder("prepared")(path)
-    source = open_prepared(folder, SENSOR)
-    check_prepared(folder)
+    source = open_prepared(folder, Reading(SENSOR, reflectance=True))
+    if check_prepared(folder):
+        raise InputError("damage was found")
     return b"".join(source[number].tobytes() for number in range(len(source)))
 
 
 def pairs(path: Path) -> bytes:
     folder = in_folder("pairs")(path)
     store = PairStore(folder, PairRecipe("0" * 16, (2, 8, 64), 0, 0, "euler", 1, 1e-5, 2, 2))
-    store.begin()
-    if store.check(0, 4) or not store.is_whole(4):
-        raise InputError("damage was found, and is made again")
-    block = store._read(store.shard_path(0), 0)
-    return block.x_1.tobytes()
+    try:
+        return store.read(0)[0]["x_1"].tobytes()
+    except Damaged as error:
+        raise InputError(str(error)) from None
 
 
 def checkpoint(path: Path) -> bytes | None:

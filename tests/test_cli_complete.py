@@ -9,7 +9,6 @@ import pytest
 
 from r2flow.data.opening import open_scans
 from r2flow.data.partial import open_partial
-from r2flow.data.preparing import Preparation, plan_files
 from r2flow.data.reading import Reading
 from r2flow.lidar.known import Ray, parse_mask
 from r2flow.lidar.projection import image_to_points, project
@@ -18,6 +17,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.transfer import image_through
 from r2flow.noise import generator
 from r2flow.stages.checkpointing import AtomicCheckpointIO
+from tests.data.conftest import prepare_folder
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_completion import network, scans
 
@@ -303,8 +303,7 @@ def prepared(folder: Path, numbers: list[int]) -> Path:
     """Some scans of `full_scan`, as they are prepared."""
     for place, number in enumerate(numbers):
         full_scan(folder / "scans" / f"{place}.npy", number)
-    work = Preparation(folder / "prep", plan_files("folder", folder / "scans", SENSOR))
-    work.make(work.begin())
+    prepare_folder(folder / "scans", folder / "prep", SENSOR)
     return folder / "prep"
 
 

@@ -13,9 +13,9 @@ import pytest
 import yaml
 
 from r2flow.data.opening import open_prepared
-from r2flow.data.prepared import read_manifest
-from r2flow.data.reading import read_scan
+from r2flow.data.reading import Reading, read_scan
 from r2flow.lidar.sensors import SENSORS
+from r2flow.store import read_manifest
 from tests.data.conftest import kitti_360, numbered, write_scan  # noqa: F401  fixtures
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.training.conftest import TINY, in_process
@@ -34,7 +34,7 @@ def test_a_data_set_is_prepared_and_checked(r2flow, kitti_360, tmp_path):  # noq
     assert code == 0
     assert f"{out}: 6 scans in 2 shards, 0.0 MiB; range within" in said
     assert "reflectance as n/256, exactly" in said
-    source = open_prepared(out, SMALL)
+    source = open_prepared(out, Reading(SMALL, reflectance=True))
     assert len(source) == 6
     raw = read_scan(kitti_360 / source.names[5], SMALL)
     assert np.abs(source[5] - raw).max() <= 1e-3
@@ -53,7 +53,7 @@ def test_a_damaged_shard_is_named_and_the_same_command_makes_it_again(r2flow, ki
     code, said, error = r2flow("prepare", "--check", out)
     assert code == 2
     assert said == f"{path}: its checksum differs\n"
-    assert error.strip() == "error: 1 of 4 shards are damaged; the same r2flow prepare command makes these again."
+    assert error.strip() == "error: 1 of 4 shards are damaged; the same r2flow prepare makes these again."
     assert r2flow(*typed)[0] == 0
     assert files(out) == whole
 
@@ -68,10 +68,10 @@ def test_nuscenes_has_its_own_sensor_and_scale(r2flow, tmp_path):  # noqa: F811
     path.write_bytes(points.astype("<f4").tobytes())
     code, _, error = r2flow("prepare", "nuscenes", path.parent, "--out", tmp_path / "out", "--workers", 1)
     assert (code, error.split("error")[1:]) == (0, [])
-    recipe = read_manifest(tmp_path / "out").recipe
-    assert {"override /sensor@_global_.sensor": recipe.sensor["name"]} in config["defaults"]
-    assert recipe.reflectance_scale == config["reflectance_scale"]
-    image = open_prepared(tmp_path / "out", SENSORS["hdl32e"])[0]
+    recipe = read_manifest(tmp_path / "out")["recipe"]["reading"]
+    assert {"override /sensor@_global_.sensor": recipe["sensor"]["name"]} in config["defaults"]
+    assert recipe["reflectance_scale"] == config["reflectance_scale"]
+    image = open_prepared(tmp_path / "out", Reading(SENSORS["hdl32e"], reflectance=True))[0]
     assert np.count_nonzero(image[0]) == 3
     assert np.array_equal(np.unique(image[1]), np.array([0, 100 / 255, 1], np.float32))
 
@@ -82,7 +82,7 @@ def test_simulated_scans_are_prepared_by_number_and_seed(r2flow, tmp_path):  # n
     )
     assert code == 0
     assert "2 scans in 1 shard," in said
-    assert open_prepared(tmp_path, SMALL).names == ["scene 0", "scene 1"]
+    assert open_prepared(tmp_path, Reading(SMALL, reflectance=True)).names == ["scene 0", "scene 1"]
 
 
 @pytest.mark.parametrize(
@@ -150,14 +150,18 @@ def test_columns_are_named_where_files_do_not(r2flow, numbered, tmp_path):  # no
     for out, given in (("one", ("folder", numbered)), ("two", ("folder", wide, *columns))):
         code, _, error = r2flow("prepare", *given, *small, "--out", tmp_path / out)
         assert (code, error) == (0, "")
-    for one, two in zip(open_prepared(tmp_path / "one", SMALL), open_prepared(tmp_path / "two", SMALL), strict=False):
+    for one, two in zip(
+        open_prepared(tmp_path / "one", Reading(SMALL, reflectance=True)),
+        open_prepared(tmp_path / "two", Reading(SMALL, reflectance=True)),
+        strict=False,
+    ):
         assert np.array_equal(one, two)
-    assert read_manifest(tmp_path / "one").recipe.columns is None
+    assert read_manifest(tmp_path / "one")["recipe"]["reading"]["columns"] is None
     code, _, error = r2flow(
         "prepare", "folder", wide, "--columns", "z,_,y,x,intensity,_", *small, "--out", tmp_path / "two"
     )
     assert code == 2
-    assert "holds other scans: columns are others" in error
+    assert "columns differ" in error
     scan, image = wide / "000000.bin", tmp_path / "image.npy"
     assert r2flow("project", scan, *columns, "--size", "4x16", "-o", image)[0] == 0
     np.testing.assert_array_equal(np.load(image), read_scan(numbered / "000000.bin", SMALL))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import yaml
 
-from r2flow.data.prepared import read_manifest
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensor_files import read_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor
+from r2flow.store import read_manifest
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.training.conftest import TINY, in_process
 
@@ -147,8 +147,7 @@ def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, 
     assert np.load(image)[1].max() > 0.95
     code, _, error = r2flow("prepare", "folder", scans, "--sensor", out, "--out", tmp_path / "prepared", "--workers", 1)
     assert (code, error) == (0, "")
-    assert read_manifest(tmp_path / "prepared").recipe.reflectance_scale == 255
-    assert "reflectance_scale" not in read_manifest(tmp_path / "prepared").recipe.sensor
+    assert read_manifest(tmp_path / "prepared")["recipe"]["reading"]["reflectance_scale"] == 255
     given = (scans, scans / "000000.bin", "--sensor", out, "--metrics", "jsd,sensor", "--workers", 0)
     assert "reflectance" not in r2flow("evaluate", *given, "--json", tmp_path / "e.json")[2]
     assert r2flow("show", scans / "000000.bin", "--sensor", out, "--out", tmp_path / "views")[:1] == (0,)

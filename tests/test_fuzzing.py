@@ -17,13 +17,13 @@ import yaml
 
 from r2flow.data.contents import RECORD, record_contents
 from r2flow.data.opening import samples_note, write_samples_note
-from r2flow.data.preparing import Preparation, plan_files
 from r2flow.data.reading import Reading
 from r2flow.data.shards import Block, PairRecipe, PairStore
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensor_files import write_sensor
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
+from tests.data.conftest import prepare_folder
 from tests.lidar.test_scan_files_damage import PCD_OF_4, TEXT, compressed, ply_ascii
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 
@@ -79,16 +79,16 @@ def write_stores(folder: Path, beside: Path) -> None:
     scans.mkdir(parents=True)
     for number in range(3):
         write_points(scans / f"{number}.bin", XYZ * [1, 1, 0.1], REFLECTANCE)
-    work = Preparation(beside / "prepared", plan_files("folder", scans, SENSOR))
-    work.make(work.begin())
+    prepare_folder(scans, beside / "prepared", SENSOR)
     keep(folder, "prepared", *(beside / "prepared").iterdir())
     recipe = PairRecipe("0" * 16, (2, 8, 64), 0, 0, "euler", 1, 1e-5, 2, 2)
     store = PairStore(beside / "pairs", recipe)
     store.begin()
-    for batch in range(2):
+    blocks = []
+    for _ in range(2):
         x_1 = DRAW.standard_normal((2, 2, 8, 64)).astype(np.float16)
-        store.commit(batch, Block(x_1, np.ones(2, np.int32), np.ones(2, bool)))
-    assert store.seal(0, 4)
+        blocks.append(Block(x_1, np.ones(2, np.int32), np.ones(2, bool)))
+    store.append(0, blocks)
     keep(folder, "pairs", *(file for file in (beside / "pairs").iterdir() if file.is_file()))
     write_points(beside / "scan.bin", XYZ, REFLECTANCE)
     (folder / "labels").mkdir()

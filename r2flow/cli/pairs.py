@@ -59,7 +59,7 @@ def pairs(
         Path | None, typer.Option("--out", "-o", help="Their folder; `pairs` in the run's if left out.")
     ] = None,
     batch_size: Annotated[int, typer.Option(min=1, help="Pairs solved at once.")] = 16,
-    shard_mib: Annotated[float, typer.Option(min=0.001, help="Size of a shard.")] = 256.0,
+    shard_mib: Annotated[float, typer.Option(min=0.001, help="Size of a shard.")] = 16.0,
     seed: Annotated[int, typer.Option(min=0, help="Of their noise.")] = 0,
     first: Annotated[
         int | None, typer.Option(min=0, help="Index of the first pair; behind the flow's own pairs if left out.")
@@ -99,10 +99,10 @@ def pairs(
     check_control(recipe.sampler.method, {"steps": solver.steps, "tolerance": solver.tolerance}, "--{}")
     store = PairStore(out or default_folder(flow.path), recipe)
     make_and_tell(store, flow, num, rank, ranks, where)
-    lacking = len(store.missing(num))
+    lacking = store.missing_pairs(num)
     if lacking:
-        print(f"{store.folder}: other processes have still to make about {lacking * batch_size} of {num} pairs")
+        print(f"{store.folder}: other processes have still to make about {lacking} of {num} pairs")
     else:
-        size = sum(store.shard_path(shard).stat().st_size for shard in store.shards(num) if store.is_sealed(shard, num))
-        shards = len(store.shards(num))
-        print(f"{store.folder}: all {num} pairs, {shards} shard{'s' * (shards != 1)}, {size / 2**20:.0f} MiB")
+        shards = store.shards(num)
+        size = sum(store.files(shard)[0].stat().st_size for shard in shards)
+        print(f"{store.folder}: all {num} pairs, {len(shards)} shard{'s' * (len(shards) != 1)}, {size / 2**20:.0f} MiB")

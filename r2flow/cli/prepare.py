@@ -12,8 +12,7 @@ from r2flow.cli.options import build_sized, check_words, cores, named_columns
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
-    from r2flow.data.prepared import Manifest
-    from r2flow.data.preparing import Plan, Preparation
+    from r2flow.data.prepared import Plan
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class ShardOptions:
     reflectance_levels: Annotated[
         int | None, typer.Option(help="Reflectance is kept as n / LEVELS; found from the scans if left out.")
     ] = None
-    shard_scans: Annotated[int, typer.Option(min=1, help="Scans a file.")] = 512
+    shard_scans: Annotated[int, typer.Option(min=1, help="Scans a file.")] = 64
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one a core if left out.")] = None
 
 
@@ -62,7 +61,7 @@ def prepare(
 ) -> None:
     """Project a data set once, into shards that training reads: range in 2 bytes, reflectance in 1.
 
-    Stopped or killed, the same command goes on; started twice, the two share the work; what is damaged, it makes again.
+    After a stop or a kill the same command resumes; two at once share the work; damaged shards are made again.
     Then: python train.py data=prepared data.root=FOLDER.
     """
     if check is not None:
@@ -70,10 +69,8 @@ def prepare(
         return
     if layout is None or out is None:
         raise InputError("r2flow prepare needs LAYOUT ROOT --out FOLDER, or --check FOLDER.")
-    from r2flow.data.preparing import Preparation
-
     check_words(projection=reading.projection, convention=reading.convention, on_bad_scan=files.on_bad_scan)
-    _run(Preparation(out, _plan(layout, root, reading, files, scenes, shards)), files.on_bad_scan, shards.workers)
+    _run(out, _plan(layout, root, reading, files, scenes, shards), files.on_bad_scan, shards.workers or cores())
 
 
 def _plan(
@@ -84,9 +81,10 @@ def _plan(
     scenes: SceneOptions,
     shards: ShardOptions,
 ) -> "Plan":
-    from r2flow.data.opening import SOURCES, scale_of_folder
+    from r2flow.data.opening import SOURCES, find_drives, scale_of_folder
     from r2flow.data.options import FOLDER
-    from r2flow.data.preparing import plan_files, plan_simulated
+    from r2flow.data.prepared import plan_files, plan_simulated
+    from r2flow.data.reading import Reading
 
     usual = SOURCES[layout]
     sensor = build_sized(reading.sensor or usual.sensor, reading.size)
@@ -106,51 +104,42 @@ def _plan(
     if scenes.num is not None:
         raise InputError("--num is for simulated scans; choose files by --split and --drives.")
     scale = scale_of_folder(root, sensor.reflectance_scale) if layout == FOLDER else usual.reflectance_scale
-    return plan_files(
-        layout, root, sensor, reading.projection or "spherical", reading.convention or "centre", files.split,
-        files.drives.split(",") if files.drives else None, reading.reflectance_scale or scale,
-        levels, shard_scans, named_columns(reading.columns),
+    how = Reading(
+        sensor, reading.projection or "spherical", reading.convention or "centre",  # type: ignore[arg-type]
+        reading.reflectance_scale or scale, columns=named_columns(reading.columns),
     )  # fmt: skip
+    drives = find_drives(layout, root, files.split, files.drives.split(",") if files.drives else None)
+    return plan_files(layout, root, drives, how, levels, shard_scans)
 
 
-def _run(work: "Preparation", on_bad_scan: str, workers: int | None) -> None:
+def _run(out: Path, plan: "Plan", on_bad_scan: str, workers: int) -> None:
+    from r2flow.data.prepared import prepare as make
     from r2flow.progress import Bar
 
-    recipe, workers = work.recipe, workers or cores()
-    with Bar("checking what is there", recipe.scans, "scans") as advance:
-        missing = work.begin(advance)
-    scans = sum(len(recipe.numbers_of(shard)) for shard in missing)
-    with Bar("preparing", scans, "scans") as advance:
-        manifest = work.make(missing, on_bad_scan, workers if workers > 1 else 0, advance)
-    print(_summary(work.folder, manifest))
-
-
-def _summary(folder: Path, manifest: "Manifest") -> str:
-    shards = manifest.shards
-    scans, size = sum(shard.scans for shard in shards), sum(shard.bytes for shard in shards)
-    said = f"range within {max(shard.range_error for shard in shards) * 1e3:.2f} mm"
-    levels, error = manifest.recipe.levels, max(shard.reflectance_error for shard in shards)
-    if levels is None:
-        said += ", no reflectance in the scans"
-    else:
-        said += f", reflectance as n/{levels}, " + (f"at most {error:.2g} off" if error else "exactly")
-    left_out = len(manifest.left_out)
-    skipped = f"; {left_out} scans left out, named in manifest.json" if left_out else ""
-    of = f"{scans} scan{'s' * (scans != 1)} in {len(shards)} shard{'s' * (len(shards) != 1)}"
-    return f"{folder}: {of}, {size / 2**20:.1f} MiB; {said}{skipped}"
+    with Bar("checking", len(plan.shards), "shards") as checked, Bar("preparing", len(plan.shards), "shards") as made:
+        notes = make(out, plan, on_bad_scan, workers, lambda shard: checked(), lambda shard: made())
+    size = sum(plan.store(out).files(shard)[0].stat().st_size for shard in plan.shards)
+    left_out = sum(len(note["left_out"]) for note in notes)
+    scans, shards, levels = plan.recipe["scans"] - left_out, len(plan.shards), plan.recipe["levels"]
+    range_error, error = (max(note["errors"][channel] for note in notes) for channel in (0, 1))
+    kept = "no reflectance in the scans"
+    if levels is not None:
+        kept = f"reflectance as n/{levels}, " + (f"at most {error:.2g} off" if error else "exactly")
+    skipped = f"; {left_out} scans left out" if left_out else ""
+    of = f"{scans} scan{'s' * (scans != 1)} in {shards} shard{'s' * (shards != 1)}"
+    print(f"{out}: {of}, {size / 2**20:.1f} MiB; range within {range_error * 1e3:.2f} mm, {kept}{skipped}")
 
 
 def _check(folder: Path) -> None:
-    from r2flow.data.prepared import check_prepared, read_manifest
+    from r2flow.data.prepared import check_prepared, read_prepared
     from r2flow.progress import Bar
 
-    shards = len(read_manifest(folder).shards)
+    recipe, _ = read_prepared(folder)
+    shards = -(-recipe["scans"] // recipe["shard_scans"])
     with Bar("checking", shards, "shards") as advance:
-        damaged = check_prepared(folder, advance)
+        damaged = check_prepared(folder, lambda shard: advance())
     for path, reason in damaged.items():
         print(f"{path}: {reason}")
     if damaged:
-        raise InputError(
-            f"{len(damaged)} of {shards} shards are damaged; the same r2flow prepare command makes these again."
-        )
+        raise InputError(f"{len(damaged)} of {shards} shards are damaged; the same r2flow prepare makes these again.")
     print(f"{folder}: all {shards} shards are what was written")

@@ -24,13 +24,15 @@ def simulate(
         int | None, typer.Option(min=1, help="Processes; one a core if left out.", show_default=False)
     ] = None,
 ) -> None:
-    """Simulate scans of street scenes. After a stop or a kill, the same command goes on."""
+    """Simulate scans of street scenes. After a stop or a kill, the same command resumes."""
     from r2flow.progress import Bar
-    from r2flow.simulator.folder import SimulatedFolder, write_folder
+    from r2flow.simulator.folder import SimulatedFolder
 
     formats = tuple(dict.fromkeys(format.split(",")))
     folder = SimulatedFolder(out, build_sized(sensor, size), seed, formats, labels)
-    with Bar("simulating", num, "scans") as advance:
-        made = write_folder(folder, range(first, first + num), workers or cores(), advance)
-    kept = f", {num - made} were there already" if made < num else ""
-    print(f"{made} scans ({', '.join(formats)}{', labels' if labels else ''}) in {out}{kept}")
+    folder.begin()
+    missing = folder.missing(range(first, first + num))
+    with Bar("simulating", len(missing), "scans") as advance:
+        folder.make(missing, folder.simulate, workers or cores(), lambda scan: advance())
+    kept = f", {num - len(missing)} were there already" if len(missing) < num else ""
+    print(f"{len(missing)} scans ({', '.join(formats)}{', labels' if labels else ''}) in {out}{kept}")

@@ -1,4 +1,4 @@
-"""What files held when a run, or a preparation, began: it goes on with the same contents alone."""
+"""What files held when a run began: it resumes with the same contents alone."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from stat import S_ISREG
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, read_json
 
-RECORD = "files.json"  # in the folder of the run or of the shards
+RECORD = "files.json"  # in the folder of the run
 FORMAT = "r2flow files 1"
 MOST_READ = 1 << 30  # bytes of all files up to which contents are compared; of more, sizes and times of change
 CHUNK = 1 << 20
@@ -26,36 +26,23 @@ def record_contents(folder: Path, files: Mapping[str, str | Path]) -> None:
 
 
 def check_contents(run: Path, files: Mapping[str, str | Path]) -> None:
-    """Compare files with what was noted when the run began; a run of an older version notes them now.
-
-    Raises:
-        InputError: a file is another one now.
-    """
-    advice = "Give back the scans that it began with, or take name=OTHER for a new run."
-    if not refuse_changed(run, files, "began to train on it", advice):
-        record_contents(run, files)
-
-
-def refuse_changed(folder: Path, files: Mapping[str, str | Path], since: str, advice: str) -> bool:
-    """Compare files with what `record_contents` has noted, if it has: whether there is a note.
-
-    Args:
-        since: What the folder did with them then, for the message.
-        advice: What to do, likewise.
+    """Compare files with what was noted when the run began.
 
     Raises:
         InputError: a file is another one now.
     """
     try:
-        noted = read_json(folder / RECORD)
+        noted = read_json(run / RECORD)
         by, there = noted["by"], dict(noted["files"])
     except (OSError, ValueError, KeyError, TypeError):
-        return False
+        return record_contents(run, files)
     for name, path in files.items():
         if name in there and there[name] != _stamp(path, by):
-            copied = f" Or, if they were copied alone, remove {folder / RECORD}." if by == "times" else ""
-            raise InputError(f"{path} has changed since {folder} {since}. {advice}{copied}")
-    return True
+            copied = f" Or, if they were copied alone, remove {run / RECORD}." if by == "times" else ""
+            raise InputError(
+                f"{path} has changed since {run} began to train on it. Give back the scans that it began with, or take "
+                f"name=OTHER for a new run.{copied}"
+            )
 
 
 def _stamp(path: str | Path, by: str) -> list[int]:

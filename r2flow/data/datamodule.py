@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader, Dataset
 from r2flow import simulator
 from r2flow.data.augment import Augmentation
 from r2flow.data.loader import FlowDataset, Further, Item, Order, Permutations, RunLoader, RunSampler, fixed_batches
-from r2flow.data.mixture import MixedOrder, Mixture, refuse_shared_scans
+from r2flow.data.mixture import MixedOrder, Mixture
 from r2flow.data.opening import held_out_options, open_source, split_parts
 from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
 from r2flow.data.pairs import PairDataset, PairSource
@@ -109,8 +109,6 @@ class ScanDataModule(L.LightningDataModule):
         Without other data to hold out, each part of a mixture holds out its own block.
         """
         whole = [self._open(options) for options in self.parts]
-        if len(whole) > 1:
-            refuse_shared_scans(whole)
         # What goes before the names of each part's scans tells them apart.
         labels = [f"{number}: " if len(whole) > 1 else "" for number in range(len(whole))]
         self.names, self.files = [], {}

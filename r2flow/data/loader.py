@@ -73,19 +73,17 @@ class Order(Protocol):
 class Permutations:
     """Scan permutation_{k // n}[k mod n] of n: every scan once, in an order of its own, then every scan again.
 
-    The permutations are counter-based, so that the order is known at every k without having drawn what came before;
-    each part of a mixture has its own.
+    The permutations are counter-based, so that the order is known at every k without having drawn what came before.
     """
 
-    def __init__(self, scans: int, seed: int, part: int = 0) -> None:
-        self.scans, self.seed, self.part = scans, seed, part
+    def __init__(self, scans: int, seed: int) -> None:
+        self.scans, self.seed = scans, seed
         self.epoch, self.order = -1, np.empty(0, dtype=np.int64)
 
     def __getitem__(self, k: int) -> int:
         epoch, turn = divmod(k, self.scans)
         if epoch != self.epoch:
-            index = (self.part << 32) + epoch
-            self.order = noise.generator(self.seed, "shuffle", index).permutation(self.scans)
+            self.order = noise.generator(self.seed, "shuffle", epoch).permutation(self.scans)
             self.epoch = epoch
         return int(self.order[turn])
 

@@ -6,12 +6,9 @@ import numpy as np
 from torch import Tensor
 
 from r2flow import noise
-from r2flow.data.loader import Permutations
 from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
-
-BLOCK = 1 << 16  # images whose parts are drawn at once
 
 
 class Mixture(ScanSource):
@@ -60,58 +57,23 @@ class Mixture(ScanSource):
         return Mixture([part.subset(own) for part, own in zip(self.parts, chosen, strict=True)])
 
 
-def refuse_shared_scans(parts: Sequence[ScanSource]) -> None:
-    """Refuse parts that share scans: each holds out a block of its own, which the other would train on."""
-    before: set[str] = set()
-    for number, part in enumerate(parts):
-        own = part.places()
-        if shared := own & before:
-            raise InputError(
-                f"data.parts[{number}] has {len(shared)} scans that a part before it has too, as {min(shared)}: they "
-                "would count twice, and what one part holds out the other would train on. Name each drive, or seed of "
-                "simulated scenes, in one part."
-            )
-        before |= own
-
-
 class MixedOrder:
-    """Which scan of a mixture is image k of a run: a part drawn by its weight, then that part's next scan.
+    """Which scan of a mixture is image k of a run: a part by its weight, then one of its scans, each alike.
 
-    Parts are drawn independently with probabilities w_p / sum w; the j-th image of a part is its scan
-    permutation_{j // n}[j mod n] of n (`Permutations`). All of it is a function of (seed, k): draws come in blocks by
-    their number, and how often a part was drawn before a block is counted from the blocks before it.
+    A function of (seed, k): part p with probability w_p / sum w, drawn with replacement.
 
     Raises:
-        InputError: a weight that is not positive, or a part without scans.
+        InputError: a part without scans.
     """
 
     def __init__(self, sizes: Sequence[int], weights: Sequence[float], seed: int) -> None:
-        if not all(0 < weight < np.inf for weight in weights):
-            raise InputError(f"data.parts: each weight must be a positive number, found {list(weights)}.")
         if not all(sizes):
             raise InputError(f"data.parts: a part has no scan left to train on; the parts have {list(sizes)}.")
-        self.seed = seed
+        self.seed, self.sizes = seed, sizes
         self.edges = np.cumsum(weights) / np.sum(weights)
-        self.orders = [Permutations(size, seed, part) for part, size in enumerate(sizes)]
         self.starts = np.cumsum([0, *sizes])
-        self._counts = [np.zeros(len(sizes), dtype=np.int64)]  # of each part before block b
-        self._block = -1
-        self._parts, self._turns = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
 
     def __getitem__(self, k: int) -> int:
-        block, offset = divmod(k, BLOCK)
-        while len(self._counts) <= block:
-            drawn = self._draw_parts(len(self._counts) - 1)
-            self._counts.append(self._counts[-1] + np.bincount(drawn, minlength=len(self.orders)))
-        if block != self._block:
-            self._block, self._parts = block, self._draw_parts(block)
-            self._turns = np.zeros(BLOCK, dtype=np.int64)  # how often each image's part came before in the block
-            for part in range(len(self.orders)):
-                own = np.flatnonzero(self._parts == part)
-                self._turns[own] = np.arange(len(own))
-        part = int(self._parts[offset])
-        return int(self.starts[part]) + self.orders[part][int(self._counts[block][part] + self._turns[offset])]
-
-    def _draw_parts(self, block: int) -> np.ndarray:
-        u = noise.generator(self.seed, "mixture", block).random(BLOCK)
-        return np.searchsorted(self.edges[:-1], u, side="right")
+        u, v = noise.generator(self.seed, "mixture", k).random(2)
+        part = int(np.searchsorted(self.edges[:-1], u, side="right"))
+        return int(self.starts[part]) + int(v * self.sizes[part])

@@ -29,15 +29,15 @@ from r2flow.data.options import (
     PartOptions,
     SourceOptions,
 )
-from r2flow.data.prepared import PreparedScans, find_prepared, read_manifest
+from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_images
 from r2flow.data.reading import AUTO, Reading, lacks_reflectance, range_image
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, warn_of_other_sensor
-from r2flow.data.store import MANIFEST
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, read_json
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.registry import Registry, check_options, did_you_mean
+from r2flow.store import MANIFEST, read_manifest
 
 log = logging.getLogger(__name__)
 
@@ -58,11 +58,10 @@ class Prepared(SourceKind):
     """Shards of `r2flow prepare`."""
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
-        how = (bool(reading.reflectance), reading.projection, reading.convention)
-        return open_prepared(options.folder, reading.sensor, options.split, options.drives, *how)
+        return open_prepared(options.folder, reading, options.split, options.drives)
 
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
-        lacks = read_manifest(Path(options.folder).expanduser()).recipe.levels is None
+        lacks = read_prepared(Path(options.folder).expanduser())[0]["levels"] is None
         return f"the scans in {options.folder} have no reflectance" if lacks else None
 
 
@@ -147,7 +146,7 @@ def parse(text: str) -> tuple[SourceOptions, Path | None]:
         raise InputError(
             f"{path} does not exist. Give a scan file, a folder of scans, NAME:FOLDER, simulated:SEED or a run."
         )
-    if (path / MANIFEST).is_file():
+    if written_by(path) == "r2flow scans":
         return SourceOptions(PREPARED, str(path)), None
     return SourceOptions(FOLDER, str(samples_of(path) or path)), None
 
@@ -195,8 +194,8 @@ def own_reading(spec: str | Path) -> Reading | None:
     """How the images of scans were made, where they say so: prepared scans and samples. Other images they are not."""
     options, _ = parse(str(spec))
     if options.name == PREPARED:
-        recipe = read_manifest(Path(options.folder).expanduser()).recipe
-        return Reading(_sensor(recipe.sensor), recipe.projection, recipe.convention, recipe.reflectance_scale)  # type: ignore[arg-type]
+        there = Reading.of(read_prepared(Path(options.folder).expanduser())[0]["reading"])
+        return replace(there, reflectance=AUTO, within_limits=False)
     return _noted(Path(options.folder)) if options.name == FOLDER else None
 
 
@@ -221,14 +220,21 @@ def scale_of_folder(root: str | Path, of_sensor: float | None) -> float:
 
 def made_here(root: str | Path) -> bool:
     """Whether a folder, or one in it, holds samples or simulated scans of r2flow."""
-    from r2flow.simulator.folder import MANIFEST
-
     folder = Path(root).expanduser()
     if not folder.is_dir():
         return False
     with os.scandir(folder) as entries:  # which knows a folder without asking the disk about each file
         places = [folder, *(Path(entry.path) for entry in entries if entry.is_dir())]
     return any((place / note).is_file() for place in places for note in (SAMPLES, MANIFEST))
+
+
+def written_by(folder: Path) -> str | None:
+    """The format of a folder that r2flow wrote, by its manifest; None where there is no manifest."""
+    try:
+        found: str = read_manifest(folder)["format"]
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return found
 
 
 def _noted(folder: Path) -> Reading | None:
@@ -280,35 +286,27 @@ def refuse_parts(spec: str | Path) -> None:
 
 
 def open_prepared(
-    root: str | Path,
-    sensor: Sensor,
-    split: str | None = None,
-    drives: Sequence[str | int] | None = None,
-    reflectance: bool = True,
-    projection: str = "spherical",
-    convention: str = "centre",
+    root: str | Path, reading: Reading, split: str | None = None, drives: Sequence[str | int] | None = None
 ) -> PreparedScans:
     """The scans of a folder that `r2flow prepare` has written, by the split and the drives of their data set.
 
     Raises:
-        InputError: what `find_prepared` refuses, no reflectance where it is needed, or no such split, drive or scan.
+        InputError: no prepared scans, unfinished or damaged ones, ones of other images, or no such split or drive.
     """
     folder = Path(root).expanduser()
-    manifest = find_prepared(folder, sensor, projection, convention)
-    kind = SOURCES[manifest.recipe.layout] if manifest.recipe.layout in SOURCES else SourceKind()
+    recipe, held = read_prepared(folder)
+    refuse_other_images(folder, recipe, reading)
+    kind = SOURCES[recipe["layout"]] if recipe["layout"] in SOURCES else SourceKind()
     if split is None and drives is None:
-        held = sorted({part for drive in manifest.drives if (part := kind.split_of(drive.name))})
-        if len(held) > 1:
-            log.warning("%s holds %s drives, and data.split=null takes all of them", folder, " and ".join(held))
-    usable = np.ones(manifest.recipe.scans, dtype=bool)
-    usable[list(manifest.left_out)] = False
-    spans = dict(zip(map(id, manifest.drives), spans_of(manifest.drives), strict=True))
-    chosen = kind.chosen(list(manifest.drives), split, drives)
-    numbers = np.array([number for drive in chosen for number in spans[id(drive)]], dtype=np.int64)
-    rows = (np.cumsum(usable) - 1)[numbers[usable[numbers]]]  # as they lie in the shards
-    if len(rows) == 0:
-        raise InputError(f"none of the {int(usable.sum())} prepared scans is of split={split!r}, drives={drives}.")
-    return PreparedScans(folder, manifest, rows, reflectance)
+        parts = sorted({part for drive in held if (part := kind.split_of(drive.name))})
+        if len(parts) > 1:
+            log.warning("%s holds %s drives, and data.split=null takes all of them", folder, " and ".join(parts))
+    spans = dict(zip(map(id, held), spans_of(held), strict=True))
+    numbers = [number for drive in kind.chosen(held, split, drives) for number in spans[id(drive)]]
+    scans = PreparedScans(folder, numbers, bool(reading.reflectance))
+    if not len(scans):
+        raise InputError(f"{folder} holds no usable scan of split={split!r}, drives={drives}.")
+    return scans
 
 
 # The sets of scans that a run's `data` names

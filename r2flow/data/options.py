@@ -88,7 +88,7 @@ class PairOptions:
     grid: str | None = None  # where fixed steps fall; None: the method's usual one
     tolerance: float = 1e-5
     batch_size: int = 16  # pairs solved together; the last bits of a pair depend on it
-    shard_mib: float = 256.0
+    shard_mib: float = 16.0  # of a shard, which a killed process begins again
     seed: int = 0  # of the noise; not the run's: runs of several seeds can share one set of pairs
     first: int | None = None  # index of the first pair; None: behind the pairs that the flow itself was trained on
     precision: Precision = "32-true"  # of the network

@@ -1,9 +1,6 @@
 """Reflow pairs (x_0, x_1): noise and where a flow carries it."""
 
 import copy
-import os
-import platform
-import random
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,6 +21,7 @@ from r2flow.flow.solvers import Solution, knot_times
 from r2flow.generators import Flow, Generated, Generator, Sampler, as_flow
 from r2flow.generators.base import RENOISE
 from r2flow.models import name_of
+from r2flow.store import PATIENCE
 
 
 def pair_noise(recipe: PairRecipe, index: int) -> Tensor:
@@ -58,14 +56,17 @@ def make_pairs(
     rank: int = 0,
     ranks: int = 1,
     progress: Callable[[Made], None] = lambda made: None,
+    wait: bool = False,
 ) -> Made:
-    """Make those of the first `num` pairs that are missing or damaged, as one of `ranks` processes.
+    """Make those of the first `num` pairs that are missing or damaged, and that no other process is making.
 
     x_1 is where the generator carries x_0 = `pair_noise`, neither clamped nor snapped, in half precision. By `chord` or
     `renoise` of a flow map it is where its first jump goes, as its later jumps correct it; fresh noise is a function of
-    (seed, index, step). Rank r owns the batches r, r + R, ... and talks to no other; a batch is computed alike whoever
-    owns it, so the shards are the same, byte for byte, for every R. What is there already, from any earlier process, is
-    kept. `progress` is called after each batch that is on the disk.
+    (seed, index, step). A batch is computed alike whoever makes it, so the shards are the same, byte for byte, for any
+    number of processes; rank r of R begins with shard r, r + R, ... `progress` is called after each batch.
+
+    Args:
+        wait: Whether to wait for the shards that other processes are making.
 
     Raises:
         InputError: no pair is usable: the flow is broken, or the tolerance out of its reach; or the folder cannot be
@@ -82,54 +83,51 @@ def make_pairs(
         )
     _refuse_unlearned_times(generator.sampler, store.recipe.sampler)
     store.begin()
-    # Shards are checked by turns; who finds one damaged makes its batches, which the others hold to be there.
-    shards = store.shards(num)
-    lost = [batch for shard in shards[rank::ranks] for batch in store.check(shard, num)]
-    own = _in_own_order({*store.batches(num)[rank::ranks], *lost}, store.recipe.shard_batches)
-    made, start = Made(), time.monotonic()
-    kept: list[tuple[int, Block]] = []
-    for batch in own:
-        if store.has(batch):
-            continue
-        block = solve_batch(store.recipe, generator, batch)
-        made.pairs += len(block.usable)
-        made.evaluations += int(block.evaluations.sum())
-        made.unusable += int((~block.usable).sum())
-        kept.append((batch, block))
-        _check_usable(made, store.recipe)
-        if made.unusable == made.pairs:
-            continue  # not to be kept before it is known that the flow can do better
-        for number, solved in kept:
-            store.commit(number, solved)
-            store.seal(number // store.recipe.shard_batches, num)
-        kept = []
-        made.seconds = time.monotonic() - start
-        progress(made)
-    if kept:
-        _check_usable(made, store.recipe, patience=0)
-    for shard in shards:  # whose last batch came from a process that was killed before it could seal
-        store.seal(shard, num)
+    shards, made, start = store.shards(num), Made(), time.monotonic()
+    store.mend(shards[rank::ranks])
+    left = sorted(shards, key=lambda shard: ((shard - rank) % ranks, shard))
+    while left := [shard for shard in left if store.lacking(shard, num)]:
+        before = made.pairs
+        for shard in left:
+            with store.claim(shard) as mine:
+                if mine:
+                    _make_shard(store, generator, shard, num, made, start, progress)
+        if not wait:
+            break
+        if made.pairs == before:
+            time.sleep(PATIENCE)
     made.seconds = time.monotonic() - start
     return made
 
 
-def _in_own_order(batches: set[int], shard_batches: int) -> list[int]:
-    """Shard by shard, in an order that no other process has.
-
-    Processes that make the same pairs at once, each for a run of its own, would else go in lock-step and make all of
-    them twice; so they find most of what they come to made.
-    """
-    draw = random.Random(f"{platform.node()} {os.getpid()}")
-    turn = {shard: draw.random() for shard in sorted({batch // shard_batches for batch in batches})}
-    return sorted(sorted(batches), key=lambda batch: (turn[batch // shard_batches], draw.random()))
-
-
-def _check_usable(made: Made, recipe: PairRecipe, patience: int = 64) -> None:
-    if made.unusable == made.pairs > patience:
+def _make_shard(
+    store: PairStore,
+    generator: Generator,
+    shard: int,
+    num: int,
+    made: Made,
+    start: float,
+    progress: Callable[[Made], None],
+) -> None:
+    store.mend([shard])
+    blocks = []
+    for batch in store.lacking(shard, num):
+        block = solve_batch(store.recipe, generator, batch)
+        made.pairs += len(block.usable)
+        made.evaluations += int(block.evaluations.sum())
+        made.unusable += int((~block.usable).sum())
+        if made.unusable == made.pairs > 64:
+            break
+        blocks.append(block)
+        made.seconds = time.monotonic() - start
+        progress(made)
+    if made.pairs and made.unusable == made.pairs:
         raise InputError(
-            f"none of {made.pairs} pairs came to an end with {recipe.method} at tolerance {recipe.tolerance:g}: "
-            "the flow is broken, or the tolerance out of its reach."
+            f"none of {made.pairs} pairs came to an end with {store.recipe.method} at tolerance "
+            f"{store.recipe.tolerance:g}: the flow is broken, or the tolerance out of its reach."
         )
+    if blocks:
+        store.append(shard, blocks)
 
 
 def solve_batch(recipe: PairRecipe, generator: Generator, batch: int) -> Block:
@@ -160,10 +158,10 @@ class PairSource:
 
     def __init__(self, store: PairStore, num: int) -> None:
         self.store = store
-        if not store.is_whole(num):
-            lacking = len(store.missing(num)) * store.recipe.batch_size
+        if lacking := store.missing_pairs(num):
             raise InputError(f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs -c RUN.")
-        self.indices = np.flatnonzero(store.usable(num))
+        usable = [flag for shard in store.shards(num) for flag in store.usable(shard)]
+        self.indices = np.flatnonzero(usable[:num])
         self._opened: dict[tuple[int, str], Any] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -190,12 +188,13 @@ class PairSource:
         shard, offset = divmod(number, recipe.shard_batches * recipe.batch_size)
         try:
             if (shard, name) not in self._opened:
-                self._opened[shard, name] = safe_open(self.store.shard_path(shard), framework="pt").get_slice(name)
+                (path,) = self.store.files(shard)
+                self._opened[shard, name] = safe_open(path, framework="pt").get_slice(name)
             values: Tensor = self._opened[shard, name][offset : offset + 1][0].float()
         except (SafetensorError, OSError, IndexError) as error:
             raise InputError(
-                f"{self.store.shard_path(shard)} was lost or damaged while it was in use ({error}). "
-                "The same command makes it again and goes on."
+                f"{self.store.files(shard)[0]} was lost or damaged while it was in use ({error}). "
+                "The same command makes it again and resumes."
             ) from None
         return values
 

@@ -4,299 +4,290 @@
     source[0]                       range in metres and reflectance, (2, H, W)
     source.encoded(0, encoding)     the same in model space
 
-A shard is a safetensors file of `range` uint16 (n, H, W), `reflectance` uint8 (n, H, W) where the scans have any, and
-`crc32` uint32 (n,). What the codes mean is told by `r2flow.data.quantise` and by `manifest.json`.
+A shard is an item of `r2flow.store`: `range` uint16 (n, H, W) and, where the scans have any, `reflectance` uint8
+(n, H, W), in the codes of `r2flow.data.quantise`.
 """
 
 import hashlib
-import json
+import logging
 import os
-import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
-from io import BufferedReader
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
 from safetensors import safe_open
 from torch import Tensor
 
-import r2flow
+from r2flow import simulator
 from r2flow.data.layouts import Drive
-from r2flow.data.quantise import RangeCodes, ReflectanceCodes
-from r2flow.data.sources import ScanSource
-from r2flow.data.store import MANIFEST, Damaged, difference, shard_count, shard_items
+from r2flow.data.options import SIMULATED
+from r2flow.data.quantise import OTHER_LEVELS, RangeCodes, ReflectanceCodes, find_levels
+from r2flow.data.reading import Reading, lacks_reflectance, range_image, stored_reflectance
+from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, spread, warn_of_other_sensor
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, read_json
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
+from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, difference, read_manifest
 
-FORMAT = "r2flow scans 1"
+log = logging.getLogger(__name__)
+
+KIND = "scans"
+SHARD_SCANS = 64  # 13 MB at 64 x 1024, held in memory while they are made
+PROBED = 8  # scans that tell whether a data set has reflectance, and in which steps
+PROJECTION = 1  # to be raised when the same files give other images, or images other codes
 
 
-# What a folder says of itself
-
-
-@dataclass(frozen=True)
-class ScanRecipe:
-    """What prepared scans are a function of, beside the files themselves; nothing in it tells where these lie."""
-
-    revision: int  # `preparing.PROJECTION` or the simulator's: a newer r2flow mends damaged shards of an older one
-    layout: str  # of the data set, or `simulated`
-    scans: int
-    names: str  # SHA-256 of the names of the scans
-    sensor: dict[str, Any]  # `Sensor.described`
-    projection: str  # as in `r2flow.data.reading.Reading`, like the next two
-    convention: str
-    reflectance_scale: float
-    levels: int | None  # code n of reflectance is n / levels; None where the scans have none
-    ranges: dict[str, float]  # the numbers of the formula in `r2flow.data.quantise.RangeCodes`
-    shard_scans: int  # scans of the data set a shard; it holds fewer where some were left out
-    seed: int | None = None  # of simulated scans
-    columns: tuple[str, ...] | None = None  # of files that do not name them
-
-    def describe(self) -> dict[str, Any]:
-        """All of it as plain values; `columns` only where they were named."""
-        return {key: value for key, value in asdict(self).items() if key != "columns" or value is not None}
-
-    @property
-    def digest(self) -> str:
-        return checksum(self.describe())
-
-    @property
-    def image_shape(self) -> tuple[int, int]:
-        """(H, W)."""
-        return len(self.sensor["elevations"]), self.sensor["columns"]
-
-    @property
-    def codes(self) -> list[RangeCodes | ReflectanceCodes]:
-        """The codes of range and, where the scans have it, of reflectance."""
-        ranges = RangeCodes(self.sensor["min_range"], self.sensor["max_range"])
-        return [ranges] if self.levels is None else [ranges, ReflectanceCodes(self.levels)]
-
-    @property
-    def shards(self) -> int:
-        return shard_count(self.scans, self.shard_scans)
-
-    def numbers_of(self, shard: int) -> range:
-        """The scans of the data set that a shard is made of."""
-        return shard_items(shard, self.scans, self.shard_scans)
+# Making
 
 
 @dataclass(frozen=True)
-class ShardEntry:
-    """What is known of a shard that was written."""
+class Plan:
+    """The scans to prepare, by drive, and the recipe of their store."""
 
-    scans: int  # that it holds
-    left_out: tuple[int, ...]  # numbers of those that could not be used
-    bytes: int  # of the file
-    head: int  # CRC-32 of the file up to its first tensor
-    sha256: str  # of the whole file
-    range_error: float  # the most that a range is off, in metres
-    reflectance_error: float  # the most that a reflectance is off
-
-    @classmethod
-    def of(cls, content: Mapping[str, Any]) -> "ShardEntry":
-        return cls(**{**content, "left_out": tuple(content["left_out"])})
-
-
-@dataclass(frozen=True)
-class Manifest:
-    """Prepared scans: their recipe, the names of the data set's scans by drive, and the shards once all are there."""
-
-    recipe: ScanRecipe
+    recipe: Mapping[str, Any]
     drives: tuple[Drive, ...]
-    shards: tuple[ShardEntry, ...] = ()
+    source: ScanSource
 
-    @cached_property
-    def left_out(self) -> frozenset[int]:
-        return frozenset(number for shard in self.shards for number in shard.left_out)
+    def store(self, folder: str | Path) -> Store:
+        return Store(folder, KIND, self.recipe)
 
     @property
-    def names(self) -> list[str]:
-        """Of all scans of the data set, also those that were left out."""
-        return [name for drive in self.drives for name in drive.scans]
+    def shards(self) -> range:
+        return range(-(-self.recipe["scans"] // self.recipe["shard_scans"]))
 
 
-def shard_name(shard: int) -> str:
-    return f"scans-{shard:06d}.safetensors"
-
-
-def checksum(content: Any) -> str:
-    """SHA-256 of what can be written as JSON."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
-def describe_sensor(sensor: Sensor) -> dict[str, Any]:
-    """What a sensor's images depend on, as JSON gives it back."""
-    fields: dict[str, Any] = json.loads(json.dumps(sensor.described()))
-    return fields
-
-
-def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Names of a drive share their beginning, which is written once."""
-    drives = []
-    for drive in manifest.drives:
-        prefix = os.path.commonprefix(drive.scans)  # noqa: RUF071  of letters, not of folders
-        drives.append({"name": drive.name, "prefix": prefix, "scans": [name[len(prefix) :] for name in drive.scans]})
-    content = {
-        "format": FORMAT,
-        "made by": f"r2flow {r2flow.__version__}",
-        "recipe": manifest.recipe.describe(),
-        "left_out": [name for number, name in enumerate(manifest.names) if number in manifest.left_out],
-        "shards": [asdict(shard) for shard in manifest.shards] or None,
-        "drives": drives,
-    }
-    content["checksum"] = checksum(content)
-    with atomic_write(folder / MANIFEST, "w") as file:
-        json.dump(content, file, indent=1)
-
-
-def read_manifest(folder: Path, finished: bool = False) -> Manifest:
-    """The manifest of a folder, checked; with `finished`, of one that has all its shards.
+def plan_files(
+    layout: str,
+    root: str | Path,
+    drives: Sequence[Drive],
+    reading: Reading,
+    levels: int | None = None,
+    shard_scans: int = SHARD_SCANS,
+) -> Plan:
+    """Scan files in drives below a root. Without `levels`, some of the scans decide those of reflectance.
 
     Raises:
-        InputError: it is not there, cannot be read, is of another format, damaged, or not finished.
+        InputError: levels out of their range.
     """
-    path = folder / MANIFEST
-    damaged = InputError(f"{path} is damaged. Delete its folder and prepare the scans again.")
-    try:
-        content = read_json(path)
-        found = content["format"]
-    except FileNotFoundError:
-        raise InputError(f"{folder} holds no prepared scans (no {MANIFEST}); make them: r2flow prepare.") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
-    except (ValueError, KeyError, TypeError):
-        raise damaged from None
-    if found != FORMAT:
-        raise InputError(f"{path} is of the format {found!r}, not {FORMAT!r}; prepare the scans again.")
-    if content.pop("checksum", None) != checksum(content):
-        raise damaged
-    if finished and not content["shards"]:
-        raise InputError(f"{folder} is not finished: the same r2flow prepare command goes on.")
-    return Manifest(
-        ScanRecipe(**content["recipe"]),
-        tuple(Drive(d["name"], tuple(d["prefix"] + rest for rest in d["scans"])) for d in content["drives"]),
-        tuple(ShardEntry.of(shard) for shard in content["shards"] or ()),
-    )
+    root = Path(root).expanduser()
+    paths = [path for drive in drives for path in drive.scans]
+    named = tuple(Drive(d.name, tuple(Path(os.path.relpath(p, root)).as_posix() for p in d.scans)) for d in drives)
+    reading = replace(reading, on_bad_scan="error", within_limits=True)
+    warn_of_other_sensor(paths, reading, root)
+    levels = _reflectance_levels(paths, reading, levels)
+    reading = replace(reading, reflectance=levels is not None)
+    return _plan(layout, named, ScanFiles(paths, reading), reading, levels, shard_scans, PROJECTION)
 
 
-# Checking
+def plan_simulated(
+    num: int, seed: int, sensor: Sensor, levels: int | None = None, shard_scans: int = SHARD_SCANS
+) -> Plan:
+    """The first `num` scenes of the simulator under a seed."""
+    drives = (Drive(SIMULATED, tuple(f"scene {scene}" for scene in range(num))),)
+    source = SimulatedScans(sensor, seed, range(num))
+    levels = find_levels(source[0][1]) if levels is None else levels
+    reading = Reading(sensor, reflectance=True, within_limits=True)
+    return _plan(SIMULATED, drives, source, reading, levels, shard_scans, simulator.REVISION, seed)
 
 
-def find_prepared(folder: Path, sensor: Sensor, projection: str, convention: str) -> Manifest:
-    """The manifest of a folder that `r2flow prepare` has written; of its shards only the heads are read.
+def _plan(
+    layout: str, drives: tuple[Drive, ...], source: ScanSource, reading: Reading, levels: int | None,
+    shard_scans: int, revision: int, seed: int | None = None,
+) -> Plan:  # fmt: skip
+    names = [name for drive in drives for name in drive.scans]
+    if levels is not None:
+        ReflectanceCodes(levels)  # refuses what is no number of levels
+    recipe = {
+        "revision": revision, "layout": layout, "scans": len(names), "names": checksum(names),
+        "reading": reading.described(), "levels": levels, "shard_scans": shard_scans, "seed": seed,
+    }  # fmt: skip
+    return Plan(recipe, drives, source)
+
+
+def _reflectance_levels(paths: Sequence[str], reading: Reading, levels: int | None) -> int | None:
+    """Levels of reflectance, `levels` where given; None where the scans have no reflectance."""
+    if lacks_reflectance(paths, "skip", reading.columns) is not None:
+        return None
+    found, scale, images = [], reading.reflectance_scale or 1.0, False
+    for index in spread(len(paths), PROBED):
+        with suppress(InputError):  # reported when the scan's turn comes
+            reflectance = stored_reflectance(paths[index], reading.columns)
+            if reflectance is not None:
+                is_image = range_image(Path(paths[index])) is not None  # whose reflectance lies in [0, 1]
+                found.append(reflectance / np.float32(1.0 if is_image else scale))
+                images |= is_image
+    values = np.concatenate(found) if found else np.zeros(0)
+    if not values.any():
+        return OTHER_LEVELS if levels is None else levels
+    if levels is not None:
+        return levels
+    levels, highest = find_levels(values), float(values.max())
+    if not images and highest < 0.25 and not ReflectanceCodes(levels).fits(values):
+        log.warning(
+            "reflectance goes up to %.3g of 1 alone and is kept in steps of 1/%d: --reflectance-scale %.3g spreads it",
+            highest, levels, highest * scale,
+        )  # fmt: skip
+    return levels
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Projects and codes the scans of a shard."""
+
+    store: Store
+    source: ScanSource
+    skip: bool
+
+    def __call__(self, shard: int) -> None:
+        recipe, kept, left_out, errors = self.store.described, [], [], [[0.0, 0.0]]
+        coders = codes_of(recipe)
+        for number in range(recipe["scans"])[shard * recipe["shard_scans"] :][: recipe["shard_scans"]]:
+            try:
+                image = self.source[number]
+            except InputError as error:
+                if not self.skip:
+                    raise
+                log.warning("left out: %s", error)
+                left_out.append(number)
+                continue
+            codes = [coder.encode(channel) for coder, channel in zip(coders, image, strict=False)]
+            off = [np.abs(c.values[code] - ch).max() for c, code, ch in zip(coders, codes, image, strict=False)]
+            errors.append([*map(float, off), 0.0][:2])
+            kept.append(codes)
+        channels = zip(("range", "reflectance"), coders, strict=False)
+        shape = (len(kept), *Reading.of(recipe["reading"]).sensor.shape)
+        tensors = {
+            name: np.array([codes[i] for codes in kept], coder.dtype).reshape(shape)
+            for i, (name, coder) in enumerate(channels)
+        }
+        self.store.write(shard, tensors, {"left_out": left_out, "errors": np.max(errors, axis=0).tolist()})
+
+
+def prepare(
+    folder: str | Path,
+    plan: Plan,
+    on_bad_scan: str = "error",
+    workers: int = 1,
+    checked: Advance = lambda shard: None,
+    made: Advance = lambda shard: None,
+) -> list[dict[str, Any]]:
+    """Check the shards of a folder, and make those that are missing or damaged.
+
+    Args:
+        on_bad_scan: `error`, or `skip` to leave out what cannot be used.
+        checked, made: Called with each shard.
+
+    Returns:
+        The notes of the shards: numbers of the scans left out, and the largest errors of range and reflectance.
 
     Raises:
-        InputError: no prepared scans, unfinished or damaged ones, or ones of another sensor, size, projection or
-            convention than the given: nothing is projected here.
+        InputError: other scans are in the folder, or a scan cannot be used.
     """
-    manifest = read_manifest(folder, finished=True)
-    recipe = manifest.recipe
-    there = {**recipe.sensor, "projection": recipe.projection, "convention": recipe.convention}
-    here = {**describe_sensor(sensor), "projection": projection, "convention": convention}
-    # An image is the same whatever these are; the order of the lasers matters where rows are found by it.
-    irrelevant = {"name", "height"} if projection == "unfolding" else {"name", "height", "firing"}
-    found = difference(*({k: v for k, v in one.items() if k not in irrelevant} for one in (there, here)))
-    if found:
-        rows, columns = recipe.image_shape
-        raise InputError(
-            f"{folder} was prepared for other images (sensor {recipe.sensor['name']}, {rows}x{columns}, "
-            f"{recipe.projection}, {recipe.convention}): {found}. Give the run the same, or prepare the scans for it."
-        )
-    for shard, entry in enumerate(manifest.shards):
-        path = folder / shard_name(shard)
-        try:
-            with _opened(path, entry):
-                pass
-        except Damaged as error:
-            raise _to_be_made_again(path, error) from None
-    return manifest
+    store = plan.store(folder)
+    if not store.check() or store.missing(plan.shards):
+        store.begin(drives=[[drive.name, drive.scans] for drive in plan.drives])
+    store.mend(plan.shards, checked)
+    store.make(store.missing(plan.shards), _Work(store, plan.source, on_bad_scan == "skip"), workers, made)
+    notes = [store.head(shard) for shard in plan.shards]
+    if sum(len(note["left_out"]) for note in notes) == plan.recipe["scans"]:
+        raise InputError(f"all {plan.recipe['scans']} scans were left out as unusable; remove {store.folder}.")
+    return notes
 
 
-def check_prepared(folder: Path, advance: Callable[[], None] = lambda: None) -> dict[Path, str]:
-    """Read every byte of every shard: the damaged ones and what is wrong with them."""
-    damaged = {}
-    for shard, entry in enumerate(read_manifest(folder, finished=True).shards):
-        path = folder / shard_name(shard)
-        if damage := damage_of(path, entry):
-            damaged[path] = damage
-        advance()
-    return damaged
-
-
-def damage_of(path: Path, entry: ShardEntry) -> str | None:
-    """What is wrong with a shard, of which every byte is read; None where it is what was written."""
-    try:
-        with _opened(path, entry) as file:
-            file.seek(0)
-            same = hashlib.file_digest(file, "sha256").hexdigest() == entry.sha256
-    except Damaged as error:
-        return str(error)
-    return None if same else "its checksum differs"
-
-
-def read_head(file: IO[bytes]) -> bytes:
-    """A safetensors file up to its first tensor: the length of its header, and the header."""
-    length = file.read(8)
-    return length + file.read(min(int.from_bytes(length, "little"), 2**20))
-
-
-def scan_crc(codes: Sequence[np.ndarray]) -> int:
-    """CRC-32 of one scan: its codes of range, then those of reflectance."""
-    crc = 0
-    for code in codes:
-        crc = zlib.crc32(np.ascontiguousarray(code).data, crc)
-    return crc
-
-
-@contextmanager
-def _opened(path: Path, entry: ShardEntry) -> Iterator[BufferedReader]:
-    """A shard of the right length with an unharmed head, open behind this head."""
-    if not path.is_file():
-        raise Damaged("it is missing, or no file")
-    try:
-        file = open(path, "rb")  # noqa: SIM115  closed below; only what opening it raises is meant
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
-    with file:
-        size = os.fstat(file.fileno()).st_size
-        if size != entry.bytes:
-            raise Damaged(f"it has {size} bytes, not {entry.bytes}")
-        if zlib.crc32(read_head(file)) != entry.head:
-            raise Damaged("its head is not what was written")
-        yield file
-
-
-def _to_be_made_again(path: Path, error: Damaged) -> InputError:
-    return InputError(f"{path} is damaged ({error}). The same r2flow prepare command makes it again.")
+def codes_of(recipe: Mapping[str, Any]) -> list[RangeCodes | ReflectanceCodes]:
+    """The codes of range and, where the scans have it, of reflectance."""
+    sensor, levels = recipe["reading"]["sensor"], recipe["levels"]
+    ranges = RangeCodes(sensor["min_range"], sensor["max_range"])
+    return [ranges] if levels is None else [ranges, ReflectanceCodes(levels)]
 
 
 # Reading
 
 
-class PreparedScans(ScanSource):
-    """Scans of shards as a source, `rows` being their numbers among all that the shards hold.
+def read_prepared(folder: Path) -> tuple[dict[str, Any], list[Drive]]:
+    """The recipe of prepared scans, and their names by drive.
 
-    Every scan that is read is compared with its checksum.
+    Raises:
+        InputError: the folder holds none, or its manifest is damaged.
+    """
+    try:
+        content = read_manifest(folder, KIND)
+    except FileNotFoundError:
+        raise InputError(f"{folder} holds no prepared scans (no {MANIFEST}); make them: r2flow prepare.") from None
+    return content["recipe"], [Drive(name, tuple(scans)) for name, scans in content["drives"]]
+
+
+def check_prepared(folder: Path, advance: Callable[[int], None] = lambda shard: None) -> dict[Path, str]:
+    """Read every byte of every shard: the damaged or missing ones and what is wrong with them."""
+    recipe, drives = read_prepared(folder)
+    plan = Plan(recipe, tuple(drives), ScanFiles([], Reading.of(recipe["reading"])))
+    store, damaged = plan.store(folder), {}
+    for shard in plan.shards:
+        damage = store.damage(shard) or ("" if store.has(shard) else "it is missing")
+        if damage:
+            damaged[store.files(shard)[0]] = damage
+        advance(shard)
+    return damaged
+
+
+def refuse_other_images(folder: Path, recipe: Mapping[str, Any], reading: Reading) -> None:
+    """Refuse prepared scans of another sensor, size, projection or convention: nothing is projected here."""
+    # An image is the same whatever these are; the order of the lasers matters where rows are found by it.
+    irrelevant = {"name", "height"} if reading.projection == "unfolding" else {"name", "height", "firing"}
+    images = []
+    for one in (recipe["reading"], reading.described()):
+        sensor = {key: value for key, value in one["sensor"].items() if key not in irrelevant}
+        images.append({**sensor, "projection": one["projection"], "convention": one["convention"]})
+    if found := difference(*images):
+        there = Reading.of(recipe["reading"])
+        raise InputError(
+            f"{folder} was prepared for other images (sensor {there.sensor.name}, "
+            f"{there.sensor.shape[0]}x{there.sensor.shape[1]}, {there.projection}, {there.convention}): {found}. Give "
+            "the run the same, or prepare the scans for it."
+        )
+
+
+class PreparedScans(ScanSource):
+    """Scans of shards as a source.
+
+    Args:
+        numbers: Of the data set's scans; those that were left out are passed over. None takes all.
+
+    Raises:
+        InputError: a shard is missing or damaged, or the scans have no reflectance where it is needed.
     """
 
-    def __init__(self, folder: Path, manifest: Manifest, rows: np.ndarray, reflectance: bool = True) -> None:
-        self.folder, self.manifest, self.rows, self.reflectance = folder, manifest, rows, reflectance
-        self._ends = np.cumsum([entry.scans for entry in manifest.shards])
-        if reflectance and manifest.recipe.levels is None:
-            raise InputError(
-                f"{folder} holds scans without reflectance. Set encoding.reflectance=false for range alone."
-            )
-        self._values = [codes.values for codes in manifest.recipe.codes[: 1 + reflectance]]
+    def __init__(self, folder: Path, numbers: Sequence[int] | None = None, reflectance: bool = True) -> None:
+        self.folder, self.reflectance = folder, reflectance
+        self.recipe, self._drives = read_prepared(folder)
+        plan = Plan(self.recipe, tuple(self._drives), self)
+        self.store, held = plan.store(folder), []
+        if reflectance and self.recipe["levels"] is None:
+            raise InputError(f"{folder} holds scans without reflectance. Set encoding.reflectance=false.")
+        for shard in plan.shards:
+            try:
+                left_out = set(self.store.head(shard)["left_out"])
+            except FileNotFoundError:
+                raise InputError(f"{folder} is not finished: the same r2flow prepare command resumes.") from None
+            except Damaged as error:
+                raise self._damaged(shard, error) from None
+            begin, size = shard * self.recipe["shard_scans"], self.recipe["shard_scans"]
+            rows = [n for n in range(begin, min(begin + size, self.recipe["scans"])) if n not in left_out]
+            held += [(number, shard, row) for row, number in enumerate(rows)]
+        #: Rows of (number in the data set, shard, row of the shard).
+        self.rows = np.array(held, dtype=np.int64).reshape(-1, 3)
+        if numbers is not None:
+            place = {int(number): row for row, number in enumerate(self.rows[:, 0])}
+            self.rows = self.rows[[place[number] for number in numbers if number in place]]
+        self._values = [codes.values for codes in codes_of(self.recipe)[: 1 + reflectance]]
         self._encoding: Encoding | None = None
         self._model: list[np.ndarray] = []
-        self._shards: dict[int, _Shard] = {}
+        self._shards: dict[int, list[Any]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_shards": {}}  # memory maps stay in their process
@@ -304,46 +295,52 @@ class PreparedScans(ScanSource):
     def __len__(self) -> int:
         return len(self.rows)
 
+    @cached_property
+    def _names(self) -> list[str]:
+        return [name for drive in self._drives for name in drive.scans]
+
     @property
     def names(self) -> list[str]:
-        left_out = self.manifest.left_out
-        held = [name for number, name in enumerate(self.manifest.names) if number not in left_out]
-        return [held[row] for row in self.rows]
+        return [self._names[number] for number in self.rows[:, 0]]
 
     def subset(self, indices: Sequence[int]) -> "PreparedScans":
-        rows = self.rows[np.asarray(indices, dtype=np.int64)]
-        return PreparedScans(self.folder, self.manifest, rows, self.reflectance)
+        part = object.__new__(PreparedScans)
+        part.__dict__ = {**self.__getstate__(), "rows": self.rows[np.asarray(indices, dtype=np.int64)]}
+        return part
 
     @property
     def drives(self) -> dict[str, list[int]]:  # type: ignore[override]
-        place = {name: number for number, name in enumerate(self.names)}
-        found = {d.name: [place[n] for n in d.scans if n in place] for d in self.manifest.drives}
+        place = {name: index for index, name in enumerate(self.names)}
+        found = {d.name: [place[n] for n in d.scans if n in place] for d in self._drives}
         return {drive: numbers for drive, numbers in found.items() if numbers}
 
     def about(self) -> dict[str, Any]:
-        kind = f"prepared {self.manifest.recipe.layout}"
-        return {"kind": kind, "manifest": self._digest[:12], "reflectance": self.reflectance}
+        kind = f"prepared {self.recipe['layout']}"
+        return {"kind": kind, "recipe": self.store.digest[:12], "reflectance": self.reflectance}
 
     def identity(self) -> dict[str, Any]:
-        rows = hashlib.sha256(self.rows.astype(np.int64).tobytes()).hexdigest()
-        return {"manifest": self._digest, "rows": rows, "reflectance": self.reflectance}
+        rows = hashlib.sha256(np.ascontiguousarray(self.rows).tobytes()).hexdigest()
+        return {"recipe": self._contents, "rows": rows, "reflectance": self.reflectance}
 
     @cached_property
-    def _digest(self) -> str:
-        return hashlib.sha256((self.folder / MANIFEST).read_bytes()).hexdigest()
+    def _contents(self) -> str:
+        """Hash of the heads of all shards, which hold their checksums."""
+        digest = hashlib.sha256(self.store.digest.encode())
+        for shard in np.unique(self.rows[:, 1]):
+            with open(self.store.files(int(shard))[0], "rb") as file:
+                digest.update(file.read(int.from_bytes(file.read(8), "little")))
+        return digest.hexdigest()
 
     def files(self) -> dict[str, str | Path]:
-        return {MANIFEST: self.folder / MANIFEST}  # which holds the checksums of all shards
+        return {path.name: path for shard in np.unique(self.rows[:, 1]) for path in self.store.files(int(shard))}
 
     def places(self) -> set[str]:
         real = os.path.realpath(self.folder)
         return {os.path.join(real, name) for name in self.names} | super().places()
 
     def simulated_scenes(self) -> dict[int, Sequence[int]]:
-        recipe = self.manifest.recipe
-        if recipe.seed is None:
-            return {}
-        return {recipe.seed: [int(name.rpartition(" ")[2]) for name in self.names]}
+        seed = self.recipe["seed"]
+        return {} if seed is None else {seed: self.rows[:, 0].tolist()}
 
     def __getitem__(self, index: int) -> np.ndarray:
         return self._looked_up(index, self._values)
@@ -351,8 +348,7 @@ class PreparedScans(ScanSource):
     def encoded(self, index: int, encoding: Encoding) -> Tensor:
         """`encoding.encode` of a scan, bit for bit, (C, H, W), where `encoding` is of this source's sensor.
 
-        Where a channel depends on its own code alone there are no more values than codes: encoded once, looked up
-        from then on.
+        Where a channel depends on its own code alone there are no more values than codes: encoded once, then looked up.
         """
         if encoding.format.channels != 1 or encoding.reflectance != self.reflectance:
             return super().encoded(index, encoding)
@@ -365,39 +361,21 @@ class PreparedScans(ScanSource):
         return torch.from_numpy(self._looked_up(index, self._model))
 
     def _looked_up(self, index: int, tables: Sequence[np.ndarray]) -> np.ndarray:
-        row, shape = int(self.rows[index]), self.manifest.recipe.image_shape
-        shard = int(np.searchsorted(self._ends, row, side="right"))
-        path, entry = self.folder / shard_name(shard), self.manifest.shards[shard]
+        _, shard, row = map(int, self.rows[index])
         try:
             if shard not in self._shards:
-                self._shards[shard] = _Shard(path, entry)
-            codes = self._shards[shard].codes(row - int(self._ends[shard]) + entry.scans)
-        except Damaged as error:
-            raise _to_be_made_again(path, error) from None
-        image = np.empty((len(tables), *shape), dtype=np.float32)
-        for channel, (table, code) in enumerate(zip(tables, codes, strict=False)):
+                self.store.head(shard)  # as long as its head says, and of this recipe
+                file = safe_open(self.store.files(shard)[0], framework="numpy")
+                self._shards[shard] = [file.get_slice(name) for name in ("range", "reflectance")[: len(self._values)]]
+        except (Damaged, OSError) as error:
+            raise self._damaged(shard, error) from None
+        codes = [image[row : row + 1][0] for image in self._shards[shard]]
+        image = np.empty((len(tables), *codes[0].shape), dtype=np.float32)
+        for channel, (table, code) in enumerate(zip(tables, codes, strict=True)):
             # No index is out of bounds, and "clip" spares the check: a code has as many values as its table.
             np.take(table, code, out=image[channel], mode="clip")
         return image
 
-
-class _Shard:
-    """A memory-mapped shard; raises `Damaged` where it is not what was written."""
-
-    def __init__(self, path: Path, entry: ShardEntry) -> None:
-        with _opened(path, entry):
-            self.file = open(path, "rb")  # noqa: SIM115  its length is looked at before each scan
-        self.bytes, tensors = entry.bytes, safe_open(path, framework="numpy")
-        self.crc32, there = tensors.get_tensor("crc32"), set(tensors.keys())
-        self.images = [tensors.get_slice(name) for name in ("range", "reflectance") if name in there]
-
-    def codes(self, row: int) -> list[np.ndarray]:
-        """Codes of range and, where there is any, of reflectance, (H, W) each."""
-        # Reading behind the end of a file that was cut meanwhile kills the process.
-        size = os.fstat(self.file.fileno()).st_size
-        if size != self.bytes:
-            raise Damaged(f"it has {size} bytes, not {self.bytes}")
-        codes: list[np.ndarray] = [image[row : row + 1][0] for image in self.images]
-        if scan_crc(codes) != self.crc32[row]:
-            raise Damaged(f"the checksum of scan {row} in it differs")
-        return codes
+    def _damaged(self, shard: int, error: Exception) -> InputError:
+        path = self.store.files(shard)[0]
+        return InputError(f"{path} is damaged ({error}). The same r2flow prepare command makes it again.")

@@ -28,6 +28,8 @@ class RangeCodes:
     is what each code means, (65536,), float32.
     """
 
+    dtype = np.uint16
+
     def __init__(self, min_range: float, max_range: float) -> None:
         self.near, self.far = np.float32(min_range), np.float32(max_range)
         self.min_range = min_range
@@ -59,16 +61,14 @@ class RangeCodes:
             code = np.where(r <= self.knee, code, self.knee_code + (r - self.knee) / self.coarse)
         return np.where(returned, np.clip(np.rint(code), 1, CODES - 1), 0).astype(np.uint16)
 
-    def describe(self) -> dict[str, float]:
-        """The formula's numbers, for a manifest."""
-        return {"knee": self.knee, "knee_code": self.knee_code, "fine": self.fine, "coarse": self.coarse}
-
 
 class ReflectanceCodes:
     """uint8 codes of reflectance, n / levels; a value between two levels becomes the nearer one.
 
     `values` is what each code means, (256,), float32 in [0, 1]. Levels outside [1, 256] are refused (`InputError`).
     """
+
+    dtype = np.uint8
 
     def __init__(self, levels: int) -> None:
         if not 1 <= levels <= 256:

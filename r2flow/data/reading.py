@@ -1,9 +1,10 @@
 """How a scan file, or a range image, becomes an image of one sensor."""
 
+import json
 import logging
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,6 +48,19 @@ class Reading:
     on_bad_scan: str = "empty"
     within_limits: bool = False
     columns: tuple[str, ...] | None = None
+
+    def described(self) -> dict[str, Any]:
+        """All of it as plain values, for a manifest or a note."""
+        own = {f.name: getattr(self, f.name) for f in fields(self)} | {"sensor": self.sensor.described()}
+        plain: dict[str, Any] = json.loads(json.dumps(own))  # tuples are lists there
+        return plain
+
+    @classmethod
+    def of(cls, described: Mapping[str, Any]) -> "Reading":
+        """The reading that a manifest describes; what it does not say is the default."""
+        plain = {key: tuple(v) if isinstance(v, list) else v for key, v in described["sensor"].items()}
+        columns = described.get("columns")
+        return cls(**{**described, "sensor": Sensor(**plain), "columns": columns and tuple(columns)})
 
 
 class Projected(NamedTuple):

@@ -294,9 +294,9 @@ class SimulatedScans(ScanSource):
         scene, channels = self.scenes[index], 1 + self.reflectance
         if self._kept is None:
             return simulate(self.sensor, self.seed, scene).image[:channels]
-        if self._kept.missing([scene]):
+        if not self._kept.has(scene):
             self._kept.begin()
-            self._kept.write(scene)
+            self._kept.simulate(scene)
         (path,) = self._kept.files(scene)
         image = range_image(path, self.sensor.shape)
         if image is None:

@@ -1,7 +1,6 @@
 """Reflow pairs made with progress: how many, how fast, how long still."""
 
 import os
-import time
 from collections.abc import Mapping
 
 import torch
@@ -19,48 +18,19 @@ def make_and_tell(
     rank: int = 0,
     ranks: int = 1,
     device: torch.device | str = "cpu",
+    wait: bool = False,
 ) -> Made:
     """`make_pairs` with a bar; with lines where several processes work."""
     generator = checkpoint.generator.to(device)
-    there = sum(store.shard_path(shard).is_file() for shard in store.shards(num))
-    if there > 4 and rank == 0:
-        print(f"checking {there} shards of pairs", flush=True)
     who = f"process {rank + 1} of {ranks}: " if ranks > 1 else ""
-    total = sum(batch % ranks == rank for batch in store.missing(num)) * store.recipe.batch_size
-    with Bar(f"{who}drawing", total, "pairs", lines=ranks > 1) as bar:
-        made = make_pairs(store, generator, num, rank, ranks, lambda made: bar.set(made.pairs))
+    with Bar(f"{who}drawing", store.missing_pairs(num), "pairs", lines=ranks > 1) as bar:
+        made = make_pairs(store, generator, num, rank, ranks, lambda made: bar.set(made.pairs), wait)
     if made.pairs:
         unusable = f", {made.unusable} did not converge and are left out" if made.unusable else ""
         rate, cost = made.pairs / made.seconds, made.evaluations / made.pairs
         drawn = f"{who}{made.pairs} pairs drawn in whole batches"
         print(f"{drawn}, {rate:.2f} pairs/s, {cost:.1f} evaluations a pair{unusable}", flush=True)
     return made
-
-
-def wait_for_others(
-    store: PairStore, num: int, launched: bool = False, pause: float = 2.0, patience: float = 120.0
-) -> bool:
-    """Wait for the other processes' pairs, without a collective call, which would time out.
-
-    Args:
-        launched: Whether one of the others started this process, which ends when that one is gone.
-
-    Returns:
-        Whether all are there; False when none has come for `patience` seconds: then any process may make the rest.
-    """
-    parent, lacking, since = os.getppid(), len(store.missing(num)), time.monotonic()
-    while not store.is_whole(num):
-        time.sleep(pause)
-        for shard in store.shards(num):
-            store.seal(shard, num)
-        now = len(store.missing(num))
-        if now != lacking:
-            lacking, since = now, time.monotonic()
-        elif time.monotonic() - since > patience:
-            return False
-        if launched and os.getppid() != parent:
-            raise SystemExit("the process that started this one is gone")
-    return True
 
 
 def place(environment: Mapping[str, str] = os.environ) -> tuple[int, int, int]:

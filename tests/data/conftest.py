@@ -5,7 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from r2flow.data.opening import find_drives
+from r2flow.data.prepared import plan_files, prepare
+from r2flow.data.reading import Reading
 from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.sensors import Sensor
 
 
 def write_scan(path: Path, number: int, reflectance: float = 0.5) -> None:
@@ -30,3 +34,9 @@ def numbered(tmp_path: Path) -> Path:
     for number in range(12):
         write_scan(tmp_path / "scans" / f"{number:06d}.bin", number)
     return tmp_path / "scans"
+
+
+def prepare_folder(root: Path, out: Path, sensor: Sensor, layout: str = "folder") -> Path:
+    """The scans of a data set, prepared."""
+    prepare(out, plan_files(layout, root, find_drives(layout, root), Reading(sensor)))
+    return out

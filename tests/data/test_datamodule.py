@@ -7,15 +7,14 @@ import torch
 
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import resolve_reflectance
-from r2flow.data.prepared import PreparedScans
-from r2flow.data.preparing import Preparation, plan_files, plan_simulated
+from r2flow.data.prepared import PreparedScans, plan_simulated, prepare
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.simulator.folder import SimulatedFolder, write_folder
-from tests.data.conftest import write_scan
+from r2flow.simulator.folder import SimulatedFolder
+from tests.data.conftest import prepare_folder, write_scan
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 
@@ -183,18 +182,6 @@ def test_parts_that_cannot_be_are_refused(parts, word: str):
         module(name="mixed", parts=parts)
 
 
-def test_parts_that_share_scans_are_refused(tmp_path: Path):
-    folder_of(tmp_path / "a", 0, 4)
-    folder_of(tmp_path / "b", 4, 4)
-    (tmp_path / "link").symlink_to(tmp_path / "b")
-    whole = {"name": "folder", "root": str(tmp_path), "drives": ["a", "b"]}
-    for other in ("b", "link"):
-        with pytest.raises(InputError, match=r"data.parts\[1\] has 4 scans that a part before it has too, as .*b/0000"):
-            module(name="mixed", parts=[whole, {"name": "folder", "root": str(tmp_path / other)}])
-    apart = module(name="mixed", parts=[{**whole, "drives": [drive]} for drive in ("a", "b")])
-    assert len(apart.names) == 8
-
-
 def test_scans_that_are_trained_on_and_held_out_are_said(numbered: Path, tmp_path: Path, caplog):
     folder_of(tmp_path / "other", 20, 2)
     module(name="folder", root=str(numbered), validation={"data": {"name": "folder", "root": str(tmp_path / "other")}})
@@ -295,8 +282,7 @@ class TestReflectance:
 def prepared_360(kitti_360: Path, tmp_path_factory) -> Path:
     """Drives 0, 2, 3, 4 and 10 of three scans each, prepared."""
     folder = tmp_path_factory.mktemp("prepared")
-    work = Preparation(folder, plan_files("kitti_360", kitti_360, SENSOR))
-    work.make(work.begin())
+    prepare_folder(kitti_360, folder, SENSOR, "kitti_360")
     return folder
 
 
@@ -349,10 +335,11 @@ def test_the_index_of_a_whole_data_set_is_small(tmp_path: Path, monkeypatch):
 def simulated_in(form: str, folder: Path, num: int, seed: int) -> dict[str, str]:
     """Scenes 0 to num - 1 of a seed as they lie on a disk."""
     if form == "prepared":
-        work = Preparation(folder, plan_simulated(num, seed, SENSOR))
-        work.make(work.begin())
+        prepare(folder, plan_simulated(num, seed, SENSOR))
     else:
-        write_folder(SimulatedFolder(folder, SENSOR, seed, ("npy",)), range(num), 1)
+        kept = SimulatedFolder(folder, SENSOR, seed, ("npy",))
+        kept.begin()
+        kept.make(range(num), kept.simulate)
     return {"name": form, "root": str(folder)}
 
 
@@ -362,13 +349,6 @@ def test_scenes_are_held_out_behind_those_that_lie_on_a_disk(tmp_path: Path, for
         stored = simulated_in(form, tmp_path / str(seed), 5, seed)
         data = module(**stored, validation={"data": {"name": "simulated", "scenes": 3}})
         assert list(data.validation_source.names) == [f"scene {number}" for number in range(first, first + 3)]
-
-
-@pytest.mark.parametrize("form", ["prepared", "folder"])
-def test_a_mixture_takes_no_scene_twice(tmp_path: Path, form: str):
-    stored = simulated_in(form, tmp_path / "a", 4, 0)
-    with pytest.raises(InputError, match=r"4 scans that a part before it has too, as scene 0 of simulator seed 0"):
-        module(name="mixed", parts=[stored, {"name": "simulated", "scenes": 20}])
 
 
 def test_what_does_not_unfold_is_named(tmp_path: Path):

@@ -9,29 +9,25 @@ import resource
 import signal
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from filelock import FileLock, Timeout
 
-from r2flow.data import contents, preparing
+from r2flow import store
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive
 from r2flow.data.opening import find_drives, open_prepared
-from r2flow.data.prepared import PreparedScans, check_prepared, read_manifest
-from r2flow.data.preparing import Plan, Preparation, plan_files, plan_simulated
+from r2flow.data.prepared import Plan, check_prepared, plan_files, plan_simulated, prepare
 from r2flow.data.quantise import RangeCodes, ReflectanceCodes, find_levels
 from r2flow.data.reading import Reading
 from r2flow.data.sources import ScanFiles, SimulatedScans
-from r2flow.data.store import MANIFEST
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import FORMATS, Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
-from tests.data.conftest import write_scan
+from r2flow.store import MANIFEST, read_manifest
 from tests.killing import MOMENTS, die_at, wait_until, was_killed
 
 SMALL = SENSORS["hdl64e"].resized(4, 16)
@@ -57,14 +53,17 @@ def clouds(tmp_path_factory) -> Path:
     return root
 
 
-def plan_of(root: Path, sensor: Sensor = SMALL, **options) -> Plan:
-    return plan_files("folder", root, sensor, **{"shard_scans": 3, **options})
+def plan_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", shard_scans: int = 3, **how) -> Plan:
+    return plan_files(layout, root, find_drives(layout, root), Reading(sensor, **how), shard_scans=shard_scans)
 
 
 def make(folder: Path, plan: Plan, **options) -> Path:
-    work = Preparation(folder, plan)
-    work.make(work.begin(), **options)
+    prepare(folder, plan, **options)
     return folder
+
+
+def prepared_in(folder: Path, sensor: Sensor = SMALL, split=None, drives=None, reflectance=True, **how):
+    return open_prepared(folder, Reading(sensor, reflectance=reflectance, **how), split, drives)
 
 
 def raw_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", **options) -> ScanFiles:
@@ -73,7 +72,7 @@ def raw_of(root: Path, sensor: Sensor = SMALL, layout: str = "folder", **options
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    return {p.name: p.read_bytes() for p in sorted(folder.glob("[!.]*")) if p.is_file()}
 
 
 # Codes
@@ -149,7 +148,7 @@ def test_the_scale_of_files_of_points_is_not_that_of_range_images(tmp_path: Path
     image = np.stack([draw.uniform(2, 70, (4, 16)), draw.integers(0, levels, (4, 16)) / levels]).astype(np.float32)
     (tmp_path / "scans").mkdir()
     np.save(tmp_path / "scans" / "1.npy", image)
-    assert plan_of(tmp_path / "scans", reflectance_scale=255.0).recipe.levels == levels
+    assert plan_of(tmp_path / "scans", reflectance_scale=255.0).recipe["levels"] == levels
     np.save(tmp_path / "scans" / "1.npy", image * np.float32([[[1]], [[0.03]]]))
     plan_of(tmp_path / "scans", reflectance_scale=255.0)
     assert caplog.text == ""  # nothing spreads them
@@ -159,7 +158,7 @@ def test_the_scale_of_files_of_points_is_not_that_of_range_images(tmp_path: Path
 
 
 def test_prepared_scans_are_the_raw_ones_to_the_stated_quantisation(clouds: Path, tmp_path: Path):
-    raw, prepared = raw_of(clouds), open_prepared(make(tmp_path, plan_of(clouds)), SMALL)
+    raw, prepared = raw_of(clouds), prepared_in(make(tmp_path, plan_of(clouds)), SMALL)
     assert len(prepared) == 10
     assert prepared.names == raw.names == [f"drive{i // 6}/{i:06d}.bin" for i in range(10)]
     for index in range(10):
@@ -181,10 +180,10 @@ def test_real_scans_keep_their_reflectance_to_the_bit(
     shared: Path, tmp_path: Path, layout: str, folder: str, most: int
 ):
     sensor = SENSORS["hdl64e"]
-    plan = plan_files(layout, shared / "real" / folder, sensor)
-    few = Plan(replace(plan.recipe, scans=most), (Drive("few", plan.drives[0].scans[:most]),), plan.source)
-    prepared = open_prepared(make(tmp_path, few), sensor)
-    assert few.recipe.levels == (256 if layout == "kitti_360" else 100)
+    plan = plan_of(shared / "real" / folder, sensor, layout)
+    few = Plan({**plan.recipe, "scans": most}, (Drive("few", plan.drives[0].scans[:most]),), plan.source)
+    prepared = prepared_in(make(tmp_path, few), sensor)
+    assert few.recipe["levels"] == (256 if layout == "kitti_360" else 100)
     raw = raw_of(shared / "real" / folder, layout=layout, sensor=sensor)
     for index in range(most):
         image, other = raw[index], prepared[index]
@@ -240,9 +239,9 @@ def test_encoded_is_the_encoding_of_the_decoded_bit_for_bit_in_every_code(
     metres = RangeCodes(sensor.min_range, sensor.max_range).values.reshape(64, 1024)
     values = np.random.default_rng(0).permutation(np.arange(65536) % 101).reshape(64, 1024) / np.float32(100)
     image = np.stack([metres, np.where(metres > 0, values, 0).astype(np.float32)])
-    recipe = replace(plan.recipe, sensor={**plan.recipe.sensor, "elevations": list(sensor.elevations), "columns": 1024})
+    recipe = {**plan.recipe, "reading": Reading(sensor, reflectance=True).described()}
     make(tmp_path, Plan(recipe, plan.drives, Images(image[None])))
-    source = open_prepared(tmp_path, sensor, reflectance=reflectance)
+    source = prepared_in(tmp_path, sensor, reflectance=reflectance)
     assert np.array_equal(source[0], image[: 1 + reflectance])
     encoding = Encoding(sensor, format, reflectance)
     expected = encoding.encode(torch.from_numpy(image[: 1 + reflectance]))
@@ -255,7 +254,7 @@ def test_encoded_is_the_encoding_of_the_decoded_bit_for_bit_in_every_code(
 def test_simulated_scans_too(tmp_path: Path):
     sensor = SMALL.resized(8, 32)
     make(tmp_path, plan_simulated(5, 3, sensor, shard_scans=2))
-    prepared, raw = open_prepared(tmp_path, sensor), SimulatedScans(sensor, 3, range(5))
+    prepared, raw = prepared_in(tmp_path, sensor), SimulatedScans(sensor, 3, range(5))
     assert prepared.names == raw.names
     for index in range(5):
         assert np.abs(prepared[index][0] - raw[index][0]).max() <= MILLIMETRE
@@ -269,15 +268,12 @@ def test_a_shard_is_three_bytes_a_pixel_and_readable_by_anybody(clouds: Path, tm
     from safetensors.numpy import load_file
 
     make(tmp_path, plan_of(clouds))
-    assert list(files(tmp_path)) == [contents.RECORD, MANIFEST, *(f"scans-{i:06d}.safetensors" for i in range(4))]
+    assert list(files(tmp_path)) == [MANIFEST, *(f"scans-{i:06d}.safetensors" for i in range(4))]
     tensors = load_file(tmp_path / "scans-000003.safetensors")  # ten scans by threes: one is left
     found = {name: (tensor.dtype.name, tensor.shape) for name, tensor in tensors.items()}
     assert found == {
-        "crc32": ("uint32", (1,)), "range": ("uint16", (1, 4, 16)), "reflectance": ("uint8", (1, 4, 16)),
+        "range": ("uint16", (1, 4, 16)), "reflectance": ("uint8", (1, 4, 16)),
     }  # fmt: skip
-    whole = plan_simulated(1, 0, SENSORS["hdl64e"])
-    size = len(Preparation(tmp_path, whole)._serialised(0, [[np.zeros((64, 1024), np.uint16)] * 2] * 8))
-    assert 81_106 / 8 * size < 17e9
 
 
 def test_nothing_tells_where_the_files_lie(clouds: Path, tmp_path: Path):
@@ -290,9 +286,8 @@ def test_nothing_tells_where_the_files_lie(clouds: Path, tmp_path: Path):
     for content in files(one).values():
         assert str(clouds).encode() not in content
     manifest = json.loads((one / MANIFEST).read_text())
-    assert manifest["made by"].startswith("r2flow ")
     assert manifest["recipe"]["levels"] == 256
-    assert [drive["name"] for drive in manifest["drives"]] == ["drive0", "drive1"]
+    assert [name for name, _ in manifest["drives"]] == ["drive0", "drive1"]
 
 
 def test_scans_without_reflectance_give_shards_without_it(tmp_path: Path):
@@ -300,25 +295,25 @@ def test_scans_without_reflectance_give_shards_without_it(tmp_path: Path):
         write_cloud(tmp_path / "scans" / f"{number}.ply", number, levels=None)
     make(tmp_path / "out", plan_of(tmp_path / "scans"))
     size = 2 * 4 * 16 * 2
-    assert size < (tmp_path / "out" / "scans-000000.safetensors").stat().st_size < size + 500
-    assert open_prepared(tmp_path / "out", SMALL, reflectance=False)[1].shape == (1, 4, 16)
+    assert size < (tmp_path / "out" / "scans-000000.safetensors").stat().st_size < size + 600
+    assert prepared_in(tmp_path / "out", SMALL, reflectance=False)[1].shape == (1, 4, 16)
     with pytest.raises(InputError, match=r"holds scans without reflectance. Set encoding.reflectance=false"):
-        open_prepared(tmp_path / "out", SMALL)
+        prepared_in(tmp_path / "out", SMALL)
 
 
 def test_splits_and_drives_are_those_of_the_data_set(kitti_360: Path, tmp_path: Path):
-    make(tmp_path / "out", plan_files("kitti_360", kitti_360, SMALL, shard_scans=4))
+    make(tmp_path / "out", plan_of(kitti_360, layout="kitti_360", shard_scans=4))
     for options in ({"split": "train"}, {"split": "test"}, {"drives": [10, "2013_05_28_drive_0002_sync"]}, {}):
         drives = find_drives("kitti_360", kitti_360, **options)
         raw = ScanFiles([p for d in drives for p in d.scans], Reading(SMALL, reflectance=True), kitti_360)
-        prepared = open_prepared(tmp_path / "out", SMALL, **options)
+        prepared = prepared_in(tmp_path / "out", SMALL, **options)
         assert prepared.names == raw.names
         for index in (0, len(raw) - 1):
             assert np.abs(prepared[index][0] - raw[index][0]).max() <= MILLIMETRE
     with pytest.raises(InputError, match=r"no split named 'best'; known: train, test"):
-        open_prepared(tmp_path / "out", SMALL, split="best")
+        prepared_in(tmp_path / "out", SMALL, split="best")
     with pytest.raises(InputError, match="no drive named '7'"):
-        open_prepared(tmp_path / "out", SMALL, drives=[7])
+        prepared_in(tmp_path / "out", SMALL, drives=[7])
 
 
 @pytest.mark.parametrize(
@@ -326,7 +321,7 @@ def test_splits_and_drives_are_those_of_the_data_set(kitti_360: Path, tmp_path: 
     [
         ({"max_range": 100.0}, {}, "max_range is 80.0 there, 100.0 here"),
         ({"columns": 32}, {}, "columns is 16 there, 32 here"),
-        ({"elevations": (3.0, 1.0, -9.0, -20.0)}, {}, "elevations are others (4 values there, 4 values here)"),
+        ({"elevations": (3.0, 1.0, -9.0, -20.0)}, {}, "elevations differ (4 values there, 4 values here)"),
         ({}, {"projection": "unfolding"}, "projection is spherical there, unfolding here"),
         ({}, {"convention": "reference"}, "convention is centre there, reference here"),
     ],
@@ -334,48 +329,19 @@ def test_splits_and_drives_are_those_of_the_data_set(kitti_360: Path, tmp_path: 
 def test_scans_prepared_for_other_images_are_refused(clouds, tmp_path, changes: dict, options: dict, said: str):
     make(tmp_path, plan_of(clouds))
     with pytest.raises(InputError) as error:
-        open_prepared(tmp_path, replace(SMALL, **changes), **options)
+        prepared_in(tmp_path, replace(SMALL, **changes), **options)
     assert said in str(error.value)
-    open_prepared(tmp_path, replace(SMALL, name="mine", height=2.0))  # no pixel depends on these
+    prepared_in(tmp_path, replace(SMALL, name="mine", height=2.0))  # no pixel depends on these
 
 
 def test_another_recipe_is_refused_in_the_same_folder(clouds: Path, tmp_path: Path):
     make(tmp_path, plan_of(clouds))
     before = files(tmp_path)
-    with pytest.raises(InputError, match=r"holds other scans: convention is centre there, reference here"):
+    with pytest.raises(InputError, match=r"holds other scans: .*convention is centre there, reference here"):
         make(tmp_path, plan_of(clouds, convention="reference"))
     with pytest.raises(InputError, match=r"holds other scans: scans is 10 there, 6 here"):
         make(tmp_path, plan_of(clouds / "drive0"))
     assert files(tmp_path) == before
-
-
-def test_settings_by_which_nothing_was_made_can_be_mended_in_the_same_folder(clouds: Path, tmp_path: Path):
-    wrong, right = plan_of(clouds, projection="spherial"), plan_of(clouds)
-    with pytest.raises(ValueError, match="no projection named 'spherial'"):
-        make(tmp_path / "out", wrong)
-    assert files(make(tmp_path / "out", right)) == files(make(tmp_path / "one", right))
-
-
-def is_locked(path: Path) -> bool:
-    """Whether another process holds a lock; a look takes it for a moment."""
-    lock = FileLock(path, timeout=0)
-    try:
-        lock.acquire()
-    except (Timeout, FileNotFoundError):
-        return path.exists()
-    lock.release()
-    return False
-
-
-def test_a_folder_in_which_another_process_makes_its_first_shard_is_not_taken_from_it(clouds: Path, tmp_path: Path):
-    slow = in_process(tmp_path, plan_of(clouds), seconds=30)
-    wait_until(lambda: is_locked(tmp_path / "making" / "000000.lock"))
-    with pytest.raises(InputError, match=r"holds other scans: convention is centre there, reference here"):
-        make(tmp_path, plan_of(clouds, convention="reference"))
-    os.kill(slow, signal.SIGKILL)
-    os.waitpid(slow, 0)
-    make(tmp_path, plan_of(clouds, convention="reference"))
-    assert read_manifest(tmp_path).recipe.convention == "reference"
 
 
 def test_what_is_finished_is_only_read(clouds: Path, tmp_path: Path, monkeypatch):
@@ -387,8 +353,8 @@ def test_what_is_finished_is_only_read(clouds: Path, tmp_path: Path, monkeypatch
     for name in ("mkdir", "unlink", "rmdir"):
         monkeypatch.setattr(Path, name, refused)
     monkeypatch.setattr("os.replace", refused)
-    work = Preparation(tmp_path, plan_of(clouds))
-    assert work.make(work.begin()) == read_manifest(tmp_path)
+    make(tmp_path, plan_of(clouds))
+    assert len(prepared_in(tmp_path)) == 10
 
 
 # Scans that cannot be used
@@ -404,17 +370,16 @@ def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(clouds: Path, tm
     plan = plan_of(root)
     with pytest.raises(InputError, match=r"000001.bin is empty \(0 bytes\)"):
         make(tmp_path / "out", plan)
-    with pytest.raises(InputError, match="is not finished: the same r2flow prepare command goes on"):
-        open_prepared(tmp_path / "out", SMALL)
+    with pytest.raises(InputError, match="is not finished: the same r2flow prepare command resumes"):
+        prepared_in(tmp_path / "out", SMALL)
     make(tmp_path / "out", plan, on_bad_scan="skip")
     assert caplog.text.count("left out:") == 4
-    content = json.loads((tmp_path / "out" / MANIFEST).read_text())
-    assert content["left_out"] == [f"drive0/{i:06d}.bin" for i in (1, 3, 4, 5)]
-    prepared, raw = open_prepared(tmp_path / "out", SMALL), raw_of(clouds)
+    assert [note["left_out"] for note in prepare(tmp_path / "out", plan)] == [[1], [3, 4, 5], [], []]
+    prepared, raw = prepared_in(tmp_path / "out", SMALL), raw_of(clouds)
     assert prepared.names == [raw.names[i] for i in (0, 2, 6, 7, 8, 9)]  # the second shard is empty
     for index, number in enumerate((0, 2, 6, 7, 8, 9)):
         assert np.array_equal(prepared[index][1], raw[number][1])
-    assert open_prepared(tmp_path / "out", SMALL, drives=["drive1"]).names == raw.names[6:]
+    assert prepared_in(tmp_path / "out", SMALL, drives=["drive1"]).names == raw.names[6:]
 
 
 def test_a_scan_that_has_no_reflectance_among_others_is_a_bad_one(tmp_path: Path):
@@ -445,19 +410,6 @@ class Slow:
         return self.source[index]
 
 
-class Stopped(Slow):
-    """The same scans, stopped by the user before one of them."""
-
-    def __init__(self, source, last: int) -> None:
-        super().__init__(source, 0)
-        self.last = last
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        if index == self.last:
-            raise KeyboardInterrupt
-        return super().__getitem__(index)
-
-
 def in_process(folder: Path, plan: Plan, seconds: float = 0.0, dies: tuple[int, bool] | None = None, **options) -> int:
     """`make` in a child of its own, with scans that take their time and perhaps a moment to die: its process id."""
     child = os.fork()
@@ -466,7 +418,7 @@ def in_process(folder: Path, plan: Plan, seconds: float = 0.0, dies: tuple[int, 
             torch.set_num_threads(1)
             if dies:
                 die_at(*dies)
-            make(folder, replace(plan, source=Slow(plan.source, seconds)), patience=0.01, **options)
+            make(folder, replace(plan, source=Slow(plan.source, seconds)), **options)
         except BaseException as error:
             print(repr(error))
             os._exit(1)
@@ -487,19 +439,7 @@ def test_killed_again_and_again_the_same_command_ends_alike(clouds: Path, tmp_pa
         assert was_killed(in_process(folder, plan, dies=dies))
         kept.append(len(list(folder.glob("scans-*"))))
     assert kept == sorted(kept)  # what was whole stays
-    (folder / ".scans-000002.safetensors.abc.part").write_bytes(b"half")  # as one of them may have left it
-    make(folder, plan)
-    left = {name for name in files(folder) if name not in one}
-    assert left <= {".scans-000002.safetensors.abc.part"}
-    assert {name: data for name, data in files(folder).items() if name in one} == one
-
-
-def test_what_a_killed_process_was_writing_is_cleared_away(clouds: Path, tmp_path: Path):
-    (tmp_path / ".scans-000002.safetensors.abc.part").write_bytes(b"half")
-    for name in (MANIFEST, contents.RECORD):
-        (tmp_path / f".{name}.abc.part").write_bytes(b"{")
-    make(tmp_path, plan_of(clouds))
-    assert list(files(tmp_path)) == [contents.RECORD, MANIFEST, *(f"scans-{i:06d}.safetensors" for i in range(4))]
+    assert files(make(folder, plan)) == one
 
 
 def test_several_at_once_share_the_work(clouds: Path, tmp_path: Path):
@@ -517,7 +457,7 @@ def test_who_waits_takes_over_from_who_is_killed(clouds: Path, tmp_path: Path):
     plan = plan_of(clouds, shard_scans=10)
     one = files(make(tmp_path / "one", plan))
     slow = in_process(tmp_path / "two", plan, seconds=30)
-    wait_until(lambda: is_locked(tmp_path / "two" / "making" / "000000.lock"))
+    wait_until((tmp_path / "two" / ".scans-000000.lock").exists)
     other = in_process(tmp_path / "two", plan)
     time.sleep(0.05)
     os.kill(slow, signal.SIGKILL)
@@ -526,41 +466,25 @@ def test_who_waits_takes_over_from_who_is_killed(clouds: Path, tmp_path: Path):
     assert files(tmp_path / "two") == one
 
 
-def test_each_scan_is_read_by_one_of_several_processes(clouds: Path, tmp_path: Path):
-    plan = plan_of(clouds, shard_scans=2)
-    log = tmp_path / "log"
-
-    class Told(Slow):
-        def __getitem__(self, index: int) -> np.ndarray:
-            with open(log, "a") as file:
-                file.write(f"{index}\n")
-            return super().__getitem__(index)
-
-    told = replace(plan, source=Told(plan.source, 0.02))
-    children = [in_process(tmp_path / "out", told) for _ in range(3)]
-    assert [os.waitpid(child, 0)[1] for child in children] == [0, 0, 0]
-    assert sorted(map(int, log.read_text().split())) == list(range(10))
-
-
 def test_a_full_disk_loses_nothing(clouds: Path, tmp_path: Path, monkeypatch):
     plan = plan_of(clouds)
     one = files(make(tmp_path / "one", plan))
-    write, written = preparing.atomic_write, []
+    write, written = store.atomic_write, []
 
     def full(path, *mode):
         written.append(path)
-        if len(written) > 4:
+        if len(written) > 3:
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
         return write(path, *mode)
 
     with monkeypatch.context() as patch:
-        patch.setattr(preparing, "atomic_write", full)
+        patch.setattr(store, "atomic_write", full)
         with pytest.raises(OSError, match="No space left on device"):
             make(tmp_path / "two", plan)
     made = {name: data for name, data in files(tmp_path / "two").items() if name.startswith("scans")}
     assert len(made) == 2
     assert made.items() <= one.items()
-    assert Preparation(tmp_path / "two", plan).begin() == [2, 3]
+    assert plan.store(tmp_path / "two").missing(plan.shards) == [2, 3]
     assert files(make(tmp_path / "two", plan)) == one
 
 
@@ -652,6 +576,7 @@ DAMAGES = [
     _cut, _cut_in_head, _longer, _huge, _empty, _text, _text_of_its_length, _missing, _dangling, _folder, _wrong_type,
     _wrong_order_of_bytes, _swapped,
 ]  # fmt: skip
+GONE = (_missing, _dangling, _folder)
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
@@ -661,166 +586,57 @@ def test_a_damaged_shard_is_refused_by_name_and_made_again(clouds: Path, tmp_pat
     whole, path = files(tmp_path), tmp_path / "scans-000001.safetensors"
     damage(path)
     assert path in check_prepared(tmp_path)
-    if damage is _wrong_order_of_bytes:  # in the tensors alone
-        source = open_prepared(tmp_path, SMALL)
-        with pytest.raises(InputError, match=rf"{path.name} is damaged \(the checksum of scan 1 in it differs\)"):
-            source[4]
-    else:
-        with pytest.raises(InputError, match=r"scans-000001.safetensors is damaged \(.*\). The same r2flow prepare"):
-            open_prepared(tmp_path, SMALL)
+    if damage is not _wrong_type and damage is not _wrong_order_of_bytes:  # of which the head says nothing
+        with pytest.raises(InputError, match="is not finished" if damage in GONE else "scans-000001.safetensors is da"):
+            prepared_in(tmp_path)
     if damage is _folder:
-        with pytest.raises(InputError, match=r"scans-000001.safetensors is a folder where a shard belongs; remove it"):
-            make(tmp_path, plan)
         path.rmdir()
     made = []
-    work = Preparation(tmp_path, plan)
-    work.make(work.begin(), advance=made.append)
-    assert sum(made) == (6 if damage is _swapped else 3)  # these alone
+    prepare(tmp_path, plan, made=made.append)
+    assert made == ([1, 2] if damage is _swapped else [1])  # these alone
     assert files(tmp_path) == whole
     assert check_prepared(tmp_path) == {}
 
 
-def outcome(work):
-    """What it gives, or the line of its InputError."""
-    try:
-        return work()
-    except InputError as error:
-        return str(error)
-
-
-def test_no_flipped_bit_of_a_shard_becomes_a_scan(clouds: Path, tmp_path: Path):
+def test_no_flipped_bit_of_a_shard_goes_unnoticed(clouds: Path, tmp_path: Path):
     make(tmp_path, plan_of(clouds))
     path = tmp_path / "scans-000001.safetensors"
-    whole, images = path.read_bytes(), [open_prepared(tmp_path, SMALL)[i].copy() for i in range(10)]
-    draw = random.Random(0)
+    whole, draw = path.read_bytes(), random.Random(0)
     for position in draw.sample(range(len(whole)), 100):
         data = bytearray(whole)
         data[position] ^= 1 << draw.randrange(8)
         path.write_bytes(data)
-        assert list(check_prepared(tmp_path)) == [path]
-        source = outcome(lambda: open_prepared(tmp_path, SMALL))
-        if isinstance(source, str):
-            assert "scans-000001.safetensors is damaged" in source
+        try:
+            assert list(check_prepared(tmp_path)) == [path]
+        except InputError:  # the flip is in the digest of the recipe
             continue
-        read = [outcome(partial(source.__getitem__, index)) for index in range(10)]
-        refused = [one for one in read if isinstance(one, str)]
-        assert len(refused) == 1
-        assert "scans-000001.safetensors is damaged" in refused[0]
-        assert all(isinstance(one, str) or np.array_equal(one, image) for one, image in zip(read, images, strict=True))
 
 
 def test_no_flipped_bit_of_the_manifest_goes_unnoticed(clouds: Path, tmp_path: Path):
     make(tmp_path, plan_of(clouds))
-    path = tmp_path / MANIFEST
+    path, draw = tmp_path / MANIFEST, random.Random(0)
     whole, manifest = path.read_bytes(), read_manifest(tmp_path)
-    draw = random.Random(0)
-    refused = 0
     for position in draw.sample(range(len(whole)), 100):
         data = bytearray(whole)
         data[position] ^= 1 << draw.randrange(8)
         path.write_bytes(data)
-        found = outcome(lambda: read_manifest(tmp_path))
-        if isinstance(found, str):
-            assert MANIFEST in found
-            refused += 1
-        else:
-            assert found == manifest  # the flip was in what JSON leaves free
-    assert refused > 50
+        try:
+            assert read_manifest(tmp_path) == manifest  # the flip was in what JSON leaves free
+        except InputError:
+            continue
     for content in (b"", b"{}", b"[]", b"null", b"\xff", whole[:-10], b"[" * 100_000):
         path.write_bytes(content)
-        with pytest.raises(InputError, match=rf"{MANIFEST} is damaged"):
-            open_prepared(tmp_path, SMALL)
+        with pytest.raises(InputError, match=MANIFEST):
+            prepared_in(tmp_path)
     path.unlink()
-    with pytest.raises(InputError, match=r"holds no prepared scans \(no manifest.json\); make them: r2flow prepare"):
-        open_prepared(tmp_path, SMALL)
-
-
-def test_a_shard_that_is_cut_while_it_is_read_is_named(clouds: Path, tmp_path: Path):
-    make(tmp_path, plan_of(clouds))
-    source = open_prepared(tmp_path, SMALL)
-    assert isinstance(source, PreparedScans)
-    source[3]
-    os.truncate(tmp_path / "scans-000001.safetensors", 100)
-    with pytest.raises(InputError, match=r"scans-000001.safetensors is damaged \(it has 100 bytes"):
-        source[4]
-    source[0]
-
-
-def test_a_damaged_shard_whose_files_have_changed_is_not_mended(tmp_path: Path):
-    for number in range(6):
-        write_scan(tmp_path / "scans" / f"{number}.bin", number)
-    make(tmp_path / "out", plan_of(tmp_path / "scans"))
-    _cut(tmp_path / "out" / "scans-000001.safetensors")
-    write_scan(tmp_path / "scans" / "4.bin", 30)
-    with pytest.raises(InputError, match=r"what it was made of has changed since: prepare all scans into another"):
-        make(tmp_path / "out", plan_of(tmp_path / "scans"))
-
-
-@pytest.mark.parametrize("by", ["contents", "times"])
-def test_files_that_have_changed_since_they_were_prepared_are_refused(tmp_path: Path, monkeypatch, by: str):
-    if by == "times":
-        monkeypatch.setattr(contents, "MOST_READ", 0)
-    for number in range(6):
-        write_cloud(tmp_path / "scans" / f"{number}.bin", number)
-    make(tmp_path / "out", plan_of(tmp_path / "scans"))
-    before = files(tmp_path / "out")
-    make(tmp_path / "out", plan_of(tmp_path / "scans"))
-    write_cloud(tmp_path / "scans" / "4.bin", 30)
-    copied = f" Or, if they were copied alone, remove {tmp_path}/out/files.json." if by == "times" else ""
-    with pytest.raises(InputError) as error:
-        make(tmp_path / "out", plan_of(tmp_path / "scans"))
-    assert str(error.value) == (
-        f"{tmp_path}/scans/4.bin has changed since {tmp_path}/out was prepared from it. Give back the scans that it "
-        f"was made of, or prepare these into another folder by --out FOLDER.{copied}"
-    )
-    assert files(tmp_path / "out") == before
-    for harmless in ("", "{", "[]"):  # as in a folder of an older version, which has none
-        (tmp_path / "out" / contents.RECORD).write_text(harmless)
-        make(tmp_path / "out", plan_of(tmp_path / "scans"))
-
-
-def test_a_file_of_which_no_shard_was_made_may_be_mended_and_others_not(tmp_path: Path):
-    for number in range(6):
-        write_cloud(tmp_path / "scans" / f"{number}.bin", number)
-    (tmp_path / "scans" / "4.bin").write_bytes(b"")
-    with pytest.raises(InputError, match=r"4\.bin is empty"):
-        make(tmp_path / "out", plan_of(tmp_path / "scans"))
-    write_cloud(tmp_path / "scans" / "4.bin", 4)
-    write_cloud(tmp_path / "scans" / "1.bin", 30)
-    with pytest.raises(InputError, match=r"1\.bin has changed since"):
-        make(tmp_path / "out", plan_of(tmp_path / "scans"))
-    write_cloud(tmp_path / "scans" / "1.bin", 1)
-    make(tmp_path / "out", plan_of(tmp_path / "scans"))
-    assert files(tmp_path / "out") == files(make(tmp_path / "one", plan_of(tmp_path / "scans")))
-    write_cloud(tmp_path / "scans" / "4.bin", 30)
-    with pytest.raises(InputError, match=r"4\.bin has changed since"):
-        make(tmp_path / "out", plan_of(tmp_path / "scans"))
-
-
-def test_a_damaged_note_of_an_unfinished_preparation_is_no_harm(clouds: Path, tmp_path: Path):
-    plan = plan_of(clouds)
-    one = files(make(tmp_path / "one", plan))
-    with pytest.raises(KeyboardInterrupt):
-        make(tmp_path / "two", replace(plan, source=Stopped(plan.source, 9)))
-    (tmp_path / "two" / "making" / "000000.json").write_text('{"recipe": 1')
-    _cut(tmp_path / "two" / "scans-000001.safetensors")
-    assert Preparation(tmp_path / "two", plan).begin() == [0, 1, 3]
-    assert files(make(tmp_path / "two", plan)) == one
-
-
-def test_shards_of_another_recipe_are_not_taken_for_these(clouds: Path, tmp_path: Path):
-    one = files(make(tmp_path / "one", plan_of(clouds)))
-    other = plan_of(clouds, convention="reference")
-    with pytest.raises(KeyboardInterrupt):
-        make(tmp_path / "two", replace(other, source=Stopped(other.source, 6)))
-    (tmp_path / "two" / MANIFEST).unlink()
-    assert files(make(tmp_path / "two", plan_of(clouds))) == one
+    with pytest.raises(InputError, match="holds no prepared scans"):
+        prepared_in(tmp_path)
 
 
 def test_the_first_scan_decides_whether_there_is_reflectance(tmp_path: Path):
     """As everywhere. One later scan without it is an error of its own, and takes no channel from the others."""
     for number in range(20):
         write_cloud(tmp_path / f"{number:02}.ply", number, None if number == 11 else 255)
-    assert plan_of(tmp_path).recipe.levels == 255
+    assert plan_of(tmp_path).recipe["levels"] == 255
     write_cloud(tmp_path / "00.ply", 0, None)
-    assert plan_of(tmp_path).recipe.levels is None
+    assert plan_of(tmp_path).recipe["levels"] is None

@@ -11,7 +11,7 @@ from r2flow.data.sources import InMemory, ScanFiles, SimulatedScans, holdout_blo
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.simulator.folder import SimulatedFolder, write_folder
+from r2flow.simulator.folder import SimulatedFolder
 from tests.data.conftest import write_scan
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
@@ -167,7 +167,9 @@ class TestKeptSimulatedScans:
         np.testing.assert_array_equal(range_alone[1], fresh[1][:1])
 
     def test_the_folder_is_that_of_the_simulate_verb(self, tmp_path: Path):
-        write_folder(SimulatedFolder(tmp_path / "kept", self.SENSOR, 3, ("npy",)), range(2), workers=1)
+        folder = SimulatedFolder(tmp_path / "kept", self.SENSOR, 3, ("npy",))
+        folder.begin()
+        folder.make(range(2), folder.simulate)
         before = sorted((path.name, path.stat().st_mtime_ns) for path in (tmp_path / "kept").iterdir())
         kept = SimulatedScans(self.SENSOR, 3, range(2), folder=tmp_path / "kept")
         np.testing.assert_array_equal(kept[1], SimulatedScans(self.SENSOR, 3, range(2))[1])
@@ -175,11 +177,11 @@ class TestKeptSimulatedScans:
 
     def test_scans_of_another_seed_or_of_others_are_refused(self, tmp_path: Path):
         _ = SimulatedScans(self.SENSOR, 3, range(2), folder=tmp_path / "kept")[0]
-        with pytest.raises(InputError, match="holds simulated scans with seed 3, not 4"):
+        with pytest.raises(InputError, match="seed is 3 there, 4 here"):
             SimulatedScans(self.SENSOR, 4, range(2), folder=tmp_path / "kept")
         (tmp_path / "mine").mkdir()
         (tmp_path / "mine" / "scan.bin").write_bytes(b"")
-        with pytest.raises(InputError, match=r"holds scans already \(scan.bin\)"):
+        with pytest.raises(InputError, match=r"holds scans \(scan.bin\)"):
             SimulatedScans(self.SENSOR, 3, range(2), folder=tmp_path / "mine")
 
     def test_held_out_simulated_scans_do_not_lie_among_files(self):

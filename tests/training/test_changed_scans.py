@@ -10,10 +10,10 @@ import pytest
 from r2flow.data import contents
 from r2flow.data.contents import RECORD, check_contents, record_contents
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.preparing import Preparation, plan_files
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
+from tests.data.conftest import prepare_folder
 from tests.training.conftest import TINY, in_process
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
@@ -87,8 +87,7 @@ def test_of_many_files_sizes_and_times_are_compared(own: Path, tmp_path: Path, m
 
 def test_prepared_scans_and_those_held_out_elsewhere_are_watched_too(own: Path, tmp_path: Path):
     def prepare() -> None:
-        work = Preparation(tmp_path / "prepared", plan_files("folder", own, SENSOR))
-        work.make(work.begin())
+        prepare_folder(own, tmp_path / "prepared", SENSOR)
 
     prepare()
     other = Path(shutil.copytree(own, tmp_path / "other"))
@@ -106,7 +105,7 @@ def test_prepared_scans_and_those_held_out_elsewhere_are_watched_too(own: Path, 
     shutil.rmtree(tmp_path / "prepared")
     mirror(own / "000005.bin")
     prepare()
-    with pytest.raises(InputError, match=r"prepared/manifest\.json has changed"):
+    with pytest.raises(InputError, match=r"prepared/scans-000000\.safetensors has changed"):
         check_contents(tmp_path, files_of(own, **keys))
 
 

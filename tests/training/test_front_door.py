@@ -136,7 +136,7 @@ def test_a_folder_that_holds_no_simulated_scans_is_a_slip_where_none_were_asked_
     named = [root, tiny, "data=simulated"]
     assert check(compose(named), named)["data"]["name"] == "simulated"
     (tmp_path / "typo").mkdir()
-    (tmp_path / "typo" / "simulated.json").touch()
+    (tmp_path / "typo" / "manifest.json").touch()
     assert check(compose([root, tiny]), [root, tiny])["data"]["name"] == "simulated"
 
 

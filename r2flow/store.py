@@ -1,0 +1,323 @@
+"""Folders of numbered items, made once by any number of processes and attempts.
+
+    store = Store(folder, "scans", recipe)
+    store.begin()                                    # takes the folder, or refuses one of another recipe
+    store.make(store.missing(range(9)), work, 4)     # work(i) calls store.write(i, tensors, notes)
+    tensors, notes = store.read(3)
+
+What an item is depends on the recipe and on its number alone: two processes that make the same item write the same
+bytes. `manifest.json` holds the recipe; an item is a safetensors file with the digest of the recipe and a checksum.
+Every file is written under a temporary name and renamed when it is whole, so that a killed command resumes.
+"""
+
+import hashlib
+import json
+import logging
+import multiprocessing
+import signal
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock, Timeout
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from r2flow.errors import InputError
+from r2flow.files import atomic_write, make_folder, parse_json, read_json
+from r2flow.lidar.scan_files import FIRM_ENDINGS
+from r2flow.signals import end_with_parent, out_of_reach
+
+log = logging.getLogger(__name__)
+
+MANIFEST = "manifest.json"
+STALE = 3600  # seconds after which a temporary file has no writer any more
+PATIENCE = 0.2  # seconds between two looks at what other processes make
+
+Advance = Callable[[int], None]  # called with the number of each item that is done
+
+
+class Damaged(Exception):
+    """A file that is not what was written."""
+
+
+class Store:
+    """A folder of items of one kind and one recipe.
+
+    Args:
+        kind: Names the files, `KIND-000003.safetensors`, and the manifest's format, `r2flow KIND`.
+        recipe: All that the items depend on, as plain values.
+        option: How a user names another folder.
+    """
+
+    def __init__(self, folder: str | Path, kind: str, recipe: Mapping[str, Any], option: str = "--out FOLDER") -> None:
+        self.folder, self.kind, self.option = Path(folder).expanduser(), kind, option
+        self.described: dict[str, Any] = json.loads(json.dumps(recipe))
+        self.digest = checksum(self.described)
+
+    def files(self, item: int) -> list[Path]:
+        """The files of an item."""
+        return [self.folder / f"{self.kind}-{item:06d}.safetensors"]
+
+    def check(self) -> bool:
+        """Whether the folder has been begun.
+
+        Raises:
+            InputError: it holds another recipe, or scans and no manifest.
+        """
+        if (self.folder / MANIFEST).is_file():
+            found = read_manifest(self.folder, self.kind)["recipe"]
+            if other := difference(found, self.described):
+                raise InputError(
+                    f"{self.folder} holds other {self.kind}: {other}. Give the same settings, or another folder by "
+                    f"{self.option}."
+                )
+            return True
+        scan = next((path for path in self.folder.rglob("*") if path.name.endswith(FIRM_ENDINGS)), None)
+        if scan is not None:
+            raise InputError(
+                f"{self.folder} holds scans ({scan.relative_to(self.folder)}) and no {MANIFEST}: give another folder "
+                f"by {self.option}."
+            )
+        return False
+
+    def begin(self, **notes: Any) -> None:
+        """Write the manifest where there is none, with `notes` beside the recipe.
+
+        Raises:
+            InputError: as `check`, or the folder cannot be written to.
+        """
+        try:
+            if not self.check():
+                content = {"format": f"r2flow {self.kind}", "recipe": self.described, **notes}
+                with atomic_write(self.folder / MANIFEST, "w") as file:
+                    json.dump({**content, "checksum": checksum(content)}, file, indent=1)
+                self.check()  # another process may have taken the folder in between
+            for left in (*self.folder.glob(".*.part"), *self.folder.glob(".*.lock")):  # of killed writers
+                with suppress(FileNotFoundError):
+                    if time.time() - left.stat().st_mtime > STALE:
+                        left.unlink()
+        except PermissionError:
+            raise InputError(f"{self.folder} cannot be written to; give another by {self.option}.") from None
+
+    def has(self, item: int) -> bool:
+        """Whether an item is there; of its file only the head is read."""
+        try:
+            self.head(item)
+        except (FileNotFoundError, Damaged):
+            return False
+        return True
+
+    def missing(self, items: Iterable[int]) -> list[int]:
+        """The items that have yet to be made."""
+        return [item for item in items if not self.has(item)]
+
+    def write(self, item: int, tensors: Mapping[str, np.ndarray], notes: Mapping[str, Any] | None = None) -> None:
+        """Keep an item: from here on it is not made again."""
+        note = {"recipe": self.digest, "item": item, "sha256": _digest(tensors, notes or {}), "notes": notes or {}}
+        (path,) = self.files(item)
+        if path.is_symlink() and not path.exists():
+            path.unlink()
+        with atomic_write(path) as file:
+            file.write(save(dict(tensors), metadata={"r2flow": json.dumps(note)}))
+
+    def read(self, item: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """The tensors and the notes of an item, every byte checked.
+
+        Raises:
+            FileNotFoundError: the item is missing.
+            Damaged: it is not what was written.
+            InputError: it is of another recipe.
+        """
+        with self._opened(item) as (file, note):
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  not a mapping
+            if note["sha256"] != _digest(tensors, note["notes"]):
+                raise Damaged("its checksum differs")
+            return tensors, note["notes"]
+
+    def head(self, item: int) -> dict[str, Any]:
+        """The notes of an item; raises as `read`."""
+        with self._opened(item) as (_, note):
+            notes: dict[str, Any] = note["notes"]
+            return notes
+
+    @contextmanager
+    def _opened(self, item: int) -> Iterator[tuple[Any, dict[str, Any]]]:
+        (path,) = self.files(item)
+        if not path.is_file():
+            raise FileNotFoundError(path)
+        try:
+            with safe_open(path, framework="numpy") as file:
+                note = parse_json((file.metadata() or {})["r2flow"])
+                if note["recipe"] != self.digest:
+                    raise InputError(
+                        f"{path} holds {self.kind} of another recipe: give the settings that they were made with, or "
+                        f"another folder by {self.option}."
+                    )
+                if note["item"] != item:
+                    raise Damaged(f"it is item {note['item']}")
+                yield file, note
+        except InputError:
+            raise
+        except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+            raise Damaged(str(error)) from None
+
+    def damage(self, item: int) -> str | None:
+        """What is wrong with an item, every byte of which is read; None where it is whole, or missing."""
+        try:
+            self.read(item)
+        except FileNotFoundError:
+            return None
+        except Damaged as error:
+            return str(error)
+        return None
+
+    def mend(self, items: Iterable[int], advance: Advance = lambda item: None) -> None:
+        """Read every byte of some items, and remove the damaged ones with a warning."""
+        for item in items:
+            if damage := self.damage(item):
+                (path,) = self.files(item)
+                log.warning("%s is damaged (%s): it is made again.", path, damage)
+                path.unlink(missing_ok=True)
+            advance(item)
+
+    @contextmanager
+    def claim(self, item: int) -> Iterator[bool]:
+        """Hold an item's lock, which ends with this process; False where another process holds it.
+
+        The lock saves work and decides nothing: what two processes write for one item are the same bytes.
+        """
+        path = self.folder / f".{self.kind}-{item:06d}.lock"
+        lock = FileLock(path, timeout=0)
+        make_folder(self.folder)
+        with suppress(Timeout):
+            lock.acquire()
+        try:
+            yield lock.is_locked
+        finally:
+            if lock.is_locked:
+                path.unlink(missing_ok=True)
+            lock.release()
+
+    def make(
+        self, items: Iterable[int], work: Callable[[int], None], workers: int = 1, advance: Advance = lambda item: None
+    ) -> None:
+        """Make items, and wait for those that other commands make at the same time.
+
+        Args:
+            work: Makes an item and writes it, in any process: it can be pickled.
+            workers: Number of processes; 1 makes the items in this one.
+
+        Raises:
+            InputError: what `work` raises, or a worker was killed.
+        """
+        left = list(items)
+        while left:
+            waiting = []
+            for item, done in self._attempts(left, work, workers):
+                if done:
+                    advance(item)
+                else:
+                    waiting.append(item)
+            if len(waiting) == len(left):
+                time.sleep(PATIENCE)
+            left = waiting
+
+    def _attempts(self, items: list[int], work: Callable[[int], None], workers: int) -> Iterator[tuple[int, bool]]:
+        if workers == 1 or len(items) == 1:
+            for item in items:
+                yield item, self.attempt(item, work)
+            return
+        # Spawned, not forked: torch's threads do not survive a fork.
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(min(workers, len(items)), context, _begin_worker, (self, work))
+        try:
+            with out_of_reach():
+                futures = {pool.submit(_attempt, item): item for item in items}
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except BrokenProcessPool:
+            raise InputError(
+                f"a process that wrote {self.folder} was killed; is there memory for {workers} of them? "
+                "The same command resumes."
+            ) from None
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    def attempt(self, item: int, work: Callable[[int], None]) -> bool:
+        """Make an item unless it is there; False where another process is making it."""
+        with self.claim(item) as mine:
+            if mine and not self.has(item):
+                work(item)
+            return mine
+
+
+_job: tuple[Store, Callable[[int], None]]  # of a worker process
+
+
+def _begin_worker(store: Store, work: Callable[[int], None]) -> None:
+    """Leave Ctrl-C to the parent process and end when it ends."""
+    global _job
+    _job = (store, work)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+
+
+def _attempt(item: int) -> bool:
+    store, work = _job
+    return store.attempt(item, work)
+
+
+def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
+    """The manifest of a folder, checked.
+
+    Raises:
+        FileNotFoundError: the folder has no manifest.
+        InputError: the manifest is damaged, or of another kind.
+    """
+    path = folder / MANIFEST
+    try:
+        content: dict[str, Any] = read_json(path)
+        found, _ = content["format"], content["recipe"]
+        damaged = content.pop("checksum", None) != checksum(content)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        damaged = True
+    if damaged:
+        raise InputError(f"{path} is damaged. Delete {folder} and make it again.")
+    if kind is not None and found != f"r2flow {kind}":
+        raise InputError(f"{folder} holds {found.removeprefix('r2flow ')}, not {kind}; give another folder.")
+    return content
+
+
+def checksum(content: Any) -> str:
+    """SHA-256 of what can be written as JSON."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str | None:
+    """The first setting that differs, in words; None where all are equal."""
+    for key in {**there, **here}:
+        old, new = there.get(key), here.get(key)
+        if old == new:
+            continue
+        if isinstance(old, dict) and isinstance(new, dict):
+            return f"{key}: {difference(old, new)}"
+        if isinstance(old, list) and isinstance(new, list):
+            return f"{key} differ ({len(old)} values there, {len(new)} values here)"
+        return f"{key} is {old} there, {new} here"
+    return None
+
+
+def _digest(tensors: Mapping[str, np.ndarray], notes: Mapping[str, Any]) -> str:
+    digest = hashlib.sha256(json.dumps(notes, sort_keys=True).encode())
+    for name, values in sorted(tensors.items()):
+        digest.update(f"{name} {values.shape} {values.dtype}".encode())
+        digest.update(np.ascontiguousarray(values).data)
+    return digest.hexdigest()
