@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from r2flow.data.preparing import plan_files
+
 from r2flow.errors import InputError
 from r2flow.lidar.beams import (
     FIRINGS,
