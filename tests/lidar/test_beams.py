@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from r2flow.data.preparing import plan_files
 
+from r2flow.data.reading import Reading
+from r2flow.data.sources import warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.beams import (
     FIRINGS,
@@ -308,7 +309,7 @@ def test_scanners_without_beams_are_refused_with_the_reason(tmp_path: Path, patt
         find_beams([scan])
     write_points(tmp_path / "0.ply", scan.xyz)
     with pytest.raises(InputError, match="lie on no beams"):
-        plan_files("folder", tmp_path, SENSORS["hdl64e"])
+        warn_of_other_sensor([tmp_path / "0.ply"], Reading(SENSORS["hdl64e"], within_limits=True), tmp_path)
     for name in SENSORS:
         assert other_sensor([scan], SENSORS[name]).hopeless
 
