@@ -94,7 +94,7 @@ def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):  # no
     image = np.load(tmp_path / "o" / "000000.npy")
     assert image.shape == (2, 8, 64)
     part = tmp_path / "o"
-    for judged in (("evaluate", part, "simulated:0"), ("report", "fidelity", "simulated:0", part, "-o", tmp_path)):
+    for judged in (("evaluate", part, "simulated:0"), ("evaluate", "simulated:0", part)):
         code, _, complaint = r2flow(*judged)
         assert code == 2
         assert f"{part} holds a part of each scan alone" in complaint

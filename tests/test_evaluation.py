@@ -14,8 +14,8 @@ from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
 from r2flow.errors import InputError
 from r2flow.evaluation import measuring
-from r2flow.evaluation.floor import floor_sets
 from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
+from r2flow.evaluation.references import reference_sets
 from r2flow.evaluation.sets import ScanSet, fixed_choice, reading_of_flow, sampled_set
 from r2flow.evaluation.statistics import FORMAT, Cache, key_of
 from r2flow.generators import Sampler
@@ -331,10 +331,10 @@ def test_intervals_hold_their_figure(real, generated):
     assert found.protocol["interval"] == {"bootstrap draws": 30, "level": 0.95, "seed": 0}
 
 
-def test_the_floor_is_halves_by_block_and_two_drives(kitti_360, tmp_path):  # noqa: F811
+def test_references_are_halves_by_block_and_two_drives(kitti_360, tmp_path):  # noqa: F811
     real = open_scans(f"kitti_360:{kitti_360}", READING, "train")
     other = open_scans(str(folder(tmp_path / "g", images(8, 2))), READING)
-    found = floor_sets(real, {"generated": other})
+    found = reference_sets(real, {"generated": other})
     assert list(found) == ["real halves", "generated, as many", "real drives"]
     names = real.source.names
     halves = [one.source.names for one in found["real halves"]]
@@ -345,7 +345,7 @@ def test_the_floor_is_halves_by_block_and_two_drives(kitti_360, tmp_path):  # no
         ["0003"], ["0004"]
     ]  # fmt: skip
     with pytest.raises(InputError, match="at least two"):
-        floor_sets(real.part([0], "one"))
+        reference_sets(real.part([0], "one"))
 
 
 def test_identity_is_plain_and_holds_no_path(real):

@@ -115,7 +115,7 @@ def test_scans_without_measured_points_are_refused(generated, kitti_360):  # noq
     assert {name: named_rules(name).name for name in PROTOCOLS} == {"r2flow": "r2flow", "paper": "paper"}
 
 
-def test_several_sets_stand_in_one_table_with_floor_and_controls(
+def test_several_sets_stand_in_one_table_with_references_and_baselines(
     r2flow, measured, generated, tmp_path, monkeypatch  # noqa: F811
 ):  # fmt: skip
     monkeypatch.setattr("r2flow.metrics.lidm.FINE", 0.5)  # millions of cells take time
@@ -127,15 +127,16 @@ def test_several_sets_stand_in_one_table_with_floor_and_controls(
     assert code == 0, warned
     lines = said.splitlines()
     assert lines[0].startswith("Protocol paper: real points as measured, generated points on rays through bin corners")
-    for words in ("generated (10 : 6)", "other (3 : 6)", "floor: real halves (3 : 3)", "control: noise (10 : 6)"):
+    for words in ("generated (10 : 6)", "other (3 : 6)", "reference: real halves (3 : 3)", "baseline: noise (10 : 6)"):
         assert words in lines[1]
     assert len(lines) == len(set(lines))
     assert sum("no full rank" in line for line in lines) == 1
     assert sum("r2flow weights" in line for line in warned.splitlines()) == 1
     content = json.loads((tmp_path / "e.json").read_text())["comparisons"]
     assert {one["comparison"]: one["kind"] for one in content} == {
-        "generated": "judged", "other": "judged", "real halves": "floor", "generated, as many": "floor",
-        "other, as many": "floor", **dict.fromkeys(("noise", "flat ground", "mean scan", "shuffled pixels"), "control"),
+        "generated": "judged", "other": "judged", "real halves": "reference",
+        "generated, as many": "reference", "other, as many": "reference",
+        **dict.fromkeys(("noise", "flat ground", "mean scan", "shuffled pixels"), "baseline"),
     }  # fmt: skip
     assert {"jsd", "mmd_lidm", "kid_handcrafted"} <= {one["metric"] for one in content[0]["metrics"]}
     (jsd,) = (one for one in content[0]["metrics"] if one["metric"] == "jsd")

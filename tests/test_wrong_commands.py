@@ -323,7 +323,7 @@ evaluate scans scans --generated-scale 0
 evaluate scans scans --steps 4 --solver nope # are of a run, a checkpoint or a model to sample; found none
 evaluate scans scans --tolerance 1 # found none
 evaluate scans scans --seed 3 # found none
-evaluate scans --floor --steps 4 # found none
+evaluate scans --reference --steps 4 # found none
 evaluate scans run --generated-scale 255 # are of files in GENERATED; found none
 evaluate scans run --generated-split foo # are of files in GENERATED; found none
 evaluate scans -c run -o out --generated-split foo # are of files in GENERATED; found none
@@ -341,7 +341,7 @@ evaluate scans scans --device nope
 evaluate scans -c run # a curve needs --out
 evaluate scans -c nowhere -o out
 evaluate scans scans -c run -o out # not both
-evaluate scans -c run -o out --floor
+evaluate scans -c run -o out --reference
 evaluate scans -c run -o out --steps 0
 evaluate scans -c run -o out --steps a
 evaluate scans -c run -o out --steps 1,,2
@@ -358,25 +358,6 @@ evaluate scans run --seed -1
 evaluate image.npy # nothing to compare with
 evaluate simulated:x scans
 evaluate simulated:² scans # as simulated:0; found 'simulated:²'
-report fidelity scans # Missing
-report fidelity scans nowhere
-report fidelity nowhere scans
-report fidelity scans scans --train nowhere
-report fidelity scans scans --floor nowhere
-report fidelity scans scans --also nowhere
-report fidelity scans scans --num 0
-report fidelity scans scans --size 8
-report fidelity scans scans -o file.txt
-report neighbours scans # Missing
-report neighbours scans scans # Missing
-report neighbours nowhere scans -o out
-report neighbours scans nowhere -o out
-report neighbours scans scans -o out --by nope
-report neighbours scans scans -o out --pairs 0
-report neighbours scans scans -o out --num 0
-report neighbours scans scans -o out --split train # no split named 'train'
-report neighbours scans scans -o file.txt
-report neighbours scans scans -o out --real nowhere
 report curvature # Missing
 report curvature -c run # Missing
 report curvature -c nowhere -o out

@@ -1,4 +1,4 @@
-"""`r2flow evaluate` and `r2flow report neighbours`: generated scans against real ones."""
+"""`r2flow evaluate`: generated scans against real ones."""
 
 import logging
 import time
@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from r2flow.cli.app import app, report
+from r2flow.cli.app import app
 from r2flow.cli.groups import ReadingOptions, SolverOptions, WorkOptions, grouped
-from r2flow.cli.options import SETS, OutOption, PrecisionOption, choose_device, choose_reading
+from r2flow.cli.options import SETS, PrecisionOption, choose_device, choose_reading
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 ALL = "all"
 SAMPLED = 1000  # scans of a flow
+REAL = "the real scans"
 
 
 @dataclass(frozen=True)
@@ -39,23 +40,27 @@ class MeasureOptions:
     metrics: Annotated[
         str | None,
         typer.Option(
-            help="Names, separated by commas; KID and Frechet of hand-made features, JSD, MMD if left out; "
+            help="Names, separated by commas; KID and Frechet of hand-made features, the panel, JSD, MMD if left out; "
             "all: whatever can be computed here."
         ),
     ] = None
     protocol: Annotated[
         str, typer.Option(help="r2flow, or paper: measured points of real scans against generated ones' bin corners.")
     ] = "r2flow"
-    floor: Annotated[
+    reference: Annotated[
         bool | None,
-        typer.Option("--floor/--no-floor", help="Real against real beside it: halves, two drives.", show_default="on"),
+        typer.Option("--reference/--no-reference", help="Real against real: halves, two drives.", show_default="on"),
     ] = None
-    controls: Annotated[
+    baselines: Annotated[
         bool | None,
         typer.Option(
-            "--controls/--no-controls", help="Beside it noise, flat ground, mean, shuffled pixels.", show_default="on"
+            "--baselines/--no-baselines", help="Noise, flat ground, mean scan, shuffled pixels.", show_default="on"
         ),
     ] = None
+    train: Annotated[
+        str | None, typer.Option(help=f"Training scans: adds distances to the nearest, to find copies: {SETS}.")
+    ] = None
+    train_split: Annotated[str | None, typer.Option(help="Part of TRAIN's standard split.")] = None
     bootstrap: Annotated[int, typer.Option(min=0, help="Resamples for 95 % intervals; 0 for none.")] = 0
     no_cache: Annotated[bool, typer.Option("--no-cache", help="Read the real scans again.")] = False
 
@@ -125,11 +130,11 @@ def evaluate(
         typer.Option("--checkpoint", "-c", help="Flow for a speed-quality curve; may be given several times."),
     ] = None,
 ) -> None:
-    """Measure generated scans against real ones: distances, each with the protocol that it holds under.
+    """Measure generated scans against real ones: distances, each with its protocol and the sensor.
 
-    Several sets make one table, with what real scans and controls come to. With --checkpoint it measures how the
-    distance falls with the number of steps, against evaluations and seconds; points that are in --out already are not
-    measured again. Under torchrun the processes share the scans.
+    Several sets make one table, next to reference distances between real scans and to baselines. With --checkpoint it
+    measures how the distance falls with the number of steps, against evaluations and seconds; points that are in --out
+    already are not measured again. Under torchrun the processes share the scans.
     """
     from r2flow.evaluation.measuring import check_reflectance
     from r2flow.evaluation.processes import joined
@@ -148,7 +153,8 @@ def evaluate(
         if flows and scans.num is None and place.rank == 0:
             each = "each point" if checkpoint else "each" if len(flows) > 1 else "it"
             print(f"{', '.join(flows)}: {SAMPLED} scans of {each} are drawn (--num says how many)")
-        reading = reading_of([real, *(one for one in named if one not in sampled)], list(flows.values()), how)
+        files = [one for one in named if one not in sampled]
+        reading = reading_of([real, *files, measured.train], list(flows.values()), how)
         if rules.convention is not None and how.convention is None:
             reading = replace(reading, convention=rules.convention)
         if wanted is not None:  # where no metric reads reflectance, its scale does not matter
@@ -172,6 +178,7 @@ def evaluate(
             truth, built, work_of(work.batch_size, work.workers, place.rank, place.ranks),
             None if measured.no_cache else Cache(), place.device, sampling, rules,
         )  # fmt: skip
+        training = None if measured.train is None else _open(measured.train, reading, measured.train_split, None)
         drawings, steps = _curve_of(flows, scans.num or SAMPLED, sampling) if checkpoint else ([], [])
         for folder in (output.out, output.json.parent if output.json else None):
             if folder is not None:
@@ -179,7 +186,7 @@ def evaluate(
         if drawings and output.out:
             _measure_curve(job, flows, drawings, steps, measured.bootstrap, output.out)
         else:
-            _compare(job, judged, measured, output)
+            _compare(job, judged, training, measured, output)
 
 
 @dataclass(frozen=True)
@@ -206,10 +213,10 @@ def _check_evaluation(
         raise InputError("give GENERATED for one comparison or --checkpoint for a curve, not both.")
     if checkpoint and output.out is None:
         raise InputError("a curve needs --out FOLDER, where its points are kept.")
-    if not generated and not checkpoint and not (measured.floor or measured.controls):
-        raise InputError("nothing to compare with: give GENERATED, --checkpoint RUN or --floor.")
-    if checkpoint and (measured.floor or measured.controls or output.json):
-        raise InputError("--floor, --controls and --json belong to a comparison; a curve writes its page to --out.")
+    if not generated and not checkpoint and not (measured.reference or measured.baselines):
+        raise InputError("nothing to compare with: give GENERATED, --checkpoint RUN or --reference.")
+    if checkpoint and (measured.reference or measured.baselines or measured.train or output.json):
+        raise InputError("--reference, --baselines, --train and --json are of a comparison; a curve writes to --out.")
     if output.json is not None and output.json.is_dir():
         raise InputError(f"--json {output.json} is a folder; name a file to write to.")
     if output.json is not None and output.json.suffix.lower() != ".json":
@@ -237,11 +244,13 @@ def _names(generated: Sequence[str]) -> list[str]:
     return labels([Path(text) for text in generated])
 
 
-def _compare(job: Job, judged: "dict[str, ScanSet]", measured: MeasureOptions, output: OutputOptions) -> None:
+def _compare(
+    job: Job, judged: "dict[str, ScanSet]", training: "ScanSet | None", measured: MeasureOptions, output: OutputOptions
+) -> None:
     from r2flow.cli.output import command
-    from r2flow.evaluation.controls import control_sets
-    from r2flow.evaluation.floor import floor_sets
+    from r2flow.evaluation.copies import Nearest, copies_result, find_nearest
     from r2flow.evaluation.measuring import Gathered, gather_real, measure
+    from r2flow.evaluation.references import baseline_sets, reference_sets
     from r2flow.reports.evaluation import Comparison, Kind, evaluation_page, print_comparisons, write_json
     from r2flow.reports.pages import write_page
     from r2flow.reports.view.panels import write_sets
@@ -249,43 +258,48 @@ def _compare(job: Job, judged: "dict[str, ScanSet]", measured: MeasureOptions, o
     kinds: dict[Kind, dict[str, tuple[ScanSet, ScanSet]]]
     kinds = {"judged": {name: (job.truth, one) for name, one in judged.items()}}
     usual = bool(judged)
-    if measured.floor or (usual and measured.floor is None and len(job.truth) > 1):
-        kinds["floor"] = floor_sets(job.truth, judged)
-    if measured.controls or (usual and measured.controls is None):
+    if measured.reference or (usual and measured.reference is None and len(job.truth) > 1):
+        kinds["reference"] = reference_sets(job.truth, judged)
+    if measured.baselines or (usual and measured.baselines is None):
         num = max((len(one) for one in judged.values()), default=len(job.truth))
-        made = control_sets(job.truth, min(num, SAMPLED))
-        kinds["control"] = {name: (job.truth, one) for name, one in made.items()}
-    found: list[Comparison] = []
-    known: dict[int, Gathered] = {}
+        baselines = baseline_sets(job.truth, min(num, SAMPLED))
+        kinds["baseline"] = {name: (job.truth, one) for name, one in baselines.items()}
+    comparisons: list[Comparison] = []
+    statistics: dict[int, Gathered] = {}
     for kind, (name, (real, other)) in ((kind, pair) for kind, pairs in kinds.items() for pair in pairs.items()):
         start = time.monotonic()
-        if id(real) not in known:
-            known[id(real)] = gather_real(job.metrics, real, job.work, job.cache, job.rules)
-        draws = 0 if kind == "control" else measured.bootstrap
-        results = measure(job.metrics, known[id(real)], other, job.work, draws)
-        found.append(Comparison(name, real, other, results, time.monotonic() - start, kind))
+        if id(real) not in statistics:
+            statistics[id(real)] = gather_real(job.metrics, real, job.work, job.cache, job.rules)
+        draws = 0 if kind == "baseline" else measured.bootstrap
+        results = measure(job.metrics, statistics[id(real)], other, job.work, draws)
+        comparisons.append(Comparison(name, real, other, results, time.monotonic() - start, kind))
     if job.work.rank > 0:
         return
+    nearest: dict[str, Nearest] = {}
+    if training is not None:
+        alone = work_of(job.work.batch_size, job.work.workers)
+        nearest = find_nearest({**judged, REAL: job.truth}, training, alone, job.device)
+        of = {("judged", name): nearest[name] for name in judged} | {("reference", "real halves"): nearest[REAL]}
+        for place, one in enumerate(comparisons):
+            if (at := of.get((one.kind, one.name))) is not None:
+                result = copies_result(at, nearest[REAL], len(training))
+                comparisons[place] = replace(one, measured=[*one.measured, result])
     seeds: dict[str, int] = {}
     if any(one.about["kind"] == "sampled" for one in judged.values()):
         seeds["sampled scans"] = job.sampling.seed
     if measured.bootstrap:
         seeds["bootstrap"] = 0
-    page = evaluation_page(found, command(), job.device, seeds)
-    print_comparisons(found)
+    drawn = {name: one for name, one in nearest.items() if name in judged}
+    page = evaluation_page(comparisons, command(), job.device, seeds, drawn, training)
+    print_comparisons(comparisons)
     if output.json is not None:
         write_json(page, output.json)
         print(output.json)
     if output.out is not None:
         for path in write_page(page, output.out):
             print(path)
-        print(
-            write_sets(
-                output.out / "evaluation.html",
-                {"real": job.truth} | {"real, judged" if name == "real" else name: one for name, one in judged.items()},
-                title="Generated and real scans",
-            )
-        )
+        sets = {"real": job.truth} | {"real, judged" if name == "real" else name: one for name, one in judged.items()}
+        print(write_sets(output.out / "evaluation.html", sets, title="Generated and real scans"))
 
 
 def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOptions) -> "tuple[list[Drawing], list[int]]":
@@ -328,44 +342,6 @@ def _measure_curve(
     if job.work.rank == 0:
         page = speed_quality_page(curve, rows, command(), done)
         finish(page, out, page.text)
-
-
-@dataclass(frozen=True)
-class HeldOutOptions:
-    """The real scans that were held out of the training, and how many scans are compared."""
-
-    real: Annotated[str | None, typer.Option(help="Real scans that were held out: which distances are usual.")] = None
-    real_split: Annotated[str | None, typer.Option(help="Part of REAL's standard split.")] = None
-    num: Annotated[int, typer.Option(min=1, help="The most generated and held-out scans, by a fixed shuffle.")] = 1000
-
-
-@report.command(
-    epilog="Example: r2flow report neighbours runs/1rf/samples prepared/train --real prepared/test --out sheet"
-)
-@grouped
-def neighbours(
-    generated: Annotated[str, typer.Argument(help=f"Scans to judge: {SETS}.", show_default=False)],
-    train: Annotated[str, typer.Argument(help="The scans that were learned from: likewise.", show_default=False)],
-    out: OutOption,
-    held_out: HeldOutOptions,
-    how: ReadingOptions,
-    work: WorkOptions,
-    pairs: Annotated[int, typer.Option(min=1, help="Nearest pairs to draw, of whole scans and of parts.")] = 4,
-    split: Annotated[str | None, typer.Option("--split", help="Part of TRAIN's standard split.")] = None,
-) -> None:
-    """Generated scans beside their nearest training scans, turned, mirrored or in parts: is anything memorised?"""
-    from r2flow.cli.output import command, finish
-    from r2flow.reports.neighbours import find_neighbours, neighbours_page
-    from r2flow.reports.pages import prepare_folder
-
-    where = choose_device(work.device)
-    reading = replace(reading_of([train, generated, held_out.real], [], how), reflectance=False)
-    trained = _open(train, reading, split, None)
-    judged = _open(generated, reading, None, held_out.num)
-    held = None if held_out.real is None else _open(held_out.real, reading, held_out.real_split, held_out.num)
-    prepare_folder(out)
-    found = find_neighbours(judged, trained, held, work_of(work.batch_size, work.workers), where)
-    finish(neighbours_page(found, pairs, command(), where), out)
 
 
 def work_of(batch_size: int, workers: int, rank: int = 0, ranks: int = 1) -> "Work":

@@ -93,8 +93,8 @@ def gather_real(
     keys = {name: key_of(metric, real, rules[name] + points) for name, metric in metrics.items()}
     held = {name: cache.read(key) for name, key in keys.items()} if cache is not None else {}
     common = _common({name for name, one in held.items() if one is not None}, work)
-    found = {name: one for name, one in held.items() if one is not None and name in common}
-    missing = {name: metric for name, metric in metrics.items() if name not in found}
+    statistics = {name: one for name, one in held.items() if one is not None and name in common}
+    missing = {name: metric for name, metric in metrics.items() if name not in statistics}
     for metric in missing.values():
         metric.reset()
     # The subset first, for every metric, then the rest, for those that take all scans: every scan is read once.
@@ -105,10 +105,10 @@ def gather_real(
     second = _update(whole_set, real, rest, len(some), True, work, protocol)
     for name, metric in missing.items():
         counts = (len(real), first + second) if name in whole_set else (len(some), first)
-        found[name] = Statistics(metric.real_state(), *counts)
+        statistics[name] = Statistics(metric.real_state(), *counts)
         if cache is not None and work.rank == 0:
-            cache.write(keys[name], found[name])
-    return Gathered(found, rules, frozenset(metrics.keys() - missing.keys()), protocol)
+            cache.write(keys[name], statistics[name])
+    return Gathered(statistics, rules, frozenset(metrics.keys() - missing.keys()), protocol)
 
 
 def measure(
@@ -143,7 +143,10 @@ def measure(
             "real": real.scans, "real_chosen": gathered.rules[name], "real_empty": real.empty,
             "generated": len(generated), "generated_empty": empty,
         }  # fmt: skip
-        image = {"sensor": generated.sensor.name, "image": list(generated.sensor.shape)}
+        e = generated.sensor.elevations
+        image = {
+            "sensor": generated.sensor.name, "elevations": [max(e), min(e)], "image": list(generated.sensor.shape)
+        }  # fmt: skip
         protocol: dict[str, Any] = {
             **gathered.protocol.describe(), **metric.protocol.asdict(), **image, "sizes": sizes
         }  # fmt: skip
@@ -162,8 +165,6 @@ def point_key(real: ScanSet, metrics: Mapping[str, ScanMetric], **sampling: Any)
     """16 hex digits of everything that the figures of a sampled flow depend on; `sampling` is how it is sampled."""
     protocols = {name: metric.protocol.asdict() for name, metric in metrics.items()}
     parts = {"real": real.identity or real.label, "metrics": protocols, **sampling}
-    if parts.get("protocol") == R2FLOW.name:  # as before there was another one
-        del parts["protocol"]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -181,13 +182,13 @@ def _update(
         return 0
     device = next(iter(metrics.values())).device
     starts = range(0, len(numbers), work.batch_size)[work.rank :: work.ranks]
-    own = [number for start in starts for number in numbers[start : start + work.batch_size]]
+    shared = [number for start in starts for number in numbers[start : start + work.batch_size]]
     names, side = scans.source.names, "real" if real else "generated"
     empty = 0
-    with work.bar(f"reading {side} scans", len(own)) as advance, torch.no_grad():
-        for start, (images, points) in zip(starts, _read(scans, own, work, protocol, real), strict=True):
-            said = [f"{names[number]} of {scans.label}" for number in numbers[start : start + work.batch_size]]
-            batch = Scans(images.to(device), scans.sensor, protocol.rays(real), points, said)
+    with work.bar(f"reading {side} scans", len(shared)) as advance, torch.no_grad():
+        for start, (images, points) in zip(starts, _read(scans, shared, work, protocol, real), strict=True):
+            labels = [f"{names[number]} of {scans.label}" for number in numbers[start : start + work.batch_size]]
+            batch = Scans(images.to(device), scans.sensor, protocol.rays(real), points, labels)
             empty += int((~batch.returned.flatten(1).any(1)).sum())
             for metric in metrics.values():
                 metric.update(batch, real=real, first=first + start)
@@ -207,14 +208,14 @@ def _read(
 def _remarks(real: Statistics, generated: int, figures: Mapping[str, float]) -> list[str]:
     """Remarks that hold for any metric."""
     sides = ((real.scans, "real"), (generated, "generated"))
-    said = [f"a single {whose} scan is no distribution." for total, whose in sides if total == 1]
+    remarks = [f"a single {whose} scan is not a distribution." for total, whose in sides if total == 1]
     lost = [name for name, value in figures.items() if math.isnan(value)]
-    return [*said, f"no figure for {', '.join(lost)}."] if lost else said
+    return [*remarks, f"no figure for {', '.join(lost)}."] if lost else remarks
 
 
 def _explained(name: str, remarks: Sequence[str]) -> bool:
-    """Whether a metric has said itself why a figure is missing."""
-    return any(said.startswith(f"{name}: no figure: ") for said in remarks)
+    """Whether a metric's own remark gives the reason for a missing figure."""
+    return any(remark.startswith(f"{name}: no figure: ") for remark in remarks)
 
 
 def _sum_over_processes(count: int, work: Work) -> int:

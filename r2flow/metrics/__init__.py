@@ -40,6 +40,7 @@ METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     mmd_unbiased=_lazily("mmd:MMDUnbiased"),
     jsd_lidm=_lazily("lidm:JSDLiDM"),
     mmd_lidm=_lazily("lidm:MMDLiDM"),
+    panel=_lazily("panel:Panel"),
 )
 
 
@@ -61,4 +62,4 @@ def default_metrics(reflectance: bool) -> tuple[str, ...]:
     beside the Frechet distance of the same features. Docs: metrics.md, "The headline".
     """
     features = "handcrafted" if reflectance else "handcrafted_range"
-    return (f"kid_{features}", f"frechet_{features}", "jsd", "jsd_extrapolated", "mmd", "mmd_unbiased")
+    return (f"kid_{features}", f"frechet_{features}", "panel", "jsd", "jsd_extrapolated", "mmd", "mmd_unbiased")

@@ -66,5 +66,6 @@ def bridged(x: np.ndarray, known: np.ndarray, gap: int = GAP) -> np.ndarray:
 
 def drop_rate(value: np.ndarray, missing: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Rays that are missing and rays at all in each bin of a value, (2, bins); unknown values (NaN) are left out."""
-    known = np.isfinite(value)
-    return np.stack([np.histogram(value[known & who], edges)[0] for who in (missing, np.ones_like(missing))])
+    held = np.isfinite(value) & (value >= edges[0]) & (value <= edges[-1])
+    place, bins = np.searchsorted(edges[1:-1], value[held], side="right"), len(edges) - 1
+    return np.stack([np.bincount(place, weights, bins) for weights in (missing[held], None)])

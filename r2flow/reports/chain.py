@@ -15,7 +15,7 @@ from r2flow.data.datamodule import ScanDataModule
 from r2flow.files import atomic_write
 from r2flow.flow.straightness import curvature
 from r2flow.generators import Flow
-from r2flow.metrics.fidelity import distances, panel
+from r2flow.metrics.panel import PANEL, distances, mean_distance, panel
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws
@@ -38,7 +38,7 @@ COLUMNS = {
 def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu", command: str = "") -> Path:
     """Sample every generator, compare the samples with held-out scans, and write figure, table and scans.
 
-    Each run's folder gets its `fidelity.json`, which `r2flow compare` reads.
+    Each run's folder gets its `evaluation.json`, which `r2flow compare` reads.
 
     Args:
         runs: Run folders by name, the first one trained on scans.
@@ -60,13 +60,18 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
         start = time.perf_counter()
         images = np.concatenate([one.images.numpy() for one in sample(flows[name], num, steps=steps)])
         seconds = (time.perf_counter() - start) / num
-        found = distances(truth, panel(images, first.sensor))
-        mean = float(np.mean(list(found.values())))
-        rows.append({"flow": name, "steps": steps, "seconds": seconds, "bend": bends[name], "mean": mean, **found})
+        lines = distances(truth, panel(images, first.sensor))
+        mean = mean_distance(lines)
+        rows.append({"flow": name, "steps": steps, "seconds": seconds, "bend": bends[name], "mean": mean, **lines})
         drawn[name, steps] = images
         # the last number of steps is the one that it is meant for
-        with atomic_write(runs[name] / "fidelity.json", "w") as file:
-            json.dump({"sets": {"other": found}, "samples": num, "steps": steps}, file, indent=2)
+        judged = [
+            {"kind": "judged", "metric": "panel", "figure": figure, "value": value}
+            for figure, value in lines.items()
+            if np.isfinite(value)
+        ]
+        with atomic_write(runs[name] / "evaluation.json", "w") as file:
+            json.dump({"rows": judged, "samples": num, "steps": steps}, file, indent=2)
     shown, rays = list(drawn[cells[-1]][:4]), first.sensor.rays()
     for index, image in enumerate(shown):
         write_scan(image, rays, out, f"{index:06d}", ("ply", "npy"))
@@ -74,11 +79,11 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     text = [
         f"{num} scans of each generator and number of steps, all from the same noise, against {len(real)} held-out "
         "scans. *Bend* is the integral of the paper's s(t) over the squared length of the path (median over scans, 0 "
-        "is straight); an untrained flow is straight too, so read it beside the *distance*: the mean of the fidelity "
+        "is straight); an untrained flow is straight too, so read it beside the *distance*: the mean of the "
         "panel's lines, 0 is equal.",
         table(rows, COLUMNS),
-        "The lines of the fidelity panel:",
-        table(rows, {"flow": "flow", "steps": "steps", **{line: line for line in truth}}),
+        "The lines of the panel:",
+        table(rows, {"flow": "flow", "steps": "steps", **{line: line for line in PANEL}}),
     ]
     figures = {"chain": figure(drawn, list(flows))}
     page = Page("chain", "From many steps to few", text, rows, figures, command, {"evaluation": 0}, device)

@@ -16,7 +16,7 @@ from r2flow.lidar.interpolation import INTERPOLATIONS
 from r2flow.lidar.known import parse_mask, ray_states
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.completion import UNITS, errors, spread_errors
-from r2flow.metrics.fidelity import PANEL, distances, panel
+from r2flow.metrics.panel import distances, mean_distance, panel
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import complete
 from r2flow.reports.pages import Page
@@ -105,13 +105,13 @@ def _errors(
     answers: Sequence[np.ndarray],
     masks: Sequence[np.ndarray],
     sensor: Sensor,
-    reference: Mapping[str, np.ndarray],
+    reference: np.ndarray,
 ) -> dict[str, float]:
     cases = list(zip(truths, answers, masks, strict=True))
     scans = [_mean([errors(truth, image, ~mask, sensor) for image in images]) for truth, images, mask in cases]
     row = {key: value for key, value in _mean(scans).items() if np.isfinite(value)}
     apart = distances(panel(np.stack([images[0] for images in answers]), sensor), reference)
-    row["panel"] = float(np.mean([apart[line] for line in PANEL if line in apart]))
+    row["panel"] = mean_distance(apart)
     if len(answers[0]) > 1:
         row |= _mean([spread_errors(truth, images, ~mask) for truth, images, mask in cases])
     return row

@@ -7,16 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from matplotlib.figure import Figure
 
+from r2flow.evaluation.copies import WAYS, Nearest
 from r2flow.evaluation.measuring import MetricResult
 from r2flow.evaluation.sets import ScanSet
 from r2flow.files import atomic_write
 from r2flow.reports.pages import STYLES, Page, blank_figure, plain, provenance
+from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
 from r2flow.reports.tables import print_table, shown, table
 
 FORMAT = "r2flow evaluation 1"
-Kind = Literal["judged", "floor", "control"]
+Kind = Literal["judged", "reference", "baseline"]
 
 # Figures that the field's tables print scaled: heading and factor. The figure itself stays what it is.
 PRINTED = {
@@ -36,6 +39,10 @@ class Comparison:
     seconds: float
     kind: Kind = "judged"
 
+    @property
+    def title(self) -> str:
+        return self.name if self.kind == "judged" else f"{self.kind}: {self.name}"
+
 
 def heading(metric: str, figure: str) -> tuple[str, float]:
     """The heading of a figure in a table, and the factor that it is printed with."""
@@ -45,15 +52,15 @@ def heading(metric: str, figure: str) -> tuple[str, float]:
 def rows_of(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
     """A row for each figure."""
     rows = []
-    for comparison, measured in ((one, metric) for one in comparisons for metric in one.measured):
-        for name, value in measured.figures.items():
-            said, factor = heading(measured.metric, name)
-            low, high = measured.intervals.get(name, (None, None))
-            sizes = measured.protocol["sizes"]
+    for comparison, result in ((one, result) for one in comparisons for result in one.measured):
+        for name, value in result.figures.items():
+            title, factor = heading(result.metric, name)
+            low, high = result.intervals.get(name, (None, None))
+            sizes = result.protocol["sizes"]
             rows.append({
-                "comparison": comparison.name, "kind": comparison.kind, "metric": measured.metric, "figure": name,
-                "value": value, "low": low, "high": high, "printed_as": said, "printed": value * factor,
-                "real": sizes["real"], "generated": sizes["generated"], "remarks": "; ".join(measured.remarks),
+                "comparison": comparison.name, "kind": comparison.kind, "metric": result.metric, "figure": name,
+                "value": value, "low": low, "high": high, "printed_as": title, "printed": value * factor,
+                "real": sizes["real"], "generated": sizes["generated"], "remarks": "; ".join(result.remarks),
             })  # fmt: skip
     return rows
 
@@ -68,22 +75,33 @@ def print_comparisons(comparisons: Sequence[Comparison]) -> None:
 
 
 def write_json(page: Page, path: Path) -> None:
-    """Write every figure with its protocol, remarks and origin, as strict JSON; one that does not exist is null."""
+    """Write every figure with its protocol, remarks and origin, as strict JSON; a missing figure is null."""
     content = {"format": FORMAT, "origin": provenance(page), **page.more}
     with atomic_write(path, "w") as file:
         file.write(json.dumps(plain(content), indent=2, allow_nan=False) + "\n")
 
 
-def evaluation_page(comparisons: Sequence[Comparison], command: str, device: str, seeds: Mapping[str, int]) -> Page:
-    """The page of an evaluation: table, sets, protocols, and a picture."""
+def evaluation_page(
+    comparisons: Sequence[Comparison],
+    command: str,
+    device: str,
+    seeds: Mapping[str, int],
+    nearest: Mapping[str, Nearest] | None = None,
+    training: ScanSet | None = None,
+) -> Page:
+    """The page of an evaluation: table, sets, protocols, and pictures.
+
+    Args:
+        nearest: The nearest training scans of the judged sets, where they were searched; drawn with `training`.
+    """
     columns, lines = _table(comparisons)
     remarks = "\n".join(f"- {remark}" for remark in _remarks(comparisons))
     sets = [
-        (one.name, whose, s.label, len(s), _words(s.about))
+        (one.name, side, s.label, len(s), _words(s.about))
         for one in comparisons
-        for whose, s in (("real", one.real), ("generated", one.generated))
+        for side, s in (("real", one.real), ("generated", one.generated))
     ]
-    protocols = [one.protocol for one in comparisons[0].measured]
+    protocols = [result.protocol for result in comparisons[0].measured]
     used = [
         (p["metric"], p["representation"], "{:g} < r < {:g}".format(*p["mask"]), p["extractor"], p["weights"],
          p["layer"], _words(p["settings"]), p["sizes"]["real_chosen"], p["sizes"]["generated"])
@@ -102,17 +120,20 @@ def evaluation_page(comparisons: Sequence[Comparison], command: str, device: str
                      "generated scans")),
     ]  # fmt: skip
     more = {"comparisons": [_plain_comparison(one) for one in comparisons]}
-    return Page("evaluation", "Generated scans against real ones", text, rows_of(comparisons),
-                {"evaluation": _figure(comparisons)}, command, seeds, device, more)  # fmt: skip
+    figures = {"evaluation": _figure(comparisons)}
+    if nearest and training is not None:
+        figures["evaluation_copies"] = copies_figure(nearest, training)
+    title = "Generated scans against real ones"
+    return Page("evaluation", title, text, rows_of(comparisons), figures, command, seeds, device, more)
 
 
 def _protocol(comparisons: Sequence[Comparison]) -> str:
-    """The protocol of all figures, in a sentence."""
+    """The protocol of all figures, and the sensor that the scans are compared under."""
     used = comparisons[0].measured[0].protocol
-    points = used["points"]
+    points, (top, bottom) = used["points"], used["elevations"]
     return (
         f"Protocol {used['name']}: real points {points['real']}, generated points {points['generated']}; "
-        f"images {'x'.join(map(str, used['image']))}."
+        f"images {'x'.join(map(str, used['image']))} of {used['sensor']}, {top:.2f} to {bottom:.2f} degrees."
     )
 
 
@@ -126,42 +147,38 @@ def _table(comparisons: Sequence[Comparison]) -> tuple[list[str], list[list[str]
             text += f" [{row['low'] * factor:#.3g}, {row['high'] * factor:#.3g}]"
         cells.setdefault(row["printed_as"], {})[row["kind"], row["comparison"]] = text
     sizes = [f"({len(one.generated)} : {len(one.real)})" for one in comparisons]
-    names = list(map(_named, comparisons))
     if len(comparisons) >= len(cells):
         lines = [
-            [name, size, *(own.get((one.kind, one.name), "") for own in cells.values())]
-            for name, size, one in zip(names, sizes, comparisons, strict=True)
+            [one.title, size, *(values.get((one.kind, one.name), "") for values in cells.values())]
+            for size, one in zip(sizes, comparisons, strict=True)
         ]
         return ["set", "its scans : real", *cells], lines
-    columns = ["", *(f"{name} {size}" for name, size in zip(names, sizes, strict=True))]
-    return columns, [[said, *(own.get((one.kind, one.name), "") for one in comparisons)] for said, own in cells.items()]
-
-
-def _named(one: Comparison) -> str:
-    return one.name if one.kind == "judged" else f"{one.kind}: {one.name}"
+    columns = ["", *(f"{one.title} {size}" for one, size in zip(comparisons, sizes, strict=True))]
+    lines = [[title, *(v.get((one.kind, one.name), "") for one in comparisons)] for title, v in cells.items()]
+    return columns, lines
 
 
 def _remarks(comparisons: Sequence[Comparison]) -> list[str]:
     """Each remark once, with the metrics and the comparisons that it holds for."""
-    said = []
+    lines = []
     drawn = [m.protocol["interval"] for one in comparisons for m in one.measured if m.intervals]
     if drawn:
         draws = drawn[0]["bootstrap draws"]
-        said.append(f"In brackets: intervals of {drawn[0]['level']:.0%}, from {draws} bootstrap draws.")
+        lines.append(f"In brackets: intervals of {drawn[0]['level']:.0%}, from {draws} bootstrap draws.")
     if len({(len(one.real), len(one.generated)) for one in comparisons}) > 1:
-        said.append("Distances of fewer scans are larger: compare only sets of equal sizes.")
-    found: dict[str, dict[str, list[str]]] = {}  # remark -> comparison -> metrics
+        lines.append("Distances of fewer scans are larger: compare only sets of equal sizes.")
+    remarks: dict[str, dict[str, list[str]]] = {}  # remark -> comparison -> metrics
     for one in comparisons:
-        for measured in one.measured:
-            for remark in measured.remarks:
-                found.setdefault(remark, {}).setdefault(_named(one), []).append(measured.metric)
-    for remark, where in found.items():
+        for result in one.measured:
+            for remark in result.remarks:
+                remarks.setdefault(remark, {}).setdefault(one.title, []).append(result.metric)
+    for remark, where in remarks.items():
         metrics = list(dict.fromkeys(name for names in where.values() for name in names))
         about = [] if len(where) == len(comparisons) else [", ".join(where)]
         if len(metrics) < len(comparisons[0].measured) and not remark.startswith(tuple(metrics)):
             about.append(", ".join(metrics))
-        said.append(f"{'; '.join(about)}: {remark}" if about else remark)
-    return said
+        lines.append(f"{'; '.join(about)}: {remark}" if about else remark)
+    return lines
 
 
 def _words(values: Mapping[str, Any]) -> str:
@@ -173,50 +190,71 @@ def _plain_comparison(one: Comparison) -> dict[str, Any]:
     return {
         "comparison": one.name,
         "kind": one.kind,
-        **{whose: {"set": s.label, "scans": len(s), **s.about} for whose, s in sets.items()},
+        **{side: {"set": s.label, "scans": len(s), **s.about} for side, s in sets.items()},
         "seconds": round(one.seconds, 2),
         "metrics": [
             {
-                "metric": measured.metric,
-                "figures": dict(measured.figures),
+                "metric": result.metric,
+                "figures": dict(result.figures),
                 "printed": {
-                    said: value * factor
-                    for name, value in measured.figures.items()
-                    for said, factor in [heading(measured.metric, name)]
+                    title: value * factor
+                    for name, value in result.figures.items()
+                    for title, factor in [heading(result.metric, name)]
                 },
-                "intervals": {name: list(ends) for name, ends in measured.intervals.items()},
-                "protocol": dict(measured.protocol),
-                "remarks": list(measured.remarks),
+                "intervals": {name: list(ends) for name, ends in result.intervals.items()},
+                "protocol": dict(result.protocol),
+                "remarks": list(result.remarks),
             }
-            for measured in one.measured
+            for result in one.measured
         ],
     }
 
 
 def _figure(comparisons: Sequence[Comparison]) -> Figure:
-    """A panel for each metric's first figure, with a mark for each comparison."""
-    first = {m.metric: next(iter(m.figures)) for m in comparisons[0].measured if m.figures}
+    """A plot for each metric's first figure, with a mark for each comparison."""
+    first = {m.metric: next(iter(m.figures)) for one in comparisons for m in one.measured if m.figures}
     columns = max(min(len(first), 4), 1)
     lines = max(math.ceil(len(first) / columns), 1)
     title = "Each metric's first figure, generated scans and real ones"
     figure = blank_figure(2.9 * columns + 1.0, (0.5 * len(comparisons) + 1.2) * lines, title)
     for place, (metric, name) in enumerate(first.items()):
         axes = figure.add_subplot(lines, columns, place + 1)
-        said, factor = heading(metric, name)
+        label, factor = heading(metric, name)
         for row, one in enumerate(comparisons):
-            measured = next(m for m in one.measured if m.metric == metric)
-            value = measured.figures.get(name, math.nan) * factor
+            result = next((m for m in one.measured if m.metric == metric), None)
+            value = math.nan if result is None else result.figures.get(name, math.nan) * factor
             style = STYLES[row % len(STYLES)]
-            if name in measured.intervals:
-                low, high = measured.intervals[name]
+            if result is not None and name in result.intervals:
+                low, high = result.intervals[name]
                 axes.hlines(row, low * factor, high * factor, color=style["color"], lw=1.5)
             axes.plot([value], [row], marker=style["marker"], color=style["color"], ms=7, ls="")
             if math.isnan(value):
                 axes.text(0.02, row, "none", transform=axes.get_yaxis_transform(), fontsize=8, va="center")
-        axes.set_yticks(range(len(comparisons)), list(map(_named, comparisons)) if place % columns == 0 else [])
-        axes.set(xlabel=said, ylim=(len(comparisons) - 0.5, -0.5))
+        axes.set_yticks(range(len(comparisons)), [one.title for one in comparisons] if place % columns == 0 else [])
+        axes.set(xlabel=label, ylim=(len(comparisons) - 0.5, -0.5))
         axes.set_xlim(min(0.0, axes.get_xlim()[0]), axes.get_xlim()[1] * 1.05)
         axes.locator_params(axis="x", nbins=4)
         axes.grid(True, axis="x", color="0.88", lw=0.6)
         axes.tick_params(labelsize=8)
+    return figure
+
+
+def copies_figure(nearest: Mapping[str, Nearest], training: ScanSet, pairs: int = 4) -> Figure:
+    """The scans of each set that are nearest to training scans, whole and in parts; right the training scan as it is
+    turned.
+    """
+    chosen = [
+        (name, way, one, int(place), float(one.distances(way)[place]))
+        for name, one in nearest.items()
+        for way in WAYS
+        for place in np.argsort(one.distances(way), kind="stable")[:pairs]
+    ]
+    figure = blank_figure(14, 0.9 * len(chosen) + 0.2)
+    figure.set_facecolor(BACKGROUND)
+    panels = figure.subplots(len(chosen), 2, squeeze=False)
+    for (left, right), (name, way, one, place, distance) in zip(panels, chosen, strict=True):
+        number = int(one.numbers[place])
+        draw_range(left, one.scans.source[number], label=False)
+        draw_range(right, one.match(place, way, training), label=False)
+        left.set_title(f"{name} {number}: {shown(distance)} away by {WAYS[way]}", color=FOREGROUND, fontsize=8, pad=2)
     return figure

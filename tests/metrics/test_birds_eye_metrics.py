@@ -151,3 +151,23 @@ def test_a_distance_map_is_that_of_the_nearest_held_cell():
     expected = (every[:, None] - at).square().sum(-1).amin(1).view(13, 9)
     assert torch.equal(squared_distance_map(held), expected.float())
     assert squared_distance_map(held & False).isnan().all()
+
+
+def test_js_distance_of_known_histograms():
+    p = np.array([1.0, 1.0, 0.0, 0.0])
+    assert js_distance(p, p * 7) == 0
+    assert js_distance(p, p[::-1]) == pytest.approx(math.sqrt(math.log(2)))
+    # p = (1, 0), q = (1/2, 1/2), m = (3/4, 1/4), by hand.
+    expected = math.sqrt((math.log(4 / 3) + 0.5 * math.log(2 / 3) + 0.5 * math.log(2)) / 2)
+    assert js_distance(np.array([5, 0]), np.array([3, 3])) == pytest.approx(expected)
+    empty = np.zeros(2)
+    assert js_distance(empty, np.ones(2)) == pytest.approx(math.sqrt(math.log(2)))
+    assert js_distance(empty, empty) == 0
+
+
+def test_the_bird_s_eye_distance_is_the_reference_s(shared):
+    case = torch.load(shared / "oracle" / "bev_metrics.pt", weights_only=False)
+    histograms = np.stack([birds_eye_histogram(points) for points in case["point_clouds"].numpy()])
+    np.testing.assert_array_equal(histograms, case["hists"].numpy())
+    distance = js_distance(histograms[:12].sum(0), histograms[12:].sum(0))
+    assert distance == pytest.approx(case["jsd"], rel=1e-4)

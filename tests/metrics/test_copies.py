@@ -1,6 +1,6 @@
 """Copies among generated scans are found, turned, mirrored or in parts, and shown."""
 
-import csv
+import json
 import math
 from itertools import permutations
 from pathlib import Path
@@ -11,9 +11,9 @@ import pytest
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
 from r2flow.errors import InputError
+from r2flow.evaluation.copies import SECTORS, copies_result, find_nearest, nearer
 from r2flow.evaluation.measuring import Work
 from r2flow.lidar.sensors import SENSORS
-from r2flow.reports.neighbours import SECTORS, find_neighbours, nearer, pair_rows, sentences
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_evaluation import folder, images
 
@@ -53,8 +53,8 @@ def by_hand(x: np.ndarray, training: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def test_each_is_beside_its_nearest_over_turns_mirror_and_parts(sets, made):
-    found = find_neighbours(sets["generated"], sets["training"], sets["held"], Work(2))
-    for one, name in ((found.generated, "generated"), (found.real, "held")):
+    found = find_nearest({name: sets[name] for name in ("generated", "held")}, sets["training"], Work(2))
+    for name, one in found.items():
         for i, image in enumerate(made[name]):
             d = by_hand(image, made["training"])
             whole, parts = d.mean(2).min(0), d.min(0)
@@ -66,21 +66,24 @@ def test_each_is_beside_its_nearest_over_turns_mirror_and_parts(sets, made):
 
 
 def test_copies_are_found_with_their_turn_and_their_parts(sets, made):
-    found = find_neighbours(sets["generated"], sets["training"], sets["held"], Work())
-    assert set(found.generated.order("whole")[:3]) == {3, 4, 5}
-    assert set(found.generated.order("parts")[:4]) == {3, 4, 5, 6}
-    rows = {row["scan"]: row for row in pair_rows(found) if row["set"] == "generated"}
-    assert [rows[f"00000{i}.npy"]["nearest"] for i in (3, 4, 5)] == ["000005.npy", "000006.npy", "000007.npy"]
-    assert [rows[f"00000{i}.npy"]["mirrored"] for i in (3, 4, 5)] == [False, False, True]
-    # The sheet draws the training scan as the sample shows it.
+    found = find_nearest({name: sets[name] for name in ("generated", "held")}, sets["training"], Work())
+    one, real = found["generated"], found["held"]
+    assert set(np.argsort(one.distances("whole"))[:3]) == {3, 4, 5}
+    assert set(np.argsort(one.distances("parts"))[:4]) == {3, 4, 5, 6}
+    assert one.neighbours[3:6, 0].tolist() == [5, 6, 7]
+    assert (one.turns[3:6, 0] < 0).tolist() == [False, False, True]
+    # The figure draws the training scan as the sample shows it.
     for way, places in (("whole", (3, 4, 5)), ("parts", (3, 6))):
         for place in places:
-            image, _ = found.generated.match(place, way, sets["training"])
-            np.testing.assert_array_equal(image[0], made["generated"][place][0])
-    for way, said in zip(("whole", "parts"), sentences(found), strict=True):
-        count = (found.generated.distances(way) < min(found.real.distances(way))).sum()
+            np.testing.assert_array_equal(one.match(place, way, sets["training"])[0], made["generated"][place][0])
+    result = copies_result(one, real, 9)
+    for way, remark in zip(("whole", "parts"), result.remarks, strict=True):
+        count = (one.distances(way) < min(real.distances(way))).sum()
         assert count >= 3
-        assert f"**{count} of 7** generated scans lie nearer to a training scan than any of 7 held-out" in said
+        assert f"{count} of 7 scans" in remark
+        assert result.figures[f"copies_{way}"] == np.median(one.distances(way))
+        wins = np.mean([a < b for a in one.distances(way) for b in real.distances(way)])
+        assert result.figures[f"copies_{way}_nearer"] == pytest.approx(wins)
 
 
 def test_how_unlikely_it_is_is_counted_over_all_orders():
@@ -97,37 +100,29 @@ def test_how_unlikely_it_is_is_counted_over_all_orders():
     assert found.p_share == pytest.approx(np.mean([win >= 10 for win in wins]))
 
 
-def test_without_held_out_scans_training_scans_are_compared_to_the_others(sets):
-    found = find_neighbours(sets["generated"], sets["training"], None, Work(4))
-    assert (found.real.neighbours.numpy() != found.real.numbers[:, None]).all()
-    assert (found.real.distances("parts") > 0.1).all()
-    assert len(found.real.numbers) == 7
-
-
 def test_scans_without_a_return_have_no_neighbour(sets, tmp_path):
     made = images(3, 2)
     made[1] = 0
     with_empty = open_scans(str(folder(tmp_path / "e", made)), Reading(SENSOR))
-    found = find_neighbours(with_empty, sets["training"], sets["held"], Work())
-    assert found.generated.numbers.tolist() == [0, 2]
-    nothing = with_empty.part([1], "empty")
+    assert find_nearest({"e": with_empty}, sets["training"], Work())["e"].numbers.tolist() == [0, 2]
     with pytest.raises(InputError, match="none of the 1 scans"):
-        find_neighbours(nothing, sets["training"], sets["held"], Work())
-    # nor are they one
-    found = find_neighbours(sets["generated"], with_empty, sets["held"], Work())
-    assert (found.generated.neighbours != 1).all()
+        find_nearest({"e": with_empty.part([1], "empty")}, sets["training"], Work())
+    assert (find_nearest({"g": sets["generated"]}, with_empty, Work())["g"].neighbours != 1).all()
 
 
-def test_the_verb_writes_the_page(r2flow, sets, tmp_path):  # noqa: F811
-    places = [tmp_path / name for name in ("generated", "training", "held")]
-    code, said, _ = r2flow(
-        "report", "neighbours", places[0], places[1], "--real", places[2], "--size", "8x64",
-        "--pairs", 1, "--workers", 0, "--out", tmp_path / "sheet",
+def test_evaluate_has_the_copies_as_lines_and_a_picture(r2flow, sets, tmp_path):  # noqa: F811
+    code, out, err = r2flow(
+        "evaluate", tmp_path / "held", tmp_path / "generated", "--train", tmp_path / "training", "--size", "8x64",
+        "--metrics", "jsd", "--workers", 0, "--json", tmp_path / "e.json", "--out", tmp_path / "page",
     )  # fmt: skip
-    assert code == 0
-    assert "generated scans lie nearer to a training scan than any of 7 held-out real scans" in said
-    assert "no copy" not in said
-    assert len(list((tmp_path / "sheet").glob("*.png"))) == 2
-    lines = (tmp_path / "sheet" / "neighbours.csv").read_text().splitlines()
-    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
-    assert len(rows) == 7 + 7
+    assert code == 0, err
+    assert "scans lie nearer to a training scan than any of 7 real ones" in out
+    found = find_nearest({name: sets[name] for name in ("generated", "held")}, sets["training"], Work())
+    figures = {
+        one["comparison"]: {k: v for m in one["metrics"] if m["metric"] == "copies" for k, v in m["figures"].items()}
+        for one in json.loads((tmp_path / "e.json").read_text())["comparisons"]
+    }
+    for name, one in (("generated", found["generated"]), ("real halves", found["held"])):
+        assert figures[name]["copies_whole"] == pytest.approx(np.median(one.distances("whole")), rel=1e-6)
+    assert figures["noise"] == {}
+    assert (tmp_path / "page" / "evaluation_copies.png").stat().st_size > 0

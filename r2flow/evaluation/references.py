@@ -1,0 +1,101 @@
+"""What a figure of generated scans is read against: real scans among themselves, and baselines made without a model."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from r2flow.data.sets import ScanSet
+from r2flow.data.sources import ScanSource
+from r2flow.errors import InputError
+from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.sensors import Sensor
+from r2flow.noise import generator, standard_normal
+
+BASELINES = ("noise", "flat ground", "mean scan", "shuffled pixels")
+LEARNED_FROM = 200  # real scans that the mean and the shuffled pixels are made of, evenly spread over the set
+
+
+def reference_sets(real: ScanSet, generated: Mapping[str, ScanSet] | None = None) -> dict[str, tuple[ScanSet, ScanSet]]:
+    """Pairs of real sets whose distance a generator cannot be expected to go below: two halves, and two drives if any.
+
+    Halves are contiguous blocks: neighbouring scans of a drive are near-duplicates, and random halves would share
+    places. The two drives are those with most scans. Distances fall with the number of scans, so generated scans that
+    need not be sampled again are compared with the first half as well, as many as the second half has.
+
+    Raises:
+        InputError: fewer than two real scans.
+    """
+    count = len(real)
+    if count < 2:
+        raise InputError(f"{real.label} holds {count} scan; --reference needs at least two real ones.")
+    half, other = real.part(range(count // 2), "first half"), real.part(range(count // 2, count), "second half")
+    pairs = {"real halves": (half, other)}
+    for name, one in (generated or {}).items():
+        if not one.source.drawn and len(one) >= len(other):
+            pairs[f"{name}, as many"] = half, one.limited(len(other))
+    largest = sorted(real.drives, key=lambda drive: -len(real.drives[drive]))[:2]
+    if len(largest) == 2:
+        a, b = (real.part(list(real.drives[drive]), f"drive {drive}") for drive in sorted(largest))
+        pairs["real drives"] = a, b
+    return pairs
+
+
+class Baseline(ScanSource):
+    """Scans (2 or 1, H, W) made without knowledge of scenes, by their numbers.
+
+    `noise` is x_0 ~ N(0, I) decoded as if it were a scan; `flat ground` measures r = -height / sin e; `mean scan` is
+    the mean of the training scans where over half of them returned; `shuffled pixels` takes each pixel from a training
+    scan of its own.
+
+    Args:
+        training: Real scans, (N, 2 or 1, H, W).
+    """
+
+    def __init__(self, name: str, training: np.ndarray, sensor: Sensor, numbers: Sequence[int], seed: int = 0) -> None:
+        self.name, self.training, self.sensor, self.numbers, self.seed = name, training, sensor, numbers, seed
+        self._same = {"flat ground": self._flat_ground, "mean scan": self._mean_scan}.get(name, lambda: None)()
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        if self._same is not None:
+            return self._same
+        return self._noise(self.numbers[index]) if self.name == "noise" else self._shuffled(self.numbers[index])
+
+    @property
+    def names(self) -> list[str]:
+        return [f"{self.name} {number}" for number in self.numbers]
+
+    def subset(self, indices: Sequence[int]) -> "Baseline":
+        return Baseline(self.name, self.training, self.sensor, [self.numbers[i] for i in indices], self.seed)
+
+    def about(self) -> dict[str, object]:
+        return {"kind": "baseline", "seed": self.seed, "reflectance": self.training.shape[1] > 1}
+
+    def _noise(self, number: int) -> np.ndarray:
+        encoding = Encoding(self.sensor, reflectance=self.training.shape[1] > 1)
+        return encoding.decode(standard_normal(self.training.shape[1:], self.seed, "evaluation", number)).numpy()
+
+    def _flat_ground(self) -> np.ndarray:
+        e = self.sensor.rays()[0].numpy().astype(np.float64)
+        r = np.where(e < 0, -self.sensor.height / np.sin(np.minimum(e, -1e-6)), 0)
+        r = np.where((r >= self.sensor.min_range) & (r <= self.sensor.max_range), r, 0)
+        return np.stack([r, 0.3 * (r > 0)])[: self.training.shape[1]].astype(np.float32)
+
+    def _mean_scan(self) -> np.ndarray:
+        returned = self.training[:, 0] > 0
+        mean = self.training.sum(0) / np.maximum(returned.sum(0), 1)
+        return np.where(returned.mean(0) > 0.5, mean, 0).astype(np.float32)
+
+    def _shuffled(self, number: int) -> np.ndarray:
+        rows, columns = np.indices(self.sensor.shape)
+        scan = generator(self.seed, "shuffle", number).integers(len(self.training), size=self.sensor.shape)
+        return np.moveaxis(self.training[scan, :, rows, columns], -1, 0)
+
+
+def baseline_sets(real: ScanSet, num: int) -> dict[str, ScanSet]:
+    """Each baseline as a set of `num` scans, made of some of the real ones."""
+    some = real.spread(LEARNED_FROM)
+    training = np.concatenate([batch.numpy() for batch in some.batches(range(len(some)), 8)])
+    return {name: ScanSet(name, Baseline(name, training, real.sensor, range(num)), real.sensor) for name in BASELINES}

@@ -1,0 +1,181 @@
+"""The panel's statistics of scans that are known."""
+
+import numpy as np
+import pytest
+import torch
+
+from r2flow.data.opening import open_scans
+from r2flow.data.reading import Reading
+from r2flow.data.sets import ScanSet
+from r2flow.evaluation.references import BASELINES, Baseline
+from r2flow.lidar.sensors import SENSORS
+from r2flow.metrics import METRICS
+from r2flow.metrics.birds_eye import js_distance
+from r2flow.metrics.panel import FIXED, PANEL, RUNS, Scan, distances, panel, run_lengths, steps_by_sector
+from r2flow.metrics.scans import Scans
+
+SENSOR = SENSORS["hdl64e"].resized(16, 64)
+
+
+def walls(count: int, seed: int) -> np.ndarray:
+    """Scenes of a sort: ground and a wall at a distance of its own."""
+    e, a = SENSOR.rays().numpy()
+    images = []
+    for index in range(count):
+        draw = np.random.default_rng(seed * 1000 + index)
+        wall = draw.uniform(8, 30) / np.maximum(np.abs(np.cos(a + draw.uniform(0, 3))), 0.05)
+        ground = np.where(e < 0, -1.73 / np.sin(np.minimum(e, -1e-3)), np.inf)
+        r = np.minimum(wall, ground)
+        r = np.where((r < 62) & (draw.random(r.shape) < 0.95), r, 0)
+        images.append(np.stack([r, (r > 0) * draw.beta(2, 5, r.shape)]))
+    return np.stack(images).astype(np.float32)
+
+
+def apart(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
+    return distances(panel(a, SENSOR), panel(b, SENSOR))
+
+
+def scan_of(image: np.ndarray, sensor=SENSOR) -> Scan:
+    return Scan(image[0], None, sensor, np.zeros((100, 100)))
+
+
+def baseline(name: str, training: np.ndarray, num: int) -> np.ndarray:
+    source = Baseline(name, training, SENSOR, range(num))
+    return np.stack([source[i] for i in range(num)])
+
+
+def test_the_histograms_are_numpy_s_and_every_member_has_its_size():
+    image = walls(1, 0)[0]
+    r, q = image
+    from r2flow.metrics.panel import (
+        COSINES,
+        GRADIENTS,
+        NORMALS,
+        REFLECTANCES,
+        gradient_elevation,
+        incidence,
+        range_pairs,
+        reflectance_pairs,
+        surface_normals,
+    )
+
+    scan = Scan(r, q, SENSOR, np.zeros((100, 100)))
+    both = (r[1:] > 0) & (r[:-1] > 0)
+    np.testing.assert_array_equal(
+        gradient_elevation(scan), np.histogram(np.abs(r[1:] - r[:-1])[both], GRADIENTS)[0]
+    )  # fmt: skip
+    up, cosine = scan.surfaces
+    np.testing.assert_array_equal(surface_normals(scan), np.histogram(up[np.isfinite(up)], NORMALS)[0])
+    np.testing.assert_array_equal(incidence(scan), np.histogram(cosine[np.isfinite(cosine)], COSINES)[0])
+    edges = np.geomspace(SENSOR.min_range, SENSOR.max_range, 17)
+    both = (r > 0) & (np.roll(r, -1, -1) > 0)
+    pairs = [x[both] for x in (r, np.roll(r, -1, -1))]
+    np.testing.assert_array_equal(range_pairs(scan).reshape(16, 16), np.histogram2d(*pairs, [edges, edges])[0])
+    pairs = [x[both] for x in (q, np.roll(q, -1, -1))]
+    expected = np.histogram2d(*pairs, [REFLECTANCES, REFLECTANCES])[0]
+    np.testing.assert_array_equal(reflectance_pairs(scan).reshape(13, 13), expected)
+    for name, member in PANEL.items():
+        assert member.counts(scan).size == (member.size or 2 * 16), name
+    assert panel(image[None], SENSOR).shape == (FIXED + 32,)
+
+
+def test_a_set_is_at_no_distance_from_itself_and_its_order_does_not_matter():
+    images = walls(6, 0)
+    assert apart(images, images[::-1]) == pytest.approx(dict.fromkeys(PANEL, 0.0), abs=1e-9)
+
+
+def test_the_metric_has_the_distances_of_the_sets_and_their_mean():
+    real, other = walls(5, 1), walls(7, 2)
+    metric = METRICS["panel"]()
+    for images, is_real in ((real, True), (other, False)):
+        metric.update(Scans(torch.from_numpy(images), SENSOR), is_real)
+    expected = apart(real, other)
+    figures = metric.compute()
+    assert figures.pop("panel") == pytest.approx(np.mean(list(expected.values())))
+    assert figures == pytest.approx(expected)
+
+
+def test_scenes_of_the_same_sort_are_nearer_than_every_baseline():
+    training, real, other = walls(40, 1), walls(40, 2), walls(40, 3)
+    d = apart(other, real)
+    far = {name: apart(baseline(name, training, 40), real) for name in BASELINES}
+    # Losses and reflectances are independent from pixel to pixel here, as the shuffled ones are.
+    alike = {"changes per row", "run lengths", "drop rate by range", "drop rate by incidence", "reflectance pairs"}
+    for line in set(PANEL) - alike:
+        assert d[line] < min(found[line] for found in far.values()), line
+
+
+@pytest.mark.slow
+def test_every_member_tells_real_drives_from_baselines(shared):
+    sensor, real = SENSORS["hdl64e"], shared / "real"
+    raw, odometry = real / "raw" / "2011_09_26", real / "odometry" / "sequences"
+    halves = (
+        [real / "kitti360", raw / "2011_09_26_drive_0048_sync", odometry / "08"],
+        [odometry / "00", raw / "2011_09_26_drive_0005_sync", real / "object"],
+    )
+
+    def read(path) -> np.ndarray:
+        scans: ScanSet = open_scans(path, Reading(sensor))
+        return np.stack([scans.source[i] for i in range(len(scans))])
+
+    one, other = (np.concatenate([read(path) for path in half]) for half in halves)
+    truth = panel(one, sensor)
+    d = distances(truth, panel(other, sensor))
+    for name in BASELINES:
+        source = Baseline(name, one, sensor, range(len(other)))
+        made = distances(truth, panel(np.stack([source[i] for i in range(len(other))]), sensor))
+        for line in PANEL:
+            assert d[line] < 0.5 * made[line], (name, line)
+
+
+def test_a_turn_changes_no_run_of_returns():
+    images = np.zeros((2, 1, 3, 40), np.float32)
+    images[0, 0, 0, 4:17], images[0, 0, 1, 30:], images[0, 0, 1, :5], images[1, 0, 2] = 9, 9, 9, 9
+    expected = np.histogram([13, 15, 40], RUNS, weights=[13, 15, 40])[0]
+    for by in (0, 7, 20):
+        turned = np.roll(images, by, -1)
+        np.testing.assert_array_equal(sum(run_lengths(scan_of(image)) for image in turned), expected)
+
+
+def test_mirrored_scans_of_a_car_that_keeps_to_the_right_are_seen():
+    e, a = SENSOR.rays().numpy()
+    draw = np.random.default_rng(0)
+    away = np.where(np.sin(a) > 0, 9, 3)[None] * draw.uniform(0.9, 1.1, (60, 1, 1))  # walls to the left and right
+    images = (np.minimum(away / np.maximum(np.abs(np.sin(a)), 0.05), 60) / np.cos(e)).astype(np.float32)[:, None]
+
+    def steps(scans: np.ndarray) -> np.ndarray:
+        return sum(steps_by_sector(scan_of(image)) for image in scans)
+
+    one, other = steps(images[:30]), steps(images[30:])
+    mirrored = steps(np.roll(images[30:, ..., ::-1], 1, axis=-1))  # about the first column
+    np.testing.assert_array_equal(mirrored, other[::-1, ::-1])  # sectors and signs change sides, nothing else
+    assert js_distance(one, mirrored) > 5 * js_distance(one, other)
+
+
+def test_range_alone_leaves_reflectance_out():
+    images = walls(4, 0)
+    lines = apart(images[:, :1], images)
+    assert np.isnan(lines.pop("reflectance pairs"))
+    assert lines == pytest.approx(dict.fromkeys(lines, 0.0), abs=1e-9)
+    metric = METRICS["panel"]()
+    metric.update(Scans(torch.from_numpy(images), SENSOR), True)
+    metric.update(Scans(torch.from_numpy(images[:, :1]), SENSOR), False)
+    assert metric.compute()["panel"] == pytest.approx(0, abs=1e-9)
+    assert any("no reflectance" in remark for remark in metric.remarks())
+
+
+def test_the_baselines_are_what_they_say():
+    training = walls(20, 1)
+    e = SENSOR.rays()[0].numpy()
+    flat = baseline("flat ground", training, 1)[0, 0]
+    np.testing.assert_allclose(flat[flat > 0], -1.73 / np.sin(e[flat > 0]), rtol=1e-5)
+    assert (flat > 0)[(-1.73 / np.sin(np.minimum(e, -1e-6)) < 80) & (e < 0)].all()
+    shuffled = baseline("shuffled pixels", training, 30)[:, 0, 2, 20]  # where walls stand before the ground
+    assert set(shuffled.tolist()) <= set(training[:, 0, 2, 20].tolist())
+    assert len(np.unique(shuffled)) > 5
+    mean = baseline("mean scan", training, 1)[0, 0]
+    held = (training[:, 0] > 0).mean(0) > 0.5
+    np.testing.assert_array_equal(mean > 0, held)
+    h, w = np.argwhere(held)[0]
+    values = training[:, 0, h, w]
+    assert mean[h, w] == pytest.approx(values[values > 0].mean(), rel=1e-5)
