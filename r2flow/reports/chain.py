@@ -1,6 +1,5 @@
 """What reflow and distillation change: every generator of a chain at few and at many steps, from the same noise."""
 
-import json
 import math
 import time
 from collections.abc import Iterable, Mapping
@@ -12,7 +11,6 @@ import torch
 from matplotlib.figure import Figure
 
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.files import atomic_write
 from r2flow.flow.straightness import curvature
 from r2flow.generators import Flow
 from r2flow.metrics.panel import PANEL, distances, mean_distance, panel
@@ -38,8 +36,6 @@ COLUMNS = {
 def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu", command: str = "") -> Path:
     """Sample every generator, compare the samples with held-out scans, and write figure, table and scans.
 
-    Each run's folder gets its `evaluation.json`, which `r2flow compare` reads.
-
     Args:
         runs: Run folders by name, the first one trained on scans.
         num: Scans of each, for each number of steps.
@@ -64,14 +60,6 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
         mean = mean_distance(lines)
         rows.append({"flow": name, "steps": steps, "seconds": seconds, "bend": bends[name], "mean": mean, **lines})
         drawn[name, steps] = images
-        # the last number of steps is the one that it is meant for
-        judged = [
-            {"kind": "judged", "metric": "panel", "figure": figure, "value": value}
-            for figure, value in lines.items()
-            if np.isfinite(value)
-        ]
-        with atomic_write(runs[name] / "evaluation.json", "w") as file:
-            json.dump({"rows": judged, "samples": num, "steps": steps}, file, indent=2)
     shown, rays = list(drawn[cells[-1]][:4]), first.sensor.rays()
     for index, image in enumerate(shown):
         write_scan(image, rays, out, f"{index:06d}", ("ply", "npy"))

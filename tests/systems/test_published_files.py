@@ -33,7 +33,17 @@ def test_a_published_file_is_sampled_and_evaluated(r2flow, shared, tmp_path: Pat
     assert (out / "000001.npy").is_file()
     rate = ["--metrics", "jsd", "--workers", 0, "--device", "cpu"]
     code, _, error = r2flow(
-        "evaluate", out, path, *options, *rate, "--num", 2, "--no-floor", "--no-controls", "--json", tmp_path / "e.json"
+        "evaluate",
+        out,
+        path,
+        *options,
+        *rate,
+        "--num",
+        2,
+        "--no-reference",
+        "--no-baselines",
+        "--json",
+        tmp_path / "e.json",
     )
     assert code == 0, error
     (found,) = json.loads((tmp_path / "e.json").read_text())["comparisons"]
