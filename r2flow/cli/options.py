@@ -61,7 +61,7 @@ ColumnsOption = Annotated[
 
 def named_columns(text: str | None) -> tuple[str, ...] | None:
     """The columns that are named by `--columns`, checked."""
-    from r2flow.lidar.scan_files.fields import check_columns
+    from r2flow.lidar.scan_files import check_columns
 
     columns = None if text is None else tuple(name.strip() for name in text.split(","))
     check_columns(columns)

@@ -9,7 +9,7 @@ from r2flow.data.shards import PairRecipe
 from r2flow.errors import InputError
 from r2flow.flow.solvers import check_knots, check_tolerance, named_grid
 from r2flow.generators.base import Precision, usual_steps
-from r2flow.lidar.scan_files.fields import check_columns
+from r2flow.lidar.scan_files import check_columns
 from r2flow.registry import NonNegative, Positive, check_options
 
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # in the table `r2flow.data.opening.SOURCES`

@@ -1,7 +1,8 @@
 """Scans of other formats, written by their own libraries, are the points that were written."""
 
-import importlib
+import resource
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -117,10 +118,10 @@ def test_archives_of_numpy(tmp_path: Path, save):
 def test_archives_that_hold_no_points_are_refused(tmp_path: Path):
     path = tmp_path / "a.npz"
     for arrays, words in (
-        ({"pose": np.eye(4), "stamp": np.zeros(1)}, "holds pose, stamp: no array of points"),
+        ({"pose": np.eye(4), "stamp": np.zeros(1)}, "no field x, y, z; it has: pose, stamp"),
         ({"points": np.array([object()])}, "holds objects"),
-        ({"xyz": F4, "intensity": INTENSITY[:9]}, "no columns of the same points"),
-        ({"points": F4[None]}, "no field x, y, z; it has: points"),
+        ({"xyz": F4, "intensity": INTENSITY[:9]}, "in the place of"),
+        ({"points": F4[None]}, r"array \(1, 500, 3\)"),
     ):
         np.savez(path, **arrays)
         with pytest.raises(InputError, match=words):
@@ -149,7 +150,7 @@ def test_tables_of_arrow(tmp_path: Path):
         parquet.write_table(table, tmp_path / "a.parquet", compression=compression, row_group_size=100)
         same(read_points(tmp_path / "a.parquet"))
     parquet.write_table(pyarrow.table({"x": ["a"], "y": [1.0], "z": [1.0]}), tmp_path / "b.parquet")
-    with pytest.raises(InputError, match="x is no numbers"):
+    with pytest.raises(InputError, match="in the place of"):
         read_points(tmp_path / "b.parquet")
     parquet.write_table(pyarrow.table({"points": [[1.0, 2.0]]}), tmp_path / "c.parquet")
     with pytest.raises(InputError, match="no field x, y, z; it has: points"):
@@ -183,13 +184,29 @@ def test_las_and_laz(tmp_path: Path, ending: str, version: str, form: int):
 
 @pytest.mark.parametrize("name", ["a.las", "a.laz", "a.feather", "a.parquet"])
 def test_an_extra_that_is_missing_is_one_line_with_the_command(tmp_path: Path, monkeypatch, name: str):
-    def missing(module: str) -> None:
-        raise ImportError(module)
-
-    monkeypatch.setattr(importlib, "import_module", missing)
+    monkeypatch.setattr("r2flow.errors.find_spec", lambda package: None)
     (tmp_path / name).write_bytes(b"something")
-    with pytest.raises(InputError, match=r"need (laspy|pyarrow): python -m pip install 'r2flow\[formats\]'"):
+    with pytest.raises(InputError, match=r"python -m pip install 'r2flow\[formats\]'"):
         read_points(tmp_path / name)
+
+
+def test_a_small_file_takes_little_memory(tmp_path: Path):
+    """Headers of a .laz that declare many points, long records or many chunks."""
+    laspy = pytest.importorskip("laspy", reason="laspy is not installed")
+    pytest.importorskip("lazrs", reason="lazrs is not installed")
+    cloud = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
+    cloud.x, cloud.y, cloud.z = XYZ.T
+    path = tmp_path / "a.laz"
+    cloud.write(path)
+    whole = path.read_bytes()
+    points = int.from_bytes(whole[96:100], "little")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for place, width in ((96, 4), (100, 4), (105, 2), (243, 4), (247, 8), (points - 34, 4), (points, 8)):
+        for value in (2 ** (8 * width - 1) - 1, 1 << 20):
+            path.write_bytes(whole[:place] + (value % 256**width).to_bytes(width, "little") + whole[place + width :])
+            with suppress(InputError):
+                read_points(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + (100 << 10)
 
 
 @pytest.mark.parametrize("ending", list(ELSEWHERE))
@@ -207,14 +224,14 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
     for text, words in (
         ("", "empty"),
         ("# nothing\n", "no line of numbers"),
-        ("x,y,z\n", "0 points"),
-        ("1,5;2,5;3,5\n" * 3, "damaged line|no field"),  # decimal commas
+        ("x,y,z\n", "no line"),
+        ("1,5;2,5;3,5\n" * 3, "no field"),  # decimal commas
         ("1 2\n3 4\n", "2 columns without names"),
         ("1,2,,4\n" * 3, "no field x"),
         ("time,lat,lon\n1,2,3\n", "no field x, y, z; it has: time, lat, lon"),
         ("1 2 3\n4 5\n", "number of columns changed"),
         ("1 2 3\nfour 5 6\n", "four"),
-        ("1 2 \xe9\n", "other bytes"),
+        ("1 2 \xe9\n", "convert"),
     ):
         (tmp_path / "a.txt").write_text(text, encoding="latin-1")
         with pytest.raises(InputError, match=words) as caught:
@@ -255,7 +272,7 @@ def test_an_intensity_that_nobody_measured_leaves_the_reflectivity(tmp_path: Pat
 def test_fields_that_hold_no_numbers_are_refused(tmp_path: Path, name: str, kind: str):
     table = np.zeros(4, [(one, kind if one == name else "f4") for one in ("x", "y", "z", "intensity", "ring")])
     np.save(tmp_path / "a.npy", table)
-    with pytest.raises(InputError, match="in the place of one number for"):
+    with pytest.raises(InputError, match="in the place of one number"):
         read_points(tmp_path / "a.npy")
 
 

@@ -237,12 +237,8 @@ def test_arrays_that_were_read_are_writable(tmp_path):
     ("name", "change", "word"),
     [
         ("a.bin", {"reflectance": None}, "reflectance"),
-        ("a.pcd.bin", {}, "not written"),
+        ("a.pcd.bin", {}, "written as"),
         ("a.las", {}, ".npy"),
-        ("a.ply", {"xyz": np.zeros((3, 4))}, r"\(3, 4\)"),
-        ("a.ply", {"reflectance": np.zeros(4)}, r"\(4,\)"),
-        ("a.ply", {"xyz": np.full((3, 3), np.nan)}, "NaN"),
-        ("a.ply", {"xyz": np.full((3, 3), 1e300)}, "infinite"),
     ],
 )
 def test_a_refused_write_leaves_the_old_file(tmp_path, name, change, word):

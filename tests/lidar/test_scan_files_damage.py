@@ -14,6 +14,7 @@ import pytest
 from r2flow.data.reading import read_scan
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import Points, read_points, write_points
+from r2flow.lidar.scan_files.clouds import decompress_lzf
 from r2flow.lidar.sensors import SENSORS
 
 # A reader that warns has met something it was not made for.
@@ -305,25 +306,29 @@ def test_memory_is_not_allocated_for_a_declared_size(tmp_path, name):
     ("name", "content", "word"),
     [
         ("a.bin", b"", "empty"),
-        ("a.bin", TABLE.tobytes()[:-7], "9 bytes more"),
+        ("a.bin", TABLE.tobytes()[:-7], "9 bytes"),
         ("a.bin", np.column_stack([TABLE, RING])[:5].tobytes(), "pcd.bin"),
-        ("a.pcd.bin", TABLE[:6].tobytes(), r"name it \.bin"),
+        ("a.pcd.bin", TABLE[:6].tobytes(), r"KITTI \(\.bin\)"),
         ("a.bin", b"x,y,z,i\n1,2,3,4\n", "text"),
-        ("a.bin", ply_ascii(), r"begins like a \.ply"),
+        ("a.bin", ply_ascii(), "ply"),
         ("a.bin", TABLE.astype(">f4").tobytes(), "big-endian"),
         ("a.pcd.bin", np.column_stack([TABLE, RING + 0.5]).astype("<f4").tobytes(), "ring"),
         ("a.obj", b"# a mesh", r"\.pcd\.bin, \.bin, \.pcd, \.ply, \.npy"),
         ("a.pcd", PCD.format(0, "ascii").encode(), "0 points"),
         ("a.pcd", PCD.format(2, "zip").encode(), "binary_compressed"),
-        ("a.pcd", PCD.format(2, "ascii").replace("x y z", "x y w").encode(), "no field z; it has: x, y, w"),
-        ("a.pcd", PCD.format(2, "ascii").replace("x y z", "x y").encode(), "2 FIELDS but 3 SIZE"),
+        (
+            "a.pcd",
+            PCD.format(1, "ascii").replace("x y z", "x y w").encode() + b"1 2 3\n",
+            "no field z; it has: x, y, w",
+        ),
+        ("a.pcd", PCD.format(2, "ascii").replace("x y z", "x y").encode(), "2 FIELDS"),
         ("a.pcd", PCD.format(2, "ascii").replace("HEIGHT 1", "HEIGHT 3").encode(), "WIDTH x HEIGHT = 6"),
-        ("a.pcd", PCD.format(2, "ascii").replace("F F F", "F F U").replace("4 4 4", "4 4 3").encode(), "'3'"),
+        ("a.pcd", PCD.format(2, "ascii").replace("F F F", "F F U").replace("4 4 4", "4 4 3").encode(), "U3"),
         ("a.pcd", PCD.format(2, "ascii").encode() + b"1 2 3\n4 5\n", "number of columns changed"),
         ("a.pcd", PCD.format(2, "ascii").encode() + b"1 2 3\n4 5 six\n", "six"),
         ("a.pcd", PCD.format(2, "ascii").encode() + b"1 2 3 4\n" * 2, "4 numbers a line"),
-        ("a.pcd", PCD.format(2, "ascii").encode() + b"1 2 3\n\xe9 5 6\n", "other bytes"),
-        ("a.pcd", PCD.format(2, "ascii").encode() + b"nan 2 3\n" * 2, "no finite point"),
+        ("a.pcd", PCD.format(2, "ascii").encode() + b"1 2 3\n\xe9 5 6\n", "ascii"),
+        ("a.pcd", PCD.format(2, "ascii").encode() + b"nan 2 3\n" * 2, "NaN"),
         ("a.ply", ply_ascii().replace(b"vertex", b"vertices"), "'vertex'"),
         ("a.ply", ply_ascii().replace(b"format ascii 1.0\n", b""), "format"),
         ("a.ply", ply_ascii().replace(b"property float x", b"property list uchar float x"), "lists"),
@@ -343,15 +348,14 @@ def test_errors_say_what_was_found(tmp_path, name, content, word):
 @pytest.mark.parametrize(
     ("array", "word"),
     [
-        (np.zeros((2, 64, 1024), np.float32), "range image"),
-        (np.zeros((4, 100), np.float32), "transposed"),
+        (np.zeros((2, 64, 1024), np.float32), "2, 64, 1024"),
+        (np.zeros((4, 100), np.float32), "4, 100"),
         (np.zeros((100, 5), np.float32), r"5 columns without names.*--columns x,y,z,intensity,_ "),
         (np.zeros((0, 3), np.float32), "no points"),
-        (np.float32(3), r"shape \(\)"),
-        (np.ones((100, 3), np.int64), "int64"),
+        (np.float32(3), r"array \(\)"),
         (np.ones((100, 3), np.complex64), "complex64"),
-        (np.ones(100, [("x", "f4"), ("y", "f4"), ("w", "f4")]), "no field z; it has: x, y, w"),
-        (np.array([["x", "y", "z"]]), "not floats"),
+        (np.ones(100, [("x", "f4"), ("y", "f4"), ("w", "f4")]), "no field z"),
+        (np.array([["x", "y", "z"]]), "U1"),
     ],
 )
 def test_arrays_that_are_not_points_are_refused(tmp_path, array, word):
@@ -398,3 +402,32 @@ def test_a_real_scan_in_a_wrong_layout_is_refused(shared, tmp_path, seed):
     assert read_bytes(tmp_path, "bin", table.astype("<f8").tobytes()) is None
     assert read_bytes(tmp_path, "bin", table[:, :3].tobytes()) is None
     assert read_bytes(tmp_path, "bin", b"\n" + table[:-1].tobytes() + bytes(15)) is None
+
+
+# Instructions by hand: 3 literals; a copy of 3 from 3 back; a copy of 7 + 2 + 3 = 12 from 1 back, which
+# repeats its own output; 1 literal; a copy of 4 from 17 back, across the first byte's reach.
+STREAM = bytes([2]) + b"abc" + bytes([1 << 5, 2]) + bytes([7 << 5, 3, 0]) + bytes([0]) + b"d"
+STREAM += bytes([2 << 5, 16])
+PLAIN = b"abcabc" + b"c" * 12 + b"d" + b"cabc"
+
+
+def test_lzf_unpacks_a_stream_made_by_hand():
+    assert decompress_lzf(STREAM, len(PLAIN)) == PLAIN
+
+
+def test_lzf_reaches_8192_bytes_back_and_no_farther():
+    far = bytes(range(256)) * 32
+    literals = b"".join(bytes([31]) + far[k : k + 32] for k in range(0, len(far), 32))
+    copy = bytes([1 << 5 | 31, 255])  # 3 bytes, the greatest distance
+    assert decompress_lzf(literals + copy, 8195) == far + b"\x00\x01\x02"
+    with pytest.raises(ValueError, match="before the beginning"):
+        decompress_lzf(literals[33:] + copy, 8163)
+
+
+@pytest.mark.parametrize(
+    ("stream", "size"),
+    [(STREAM[:-1], len(PLAIN)), (STREAM[:2], 3), (STREAM, len(PLAIN) + 1), (STREAM, 5), (b"\x20\x00", 3)],
+)
+def test_lzf_refuses_damaged_streams(stream, size):
+    with pytest.raises((ValueError, IndexError)):
+        decompress_lzf(stream, size)

@@ -1,66 +1,45 @@
 """Scan files: KITTI .bin, nuScenes .pcd.bin, PCD, PLY, NPY, tables, LAS are read; .bin, PCD, PLY, NPY are written.
 
-    points = read_points("000000.bin")
-    write_points("000000.ply", points.xyz, points.reflectance)
-
-The readers are our own: plyfile is under the GPL and allocates whatever a header declares, pypcd4 returns half a scan
-from half a file, and the bindings to LZF need a compiler.
+points = read_points("000000.bin")
+write_points("000000.ply", points.xyz, points.reflectance)
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, naming
 from r2flow.files import atomic_write, refuse_unreadable
-from r2flow.lidar.scan_files.arrays import (
-    Columns,
-    named_already,
+from r2flow.lidar.scan_files.clouds import read_pcd, read_ply, write_pcd, write_ply
+from r2flow.lidar.scan_files.points import NoPointsError, Points, check, check_columns, column_points
+from r2flow.lidar.scan_files.tables import (
     read_array,
-    read_image,
-    read_kitti,
+    read_arrow,
+    read_las,
     read_npy,
-    read_nuscenes,
+    read_npz,
+    read_rows,
+    read_text,
+    usual_names,
 )
-from r2flow.lidar.scan_files.fields import check_columns
-from r2flow.lidar.scan_files.pcd import read_pcd, write_pcd
-from r2flow.lidar.scan_files.ply import PLY_NAMES, read_ply, write_ply
-from r2flow.lidar.scan_files.points import NoPointsError, Points
-from r2flow.lidar.scan_files.tables import read_arrow, read_las, read_npz, read_text
 
 __all__ = [
-    "ELSEWHERE",
-    "FIRM_ENDINGS",
-    "LOOSE_ENDINGS",
-    "SCAN_ENDINGS",
     "NoPointsError",
     "Points",
+    "check_columns",
     "read_numbers",
     "read_points",
     "read_range_image",
     "write_points",
 ]
 
-
-def _naming(reader: Callable[[Path], Points]) -> Callable[[Path, Columns], Points]:
-    """A reader of files that always name their columns."""
-
-    def read(path: Path, columns: Columns) -> Points:
-        if columns is not None:
-            raise named_already(path)
-        return reader(path)
-
-    return read
-
-
-_READERS: dict[str, Callable[[Path, Columns], Points]] = {
-    ".pcd.bin": read_nuscenes,  # before ".bin", which it ends with
-    ".bin": read_kitti,
-    ".pcd": _naming(read_pcd),
-    ".ply": _naming(read_ply),
+_READERS = {
+    ".pcd.bin": read_rows,  # before ".bin", which it ends with
+    ".bin": read_rows,
+    ".pcd": read_pcd,
+    ".ply": read_ply,
     ".npy": read_npy,
     ".npz": read_npz,
     ".csv": read_text,
@@ -71,7 +50,7 @@ _READERS: dict[str, Callable[[Path, Columns], Points]] = {
     ".las": read_las,
     ".laz": read_las,
 }
-# What is not read, and what turns it into files that are.
+# Formats that are not read, and what turns them into files that are.
 ELSEWHERE = {
     **dict.fromkeys((".mcap", ".db3", ".bag"), "holds many scans: r2flow unpack {path} --out FOLDER writes them"),
     **dict.fromkeys(
@@ -82,20 +61,9 @@ ELSEWHERE = {
     **dict.fromkeys((".e57", ".pts", ".ptx", ".rcp", ".fls"), "is read by CloudCompare, which saves it as .ply"),
     **dict.fromkeys((".h5", ".hdf5", ".zarr", ".mat", ".pkl"), "holds arrays: write x, y, z, intensity by numpy.savez"),
     ".tfrecord": "is read by Waymo's own tools: write x, y, z, intensity by numpy.savez",
-    **dict.fromkeys(
-        (".lvx", ".lvx2", ".lvx3"),
-        "is of a Livox, whose scan never repeats: it has no beams, and so no rows of a range image; r2flow needs a "
-        "spinning LiDAR",
-    ),
+    **dict.fromkeys((".lvx", ".lvx2", ".lvx3"), "is of a Livox, which has no beams; r2flow needs a spinning LiDAR"),
 }
-
-_WRITERS: dict[str, Callable[[IO[bytes], np.ndarray], object]] = {
-    ".bin": lambda file, table: file.write(table.tobytes()),
-    ".pcd": write_pcd,
-    ".ply": write_ply,
-    ".npy": np.save,
-}
-
+WRITTEN = (".bin", ".pcd", ".ply", ".npy")
 SCAN_ENDINGS = tuple(_READERS)
 LOOSE_ENDINGS = (".csv", ".txt", ".npz")  # which other things than scans have too
 FIRM_ENDINGS = tuple(ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS)
@@ -108,8 +76,8 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
 
     The ending tells the format. .bin: KITTI's float32 rows x y z reflectance. .pcd.bin: nuScenes' x y z intensity ring.
     .pcd, .ply, .las, .laz, .feather, .parquet: fields x y z and, where present, intensity (or reflectance,
-    reflectivity, remission, i) and ring, of any type. .npy, .npz: float (N, 3) or (N, 4), or named fields. .csv, .xyz,
-    .txt: three or four columns, or columns named in the first line. LAS needs laspy, Arrow tables pyarrow.
+    reflectivity, remission, i) and ring, of any type. .npy, .npz: (N, 3) or (N, 4), or named fields. .csv, .xyz, .txt:
+    three or four columns, or columns named in the first line. LAS needs laspy, Arrow tables pyarrow.
 
     Args:
         columns: What each column of a .bin, .npy, .npz or text file without names holds: x, y, z and, where present,
@@ -125,33 +93,31 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     """
     path = Path(path)
     check_columns(columns)
-    reader = _READERS[_ending(path, _READERS)]
-    try:
-        if reader in (read_kitti, read_nuscenes) and path.is_file() and path.stat().st_size == 0:
-            raise NoPointsError(f"{path} is empty (0 bytes): rows of floats without one; fetch or write it again.")
+    ending = _ending(path)
+    with _door(path):
+        if ending in (".bin", ".pcd.bin") and path.is_file() and path.stat().st_size == 0:
+            raise NoPointsError("it is empty (0 bytes); fetch or write it again.")
         refuse_unreadable(path, LARGEST_FILE, "scan file")
-        return reader(path, columns)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
+        names, arrays = _READERS[ending](path, columns)
+        check(names is None or columns is None, "it names its columns itself: leave --columns (data.columns) out.")
+        if names is None and columns is None and ending == ".pcd.bin":
+            columns = ("x", "y", "z", "intensity", "ring")
+        return column_points(names or usual_names(len(arrays), columns), arrays, ending in (".bin", ".pcd.bin"))
 
 
 def read_range_image(path: str | Path) -> np.ndarray | None:
-    """The range image in a .npy of floats (2 or 1, H, W), float32, what is not finite as 0; None where it is no .npy.
-
-    None, too, where a .npy is of another shape or type: it may hold points. Nothing is unpickled, and no more memory is
-    taken than the file has bytes.
+    """The range image in a .npy of floats (2 or 1, H, W), float32, what is not finite as 0; None for any other array.
 
     Raises:
         InputError: the file is missing, no regular file or damaged.
     """
-    path = Path(path)
-    if path.suffix.lower() != ".npy":
+    if Path(path).suffix.lower() != ".npy":
         return None
-    try:
-        refuse_unreadable(path, LARGEST_FILE, "range image")
-        return read_image(path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
+    array = read_numbers(path)
+    if array.ndim != 3 or array.shape[0] not in (1, 2) or array.dtype.kind != "f" or not array.size:
+        return None
+    with np.errstate(over="ignore"):  # beyond float32 is infinite, and so no return
+        return np.nan_to_num(array.astype(np.float32), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def read_numbers(path: str | Path) -> np.ndarray:
@@ -161,12 +127,29 @@ def read_numbers(path: str | Path) -> np.ndarray:
         InputError: the file is missing, no regular file, damaged, or holds objects.
     """
     path = Path(path)
-    try:
+    with _door(path):
         refuse_unreadable(path, LARGEST_FILE, ".npy file")
         with path.open("rb") as file:
-            return read_array(path, file, None)
+            return read_array(file, path.stat().st_size)
+
+
+@contextmanager
+def _door(path: Path) -> Iterator[None]:
+    """Turns every error of a reader into an InputError of one line with the file's name."""
+    try:
+        yield
+    except InputError as error:
+        if str(path) in str(error):
+            raise
+        with naming(path):
+            raise
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
+    except BaseException as error:  # NumPy, laspy, pyarrow and their decoders raise many kinds on damaged files
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # of Rust's decoders
+            raise
+        reason = " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__
+        raise InputError(f"{path} is not a readable {path.suffix} file ({reason}). Is it damaged?") from None
 
 
 def write_points(
@@ -182,23 +165,28 @@ def write_points(
         ring: Number of each point's beam, (N,), or None; for a .ply.
 
     Raises:
-        InputError: an unknown format, a .bin without reflectance, shapes that do not fit, values that are not finite in
-            float32, or a path that cannot be written.
+        InputError: an unknown format, a .bin without reflectance, or a path that cannot be written.
     """
     path = Path(path)
-    ending = _ending(path, _WRITERS)
+    ending = path.suffix.lower()
+    if ending not in WRITTEN or scan_ending(path.name) != ending:
+        raise InputError(f"{path}: scans are written as {', '.join(WRITTEN)}.")
     if ending == ".bin" and reflectance is None:
         raise InputError(f"{path}: KITTI's .bin needs a reflectance; give one, or choose .ply, .pcd or .npy.")
-    table = _table(path, xyz, reflectance)
-    write = _WRITERS[ending]
-    if ring is not None:
-        if ending != ".ply" or np.shape(ring) != (len(table),):
-            raise InputError(f"{path}: ring numbers, one for each point, are written as .ply alone.")
-        table = np.column_stack([table, ring]).astype("<f4")
-        write = partial(write_ply, names=(*PLY_NAMES[: table.shape[1] - 1], "ring"))
+    assert ring is None or ending == ".ply"
+    columns = {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], "intensity": reflectance, "ring": ring}
+    columns = {name: column for name, column in columns.items() if column is not None}
+    with np.errstate(over="ignore"):  # beyond float32 is infinite
+        table = np.column_stack(list(columns.values())).astype("<f4")
+    assert np.isfinite(table).all(), "a coordinate or reflectance is NaN or infinite"
     try:
         with atomic_write(path) as file:
-            write(file, table)
+            if ending == ".npy":
+                np.save(file, table)
+            elif ending == ".bin":
+                file.write(table.tobytes())
+            else:
+                {".pcd": write_pcd, ".ply": write_ply}[ending](file, table, tuple(columns))
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror or error}.") from None
 
@@ -208,29 +196,11 @@ def scan_ending(name: str) -> str:
     return next((ending for ending in SCAN_ENDINGS if name.lower().endswith(ending)), "")
 
 
-def _ending(path: Path, known: Iterable[str]) -> str:
+def _ending(path: Path) -> str:
     name = path.name.lower()
-    ending = scan_ending(name)
-    if not ending:
-        for other, advice in ELSEWHERE.items():
-            if name.endswith(other):
-                raise InputError(f"{path} {advice.format(path=path)}.")
-        raise InputError(f"{path} has no ending of a scan file; known: {', '.join(known)}. Convert or rename it.")
-    if ending not in known:
-        raise InputError(f"{path}: {ending} is read but not written; choose one of {', '.join(known)}.")
-    return ending
-
-
-def _table(path: Path, xyz: np.ndarray, reflectance: np.ndarray | None) -> np.ndarray:
-    """x y z and, when given, reflectance: little-endian float32, (N, 3) or (N, 4)."""
-    shape = np.shape(xyz)
-    if len(shape) != 2 or shape[1] != 3:
-        raise InputError(f"{path}: xyz must have the shape (N, 3), found {shape}.")
-    if reflectance is not None and np.shape(reflectance) != shape[:1]:
-        raise InputError(f"{path}: reflectance must have the shape {shape[:1]}, found {np.shape(reflectance)}.")
-    columns = [xyz] if reflectance is None else [xyz, reflectance]
-    with np.errstate(over="ignore"):  # beyond float32 is infinite, and refused
-        table = np.column_stack(columns).astype("<f4")
-    if not np.isfinite(table).all():
-        raise InputError(f"{path}: a coordinate or reflectance is NaN or infinite; drop such points first.")
-    return table
+    if ending := scan_ending(name):
+        return ending
+    for other, advice in ELSEWHERE.items():
+        if name.endswith(other):
+            raise InputError(f"{path} {advice.format(path=path)}.")
+    raise InputError(f"{path} has no ending of a scan file; known: {', '.join(SCAN_ENDINGS)}. Convert or rename it.")

@@ -1,108 +1,115 @@
-"""Points as columns: text (.csv, .xyz, .txt), NumPy archives (.npz), Arrow tables (.feather, .parquet), LAS and LAZ."""
+"""Points as columns: rows of floats, NumPy's .npy and .npz, text, Arrow tables, LAS and LAZ."""
 
-import importlib
+import io
+import math
 import re
 import zipfile
-import zlib
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
-from types import ModuleType
+from typing import IO
 
 import numpy as np
 
-from r2flow.errors import InputError
-from r2flow.lidar.scan_files.arrays import Columns, named_already, read_array, table_columns
-from r2flow.lidar.scan_files.fields import (
-    ROLES,
-    PointField,
-    column_points,
-    named_roles,
-    point_count,
-    text_columns,
-    text_lines,
-    usual_names,
-)
-from r2flow.lidar.scan_files.points import Points
+from r2flow.errors import require
+from r2flow.lidar.scan_files.clouds import Table
+from r2flow.lidar.scan_files.points import MOST_COLUMNS, ROLES, check
 
-INSTALL = "python -m pip install 'r2flow[formats]'"
-MOST_POINTS = 1 << 24  # of a compressed file, whose size says little: thirty times the scan of 128 beams
-MOST_UNPACKED = 100  # times its own size that a compressed file may hold
+MOST_UNPACKED = 100  # times its own size that a compressed file may hold, beside 1 MiB
 TABLES = ("points", "xyz", "point_cloud", "pointcloud", "cloud", "pts", "lidar", "scan", "data", "arr_0")
 
 
-def read_text(path: Path, columns: Columns = None) -> Points:
-    """One point a line, numbers apart by commas, semicolons, tabs or spaces; names in the first line are read."""
-    content = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
-    head = content[: content.find(b"\n") + 1]
-    with suppress(UnicodeDecodeError):  # a unit among the names, as degrees
-        if not head.isascii():
-            content = head.decode("utf-8").encode("ascii", "replace") + content[len(head) :]
-    lines = text_lines(path, content)
-    width = next((len(_words(line)) for line in lines if line.lstrip()[0] not in "#/"), 0)
-    lines = [line for line in lines if line.lstrip()[0] not in "#/" or _is_header(line, width)]
-    if not lines:
-        raise InputError(f"{path} holds no line of numbers.")
-    words = _words(lines[0])
-    if any(not _is_number(word) for word in words):
-        if columns is not None:
-            raise named_already(path)
-        names: Sequence[str] = [re.sub(r"\s*[\[(].*", "", word) for word in words]
-        lines = lines[1:]
-    else:
-        names = usual_names(path, len(words), columns)
-    roles = named_roles(path, names)
-    point_count(path, len(lines))
-    apart = _apart(lines[0])
-    fields = [PointField(name, np.dtype("<f8")) for name in names]
+def read_rows(path: Path, columns: Sequence[str] | None) -> Table:
+    """Rows of little-endian float32: KITTI's 4, nuScenes' 5, or as many as there are columns."""
+    content = path.read_bytes()
+    head = content[:64]
+    text = all(32 <= byte < 127 or byte in b"\t\r\n" for byte in head) or head.startswith(b"\x93NUMPY")
+    check(not text, f"it is not rows of float32: it begins with {head[:16]!r}, as text or another format.")
+    usual = 5 if path.name.lower().endswith(".pcd.bin") else 4
+    width = usual if columns is None else len(columns)
+    rows, rest = divmod(len(content), 4 * width)
+    other = ", but of the 5 of nuScenes (.pcd.bin)" if len(content) % 20 == 0 else ""
+    other = ", but of the 4 of KITTI (.bin)" if usual == 5 and len(content) % 16 == 0 else other
+    check(rest == 0, f"it is not made of rows of {width} float32{other}: {rest} bytes are left. Is it cut short?")
+    return None, list(np.frombuffer(content, "<f4").reshape(rows, width).T)
 
-    def columns_of(some: Sequence[str]) -> dict[str, np.ndarray]:
-        return text_columns(path, [line.replace(apart, " ") for line in some], fields, roles)
 
+def read_npy(path: Path, columns: object = None) -> Table:
+    """An array (N, 3) or more, or with named fields."""
+    with path.open("rb") as file:
+        return _columns_of(read_array(file, path.stat().st_size))
+
+
+def read_npz(path: Path, columns: object = None) -> Table:
+    """An archive of arrays: one of points by its usual name or the only one, and columns beside it; or all columns."""
+    with zipfile.ZipFile(path) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        check_unpacked(path, sum(info.file_size for info in members.values()))
+        lower = {name.lower(): name for name in members}
+        table = next(
+            (lower[name] for name in TABLES if name in lower), next(iter(members)) if len(members) == 1 else None
+        )
+        roles = {alias for aliases in ROLES.values() for alias in aliases}
+        beside = [name for name in members if name.lower() in roles and name != table]
+        arrays = {}
+        for name in [*([table] if table else []), *beside]:
+            with archive.open(members[name]) as file:
+                arrays[name] = read_array(file, members[name].file_size)
+    if table is None:
+        return beside or list(members), list(arrays.values())
+    names, fields = _columns_of(arrays.pop(table))
+    if names is None and beside:
+        names = usual_names(len(fields), None)
+    return [*names, *beside] if names else None, [*fields, *arrays.values()]
+
+
+def read_array(file: IO[bytes], size: int) -> np.ndarray:
+    """The array of numbers in an open .npy of `size` bytes. Never unpickles or allocates more than the file has."""
+    version = np.lib.format.read_magic(file)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran_order, dtype = header(file)
+    check(not dtype.hasobject, "it holds objects, not numbers.")
+    declared, present = math.prod(shape) * dtype.itemsize, size - file.tell()
+    check(declared == present, f"it declares the shape {shape} of {dtype}, but {present} bytes follow. Is it damaged?")
+    return np.frombuffer(file.read(), dtype).reshape(shape, order="F" if fortran_order else "C")
+
+
+def _columns_of(array: np.ndarray) -> Table:
+    if array.dtype.names is not None:
+        return list(array.dtype.names), [array[name] for name in array.dtype.names]
+    check(
+        array.ndim == 2 and array.dtype.kind in "fiu" and array.shape[1] <= MOST_COLUMNS,
+        f"it holds an array {array.shape} of {array.dtype}, not points: these are (N, 3) or (N, 4), x y z reflectance.",
+    )
+    return None, list(array.T)
+
+
+def read_text(path: Path, columns: object = None) -> Table:
+    """One point a line, numbers apart by commas, semicolons, tabs or spaces; names in the first line or a comment."""
+    lines = [line.strip(" \r") for line in path.read_text("utf-8-sig", "replace").split("\n") if line.strip()]
+    rows = [line for line in lines if line[0] not in "#/"]
+    check(bool(rows), "it holds no line of numbers.")
+    apart = next((mark for mark in ";\t," if mark in rows[-1]), None)
+
+    def words(line: str) -> list[str]:
+        return [re.sub(r"\s*[\[(].*", "", word.strip(' "')) for word in line.lstrip("#/ ").split(apart)]
+
+    names = None
+    if not _is_number(words(rows[0])[0]) and len([word for word in words(rows[0]) if _is_number(word)]) == 0:
+        names, rows = words(rows[0]), rows[1:]
+        check(bool(rows), "it holds no line of numbers.")
+    else:  # CloudCompare writes names behind //, numpy behind #
+        width = len(words(rows[0]))
+        comments = [line for line in lines if line[0] in "#/" and {"x", "y", "z"} <= set(map(str.lower, words(line)))]
+        names = next((words(line) for line in comments if len(words(line)) == width), None)
+    if apart and names is not None and rows[-1].endswith(apart) and rows[-1].count(apart) == len(names):
+        rows = [line.removesuffix(apart) for line in rows]  # a separator at the end
     try:
-        found = columns_of(lines)
-    except InputError:  # looked for there alone: in all tables it would take a fifth of the time
-        filled = [_filled(line, apart, len(names)) for line in lines]
-        if filled == lines:
+        table = np.loadtxt(rows, delimiter=apart, comments=None, ndmin=2)
+    except ValueError:
+        if apart is None:
             raise
-        found = columns_of(filled)
-    return column_points(path, found)
-
-
-def _is_header(line: str, width: int) -> bool:
-    """Whether a comment holds the names of the columns, which CloudCompare writes behind // and numpy behind #.
-
-    Args:
-        width: How many numbers the lines have.
-    """
-    if re.match(r'[\s#/]*"?x\b', line.lower()):
-        return True
-    names = [word.lower() for word in _words(line)]
-    return len(names) == width and {"x", "y", "z"} <= set(names)
-
-
-def _apart(line: str) -> str:
-    """What stands between two numbers."""
-    return next((mark for mark in ";\t," if mark in line), " ")
-
-
-def _filled(line: str, apart: str, count: int) -> str:
-    """A line with nan in the place of a number that is missing, as tables write a ray without return.
-
-    Args:
-        count: Numbers of a line; one more separator at its end separates nothing.
-    """
-    if apart == " " or not (apart + apart in line or line[0] == apart or line.rstrip("\r ")[-1] == apart):
-        return line
-    words = [word.strip() for word in line.split(apart)]
-    words = words[:-1] if len(words) == count + 1 and not words[-1] else words
-    return apart.join(word or "nan" for word in words)
-
-
-def _words(line: str) -> list[str]:
-    text = line.strip().lstrip("#/").strip()
-    parts = text.split(_apart(text)) if _apart(text) != " " else text.split()
-    return [part.strip().strip('"') for part in parts]
+        table = np.genfromtxt(rows, delimiter=apart, comments=None)  # slower; a gap, as of a ray without return, is NaN
+    return names, list(np.atleast_2d(table).T)
 
 
 def _is_number(word: str) -> bool:
@@ -113,162 +120,78 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def read_npz(path: Path, columns: Columns = None) -> Points:
-    """An archive of arrays: one of points, (N, 3) or more, or one a column, named x, y, z, ...; never unpickles."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            size = sum(info.file_size for info in members.values())
-            if size > MOST_UNPACKED * path.stat().st_size + (1 << 20):
-                raise InputError(f"{path} unpacks to {size:,} bytes, far more than its own size. Is it damaged?")
-            found = {}
-            for name in _wanted(path, list(members)):
-                with archive.open(members[name]) as file:
-                    found[name] = read_array(path, file, members[name].file_size)
-    except InputError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path} is not a readable .npz file ({reason[:120]}). Is it damaged?") from None
-    table = next((name for name in found if found[name].ndim == 2 or found[name].dtype.names), None)
-    if table is None:
-        if columns is not None:
-            raise named_already(path)
-        roles = {role: found[list(found)[index]] for role, index in named_roles(path, list(found)).items()}
+def read_arrow(path: Path, columns: object = None) -> Table:
+    """A Feather or Parquet table: Argoverse 2's lidar."""
+    require(str(path), "formats", "pyarrow")
+    import pyarrow
+    from pyarrow import feather, parquet
+
+    wanted = {alias for aliases in ROLES.values() for alias in aliases}
+    if path.name.lower().endswith(".parquet"):
+        file = parquet.ParquetFile(path)
+        names = [name for name in file.schema_arrow.names if name.lower() in wanted]
+        check_unpacked(path, 8 * file.metadata.num_rows)
+        check(bool(names), f"it has no field x, y, z; it has: {', '.join(file.schema_arrow.names)[:120]}.")
+        table = file.read(names)
     else:
-        roles = table_columns(path, found.pop(table), columns)
-        roles |= {role: array for role, array in _roles_beside(path, found).items() if role not in roles}
-    rows = roles["x"].shape
-    if len(rows) != 1 or any(array.shape != rows or array.dtype.kind not in "fiu" for array in roles.values()):
-        shapes = ", ".join(f"{role} {array.shape} {array.dtype}" for role, array in roles.items())
-        raise InputError(f"{path} holds arrays that are no columns of the same points: {shapes}.")
-    return column_points(path, roles)
+        with pyarrow.memory_map(str(path)) as source:
+            names = [name for name in pyarrow.ipc.open_file(source).schema.names if name.lower() in wanted]
+        table = feather.read_table(path, names, memory_map=False)
+    table.validate(full=True)
+    return names, [table.column(name).to_numpy() for name in names]
 
 
-def _wanted(path: Path, names: list[str]) -> list[str]:
-    """The arrays to read: a table by its usual name, or the only one, and columns beside it; else all columns."""
-    lower = {name.lower(): name for name in names}
-    table = next((lower[name] for name in TABLES if name in lower), names[0] if len(names) == 1 else None)
-    beside = [lower[name] for name in (*ROLES["reflectance"], *ROLES["ring"]) if name in lower]
-    if table is None and not {"x", "y", "z"} <= lower.keys():
-        found = ", ".join(names)[:120] or "nothing"
-        raise InputError(f"{path} holds {found}: no array of points, as {', '.join(TABLES[:3])}, nor x, y and z.")
-    return [*([table] if table else [lower[axis] for axis in "xyz"]), *beside]
+def read_las(path: Path, columns: object = None) -> Table:
+    """LAS and LAZ by laspy: scaled x, y, z in the sensor's frame, intensity where it was measured, extra fields."""
+    require(str(path), "formats", "laspy", "lazrs")
+    import laspy
+    import lazrs
+
+    content = path.read_bytes()
+    records = 54 * int.from_bytes(content[100:104], "little")
+    records += 60 * int.from_bytes(content[243:247], "little") if content[24:26] == b"\x01\x04" else 0
+    check(content[:4] == b"LASF" and records <= len(content), "it is not a LAS file, or its header is damaged.")
+    # From memory, which gives no more bytes than there are: laspy and lazrs allocate what a header declares.
+    with laspy.open(io.BytesIO(content), laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
+        header = reader.header
+        check_unpacked(path, header.point_count * header.point_format.size)
+        if header.are_points_compressed:
+            size = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data).item_size()
+            check(size == header.point_format.size, f"its points have {header.point_format.size} and {size} bytes.")
+            _check_chunks(content, header.offset_to_point_data)
+        points = reader.read()
+    check(len(points.points) == header.point_count, f"it declares {header.point_count} points. Is it whole?")
+    extra = [name for name in points.point_format.dimension_names if name not in ("X", "Y", "Z")]
+    extra = [name for name in extra if name != "intensity" or np.asarray(points[name]).any()]
+    names = ["x", "y", "z", *extra]
+    return names, [np.asarray(points[name]) for name in names]
 
 
-def _roles_beside(path: Path, found: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Columns that lie beside a table of points."""
-    names = [*"xyz", *found]
-    return {role: found[names[i]] for role, i in named_roles(path, names).items() if names[i] in found}
-
-
-def read_arrow(path: Path, columns: Columns = None) -> Points:
-    """Columns x, y, z and, where present, intensity and ring (laser_number) of an Arrow table: Argoverse 2's lidar."""
-    if columns is not None:
-        raise named_already(path)
-    pyarrow = _extra("pyarrow", path)
-    try:
-        if path.name.lower().endswith(".parquet"):
-            file = importlib.import_module("pyarrow.parquet").ParquetFile(path)
-            names, rows = file.schema_arrow.names, file.metadata.num_rows
-            _refuse_many(path, rows)
-            roles = named_roles(path, names)
-            table = file.read([names[index] for index in roles.values()])
-        else:
-            wanted = importlib.import_module("pyarrow.feather")
-            with pyarrow.memory_map(str(path)) as source:
-                names = pyarrow.ipc.open_file(source).schema.names
-            roles = named_roles(path, names)
-            table = wanted.read_table(path, [names[index] for index in roles.values()], memory_map=False)
-            _refuse_many(path, table.num_rows)
-        table.validate(full=True)
-        point_count(path, table.num_rows)
-        arrays = {role: table.column(names[index]).to_numpy() for role, index in roles.items()}
-    except (pyarrow.ArrowException, OSError, MemoryError, ValueError, KeyError, TypeError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path} is not a readable Arrow table ({reason[:120]}). Is it damaged?") from None
-    wrong = [role for role, array in arrays.items() if array.dtype.kind not in "fiu"]
-    if wrong:
-        raise InputError(f"{path}: {', '.join(wrong)} {'is' if len(wrong) == 1 else 'are'} no numbers, one a point.")
-    return column_points(path, arrays)
-
-
-def read_las(path: Path, columns: Columns = None) -> Points:
-    """LAS and LAZ by laspy: scaled x, y, z, intensity and, where a unit wrote it, ring. In the sensor's frame only."""
-    if columns is not None:
-        raise named_already(path)
-    laspy = _extra("laspy", path)
-    _refuse_records(path)
-    try:
-        with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
-            count, header = reader.header.point_count, reader.header
-            _refuse_many(path, count)
-            if not header.are_points_compressed and count * header.point_format.size > path.stat().st_size:
-                raise InputError(f"{path} declares {count} points, more than its bytes hold. Is it whole?")
-            if header.are_points_compressed:
-                _refuse_chunks(path, header.offset_to_point_data)
-            point_count(path, count)
-            points = reader.read()
-        if len(points.points) != count:
-            raise InputError(f"{path} declares {count} points but holds {len(points.points)}. Is it whole?")
-        roles = {axis: np.asarray(points[axis]) for axis in "xyz"}
-        for role, index in named_roles(path, names := list(points.point_format.dimension_names)).items():
-            roles.setdefault(role, np.asarray(points[names[index]]))
-    except InputError:
-        raise
-    except MemoryError:
-        raise InputError(f"{path} declares more points than fit into memory. Is it damaged?") from None
-    except Exception as error:  # laspy and its decoders raise many kinds on damaged files
-        if "LazBackend" in str(error):
-            raise InputError(f"{path}: .laz files need lazrs: {INSTALL}.") from None
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path} is not a readable LAS file ({reason[:120]}). Is it damaged?") from None
-    for role in [role for role in roles if role.startswith("reflectance") and not roles[role].any()]:
-        del roles[role]  # LAS has a field for it whether or not a sensor measured it
-    return column_points(path, roles)
-
-
-def _refuse_records(path: Path) -> None:
-    """Refuse more records in a LAS header than fit into the file: laspy would go through all that it declares."""
-    with path.open("rb") as file:
-        head = file.read(375).ljust(375, b"\0")
-    records = 54 * int.from_bytes(head[100:104], "little")
-    if head[24:26] == b"\x01\x04":
-        records += 60 * int.from_bytes(head[243:247], "little")
-    if head[:4] != b"LASF" or records > path.stat().st_size:
-        raise InputError(f"{path} is not a LAS file, or its header is damaged.")
-
-
-def _refuse_chunks(path: Path, start: int) -> None:
+def _check_chunks(content: bytes, start: int) -> None:
     """Refuse compressed points of more chunks than the file has bytes: lazrs ends the process where memory is short.
 
     Points begin with the place of the chunk table, int64, or -1 where it is in the last 8 bytes; the table with its
     version and its number of chunks, uint32 each.
     """
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        for place in (start, size - 8):
-            file.seek(min(max(place, 0), size))
-            table = int.from_bytes(file.read(8), "little", signed=True)
-            if table != -1:
-                break
-        file.seek(min(max(table, 0), size))
-        head = file.read(8)
-    if len(head) < 8 or int.from_bytes(head[4:], "little") > size:
-        raise InputError(f"{path} has a damaged table of compressed points.")
+    places = (int.from_bytes(content[at : at + 8], "little", signed=True) for at in (start, len(content) - 8))
+    table = max(next((place for place in places if place != -1), 0), 0)
+    head = content[table : table + 8]
+    check(len(head) == 8 and int.from_bytes(head[4:], "little") <= len(content), "its table of points is damaged.")
 
 
-def _refuse_many(path: Path, count: int) -> None:
-    """Refuse more points than a scan has, or than a file of its size holds, by 8 bytes each."""
-    if not 0 <= count <= min(MOST_POINTS, (MOST_UNPACKED * path.stat().st_size + (1 << 20)) // 8):
-        raise InputError(f"{path} declares {count:,} points, more than one scan has. Is it damaged, or a whole map?")
+def check_unpacked(path: Path, size: int) -> None:
+    """Refuse a compressed file that declares far more bytes than its size allows."""
+    most = MOST_UNPACKED * path.stat().st_size + (1 << 20)
+    check(0 <= size <= most, f"it unpacks to {size:,} bytes, far more than its own size. Is it damaged?")
 
 
-def _extra(name: str, path: Path) -> ModuleType:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        ending = path.suffix.lower()
-        raise InputError(f"{path}: {ending} files need {name}: {INSTALL}.") from None
+def usual_names(width: int, columns: Sequence[str] | None) -> Sequence[str]:
+    """Names of the columns of a file without names: those given, else x, y, z and perhaps reflectance."""
+    if columns is not None:
+        check(len(columns) == width, f"it has {width} columns, but {len(columns)} were named: {','.join(columns)}.")
+        return columns
+    example = ",".join(["x", "y", "z", "intensity", *("_" * width)][:width])
+    check(
+        width in (3, 4), f"it has {width} columns without names: give --columns {example} (data.columns=[{example}])."
+    )
+    return ("x", "y", "z", "reflectance")[:width]
