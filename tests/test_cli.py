@@ -80,21 +80,21 @@ def test_the_formats_hold_the_same_scan(r2flow, saved, tmp_path):  # noqa: F811
     np.testing.assert_allclose(np.sort(np.linalg.norm(ply.xyz, axis=1)), np.sort(image[0][image[0] > 0]), rtol=1e-5)
 
 
-def test_project_writes_the_image(r2flow, scan, tmp_path):
-    out = tmp_path / "image.npy"
-    code, said, _ = r2flow("project", scan, "--projection", "unfolding", "--size", "64x1024", "--out", out)
+def test_show_writes_range_images(r2flow, scan, tmp_path):
+    more = ("--projection", "unfolding", "--size", "64x1024", "--format", "npy", "--out", tmp_path)
+    code, said, _ = r2flow("show", scan, *more)
     assert code == 0
-    image = np.load(out)
+    image = np.load(tmp_path / f"{scan.stem}.npy")
     assert (image.shape, image.dtype) == ((2, 64, 1024), np.float32)
     e = SENSORS["hdl64e"].rays()[0].numpy()
     seen = image[0] > 0
     np.testing.assert_allclose(image[0][seen], -1.73 / np.sin(e[seen]), rtol=1e-4)
-    assert "64 x 1024" in said
+    assert "2 x 64 x 1024" in said
 
 
 def test_show_draws_files_folders_and_range_images(r2flow, scan, tmp_path):
-    r2flow("project", scan, "--size", "32x256", "--out", tmp_path / "more" / "image.npy")
-    code, said, _ = r2flow("show", scan, tmp_path / "more", "--out", tmp_path / "views")
+    np.save(tmp_path / "image.npy", np.full((2, 32, 256), 9, np.float32))
+    code, said, _ = r2flow("show", scan, tmp_path / "image.npy", "--out", tmp_path / "views")
     assert code == 0
     assert sorted(p.name for p in (tmp_path / "views").iterdir()) == ["ground.png", "image.png"]
     assert (tmp_path / "views" / "ground.png").read_bytes().startswith(b"\x89PNG")
@@ -175,7 +175,6 @@ class TestBadInput:
     )
     def test_scans(self, r2flow, tmp_path, content, words):
         (tmp_path / "bad.bin").write_bytes(content)
-        self.check(r2flow("project", tmp_path / "bad.bin", "--out", tmp_path / "o.npy"), tmp_path / "o.npy", *words)
         self.check(r2flow("show", tmp_path / "bad.bin", "--out", tmp_path / "views"), tmp_path / "views", *words)
 
     def test_missing_and_empty_places(self, r2flow, tmp_path):
@@ -186,11 +185,9 @@ class TestBadInput:
 
     def test_options(self, r2flow, saved, scan, tmp_path):  # noqa: F811
         out = tmp_path / "out"
-        self.check(r2flow("project", scan, "--size", "64", "-o", out), out, "ROWSxCOLUMNS", "'64'")
-        self.check(r2flow("project", scan, "--sensor", "hdl64", "-o", out), out, "Did you mean 'hdl64e'?")
-        image = tmp_path / "image.npy"
-        self.check(r2flow("project", scan, "--projection", "flat", "-o", image), image, "spherical, unfolding")
-        self.check(r2flow("project", scan, "-o", out), out, "written as .npy")
+        self.check(r2flow("show", scan, "--size", "64", "-o", out), out, "ROWSxCOLUMNS", "'64'")
+        self.check(r2flow("show", scan, "--sensor", "hdl64", "-o", out), out, "Did you mean 'hdl64e'?")
+        self.check(r2flow("show", scan, "--projection", "flat", "-o", out), out, "spherical, unfolding")
         self.check(r2flow("sample", "-c", saved[0], "--solver", "eulr", "-o", out), out, "Did you mean 'euler'?")
         self.check(r2flow("sample", "-c", saved[0], "--format", "las", "-o", out), out, "ply, bin, npy")
         self.check(r2flow("sample", "-c", saved[0], "--num", 0, "-o", out), out, "--num")
@@ -208,8 +205,8 @@ class TestBadInput:
 
     def test_a_scan_that_does_not_unfold(self, r2flow, tmp_path):
         write_scan(tmp_path / "one.bin", 3)
-        result = r2flow("project", tmp_path / "one.bin", "--projection", "unfolding", "-o", tmp_path / "o.npy")
-        self.check(result, tmp_path / "o.npy", "unfolds into 1 rings")
+        result = r2flow("show", tmp_path / "one.bin", "--projection", "unfolding", "-o", tmp_path / "o")
+        self.check(result, tmp_path / "o", "unfolds into 1 rings")
 
 
 @pytest.mark.parametrize(

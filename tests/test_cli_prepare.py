@@ -162,9 +162,9 @@ def test_columns_are_named_where_files_do_not(r2flow, numbered, tmp_path):  # no
     )
     assert code == 2
     assert "columns differ" in error
-    scan, image = wide / "000000.bin", tmp_path / "image.npy"
-    assert r2flow("project", scan, *columns, "--size", "4x16", "-o", image)[0] == 0
-    np.testing.assert_array_equal(np.load(image), read_scan(numbered / "000000.bin", SMALL))
+    scan = wide / "000000.bin"
+    assert r2flow("show", scan, *columns, "--size", "4x16", "--format", "npy", "-o", tmp_path / "image")[0] == 0
+    np.testing.assert_array_equal(np.load(tmp_path / "image" / "000000.npy"), read_scan(numbered / "000000.bin", SMALL))
     for verb in (
         ("show", scan, "--out", tmp_path / "v"),
         ("evaluate", wide, scan, "--size", "4x16", "--metrics", "jsd"),

@@ -49,13 +49,12 @@ def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: P
     np.testing.assert_allclose(options["elevations"], MINE.elevations, atol=1e-3)
     assert sorted(path.name for path in out.parent.iterdir()) == ["mine.yaml"]
 
-    image = tmp_path / "image.npy"
-    code, printed, _ = r2flow("project", scans / "000000.bin", "--sensor", out, "--reflectance-scale", 255, "-o", image)
+    npy, image = ("--format", "npy", "-o", tmp_path / "image"), tmp_path / "image" / "000000.npy"
+    code, printed, _ = r2flow("show", scans / "000000.bin", "--sensor", out, *npy)
     assert code == 0
     assert "8 x 128" in printed
     assert (np.load(image)[0] > 0).mean() == pytest.approx(0.9, abs=0.03)
-    code, printed, _ = r2flow("project", scans / "000000.bin", "--sensor", out, "--reflectance-scale", 255,
-                              "--size", "4x64", "-o", image)  # fmt: skip
+    code, printed, _ = r2flow("show", scans / "000000.bin", "--sensor", out, "--size", "4x64", *npy)
     assert np.load(image).shape == (2, 4, 64)
     code, _, _ = r2flow("show", scans / "000000.bin", "--sensor", out, "--out", tmp_path / "views")
     assert code == 0
@@ -94,7 +93,7 @@ def test_errors_are_one_line(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
         assert words in error
         assert error.count("\n") == 1
     for sensor, words in ((tmp_path / "wrong.yaml", "fall from the top"), (tmp_path / "none.yaml", "is not a file")):
-        code, _, error = r2flow("project", scans / "000000.bin", "--sensor", sensor, "-o", tmp_path / "x.npy")
+        code, _, error = r2flow("show", scans / "000000.bin", "--sensor", sensor, "-o", tmp_path / "x")
         assert code == 2
         assert words in error
         assert error.count("\n") == 1
@@ -102,10 +101,10 @@ def test_errors_are_one_line(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
 
 def test_built_in_sensors_are_given_by_name(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
     for name in ("vlp32c", "os1_128"):
-        out = tmp_path / f"{name}.npy"
-        code, _, _ = r2flow("project", scans / "000000.bin", "--sensor", name, "--reflectance-scale", 255, "-o", out)
+        out = tmp_path / name
+        code, _, _ = r2flow("show", scans / "000000.bin", "--sensor", name, "--format", "npy", "-o", out)
         assert code == 0
-        assert np.load(out).shape == (2, *SENSORS[name].shape)
+        assert np.load(out / "000000.npy").shape == (2, *SENSORS[name].shape)
 
 
 def test_the_wrong_sensor_is_said_in_one_line_with_the_right_one(r2flow, tmp_path: Path):  # noqa: F811
@@ -119,7 +118,6 @@ def test_the_wrong_sensor_is_said_in_one_line_with_the_right_one(r2flow, tmp_pat
     for verb in (
         ("show", tmp_path / "scans"),
         ("prepare", "folder", tmp_path / "scans", "--workers", 1),
-        ("project", one, "-o", tmp_path / "x.npy"),
         ("evaluate", tmp_path / "scans", one, "--metrics", "jsd", "--workers", 0),
     ):
         given = verb if "-o" in verb else (*verb, "--out", out / verb[0])
@@ -140,8 +138,8 @@ def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, 
     assert yaml.safe_load(out.read_text())["reflectance_scale"] == 255
     raw = np.fromfile(scans / "000000.bin", np.float32).reshape(-1, 4)[:, 3]
     assert raw.max() > 250
-    image = tmp_path / "image.npy"
-    assert r2flow("project", scans / "000000.bin", "--sensor", out, "-o", image)[0] == 0
+    npy, image = ("--format", "npy", "-o", tmp_path / "image"), tmp_path / "image" / "000000.npy"
+    assert r2flow("show", scans / "000000.bin", "--sensor", out, *npy)[0] == 0
     expected = np.unique(raw / np.float32(255))
     assert set(np.unique(np.load(image)[1])) <= {0, *expected}
     assert np.load(image)[1].max() > 0.95
@@ -151,7 +149,7 @@ def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, 
     given = (scans, scans / "000000.bin", "--sensor", out, "--metrics", "jsd,sensor", "--workers", 0)
     assert "reflectance" not in r2flow("evaluate", *given, "--json", tmp_path / "e.json")[2]
     assert r2flow("show", scans / "000000.bin", "--sensor", out, "--out", tmp_path / "views")[:1] == (0,)
-    r2flow("project", scans / "000000.bin", "--sensor", out, "--reflectance-scale", 510, "-o", image)
+    r2flow("show", scans / "000000.bin", "--sensor", out, "--reflectance-scale", 510, *npy)
     assert np.load(image)[1].max() == pytest.approx(raw.max() / 510, abs=0.01)  # what is given comes first
 
 

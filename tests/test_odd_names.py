@@ -40,7 +40,7 @@ def test_scans_of_any_name_are_drawn_measured_and_prepared(r2flow, tmp_path, mon
 def test_a_mistake_in_a_scan_of_any_name_is_one_line(r2flow, tmp_path, monkeypatch, name):  # noqa: F811
     monkeypatch.chdir(tmp_path)
     Path(f"./{name}.bin").write_bytes(b"\0" * 30)
-    code, _, err = r2flow("project", f"./{name}.bin", "-o", "out.npy")
+    code, _, err = r2flow("show", f"./{name}.bin", "-o", "out")
     assert code == 2
     (line,) = err.splitlines()
     assert "bin is not a whole number" in line

@@ -121,19 +121,18 @@ sample -c run -o out --steps 10000000 # a sampler takes 1 to 1,000,000 steps, fo
 sample -c run -o out --solver jump:2 # jump:2 is for flow maps
 view scans --seed 3 -o v.html # --seed and --device are of a run
 view scans --device cpu -o v.html # --seed and --device are of a run
-project scans/000000.bin -o out.npy --reflectance-scale inf # found inf
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
 export run --to onnx --half # --half
-backbones --only nope
-backbones --size 64
-backbones --size 0x0
-backbones --size ²x²
-backbones --size 99999999x99999999 # at most 16,777,216 pixels
-backbones --sensor nope
-backbones --channels 0
-backbones --repeats -1
-backbones --device nope
-backbones extra
+report backbones --only nope
+report backbones --size 64
+report backbones --size 0x0
+report backbones --size ²x²
+report backbones --size 99999999x99999999 # at most 16,777,216 pixels
+report backbones --sensor nope
+report backbones --channels 0
+report backbones --repeats -1
+report backbones --device nope
+report backbones extra
 complete # Missing
 complete nowhere -o out
 complete empty -o out
@@ -190,6 +189,7 @@ interpolate scans/000000.bin scans/000001.bin -c run -o out --frames 1
 interpolate scans/000000.bin scans/000001.bin -c run -o out --solver nope
 interpolate scans/000000.bin scans/000001.bin -c run -o file.txt
 interpolate scans scans -c run -o out # scan
+show scans/000000.bin -o out --format nope # png or npy
 show # Missing
 show scans # Missing
 show nowhere -o out
@@ -211,19 +211,6 @@ show run -o out # a run without samples
 show nope:scans -o out
 show simulated:a -o out
 show kitti_360:nowhere -o out
-project # Missing
-project scans/000000.bin # Missing
-project scans -o out.npy # is a folder, not a scan file
-project nowhere.bin -o out.npy
-project scans/000000.bin -o out # written as .npy
-project scans/000000.bin -o out.npy --size 0x0
-project scans/000000.bin -o out.npy --convention nope
-project scans/000000.bin -o out.npy --projection unfolding
-project scans/000000.bin -o out.npy --reflectance-scale 0
-project scans/000000.bin -o out.npy --sensor nope
-project scans/000000.bin -o file.txt/out.npy
-project image.npy -o out.npy --sensor vlp16
-project bad.ckpt -o out.npy
 sensor # Missing
 sensor nowhere
 sensor empty
@@ -388,7 +375,7 @@ report paper run -o file.txt
 sample -c run -o out --format '' # an argument is empty
 sample -c run -o '' # an argument is empty
 evaluate scans scans --metrics '' # an argument is empty
-backbones --only '' # an argument is empty
+report backbones --only '' # an argument is empty
 """
 
 TRAIN = """

@@ -10,12 +10,8 @@ import typer
 from r2flow.cli.app import app
 from r2flow.cli.groups import DrawOptions, SolverOptions, grouped
 from r2flow.cli.options import (
-    DeviceOption,
     OutOption,
     PrecisionOption,
-    SensorOption,
-    SizeOption,
-    build_sized,
     choose_device,
 )
 from r2flow.errors import InputError
@@ -129,30 +125,3 @@ def info(
         print(to_json(contents, indent=2))
     else:
         print_contents(contents)
-
-
-def _keep_source(checkpoint: "Checkpoint", out: Path) -> None:
-    if out.exists() and out.samefile(checkpoint.path):
-        raise InputError(f"{out} would be replaced by what is made of it; give another name.")
-
-
-@app.command(epilog="Example: r2flow backbones --size 64x1024")
-def backbones(
-    only: Annotated[str | None, typer.Option(help="Names, separated by commas; all if left out.")] = None,
-    sensor: SensorOption = "hdl64e",
-    size: SizeOption = None,
-    channels: Annotated[int, typer.Option(min=1, help="Channels of the image.")] = 2,
-    repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each; 0 leaves the latency out.")] = 3,
-    device: DeviceOption = "auto",
-    json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
-) -> None:
-    """Parameters, multiply-accumulates and measured latency of every configuration: the paper's table II."""
-    from r2flow.backbones import configurations
-    from r2flow.progress import track
-    from r2flow.reports.backbones import backbone_costs, print_costs
-
-    chosen, where = build_sized(sensor, size), choose_device(device)
-    names = only.split(",") if only else list(configurations())
-    rows = backbone_costs(chosen, names, channels, repeats, where)
-    measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
-    print(to_json(measured, indent=2)) if json else print_costs(measured, chosen, where)

@@ -26,7 +26,6 @@ OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to
 SensorOption = Annotated[str, typer.Option(help="Name of the sensor, or the YAML file of your own (r2flow sensor).")]
 SizeOption = Annotated[str | None, typer.Option(help="Rows x columns, as 64x1024; the sensor's own if left out.")]
 ProjectionOption = Annotated[str, typer.Option(help="spherical or unfolding.")]
-ConventionOption = Annotated[str, typer.Option(help="centre, or reference for the published models'.")]
 SurfacesOption = Annotated[
     bool,
     typer.Option("--surfaces/--no-surfaces", help="Move answers to the surfaces that measured returns lie on."),

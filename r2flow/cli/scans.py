@@ -11,12 +11,9 @@ from r2flow.cli.app import app
 from r2flow.cli.options import (
     SETS,
     ColumnsOption,
-    ConventionOption,
     OutOption,
     ProjectionOption,
-    ScaleChoice,
     SensorChoice,
-    SensorOption,
     SizeOption,
     build_sized,
     named_columns,
@@ -43,51 +40,29 @@ def show(
     columns: ColumnsOption = None,
     most: Annotated[int, typer.Option("--num", min=1, help="The most scans to draw of a folder.")] = 16,
     labels: Annotated[bool, typer.Option("--labels", help="Draw the classes of .label files, too.")] = False,
+    format: Annotated[str, typer.Option(help="png, or npy for range images, (2, H, W).")] = "png",
 ) -> None:
-    """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each."""
+    """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each; or write range images."""
+    import numpy as np
+
+    from r2flow.files import atomic_write
     from r2flow.reports.pictures import save_figure, scan_figure
     from r2flow.reports.views import label_view
 
+    if format not in ("png", "npy"):
+        raise InputError(f"--format must be png or npy, found {format!r}.")
+
     views = views_to_draw(scans, sensor, size, projection, reflectance_scale, columns, most)
     for view, name in zip(views, unique_stems([view.path for view in views]), strict=True):
+        if format == "npy":
+            image = view.image
+            with atomic_write(out / f"{name}.npy") as file:
+                np.save(file, image)
+            print(f"{out / name}.npy: {' x '.join(map(str, image.shape))}, {(image[0] > 0).mean():.1%} returns")
+            continue
         classes = label_view(view) if labels else None
         figure = scan_figure(view.image, view.rays, view.path.name, classes)
         print(save_figure(figure, out / f"{name}.png"))
-
-
-@app.command(
-    epilog="Example: r2flow project velodyne/0000000100.bin --projection unfolding --size 64x1024 --out image.npy"
-)
-def project(
-    scan: Annotated[Path, typer.Argument(help="A scan file.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The .npy to write.", show_default=False)],
-    projection: ProjectionOption = "spherical",
-    convention: ConventionOption = "centre",
-    sensor: SensorOption = "hdl64e",
-    size: SizeOption = None,
-    reflectance_scale: ScaleChoice = None,
-    columns: ColumnsOption = None,
-) -> None:
-    """Project a scan to a range image: float32 (2, H, W), range in metres and reflectance, 0 where missing."""
-    import numpy as np
-
-    from r2flow.data.opening import open_scans, usual_scale
-    from r2flow.data.reading import Reading
-    from r2flow.files import atomic_write
-
-    chosen = build_sized(sensor, size)
-    if out.suffix != ".npy":
-        raise InputError(f"--out {out}: a range image is written as .npy; r2flow show draws pictures.")
-    if scan.is_dir():
-        raise InputError(f"{scan} is a folder, not a scan file; name a file in it.")
-    scale = usual_scale(scan, chosen) if reflectance_scale is None else reflectance_scale
-    reading = Reading(chosen, projection, convention, scale, on_bad_scan="error", columns=named_columns(columns))  # type: ignore[arg-type]
-    image = open_scans(scan, reading).source[0]
-    image = image if len(image) > 1 else np.concatenate([image, np.zeros_like(image)])
-    with atomic_write(out) as file:
-        np.save(file, image)
-    returns = int((image[0] > 0).sum())
-    print(f"{out}: {image.shape[1]} x {image.shape[2]}, {returns} returns ({returns / image[0].size:.1%})")
 
 
 def views_to_draw(

@@ -1,9 +1,10 @@
-"""`r2flow report solvers` and `r2flow report curvature`: accuracy and straightness of flows."""
+"""`r2flow report solvers`, `curvature` and `backbones`: accuracy, straightness and cost of flows."""
 
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from json import dumps as to_json
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +12,7 @@ import typer
 
 from r2flow.cli.app import report
 from r2flow.cli.groups import DrawOptions, grouped
-from r2flow.cli.options import OutOption, choose_device
+from r2flow.cli.options import DeviceOption, OutOption, SensorOption, SizeOption, build_sized, choose_device
 from r2flow.cli.output import command, finish, numbers
 from r2flow.errors import InputError
 
@@ -113,6 +114,28 @@ def solvers(
             verdicts = measuring.judge(problems, methods, progress=advance)
     page = measuring.solvers_page(rows, verdicts, flow, budgets, {"scans": draw.seed}, command(), where)
     finish(page, out, page.text[: -(2 + 3 * bool(verdicts))])  # without the long tables
+
+
+@report.command(epilog="Example: r2flow report backbones --size 64x1024")
+def backbones(
+    only: Annotated[str | None, typer.Option(help="Names, separated by commas; all if left out.")] = None,
+    sensor: SensorOption = "hdl64e",
+    size: SizeOption = None,
+    channels: Annotated[int, typer.Option(min=1, help="Channels of the image.")] = 2,
+    repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each; 0 leaves the latency out.")] = 3,
+    device: DeviceOption = "auto",
+    json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """Parameters, multiply-accumulates and measured latency of every configuration: the paper's table II."""
+    from r2flow.backbones import configurations
+    from r2flow.progress import track
+    from r2flow.reports.backbones import backbone_costs, print_costs
+
+    chosen, where = build_sized(sensor, size), choose_device(device)
+    names = only.split(",") if only else list(configurations())
+    rows = backbone_costs(chosen, names, channels, repeats, where)
+    measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
+    print(to_json(measured, indent=2)) if json else print_costs(measured, chosen, where)
 
 
 @contextmanager

@@ -37,6 +37,21 @@ from r2flow.signals import Stopped, listening, stop_at_once
 # Its home is click in older releases of typer and typer itself in newer ones.
 USAGE_ERROR: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
+# The verbs of --help in their order.
+GROUPS = {
+    "Make": ("train", "pairs"),
+    "Draw": ("sample", "complete", "interpolate"),
+    "Look": ("view", "show"),
+    "Measure": ("evaluate", "compare"),
+    "Data": ("simulate", "prepare", "sensor"),
+    "Files": ("export", "info", "weights"),
+}
+for one in app.registered_commands:
+    assert one.callback is not None
+    one.name = one.callback.__name__
+    one.rich_help_panel = next((group for group, names in GROUPS.items() if one.name in names), "Data")
+app.registered_groups[0].rich_help_panel = "Measure"
+app.registered_commands.sort(key=lambda one: list(GROUPS).index(str(one.rich_help_panel)))
 
 FULL = ("can't allocate memory", "not enough memory", "out of memory")  # of the RuntimeErrors of torch
 

@@ -50,7 +50,7 @@ def test_every_configuration_takes_every_sensor_s_shape(sensor):
 
 
 def test_the_verb_prints_every_configuration(r2flow):  # noqa: F811
-    code, out, _ = r2flow("backbones", "--repeats", 0, "--device", "cpu")
+    code, out, _ = r2flow("report", "backbones", "--repeats", 0, "--device", "cpu")
     assert code == 0
     for name in configurations():
         assert name in out
@@ -60,12 +60,14 @@ def test_the_verb_prints_every_configuration(r2flow):  # noqa: F811
 
 def test_the_verb_measures_what_it_is_asked_for(r2flow):  # noqa: F811
     options = ("--only", "hdit_tiny,adm_unet_large", "--size", "16x64", "--channels", 1, "--repeats", 0, "--json")
-    code, out, _ = r2flow("backbones", *options)
+    code, out, _ = r2flow("report", "backbones", *options)
     assert code == 0
     assert [row["name"] for row in json.loads(out)] == ["hdit_tiny", "adm_unet_large"]
-    code, out, _ = r2flow("backbones", "--only", "hdit_tiny", "--size", "16x64", "--repeats", 1, "--device", "cpu")
+    code, out, _ = r2flow(
+        "report", "backbones", "--only", "hdit_tiny", "--size", "16x64", "--repeats", 1, "--device", "cpu"
+    )
     assert code == 0
     assert "hdit_tiny" in out
-    code, _, err = r2flow("backbones", "--only", "hditt", "--repeats", 0)
+    code, _, err = r2flow("report", "backbones", "--only", "hditt", "--repeats", 0)
     assert code != 0
     assert "Did you mean 'hdit'?" in err
