@@ -135,7 +135,7 @@ class HalfLifeEMA(EMA):
         self.batch_size, self.half_life, self.rampup = batch_size, half_life, rampup
 
     def _decay(self) -> float:
-        return half_life_decay(self._step, self.batch_size, self.half_life, self.rampup)
+        return half_life_decay(self._step + 1, self.batch_size, self.half_life, self.rampup)
 
 
 @contextmanager

@@ -166,7 +166,8 @@ class Inert:
         """Nothing is done with the arguments."""
 
 
-# The classes that a pickled DictConfig names. `weights_only` refuses every other.
+# The classes that a pickled DictConfig names, and the keys of Lightning 1.4's callback states. `weights_only` refuses
+# every other.
 NAMES = (
     "omegaconf.dictconfig.DictConfig",
     "omegaconf.listconfig.ListConfig",
@@ -175,6 +176,7 @@ NAMES = (
     "typing.Any",
     "collections.defaultdict",
     *(f"builtins.{name}" for name in ("bool", "dict", "float", "int", "list", "str")),
+    "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint",
 )
 CONTENT, VALUE = "_content", "_val"
 

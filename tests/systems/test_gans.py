@@ -547,18 +547,18 @@ def assert_equal(a: Any, b: Any) -> None:
 
 @pytest.mark.parametrize("system", [pytest.param(s, marks=pytest.mark.slow) for s in SYSTEMS])
 def test_a_stopped_gan_ends_as_the_one_left_alone(tmp_path: Path, system: str):
-    whole = trained(tmp_path / "run", system, "trainer.max_steps=5")
+    whole = trained(tmp_path / "run", system, "trainer.max_steps=6")
     stopped = Path(shutil.copytree(tmp_path / "run", tmp_path / "stopped"))
-    (stopped / "checkpoints" / "step-00000005.ckpt").unlink()  # as if killed after step 4
-    resumed = trained(stopped, system, "trainer.max_steps=5")
-    # R1's turns are steps 0, 2 and 4, and p moves in the same ones: both in what was done again.
+    (stopped / "checkpoints" / "step-00000006.ckpt").unlink()  # as if killed after step 4
+    resumed = trained(stopped, system, "trainer.max_steps=6")
+    # R1's turns are steps 2, 4 and 6, and p moves in the same ones: both in what was done again.
     for part in ("state_dict", "current_model_state", "optimizer_states"):
         assert_equal(whole[part], resumed[part])
     assert float(whole["current_model_state"]["augment.p"]) != 0.5
     steps = [{int(s["step"]) for s in one["state"].values()} for one in whole["optimizer_states"]]
-    assert steps[0] == {5}
-    assert steps[1] <= {8, 5}  # 5 and 3 of R1, which has no gradient by the last bias
-    assert 8 in steps[1]
+    assert steps[0] == {6}
+    assert steps[1] <= {9, 6}  # 6 and 3 of R1, which has no gradient by the last bias
+    assert 9 in steps[1]
 
 
 @pytest.mark.slow

@@ -2,7 +2,9 @@
 
 import json
 import shutil
+import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -311,6 +313,9 @@ def test_ranges_and_masks_are_encoded_and_decoded_as_published(shared: Path):
     x = encoding.encode(case["metres"][None])
     assert_near(x, case["model_space"], 1e-6)
     assert torch.equal(returns(x[None], encoding)[0], case["mask"])
+    metric = Encoding(sensor, "metric", reflectance=False)  # published: r < 1 / 255 m is no return, without the shift
+    edge = torch.tensor([0.0, 0.0038, 0.005, 1.0])[None, None, None]
+    assert returns(metric.encode(edge), metric).flatten().tolist() == [-1, -1, 1, 1]
     encoding = Encoding(sensor, "shifted_log", reflectance=False, limits="open")
     decoded = encoding.decode(case["sample"][None])[0]
     assert torch.equal(decoded > 0, case["sample_valid"])
@@ -357,12 +362,27 @@ def test_a_published_diffusion_gives_its_noise_and_images(published: tuple[Path,
         assert_near(generator.first_stage_model.decode(io["z"]), io["decoded"], 5e-5)
 
 
-def test_a_published_diffusion_without_its_config_has_the_published_size(shared: Path):
+def test_a_published_diffusion_without_its_config_has_the_published_size(shared: Path, caplog: Any):
     loaded = load_checkpoint(shared / "oracle_baselines" / "lidm_published.ckpt")
+    assert "64 x 1024" in caplog.text
+    assert "heads of 32" in caplog.text
     assert loaded.generator.space.shape == (1, 64, 1024)
     assert loaded.config["generator"]["unet"]["head_channels"] == 32
     assert loaded.config["generator"]["unet"]["multipliers"] == [1, 1]
     assert loaded.config["generator"]["beta_last"] == 0.0195
+
+
+def test_callback_states_keyed_by_their_class_are_read(shared: Path, tmp_path: Path, monkeypatch: Any):
+    """As Lightning 1.4.2 wrote them; the class is not imported."""
+    place = "pytorch_lightning.callbacks.model_checkpoint"
+    key = type("ModelCheckpoint", (), {"__module__": place})
+    with monkeypatch.context() as patch:
+        for name in ("pytorch_lightning", "pytorch_lightning.callbacks", place):
+            patch.setitem(sys.modules, name, ModuleType(name))
+        sys.modules[place].ModelCheckpoint = key
+        content = load_case(shared, "lidm_ae_published.ckpt")
+        torch.save({**content, "callbacks": {key: {"best_model_path": "a"}}}, tmp_path / "model.ckpt")
+    assert load_checkpoint(tmp_path / "model.ckpt").config["generator"]["name"] == "vq_autoencoder"
 
 
 def lists(value: Any) -> Any:
@@ -419,8 +439,8 @@ def test_an_autoencoder_where_scans_are_wanted_is_one_line(shared: Path, tmp_pat
         main()
     said = capsys.readouterr().err.splitlines()
     assert end.value.code == 2
-    assert len(said) == 1
-    assert "makes none of noise" in said[0]
+    assert len(said) == 2  # the assumed size, and the mistake
+    assert "makes none of noise" in said[-1]
     assert not (tmp_path / "out").exists()
 
 

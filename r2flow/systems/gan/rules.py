@@ -11,10 +11,10 @@ from r2flow.registry import Natural, NonNegative, Portion
 
 
 def half_life_decay(step: int, batch_size: int, half_life: float, rampup: float) -> float:
-    """Decay of the generator's average after step 0, 1, ...: 2^(-B / h), h = min(half_life, rampup B step).
+    """Decay of the generator's average after step 1, 2, ...: 2^(-B / h), h = min(half_life, rampup B step).
 
     Half of the average is from the last h images. h grows with the images seen, so that the average is not that of an
-    untrained generator; the first step copies the weights (Karras et al. 2020, StyleGAN2-ADA, appendix B).
+    untrained generator; the first step all but copies the weights (Karras et al. 2020, StyleGAN2-ADA, appendix B).
     """
     images = min(half_life, rampup * batch_size * step)
     return 0.5 ** (batch_size / images) if images > 0 else 0.0

@@ -117,7 +117,8 @@ class LearnGan(Stage):
 
     def training_step(self, batch: Batch, batch_idx: int) -> None:
         assert isinstance(self.generator, Gan)
-        step, (for_generator, for_discriminator) = self.global_step, self.own_optimizers()
+        step = self.global_step + 1  # counted from 1, as published
+        for_generator, for_discriminator = self.own_optimizers()
         images, real = step * self.batch_size, batch["x_1"]
 
         draws = BatchDraws(self.seed, batch, Part.GENERATOR)

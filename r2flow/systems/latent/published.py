@@ -5,6 +5,7 @@ The files say neither the size of the images nor the width of attention heads. B
 published with them: where that lies beside a file it is read, else they are 64 x 1024 and 32, as in all of them.
 """
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from r2flow.lidar.encoding import ShiftedLog
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.published import Format, Published
 from r2flow.systems.latent.autoencoder import UP
+
+log = logging.getLogger(__name__)
 
 UNET, AUTOENCODER, AVERAGE = "model.diffusion_model.", "first_stage_model.", "model_ema."
 FIRST, CODES = "encoder.conv_in.weight", "quantize.embedding.weight"
@@ -158,7 +161,14 @@ def _config(generator: dict[str, Any], path: Path) -> dict[str, Any]:
     Raises:
         InputError: a field of view or a scale of the ranges that LiDM's published images do not have.
     """
-    data = _beside(path).get("data") or {}
+    content = _beside(path)
+    if not content:
+        heads = f", attention heads of {HEAD} channels" if generator["name"] == "latent_diffusion" else ""
+        log.warning(
+            "%s has no config.yaml: assumed images of %d x %d, ranges of %g to %g m on a logarithmic scale%s.",
+            path, *SIZE, *RANGES, heads,
+        )  # fmt: skip
+    data = content.get("data") or {}
     images = (data.get("params") or {}).get("dataset") or {}
     rows, columns = (int(size) for size in images.get("size", SIZE))
     nearest, farthest = (float(limit) for limit in images.get("depth_range", RANGES))

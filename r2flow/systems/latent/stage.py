@@ -8,7 +8,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.generators import Generator
-from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.encoding import Encoding, ShiftedLog
 from r2flow.processes import averaged
 from r2flow.registry import Natural, NonNegative, check_options
 from r2flow.stages.base import Batch, SingleLoss, Stage
@@ -17,12 +17,14 @@ from r2flow.systems.latent.generator import LatentDiffusion, VQAutoencoder
 from r2flow.systems.latent.hinge import adaptive_weight, adversarial_factor, hinge_loss, reconstruction_loss
 from r2flow.systems.latent.patch_discriminator import PatchDiscriminator
 
-LEAST = 1 / 255  # metres: what is nearer is no return
+LEAST = 1 / 255  # metres: shorter ranges are not returns
+SHIFT = 1e-4  # metres that the published threshold lacks under the logarithm, and `ShiftedLog` adds
 
 
 def returns(x: Tensor, encoding: Encoding) -> Tensor:
     """1 where a ray of images in model space returns and -1 where it does not, (B, 1, H, W)."""
-    least = encoding.format.forward(torch.full((1, 1, 1), LEAST - 1e-4, device=x.device))
+    metres = LEAST - SHIFT if isinstance(encoding.format, ShiftedLog) else LEAST
+    least = encoding.format.forward(torch.full((1, 1, 1), metres, device=x.device))
     return torch.where(x[:, :1] < 2 * least - 1 + 1e-6, -1.0, 1.0)
 
 
