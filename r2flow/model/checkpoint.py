@@ -122,25 +122,21 @@ def find_checkpoint(path: str | Path) -> Path:
         InputError: nothing is there.
     """
     name, path = str(path), Path(path).expanduser()
-    if path.is_dir():
-        found = checkpoints_of(path) or sorted(path.glob("step-*.ckpt"), key=step_of, reverse=True)
-        if not found and name in MODELS:
-            return find_model(name)
-        if not found:
-            runs = sorted(str(one.parent) for one in path.glob(f"*/{FOLDER}") if checkpoints_of(one.parent))
-            hint = f"Give a run folder, a .ckpt, a .safetensors or a model ({', '.join(MODELS)})."
-            hint = f"It holds runs: give {' or '.join(runs[:8])}." if runs else hint
-            raise InputError(f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt). {hint}")
+    if path.is_file():
+        return path
+    found = checkpoints_of(path) or sorted(path.glob("step-*.ckpt"), key=step_of, reverse=True)
+    if found:
         return found[0]
-    if not path.is_file():
-        if name in MODELS:
-            return find_model(name)
-        if path.exists():  # a pipe would be waited for
-            raise InputError(f"{path} is not a regular file. Give a checkpoint file or a run folder.")
-        known = f"a model ({', '.join(MODELS)})"
-        hint = did_you_mean(name, [*MODELS])
-        raise InputError(f"no checkpoint at {path}. Give a checkpoint file, a run folder or {known}.{hint}")
-    return path
+    if name in MODELS and (path.is_dir() or not path.exists()):
+        return find_model(name)
+    hint = f"Give a checkpoint file, a run folder or a model ({', '.join(MODELS)})."
+    if path.is_dir():
+        runs = sorted(str(one.parent) for one in path.glob(f"*/{FOLDER}") if checkpoints_of(one.parent))
+        hint = f"It holds runs: give {' or '.join(runs[:8])}." if runs else hint
+        raise InputError(f"{path} holds no checkpoint ({FOLDER}/step-*.ckpt). {hint}")
+    if path.exists():  # a pipe would be waited for
+        raise InputError(f"{path} is not a regular file. {hint}")
+    raise InputError(f"no checkpoint at {path}. {hint}{did_you_mean(name, [*MODELS])}")
 
 
 def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
@@ -352,23 +348,21 @@ def check_weights(model: nn.Module, weights: Mapping[str, Tensor], path: Path) -
     """Account for every name and shape before anything is loaded.
 
     Raises:
-        InputError: the first name or shape that differs.
+        InputError: the first name or shape that differs, or a tensor that is not of plain numbers.
     """
     own = model.state_dict()
     missing, surplus = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
-    if missing or surplus:
-        raise InputError(
-            f"the weights in {path} do not fit its config: {len(missing)} names missing {missing[:2]}, "
-            f"{len(surplus)} unknown {surplus[:2]}."
-        )
-    for name, value in own.items():
-        if weights[name].shape != value.shape:
-            raise InputError(
-                f"the weights in {path} do not fit its config: '{name}' has shape {tuple(weights[name].shape)}, "
-                f"the config makes it {tuple(value.shape)}."
-            )
-        there = weights[name]
-        if there.layout != torch.strided or there.is_meta or there.is_complex():
-            raise InputError(f"the weights in {path} are no plain numbers: '{name}' is {there.layout}, {there.dtype}.")
-        if value.is_floating_point() != there.is_floating_point():
-            raise InputError(f"the weights in {path} do not fit: '{name}' is {there.dtype}, the model's {value.dtype}.")
+    wrong = [f"{len(missing)} names missing {missing[:2]}, {len(surplus)} unknown {surplus[:2]}"]
+    if not (missing or surplus):
+        wrong = [
+            f"'{name}' has shape {tuple(there.shape)} ({there.layout}, {there.dtype}), the config makes it "
+            f"{tuple(value.shape)} ({value.dtype})"
+            for name, value in own.items()
+            if (there := weights[name]).shape != value.shape
+            or there.layout != torch.strided
+            or there.is_meta
+            or there.is_complex()
+            or value.is_floating_point() != there.is_floating_point()
+        ]
+    if wrong:
+        raise InputError(f"the weights in {path} do not fit its config: {wrong[0]}.")

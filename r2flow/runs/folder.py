@@ -22,14 +22,20 @@ log = logging.getLogger(__name__)
 CONFIG = "config.yaml"
 
 
-def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """The keys, with both values, in which a command departs from the run that it would go on with."""
+def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, str]:
+    """The keys that two configs have other values of, with both values."""
     before, now = dict(flatten(old)), dict(flatten(new))
-    unused = "" if "pairs" in (before.get("data.name"), now.get("data.name")) else "data.pairs."
+    keys = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
+    return {key: f"{key}={before.get(key)} there, {now.get(key)} here" for key in keys}
+
+
+def contradictions(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """The differences by which a command cannot resume a run."""
+    on_pairs = any((config.get("data") or {}).get("name") == "pairs" for config in (old, new))
     return [
-        f"{key}={before.get(key)} there, {now.get(key)} here"
-        for key in sorted(before.keys() | now.keys())
-        if before.get(key) != now.get(key) and rule(key).resume != "free" and not (unused and key.startswith(unused))
+        text
+        for key, text in differences(old, new).items()
+        if rule(key).resume != "free" and (on_pairs or not key.startswith("data.pairs."))
     ]
 
 
@@ -102,40 +108,23 @@ def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Ten
     if old is None:
         write_config(run, config)
         return None
-    differing = contradictions(old, config)
-    found = _resumable(run)
-    newest = next(found, None)
-    if not differing:
-        last = newest and _fitting(run, [newest, *found] if state else [newest], state)
-        if last and step_of(last) >= config["trainer"]["max_steps"]:
-            _check_sampler(run, old, config)
-        # Free keys moved: the folder says what runs now.
-        if last and (old != dict(config) or not Path(run, CONFIG).is_file()):
-            write_config(run, config)
-        return last
+    differing, resumable = contradictions(old, config), _resumable(run)
+    newest = next(resumable, None)
+    if differing and newest is not None:
+        raise InputError(_another_config(run, differing))
     if newest is None:  # nothing has been learned there yet
+        last = None
+    else:
+        last = _fitting(run, [newest, *resumable] if state else [newest], state)
+        samplers = [text for key, text in differences(old, config).items() if key.startswith("sampler.")]
+        if samplers and step_of(last) >= config["trainer"]["max_steps"]:
+            raise InputError(
+                f"{run} is finished and keeps its sampler: {'; '.join(samplers)}. Leave it as it was, and draw by "
+                f"another with r2flow sample -c {run} --solver NAME --steps N."
+            )
+    if old != dict(config) or not Path(run, CONFIG).is_file():  # free keys may have moved
         write_config(run, config)
-        return None
-    raise InputError(_another_config(run, differing))
-
-
-def _check_sampler(run: str | Path, old: Mapping[str, Any], new: Mapping[str, Any]) -> None:
-    """Refuse another sampler for a run that is finished: its checkpoint would keep the one that it has.
-
-    Raises:
-        InputError: the samplers differ.
-    """
-    before, now = (dict(flatten({"sampler": config.get("sampler") or {}})) for config in (old, new))
-    differing = [
-        f"{key}={before.get(key)} there, {now.get(key)} here"
-        for key in sorted(before.keys() | now.keys())
-        if before.get(key) != now.get(key)
-    ]
-    if differing:
-        raise InputError(
-            f"{run} is finished and keeps its sampler: {'; '.join(differing)}. Leave it as it was, and draw by another "
-            f"with r2flow sample -c {run} --solver NAME --steps N."
-        )
+    return last
 
 
 def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
@@ -147,16 +136,12 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
     old = read_config(run)
     if old is None or not checkpoints_of(run):
         return
-    told_later = {"scans", "parent", "encoding.reflectance", "data.pairs.parent"}
-    differing = contradictions(
-        *({k: v for k, v in flatten(one) if not _within(k, told_later)} for one in (old, config))
-    )
+    later = ("scans", "parent", "encoding.reflectance", "data.pairs.parent")
+    known = [{k: v for k, v in flatten(one) if not f"{k}.".startswith(tuple(f"{group}." for group in later))}
+             for one in (old, config)]  # fmt: skip
+    differing = contradictions(*known)
     if differing:
         raise InputError(_another_config(run, differing))
-
-
-def _within(key: str, groups: Iterable[str]) -> bool:
-    return any(key == group or key.startswith(f"{group}.") for group in groups)
 
 
 def _another_config(run: str | Path, differing: list[str]) -> str:
@@ -173,35 +158,29 @@ RESUMED = ("config", "state_dict", "optimizer_states", "lr_schedulers", "loops",
 
 
 def _whole(run: str | Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """The checkpoints that are what was written, the newest first."""
+    """The checkpoints that can be read, the newest first."""
     for path in checkpoints_of(run):
         try:
-            content = read_checkpoint(path)
+            yield path, read_checkpoint(path)
         except InputError as error:
             log.warning("%s Passing it over.", error)
-        else:
-            yield path, content
 
 
 def _resumable(run: str | Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Those of them from which a run can go on: weights alone, as of a model that was saved for sampling, are none."""
+    """The checkpoints that a run can resume from; one of weights alone cannot be resumed."""
     for path, content in _whole(run):
         lacking = [key for key in RESUMED if key not in content]
-        if lacking:
-            log.warning("%s cannot be gone on from: it has no %s. Passing it over.", path, lacking[0])
-        else:
+        if not lacking:
             yield path, content
+        else:
+            log.warning("%s cannot be resumed: it has no %s. Passing it over.", path, lacking[0])
 
 
 def _fitting(run: str | Path, found: Iterable[tuple[Path, dict[str, Any]]], state: Mapping[str, Tensor] | None) -> Path:
     """The first checkpoint whose weights have the names and shapes of `state`."""
     for path, content in found:
-        held = content["state_dict"]
-        if state is None or {name: _shape(v) for name, v in held.items()} == {n: v.shape for n, v in state.items()}:
+        held = {name: getattr(value, "shape", None) for name, value in content["state_dict"].items()}
+        if state is None or held == {name: value.shape for name, value in state.items()}:
             return path
-        log.warning("%s has not the weights of this run's config. Passing it over.", path)
+        log.warning("%s does not have the weights of this run's config. Passing it over.", path)
     raise InputError(f"no checkpoint in {run} has the weights of its config; give name=OTHER for a new run.")
-
-
-def _shape(value: Any) -> Any:
-    return value.shape if isinstance(value, Tensor) else None

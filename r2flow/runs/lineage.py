@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from r2flow.config import flatten, groups_of, key_of, rule
+from r2flow.config import groups_of, key_of, rule
 from r2flow.data.opening import made_here, scale_of_folder
 from r2flow.data.options import FOLDER, MIXED, SIMULATED, PairOptions, SourceOptions
 from r2flow.data.pairs import default_folder
@@ -61,9 +61,8 @@ def find_parent(config: Mapping[str, Any]) -> tuple[Parent, Checkpoint] | None:
 def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | None) -> dict[str, Any]:
     """The config of a run, completed by what its parent says.
 
-    Encoding and backbone are the parent's, and so are the sensor and how scans in files become images (projection and
-    convention) unless others are asked for; pairs are those of its
-    averaged weights, in its folder, and of its sensor, or those of another flow (`data.pairs.of`).
+    Encoding and backbone are the parent's; sensor, projection and convention too, unless the command line gives them.
+    Pairs are drawn by the parent's averaged weights, or by another flow (`data.pairs.of`), at its sensor.
 
     Args:
         asked: What the command line gave, as `backbone=hdit` or `backbone.depths=[1]`.
@@ -82,17 +81,8 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         config["generator"] = generator_of(config, parent)
         return config
     keys = [key_of(one) for one in asked]
-    for key in keys:
-        _check_agrees(key, config, parent)
     for group in (*groups_of(inherited="always"), *groups_of(inherited="with_pairs")):
-        there = parent.config.get(group)
-        if not isinstance(there, Mapping):
-            config[group] = there
-            continue
-        if group in keys and inherited(group, config) == "unless_given":
-            continue
-        single = [key for key in keys if key != group]  # a group that is named must agree, and changes nothing
-        config[group] = _with_own(there, config[group], group, single, config)
+        config[group] = _chosen(group, parent.config.get(group), config.get(group), keys, config, parent)
     config["generator"] = generator_of(config, parent)
     config["parent"] = as_parent(parent.config, parent.path, parent.step, parent.weights)
     data = config["data"]
@@ -112,18 +102,32 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
     return config
 
 
-def _with_own(
-    theirs: Mapping[str, Any], ours: Mapping[str, Any], group: str, asked: Sequence[str], config: Mapping[str, Any]
-) -> dict[str, Any]:
-    """The parent's group of options, with ours where they were asked for and may be other than the parent's."""
-    found = dict(theirs)
-    for name, value in ours.items():
-        key = f"{group}.{name}"
-        if isinstance(value, Mapping) and isinstance(theirs.get(name), Mapping):
-            found[name] = _with_own(theirs[name], value, key, asked, config)
-        elif inherited(key, config) == "unless_given" and any(f"{key}.".startswith(f"{one}.") for one in asked):
-            found[name] = value
-    return found
+ABSENT = object()
+
+
+def _chosen(key: str, theirs: Any, ours: Any, asked: Sequence[str], config: Mapping[str, Any], parent: Parent) -> Any:
+    """The parent's value of a key, or ours where the command line asked for it and it may differ.
+
+    Raises:
+        InputError: the command line asks for a value that the parent's weights do not fit.
+    """
+    group, may_differ = key.partition(".")[0], inherited(key, config) == "unless_given"
+    if key == group and (ours is None or not isinstance(theirs, Mapping) or (may_differ and key in asked)):
+        return ours if isinstance(theirs, Mapping) and may_differ and key in asked else theirs
+    if isinstance(theirs, Mapping) and isinstance(ours, Mapping):
+        values = {name: _chosen(f"{key}.{name}", theirs.get(name, ABSENT), value, asked, config, parent)
+                  for name, value in ours.items()}  # fmt: skip
+        return {**theirs, **{name: value for name, value in values.items() if value is not ABSENT}}
+    named = any(one != group and f"{key}.".startswith(f"{one}.") for one in asked)
+    if may_differ:
+        return ours if named else theirs
+    differs = key in asked if theirs is ABSENT else ours != theirs
+    if differs and (named or group in asked) and not (key == "encoding.reflectance" and ours == AUTO):
+        raise InputError(
+            f"{key} is {ours} here, but {'not known' if theirs is ABSENT else theirs} in {parent.path}, whose weights "
+            f"this run starts from. Leave it out: the {group} is the parent's."
+        )
+    return theirs
 
 
 def with_scales(config: dict[str, Any], asked: Sequence[str]) -> dict[str, Any]:
@@ -229,21 +233,3 @@ def check_finished(init: Path, parent: Checkpoint) -> None:
             f"{init} has stopped at step {parent.step} of {wanted}: finish it, or name the checkpoint to start from, "
             f"{parent.path}."
         )
-
-
-def _check_agrees(key: str, config: Mapping[str, Any], parent: Parent) -> None:
-    group = key.split(".")[0]
-    theirs, ours = parent.config.get(group), config.get(group)
-    if inherited(key, config) != "always" or ours is None:
-        return
-    there = dict(flatten({group: theirs}))
-    for leaf, value in flatten({group: ours}):
-        asked = leaf == key or leaf.startswith(f"{key}.")
-        if leaf == "encoding.reflectance" and value == AUTO:
-            continue
-        unknown = leaf not in there and leaf == key
-        if asked and inherited(leaf, config) == "always" and (unknown or there.get(leaf, value) != value):
-            raise InputError(
-                f"{leaf} is {value} here, but {there.get(leaf, 'not known')} in {parent.path}, whose weights this run "
-                f"starts from. Leave {key} out: the {group} is the parent's."
-            )
