@@ -3,12 +3,10 @@
 import math
 import time
 from collections.abc import Iterable, Mapping
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.flow.straightness import curvature
@@ -20,7 +18,7 @@ from r2flow.noise import Draws
 from r2flow.progress import track
 from r2flow.reports.outputs import draw_pages, what_next, write_scan
 from r2flow.reports.pages import Page, write_page
-from r2flow.reports.pictures import BACKGROUND, FOREGROUND, dark_figure, draw_range
+from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.tables import print_table, table
 from r2flow.runs.folder import read_config
 
@@ -73,7 +71,8 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
         "The lines of the panel:",
         table(rows, {"flow": "flow", "steps": "steps", **{line: line for line in PANEL}}),
     ]
-    figures = {"chain": figure(drawn, list(flows))}
+    titles = [f"{name}, {steps} step{'s' * (steps > 1)}" for name, steps in cells]
+    figures = {"chain": contact_sheet([drawn[cell][0] for cell in cells], rays, titles)}
     page = Page("chain", "From many steps to few", text, rows, figures, command, {"evaluation": 0}, device)
     written = write_page(page, out)[-1]
     print_table(rows, COLUMNS)
@@ -116,23 +115,3 @@ def bend(flow: Checkpoint, num: int) -> float:
     x_0 = Draws(0, range(num)).start(followed.noise_shape).to(followed.device)
     with torch.inference_mode():
         return float(curvature(followed.velocity, x_0, MANY).normalised.median())
-
-
-def figure(drawn: Mapping[tuple[str, int], np.ndarray], names: list[str]) -> Figure:
-    """One scan by every generator (rows) at every number of steps (columns)."""
-    columns = sorted({steps for _, steps in drawn})
-    sheet = dark_figure(5.2 * len(columns), 1.35 * len(names) + 0.4)
-    axes = sheet.subplots(len(names), len(columns), squeeze=False)
-    for (row, name), (column, steps) in product(enumerate(names), enumerate(columns)):
-        cell = axes[row][column]
-        if (name, steps) in drawn:
-            draw_range(cell, drawn[name, steps][0], label=False)
-        else:
-            cell.set(facecolor=BACKGROUND, xticks=[], yticks=[])
-            cell.spines[:].set_visible(False)
-        if row == 0:
-            cell.set_title(f"{steps} step{'s' * (steps > 1)}", color=FOREGROUND, fontsize=11)
-        if column == 0:
-            cell.set_ylabel(name, color=FOREGROUND, fontsize=11)
-    sheet.subplots_adjust(left=0.05, right=0.99, top=0.88, bottom=0.02, wspace=0.03, hspace=0.08)
-    return sheet

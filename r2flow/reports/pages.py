@@ -13,7 +13,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -102,15 +101,12 @@ def prepare_folder(out: str | Path) -> Path:
 
 def provenance(page: Page) -> dict[str, Any]:
     """The machine, the versions, the seeds, the date and the command of a page. No paths but the command's."""
-    machine: dict[str, Any] = {
-        "cpu": _cpu_name(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
-        "threads": torch.get_num_threads(),
-        "load": round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None,
-        "system": f"{platform.system()} {platform.machine()}",
-    }
-    if page.device.startswith("cuda"):
-        machine["gpu"] = torch.cuda.get_device_name(page.device)
+    cuda = page.device.startswith("cuda")
+    machine = {
+        "cpu": _cpu_name(), "cores": os.cpu_count() or 1, "threads": torch.get_num_threads(),
+        "system": platform.platform(terse=True),
+        **({"gpu": torch.cuda.get_device_name(page.device)} if cuda else {}),
+    }  # fmt: skip
     return {
         "report": page.title,
         "command": page.command,
@@ -120,11 +116,6 @@ def provenance(page: Page) -> dict[str, Any]:
         "seeds": dict(page.seeds),
         "device": page.device,
     }
-
-
-def picture(name: str) -> str:
-    """The line of Markdown that places a page's figure in its text."""
-    return f"![{name.replace('_', ' ')}]({name}.png)"
 
 
 def blank_figure(width: float, height: float, title: str = "") -> Figure:
@@ -144,19 +135,12 @@ def few_log_ticks(axis: Any) -> None:
 
 
 def _write_figure(figure: Figure, path: Path, origin: Mapping[str, Any]) -> Path:
-    from PIL import Image, PngImagePlugin  # what matplotlib writes with
-
-    canvas = figure.canvas
-    assert isinstance(canvas, FigureCanvasAgg)
+    """Write a PNG that carries its origin: figures travel without their page."""
     take_names_as_they_are(figure)
-    canvas.draw()
-    # A palette makes it a third of the size, and figures go into repositories.
-    image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()).quantize(128)
-    notes = PngImagePlugin.PngInfo()  # figures travel without their page
-    for name, text in (("Title", origin["report"]), ("Source", origin["command"]), ("Description", json.dumps(origin))):
-        notes.add_itxt(name, printable(str(text)))
+    # Latin-1 is all that the notes of a PNG hold.
+    note = printable(json.dumps(origin)).encode("latin-1", "backslashreplace").decode("latin-1")
     with atomic_write(path) as file:
-        image.save(file, format="png", optimize=True, pnginfo=notes)
+        figure.savefig(file, format="png", dpi=100, metadata={"Title": origin["report"], "Description": note})
     return path
 
 
@@ -182,9 +166,7 @@ def _json(contents: Mapping[str, Any]) -> str:
 
 
 def _markdown(page: Page, origin: Mapping[str, Any]) -> str:
-    # A figure that the text does not place itself stands above it.
-    placed = "\n".join(page.text)
-    pictures = [picture(name) for name in page.figures if picture(name) not in placed]
+    pictures = [f"![{name.replace('_', ' ')}]({name}.png)" for name in page.figures]
     notes = [f"- {key}: {_one_line(value)}" for key, value in origin.items() if key not in ("report", "command")]
     again = ["## Where this comes from", "Made with", f"```\n{page.command}\n```", "\n".join(notes)]
     return "\n\n".join([f"# {page.title}", *pictures, *page.text, *again]) + "\n"
