@@ -79,8 +79,8 @@ def test_errors_are_one_line(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
     (tmp_path / "wrong.yaml").write_text("name: mine\nelevations: [1, 2]\n")
     for arguments, words in (
         ([tmp_path / "one.bin"], "too few"),
-        ([tmp_path / "text.bin"], "is text"),
-        ([tmp_path / "notes.txt"], "no field x, y, z; it has: text"),
+        ([tmp_path / "text.bin"], "text"),
+        ([tmp_path / "notes.txt"], "no line of numbers"),
         ([tmp_path / "empty"], "holds no scan"),
         ([tmp_path / "missing"], "does not exist"),
         ([scans, "--out", tmp_path / "mine.txt"], "--out must be a .yaml"),

@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
 from r2flow.lidar.sensors import Convention, Sensor
 from r2flow.lidar.unfolding import unfolded_rows
 
@@ -47,8 +46,7 @@ def project(
         Range in metres and reflectance, (2, H, W) float32; 0 where no return was kept.
 
     Raises:
-        InputError: an unknown projection or convention; or a scan that does not unfold into the
-            sensor's rings.
+        InputError: a scan that does not unfold into the sensor's rings.
     """
     hit, chosen, r = project_indices(xyz, sensor, projection, convention, ring)
     return image_of(sensor, hit, r, None if reflectance is None else reflectance[chosen])
@@ -75,8 +73,8 @@ def project_indices(
     Returns:
         The pixels that keep one, h W + w, ascending; the index of its point in `xyz`; its range in metres: (M,) each.
     """
-    if convention not in CONVENTIONS:
-        raise InputError(f"no projection convention named {convention!r}; known: {', '.join(CONVENTIONS)}.")
+    assert convention in CONVENTIONS, convention
+    assert projection in PROJECTIONS, projection
     xyz = np.asarray(xyz, dtype=np.float32)
     rows, columns = sensor.shape
     r = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
@@ -110,8 +108,6 @@ def _rows(
     """Row of every point, (N,) int64; outside [0, H) where the view does not hold it."""
     if projection == "unfolding":
         return unfolded_rows(xyz, sensor, convention, ring)
-    if projection != "spherical":
-        raise InputError(f"no projection named {projection!r}; known: {', '.join(PROJECTIONS)}.")
     rows = sensor.shape[0]
     elevation = np.arcsin(xyz[:, 2] / np.maximum(r, np.float32(1e-12)))
     edges = np.deg2rad(sensor.row_edges)

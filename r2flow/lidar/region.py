@@ -68,13 +68,8 @@ class Region:
         return Region(self.shape, self.top, self.height, left % self.shape[1], width)
 
     def rounded(self, unit: tuple[int, int]) -> "Region":
-        """The smallest region around this one that is made of whole units of rows and columns.
-
-        Raises:
-            InputError: the image is not made of them.
-        """
-        if any(size % step for size, step in zip(self.shape, unit, strict=True)):
-            raise InputError(f"an image of {self.shape} is not made of units of {unit} pixels.")
+        """The smallest region around this one of whole units of rows and columns, of which the image is made."""
+        assert not any(size % step for size, step in zip(self.shape, unit, strict=True)), unit
         top, height = _outward(self.top, self.height, unit[0])
         left, width = _outward(self.left, self.width, unit[1])
         if width >= self.shape[1]:  # both ends may lie in one unit

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import chain, pairwise
-from types import UnionType
+from operator import index
 from typing import Any, Literal
 
 import numpy as np
@@ -35,9 +35,7 @@ class Sensor:
         reflectance_scale: The value in its scan files that means full reflectance; None where they do not say.
 
     Raises:
-        InputError: fewer than two rows or one column, more than `MOST_PIXELS`, elevations that do not fall or leave
-            (-90, 90) degrees, range limits that are not 0 < min_range < max_range, a height that is not positive,
-            a firing order that does not name every row once, or a scale of reflectance that is not positive.
+        InputError: a value that no sensor has; NaN is refused too, since comparisons with it are false.
     """
 
     name: str
@@ -50,35 +48,23 @@ class Sensor:
     reflectance_scale: float | None = None
 
     def __post_init__(self) -> None:
-        e = self.elevations
-        # Comparisons with NaN are false: it is refused too.
-        if len(e) < 2 or not all(a > b for a, b in pairwise(e)) or not (e[0] < 90 and e[-1] > -90):
-            raise InputError(
-                f"sensor {self.name!r}: elevations must be two or more, fall from the top row down and lie "
-                f"within (-90, 90) degrees; found {len(e)} of them, {list(e)[:4]}..."
-            )
-        if self.columns < 1:
-            raise InputError(f"sensor {self.name!r}: columns must be at least 1, found {self.columns}.")
-        if len(e) * self.columns > MOST_PIXELS:
-            raise InputError(
-                f"sensor {self.name!r}: an image has at most {MOST_PIXELS:,} pixels, found {len(e)} x {self.columns}."
-            )
-        if not (0 < self.min_range < self.max_range < math.inf):
-            raise InputError(
-                f"sensor {self.name!r}: needs 0 < min_range < max_range, "
-                f"found {self.min_range} and {self.max_range} metres."
-            )
-        if not 0 < self.height < math.inf:
-            raise InputError(f"sensor {self.name!r}: height must be metres above the ground, found {self.height}.")
-        if self.firing is not None and sorted(self.firing) != list(range(len(e))):
-            raise InputError(
-                f"sensor {self.name!r}: firing must name each of the rows 0 to {len(e) - 1} once, one for each laser; "
-                f"found {len(self.firing)} of them, {list(self.firing)[:4]}..."
-            )
-        if self.reflectance_scale is not None and not 0 < self.reflectance_scale < math.inf:
-            raise InputError(
-                f"sensor {self.name!r}: reflectance_scale must be a positive number, found {self.reflectance_scale}."
-            )
+        e, near, far, scale = self.elevations, self.min_range, self.max_range, self.reflectance_scale
+        fall = len(e) >= 2 and all(a > b for a, b in pairwise(e)) and e[0] < 90 and e[-1] > -90
+        for holds, rule, value in (
+            (fall, "elevations must be two or more, fall from the top row down, within (-90, 90) degrees", [*e[:4]]),
+            (self.columns >= 1, "columns must be at least 1", self.columns),
+            (len(e) * self.columns <= MOST_PIXELS, f"at most {MOST_PIXELS:,} pixels", f"{len(e)} x {self.columns}"),
+            (0 < near < far < math.inf, "needs 0 < min_range < max_range in metres", f"{near} and {far}"),
+            (0 < self.height < math.inf, "height must be metres above the ground", self.height),
+            (
+                self.firing is None or sorted(self.firing) == [*range(len(e))],
+                "firing must name each row once",
+                self.firing,
+            ),
+            (scale is None or 0 < scale < math.inf, "reflectance_scale must be a positive number", scale),
+        ):
+            if not holds:
+                raise InputError(f"sensor {self.name!r}: {rule}; found {str(value)[:80]}.")
 
     def described(self) -> dict[str, Any]:
         """What its images depend on, as plain values: all fields but the scale of the files' reflectance."""
@@ -107,10 +93,9 @@ class Sensor:
         """
         if convention == "centre":
             elevation, shift = np.asarray(self.elevations, dtype=np.float64), 0.5
-        elif convention == "reference":
-            elevation, shift = self.row_edges[:-1], 0.0
         else:
-            raise InputError(f"no ray convention named {convention!r}; known: centre, reference.")
+            assert convention == "reference", convention
+            elevation, shift = self.row_edges[:-1], 0.0
         azimuth = math.pi - 2 * math.pi * (np.arange(self.columns) + shift) / self.columns
         grid = np.stack(np.meshgrid(np.deg2rad(elevation), azimuth, indexing="ij"))
         return torch.from_numpy(grid.astype(np.float32))
@@ -125,10 +110,9 @@ class Sensor:
         old = len(self.elevations)
         if rows is None or rows == old:
             return sensor
-        most = MOST_PIXELS // sensor.columns
-        if not 2 <= rows <= most:
+        if not 2 <= rows <= MOST_PIXELS // sensor.columns:
             raise InputError(
-                f"sensor {self.name!r}: an image of {sensor.columns} columns has 2 to {most:,} rows, found {rows}."
+                f"sensor {self.name!r}: rows must be 2 or more, at most {MOST_PIXELS:,} pixels; found {rows}."
             )
         edges = np.interp(np.linspace(0, old, rows + 1), np.arange(old + 1), self.row_edges)
         middle = (edges[:-1] + edges[1:]) / 2
@@ -141,7 +125,7 @@ def evenly_spaced(top: float, bottom: float, rows: int) -> tuple[float, ...]:
     return tuple(top - step * (row + 0.5) for row in range(rows))
 
 
-def _beams(top: float, step: float, count: int) -> Sequence[float]:
+def _beams(top: float, step: float, count: int) -> tuple[float, ...]:
     return tuple(top - step * beam for beam in range(count))
 
 
@@ -197,16 +181,16 @@ SENSORS: Registry[Sensor] = Registry(
     hdl64e_rings=Sensor("hdl64e_rings", HDL64E_RINGS),
     hdl32e=Sensor(
         "hdl32e",
-        tuple(_beams(32 / 3, 4 / 3, 32)),
+        _beams(32 / 3, 4 / 3, 32),
         min_range=1.0,
         max_range=100.0,
         height=1.84,
         firing=_halves_in_turn(32),
     ),
-    vlp16=Sensor("vlp16", tuple(_beams(15.0, 2.0, 16)), min_range=0.5, max_range=100.0, firing=_halves_in_turn(16)),
+    vlp16=Sensor("vlp16", _beams(15.0, 2.0, 16), min_range=0.5, max_range=100.0, firing=_halves_in_turn(16)),
     vlp32c=Sensor("vlp32c", **_by_laser(VLP32C_LASERS), min_range=0.5, max_range=200.0),
-    os1_64=Sensor("os1_64", tuple(_beams(16.6, 33.2 / 63, 64)), min_range=0.8, max_range=120.0),
-    os1_128=Sensor("os1_128", tuple(_beams(22.5, 45 / 127, 128)), min_range=0.8, max_range=120.0),
+    os1_64=Sensor("os1_64", _beams(16.6, 33.2 / 63, 64), min_range=0.8, max_range=120.0),
+    os1_128=Sensor("os1_128", _beams(22.5, 45 / 127, 128), min_range=0.8, max_range=120.0),
     pandar64=Sensor("pandar64", PANDAR64_CHANNELS, min_range=0.3, max_range=200.0),
 )
 
@@ -229,20 +213,12 @@ def build_sensor(
     """
     if elevations is not None and name in SENSORS:
         raise InputError(f"{name!r} is the name of a built-in sensor; give your own sensor another one.")
-    if elevations is None:
-        sensor = SENSORS[name]
-    else:
-        sensor = Sensor(name, tuple(map(float, _numbers(name, "elevations", elevations, int | float))))
-    if firing is not None:
-        sensor = replace(sensor, firing=_numbers(name, "firing", firing, int))
     limits = {"min_range": min_range, "max_range": max_range, "height": height, "reflectance_scale": reflectance_scale}
-    given = {key: float(value) for key, value in limits.items() if value is not None}
+    try:
+        given = {key: float(value) for key, value in limits.items() if value is not None}
+        sensor = SENSORS[name] if elevations is None else Sensor(name, tuple(e + 0.0 for e in elevations))
+        if firing is not None:
+            sensor = replace(sensor, firing=tuple(map(index, firing)))
+    except (OverflowError, TypeError) as error:  # a whole number of YAML has any number of digits, a list any values
+        raise InputError(f"sensor {name!r}: elevations, firing and limits must be numbers; {error}.") from None
     return replace(sensor.resized(rows, columns), **given)  # type: ignore[arg-type]
-
-
-def _numbers(name: str, key: str, values: Sequence[Any], kind: type | UnionType) -> tuple[Any, ...]:
-    for value in values:
-        if not isinstance(value, kind) or isinstance(value, bool):
-            what = "whole numbers" if kind is int else "numbers"
-            raise InputError(f"sensor {name!r}: {key} must be a list of {what}, found {value!r} in it.")
-    return tuple(values)

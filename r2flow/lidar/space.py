@@ -72,14 +72,12 @@ class ModelSpace:
             scan to scan. Reflectance is 0 where it is not known.
 
         Raises:
-            InputError: images of another shape, or NaN.
+            InputError: images of another shape.
         """
         images = torch.as_tensor(images)
         if images.ndim != 4 or images.shape[1] not in (1, 2) or tuple(images.shape[2:]) != self.sensor.shape:
             h, w = self.sensor.shape
             raise InputError(f"range images have the shape (B, 2 or 1, {h}, {w}), found {tuple(images.shape)}.")
-        if not bool(images.isfinite().all()):
-            raise InputError("range images hold NaN or infinite values; a ray without a return has the range 0.")
         rays = self.sensor.rays()
         clouds = (image_to_points(image, rays) for image in images.float().cpu().numpy())
         return [np.column_stack(cloud) for cloud in clouds]

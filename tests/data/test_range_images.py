@@ -56,7 +56,7 @@ FILES = {
     "a huge shape": (with_header(SHAPE.format((2, 2**31, 2**31))), "Is it damaged"),
     "a huge shape of one channel": (with_header(SHAPE.format((1, 10**6, 10**6))), "Is it damaged"),
     "a negative shape": (with_header(SHAPE.format((2, -8, 32))), "Is it damaged"),
-    "another type": (npy(IMAGE.astype(np.int32)), "not floats"),
+    "another type": (npy(IMAGE.astype(np.int32)), "not points"),
     "objects": (npy(np.array([[[Told()]]] * 2, dtype=object), allow_pickle=True), "not numbers"),
     "nothing": (b"", "is empty"),
 }

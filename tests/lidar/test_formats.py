@@ -227,7 +227,7 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
         ("x,y,z\n", "no line"),
         ("1,5;2,5;3,5\n" * 3, "no field"),  # decimal commas
         ("1 2\n3 4\n", "2 columns without names"),
-        ("1,2,,4\n" * 3, "no field x"),
+        ("1,2,,4\n" * 3, "NaN"),
         ("time,lat,lon\n1,2,3\n", "no field x, y, z; it has: time, lat, lon"),
         ("1 2 3\n4 5\n", "number of columns changed"),
         ("1 2 3\nfour 5 6\n", "four"),

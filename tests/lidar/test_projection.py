@@ -218,10 +218,3 @@ def test_unfolded_real_scans_unproject_to_their_points(shared):
         there = unproject(torch.from_numpy(image[None, :1]), sensor.rays())[0].numpy()[:, seen].T
         height_error = np.abs(there[:, 2] - points.xyz[image[1][seen].astype(int), 2])
         assert np.median(height_error) < 0.05
-
-
-def test_unknown_names_are_refused():
-    with pytest.raises(InputError, match="no projection named"):
-        project(np.ones((1, 3)), None, HDL64E, "cylindrical")
-    with pytest.raises(InputError, match="no projection convention"):
-        project(np.ones((1, 3)), None, HDL64E, convention="center")

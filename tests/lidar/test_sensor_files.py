@@ -55,7 +55,7 @@ def test_the_configs_of_built_in_sensors_are_sensor_files():
         ("name: 12\nelevations: [2, 1]", "name must be a word"),
         (MINE + "colums: 3", "Did you mean 'columns'?"),
         (MINE + "columns: wide", "columns must be a whole number"),
-        (MINE + "firing: [0, 1]", "firing must name each of the rows 0 to 3"),
+        (MINE + "firing: [0, 1]", "firing must name"),
         ("name: mine\nelevations: 5", "elevations must be a list"),
         ("name: mine\nelevations: [1, 2]", "fall from the top"),
         ("name: mine", "no sensor named 'mine'"),

@@ -58,9 +58,9 @@ def test_impossible_sensors_are_refused():
     with pytest.raises(InputError, match="columns"):
         Sensor("s", (1.0, 0.0), columns=0)
     # Sizes that no memory holds are refused before anything is allocated.
-    with pytest.raises(InputError, match="at most 16,777,216 pixels, found 2 x 10000000000000"):
+    with pytest.raises(InputError, match="at most 16,777,216 pixels"):
         Sensor("s", (1.0, 0.0), columns=10**13)
-    with pytest.raises(InputError, match="has 2 to 16,384 rows, found 10000000000000"):
+    with pytest.raises(InputError, match="at most 16,777,216 pixels"):
         build_sensor("hdl64e", 10**13)
     with pytest.raises(InputError, match="Did you mean 'hdl64e'"):
         build_sensor("hdl64")
@@ -138,13 +138,14 @@ def test_a_user_s_own_sensor_is_built():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"elevations": [2, "a"]}, "elevations must be a list of numbers, found 'a'"),
-        ({"elevations": [2, True]}, "elevations must be a list of numbers, found True"),
+        ({"elevations": [2, "a"]}, "must be numbers"),
+        ({"elevations": [2, 10**400]}, "must be numbers"),
+        ({"elevations": [2, 1], "max_range": 10**400}, "must be numbers"),
         ({"elevations": [1, 2]}, "fall from the top"),
         ({"elevations": [2, math.nan]}, "fall from the top"),
         ({"elevations": [90, 2]}, "within (-90, 90)"),
-        ({"elevations": [2, 1], "firing": [0, 0]}, "firing must name each of the rows 0 to 1 once"),
-        ({"elevations": [2, 1], "firing": [0, 1.0]}, "firing must be a list of whole numbers, found 1.0"),
+        ({"elevations": [2, 1], "firing": [0, 0]}, "firing must name"),
+        ({"elevations": [2, 1], "firing": [0, 1.0]}, "must be numbers"),
         ({"elevations": [2, 1], "height": math.inf}, "height must be metres above the ground"),
         ({"elevations": [2, 1], "max_range": math.nan}, "min_range < max_range"),
         ({"name": "vlp16", "elevations": [2, 1]}, "another one"),
