@@ -1,12 +1,9 @@
-import gzip
 import hashlib
 import io
 import os
 import pickle
 import signal
 import tarfile
-import tracemalloc
-import zipfile
 
 import pytest
 import torch
@@ -192,25 +189,6 @@ def test_archives_of_nothing_of_several_and_of_halves_are_said(tmp_path):
         read_published(path)
 
 
-def test_a_byte_that_came_otherwise_is_damage(tmp_path, pointnet):
-    _, path = pointnet
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1  # in the midst of a tensor, where the file still reads as one
-    path.write_bytes(data)
-    with pytest.raises(InputError, match="damaged"):
-        read_published(path)
-    # Stored uncompressed in a gzip file: the check sum alone says that a tensor is another.
-    whole, archive = gzip.decompress(pack(tmp_path, "tar.gz").read_bytes()), tmp_path / "stored.tar.gz"
-    archive.write_bytes(gzip.compress(whole, 0))
-    assert set(read_published(archive)[0]) == {name for part in PARTS.values() for name in part}
-    at = gzip.compress(whole, 0).index(torch.ones(2).numpy().tobytes())
-    packed = bytearray(archive.read_bytes())
-    packed[at + 1] ^= 1
-    archive.write_bytes(packed)
-    with pytest.raises(InputError, match="damaged"):
-        read_published(archive)
-
-
 def test_settings_of_an_archive_are_a_table_of_whatever(tmp_path, pointnet):
     network, _ = pointnet
     (tmp_path / "net").mkdir()
@@ -218,7 +196,7 @@ def test_settings_of_an_archive_are_a_table_of_whatever(tmp_path, pointnet):
     (tmp_path / "net" / "arch_cfg.yaml").write_text("date: 2020-01-01\n")
     assert add("pointnet", tmp_path / "net").weights == weights_hash(network)
     (tmp_path / "net" / "arch_cfg.yaml").write_text("[1, 2]\n")
-    with pytest.raises(InputError, match="no table of settings"):
+    with pytest.raises(InputError, match="not a table"):
         add("pointnet", tmp_path / "net")
 
 
@@ -238,56 +216,6 @@ def test_what_is_kept_is_safetensors(pointnet, folder):
     assert [file.name for file in folder.iterdir()] == ["pointnet.safetensors"]
 
 
-def grown(read) -> int:
-    """The most bytes of Python's and NumPy's memory that reading a refused file takes."""
-    tracemalloc.start()
-    try:
-        with pytest.raises(InputError) as caught:
-            read()
-        assert "\n" not in str(caught.value)
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-
-
-@pytest.mark.parametrize("name", ["model.ckpt", "notes.txt"])
-def test_an_archive_that_unpacks_to_far_more_is_refused_before_it_does(tmp_path, name):
-    path = tmp_path / "bomb.tar.gz"
-    with tarfile.open(path, "w:gz") as tar:
-        info = tarfile.TarInfo(name)
-        info.size = 100 << 20
-        tar.addfile(info, Zeros(info.size))
-    assert path.stat().st_size < 1 << 20
-    assert grown(lambda: read_published(path)) < 8 << 20
-
-
-class Zeros(io.RawIOBase):
-    """So many bytes of zero."""
-
-    def __init__(self, size: int) -> None:
-        self.left = size
-
-    def readable(self) -> bool:
-        return True
-
-    def read(self, size: int = -1) -> bytes:
-        size = min(size, self.left)
-        self.left -= size
-        return bytes(size)
-
-
-def test_bombs_of_zip_of_gzip_and_of_views_are_refused(tmp_path):
-    path = tmp_path / "weights.pth"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("archive/data/0", "w") as entry:
-        for _ in range(100):
-            entry.write(bytes(1 << 20))
-    assert grown(lambda: read_published(path)) < 8 << 20
-    path.write_bytes(gzip.compress(bytes(100 << 20)))
-    assert grown(lambda: read_published(path)) < 8 << 20
-    torch.save({"weight": torch.zeros(1).expand(10**5, 10**5)}, path)  # four bytes that say they are forty gigabytes
-    assert grown(lambda: read_published(path)) < 8 << 20
-
-
 def test_pipes_and_devices_are_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe.pth")
     os.mkfifo(tmp_path / "pipe.safetensors")
@@ -303,11 +231,3 @@ def test_pipes_and_devices_are_refused_at_once(tmp_path):
             add("pointnet", tmp_path / "folder")
     finally:
         signal.alarm(0)
-
-
-def test_settings_that_repeat_themselves_are_refused(tmp_path):
-    (tmp_path / "model.ckpt").write_bytes(saved(PARTS["backbone"]))
-    lines = ["a0: &a0 [1, 1]", *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 30))]
-    (tmp_path / "arch_cfg.yaml").write_text("\n".join(lines))
-    with pytest.raises(InputError, match="no table of settings"):
-        read_published(tmp_path)

@@ -12,10 +12,8 @@ import os
 import pickle
 import re
 import tarfile
-import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, TypeVar
@@ -69,16 +67,12 @@ SOURCES: Registry[Source] = Registry(
     spvcnn=Source("FPVD", f"{R2FLOW}spvcnn_lidm.tar.gz"),
 )
 
-GZIP = b"\x1f\x8b"  # with which such a file begins
 DAMAGES = (tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError, ValueError, OSError)
 
 # Files of an archive that hold parameters, and its config.
 PARTS = ("backbone", "segmentation_decoder", "segmentation_head", "model.ckpt")
 CONFIG = "arch_cfg.yaml"
 LARGEST = 2**31  # bytes of a file: the largest of these networks has 0.2 GB
-MOST_UNPACKED = 4  # times the bytes of its file that weights may take: these hardly compress
-MOST_ALIASES = 20
-SPARE = 2**24  # bytes more, for small files
 
 
 def weights_folder() -> Path:
@@ -136,12 +130,12 @@ def add(name: str, path: Path) -> InstalledWeights:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     sha256 = None if path.is_dir() else hashlib.sha256(path.read_bytes()).hexdigest()
-    found = InstalledWeights(weights_hash(extractor), path.name, sha256, source.matches(path))
+    installed = InstalledWeights(weights_hash(extractor), path.name, sha256, source.matches(path))
     whole = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}  # some share their memory
-    notes = json.dumps({**asdict(found), "config": config}, default=str)
+    notes = json.dumps({**asdict(installed), "config": config}, default=str)
     with atomic_write(kept_file(name)) as file:
         file.write(save(whole, metadata={"r2flow": notes}))
-    return found
+    return installed
 
 
 def read_kept(cls: type[E]) -> E:
@@ -175,7 +169,7 @@ def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors by name, and the archive's config, of a file or of an archive or folder of several.
 
     Raises:
-        InputError: nothing there, nothing of weights in it, or objects that would run code when loaded.
+        InputError: nothing there, no weights in it, or objects that would run code when loaded.
     """
     import yaml
 
@@ -186,108 +180,47 @@ def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if path.suffix == ".safetensors":
         tensors, notes = read_safetensors(path)
         return tensors, notes["config"]
-    most = _most_unpacked(path)
     if not (path.is_dir() or _is_tar(path)):
         with path.open("rb") as file:
-            return _read_torch(file, str(path), most), {}
-    members = _read_members(path, most)
-    parts = [_read_torch(io.BytesIO(members[part]), f"{path}: {part}", most) for part in PARTS if part in members]
+            return _read_torch(file, str(path)), {}
+    members = _read_members(path)
+    parts = [_read_torch(io.BytesIO(members[part]), f"{path}: {part}") for part in PARTS if part in members]
     if not parts:
         raise InputError(f"{path} holds none of {', '.join(PARTS)}; give the archive as it was published.")
-    text = members.get(CONFIG, b"{}")
     try:
-        # A few lines of aliases of aliases stand for billions of values.
-        aliases = sum(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader))
-        config = yaml.safe_load(text) if aliases <= MOST_ALIASES else None
+        config = yaml.safe_load(members.get(CONFIG, b"{}"))
     except (yaml.YAMLError, ValueError, RecursionError):
         config = None
     if not isinstance(config, dict):
-        raise InputError(f"{path}: {CONFIG} is no table of settings; is the archive whole?")
+        raise InputError(f"{path}: {CONFIG} is not a table of settings; is the archive whole?")
     return {name: tensor for part in parts for name, tensor in part.items()}, config
 
 
-def _most_unpacked(path: Path) -> int:
-    """The bytes that the weights in a file or folder may take."""
-    files = path.iterdir() if path.is_dir() else [path]
-    return MOST_UNPACKED * sum(file.stat().st_size for file in files if file.is_file()) + SPARE
-
-
-class _Bounded(io.RawIOBase):
-    """An unpacked stream that ends in an error where it is longer than it may be."""
-
-    def __init__(self, stream: IO[bytes], most: int) -> None:
-        self.stream, self.most = stream, most
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self.stream.tell()
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        if whence == io.SEEK_SET and offset > self.most:
-            raise _TooLong
-        return self.stream.seek(offset, whence)
-
-    def readinto(self, buffer: Any) -> int:
-        data = self.stream.read(len(buffer))
-        if self.stream.tell() > self.most:
-            raise _TooLong
-        buffer[: len(data)] = data
-        return len(data)
-
-
-class _TooLong(Exception):
-    """More bytes than weights of a file take."""
-
-
-@contextmanager
-def _unpacked(path: Path, most: int) -> Iterator[IO[bytes]]:
-    """The bytes of a tar archive, compressed by gzip or not at all."""
-    with path.open("rb") as file:
-        is_packed = file.read(2) == GZIP
-    with gzip.open(path) if is_packed else path.open("rb") as stream:
-        yield io.BufferedReader(_Bounded(stream, most))  # type: ignore[arg-type]
-
-
 def _is_tar(path: Path) -> bool:
-    """Whether a file is a tar archive: one that is compressed is nothing else."""
+    """Whether a file is a tar archive: a compressed one is nothing else."""
     with path.open("rb") as file:
-        return file.read(2) == GZIP or tarfile.is_tarfile(path)
+        return file.read(2) == b"\x1f\x8b" or tarfile.is_tarfile(path)
 
 
-def _too_long(path: Path) -> InputError:
-    return InputError(f"{path} unpacks to far more bytes than weights take; get it again.")
-
-
-def _read_members(path: Path, most: int) -> dict[str, bytes]:
+def _read_members(path: Path) -> dict[str, bytes]:
     """The files of `PARTS` and `CONFIG` in a folder or a tar archive, by their last name."""
-    found: dict[str, bytes] = {}
+    members: dict[str, bytes] = {}
     try:
-        for name, size, file in _opened(path, most):
+        for name, size, file in _opened(path):
             last = PurePosixPath(name).name
             if last not in (*PARTS, CONFIG):
                 continue
-            if last in found:
-                raise InputError(
-                    f"{path} holds several networks ('{last}' twice); unpack it and give the folder of one."
-                )
-            if size > most:
-                raise _too_long(path)
-            found[last] = file.read(size)
-    except InputError:
-        raise
-    except _TooLong:
-        raise _too_long(path) from None
-    except DAMAGES:
+            if last in members or size > LARGEST:
+                raise InputError(f"{path} holds several networks ('{last}' twice), or a file that is too large.")
+            members[last] = file.read()
+    except DAMAGES as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path} is a damaged archive; get it again.") from None
-    return found
+    return members
 
 
-def _opened(path: Path, most: int) -> Iterator[tuple[str, int, IO[bytes]]]:
+def _opened(path: Path) -> Iterator[tuple[str, int, IO[bytes]]]:
     """Name, size and content of each plain file in a folder or a tar archive."""
     if path.is_dir():
         for child in sorted(path.iterdir()):
@@ -295,52 +228,29 @@ def _opened(path: Path, most: int) -> Iterator[tuple[str, int, IO[bytes]]]:
                 with child.open("rb") as part:
                     yield child.name, child.stat().st_size, part
         return
-    with _unpacked(path, most) as stream, tarfile.open(fileobj=stream, mode="r:") as tar:
+    with tarfile.open(path) as tar:
         for member in tar:
             if member.isreg() and (content := tar.extractfile(member)) is not None:
                 yield member.name, member.size, content
-        # A compressed archive ends with a check sum, which is compared when the end is read.
-        while stream.read(2**20):
-            pass
 
 
-def _read_torch(file: IO[bytes], what: str, most: int) -> dict[str, Tensor]:
-    """The tensors of one of torch's files, by name, of at most so many bytes."""
-    _check_sums(file, what, most)
+def _read_torch(file: IO[bytes], label: str) -> dict[str, Tensor]:
+    """The tensors of one of torch's files, by name."""
     try:
         content = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds of errors on other files
         held = re.search(r"(?:GLOBAL|Unsupported (?:global|class):?(?: GLOBAL)?) (\S+)", str(error))
         if held is None or not isinstance(error, pickle.UnpicklingError):
-            raise InputError(f"{what} is not a file of weights.") from None
+            raise InputError(f"{label} is not a file of weights.") from None
         raise InputError(
-            f"{what} is refused: it holds objects that would run code when loaded ({held[1]}). Save its 'state_dict' "
+            f"{label} is refused: it holds objects that would run code when loaded ({held[1]}). Save its 'state_dict' "
             "alone, where you trust it: torch.save(torch.load(FILE, weights_only=False)['state_dict'], 'weights.pth')."
         ) from None
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         content = content["state_dict"]
     if not isinstance(content, dict) or not content or not all(_is_plain(*item) for item in content.items()):
-        raise InputError(f"{what} holds no table of tensors.")
-    if sum(tensor.numel() * tensor.element_size() for tensor in content.values()) > most:
-        raise InputError(f"{what} declares larger tensors than its bytes hold; get it again.")
+        raise InputError(f"{label} holds no table of tensors.")
     return dict(content)
-
-
-def _check_sums(file: IO[bytes], what: str, most: int) -> None:
-    """Verify the check sums of a file of torch's, a .zip, which torch itself does not."""
-    if zipfile.is_zipfile(file):
-        try:
-            with zipfile.ZipFile(file) as archive:
-                if sum(entry.file_size for entry in archive.infolist()) > most:
-                    raise InputError(f"{what} unpacks to far more bytes than weights take; get it again.")
-                whole = archive.testzip() is None
-        except InputError:
-            raise
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError, OSError):
-            whole = False
-        if not whole:
-            raise InputError(f"{what} is damaged: its check sums do not hold; get it again.")
-    file.seek(0)
 
 
 def _is_plain(name: object, value: object) -> bool:
@@ -350,17 +260,15 @@ def _is_plain(name: object, value: object) -> bool:
     return not (value.is_meta or value.is_quantized or value.is_complex())
 
 
-def read_safetensors(
-    path: Path, notes: str = "r2flow", with_tensors: bool = True
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors of a safetensors file, and the notes that are kept with them under a name; those of `add` by default.
+def read_safetensors(path: Path, with_tensors: bool = True) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors of a safetensors file, and the notes of `add`.
 
     Raises:
         InputError: not such a file, or a damaged one.
     """
     try:
         with safe_open(path, framework="pt") as file:
-            noted = parse_json((file.metadata() or {}).get(notes, "{}"))
+            noted = parse_json((file.metadata() or {}).get("r2flow", "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys() if with_tensors}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError):
         raise InputError(f"{path} is not a safetensors file, or a damaged one.") from None
