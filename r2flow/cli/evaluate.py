@@ -415,8 +415,7 @@ def _sampled(label: str, flow: "Checkpoint", num: int, sampling: SamplingOptions
 def _build(names: Sequence[str], bootstrap: int, place: "Process") -> "dict[str, ScanMetric]":
     from r2flow.metrics import METRICS
 
-    options = {"keep": bootstrap > 0, "folder": place.folder}
-    return {name: METRICS[name](**options).to(place.device) for name in dict.fromkeys(names)}
+    return {name: METRICS[name](keep=bootstrap > 0).to(place.device) for name in dict.fromkeys(names)}
 
 
 def _build_those_possible(

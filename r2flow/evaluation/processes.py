@@ -1,13 +1,10 @@
 """An evaluation that the processes of torchrun share."""
 
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
-from pathlib import Path
 
 import torch
 import torch.distributed as dist
@@ -20,7 +17,6 @@ class Process:
     rank: int  # its number
     ranks: int  # how many there are
     device: str  # that it computes on
-    folder: Path | None = None  # where all processes keep the rows of single scans; None for a process alone
 
 
 @contextmanager
@@ -28,7 +24,7 @@ def joined(device: str, environment: Mapping[str, str] = os.environ) -> Iterator
     """Join the group of processes that torchrun has started, and leave it afterwards; alone without torchrun.
 
     The processes take batches by turns, statistics are added up when figures are computed, and every process has all
-    figures. The folder lies in TMPDIR of the first process: on several machines TMPDIR must be a shared folder.
+    figures.
     """
     ranks = int(environment.get("WORLD_SIZE", "1"))
     if ranks == 1 or "RANK" not in environment:
@@ -41,13 +37,8 @@ def joined(device: str, environment: Mapping[str, str] = os.environ) -> Iterator
     # Counts are exchanged on the CPU, statistics on the device that they are on.
     # The first process alone resamples, which can take hours (`--bootstrap`), and the others wait for it.
     dist.init_process_group("cpu:gloo,cuda:nccl" if device.startswith("cuda") else "gloo", timeout=timedelta(days=7))
-    shared: list[str | None] = [tempfile.mkdtemp(prefix="r2flow-rows-") if rank == 0 else None]
     try:
-        dist.broadcast_object_list(shared, src=0)
-        assert shared[0] is not None
-        yield Process(rank, ranks, device, Path(shared[0]))
+        yield Process(rank, ranks, device)
         dist.barrier()
     finally:
-        if rank == 0 and shared[0] is not None:
-            shutil.rmtree(shared[0], ignore_errors=True)
         dist.destroy_process_group()

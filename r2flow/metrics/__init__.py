@@ -1,6 +1,6 @@
 """Distances between real and generated scans, by name; a name means one protocol.
 
-`METRICS[name](keep=..., folder=...)` builds one. Importing this module loads no metric, no network and not torch.
+`METRICS[name](keep=..., sensor=...)` builds one. Importing this module loads no metric, no network and not torch.
 
 Two protocols of the field are not offered: LiDARGen's JSD and MMD keep returns up to 70 m, where all scans here are
 masked to 63 m, and UltraLiDAR's compare voxel centres of real scans with points of generated ones.

@@ -60,7 +60,7 @@ def bootstrap(
     if draws < 4 or not 0 < level < 1:
         raise InputError(f"an interval needs 4 draws and a level within (0, 1), found {draws} and {level}.")
     values = {name: value for name, value in metric.compute().items() if not np.isnan(value)}
-    sizes = {side: len(metric.store(side)) for side in SIDES}
+    sizes = {side: len(metric.kept(side)) for side in SIDES}
     if not values or min(sizes.values()) < metric.fewest:
         return {}
     found: dict[str, list[Tensor]] = {}

@@ -1,7 +1,6 @@
 """Metrics on a network's features of scans."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
@@ -19,7 +18,7 @@ class FeatureMetric(ScanMetric):
 
     Args:
         extractor: The network, or its name in `EXTRACTORS`: then it is loaded with its weights.
-        keep, folder, options: As `ScanMetric`.
+        keep, options: As `ScanMetric`.
 
     Raises:
         InputError: no network of that name, or no weights for it on this machine.
@@ -29,13 +28,11 @@ class FeatureMetric(ScanMetric):
     kind: ClassVar[str]
     names: ClassVar[Mapping[str, str]] = {}
 
-    def __init__(
-        self, extractor: Extractor | str, keep: bool = False, folder: str | Path | None = None, **options: Any
-    ) -> None:
+    def __init__(self, extractor: Extractor | str, keep: bool = False, **options: Any) -> None:
         network = extractor.eval() if isinstance(extractor, Extractor) else extractors.load_extractor(extractor)
         random = "_random" if network.weights == "random" else ""
         name = "" if random else self.names.get(network.name, "")
-        super().__init__(keep, folder, name=name or f"{self.kind}_{network.name}{random}", **options)
+        super().__init__(keep, name=name or f"{self.kind}_{network.name}{random}", **options)
         self.extractor = network
         self.needs_reflectance = network.needs_reflectance
 

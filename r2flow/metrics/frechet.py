@@ -1,18 +1,16 @@
 """Frechet distance between Gaussians that are fitted to features of real and generated scans."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from r2flow.metrics import FIELD_NAMES
-from r2flow.metrics.base import SIDES, Side
+from r2flow.metrics.base import SIDES, Side, blocks
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.features import FeatureMetric
 from r2flow.metrics.moments import add_moments, merge_moments, moments, no_moments
-from r2flow.metrics.store import FeatureStore
 
 BLOCK = 4000  # kept features read at once
 FEW = (
@@ -69,10 +67,8 @@ class FrechetDistance(FeatureMetric):
     fewest = 100  # intervals of 95 % from 50 scans held what is expected in 91 of 100 cases
     settings: ClassVar[Mapping[str, Any]] = {"covariance": "unbiased, n - 1"}
 
-    def __init__(
-        self, extractor: Extractor | str, keep: bool = False, folder: str | Path | None = None, **options: Any
-    ) -> None:
-        super().__init__(extractor, keep, folder, **options)
+    def __init__(self, extractor: Extractor | str, keep: bool = False, **options: Any) -> None:
+        super().__init__(extractor, keep, **options)
         for side in SIDES:
             self.add_state(f"{side}_moments", no_moments(self.extractor.dim), dist_reduce_fx=merge_moments)
 
@@ -89,23 +85,22 @@ class FrechetDistance(FeatureMetric):
         return {name: value}, [FEW] if min(one.n for one in both.values()) <= dim else []
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
+        rows = {side: self.kept(side) for side in SIDES}
         drawn = [
-            distance_from_roots(
-                *weighted_root(self.store("real"), real), *weighted_root(self.store("generated"), other)
-            )
+            distance_from_roots(*weighted_root(rows["real"], real), *weighted_root(rows["generated"], other))
             for real, other in zip(weights["real"], weights["generated"], strict=True)
         ]
         return {self.name: torch.tensor(drawn, dtype=torch.float64)}
 
 
-def weighted_root(store: FeatureStore, weights: Tensor) -> tuple[Tensor, Tensor]:
+def weighted_root(rows: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Mean (D) and A, A A^T = S, of kept features of which number i counts `weights[i]` times.
 
     Of fewer scans than dimensions the centred features themselves are A, (D, N), and no spectrum is needed.
     """
     n = weights.sum()
-    mean = torch.stack([weights[at] @ x for at, x in store.blocks(BLOCK)]).sum(0) / n
-    parts = ((x - mean) * weights[at, None].sqrt() for at, x in store.blocks(BLOCK))
+    mean = torch.stack([weights[at] @ x for at, x in blocks(rows, BLOCK)]).sum(0) / n
+    parts = ((x - mean) * weights[at, None].sqrt() for at, x in blocks(rows, BLOCK))
     if int((weights > 0).sum()) < len(mean):
         centred = torch.cat(list(parts))[weights > 0]
         return mean, centred.T / (n - 1).sqrt()

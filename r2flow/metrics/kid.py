@@ -5,9 +5,8 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from r2flow.metrics.base import SIDES
+from r2flow.metrics.base import SIDES, blocks
 from r2flow.metrics.features import FeatureMetric
-from r2flow.metrics.store import FeatureStore
 
 BLOCK = 2000  # scans: their kernel takes 32 MB
 
@@ -29,14 +28,14 @@ class KernelDistance(FeatureMetric):
     def figures(self) -> tuple[dict[str, float], list[str]]:
         if any(self.count(side) < 2 for side in SIDES):
             return {self.name: float("nan")}, [f"{self.name} needs two scans of each set."]
-        x, y = (self.store(side) for side in SIDES)
+        x, y = (self.kept(side) for side in SIDES)
         return {self.name: _mean(x, x) + _mean(y, y) - 2 * _mean(x, y)}, []
 
 
-def _mean(x: FeatureStore, y: FeatureStore) -> float:
+def _mean(x: Tensor, y: Tensor) -> float:
     """Mean of k - 1 over all pairs of two sets; of one and the same set, without pairs of a scan and itself."""
     within = x is y
-    total = sum(_sum(a, b, within and i == j) for i, a in x.blocks(BLOCK) for j, b in y.blocks(BLOCK))
+    total = sum(_sum(a, b, within and i == j) for i, a in blocks(x, BLOCK) for j, b in blocks(y, BLOCK))
     return total / (len(x) * (len(y) - within))
 
 

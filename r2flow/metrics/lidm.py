@@ -6,13 +6,12 @@ al. (2018). There 2000 samples are compared with KITTI-360's drive 0003.
 """
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from r2flow.metrics.base import SIDES, ScanMetric, Side
+from r2flow.metrics.base import SIDES, ScanMetric, Side, blocks
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.metrics.jsd import one_sided
 from r2flow.metrics.scans import Scans
@@ -46,8 +45,8 @@ class JSDLiDM(ScanMetric):
     keeping = "never"
     resamples = False
 
-    def __init__(self, keep: bool = False, folder: str | Path | None = None, **options: Any) -> None:
-        super().__init__(keep, folder, **options)
+    def __init__(self, keep: bool = False, **options: Any) -> None:
+        super().__init__(keep, **options)
         cells = round(2 * EXTENT / FINE) ** 2
         for side in SIDES:
             self.add_state(f"{side}_cells", torch.zeros(cells, dtype=torch.int32), dist_reduce_fx="sum")
@@ -98,10 +97,10 @@ class MMDLiDM(ScanMetric):
 
     def _nearest(self) -> Tensor:
         """Chamfer distance of every real scan to the nearest generated one, (N)."""
-        real, generated = (self.store(side) for side in SIDES)
+        real, generated = (self.kept(side) for side in SIDES)
         nearest = torch.full((len(real),), torch.inf, dtype=torch.float64)
-        for i, x in real.blocks(BLOCK):
-            for _, y in generated.blocks(BLOCK):
+        for i, x in blocks(real, BLOCK):
+            for _, y in blocks(generated, BLOCK):
                 nearest[i] = torch.minimum(nearest[i], _chamfer(x, y).amin(1))
         return nearest * (COARSE / (2 * EXTENT)) ** 2
 

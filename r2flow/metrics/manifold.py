@@ -6,9 +6,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from r2flow.metrics.base import SIDES
+from r2flow.metrics.base import SIDES, blocks
 from r2flow.metrics.features import FeatureMetric
-from r2flow.metrics.store import FeatureStore
 
 NEIGHBOURS = 5  # k
 BLOCK = 2000  # scans: their distances take 32 MB
@@ -49,13 +48,13 @@ class Manifold(FeatureMetric):
 
     def _per_scan(self) -> dict[str, Tensor]:
         """What each scan of the side in question adds to the figures, (N)."""
-        real, generated = self.store("real"), self.store("generated")
-        middle = next(block for _, block in real.blocks(BLOCK)).mean(0)
-        in_real, in_generated = (radii(store, NEIGHBOURS, middle) * (1 + TIE) for store in (real, generated))
+        real, generated = self.kept("real"), self.kept("generated")
+        middle = real[:BLOCK].double().mean(0)
+        in_real, in_generated = (radii(rows, NEIGHBOURS, middle) * (1 + TIE) for rows in (real, generated))
         balls = torch.zeros(len(generated), dtype=torch.float64)
         recalled, covered = (torch.zeros(len(real), dtype=torch.bool) for _ in range(2))
-        for i, x in real.blocks(BLOCK):
-            for j, y in generated.blocks(BLOCK):
+        for i, x in blocks(real, BLOCK):
+            for j, y in blocks(generated, BLOCK):
                 d = squared_distances(x - middle, y - middle)
                 within = d <= in_real[i, None]
                 balls[j] += within.sum(0)
@@ -69,12 +68,12 @@ class Manifold(FeatureMetric):
         }
 
 
-def radii(store: FeatureStore, k: int, middle: Tensor) -> Tensor:
+def radii(rows: Tensor, k: int, middle: Tensor) -> Tensor:
     """Squared distance of every row from its k-th nearest neighbour among the others, (N), about a common middle."""
     found = []
-    for i, x in store.blocks(BLOCK):
+    for i, x in blocks(rows, BLOCK):
         nearest = torch.full((len(x), k), torch.inf, dtype=torch.float64)
-        for j, y in store.blocks(BLOCK):
+        for j, y in blocks(rows, BLOCK):
             d = squared_distances(x - middle, y - middle)
             if i == j:
                 d.fill_diagonal_(torch.inf)

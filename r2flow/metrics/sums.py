@@ -2,7 +2,6 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.metrics.base import SIDES, ScanMetric, Side
+from r2flow.metrics.base import SIDES, ScanMetric, Side, blocks
 
 BLOCK = 1000  # scans read from a file at once
 
@@ -26,8 +25,8 @@ class SumMetric(ScanMetric):
     real_sum: Tensor
     generated_sum: Tensor
 
-    def __init__(self, keep: bool = False, folder: str | Path | None = None, **options: Any) -> None:
-        super().__init__(keep, folder, **options)
+    def __init__(self, keep: bool = False, **options: Any) -> None:
+        super().__init__(keep, **options)
         for side in SIDES:
             self.add_state(f"{side}_sum", torch.zeros(self.width, dtype=torch.float64), dist_reduce_fx="sum")
             self.add_state(f"{side}_width", torch.tensor(0), dist_reduce_fx="max")
@@ -58,7 +57,7 @@ class SumMetric(ScanMetric):
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
         sums = {}
         for side in SIDES:
-            parts = [weights[side][:, at] @ block for at, block in self.store(side).blocks(BLOCK)]
+            parts = [weights[side][:, at] @ block for at, block in blocks(self.kept(side), BLOCK)]
             sums[side] = torch.stack(parts).sum(0).numpy()
         drawn = [self.figures_of(real, generated) for real, generated in zip(*sums.values(), strict=True)]
         return {name: torch.tensor([one[name] for one in drawn], dtype=torch.float64) for name in drawn[0]}

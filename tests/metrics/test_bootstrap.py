@@ -40,7 +40,8 @@ def given(metric, rows, side):
     """A set by its rows instead of its scans."""
     metric.add_scans(side, len(rows), 0)
     metric.accumulate(rows, side)
-    metric.store(side).write(0, rows)
+    setattr(metric, f"{side}_rows", [rows.float()])
+    setattr(metric, f"{side}_numbers", [torch.arange(len(rows))])
 
 
 class SquaredMeanDistance(SumMetric):

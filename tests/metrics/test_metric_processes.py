@@ -27,11 +27,11 @@ def images(seed, n):
     return torch.cat([r, torch.rand(r.shape, generator=g)], 1)
 
 
-def measure(rank, ranks, folder):
+def measure(rank, ranks):
     """Figures, remarks and intervals of all metrics, of two generated sets one after the other."""
     network = extractor_class("handcrafted").trained()
-    metrics = [METRICS[name](keep=True, folder=folder / name) for name in PLAIN]
-    metrics += [FrechetDistance(network, keep=True, folder=folder), Manifold(network, folder=folder)]
+    metrics = [METRICS[name](keep=True) for name in PLAIN]
+    metrics += [FrechetDistance(network, keep=True), Manifold(network)]
     found = []
     for metric in metrics:
         kept = None
@@ -58,9 +58,9 @@ def on_their_own(network, rank, ranks):
             for real, scans in ((True, images(seed, 14)), (False, images(seed + 1, 11))):
                 for batch in scans.split(3)[rank::ranks]:
                     metric.update(batch, real=real)
-            kept = len(metric.store("real")) if metric.keeps else 0
+            kept = len(metric.kept("real")) if metric.keeps else 0
             found.append([metric.compute(), metric.remarks(), {}])
-            assert not metric.keeps or len(metric.store("real")) == kept  # its own again
+            assert not metric.keeps or len(metric.kept("real")) == kept  # its own again
     return found
 
 
@@ -73,14 +73,14 @@ def give(metric, scans, real, rank, ranks):
 def work(rank, ranks, folder):
     torch.set_num_threads(1)
     dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=ranks)
-    (folder / f"{rank}.json").write_text(json.dumps(measure(rank, ranks, folder / "rows")))
+    (folder / f"{rank}.json").write_text(json.dumps(measure(rank, ranks)))
     dist.destroy_process_group()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ranks", [2, 3])
 def test_processes_have_the_figures_of_one(ranks, tmp_path):
-    expected = measure(0, 1, tmp_path / "alone")
+    expected = measure(0, 1)
     mp.start_processes(work, (ranks, tmp_path), nprocs=ranks, start_method="spawn")
     for rank in range(ranks):
         for one, other in zip(json.loads((tmp_path / f"{rank}.json").read_text()), expected, strict=True):
