@@ -3,8 +3,9 @@
 Notation everywhere: `t = 0` is noise and `t = 1` is data; `x_0 ~ N(0, I)`, `x_1` a scan,
 `x_t = (1 - t) x_0 + t x_1`, target `u_t = x_1 - x_0`, estimate `v_t = v(t, x_t)`.
 
-    flow = r2flow.load("street")  # a model by name, a run folder or a checkpoint
-    scans = flow.sample(4)        # range in metres and reflectance, (4, 2, H, W)
+    flow = r2flow.load("street")              # a model by name, a run folder or a checkpoint
+    scans = flow.sample(4)                    # range in metres and reflectance, (4, 2, H, W)
+    scan = r2flow.read("000000.bin", "vlp16")  # a file's scan as such an image, (2, H, W)
 """
 
 import os
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
     import torch
 
+    from r2flow.lidar.sensors import Sensor
     from r2flow.model.checkpoint import Checkpoint
 
 __version__ = "0.2.0"
@@ -36,3 +38,23 @@ def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoin
     if not isinstance(name, str | os.PathLike):
         raise InputError(f"a model has a name, a run folder or a file; found {name!r}.")
     return load_checkpoint(name, choose_device(str(device), "device"))
+
+
+def read(path: "str | Path", sensor: "Sensor | str | None" = None) -> "torch.Tensor":
+    """A scan from a file: range in metres and reflectance, (2, H, W) float32, 0 where there is no return.
+
+    Args:
+        path: A scan file, or a range image (.npy).
+        sensor: Whose image the points become, or its name, or the YAML file of one. If left out, the sensor that the
+            file's folder names where r2flow wrote it, else hdl64e.
+
+    Raises:
+        InputError: the file cannot be read, or no point lies in the sensor's view.
+    """
+    from r2flow.data.opening import read
+
+    return read(path, sensor)
+
+
+def __dir__() -> list[str]:
+    return ["__version__", "load", "read"]

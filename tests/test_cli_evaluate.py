@@ -131,10 +131,10 @@ def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):
     assert (about["kind"], about["num"], about["steps"], about["noise"]) == ("sampled", 3, 2, "evaluation")
     code, _, said = r2flow("evaluate", real, run, *QUICK[:2], "--size", "16x64", "--num", 3)
     assert code == 2
-    assert "the flow's images are 8x64, not 16x64" in said
+    assert "8x64, not of hdl64e 16x64" in said
     code, _, said = r2flow("evaluate", real, run, *QUICK[:2], "--sensor", "vlp16", "--size", "8x64", "--num", 3)
     assert code == 2
-    assert "the flow looks through hdl64e, not vlp16" in said
+    assert "not of vlp16 8x64" in said
     code, _, said = r2flow("evaluate", real, run, *QUICK[:2], "--projection", "flat", "--num", 3)
     assert code == 2
     assert "--projection must be one of spherical, unfolding; found 'flat'" in said
@@ -336,7 +336,9 @@ def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):  # noqa: F
     run = saved[0].parent.parent
     assert r2flow("sample", "-c", run, "--num", 2, "--steps", 2, "-o", run / "samples", "--pictures", 0)[0] == 0
     note = json.loads((run / "samples" / "scans.json").read_text())
-    assert (len(note["sensor"]["elevations"]), note["sensor"]["columns"], note["projection"]) == (8, 64, "spherical")
+    assert note["reading"]["projection"] == "spherical"
+    sensor = note["reading"]["sensor"]
+    assert (len(sensor["elevations"]), sensor["columns"]) == (8, 64)
     assert (note["seed"], note["sampler"]["steps"], note["encoding"]["max_range"]) == (0, 2, 80.0)
     quick = ("--metrics", "jsd", "--workers", 0)
     code, said, _ = r2flow("evaluate", real, run / "samples", *quick)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.data.opening import open_scans
+from r2flow.data.opening import open_scans, reading_for
 from r2flow.data.reading import Reading
 from r2flow.errors import InputError
 from r2flow.evaluation import measuring
 from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
 from r2flow.evaluation.references import reference_sets
-from r2flow.evaluation.sets import ScanSet, fixed_choice, reading_of_flow, sampled_set
+from r2flow.evaluation.sets import ScanSet, fixed_choice, sampled_set
 from r2flow.evaluation.statistics import FORMAT, Cache, key_of
 from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
@@ -263,7 +263,7 @@ class TestSets:
         parts = [{"convention": "reference", "reflectance_scale": 255.0}, {"convention": "reference"}]
         learned = flow()
         learned.config["data"] = {"name": "mixed", "convention": "centre", "reflectance_scale": 1.0, "parts": parts}
-        found = reading_of_flow(learned)
+        found = reading_for([], learned)
         assert (found.projection, found.convention, found.reflectance_scale) == ("spherical", "reference", 1.0)
 
     def test_a_flow_is_sampled_from_the_noise_of_evaluations(self):

@@ -81,8 +81,8 @@ def complete(
 
     import numpy as np
 
+    from r2flow.data.opening import reading_for
     from r2flow.data.partial import open_partial
-    from r2flow.evaluation.sets import reading_of_flow
     from r2flow.lidar.known import mask_identity, parse_mask
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.model.completion import completing
@@ -94,7 +94,7 @@ def complete(
     mask = None if known.mask is None else parse_mask(known.mask)
     source = None if known.source is None else build_sized(known.source, None)
     loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(answers.device))
-    reading = replace(reading_of_flow(loaded), columns=named_columns(known.columns))
+    reading = replace(reading_for([], loaded), columns=named_columns(known.columns))
     scans, said = open_partial(what, reading, source, known.reflectance_scale, answers.scans)
     sampler = completing(loaded.generator, solver.change(completing(loaded.generator), precision=precision))
     for line in said:

@@ -167,8 +167,8 @@ def evaluate(
             if text in sampled:
                 judged[name] = _sampled(text, flows[text], scans.num or SAMPLED, sampling)
             else:
-                own = _rescaled(text, reading, scans.generated_scale)
-                judged[name] = _open(text, own, scans.generated_split, scans.num)
+                scale = scans.generated_scale or reading.reflectance_scale
+                judged[name] = _open(text, replace(reading, reflectance_scale=scale), scans.generated_split, scans.num)
         sets = [truth, *judged.values()]
         reflectance = all(s.about["reflectance"] for s in sets)
         reflectance = reflectance and all(flow.encoding.reflectance for flow in flows.values())
@@ -372,20 +372,7 @@ def reading_of(
     specs: "Sequence[str | None]", flows: "Sequence[Checkpoint]" = (), how: ReadingOptions | None = None
 ) -> "Reading":
     """How scans become images: as asked for, else as the flow's or one of the named sets' were, else the usual way."""
-    from r2flow.evaluation.sets import reading_of_flow
-
-    flow = reading_of_flow(flows[0]) if flows else None
-    return choose_reading(specs, **vars(how or ReadingOptions()), flow=flow)
-
-
-def _rescaled(generated: str, reading: "Reading", scale: float | None) -> "Reading":
-    """The reading with the scale of reflectance that was asked for, else the generated scans' own."""
-    from r2flow.data.opening import own_reading
-
-    own = own_reading(generated)
-    if scale is None:
-        scale = reading.reflectance_scale if own is None else own.reflectance_scale
-    return replace(reading, reflectance_scale=scale)
+    return choose_reading(specs, **vars(how or ReadingOptions()), model=flows[0] if flows else None)
 
 
 def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> "ScanSet":

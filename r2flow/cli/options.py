@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +13,7 @@ from r2flow.errors import InputError
 if TYPE_CHECKING:
     from r2flow.data.reading import Reading
     from r2flow.lidar.sensors import Sensor
+    from r2flow.model.checkpoint import Checkpoint
 
 CheckpointOption = Annotated[
     Path, typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model.", show_default=False)
@@ -69,13 +69,9 @@ def named_columns(text: str | None) -> tuple[str, ...] | None:
 
 def build_sized(sensor: str, size: str | None) -> "Sensor":
     """The sensor of a name or a YAML file, at an image size written as 64x1024."""
-    from r2flow.lidar.sensor_files import ENDINGS, read_sensor
-    from r2flow.lidar.sensors import build_sensor
+    from r2flow.data.opening import named_sensor
 
-    rows, columns = rows_and_columns(size)
-    if sensor.lower().endswith(ENDINGS):
-        return read_sensor(sensor, rows, columns)
-    return build_sensor(sensor, rows, columns)
+    return named_sensor(sensor, rows_and_columns(size))
 
 
 def choose_reading(
@@ -86,44 +82,15 @@ def choose_reading(
     convention: str | None = None,
     reflectance_scale: float | None = None,
     columns: str | None = None,
-    flow: "Reading | None" = None,
+    model: "Checkpoint | None" = None,
 ) -> "Reading":
-    """How named scans become images of one sensor: as asked for; else as a flow's or one of theirs were; else usual.
+    """`reading_for` with the values of `ReadingOptions`."""
+    from r2flow.data.opening import reading_for
 
-    Args:
-        specs: Names of scans, as for `open_scans`; None is passed over.
-        flow: That of the flow that the scans are compared with.
-
-    Raises:
-        InputError: an unknown name, or another sensor or size than the flow's.
-    """
-    from r2flow.data.opening import own_reading, parse, refuse_other_samples, usual_reading, usual_scale
-    from r2flow.data.options import FOLDER
-
-    named = [spec for spec in specs if spec is not None]
-    own = [reading for spec in named if (reading := own_reading(spec)) is not None]
-    usual = usual_reading(named[0])
-    found = flow or next(iter(own), None) or usual
-    if flow is not None and (sensor is not None or size is not None):
-        chosen = build_sized(sensor or flow.sensor.name, size)
-        if chosen.shape != flow.sensor.shape:
-            asked, there = ("x".join(map(str, one.shape)) for one in (chosen, flow.sensor))
-            raise InputError(f"the flow's images are {there}, not {asked}; leave --sensor and --size out.")
-        if chosen.elevations != flow.sensor.elevations:
-            raise InputError(f"the flow looks through {flow.sensor.name}, not {chosen.name}; leave --sensor out.")
-    elif sensor is not None:
-        found = replace(found, sensor=build_sized(sensor, size))
-    elif size is not None:
-        found = replace(found, sensor=found.sensor.resized(*rows_and_columns(size)))
     check_words(projection=projection, convention=convention)
-    for spec in named:  # before anything is read
-        options, _ = parse(str(spec))
-        if options.name == FOLDER:
-            refuse_other_samples(Path(options.folder), found.sensor)
-    scale = usual_scale(named[0], found.sensor) if reflectance_scale is None else reflectance_scale
-    found = replace(found, reflectance_scale=scale, columns=named_columns(columns))
-    asked_for = {"projection": projection, "convention": convention}
-    return replace(found, **{key: value for key, value in asked_for.items() if value is not None})  # type: ignore[arg-type]
+    return reading_for(
+        specs, model, sensor, rows_and_columns(size), projection, convention, reflectance_scale, named_columns(columns)
+    )
 
 
 def check_words(**options: str | None) -> None:
@@ -141,10 +108,10 @@ def check_words(**options: str | None) -> None:
             raise InputError(f"--{option.replace('_', '-')} must be one of {words}; found {value!r}.")
 
 
-def rows_and_columns(size: str | None) -> tuple[int | None, int | None]:
-    """The numbers of an image size written as 64x1024; of no size, None for both."""
+def rows_and_columns(size: str | None) -> tuple[int, int] | None:
+    """The numbers of an image size written as 64x1024."""
     if size is None:
-        return None, None
+        return None
     parts = size.lower().split("x")
     if len(parts) != 2 or not all(part.isascii() and part.isdigit() and int(part) > 0 for part in parts):
         raise InputError(f"--size must be ROWSxCOLUMNS, as 64x1024; found {size!r}.")

@@ -27,8 +27,7 @@ def paper(
 ) -> None:
     """The paper's tables I and II and figures 3 and 5 to 8: its printed numbers next to those of `evaluate`."""
     from r2flow.cli.output import command, finish
-    from r2flow.data.opening import open_scans
-    from r2flow.evaluation.sets import reading_of_flow
+    from r2flow.data.opening import open_scans, reading_for
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.pages import prepare_folder
     from r2flow.reports.paper import PaperRun, paper_page, read_results, role_of
@@ -44,7 +43,7 @@ def paper(
         if not checkpoint.generator.draws:
             raise InputError(f"{model} is an autoencoder and draws no scans.")
         runs.append(PaperRun(role or role_of(checkpoint, Path(model).stem), model, checkpoint))
-    scans = None if real is None else open_scans(real, reading_of_flow(runs[0].checkpoint))
+    scans = None if real is None else open_scans(real, reading_for([], runs[0].checkpoint))
     prepare_folder(out)
     page = paper_page(runs, read_results(files), scans, num, paths, steps, repeats, command(), where)
     finish(page, out, page.text[:1])

@@ -9,13 +9,14 @@
 
 import json
 import logging
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from r2flow.data import layouts
 from r2flow.data.layouts import Drive, Layout, SourceKind, spans_of
@@ -32,16 +33,16 @@ from r2flow.data.options import (
 from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_images
 from r2flow.data.reading import AUTO, Reading, lacks_reflectance, range_image
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, warn_of_other_sensor
+from r2flow.data.sources import SAMPLES, ScanFiles, ScanSource, SimulatedScans, made_here, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, read_json
-from r2flow.lidar.sensors import SENSORS, Sensor
+from r2flow.lidar.sensor_files import ENDINGS, read_sensor
+from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.registry import Registry, check_options, did_you_mean
-from r2flow.store import MANIFEST, read_manifest
+from r2flow.store import read_manifest
 
 log = logging.getLogger(__name__)
 
-SAMPLES = "scans.json"  # what a folder of samples says of itself
 SCENES = 1000  # of simulated scans, where nobody says how many
 
 
@@ -90,7 +91,7 @@ def open_scans(
     Args:
         spec: A scan file, a range image (.npy) or a folder of them, a folder of `r2flow prepare`, `NAME:ROOT` with a
             name of `SOURCES`, `simulated:SEED`, a folder of samples, or a run folder, which stands for its samples.
-        reading: How scans become images; what the scans say of themselves, or `usual_reading`, if left out.
+        reading: How scans become images; `reading_for` the scans if left out.
         split: A part of the data set's standard split.
         num: At most so many, by a fixed shuffle; the number of simulated scenes.
         own_size: For pictures: a range image's own size is taken in place of the sensor's, and no beams are compared.
@@ -100,7 +101,7 @@ def open_scans(
     """
     label = str(spec)
     options, file = parse(label)
-    reading = reading or own_reading(label) or usual_reading(label)
+    reading = reading or reading_for([label])
     if file is None:
         columns = None if reading.columns is None else list(reading.columns)
         options = replace(options, split=split, scenes=num or SCENES, columns=columns)
@@ -125,6 +126,8 @@ def open_source(options: SourceOptions, reading: Reading, seed: int = 0, first_s
     kind = SOURCES[options.name]
     if options.name == FOLDER:
         refuse_other_samples(Path(options.folder), reading.sensor)
+        if made_here(options.folder):  # which is believed
+            reading = replace(reading, reflectance_scale=1.0)
     if reading.reflectance == AUTO:
         reading = replace(reading, reflectance=kind.lacks_reflectance(options, reading.on_bad_scan) is None)
     return kind.open(options, reading, seed, first_scene)
@@ -163,9 +166,8 @@ def find_drives(
 
 def samples_note(reading: Reading, **about: Any) -> dict[str, Any]:
     """What a folder of samples says of their images, as plain values: `open_scans` then needs no sensor and no size."""
-    images = {"sensor": reading.sensor.described(), "projection": reading.projection, "convention": reading.convention}
-    found: dict[str, Any] = json.loads(json.dumps({"format": "r2flow samples 1", **images, **about}))
-    return found
+    note: dict[str, Any] = json.loads(json.dumps({"format": "r2flow samples", "reading": reading.described(), **about}))
+    return note
 
 
 def write_samples_note(folder: Path, note: Mapping[str, Any]) -> None:
@@ -190,23 +192,99 @@ def samples_of(run: Path) -> Path | None:
     return run / "samples"
 
 
+class Model(Protocol):
+    """A trained generator, as far as its images are concerned."""
+
+    config: Mapping[str, Any]
+
+    @property
+    def sensor(self) -> Sensor: ...
+
+
+def reading_for(
+    scans: Sequence[str | Path | None],
+    model: Model | None = None,
+    sensor: Sensor | str | None = None,
+    size: tuple[int, int] | None = None,
+    projection: str | None = None,
+    convention: str | None = None,
+    reflectance_scale: float | None = None,
+    columns: Sequence[str] | None = None,
+) -> Reading:
+    """How scans become images: as asked for, else as the model's training scans, else as the scans say, else as usual.
+
+    Args:
+        scans: Names as for `open_scans`; None is passed over.
+        model: The model that the scans are for; another sensor or size than the model's is refused.
+        sensor, size, ...: What was asked for; None where nothing was.
+
+    Raises:
+        InputError: an unknown name, or another sensor or size than the model's or a folder's of samples.
+    """
+    named = [str(one) for one in scans if one is not None]
+    own = next((reading for one in named if (reading := own_reading(one)) is not None), None)
+    kind = SOURCES[parse(named[0])[0].name] if named else SourceKind()
+    reading = _reading_of(model) if model else own or Reading(SENSORS[kind.sensor])
+    chosen = named_sensor(sensor or reading.sensor, size)
+    if model is not None and (chosen.shape != model.sensor.shape or chosen.elevations != model.sensor.elevations):
+        there, asked = (f"{one.name} {one.shape[0]}x{one.shape[1]}" for one in (model.sensor, chosen))
+        raise InputError(f"the flow's images are of {there}, not of {asked}; leave --sensor and --size out.")
+    reading = replace(reading, sensor=reading.sensor if model else chosen)
+    for spec in named:  # before anything is read
+        options, _ = parse(spec)
+        if options.name == FOLDER:
+            refuse_other_samples(Path(options.folder), reading.sensor)
+    if reflectance_scale is None and named:
+        reflectance_scale = usual_scale(named[0], reading.sensor)
+    asked_for = {
+        "projection": projection, "convention": convention, "reflectance_scale": reflectance_scale,
+        "columns": None if columns is None else tuple(columns),
+    }  # fmt: skip
+    return replace(reading, **{key: value for key, value in asked_for.items() if value is not None})  # type: ignore[arg-type]
+
+
+def _reading_of(model: Model) -> Reading:
+    """How a model's training scans became images; of a mixture, what all its parts say, else what the run says."""
+    data = model.config.get("data", {})
+    usual = {"projection": "spherical", "convention": "centre", "reflectance_scale": 1.0}
+    own = {key: data.get(key, value) for key, value in usual.items()}
+    for key, value in own.items():
+        parts = {part.get(key, value) for part in data.get("parts") or ()}
+        own[key] = parts.pop() if len(parts) == 1 else value
+    return Reading(model.sensor, **own)
+
+
+def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> Sensor:
+    """A sensor, by its name or its YAML file too, at an image size of (rows, columns)."""
+    if isinstance(sensor, Sensor):
+        return sensor if size is None else sensor.resized(*size)
+    build = read_sensor if sensor.lower().endswith(ENDINGS) else build_sensor
+    return build(sensor, *(size or (None, None)))
+
+
+def read(path: str | Path, sensor: Sensor | str | None = None) -> Tensor:
+    """`r2flow.read`."""
+    reading = replace(reading_for([path], sensor=sensor), on_bad_scan="error", within_limits=True)
+    image = torch.from_numpy(open_scans(path, reading).source[0])
+    return image if len(image) > 1 else torch.cat([image, torch.zeros_like(image)])
+
+
 def own_reading(spec: str | Path) -> Reading | None:
-    """How the images of scans were made, where they say so: prepared scans and samples. Other images they are not."""
+    """How scans that r2flow wrote are read: prepared scans, samples and simulated scans; None for other scans."""
     options, _ = parse(str(spec))
     if options.name == PREPARED:
         there = Reading.of(read_prepared(Path(options.folder).expanduser())[0]["reading"])
         return replace(there, reflectance=AUTO, within_limits=False)
-    return _noted(Path(options.folder)) if options.name == FOLDER else None
-
-
-def usual_reading(spec: str | Path) -> Reading:
-    """How scans of this kind usually become images."""
-    kind = SOURCES[parse(str(spec))[0].name]
-    return Reading(SENSORS[kind.sensor], reflectance_scale=kind.reflectance_scale)
+    if options.name != FOLDER:
+        return None
+    folder = Path(options.folder)
+    if written_by(folder) == "r2flow simulated":
+        return Reading.of(read_manifest(folder)["recipe"]["reading"])
+    return _noted(folder)
 
 
 def usual_scale(spec: str | Path, sensor: Sensor) -> float:
-    """The value in the files of a set of scans that usually means full reflectance."""
+    """The value in the files of a set of scans that usually means full reflectance: 1 in what r2flow wrote."""
     options = parse(str(spec))[0]
     if options.name == FOLDER:
         return scale_of_folder(options.folder, sensor.reflectance_scale)
@@ -214,18 +292,8 @@ def usual_scale(spec: str | Path, sensor: Sensor) -> float:
 
 
 def scale_of_folder(root: str | Path, of_sensor: float | None) -> float:
-    """The same in a folder of scan files: its sensor's, but 1 in samples and simulated scans of r2flow."""
+    """The same of a folder of scan files, else the sensor's."""
     return 1.0 if made_here(root) else of_sensor or 1.0
-
-
-def made_here(root: str | Path) -> bool:
-    """Whether a folder, or one in it, holds samples or simulated scans of r2flow."""
-    folder = Path(root).expanduser()
-    if not folder.is_dir():
-        return False
-    with os.scandir(folder) as entries:  # which knows a folder without asking the disk about each file
-        places = [folder, *(Path(entry.path) for entry in entries if entry.is_dir())]
-    return any((place / note).is_file() for place in places for note in (SAMPLES, MANIFEST))
 
 
 def written_by(folder: Path) -> str | None:
@@ -242,15 +310,9 @@ def _noted(folder: Path) -> Reading | None:
     if not path.is_file():
         return None
     try:
-        content = read_json(path)
-        return Reading(_sensor(content["sensor"]), content["projection"], content["convention"])
+        return Reading.of(read_json(path)["reading"])
     except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(f"{path} is damaged; delete it and give --sensor and --size.") from None
-
-
-def _sensor(described: Mapping[str, Any]) -> Sensor:
-    plain: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in described.items()}
-    return Sensor(**plain)
 
 
 def refuse_other_samples(folder: Path, sensor: Sensor) -> None:

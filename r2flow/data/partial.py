@@ -1,6 +1,6 @@
 """Scans of any sensor as what is known of a model's images: for `r2flow complete`.
 
-scans, lines = open_partial(["scans"], reading_of_flow(flow))
+scans, lines = open_partial(["scans"], reading_for([], flow))
 scans[0].read()         image, state, xyz
 """
 
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from r2flow.data.opening import SAMPLES, SOURCES, open_scans, own_reading, parse, usual_scale
+from r2flow.data.opening import SOURCES, open_scans, own_reading, parse, usual_scale
 from r2flow.data.options import PREPARED, SIMULATED
 from r2flow.data.reading import Reading, nothing_in_view
 from r2flow.data.sources import LOOKED_AT, ScanSource, spread
@@ -116,7 +116,7 @@ def _files(
 ) -> Opened:
     """Scan files of one sensor."""
     target, lines = reading.sensor, list[str]()
-    noted = own_reading(folder) if (folder / SAMPLES).is_file() else None
+    noted = own_reading(folder)
     source = source or (noted.sensor if noted else None)
     images = {path for path in paths if path.suffix.lower() == ".npy" and read_range_image(path) is not None}
     read_image: Callable[[Path], Partial] = partial(_read_image, source=source, target=target)

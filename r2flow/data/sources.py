@@ -24,6 +24,7 @@ from r2flow.lidar.beams import other_sensor
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import Sensor
+from r2flow.store import MANIFEST
 
 if TYPE_CHECKING:
     from r2flow.simulator.folder import SimulatedFolder
@@ -32,6 +33,7 @@ log = logging.getLogger(__name__)
 
 Read = TypeVar("Read")
 
+SAMPLES = "scans.json"  # what a folder of samples says of itself
 LOOKED_AT = 3  # scans of a set, whose beams are compared with the sensor's
 
 
@@ -110,14 +112,29 @@ class ScanSource(ABC):
         return {}
 
 
+def made_here(root: str | Path) -> bool:
+    """Whether a folder, or one in it, holds samples or simulated scans of r2flow, or the folder of a file does."""
+    folder = Path(root).expanduser()
+    if folder.is_file():
+        folder = folder.parent
+    if not folder.is_dir():
+        return False
+    with os.scandir(folder) as entries:  # which knows a folder without asking the disk about each file
+        places = [folder, *(Path(entry.path) for entry in entries if entry.is_dir())]
+    return any((place / note).is_file() for place in places for note in (SAMPLES, MANIFEST))
+
+
 def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> None:
     """Say in one line that scan files do not look like a sensor's, and which sensor they fit (`other_sensor`).
 
-    Range images have no beams, and files that cannot be read are met again when their turn comes.
+    For bare scan files alone: what r2flow wrote says its sensor, and range images have no beams. Files that cannot be
+    read are reported when their turn comes.
 
     Raises:
         InputError: the scans are for a model (`reading.within_limits`), and those of no spinning LiDAR.
     """
+    if made_here(root):
+        return
     scans, sensor = [], reading.sensor
     for number in spread(len(paths), LOOKED_AT):
         with suppress(InputError):

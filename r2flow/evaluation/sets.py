@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
@@ -16,7 +15,7 @@ from r2flow.model.checkpoint import Checkpoint, checkpoints_of, weights_hash
 from r2flow.model.sampling import draw
 from r2flow.models import MODELS
 
-__all__ = ["SampledScans", "ScanSet", "fixed_choice", "is_checkpoint", "reading_of_flow", "sampled_set"]
+__all__ = ["SampledScans", "ScanSet", "fixed_choice", "is_checkpoint", "sampled_set"]
 
 CHECKPOINTS = (".ckpt", ".pth", ".safetensors")
 
@@ -27,17 +26,6 @@ def is_checkpoint(text: str) -> bool:
     if path.is_dir():
         return bool(checkpoints_of(path)) or any(path.glob("step-*.ckpt"))
     return path.suffix in CHECKPOINTS or (not path.exists() and text in MODELS)
-
-
-def reading_of_flow(flow: Checkpoint) -> Reading:
-    """How a generator's training scans became images; of a mixture, what all its parts say, else what the run says."""
-    data = flow.config.get("data", {})
-    usual = {"projection": "spherical", "convention": "centre", "reflectance_scale": 1.0}
-    own = {key: data.get(key, value) for key, value in usual.items()}
-    for key, value in own.items():
-        said = {part.get(key, value) for part in data.get("parts") or ()}
-        own[key] = said.pop() if len(said) == 1 else value
-    return Reading(flow.sensor, **own)
 
 
 def sampled_set(flow: Checkpoint, label: str, num: int, sampler: Sampler | None = None, seed: int = 0) -> ScanSet:

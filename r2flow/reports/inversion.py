@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from r2flow.data.opening import open_scans
-from r2flow.evaluation.sets import reading_of_flow
+from r2flow.data.opening import open_scans, reading_for
 from r2flow.inversion import Inversion, round_trip
 from r2flow.model.checkpoint import Checkpoint
 
@@ -41,7 +40,7 @@ def real_scans(
     Raises:
         InputError: a scan that cannot be read, has another size, or no reflectance where the flow needs it.
     """
-    own, needed = reading_of_flow(checkpoint), checkpoint.encoding.reflectance
+    own, needed = reading_for([], checkpoint), checkpoint.encoding.reflectance
     scale = own.reflectance_scale if reflectance_scale is None else reflectance_scale
     reading = replace(own, reflectance=needed, reflectance_scale=scale, on_bad_scan="error", within_limits=True)
     sets = [open_scans(spec, reading).spread(most) for spec in specs]

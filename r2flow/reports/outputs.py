@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from r2flow.config import as_override
-from r2flow.data.opening import SAMPLES, samples_note, write_samples_note
+from r2flow.data.opening import SAMPLES, reading_for, samples_note, write_samples_note
 from r2flow.errors import InputError
-from r2flow.evaluation.sets import reading_of_flow
 from r2flow.files import atomic_write, read_json
 from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
@@ -176,7 +175,7 @@ def note_of(checkpoint: Checkpoint, seed: int, more: Mapping[str, Any] | None = 
     """What is written beside samples: what they are and `more`, so that readers know their size and sensor."""
     about = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
     about |= {"min_range": checkpoint.sensor.min_range, "max_range": checkpoint.sensor.max_range}
-    reading, step = reading_of_flow(checkpoint), checkpoint.step
+    reading, step = reading_for([], checkpoint), checkpoint.step
     # Points lie on rays through the middles of the bins, whatever rays the model was told.
     return samples_note(reading, encoding=about, seed=seed, sampler=sampler, step=step,
                         weights=weights_hash(checkpoint), rays="centre", **(more or {}))  # fmt: skip

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
-from r2flow.data.opening import find_drives, open_scans, own_reading, parse, usual_reading
+from r2flow.data.opening import find_drives, open_scans, own_reading, parse, reading_for
 from r2flow.data.options import FOLDER, SIMULATED
 from r2flow.data.reading import range_image, read_labelled_scan
 from r2flow.data.sets import ScanSet
@@ -97,7 +97,7 @@ def views_of(
     """
     options, file = parse(str(spec))
     own = own_reading(spec)
-    reading = own or replace(usual_reading(spec), projection=projection)  # type: ignore[arg-type]
+    reading = own or reading_for([spec], projection=projection)
     sensor = sensor or reading.sensor
     if own is None and reflectance_scale is None:
         reflectance_scale = sensor.reflectance_scale

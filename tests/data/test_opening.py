@@ -1,12 +1,14 @@
 """One opener: what a name may be, whether scans have reflectance, and kinds of scans that a user adds."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+import r2flow
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive, Layout, SourceKind
 from r2flow.data.opening import (
@@ -15,9 +17,9 @@ from r2flow.data.opening import (
     open_scans,
     open_source,
     own_reading,
+    reading_for,
     resolve_reflectance,
     samples_note,
-    usual_reading,
     write_samples_note,
 )
 from r2flow.data.options import PairOptions, SourceOptions
@@ -32,6 +34,8 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.noise import standard_normal
+from r2flow.simulator import simulate
+from r2flow.simulator.folder import SimulatedFolder
 from tests.data.conftest import prepare_folder, write_scan
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
@@ -100,8 +104,8 @@ class TestNames:
         assert "\n" not in str(error.value)
 
     def test_a_usual_sensor_is_the_data_set_s(self):
-        assert usual_reading("nuscenes:x") == Reading(SENSORS["hdl32e"], reflectance_scale=255.0)
-        assert usual_reading("kitti_raw:x") == Reading(SENSORS["hdl64e"])
+        assert reading_for(["nuscenes:x"]) == Reading(SENSORS["hdl32e"], reflectance_scale=255.0)
+        assert reading_for(["kitti_raw:x"]) == Reading(SENSORS["hdl64e"])
 
 
 class TestSamples:
@@ -157,11 +161,42 @@ class TestSamples:
 
     def test_a_damaged_note_is_one_line(self, tmp_path: Path):
         self.samples(tmp_path)
-        for content in ("{", "[]", '{"sensor": {}}', '{"sensor": {"name": "a", "elevation": 3}}'):
+        for content in ("{", "[]", '{"reading": {}}', '{"reading": {"sensor": {"name": "a", "elevation": 3}}}'):
             (tmp_path / SAMPLES).write_text(content)
             with pytest.raises(InputError, match=r"scans.json is damaged; delete it") as error:
                 open_scans(tmp_path)
             assert "\n" not in str(error.value)
+
+
+class TestWhatR2FlowWrote:
+    """Size, sensor and scale of simulated scans are believed."""
+
+    def test_simulated_scans_need_no_sensor_and_no_size(self, tmp_path: Path, caplog):
+        sensor = SENSORS["vlp32c"].resized(16, 64)
+        folder = SimulatedFolder(tmp_path, sensor, 3, ("ply",))
+        folder.begin()
+        folder.simulate(5)
+        reading = reading_for([tmp_path, "simulated:3"])
+        assert (reading.sensor, reading.reflectance_scale) == (replace(sensor, reflectance_scale=None), 1.0)
+        image = simulate(sensor, 3, 5).image
+        np.testing.assert_allclose(open_scans(tmp_path, reading).source[0], image, atol=1e-5)
+        wrong_scale = replace(reading, reflectance_scale=255.0)
+        np.testing.assert_allclose(open_scans(tmp_path, wrong_scale).source[0], image, atol=1e-5)
+        scan = r2flow.read(tmp_path / "000005.ply")
+        assert (scan.dtype, scan.shape) == (torch.float32, (2, 16, 64))
+        np.testing.assert_allclose(scan.numpy(), image, atol=1e-5)
+        assert not caplog.text
+
+    def test_a_file_is_read_through_any_sensor(self, tmp_path: Path):
+        write_points(tmp_path / "a.ply", np.array([[10.0, 0, 0]], np.float32))  # without reflectance
+        for sensor in ("vlp16", SENSORS["vlp16"]):
+            scan = r2flow.read(tmp_path / "a.ply", sensor)
+            assert scan.shape == (2, *SENSORS["vlp16"].shape)
+            assert scan[0].max() == 10
+            assert not scan[1].any()
+
+    def test_the_front_door_shows_what_a_user_may_use(self):
+        assert dir(r2flow) == ["__version__", "load", "read"]
 
 
 class TestReflectance:
