@@ -14,9 +14,8 @@ import numpy as np
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.noise import generator
 from r2flow.simulator import draw_scene, simulate
-from r2flow.simulator.lasers import lasers_of
+from r2flow.simulator.lasers import Rays, lasers_of
 from r2flow.simulator.raycast import cast
-from r2flow.simulator.rays import Rays
 from r2flow.simulator.returns import report
 
 

@@ -9,12 +9,13 @@ import numpy as np
 
 from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator
-from r2flow.simulator.lasers import lasers_of
+from r2flow.simulator import roadside
+from r2flow.simulator.draws import ScalarDraws
+from r2flow.simulator.kinds import KINDS, draw_ground
+from r2flow.simulator.lasers import RIGS, Rays, lasers_of
 from r2flow.simulator.raycast import cast
-from r2flow.simulator.rays import Rays
 from r2flow.simulator.returns import report
-from r2flow.simulator.scene import Scene
-from r2flow.simulator.streets import draw_scene
+from r2flow.simulator.scene import Scene, SceneBuilder
 
 REVISION = 3  # of the scans: rises with every change after which a seed gives other scans
 
@@ -39,6 +40,26 @@ def simulate(sensor: Sensor, seed: int, index: int) -> SimulatedScan:
     """
     rng = generator(seed, "simulator", index)
     return observe(draw_scene(rng), sensor, rng)
+
+
+def draw_scene(rng: np.random.Generator) -> Scene:
+    """A scene of one of `kinds.KINDS`, drawn by their shares."""
+    draws = ScalarDraws(rng)
+    name = draws.pick(list(KINDS), [k.share for k in KINDS.values()])
+    b, k = SceneBuilder(draw_ground(draws, name), draws), KINDS[name]
+    streets = b.ground.streets
+    for street in streets:
+        for side in (1, -1):
+            roadside.line_front(b, k, street, side)
+            roadside.park(b, k, street, side)
+            roadside.furnish(b, street, side)
+        roadside.close_street(b, street)
+    roadside.close_view(b)
+    roadside.drive(b, k, streets[0])
+    roadside.walk(b, k, streets[0])
+    if name == "highway":
+        roadside.guard(b, streets[0])
+    return b.build(rig=draws.pick(range(len(RIGS)), (0.7, 0.3)))
 
 
 def observe(scene: Scene, sensor: Sensor, rng: np.random.Generator) -> SimulatedScan:

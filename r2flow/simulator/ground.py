@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from r2flow.lidar.labels import LABELS
-from r2flow.simulator.exact import sine
+from r2flow.simulator.draws import sine
+from r2flow.simulator.lasers import Rays
 from r2flow.simulator.materials import INDEX, column
-from r2flow.simulator.rays import Rays
 
 SAMPLES = 72  # points of a column's profile; between them the ground is straight
 NEAREST = 1.5  # metres: the profile's first point; nearer, the ground is level

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from r2flow.lidar.labels import LABELS
+from r2flow.simulator.draws import ScalarDraws
 from r2flow.simulator.ground import Ground, Patch, Street
 from r2flow.simulator.materials import INDEX, MATERIALS
-from r2flow.simulator.scalar_draws import ScalarDraws
 
 Span = tuple[float, float]
 

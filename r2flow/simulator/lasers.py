@@ -10,7 +10,8 @@ places and full in others.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -105,3 +106,140 @@ def rows_of(sensor: Sensor, slope: np.ndarray) -> np.ndarray:
     h = len(sensor.elevations)
     row = h - np.searchsorted(edges, slope, side="right")
     return np.where((row >= 0) & (row < h), row, -1)
+
+
+@dataclass(frozen=True)
+class Rays:
+    """B lasers by W azimuths.
+
+    Every ray is p(s) = (s cos a, s sin a, z + s T): s the horizontal distance, a the azimuth of the column, T = tan E
+    the slope of the laser and z its height. An upright surface is met at an s that depends on the column alone.
+
+    Attributes:
+        lasers: The lasers, (B,).
+        columns: Number W of azimuths; column w looks along a = pi - 2 pi (w + 1/2) / W.
+        ground: Height of the sensor's origin above the scene's z = 0, in metres.
+    """
+
+    lasers: Lasers
+    columns: int
+    ground: float = 0.0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(B, W)."""
+        return len(self.lasers.elevation), self.columns
+
+    @cached_property
+    def azimuth(self) -> np.ndarray:
+        """Azimuth a in radians, (W,), float64."""
+        return np.pi - 2 * np.pi * (np.arange(self.columns) + 0.5) / self.columns
+
+    @cached_property
+    def cos(self) -> np.ndarray:
+        """cos a, (W,), float32."""
+        return np.cos(self.azimuth).astype(np.float32)
+
+    @cached_property
+    def sin(self) -> np.ndarray:
+        """sin a, (W,), float32."""
+        return np.sin(self.azimuth).astype(np.float32)
+
+    @cached_property
+    def slope(self) -> np.ndarray:
+        """T = tan E, falling, (B,), float32."""
+        return np.tan(self.lasers.elevation).astype(np.float32)
+
+    @cached_property
+    def height(self) -> np.ndarray:
+        """Height z of each laser above the scene's z = 0 in metres, (B,), float32."""
+        return (self.lasers.height + self.ground).astype(np.float32)
+
+
+def expand(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """All integers first_k <= j < first_k + count_k: (k, j), each (sum of counts,), int32."""
+    count = np.maximum(count, 0)
+    k = np.repeat(np.arange(len(count), dtype=np.int32), count)
+    start = np.cumsum(count) - count
+    j = np.arange(len(k), dtype=np.int32) - (start - first)[k].astype(np.int32)
+    return k, j
+
+
+def column_windows(azimuth: np.ndarray, half: np.ndarray, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (object k, column w) whose azimuth lies within half_k of azimuth_k, (N,) each, int32."""
+    to_column = columns / (2 * np.pi)
+    half = np.minimum(half, np.pi * (1 - 1e-9))
+    first = np.ceil((np.pi - azimuth - half) * to_column - 0.5).astype(np.int64)
+    last = np.floor((np.pi - azimuth + half) * to_column - 0.5).astype(np.int64)
+    k, w = expand(first, np.minimum(last - first + 1, columns))
+    return k, w % columns
+
+
+def row_windows(
+    rays: Rays, near: np.ndarray, far: np.ndarray, bottom: np.ndarray, top: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (n, laser b) that may meet [bottom, top] between the distances near and far, (F,) each, int32."""
+    low, high = rays.height.min(), rays.height.max()
+    falling, rising = bottom - high, top - low
+    least = falling / np.where(falling < 0, near, far)
+    most = rising / np.where(rising > 0, near, far)
+    descending = -rays.slope
+    first = np.searchsorted(descending, -most, side="left")
+    last = np.searchsorted(descending, -least, side="right")
+    return expand(first, last - first)
+
+
+class Silhouette(NamedTuple):
+    """A part of the own car, read off two KITTI drives: |across|^p + |up|^p < 1 in degrees; `grounded`: straight down.
+
+    It is about a metre away, nearer than any valid return, so that a scan shows only its shadow. A laser beside the
+    axis sees it displaced: neighbouring rings are cut off alternately left and right.
+
+    `away` is the distance in metres from the axis to the object, which sets how far neighbouring rings shift.
+    """
+
+    azimuth: float
+    elevation: float
+    half_width: float
+    half_height: float
+    away: float
+    grounded: bool = False
+    power: int = 2
+
+
+_ROOF = (
+    Silhouette(0, -26.5, 22, 5.0, 1.2, grounded=True),
+    Silhouette(34, -26.2, 6, 2.6, 0.8, grounded=True),
+    Silhouette(-34, -26.2, 6, 2.6, 0.8, grounded=True),
+    Silhouette(131, -23.2, 5.0, 2.4, 0.7, grounded=True),
+    Silhouette(-128, -23.2, 5.0, 2.4, 0.7, grounded=True),
+    Silhouette(142, -26.5, 14, 2.9, 0.8, grounded=True),
+    Silhouette(-142, -26.5, 14, 2.9, 0.8, grounded=True),
+    Silhouette(163, -26, 15, 6.2, 1.2, grounded=True),
+    Silhouette(-163, -26, 15, 6.2, 1.2, grounded=True),
+    Silhouette(180, -26, 18, 6.6, 1.5, grounded=True, power=6),
+    Silhouette(161, -17.0, 4.2, 4.0, 1.0, power=4),
+    Silhouette(-158.5, -17.0, 4.2, 4.0, 1.0, power=4),
+)
+# A roof with its posts; with an instrument beside the sensor, and without.
+RIGS = ((*_ROOF, Silhouette(-69, -20.0, 11.0, 4.4, 0.55)), _ROOF)
+
+
+@lru_cache(maxsize=16)
+def _hidden(elevation: tuple[float, ...], side: tuple[float, ...], columns: int, rig: int) -> np.ndarray:
+    azimuth = 180 - 360 * (np.arange(columns) + 0.5) / columns
+    e = np.rad2deg(np.array(elevation))[:, None]
+    hidden = np.zeros((len(elevation), columns), bool)
+    for s in RIGS[rig]:
+        shift = np.rad2deg(np.arctan2(np.array(side), s.away))[:, None]
+        across = ((azimuth - shift - s.azimuth + 180) % 360 - 180) / s.half_width
+        up = (e - s.elevation) / s.half_height
+        up = np.maximum(up, 0) if s.grounded else up
+        hidden |= np.abs(across) ** s.power + np.abs(up) ** s.power < 1
+    hidden.setflags(write=False)
+    return hidden
+
+
+def hidden(lasers: Lasers, columns: int, rig: int) -> np.ndarray:
+    """Rays that end on the own car, (B, W), bool, for one of `RIGS`."""
+    return _hidden(tuple(lasers.elevation.tolist()), tuple(lasers.side.tolist()), columns, rig)

@@ -5,12 +5,10 @@ from functools import cache
 import numpy as np
 
 from r2flow.lidar.sensors import Sensor
-from r2flow.simulator.ego import hidden
-from r2flow.simulator.exact import exponentials, logistic, normals
-from r2flow.simulator.lasers import rows_of
+from r2flow.simulator.draws import exponentials, logistic, normals
+from r2flow.simulator.lasers import Rays, hidden, rows_of
 from r2flow.simulator.materials import column
 from r2flow.simulator.raycast import Hits
-from r2flow.simulator.rays import Rays
 
 NOISE = 0.006  # metres, scale of the range noise at range 0
 NOISE_FAR = 0.0002  # added to it for each metre of range

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from r2flow.lidar.labels import LABELS
+from r2flow.simulator.draws import ScalarDraws
 from r2flow.simulator.ground import Ground
 from r2flow.simulator.materials import INDEX, MATERIALS
-from r2flow.simulator.scalar_draws import ScalarDraws
 from r2flow.simulator.shapes import Blobs, Boxes, Cylinders, Frusta, Shape
 
 PLAIN, FACADE, CABIN, BODY = range(4)  # patterns that divide a surface among materials

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from r2flow.simulator.exact import cosine, exponential_quantiles, hypotenuse, sine
-from r2flow.simulator.rays import Rays, column_windows, row_windows
+from r2flow.simulator.draws import cosine, exponential_quantiles, hypotenuse, sine
+from r2flow.simulator.lasers import Rays, column_windows, row_windows
 
 # A field of all solids of a table, (P,) float32; a number for a single solid before it is in a table.
 Column = Any

@@ -6,8 +6,7 @@ import pytest
 from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator.ground import Ground, Street
-from r2flow.simulator.lasers import along_rows
-from r2flow.simulator.rays import Rays
+from r2flow.simulator.lasers import Rays, along_rows
 
 HDL64E = SENSORS["hdl64e"]
 HEIGHT = HDL64E.height

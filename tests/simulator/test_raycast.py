@@ -5,12 +5,11 @@ import pytest
 
 from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
+from r2flow.simulator.draws import ScalarDraws
 from r2flow.simulator.ground import Ground
-from r2flow.simulator.lasers import along_rows, lasers_of
+from r2flow.simulator.lasers import Rays, along_rows, lasers_of
 from r2flow.simulator.materials import INDEX
 from r2flow.simulator.raycast import cast
-from r2flow.simulator.rays import Rays
-from r2flow.simulator.scalar_draws import ScalarDraws
 from r2flow.simulator.scene import SceneBuilder
 from r2flow.simulator.shapes import Blobs, Boxes, Cylinders, Frusta
 

@@ -6,11 +6,10 @@ import pytest
 from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator import observe
-from r2flow.simulator.ego import RIGS, hidden
+from r2flow.simulator.draws import ScalarDraws
 from r2flow.simulator.ground import Ground
-from r2flow.simulator.lasers import HDL64E, along_rows, lasers_of, rows_of
+from r2flow.simulator.lasers import HDL64E, RIGS, along_rows, hidden, lasers_of, rows_of
 from r2flow.simulator.materials import INDEX, MATERIALS
-from r2flow.simulator.scalar_draws import ScalarDraws
 from r2flow.simulator.scene import SceneBuilder
 from r2flow.simulator.shapes import Boxes, Cylinders
 
