@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cache
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -55,26 +56,14 @@ def scan_figure(image: np.ndarray, rays: Tensor, title: str = "", labels: np.nda
 
 def contact_sheet(images: Sequence[np.ndarray], rays: Tensor, titles: Sequence[str] = ()) -> Figure:
     """Several scans, one a row: images on the left, bird's-eye view and perspective on the right."""
-    rows = len(images)
-    figure = dark_figure(15, 2.5 * rows)
-    grid = figure.add_gridspec(
-        rows, 3, width_ratios=[2.6, 0.9, 1.3], hspace=0.12, wspace=0.03,
-        left=0.01, right=0.99, top=1 - 0.3 / (2.5 * rows), bottom=0.01,
-    )  # fmt: skip
-    for row, image in enumerate(images):
-        strips = grid[row, 0].subgridspec(len(image), 1, hspace=0.16)
-        axes = figure.add_subplot(strips[0])
-        draw_range(axes, image, label=row == 0)
-        if row < len(titles):
-            axes.text(
-                0.004, 0.94, titles[row], transform=axes.transAxes, va="top", fontsize=8, color="white",
+    figure, grid = _sheet([2.5] * len(images), space=0.12, top=0.3)
+    for row, (image, title) in enumerate(zip_longest(images, titles)):
+        first, *_ = _draw_row(figure, grid, row, image, rays)
+        if title is not None:
+            first.text(
+                0.004, 0.94, title, transform=first.transAxes, va="top", fontsize=8, color="white",
                 bbox={"facecolor": BACKGROUND, "edgecolor": "none", "alpha": 0.7, "pad": 1.5},
             )  # fmt: skip
-        if len(image) > 1:
-            draw_reflectance(figure.add_subplot(strips[1]), image, label=row == 0)
-        xyz, _ = image_to_points(image, rays)
-        draw_birds_eye(figure.add_subplot(grid[row, 1]), xyz, label=row == 0)
-        draw_perspective(figure.add_subplot(grid[row, 2]), xyz, label=row == 0)
     return figure
 
 
@@ -92,39 +81,44 @@ def completed_figure(
         unknown: Rays of it that were not measured, (H, W) bool; drawn in grey.
         spread: Standard deviation of the range in metres and share of answers with a return, (2, H, W).
     """
-    heights = [2.4] * len(rows) + [1.3] * (spread is not None)
-    figure = dark_figure(15, sum(heights) + 0.35)
-    grid = figure.add_gridspec(
-        len(heights), 3, width_ratios=[2.6, 0.9, 1.3], height_ratios=heights, hspace=0.16, wspace=0.03,
-        left=0.01, right=0.99, top=1 - 0.5 / sum(heights), bottom=0.01,
-    )  # fmt: skip
+    figure, grid = _sheet([2.4] * len(rows) + [1.3] * (spread is not None), space=0.16, top=0.5)
     grey = np.where(unknown[..., None], np.array([0.45, 0.45, 0.45, 1.0]), 0.0)
     for row, (name, image) in enumerate(rows):
-        strips = grid[row, 0].subgridspec(len(image), 1, hspace=0.2)
-        axes = figure.add_subplot(strips[0])
-        draw_range(axes, image, label=False)
+        strips = _draw_row(figure, grid, row, image, rays)
         legend = " (grey: not measured, black: measured without a return)" if row == 0 else ""
-        axes.set_title(f"{name}: range{legend}", color=FOREGROUND, fontsize=8, loc="left", pad=3)
-        drawn = [axes]
-        if len(image) > 1:
-            drawn.append(figure.add_subplot(strips[1]))
-            draw_reflectance(drawn[-1], image)
-        for one in drawn if row == 0 else ():
-            one.imshow(grey, aspect="auto", interpolation="nearest")
-        xyz, _ = image_to_points(image, rays)
-        draw_birds_eye(figure.add_subplot(grid[row, 1]), xyz, label=row == 0)
-        draw_perspective(figure.add_subplot(grid[row, 2]), xyz, label=row == 0)
+        strips[0].set_title(f"{name}: range{legend}", color=FOREGROUND, fontsize=8, loc="left", pad=3)
+        for axes in strips if row == 0 else ():
+            axes.imshow(grey, aspect="auto", interpolation="nearest")
     if spread is not None:
-        shown = (
-            ("deviation of the range, 0 to 5 m", spread[0], 5.0),
-            ("share of answers with a return, 0 to 1", spread[1], 1.0),
-        )
-        for (name, values, most), place in zip(shown, (grid[-1, 0], grid[-1, 1:]), strict=True):
+        shown = ("deviation of the range, 0 to 5 m", 5.0), ("share of answers with a return, 0 to 1", 1.0)
+        for (name, most), values, place in zip(shown, spread, (grid[-1, 0], grid[-1, 1:]), strict=True):
             axes = figure.add_subplot(place)
             axes.imshow(values, cmap="magma", vmin=0, vmax=most, aspect="auto", interpolation="nearest")
             _strip(axes, name)
     figure.suptitle(title, color=FOREGROUND, fontsize=11, x=0.01, ha="left", y=0.995)
     return figure
+
+
+def _sheet(heights: Sequence[float], space: float, top: float) -> tuple[Figure, Any]:
+    """A dark figure with a row of inches for each scan and its columns: images, bird's-eye view, perspective."""
+    figure = dark_figure(15, sum(heights))
+    grid = figure.add_gridspec(
+        len(heights), 3, width_ratios=[2.6, 0.9, 1.3], height_ratios=heights, hspace=space, wspace=0.03,
+        left=0.01, right=0.99, top=1 - top / sum(heights), bottom=0.01,
+    )  # fmt: skip
+    return figure, grid
+
+
+def _draw_row(figure: Figure, grid: Any, row: int, image: np.ndarray, rays: Tensor) -> list[Any]:
+    """One scan in a row of a sheet; the axes of its range and reflectance."""
+    cells = grid[row, 0].subgridspec(len(image), 1, hspace=0.18)
+    strips = [figure.add_subplot(cell) for cell in cells]
+    for axes, draw in zip(strips, (draw_range, draw_reflectance), strict=False):
+        draw(axes, image, label=row == 0)
+    xyz, _ = image_to_points(image, rays)
+    draw_birds_eye(figure.add_subplot(grid[row, 1]), xyz, label=row == 0)
+    draw_perspective(figure.add_subplot(grid[row, 2]), xyz, label=row == 0)
+    return strips
 
 
 def loss_figure(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
