@@ -1,4 +1,4 @@
-"""Numbers that are no numbers: steps that are skipped, and a run that stops before it is spoilt."""
+"""Guard against NaN: steps with a loss or gradient that is not finite are skipped, or end the run."""
 
 import copy
 import logging
@@ -133,14 +133,12 @@ class Guard(L.Callback):
 
 
 def describe_gradients(module: torch.nn.Module) -> str:
-    """The first parameter, in the module's order, with a non-finite gradient, and the largest finite one."""
+    """The first parameter, in the module's order, with a non-finite gradient."""
     gradients = [(name, p.grad) for name, p in module.named_parameters() if p.grad is not None]
-    broken = set(_not_finite(gradients))
-    finite = [(float(g.norm()), name) for name, g in gradients if name not in broken]
-    first = next((name for name, _ in gradients if name in broken), None)
-    said = f"gradient of {first} non-finite first, {len(broken)} of {len(gradients)}" if first else "gradients finite"
-    norm, largest = max(finite, default=(0.0, ""))
-    return f"{said}, largest finite norm " + (f"{norm:.3g} ({largest})" if finite else "none")
+    broken = _not_finite(gradients)
+    return (
+        f"gradient of {broken[0]} non-finite first, {len(broken)} of {len(gradients)}" if broken else "gradients finite"
+    )
 
 
 def describe_batch(trainer: L.Trainer) -> str:

@@ -56,13 +56,11 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
         raise InputError("stage.init is each link's own: give +chain.LINK.stage.init=RUN to one of them.")
     links: list[Link] = []
     for name, difference in chain.items():
-        if not isinstance(difference, Mapping):
-            raise InputError(f"chain.{name} must be a group of keys, in which it differs; found {difference!r}.")
+        if not isinstance(difference, Mapping) or not isinstance(difference.get("stage") or {}, Mapping):
+            raise InputError(f"chain.{name} and its stage must be groups of keys; found {difference!r}.")
         if not re.fullmatch(r"[\w-][\w.-]*", str(name)):
-            raise InputError(f"chain: a link is a folder of its own, which cannot be called {name!r}.")
+            raise InputError(f"chain: a link is a folder, which cannot be called {name!r}.")
         own = dict(difference)
-        if not isinstance(own.get("stage") or {}, Mapping):
-            raise InputError(f"chain.{name}.stage must be a group of keys, found {own['stage']!r}.")
         parent = own.pop("init", None)
         overrides = [override(key, value) for key, value in flatten(own) if (key, value) != ("experiment", None)]
         if any(key_of(one) == "plugins" for one in overrides):
@@ -74,10 +72,9 @@ def links_of(chain: Mapping[str, Mapping[str, Any]], folder: str | Path, given: 
         reads_scans = parent is None and (own.get("stage") or {}).get("init") is None
         concerning = ("all", "scans" if reads_scans else "pairs")
         overrides += [one for one in given if rule(key_of(one)).links in concerning]
-        # What the user gave to this link alone comes last, for it is what the link's own has become.
-        mine = f"chain.{name}."
-        alone = [one.lstrip("+").removeprefix(mine) for one in given if one.lstrip("+").startswith(mine)]
-        overrides += [one for one in alone if not one.startswith("init=")]
+        # What the user gave to this link alone comes last: it replaces the link's own keys.
+        alone = [one.lstrip("+") for one in given if one.lstrip("+").startswith(f"chain.{name}.")]
+        overrides += [key for one in alone if not (key := one.removeprefix(f"chain.{name}.")).startswith("init=")]
         run_dir = Path(folder, name)
         links.append(Link(name, run_dir, (*overrides, override("run_dir", str(run_dir))), parent))
     return links
@@ -105,8 +102,7 @@ def run_chain(links: Sequence[Link], command: Sequence[str]) -> tuple[int, bool]
             if code != 2:  # which is the user's to mend, and has been said
                 print(f"the chain stopped in {link.name}; the same command goes on there", file=sys.stderr, flush=True)
             return code, True
-        with atomic_write(link.run_dir / RECORD, "w") as file:
-            json.dump(_record(link), file, indent=2)
+        _note(link.run_dir, _record(link))
     return 0, not skipping
 
 
@@ -118,11 +114,17 @@ def has_ended(run: Path) -> bool:
 
 def is_finished(link: Link) -> bool:
     """Whether a link came to its end under the same command, and has not lost its checkpoint since."""
-    try:
-        record = read_json(link.run_dir / RECORD)
-    except (OSError, ValueError):
-        return False
-    return bool(record == _record(link)) and has_ended(link.run_dir)
+    return _is_noted(link.run_dir, _record(link)) and has_ended(link.run_dir)
+
+
+def record_report(links: Sequence[Link], out: Path) -> None:
+    """Note next to the report which links it is of."""
+    _note(out, [_record(link) for link in links])
+
+
+def is_reported(links: Sequence[Link], out: Path) -> bool:
+    """Whether the report on just these links is there."""
+    return _is_noted(out, [_record(link) for link in links])
 
 
 def _record(link: Link) -> dict[str, Any]:
@@ -131,16 +133,14 @@ def _record(link: Link) -> dict[str, Any]:
     return {"overrides": list(link.overrides), "checkpoint": last and [last.name, last.stat().st_size]}
 
 
-def record_report(links: Sequence[Link], out: Path) -> None:
-    """Note beside the report what it is of."""
-    with atomic_write(out / RECORD, "w") as file:
-        json.dump([_record(link) for link in links], file, indent=2)
+def _note(folder: Path, record: Any) -> None:
+    with atomic_write(folder / RECORD, "w") as file:
+        json.dump(record, file, indent=2)
 
 
-def is_reported(links: Sequence[Link], out: Path) -> bool:
-    """Whether the report on just these links is there."""
+def _is_noted(folder: Path, record: Any) -> bool:
     try:
-        return bool(read_json(out / RECORD) == [_record(link) for link in links])
+        return bool(read_json(folder / RECORD) == record)
     except (OSError, ValueError):
         return False
 

@@ -46,12 +46,8 @@ log = logging.getLogger("r2flow")
 Task = Callable[[DictConfig], None]
 
 
-class JobFailed(RuntimeError):
-    """A job of a sweep ended badly; its own lines have said why."""
-
-
-class JobUnfinished(JobFailed):
-    """A job of a sweep stopped before its end, as it was asked to."""
+class JobEnded(RuntimeError):
+    """A job of a sweep ended before its run did: its exit code and its folder."""
 
 
 def main(arguments: Sequence[str], command: Sequence[str]) -> int:
@@ -65,8 +61,7 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
         The exit code; what went wrong has been said in one line.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints mistakes itself, over many lines, and exits with 1
-    failed: list[str] = []
-    unfinished: list[str] = []
+    ended: list[tuple[int, str]] = []  # jobs of a sweep
     open_streams()
     try:
         # SLURM signals every process of a job: a run answers, a chain waits for it.
@@ -80,11 +75,9 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
             for group in REGISTRIES if plugins else ():
                 add_choices(group)
             arguments = _checked_arguments(arguments)
-            _run_hydra(arguments, functools.partial(_job, arguments, command, failed, unfinished, os.getpid()))
-            if failed:
-                raise JobFailed(failed[0])
-            if unfinished:
-                raise JobUnfinished(unfinished[0])
+            _run_hydra(arguments, functools.partial(_job, arguments, command, ended, os.getpid()))
+            if ended:
+                raise JobEnded(*ended[0])
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except Stopped as stop:
@@ -94,14 +87,15 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
     except KeyboardInterrupt:  # Ctrl-C where nobody listens: in a library's thread
         print("stopped", flush=True)
         return 130
-    except JobUnfinished as error:
-        names = unfinished or [f"{error}, the first of them"]
-        print(f"{len(unfinished) or 'some'} of the sweep's jobs go on with the same command: {'; '.join(names)}")
+    except JobEnded as error:
+        jobs = ended or [error.args]  # a launcher elsewhere raises the first alone
+        failed = [folder for code, folder in jobs if code != LATER]
+        number, names = (len(failed or jobs) if ended else "some"), "; ".join(failed or [folder for _, folder in jobs])
+        if failed:
+            print(f"error: {number} of the sweep's jobs failed: {names}", file=sys.stderr)
+            return 2
+        print(f"{number} of the sweep's jobs go on with the same command: {names}")
         return LATER
-    except JobFailed as error:
-        names = failed or [f"{error}, the first of them"]  # of other processes only the first is heard
-        print(f"error: {len(failed) or 'some'} of the sweep's jobs failed: {'; '.join(names)}", file=sys.stderr)
-        return 2
     except (HydraException, OmegaConfBaseException) as error:
         print(f"error: {one_line(explain(error))}{_forgotten_plugins(arguments)}", file=sys.stderr)
         return 2
@@ -194,19 +188,13 @@ def job_folder(arguments: Sequence[str], overrides: str) -> str:
 
 
 def _job(
-    arguments: Sequence[str],
-    command: Sequence[str],
-    failed: list[str],
-    unfinished: list[str],
-    launcher: int,
-    config: DictConfig,
+    arguments: Sequence[str], command: Sequence[str], ended: list[tuple[int, str]], launcher: int, config: DictConfig
 ) -> None:
     """What Hydra runs. Of the exceptions only `Exception` is caught by it: SystemExit says the code.
 
     Args:
-        failed: Where the folders of a sweep's jobs are noted that ended badly.
-        unfinished: The same of jobs that `trainer.max_time` ended.
-        launcher: The process in which these lists are read.
+        ended: Where the jobs of a sweep are noted that ended before their runs.
+        launcher: The process in which this list is read.
     """
     try:
         given = list(HydraConfig.get().overrides.task)
@@ -215,12 +203,9 @@ def _job(
             named = " ".join(f"--plugin {name}" for name in config["plugins"])
             raise InputError(f"plug-ins are named on the command line, never in a file: give {named}.")
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            _sweep_job(command, given, failed, unfinished)
-            if os.getpid() != launcher:  # a launcher elsewhere hears exceptions alone, after all jobs
-                if failed:
-                    raise JobFailed(failed[-1])
-                if unfinished:
-                    raise JobUnfinished(unfinished[-1])
+            _sweep_job(command, given, ended)
+            if ended and os.getpid() != launcher:  # a launcher elsewhere hears exceptions alone, after all jobs
+                raise JobEnded(*ended[-1])
             return
         settings = plain(config)
         check_keys(settings)
@@ -243,7 +228,7 @@ def _restart(command: Sequence[str]) -> list[str]:
     return [*command, *(part for folder in _config_folders() for part in ("--config-dir", folder))]
 
 
-def _sweep_job(command: Sequence[str], given: Sequence[str], failed: list[str], unfinished: list[str]) -> None:
+def _sweep_job(command: Sequence[str], given: Sequence[str], ended: list[tuple[int, str]]) -> None:
     """One job of a sweep, as its own process: its failure or its DDP relaunch touches no other job."""
     from r2flow.runs.chain import run_process
 
@@ -252,10 +237,8 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], failed: list[str], 
     code = run_process([*_restart(command), *given, override("run_dir", str(run_dir))])
     if code in (130, 143):
         raise Stopped(code, "the sweep stopped; the same command goes on there")
-    if code == LATER:
-        unfinished.append(str(run_dir))
-    elif code:
-        failed.append(str(run_dir))
+    if code:
+        ended.append((code, str(run_dir)))
 
 
 def _fit(settings: dict[str, Any], given: Sequence[str]) -> int:

@@ -127,7 +127,7 @@ def test_the_line_names_everything_needed_to_look_further(tmp_path):
     for words in (
         "stopped at step 2: the step was skipped",
         "Loss nan",
-        "gradient of inner.weight non-finite first, 4 of 4, largest finite norm none",
+        "gradient of inner.weight non-finite first, 4 of 4",
         "no loss scale in 32-true",
         "images k = 4 to 7, scans " + ", ".join(map(str, order[4:8])),
         f"last good checkpoint is {tmp_path}/checkpoints/step-00000001.ckpt",
@@ -142,17 +142,11 @@ class Poisoned(Line):
         self.outer.weight.grad[0, 0] = INF
 
 
-def test_the_first_broken_gradient_and_the_largest_whole_one_are_named(tmp_path):
+def test_the_first_broken_gradient_is_named(tmp_path):
     module = Poisoned()
     with pytest.raises(InputError) as caught:
         fit(module, batches(1.0), tmp_path, Guard(tmp_path, skips=1))
-    reference = Line()
-    reference.training_step((torch.tensor([[1.0]]), torch.tensor([0.0])), 0).backward()
-    norms = {n: p.grad.norm().item() for n, p in reference.named_parameters() if n != "outer.weight"}
-    largest = max(norms, key=norms.__getitem__)
-    said = str(caught.value)
-    assert "gradient of outer.weight non-finite first, 1 of 4" in said
-    assert f"largest finite norm {norms[largest]:.3g} ({largest})" in said
+    assert "gradient of outer.weight non-finite first, 1 of 4" in str(caught.value)
 
 
 def half(scale: float) -> MixedPrecision:
