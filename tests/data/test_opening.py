@@ -358,7 +358,7 @@ class TestRangeImagesForAModel:
             open_scans(path, self.READ).source[0]
         assert open_scans(self.image(tmp_path / "1.npy", 5, 1.0005), self.READ).source[0][1].max() == 1
 
-    @pytest.mark.parametrize(("ranges", "said"), [(5000, "its ranges are 5000 to 5000, in metres"), (0, "80 m.")])
+    @pytest.mark.parametrize(("ranges", "said"), [(90, "its ranges are 90 to 90, in metres"), (0, "80 m.")])
     def test_one_without_a_return_is_refused_or_stays_empty(self, tmp_path: Path, ranges: float, said: str):
         path = self.image(tmp_path / "0.npy", ranges, 0.5)
         with pytest.raises(InputError, match="has no return from 1.45 to 80 m") as refused:

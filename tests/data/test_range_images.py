@@ -133,3 +133,18 @@ def test_no_more_memory_is_taken_than_a_few_times_the_file(tmp_path: Path):
         assert tracemalloc.get_traced_memory()[1] < 4 * path.stat().st_size
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("absurd", [-5.0, 500.0, 1e30])
+def test_ranges_that_no_lidar_measures_are_reported_and_are_no_returns(tmp_path: Path, caplog, absurd: float):
+    image = np.full((2, 8, 32), 0.5, np.float32)
+    image[0] = 20
+    np.save(tmp_path / "whole.npy", image)
+    assert np.array_equal(range_image(tmp_path / "whole.npy"), image)
+    assert not caplog.text
+    image[0, 3, 5:9] = absurd
+    np.save(tmp_path / "image.npy", image)
+    found = range_image(tmp_path / "image.npy")
+    assert "image.npy: 4 ranges" in caplog.text
+    image[:, 3, 5:9] = 0
+    assert np.array_equal(found, image)

@@ -4,6 +4,7 @@ points = read_points("000000.bin")
 write_points("000000.ply", points.xyz, points.reflectance)
 """
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -68,6 +69,9 @@ SCAN_ENDINGS = tuple(_READERS)
 LOOSE_ENDINGS = (".csv", ".txt", ".npz")  # which other things than scans have too
 FIRM_ENDINGS = tuple(ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS)
 
+log = logging.getLogger(__name__)
+
+FARTHEST_RAY = 400.0  # metres; no spinning LiDAR measures farther
 LARGEST_FILE = 1 << 30  # bytes: 67 million points, hundreds of scans; reading more exhausts the memory
 
 
@@ -106,7 +110,9 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
 
 
 def read_range_image(path: str | Path) -> np.ndarray | None:
-    """The range image in a .npy of floats (2 or 1, H, W), float32, what is not finite as 0; None for any other array.
+    """The range image in a .npy of floats (2 or 1, H, W), float32; None for any other array.
+
+    What is not finite is 0, a ray without return; so is a range that no LiDAR measures, with a warning.
 
     Raises:
         InputError: the file is missing, no regular file or damaged.
@@ -117,7 +123,15 @@ def read_range_image(path: str | Path) -> np.ndarray | None:
     if array.ndim != 3 or array.shape[0] not in (1, 2) or array.dtype.kind != "f" or not array.size:
         return None
     with np.errstate(over="ignore"):  # beyond float32 is infinite, and so no return
-        return np.nan_to_num(array.astype(np.float32), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+        image = np.nan_to_num(array.astype(np.float32), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+    wrong = (image[0] < 0) | (image[0] > FARTHEST_RAY)
+    if wrong.any():
+        log.warning(
+            "%s: %d ranges below 0 or above %g m, from %.3g to %.3g, are taken as no return; ranges are metres",
+            path, wrong.sum(), FARTHEST_RAY, image[0][wrong].min(), image[0][wrong].max(),
+        )  # fmt: skip
+        image[:, wrong] = 0
+    return image
 
 
 def read_numbers(path: str | Path) -> np.ndarray:
