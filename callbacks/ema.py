@@ -10,7 +10,7 @@ from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 
 from r2flow.registry import Count, Natural, Portion, Positive, Registry
-from r2flow.systems.gan.rules import half_life_decay
+from r2flow.systems.gan.losses import half_life_decay
 
 
 def ema_decay(step: int, warmup: int, highest: float = 0.995, power: float = 2 / 3) -> float:
@@ -122,7 +122,7 @@ class EMA(WeightAveraging):
 
 class HalfLifeEMA(EMA):
     """The average of a GAN's generator: half of it is from the last `half_life` images, or from a share `rampup` of
-    those seen, where these are fewer (`r2flow.systems.gan.rules.half_life_decay`); every step, buffers copied.
+    those seen, where these are fewer (`r2flow.systems.gan.losses.half_life_decay`); every step, buffers copied.
 
     Args:
         batch_size: Images a step.

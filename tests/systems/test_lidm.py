@@ -27,9 +27,14 @@ from r2flow.registry import options_of
 from r2flow.systems.diffusion.sampling import noised
 from r2flow.systems.latent.autoencoder import Autoencoder
 from r2flow.systems.latent.ddim import Tables, ddim, ddim_walk, noise_loss, square_root_linear, tables
+from r2flow.systems.latent.discriminator import (
+    PatchDiscriminator,
+    adaptive_weight,
+    adversarial_factor,
+    hinge_loss,
+    reconstruction_loss,
+)
 from r2flow.systems.latent.generator import LatentDiffusion
-from r2flow.systems.latent.hinge import adaptive_weight, adversarial_factor, hinge_loss, reconstruction_loss
-from r2flow.systems.latent.patch_discriminator import PatchDiscriminator
 from r2flow.systems.latent.published import _autoencoder, _unet
 from r2flow.systems.latent.quantiser import Quantiser
 from r2flow.systems.latent.stage import returns

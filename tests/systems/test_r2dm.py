@@ -314,7 +314,7 @@ def test_unfolded_scans_look_along_the_rings_of_the_weights(shared, tmp_path):
 
 
 CHANGES = {
-    "found 90.0 and 80.0 metres": lambda cfg: cfg["data"].update(min_depth=90.0),
+    "found 90.0 and 80.0": lambda cfg: cfg["data"].update(min_depth=90.0),
     "its diffusion is of discrete steps": lambda cfg: cfg["diffusion"].update(timestep_type="discrete"),
     "it makes reflectance without range": lambda cfg: cfg["data"].update(train_depth=False),
     "lacks or garbles 'data'": lambda cfg: cfg.pop("data"),

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from r2flow.backbones.layers import ExactBuffers, at_least_float32, wrapped
 from r2flow.errors import InputError
 from r2flow.processes import averaged
-from r2flow.systems.gan.masks import logistic, straight_through_mask
+from r2flow.systems.gan.losses import logistic, straight_through_mask
 
 IMAGE, LOGIT, MASK, ORIGINAL, CODE = "image", "raydrop_logit", "raydrop_mask", "image_orig", "w"
 

@@ -1,11 +1,14 @@
-"""What a generator G and a discriminator D play for: the non-saturating loss, and R1 on real images.
+"""A GAN's losses and R1, relaxed ray-drop masks, and the rules of a run: learning rates, average, warm-up."""
 
-D gives each image one score s = D(x), the logit of "real".
-"""
+import math
+from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.nn.functional import softplus
+
+from r2flow.registry import Natural, NonNegative, Portion
 
 
 def generator_loss(fake: Tensor) -> Tensor:
@@ -27,3 +30,93 @@ def r1(scores: Tensor, x: Tensor) -> Tensor:
     """
     (gradient,) = torch.autograd.grad(scores.sum(), x, create_graph=True)
     return gradient.square().flatten(1).sum(1).mean()
+
+
+EPS = torch.finfo(torch.float32).eps
+
+
+def logistic(uniform: Tensor) -> Tensor:
+    """log u - log(1 - u): standard logistic noise of u in [0, 1), clamped to [eps, 1 - eps] of float32."""
+    u = uniform.clamp(EPS, 1 - EPS)
+    return u.log() - torch.log1p(-u)
+
+
+def straight_through_mask(logit: Tensor, noise: Tensor, temperature: float = 1.0) -> Tensor:
+    """m ~ Bernoulli(sigmoid(logit)), 0 or 1, with the gradient of its relaxation s.
+
+    s = sigmoid((logit + noise) / temperature) and m = [s > 1/2] (Maddison et al. 2017, appendix B; Nakashima and
+    Kurazume 2021, eq. 4).
+
+    Args:
+        logit: Log-odds that a ray returns, (B, 1, H, W).
+        noise: `logistic` noise of the same shape.
+    """
+    soft = torch.sigmoid((logit + noise) / temperature)
+    return soft + ((soft > 0.5).to(soft) - soft).detach()
+
+
+def half_life_decay(step: int, batch_size: int, half_life: float, rampup: float) -> float:
+    """Decay of the generator's average after step 1, 2, ...: 2^(-B / h), h = min(half_life, rampup B step).
+
+    Half of the average is from the last h images. h grows with the images seen, so that the average is not that of an
+    untrained generator; the first step all but copies the weights (Karras et al. 2020, StyleGAN2-ADA, appendix B).
+    """
+    images = min(half_life, rampup * batch_size * step)
+    return 0.5 ** (batch_size / images) if images > 0 else 0.0
+
+
+def lazy_adam(learning_rate: float, betas: tuple[float, float], every: int) -> tuple[float, tuple[float, float]]:
+    """Adam's learning rate and betas where every `every` steps one more is taken for a penalty.
+
+    With c = every / (every + 1): c times the rate, and betas to the power of c (Karras et al. 2020, StyleGAN2,
+    appendix B). 0 for no such steps.
+    """
+    c = every / (every + 1) if every else 1.0
+    return c * learning_rate, (betas[0] ** c, betas[1] ** c)
+
+
+@dataclass(frozen=True)
+class Warmup:
+    """What is made harder for the discriminator at first: pixels dropped and images blurred, both less and less.
+
+    Attributes:
+        images: Images seen until nothing is changed any more; 0 for no warm-up.
+        dropout: Share of dropped pixels at the start.
+        blur: sigma of the blur at the start, in pixels.
+    """
+
+    images: Natural = 200_000
+    dropout: Portion = 0.5
+    blur: NonNegative = 0.0
+
+    def left(self, images: int) -> float:
+        """1 at the start, 0 from `images` on, linear between."""
+        return max(1 - images / self.images, 0.0) if self.images else 0.0
+
+    def __call__(self, x: Tensor, images: int, uniform: Tensor | None, dropped: float = -1.0) -> Tensor:
+        """x after so many images of the run.
+
+        Args:
+            x: (B, C, H, W) in model space.
+            uniform: For each value of x, in [0, 1); None is enough once the warm-up is over.
+            dropped: The value of a dropped pixel.
+        """
+        left = self.left(images)
+        x = blurred(x, self.blur * left)
+        if uniform is None or self.dropout * left == 0:
+            return x
+        return torch.where(uniform < 1 - self.dropout * left, x, torch.full_like(x, dropped))
+
+
+def blurred(x: Tensor, sigma: float) -> Tensor:
+    """x filtered by 2^(-(k / sigma)^2), |k| <= floor(3 sigma), over its sum (Karras et al. 2021, StyleGAN3).
+
+    Circular in azimuth, the edge rows repeated.
+    """
+    reach = math.floor(3 * sigma)
+    if reach == 0:
+        return x
+    taps = torch.exp2(-((torch.arange(-reach, reach + 1, device=x.device) / sigma) ** 2))
+    taps = (taps / taps.sum()).to(x.dtype).expand(x.shape[1], 1, 1, -1)
+    x = F.conv2d(F.pad(x, (reach, reach, 0, 0), mode="circular"), taps, groups=x.shape[1])
+    return F.conv2d(F.pad(x, (0, 0, reach, reach), mode="replicate"), taps.mT, groups=x.shape[1])

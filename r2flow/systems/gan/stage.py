@@ -15,8 +15,7 @@ from r2flow.stages.base import Batch, Stage
 from r2flow.systems.gan import dcgan, style_gan
 from r2flow.systems.gan.augment import AdaptiveAugment
 from r2flow.systems.gan.generator import DustyV2, Gan
-from r2flow.systems.gan.losses import discriminator_loss, generator_loss, r1
-from r2flow.systems.gan.rules import Warmup, lazy_adam
+from r2flow.systems.gan.losses import Warmup, discriminator_loss, generator_loss, lazy_adam, r1
 
 DISCRIMINATORS: Registry[type[nn.Module]] = Registry(
     "discriminator", dcgan=dcgan.Discriminator, style_gan=style_gan.Discriminator
@@ -59,7 +58,7 @@ class BatchDraws:
 class LearnGan(Stage):
     """G and D in turn: a step of G, one of D on fresh G(z) and the scans, and every `r1_every` steps one of R1.
 
-    All that D sees is warmed up (`r2flow.systems.gan.rules.Warmup`) and augmented (`AdaptiveAugment`). Both learn by
+    All that D sees is warmed up (`r2flow.systems.gan.losses.Warmup`) and augmented (`AdaptiveAugment`). Both learn by
     Adam at a constant rate (`lazy_adam` for D). The loss is the non-saturating one; R1's weight is
     r1 r1_every / 2, which makes up for the steps without it. The recipe is DUSty v2's.
 

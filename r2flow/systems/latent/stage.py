@@ -13,9 +13,14 @@ from r2flow.processes import averaged
 from r2flow.registry import Natural, NonNegative, check_options
 from r2flow.stages.base import Batch, SingleLoss, Stage
 from r2flow.systems.latent.ddim import noise_loss
+from r2flow.systems.latent.discriminator import (
+    PatchDiscriminator,
+    adaptive_weight,
+    adversarial_factor,
+    hinge_loss,
+    reconstruction_loss,
+)
 from r2flow.systems.latent.generator import LatentDiffusion, VQAutoencoder
-from r2flow.systems.latent.hinge import adaptive_weight, adversarial_factor, hinge_loss, reconstruction_loss
-from r2flow.systems.latent.patch_discriminator import PatchDiscriminator
 
 LEAST = 1 / 255  # metres: shorter ranges are not returns
 SHIFT = 1e-4  # metres that the published threshold lacks under the logarithm, and `ShiftedLog` adds
@@ -32,7 +37,7 @@ class LearnAutoencoder(Stage):
     """Reconstruction, codebook and a patch discriminator: R + f w A + c Q for the autoencoder, f H for the latter.
 
     R is the mean absolute error, A the discriminator's verdict, w `adaptive_weight`, Q the quantiser's loss, H the
-    hinge loss and f `adversarial_factor`, all of `r2flow.systems.latent.hinge` (Esser et al. 2021).
+    hinge loss and f `adversarial_factor`, all of `r2flow.systems.latent.discriminator` (Esser et al. 2021).
 
     Args:
         generator: A `VQAutoencoder`.
