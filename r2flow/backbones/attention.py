@@ -42,9 +42,6 @@ def neighbourhood_attention(
 
     Returns:
         (B, H, W, N, D).
-
-    Raises:
-        InputError: an even or empty window, no such backend, or one that cannot be had here.
     """
     check_window(window)
     rows = _Axis(q.shape[1], window[0], wrap=False)
@@ -54,11 +51,7 @@ def neighbourhood_attention(
 
 
 def check_window(window: Sequence[int]) -> None:
-    """Refuse a window without a middle.
-
-    Raises:
-        InputError: a size that is even, or below 1.
-    """
+    """Refuse a window without a middle."""
     if any(size < 1 or size % 2 == 0 for size in window):
         raise InputError(f"the attention window must have odd sizes of at least 1, found {tuple(window)}.")
 
@@ -235,11 +228,7 @@ BACKENDS: Registry[Backend] = Registry("attention backend", dense=_dense, tiles=
 
 
 def backend_name(name: str) -> str:
-    """The backend of a config, so that a wrong name is found when a network is built.
-
-    Raises:
-        InputError: neither "auto" nor in `BACKENDS`.
-    """
+    """The backend of a config, so that a wrong name is found when a network is built."""
     if name == "shifts":  # a backend of version 0.1.0, of the same values
         return "tiles"
     if name != "auto":

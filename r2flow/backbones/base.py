@@ -60,10 +60,6 @@ class Backbone(ExactBuffers):
         out_channels: Channels C' of the answer; None for C.
         second_time: Whether the network takes s.
         data_std: Standard deviation of the data, for `precondition`; None for a network that gives v itself.
-
-    Raises:
-        InputError: rays of another shape, H or W that is not a multiple of the unit, channels below 1, or
-            second_time for a class that does not take it.
     """
 
     takes_second_time: ClassVar[bool] = False
@@ -100,10 +96,6 @@ class Backbone(ExactBuffers):
 
         Returns:
             (B, C', H, W), in x's type.
-
-        Raises:
-            InputError: x of another shape, or s for a network of one time.
-            ValueError: times of another shape.
         """
         expected = self.in_channels, *self.coords.shape[2:]
         if x.shape[1:] != expected:
@@ -174,9 +166,6 @@ class Backbone(ExactBuffers):
         Args:
             rows: Numbers of neighbouring rows, ascending.
             columns: Numbers of neighbouring columns; they may pass the end of the ring.
-
-        Raises:
-            InputError: a backbone that cannot be cropped, or a part that is not made up of whole units.
         """
         if not self.croppable:
             raise InputError(
@@ -255,11 +244,7 @@ def _times(name: str, times: Tensor | float, x: Tensor) -> Tensor:
 
 
 def integers(name: str, values: int | Sequence[int], count: int) -> tuple[int, ...]:
-    """As many integers as asked for, from such a list or from one for all.
-
-    Raises:
-        InputError: another number of values, or one below 1.
-    """
+    """As many integers as asked for, from such a list or from one for all."""
     found = (int(values),) * count if isinstance(values, int) else tuple(int(value) for value in values)
     if len(found) != count or not found or min(found) < 1:
         raise InputError(f"{name} must be {count or 1} integers of at least 1, found {list(found)}.")

@@ -211,9 +211,6 @@ class UNet(Backbone):
         groups: Of group norms; every width is a multiple of it.
         eps: Added to their variance.
         common: See `Backbone`.
-
-    Raises:
-        InputError: a shape, width, head count or position that cannot work.
     """
 
     takes_second_time = True

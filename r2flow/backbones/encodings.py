@@ -137,11 +137,7 @@ PUBLISHED_NAMES = {"learnable_embedding": "learnable", "polar_coordinates": "pol
 
 
 def position_name(position: str | None, *special: str) -> str:
-    """Our name of a position option: the published configs' names are taken too.
-
-    Raises:
-        InputError: neither in `ENCODINGS` nor among the `special` ones of the backbone.
-    """
+    """Our name of a position option: the published configs' names are taken too."""
     name = PUBLISHED_NAMES.get(str(position), str(position).lower())
     if name not in special and name not in ENCODINGS:
         raise InputError(f"no position named {position!r}; known: {', '.join([*special, *ENCODINGS])}.")

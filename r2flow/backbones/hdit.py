@@ -55,9 +55,6 @@ class HDiT(Backbone):
         detail: Blocks and channels of a convolutional path at full resolution beside the tokens (`Detail`), which
             learns smooth surfaces sooner; None for the paper's network.
         common: See `Backbone`.
-
-    Raises:
-        InputError: a shape, head count, window, position or backend that cannot work.
     """
 
     takes_second_time = True

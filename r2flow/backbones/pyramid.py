@@ -49,9 +49,6 @@ class Pyramid(Backbone):
             takes a degree of freedom.
         ring: Whether the columns are a full turn.
         common: See `Backbone`.
-
-    Raises:
-        InputError: an inner network that cannot be built, or an image that it cannot see the means of.
     """
 
     takes_second_time = True

@@ -75,11 +75,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
 
 
 def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Our config of a published checkpoint's `cfg`, which holds data, model, flow, training and finetuning.
-
-    Raises:
-        InputError: a part that is missing or unknown to us.
-    """
+    """Our config of a published checkpoint's `cfg`, which holds data, model, flow, training and finetuning."""
     try:
         data, model = cfg["data"], cfg["model"]
         rows, columns = (int(n) for n in data["resolution"])
@@ -108,11 +104,7 @@ def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
 
 def backbone_of(model: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Our backbone's options of a published config's `model`.
-
-    Raises:
-        InputError: an unknown architecture.
-    """
+    """Our backbone's options of a published config's `model`."""
     architecture = str(model["architecture"])
     if architecture not in ARCHITECTURES:
         raise InputError(

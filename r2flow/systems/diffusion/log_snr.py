@@ -26,9 +26,6 @@ class Cosine:
     Args:
         lowest: lambda(1).
         highest: lambda(0).
-
-    Raises:
-        InputError: lowest is not below highest, or one is beyond `FARTHEST`.
     """
 
     def __init__(self, lowest: float = -15.0, highest: float = 15.0) -> None:

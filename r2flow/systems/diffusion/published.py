@@ -29,11 +29,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
 
 
 def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Our config of a published checkpoint's `cfg`, which holds data, model, diffusion and training.
-
-    Raises:
-        InputError: a part that is missing or unknown to us.
-    """
+    """Our config of a published checkpoint's `cfg`, which holds data, model, diffusion and training."""
     try:
         data, model, diffusion = cfg["data"], cfg["model"], cfg["diffusion"]
         rows, columns = (int(n) for n in data["resolution"])

@@ -19,11 +19,7 @@ DDPM, DDIM = "ddpm", "ddim"
 
 
 def eta_of(method: str) -> float | None:
-    """eta of a sampler's name: `ddpm` is 1, `ddim` is 0, `ddim:ETA` is what it says; None for another method.
-
-    Raises:
-        InputError: an eta outside [0, 1].
-    """
+    """eta of a sampler's name: `ddpm` is 1, `ddim` is 0, `ddim:ETA` is what it says; None for another method."""
     if method in (DDPM, DDIM):
         return float(method == DDPM)
     if not method.startswith(f"{DDIM}:"):

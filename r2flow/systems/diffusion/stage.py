@@ -24,9 +24,6 @@ class LearnDiffusion(SingleLoss):
         paired: Whether a sample's error has its own weight; False as published, see
             `r2flow.systems.diffusion.objectives.weighted_mean`.
         options: Those of `Stage`.
-
-    Raises:
-        InputError: another generator, or an unknown loss.
     """
 
     generator_name = "diffusion"

@@ -86,9 +86,6 @@ class AdaptiveAugment(nn.Module):
         every: Steps between two moves.
         policy: By what each transformation's probability differs from p, as a factor; a transformation that is not
             named has 1, and 0 leaves it out. Names: `TRANSFORMATIONS`.
-
-    Raises:
-        InputError: an unknown transformation.
     """
 
     p: Tensor

@@ -22,11 +22,7 @@ from r2flow.systems.gan.layers import (
 
 
 def _first_map(what: str, shape: tuple[int, int], doublings: int) -> tuple[int, int]:
-    """Rows and columns of the smallest map.
-
-    Raises:
-        InputError: fewer than 2, which cannot be mirrored at their edges, or an image that is no multiple.
-    """
+    """Rows and columns of the smallest map."""
     check_shape(what, shape, 2**doublings)
     rows, columns = shape[0] >> doublings, shape[1] >> doublings
     if min(rows, columns) < 2:

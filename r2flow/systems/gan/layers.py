@@ -181,9 +181,6 @@ class LatentGenerator(nn.Module):
         Returns:
             `image` (B, C, H, W) and `w` (B, layers, code); where rays are dropped also `image_orig`, `raydrop_logit`
             and `raydrop_mask`.
-
-        Raises:
-            InputError: no noise for a mask that needs it.
         """
         w: Tensor = self.mapping_network(z)
         if self.training:
@@ -205,10 +202,6 @@ def outputs(channels: int, drops: bool) -> dict[str, int]:
 
 
 def check_shape(what: str, shape: tuple[int, int], unit: int) -> None:
-    """Refuse an image that cannot be halved so often.
-
-    Raises:
-        InputError: rows or columns that are no multiple of `unit`.
-    """
+    """Refuse an image that cannot be halved so often."""
     if shape[0] % unit or shape[1] % unit:
         raise InputError(f"{what} needs rows and columns that are multiples of {unit}, found {shape[0]} x {shape[1]}.")

@@ -22,11 +22,7 @@ def holds(content: Any) -> bool:
 
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
-    """A published GAN: its generator, by the averaged weights or the raw ones.
-
-    Raises:
-        InputError: a part that is missing or unknown to us.
-    """
+    """A published GAN: its generator, by the averaged weights or the raw ones."""
     cfg, angle = content["cfg"], content["angle"]
     try:
         name, own = _generator(cfg["model"]["generator"])

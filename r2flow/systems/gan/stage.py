@@ -73,9 +73,6 @@ class LearnGan(Stage):
         augment: Options of `AdaptiveAugment`; None for no augmentation.
         batch_size: Images a step.
         seed: Run seed.
-
-    Raises:
-        InputError: a generator that is no GAN's, an unknown discriminator or option.
     """
 
     def __init__(

@@ -241,9 +241,6 @@ class Autoencoder(nn.Module):
         legacy: See `Quantiser`.
         mask: Whether the decoder says, in one channel more, which rays return; where it is negative there is none.
         dropout: Share of activations dropped in training.
-
-    Raises:
-        InputError: widths, strides or levels that do not go together.
     """
 
     def __init__(
@@ -281,11 +278,7 @@ class Autoencoder(nn.Module):
         self.post_quant_conv = nn.Conv2d(code_channels, latent_channels, 1)
 
     def latent_shape(self, rows: int, columns: int) -> tuple[int, int, int]:
-        """(code_channels, h, w) of an image's latents.
-
-        Raises:
-            InputError: rows or columns that the strides do not divide.
-        """
+        """(code_channels, h, w) of an image's latents."""
         high, wide = (math.prod(stride[axis] for stride in self.strides) for axis in (0, 1))
         if rows % high or columns % wide:
             raise InputError(

@@ -52,9 +52,6 @@ def ddim_walk(alpha_bar: Tensor, steps: int, eta: float) -> Walk:
     """Every (N // steps)-th of the N steps, from 1 on: more than `steps` where that does not divide N.
 
     The last step goes to alpha_bar_0 and not to 1, as in the published code, and adds noise too.
-
-    Raises:
-        InputError: steps outside 1 to N - 1.
     """
     total = len(alpha_bar)
     if not 1 <= steps < total:

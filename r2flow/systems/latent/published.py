@@ -156,11 +156,7 @@ def _params(path: Path) -> Mapping[str, Any]:
 
 
 def _config(generator: dict[str, Any], path: Path) -> dict[str, Any]:
-    """The config of a file, with what its `config.yaml` says of the data.
-
-    Raises:
-        InputError: a field of view or a scale of the ranges that LiDM's published images do not have.
-    """
+    """The config of a file, with what its `config.yaml` says of the data."""
     content = _beside(path)
     if not content:
         heads = f", attention heads of {HEAD} channels" if generator["name"] == "latent_diffusion" else ""

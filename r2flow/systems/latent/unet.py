@@ -113,9 +113,6 @@ class LatentUNet(nn.Module):
         position: "learnable" adds a learned bias for each place after the first convolution, (width, rows, columns),
             zero at the start: the paper's LiDM + APE. "none": LiDM.
         dropout: Share of activations dropped in training.
-
-    Raises:
-        InputError: sizes, widths or heads that do not go together.
     """
 
     def __init__(

@@ -24,11 +24,7 @@ SPACINGS: Registry[Callable[[float, float, int], np.ndarray]] = Registry(
 
 
 def noise_levels(first: float, last: float, levels: int, spacing: str = "geometric") -> Tensor:
-    """sigma_0 = first > ... > sigma_{L-1} = last, (levels,) float32.
-
-    Raises:
-        InputError: an unknown spacing, or last above first.
-    """
+    """sigma_0 = first > ... > sigma_{L-1} = last, (levels,) float32."""
     if last > first:
         raise InputError(f"noise levels fall from {first:g} and cannot reach {last:g}.")
     return torch.from_numpy(SPACINGS[spacing](first, last, levels).astype(np.float32))

@@ -175,11 +175,7 @@ class RefineNet(nn.Module):
         self.refine4 = RefineBlock([width, width], width, last=True)
 
     def forward(self, x: Tensor, labels: Tensor) -> Tensor:
-        """The score of images (B, C, H, W) at the noise levels (B,) int64, of their shape; H and W are even.
-
-        Raises:
-            InputError: an odd height or width.
-        """
+        """The score of images (B, C, H, W) at the noise levels (B,) int64, of their shape; H and W are even."""
         rows, columns = x.shape[2:]
         if rows % 2 or columns % 2:
             raise InputError(f"RefineNet halves the image: its height and width must be even, found {rows}x{columns}.")
