@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -16,22 +16,23 @@ from r2flow.registry import Registry, check_options
 LIMIT_TOLERANCE = 1e-5
 
 
-class RangeFormat(Protocol):
-    """A range r in metres as `channels` values y of [0, 1]."""
-
-    channels: int
-
-    def forward(self, r: Tensor) -> Tensor:
-        """(..., 1, H, W) -> (..., channels, H, W)."""
-
-    def inverse(self, y: Tensor) -> Tensor:
-        """(..., channels, H, W) -> (..., 1, H, W)."""
-
-
-class LogScale:
-    """log2(r + 1) / log2(r_max + 1), the paper's eq. 4: finer near the sensor."""
+class RangeFormat:
+    """A range r in metres as `channels` values y of [0, 1]: (..., 1, H, W) to (..., channels, H, W), and back."""
 
     channels = 1
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.min_range, self.max_range = sensor.min_range, sensor.max_range
+
+    def forward(self, r: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def inverse(self, y: Tensor) -> Tensor:
+        raise NotImplementedError
+
+
+class LogScale(RangeFormat):
+    """log2(r + 1) / log2(r_max + 1), the paper's eq. 4: finer near the sensor."""
 
     def __init__(self, sensor: Sensor) -> None:
         self.scale = math.log2(sensor.max_range + 1)
@@ -43,14 +44,12 @@ class LogScale:
         return torch.exp2(y * self.scale) - 1
 
 
-class ShiftedLog:
+class ShiftedLog(RangeFormat):
     """log2(r + 1.0001) / scale, clipped to [0, 1], with scale = log2(r_max + 1) rounded up to hundredths.
 
     LiDARGen's (r_max 63 m, scale 6) and LiDM's (56 m, 5.84). A ray without return is log2(1.0001) / scale and not
     quite 0; the way back, 2^(scale y) - 1, leaves the 0.1 mm in.
     """
-
-    channels = 1
 
     def __init__(self, sensor: Sensor) -> None:
         self.scale = math.ceil(100 * math.log2(sensor.max_range + 1) - 1e-9) / 100
@@ -62,27 +61,17 @@ class ShiftedLog:
         return torch.exp2(y.clamp(0, 1) * self.scale) - 1
 
 
-class Inverse:
+class Inverse(RangeFormat):
     """r_min / r, 0 where there is no return; float32 holds r to within r^2 / r_min 2^-26, 2 mm of 0.3 to 200 m."""
-
-    channels = 1
-
-    def __init__(self, sensor: Sensor) -> None:
-        self.min_range = sensor.min_range
 
     def forward(self, r: Tensor) -> Tensor:
         return torch.where(r > 0, self.min_range / r.clamp(min=1e-12), 0.0)
 
-    def inverse(self, y: Tensor) -> Tensor:
-        return torch.where(y > 0, self.min_range / y.clamp(min=1e-12), 0.0)
+    inverse = forward
 
 
 class InverseDepth(Inverse):
     """r_min / r within the range limits and 0 beyond them, both ways and without tolerance, as DUSty has it."""
-
-    def __init__(self, sensor: Sensor) -> None:
-        super().__init__(sensor)
-        self.max_range = sensor.max_range
 
     def forward(self, r: Tensor) -> Tensor:
         held = (r >= self.min_range) & (r <= self.max_range)
@@ -94,13 +83,8 @@ class InverseDepth(Inverse):
         return torch.where(held, super().inverse(y), 0.0)
 
 
-class Metric:
+class Metric(RangeFormat):
     """r / r_max."""
-
-    channels = 1
-
-    def __init__(self, sensor: Sensor) -> None:
-        self.max_range = sensor.max_range
 
     def forward(self, r: Tensor) -> Tensor:
         return r / self.max_range
@@ -109,13 +93,13 @@ class Metric:
         return y * self.max_range
 
 
-class Cartesian:
+class Cartesian(RangeFormat):
     """(x, y, z) / r_max, shifted from [-1, 1] to [0, 1]; a ray without return is the sensor's origin."""
 
     channels = 3
 
     def __init__(self, sensor: Sensor) -> None:
-        self.max_range = sensor.max_range
+        super().__init__(sensor)
         self.rays = sensor.rays()
 
     def forward(self, r: Tensor) -> Tensor:

@@ -57,16 +57,11 @@ def read_labels(path: str | Path, scan: str | Path, points: Points | None = None
     path = Path(path)
     points = read_points(scan) if points is None else points
     rows = len(points.xyz) + points.dropped
-    if path.is_symlink() and not path.exists():
-        raise InputError(f"{path} is a link to {path.readlink()}, which does not exist.")
     if not path.is_file():
-        raise InputError(f"{path} is not a file of labels.")
+        raise InputError(f"{path} is not a file of labels, or a link to a file that does not exist.")
     size = path.stat().st_size  # looked at first: a file of the wrong length is never loaded
     if size != 4 * rows:
-        raise InputError(
-            f"{path} holds {size} bytes, but {scan} has {rows} points, which need {4 * rows}. "
-            f"Is it whole, {LAYOUT}, and of this scan?"
-        )
+        raise InputError(f"{path} holds {size} bytes, but {scan} has {rows} points, which need {4 * rows}: {LAYOUT}.")
     try:
         labels = np.fromfile(path, dtype="<u4")
     except OSError as error:
@@ -75,6 +70,5 @@ def read_labels(path: str | Path, scan: str | Path, points: Points | None = None
     # Big-endian integers and floats keep their digits in the high bits: instances, without a class, everywhere.
     instances = int(np.count_nonzero((ids == 0) & (labels > 0)))
     if ids.max(initial=0) > LARGEST_CLASS or instances > rows / 2:
-        found = f"classes up to {ids.max()}, {instances} of {rows} points an instance of no class"
-        raise InputError(f"{path} does not look like {LAYOUT}: {found}. Is it damaged, big-endian or of floats?")
+        raise InputError(f"{path} does not look like {LAYOUT}. Is it damaged, big-endian or of floats?")
     return ids if points.kept is None else ids[points.kept]
