@@ -158,7 +158,7 @@ class ScanDataModule(L.LightningDataModule):
     def fingerprint(self) -> str:
         """What is trained on, wherever it lies: a run goes on only with the same scans in the same order."""
         if self.pairs is not None:
-            pairs = f"{self.pairs.num} pairs, {self.pair_store.recipe.digest}"
+            pairs = f"{self.pairs.num} pairs, {self.pair_store.digest[:16]}"
             beside = self.options.beside
             return f"{pairs}; {self._named(self.scans, [beside])}" if self.scans is not None and beside else pairs
         assert isinstance(self.training_source, ScanSource)
