@@ -50,15 +50,13 @@ def page(
         rays: Elevation and azimuth in radians, (2, H, W), of all scans, or of each.
         captions: Of each scan; its number if left out.
         frames: What the slider says at each frame.
-        labels: Semantic id of each pixel of a scan, (H, W), or of each of its frames, (T, H, W); None for a scan
-            without.
-        title: Of the page.
+        labels: Semantic id of each pixel of a scan, (H, W) or (T, H, W); None for a scan without.
 
     Returns:
         The page, about 50 kB and 130 kB for each image of 64 x 1024. Texts in it are never read as HTML.
 
     Raises:
-        InputError: no scan, more than `MOST` pixels, or rays, captions or labels that do not fit them.
+        InputError: no scan, or more than `MOST` pixels.
     """
     stacks = [_frames_of(one) for one in images]
     count, pixels = sum(map(len, stacks)), sum(stack[:, 0].size for stack in stacks)
@@ -70,17 +68,13 @@ def page(
     shared = isinstance(rays, np.ndarray | Tensor) and rays.ndim == 3
     each_rays = [np.asarray(one, dtype=np.float64) for one in ([rays] * len(stacks) if shared else rays)]
     each_labels = [None if one is None else np.asarray(one) for one in labels or [None] * len(stacks)]
-    said = list(captions) or [f"{number}" for number in range(len(stacks))]
-    if not len(stacks) == len(each_rays) == len(each_labels) == len(said):
-        counts = f"{len(each_rays)} rays, {len(each_labels)} labels and {len(said)} captions"
-        raise InputError(f"each of {len(stacks)} scans needs rays, labels and a caption, found {counts}.")
+    each_caption = list(captions) or [f"{number}" for number in range(len(stacks))]
     sensors: dict[bytes, tuple[int, dict[str, Any]]] = {}
     classes = _classes(each_labels)
     step = max(STEP, max(float(stack[:, 0].max(initial=0)) for stack in stacks) / (CODES - 1))
     scans = []
-    for stack, seen, ids, caption in zip(stacks, each_rays, each_labels, said, strict=True):
-        if seen.shape != (2, *stack.shape[2:]):
-            raise InputError(f"{caption}: images of {stack.shape[2:]} need rays of as many pixels, found {seen.shape}.")
+    for stack, seen, ids, caption in zip(stacks, each_rays, each_labels, each_caption, strict=True):
+        assert seen.shape == (2, *stack.shape[2:]), f"{caption}: images of {stack.shape[2:]}, rays of {seen.shape}"
         number, _ = sensors.setdefault(seen.tobytes(), (len(sensors), _described(seen)))
         numbers = None if ids is None else _numbered(ids, stack, classes)
         packed = [packed_image(image, step, None if numbers is None else numbers[t]) for t, image in enumerate(stack)]
@@ -142,8 +136,8 @@ def _frames_of(images: Images) -> np.ndarray:
     """(T, 2 or 1, H, W) of one scan."""
     stack = np.asarray(images, dtype=np.float32)
     stack = stack[None] if stack.ndim == 3 else stack
-    if stack.ndim != 4 or stack.shape[1] not in (1, 2) or not stack.size:
-        raise InputError(f"a scan is an image of (2 or 1, H, W), or a stack of them; found {np.shape(images)}.")
+    assert stack.ndim == 4, np.shape(images)
+    assert stack.shape[1] in (1, 2), np.shape(images)
     return stack
 
 
@@ -171,12 +165,9 @@ def _classes(labels: Sequence[np.ndarray | None]) -> dict[int, tuple[str, str]]:
 
 def _numbered(ids: np.ndarray, stack: np.ndarray, classes: dict[int, tuple[str, str]]) -> np.ndarray:
     """The place of each id among the classes, from 1 on, (T, H, W); 0 for none."""
-    shape = (len(stack), *stack.shape[2:])
-    if ids.shape not in (shape, shape[1:]):
-        raise InputError(f"labels of {ids.shape} do not fit images of {shape}.")
     table = np.zeros(int(max(ids.max(initial=0), *classes, 0)) + 1, np.uint8)
     table[list(classes)] = np.arange(1, len(classes) + 1)
-    return np.broadcast_to(table[ids], shape)
+    return np.broadcast_to(table[ids], (len(stack), *stack.shape[2:]))
 
 
 def _filled(contents: dict[str, Any], title: str) -> str:
