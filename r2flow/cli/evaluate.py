@@ -136,13 +136,15 @@ def evaluate(
     measures how the distance falls with the number of steps, against evaluations and seconds; points that are in --out
     already are not measured again. Under torchrun the processes share the scans.
     """
-    from r2flow.evaluation.measuring import check_reflectance
+    from r2flow.evaluation.measuring import Work, check_reflectance
     from r2flow.evaluation.processes import joined
+    from r2flow.evaluation.sets import is_checkpoint
     from r2flow.evaluation.statistics import Cache
+    from r2flow.metrics import METRICS, default_metrics
     from r2flow.reports.pages import prepare_folder
 
     named = list(dict.fromkeys(generated or []))
-    sampled = [one for one in named if _is_flow(one)]
+    sampled = [one for one in named if is_checkpoint(one)]
     rules = _check_evaluation(named, checkpoint, measured, output)
     _check_used(len(named) > len(sampled), bool(sampled or checkpoint), scans, sampling)
     with joined(choose_device(work.device)) as place:
@@ -154,7 +156,8 @@ def evaluate(
             each = "each point" if checkpoint else "each" if len(flows) > 1 else "it"
             print(f"{', '.join(flows)}: {SAMPLED} scans of {each} are drawn (--num says how many)")
         files = [one for one in named if one not in sampled]
-        reading = reading_of([real, *files, measured.train], list(flows.values()), how)
+        flow = next(iter(flows.values()), None)
+        reading = choose_reading([real, *files, measured.train], **vars(how), model=flow)
         if rules.convention is not None and how.convention is None:
             reading = replace(reading, convention=rules.convention)
         if wanted is not None:  # where no metric reads reflectance, its scale does not matter
@@ -172,10 +175,11 @@ def evaluate(
         sets = [truth, *judged.values()]
         reflectance = all(s.about["reflectance"] for s in sets)
         reflectance = reflectance and all(flow.encoding.reflectance for flow in flows.values())
-        built = wanted or _build_those_possible(measured.metrics == ALL, reflectance, measured.bootstrap, place)
+        names = METRICS if measured.metrics == ALL else default_metrics(reflectance)
+        built = wanted or _build_possible([*names], reflectance, measured.bootstrap, place)
         check_reflectance(built, sets)
         job = Job(
-            truth, built, work_of(work.batch_size, work.workers, place.rank, place.ranks),
+            truth, built, Work(work.batch_size, work.workers, place.rank, place.ranks, watched=place.rank == 0),
             None if measured.no_cache else Cache(), place.device, sampling, rules,
         )  # fmt: skip
         training = None if measured.train is None else _open(measured.train, reading, measured.train_split, None)
@@ -206,9 +210,9 @@ def _check_evaluation(
     generated: list[str], checkpoint: list[Path] | None, measured: MeasureOptions, output: OutputOptions
 ) -> "Rules":
     """The protocol; options that do not go together are refused before anything is read."""
-    from r2flow.evaluation.protocols import named_rules
+    from r2flow.evaluation.protocols import PROTOCOLS
 
-    rules = named_rules(measured.protocol)
+    rules = PROTOCOLS[measured.protocol]
     if checkpoint and generated:
         raise InputError("give GENERATED for one comparison or --checkpoint for a curve, not both.")
     if checkpoint and output.out is None:
@@ -277,7 +281,7 @@ def _compare(
         return
     nearest: dict[str, Nearest] = {}
     if training is not None:
-        alone = work_of(job.work.batch_size, job.work.workers)
+        alone = replace(job.work, ranks=1)
         nearest = find_nearest({**judged, REAL: job.truth}, training, alone, job.device)
         of = {("judged", name): nearest[name] for name in judged} | {("reference", "real halves"): nearest[REAL]}
         for place, one in enumerate(comparisons):
@@ -344,19 +348,6 @@ def _measure_curve(
         finish(page, out, page.text)
 
 
-def work_of(batch_size: int, workers: int, rank: int = 0, ranks: int = 1) -> "Work":
-    """How the work is done; the first process shows its progress on standard error."""
-    from r2flow.evaluation.measuring import Work
-
-    return Work(batch_size, workers, rank, ranks, watched=rank == 0)
-
-
-def _is_flow(text: str | None) -> bool:
-    from r2flow.evaluation.sets import is_checkpoint
-
-    return text is not None and is_checkpoint(text)
-
-
 def _load_flows(paths: list[Path], device: str) -> "dict[str, Checkpoint]":
     from r2flow.model.checkpoint import load_checkpoint
 
@@ -366,13 +357,6 @@ def _load_flows(paths: list[Path], device: str) -> "dict[str, Checkpoint]":
         seen = (f"{name} {flow.sensor.name} {'x'.join(map(str, flow.sensor.shape))}" for name, flow in flows.items())
         raise InputError(f"flows of different sensors or sizes, {', '.join(seen)}: measure each by itself.")
     return flows
-
-
-def reading_of(
-    specs: "Sequence[str | None]", flows: "Sequence[Checkpoint]" = (), how: ReadingOptions | None = None
-) -> "Reading":
-    """How scans become images: as asked for, else as the flow's or one of the named sets' were, else the usual way."""
-    return choose_reading(specs, **vars(how or ReadingOptions()), model=flows[0] if flows else None)
 
 
 def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> "ScanSet":
@@ -405,22 +389,17 @@ def _build(names: Sequence[str], bootstrap: int, place: "Process") -> "dict[str,
     return {name: METRICS[name](keep=bootstrap > 0).to(place.device) for name in dict.fromkeys(names)}
 
 
-def _build_those_possible(
-    everything: bool, reflectance: bool, bootstrap: int, place: "Process"
+def _build_possible(
+    names: Sequence[str], reflectance: bool, bootstrap: int, place: "Process"
 ) -> "dict[str, ScanMetric]":
-    """The default metrics, or every one of the table; one warning says which of them cannot be computed here."""
-    from r2flow.metrics import METRICS, default_metrics
-
-    names = METRICS if everything else default_metrics(reflectance)
+    """The metrics that can be computed here; a warning names the others."""
     built: dict[str, ScanMetric] = {}
     left_out: dict[str, list[str]] = {}
     for name in names:
         try:
             (metric,) = _build([name], bootstrap, place).values()
-        except InputError as error:
-            left_out.setdefault("their weights are not here (r2flow weights)" if everything else str(error), []).append(
-                name
-            )
+        except InputError:
+            left_out.setdefault("their weights are not here (r2flow weights)", []).append(name)
             continue
         if metric.needs_reflectance and not reflectance:
             left_out.setdefault("a set has no reflectance", []).append(name)

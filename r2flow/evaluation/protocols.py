@@ -14,6 +14,7 @@ from r2flow.data.opening import SOURCES
 from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Convention
+from r2flow.registry import Registry
 
 Points = Literal["measured"] | Convention
 
@@ -47,23 +48,12 @@ class Rules:
         """The rays on which points lie that were not measured."""
         return self.real if real and self.real != "measured" else self.generated
 
-    def lacking(self, real: ScanSet) -> str | None:
-        """Why a set cannot be the real one; None where it can."""
-        if self.real != "measured" or real.source.measured:
-            return None
-        return f"{real.label} lacks the measured coordinates of its points: files of points alone hold them"
-
     def check(self, real: ScanSet) -> None:
-        """Refuse a real set without what the protocol compares.
-
-        Raises:
-            InputError: it lacks measured coordinates.
-        """
-        lacks = self.lacking(real)
-        if lacks:
+        """Refuse a real set without the measured coordinates that the protocol compares."""
+        if self.real == "measured" and not real.source.measured:
             raise InputError(
-                f"{lacks}, and the protocol '{self.name}' compares them. Name such files (KITTI's .bin), or give "
-                "--protocol r2flow."
+                f"{real.label} lacks the measured coordinates of its points, which the protocol '{self.name}' compares:"
+                " only files of points have them (KITTI's .bin). Or give --protocol r2flow."
             )
 
 
@@ -87,15 +77,4 @@ R2FLOW = Rules(
     "r2flow", "centre", "centre", None, lambda scans, most: fixed_choice(len(scans), most), "fixed shuffle, seed 0"
 )
 PAPER = Rules("paper", "measured", "reference", "reference", published_choice, "Python's shuffle, seed 0")
-PROTOCOLS = {one.name: one for one in (R2FLOW, PAPER)}
-
-
-def named_rules(name: str) -> Rules:
-    """A protocol by its name.
-
-    Raises:
-        InputError: no such protocol.
-    """
-    if name not in PROTOCOLS:
-        raise InputError(f"--protocol must be one of {', '.join(PROTOCOLS)}; found {name!r}.")
-    return PROTOCOLS[name]
+PROTOCOLS: Registry[Rules] = Registry("protocol", r2flow=R2FLOW, paper=PAPER)

@@ -45,8 +45,7 @@ class Scans:
         if images.ndim != 4 or images.shape[1] not in (1, 2) or tuple(images.shape[2:]) != sensor.shape:
             h, w = sensor.shape
             raise InputError(
-                f"range images of sensor '{sensor.name}' have the shape (B, 2 or 1, {h}, {w}), "
-                f"found {tuple(images.shape)}."
+                f"images of {sensor.name} have the shape (B, 2 or 1, {h}, {w}), not {tuple(images.shape)}."
             )
         images = images.float()
         check_values(images, names)
@@ -64,13 +63,8 @@ class Scans:
 
     @property
     def reflectance(self) -> Tensor:
-        """Reflectance of every pixel, (B, 1, H, W); 0 where missing.
-
-        Raises:
-            InputError: the scans have none.
-        """
-        if not self.has_reflectance:
-            raise InputError("these scans have no reflectance; use features of range alone, as handcrafted_range.")
+        """Reflectance of every pixel, (B, 1, H, W); 0 where missing."""
+        assert self.has_reflectance
         return self.images[:, 1:]
 
     @cached_property
@@ -135,16 +129,13 @@ def _wrong_with(image: Tensor) -> str | None:
     """What is wrong with an image, (2 or 1, H, W), and what to do."""
     for channel, what in zip(image, ("range", "reflectance"), strict=False):
         if not channel.isfinite().all():
-            bad = int((~channel.isfinite()).sum())
-            return f"{bad} pixels of its {what} are NaN or infinite; 0 stands for a ray without a return"
+            return f"its {what} is NaN or infinite in places; 0 stands for a ray without a return"
         if channel.min() < 0:
             hint = "is it in model space ([-1, 1])? Decode it" if channel.abs().max() <= 1 else "0 stands for no return"
             return f"its {what} goes down to {float(channel.min()):.4g}; {hint}"
     returned = image[0][image[0] > 0]
     if len(returned) and returned.median() >= FAR:
-        middle = float(returned.median())
-        return f"its median range is {middle:.4g} m; are these millimetres? Give metres"
+        return f"its median range is {float(returned.median()):.4g} m; are these millimetres? Give metres"
     if len(image) > 1 and image[1].max() > FULL:
-        highest = float(image[1].max())
-        return f"its reflectance goes up to {highest:.4g}, where [0, 1] is meant; divide by its full scale, often 255"
+        return f"its reflectance goes up to {float(image[1].max()):.4g}, not 1; divide by its full scale, often 255"
     return None

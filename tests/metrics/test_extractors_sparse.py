@@ -96,20 +96,6 @@ def test_coordinates_may_be_negative_and_scans_do_not_touch():
     assert sorted(grid.coarser().coords.tolist()) == [[0, -2, 2, 0], [1, -2, 2, 0], [1, -1, 2, 0]]
 
 
-def test_what_is_no_grid_is_refused():
-    with pytest.raises(ValueError, match="distinct"):
-        VoxelGrid(torch.zeros(2, 4, dtype=torch.int64))
-    with pytest.raises(ValueError, match="at least one voxel"):
-        VoxelGrid(torch.zeros(0, 4, dtype=torch.int64))
-    with pytest.raises(ValueError, match="too far apart"):
-        VoxelGrid(torch.tensor([[0, 0, 0, 0], [0, 2**30, 2**30, 2**30]]))
-    voxel = VoxelGrid(torch.zeros(1, 4, dtype=torch.int64))
-    with pytest.raises(ValueError, match="no stride was taken"):
-        SparseConv3d(1, 1, 2, 2, transposed=True)(Sparse(torch.zeros(1, 1), voxel))
-    with pytest.raises(ValueError, match="found 2, 3"):
-        SparseConv3d(1, 1, 3, 2)
-
-
 class Dense:
     """The sparse U-Nets once more, on dense cubes: everything outside the voxels is put to 0 after each layer."""
 

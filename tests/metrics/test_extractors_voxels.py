@@ -83,9 +83,9 @@ def test_sizes_are_read_off_the_weights(cls):
     assert all(torch.equal(value, saved[name]) for name, value in loaded.state_dict().items())
     assert not any(module.training for module in loaded.modules())
     del saved["up3.1.0.net.0.kernel"]
-    with pytest.raises(InputError, match=r"missing \('up3.1.0.net.0.kernel'\)"):
+    with pytest.raises(InputError, match="'up3.1.0.net.0.kernel' is missing"):
         cls.from_tensors(saved, {})
-    with pytest.raises(InputError, match="no weights of"):
+    with pytest.raises(InputError, match="not the weights of"):
         cls.from_tensors({"stem.0.kernel": torch.zeros(2)}, {})
 
 

@@ -39,11 +39,7 @@ EXTRACTORS = Extractors(
 
 
 def extractor_class(name: str) -> type[Extractor]:
-    """The class behind a name of `EXTRACTORS`.
-
-    Raises:
-        InputError: no such name.
-    """
+    """The class behind a name of `EXTRACTORS`."""
     entry = EXTRACTORS[name]
     if not isinstance(entry, str):
         return entry

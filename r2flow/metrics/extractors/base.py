@@ -74,19 +74,17 @@ class Extractor(nn.Module):
         wanted = self.state_dict()
         # A count of training steps that inference does not read; older files lack it.
         given = {**{name: value for name, value in wanted.items() if name.endswith("num_batches_tracked")}, **tensors}
-        missing, left = ([name for name in a if name not in b] for a, b in ((wanted, given), (given, wanted)))
-        other = [name for name in wanted if name in given and given[name].shape != wanted[name].shape]
-        if missing or left:
-            found = [f"{len(missing)} of its {len(wanted)} parameters are missing ('{missing[0]}')"] if missing else []
-            wrong = " and ".join([*found, *([f"{len(left)} are none of its own ('{left[0]}')"] if left else [])])
-        elif other:
-            sizes = f"the shape {tuple(given[other[0]].shape)}, not {tuple(wanted[other[0]].shape)}"
-            wrong = f"'{other[0]}' has {sizes}"
-        else:
-            bad = next((name for name in wanted if not given[name].isfinite().all()), None)
-            wrong = f"'{bad}' has values that are not finite" if bad else ""
-        if wrong:
-            raise InputError(f"these are no weights of {self.name}: {wrong}.")
+        problems = [f"'{name}' is missing" for name in wanted if name not in given]
+        problems += [f"'{name}' is unknown" for name in given if name not in wanted]
+        for name in wanted.keys() & given.keys():
+            shape, expected = tuple(given[name].shape), tuple(wanted[name].shape)
+            if shape != expected:
+                problems.append(f"'{name}' has the shape {shape}, not {expected}")
+            elif not given[name].isfinite().all():
+                problems.append(f"'{name}' has values that are not finite")
+        if problems:
+            more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+            raise InputError(f"not the weights of {self.name}: {problems[0]}{more}.")
         self.load_state_dict(given)
         return self.requires_grad_(False).eval()
 

@@ -116,7 +116,7 @@ class MinkowskiNet(Extractor):
             up = [tensors[f"up{level}.0.net.0.kernel"].shape[2] for level in range(1, 5)]
             extractor = cls((stem.shape[2], *down, *up), len(tensors["classifier.0.bias"]), stem.shape[1])
         except (KeyError, IndexError):
-            raise InputError(f"these are no weights of {cls.name}: it has other parameters.") from None
+            raise InputError(f"not the weights of {cls.name}: other parameters.") from None
         # Files saved in training may also hold parameters of the loss.
         known = {name for name, _ in extractor.named_children()}
         return extractor.filled({name: tensor for name, tensor in tensors.items() if name.split(".")[0] in known})

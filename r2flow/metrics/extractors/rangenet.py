@@ -100,13 +100,7 @@ class RangeNet(Extractor):
         return (image - self.mean) / self.std * (image[:, :1] > 0)
 
     def forward(self, x: Tensor) -> Tensor:
-        """The decoder's last map, (B, 32, H, W), of a normalised image.
-
-        Raises:
-            InputError: a width that cannot be halved five times.
-        """
-        if x.shape[-1] % 32:
-            raise InputError(f"RangeNet's width must be a multiple of 32, found {x.shape[-1]}; choose another --size.")
+        """The decoder's last map, (B, 32, H, W), of a normalised image; W a multiple of 32."""
         kept = [self.stem(x)]
         for level in range(1, 6):
             kept.append(self.get_submodule(f"enc{level}")(kept[-1]))
@@ -117,6 +111,9 @@ class RangeNet(Extractor):
 
     @torch.inference_mode()
     def features(self, scans: Scans) -> Tensor:
+        h, w = scans.sensor.shape
+        if w % 32 or (self.layers == 21 and h % BANDS):
+            raise InputError(f"RangeNet needs images of multiples of {BANDS} x 32, found {h} x {w}; choose a --size.")
         if not len(scans):
             return torch.zeros(0, self.dim, device=self.device)
         reflectance = [scans.reflectance] if self.needs_reflectance else []
@@ -167,27 +164,13 @@ def _draw(size: int, num: int) -> tuple[int, ...]:
 
 
 def subsample(maps: Tensor, num: int = 4096) -> Tensor:
-    """`num` values of each map (B, C, H, W), the same ones at every call: (B, num).
-
-    Raises:
-        InputError: maps of fewer values than that.
-    """
+    """`num` values of each map (B, C, H, W), the same ones at every call: (B, num)."""
     flat = maps.flatten(1)
-    if flat.shape[1] < num:
-        size = " x ".join(map(str, maps.shape[1:]))
-        raise InputError(f"the metric draws {num} values of a map of {size}; project to a larger size (--size).")
     return flat[:, torch.tensor(_draw(flat.shape[1], num), device=maps.device)]
 
 
 def mean_by_depth(maps: Tensor, bands: int = BANDS) -> Tensor:
-    """Means over `bands` bands of rows, (B, C bands), C slowest: the published "depth", which means elevation.
-
-    Raises:
-        InputError: a number of rows that is no multiple of the bands.
-    """
-    if maps.shape[2] % bands:
-        parts = f"{bands} equal parts of the rows, found {maps.shape[2]}"
-        raise InputError(f"the metric takes means over {parts}; project to a multiple of {bands} (--size).")
+    """Means over `bands` bands of rows, (B, C bands), C slowest: the published "depth", which means elevation."""
     return maps.unflatten(2, (bands, -1)).mean((3, 4)).flatten(1)
 
 

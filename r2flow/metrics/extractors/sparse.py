@@ -38,21 +38,15 @@ class VoxelGrid:
     Args:
         coords: Scan, x, y, z of each voxel, (N, 4), int64, in voxels of this size.
         finer: The grid of voxels half as large that this one was made from, None where it is the first.
-
-    Raises:
-        ValueError: no coordinates, some that occur twice, or some too far apart to be numbered.
     """
 
     def __init__(self, coords: Tensor, finer: Self | None = None) -> None:
-        if not len(coords):
-            raise ValueError("a grid needs at least one voxel.")
         self.coords = coords
         self.finer = finer
         self._around: dict[int, KernelMap] = {}
         self._box = Box(coords)
         self.keys, self.order = self._box.keys(coords).sort()
-        if (self.keys.diff() == 0).any():
-            raise ValueError("a grid's voxels must be distinct.")
+        assert (self.keys.diff() > 0).all(), "voxels are distinct"
 
     def __len__(self) -> int:
         return len(self.coords)
@@ -79,8 +73,7 @@ class VoxelGrid:
     @cached_property
     def inside(self) -> KernelMap:
         """Which voxels of the finer grid lie in each of this one's: a kernel of 2^3 and stride 2."""
-        if self.finer is None:
-            raise ValueError("no stride was taken that could be undone.")
+        assert self.finer is not None
         return self._map(self.finer, 2, 2)
 
     def _map(self, inputs: "VoxelGrid", size: int, stride: int) -> KernelMap:
@@ -103,8 +96,7 @@ class Box:
     def __init__(self, coords: Tensor) -> None:
         self.low, self.high = coords.amin(0), coords.amax(0)
         self.sizes = (self.high - self.low + 1).tolist()
-        if math.prod(self.sizes) >= 2**63:
-            raise ValueError(f"voxels over {self.sizes} (scans, x, y, z) lie too far apart to be numbered.")
+        assert math.prod(self.sizes) < 2**63, self.sizes
 
     def holds(self, coords: Tensor) -> Tensor:
         return ((coords >= self.low) & (coords <= self.high)).all(-1)
@@ -143,15 +135,11 @@ class SparseConv3d(nn.Module):
         size: Voxels of the kernel along each axis.
         stride: 1, or 2 with a kernel of 2.
         transposed: Undo a stride.
-
-    Raises:
-        ValueError: another stride.
     """
 
     def __init__(self, channels: int, out: int, size: int = 3, stride: int = 1, transposed: bool = False) -> None:
         super().__init__()
-        if (size, stride) != (2, 2) and (stride != 1 or transposed):
-            raise ValueError(f"a sparse convolution has the stride 1, or 2 with a kernel of 2; found {stride}, {size}.")
+        assert (size, stride) == (2, 2) or (stride == 1 and not transposed)
         self.size, self.stride, self.transposed = size, stride, transposed
         shape = (channels, out) if size == 1 else (size**3, channels, out)
         bound = ((out if transposed else channels) * size**3) ** -0.5
