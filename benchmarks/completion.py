@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from r2flow.flow.maps import MeanVelocity
-from r2flow.flow.posterior import methods_in, parse_method, sample_posterior
 from r2flow.flow.problems import Correlated
 from r2flow.flow.solvers import named_grid
+from r2flow.samplers import build_sampler
 
 WIDTH = 32
 METHODS_SHOWN = "replace,repaint:4,repaint:10,mmps:1,0,mmps:2,0,mmps:2"
@@ -88,7 +88,7 @@ def moments(u: MeanVelocity, method: str, case: Case, y: Tensor, times: Tensor) 
         drawn[0] = max(drawn[0], j)
         return nothing
 
-    means = sample_posterior(u, nothing, *case.measurement(y), method, times, no_noise)
+    means = build_sampler(method).given(u, nothing, *case.measurement(y), times, no_noise)
     unit = torch.eye(case.width, dtype=torch.float64)
     rows = (1 + drawn[0]) * case.width  # a unit of each value of each noise
 
@@ -97,7 +97,7 @@ def moments(u: MeanVelocity, method: str, case: Case, y: Tensor, times: Tensor) 
         e[j * case.width : (j + 1) * case.width] = unit
         return e
 
-    x_1 = sample_posterior(u, noise(0), *case.measurement(y[:1].expand(rows, -1)), method, times, noise)
+    x_1 = build_sampler(method).given(u, noise(0), *case.measurement(y[:1].expand(rows, -1)), times, noise)
     effect = x_1 - means[:1]
     return means, effect.T @ effect
 
@@ -125,8 +125,8 @@ def distance(means: Tensor, covariance: Tensor, posteriors: list[Correlated], ca
 
 def steps_within(method: str, evaluations: int) -> int:
     """The most steps whose evaluations are no more than these; 0 where one step takes more."""
-    chosen = parse_method(method)
-    return max((n for n in range(1, evaluations + 1) if chosen.evaluations(n) <= evaluations), default=0)
+    costs = {n: build_sampler(method, steps=n).evaluations(None) for n in range(1, evaluations + 1)}
+    return max((n for n, cost in costs.items() if cost <= evaluations), default=0)
 
 
 def table(name: str, methods: list[str], evaluations: list[int], grid: str) -> None:
@@ -162,7 +162,7 @@ def main() -> None:
     parser.add_argument("--evaluations", default="8,16,32,64,256")
     parser.add_argument("--grid", default="uniform")
     args = parser.parse_args()
-    methods, evaluations = methods_in(args.methods), [int(n) for n in args.evaluations.split(",")]
+    methods, evaluations = args.methods.split(","), [int(n) for n in args.evaluations.split(",")]
     print("method".ljust(22) + "  ".join(f"{n:<19d}" for n in evaluations))
     for name in args.cases.split(","):
         table(name, methods, evaluations, args.grid)

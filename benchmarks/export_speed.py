@@ -28,11 +28,11 @@ def main() -> None:
     torch.set_num_threads(given.threads)
     loaded = r2flow.load(given.flow)
     flow = loaded.generator
-    sampler = flow.in_steps(given.steps)
+    sampler = flow.choose(flow.plain, steps=given.steps)
     noise = Draws(0, [0]).start(flow.noise_shape)
 
     def drawn(generator: torch.nn.Module) -> Callable[[], object]:
-        return lambda: flow.space.decode(generator.generate(noise, sampler=sampler).x)
+        return lambda: flow.space.decode(generator(noise, sampler=sampler).x)
 
     ways = {"eager": drawn(flow)}
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():

@@ -48,6 +48,7 @@ RULES: dict[str, Key] = {
     "loggers": FREE,
     "samples": FREE,
     "sampler": FREE,
+    "few": FREE,
     "parent.path": FREE,
     "sensor": replace(OF_THE_MODEL, inherited="with_pairs"),
     "encoding": OF_THE_MODEL,

@@ -30,7 +30,7 @@ def grown(checkpoint: Checkpoint, shape: tuple[int, int], **options: Any) -> Che
     flow = checkpoint.generator
     if not isinstance(flow, RectifiedFlow) or flow.condition_channels:
         raise InputError(f"{checkpoint.path} holds a {type(flow).__name__}; only a flow of whole scans can grow.")
-    if flow.sampler.fixed:
+    if flow.fixed:
         raise InputError(
             f"{checkpoint.path} was distilled for its own steps and knows no other times: grow the flow that it was "
             "distilled from."

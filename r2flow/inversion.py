@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.generators import FlowMap, Sampler, as_flow
-from r2flow.generators.base import CHORD, JUMP, Progress
+from r2flow.generators import Sampler, as_flow
+from r2flow.generators.base import Progress
 from r2flow.model.checkpoint import Checkpoint
+from r2flow.samplers import Adaptive, Jump
 
-TIGHT = Sampler("dopri5", tolerance=1e-5)
+TIGHT = Adaptive(tolerance=1e-5)
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,9 @@ def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, pro
 
 def _check_way_back(checkpoint: Checkpoint, sampler: Sampler) -> None:
     jumps = (checkpoint.config.get("stage") or {}).get("jumps") or {}
-    if sampler.method in (JUMP, CHORD) and isinstance(checkpoint.generator, FlowMap) and not jumps.get("backward"):
+    if isinstance(sampler, Jump) and not jumps.get("backward"):
         raise InputError(
-            "this flow map has learned no jumps back in time (stage.jumps.backward); give a solver, as --solver adams3."
+            "this flow map has learned no jumps back in time (stage.jumps.backward): give --sampler adams3."
         )
 
 
@@ -186,7 +187,7 @@ def interpolate_scans(
         inverted.append(invert(checkpoint, scan[None], sampler, progress))
         if not inverted[-1].converged.all():
             raise InputError(
-                f"the {which} scan cannot be carried to its noise and back by {sampler.method}: try another solver, "
+                f"the {which} scan cannot be carried to its noise and back by {sampler.name}: try another sampler, "
                 "a larger tolerance or more steps."
             )
         arrived(len(inverted))

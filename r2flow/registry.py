@@ -71,8 +71,8 @@ class Registry(Generic[T]):
 
     def __getitem__(self, name: str) -> T:
         if name not in self:
-            known = ", ".join(sorted(self._entries))
-            hint = did_you_mean(str(name), self._entries)
+            known = ", ".join(sorted(self))
+            hint = did_you_mean(str(name), list(self))
             raise UnknownName(f"no {self.kind} named {name!r}; known: {known}.{hint}")
         entry = self._entries[name]
         if isinstance(entry, _Lazy):

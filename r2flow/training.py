@@ -30,9 +30,7 @@ from r2flow.data.opening import SOURCES, Layout, Prepared, resolve_reflectance
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, SourceOptions
 from r2flow.data.reading import AUTO
 from r2flow.errors import InputError
-from r2flow.flow.solvers import check_method
-from r2flow.generators import GENERATORS, Flow, FlowMap, Generator, build_generator
-from r2flow.generators.base import WAYS
+from r2flow.generators import Generator, build_generator
 from r2flow.model.checkpoint import checkpoints_of, step_of
 from r2flow.noise import seed_torch
 from r2flow.plugins import made_with
@@ -161,7 +159,7 @@ def _build(config: Mapping[str, Any], asked: Sequence[str]) -> Run:
     generator = build_generator(config)
     if checkpoint is not None:
         generator.start_from(checkpoint.generator)
-    return _assembled(config, generator, parent)
+    return _assembled(config, generator)
 
 
 def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None) -> dict[str, Any]:
@@ -185,7 +183,7 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
         config["encoding"]["reflectance"] = True  # the scans will tell
     with torch.device("meta"):
         generator = build_generator(config)
-    run = _assembled(config, generator, parent)
+    run = _assembled(config, generator)
     check_run(run.folder, config)
     return config
 
@@ -247,17 +245,11 @@ def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
         raise InputError(f"{what}: leave {', '.join(wrong)} out.")
 
 
-def _assembled(config: dict[str, Any], generator: Generator, parent: Parent | None) -> Run:
+def _assembled(config: dict[str, Any], generator: Generator) -> Run:
     space = generator.space
     data = ScanDataModule(space.sensor, space.encoding, config["seed"], generator.noise_shape, **config["data"])
-    usual = {"name": "rectified_flow"}
-    family = GENERATORS[(parent.config.get("generator") or usual)["name"]] if parent else None
-    jumps = isinstance(family, type) and issubclass(family, FlowMap)
     if data.pairs is not None:
         data.pairs.recipe(data.encoding.shape, data.noise_shape)  # refuses what is out of its range
-        own = jumps and data.pairs.method in WAYS
-        if isinstance(family, type) and issubclass(family, Flow) and not own:  # others say themselves how they run
-            check_method(data.pairs.method)
     check_roll(data.augment, generator)
     stage = build_stage(config, generator)
     data.further = stage.further

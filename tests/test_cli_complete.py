@@ -186,7 +186,7 @@ def test_a_model_of_range_alone_leaves_reflectance_out(r2flow, tmp_path):  # noq
         (["--mask", "row:4"], "no mask 'row:4'"),
         (["--mask", "{folder}/mask.npy"], "is of (4, 4), the scans are of (8, 64) rays"),
         (["--from", "vlp16"], "is a range image of 8x64, those of the model are 8x64: --from vlp16 has 16 rows"),
-        (["--solver", "dopri6"], "dopri6"),
+        (["--sampler", "dopri6"], "dopri6"),
         (["--out", "{folder}"], "is the folder of the scans"),
     ],
 )

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from r2flow.data.opening import open_scans
-from r2flow.generators import Sampler, build_generator
+from r2flow.generators import build_generator
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.metrics import METRICS
@@ -22,6 +22,7 @@ from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.sums import SumMetric
 from r2flow.model.checkpoint import Checkpoint, save_checkpoint
+from r2flow.samplers import build_sampler
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_evaluation import SENSOR, folder, generated, images, real  # noqa: F401  fixtures
@@ -153,7 +154,7 @@ def test_how_many_scans_are_drawn_is_said_where_nobody_asked(r2flow, saved, real
 
 def test_a_curve_of_several_solvers_has_a_line_for_each_with_intervals(r2flow, saved, real, tmp_path):  # noqa: F811
     code, _, err = r2flow(
-        "evaluate", real, "-c", saved[0], "--solver", "euler,heun2", "--steps", "1,2", "--metrics", "jsd", "--num", 4,
+        "evaluate", real, "-c", saved[0], "--sampler", "euler,heun2", "--steps", "1,2", "--metrics", "jsd", "--num", 4,
         "--bootstrap", 8, "--workers", 0, "--out", tmp_path,
     )  # fmt: skip
     assert code == 0, err
@@ -169,7 +170,7 @@ def test_a_curve_of_several_solvers_has_a_line_for_each_with_intervals(r2flow, s
 def test_a_curve_names_the_solver_where_a_model_has_another_in_fewer_steps(r2flow, real, tmp_path):  # noqa: F811
     config = {**CONFIG, "generator": {"name": "flow_map"}}
     generator = build_generator(config).eval()
-    generator.sampler = Sampler("adams3", 2, grid="power:1.75", fewer="chord")
+    generator.sampler = build_sampler("adams3", steps=2, grid="power:1.75")
     save_checkpoint(Checkpoint(generator, config), tmp_path / "map.safetensors")
     code, _, err = r2flow(
         "evaluate", real, "-c", tmp_path / "map.safetensors", "--steps", "1,2", "--metrics", "jsd", "--num", 4,
@@ -184,11 +185,11 @@ def test_a_curve_names_the_solver_where_a_model_has_another_in_fewer_steps(r2flo
 
 def test_of_an_adaptive_solver_a_curve_has_one_point(r2flow, saved, real, tmp_path):  # noqa: F811
     measured = ("evaluate", real, "-c", saved[0], "--metrics", "jsd", "--num", 2, "--workers", 0, "--out", tmp_path)
-    code, _, err = r2flow(*measured, "--solver", "dopri5,euler", "--steps", "1,2", "--tolerance", 1e-2)
+    code, _, err = r2flow(*measured, "--sampler", "dopri5,euler", "--steps", "1,2", "--tolerance", 1e-2)
     assert code == 0, err
     rows = json.loads((tmp_path / "speed_quality.json").read_text())["rows"]
     assert [row["solver"] for row in rows] == ["dopri5", "euler", "euler"]
-    code, _, said = r2flow(*measured, "--solver", "dopri5", "--steps", "1,2")
+    code, _, said = r2flow(*measured, "--sampler", "dopri5", "--steps", "1,2")
     assert (code, "--steps is for a solver of fixed steps; dopri5 chooses its own." in said) == (2, True)
 
 

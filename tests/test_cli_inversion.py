@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.generators import Sampler
 from r2flow.inversion import invert
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint
+from r2flow.samplers import build_sampler
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_sampling import network, scans
@@ -56,7 +56,7 @@ def test_a_range_image_is_a_scan_like_any_other(r2flow, run, files, tmp_path):  
     image[0, 0, 0] = 500  # beyond the sensor's reach: a dropped ray
     image[0, 0, 1] = np.nan
     np.save(tmp_path / "image.npy", image)
-    code, _, _ = r2flow("invert", tmp_path / "image.npy", "-c", run, "-o", tmp_path / "o", "--solver", "rk4")
+    code, _, _ = r2flow("invert", tmp_path / "image.npy", "-c", run, "-o", tmp_path / "o", "--sampler", "rk4")
     assert code == 0
     (row,) = json.loads((tmp_path / "o" / "invert.json").read_text())["rows"]
     assert row["returns"] == int((scans(1)[0, 0].flatten()[2:] > 0).sum())
@@ -65,7 +65,7 @@ def test_a_range_image_is_a_scan_like_any_other(r2flow, run, files, tmp_path):  
 
 def test_interpolate_writes_every_frame(r2flow, run, files, tmp_path):  # noqa: F811
     out = tmp_path / "between"
-    code, said, _ = r2flow("interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--solver", "rk4", "--steps", 8)
+    code, said, _ = r2flow("interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--sampler", "rk4", "--steps", 8)
     assert code == 0
     assert [path.name for path in sorted((out / "frames").glob("*.ply"))] == [f"{i:03d}.ply" for i in range(4)]
     for index in range(4):
@@ -156,7 +156,7 @@ class TestBadInput:
         self.check(r2flow("invert", tmp_path / "bad.bin", *with_run), out, "bad.bin", "14 bytes more")
         self.check(r2flow("invert", files[0], tmp_path / "wide.npy", *with_run), out, "8x128", "8x64")
         self.check(r2flow("invert", tmp_path / "range.npy", *with_run), out, "has no reflectance")
-        self.check(r2flow("invert", files[0], *with_run, "--solver", "dopri6"), out, "Did you mean 'dopri5'?")
+        self.check(r2flow("invert", files[0], *with_run, "--sampler", "dopri6"), out, "Did you mean 'dopri5'?")
         self.check(r2flow("invert", files[0], *with_run, "--tolerance", 0), out, "must be positive")
         self.check(r2flow("interpolate", *files, *with_run, "--frames", 1), out, "--frames")
         self.check(r2flow("interpolate", files[0], tmp_path / "no.ply", *with_run), out, "no.ply")
@@ -166,11 +166,11 @@ class TestBadInput:
         options = ("sample", "-c", run, "-o", out)
         for grid in ("cubic", "power", "power:0", tmp_path / "no.json"):
             self.check(r2flow(*options, "--grid", grid), out, "power:P or power-start:P with P from 1 to 10", str(grid))
-        self.check(r2flow(*options, "--grid", "power:2", "--solver", "dopri5"), out, "dopri5 chooses its own")
+        self.check(r2flow(*options, "--grid", "power:2", "--sampler", "dopri5"), out, "dopri5 chooses its own")
         self.check(r2flow(*options, "--error", "0.1m"), out, "are not known yet; measure them: r2flow calibrate")
         self.check(r2flow(*options, "--error", "0.1m", "--steps", 3), out, "leave solver, steps, tolerance, grid")
         self.check(
-            r2flow("calibrate", "-c", run, "--solver", "bosh3"), out, "only predictor-correctors", "adams3", "'bosh3'"
+            r2flow("calibrate", "-c", run, "--sampler", "bosh3"), out, "only predictor-correctors", "adams3", "'bosh3'"
         )
         self.check(r2flow("calibrate", "-c", tmp_path / "none"), out, "no checkpoint")
 
@@ -224,4 +224,4 @@ def test_a_real_scan_goes_there_and_back(r2flow, run, shared, tmp_path):  # noqa
 def test_jumps_back_that_a_map_has_not_learned_are_refused(method):
     street = load_checkpoint("street")
     with pytest.raises(InputError, match="has learned no jumps back in time"):
-        invert(street, torch.zeros(1, 2, 32, 256), Sampler(method, 2))
+        invert(street, torch.zeros(1, 2, 32, 256), build_sampler(method, steps=2))

@@ -17,7 +17,7 @@ from r2flow.runs.lineage import pairs_of
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 
-QUICK = ("--solver", "euler", "--steps", 2, "--batch-size", 4, "--num", 10)
+QUICK = ("--sampler", "euler", "--steps", 2, "--batch-size", 4, "--num", 10)
 
 
 def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):  # noqa: F811
@@ -28,7 +28,7 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):  # noqa: F811
     for words in ("12 pairs", "pairs/s", "2.0 evaluations a pair", f"{folder}: all 10 pairs, 1 shard"):
         assert words in said
     flow = load_checkpoint(path)
-    options = {"num": 10, "method": "euler", "steps": 2, "batch_size": 4}
+    options = {"sampler": {"name": "euler", "steps": 2}, "num": 10, "batch_size": 4}
     recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(flow.encoding.shape)
     assert len(PairSource(PairStore(folder, recipe), 10)) == 10
     code, said, _ = r2flow("pairs", "-c", path, *QUICK)
@@ -106,7 +106,7 @@ def test_where_a_process_stands(environment: dict[str, str], expected: tuple[int
     [
         (["--rank", 1], "--rank and --ranks belong together"),
         (["--rank", 2, "--ranks", 2], "process 2 of 2: they count from 0"),
-        (["--solver", "eulr"], "Did you mean 'euler'"),
+        (["--sampler", "eulr"], "Did you mean 'euler'"),
         (["--tolerance", -1], "tolerance"),
         (["--out", "/proc/nowhere"], "/proc/nowhere"),
     ],

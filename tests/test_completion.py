@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.generators import Generator, Sampler, build_generator
+from r2flow.generators import Generator, build_generator
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import ANSWER, ROUGH, SURE, TAILS, complete, completing, settled, spread_of
 from r2flow.noise import Draws, generator
+from r2flow.samplers import build_sampler
 from tests.test_checkpoints import CONFIG
 
 SHAPE = 8, 64
@@ -27,7 +28,7 @@ def network(name: str = "conditional_flow", reflectance: bool = True, **backbone
     made = build_generator(config).eval().requires_grad_(False)
     for parameter in made.parameters():
         parameter.copy_(0.2 * torch.randn_like(parameter))
-    made.sampler = Sampler("euler", 3)
+    made.sampler = build_sampler("euler", steps=3)
     return Checkpoint(made, config)
 
 
@@ -179,7 +180,7 @@ def test_a_generator_that_cannot_complete_is_refused():
 
 
 def test_a_flow_without_a_condition_says_what_completes_with_it():
-    with pytest.raises(InputError, match="a scan is completed with it by --solver replace, repaint, "):
+    with pytest.raises(InputError, match="a scan is completed with it by --sampler replace, repaint, "):
         completing(network("rectified_flow").generator, method="euler")
     assert completing(network().generator, method="euler").method == "euler"
 
@@ -230,7 +231,7 @@ def test_answers_of_a_flow_are_moved_to_surfaces(kind, method):
     images[:, 0] = torch.where(images[:, 0] > 0, 7.0, 0)  # walls around the sensor
     state = halved(images)
     plain = network(kind)
-    how = {"num": 2, "sampler": Sampler(method, 2)}
+    how = {"num": 2, "sampler": build_sampler(method, steps=2)}
     by_default, without = plain.complete(images, state, **how), plain.complete(images, state, on_surfaces=False, **how)
     known = (state != Ray.UNKNOWN)[:, None, None].expand_as(without)
     assert torch.equal(by_default[known], without[known])

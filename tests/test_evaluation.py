@@ -18,7 +18,6 @@ from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
 from r2flow.evaluation.references import reference_sets
 from r2flow.evaluation.sets import ScanSet, fixed_choice, sampled_set
 from r2flow.evaluation.statistics import FORMAT, Cache, key_of
-from r2flow.generators import Sampler
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
@@ -26,6 +25,7 @@ from r2flow.metrics.jsd import JSD
 from r2flow.metrics.mmd import MMD
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import standard_normal
+from r2flow.samplers import build_sampler
 from tests.data.conftest import kitti_360  # noqa: F401  a fixture
 from tests.test_sampling import flow as without_config
 
@@ -267,7 +267,7 @@ class TestSets:
         assert (found.projection, found.convention, found.reflectance_scale) == ("spherical", "reference", 1.0)
 
     def test_a_flow_is_sampled_from_the_noise_of_evaluations(self):
-        drawn = sampled_set(flow(), "flow", 5, Sampler("euler", 1), seed=9)
+        drawn = sampled_set(flow(), "flow", 5, build_sampler("euler", steps=1), seed=9)
         batches = list(drawn.batches(range(5), 2))
         assert [len(batch) for batch in batches] == [2, 2, 1]
         x_0 = standard_normal((2, 8, 64), 9, "evaluation", 3)

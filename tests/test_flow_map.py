@@ -15,10 +15,11 @@ from r2flow.errors import InputError
 from r2flow.flow.maps import OBJECTIVES
 from r2flow.flow.path import interpolate
 from r2flow.flow.problems import Gaussian
-from r2flow.generators import Field, FlowMap, RectifiedFlow, Sampler, build_generator
+from r2flow.generators import Field, FlowMap, RectifiedFlow, build_generator
 from r2flow.lidar.region import Region
 from r2flow.noise import Draws, standard_normal
 from r2flow.runs.lineage import Parent, generator_of
+from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
 from r2flow.stages.flow_map import LearnFlowMap, paths_of
 
@@ -75,8 +76,8 @@ def exact() -> Exact:
 def test_before_it_has_learned_jumps_are_its_parent_s_euler_steps(grown):
     x_0 = Draws(0, range(2)).start(grown.noise_shape)
     for steps in (1, 3):
-        jumped = grown.generate(x_0, sampler=Sampler("jump", steps))
-        walked = parent().generate(x_0, sampler=Sampler("euler", steps))
+        jumped = grown(x_0, sampler=build_sampler("jump", steps=steps))
+        walked = parent()(x_0, sampler=build_sampler("euler", steps=steps))
         torch.testing.assert_close(jumped.x, walked.x, rtol=0, atol=1e-5)  # s - t is rounded otherwise
         assert jumped.evaluations.tolist() == [steps, steps]
     t = torch.tensor([0.3, 0.6])
@@ -111,15 +112,15 @@ def test_what_a_stage_makes_of_a_map(stage, made):
 @pytest.mark.parametrize(("steps", "grid"), [(1, "uniform"), (4, "power:2"), (3, (0.0, 0.2, 0.7, 1.0))])
 def test_jumps_of_an_exact_map_end_where_the_flow_does(exact, steps, grid):
     x_0 = Draws(0, range(3)).start(exact.noise_shape)
-    found = exact.generate(x_0, sampler=Sampler("jump", steps, grid=grid))
+    found = exact(x_0, sampler=build_sampler("jump", steps=steps, grid=grid))
     torch.testing.assert_close(found.x.double(), Exact.problem.solution(x_0, 1.0), rtol=0, atol=1e-5)
     assert found.converged.all()
 
 
 def test_backward_jumps_lead_back_to_the_noise(exact):
     x_0 = Draws(0, range(2)).start(exact.noise_shape)
-    there = exact.solve(x_0, sampler=Sampler("jump", 2)).x
-    back = exact.solve(there, 1.0, 0.0, sampler=Sampler("jump", 3))
+    there = exact.solve(x_0, sampler=build_sampler("jump", steps=2)).x
+    back = exact.solve(there, 1.0, 0.0, sampler=build_sampler("jump", steps=3))
     torch.testing.assert_close(back.x, x_0, rtol=0, atol=1e-4)
     assert back.evaluations.tolist() == [3, 3]
 
@@ -135,135 +136,120 @@ def test_the_chord_leads_to_where_a_jump_to_the_end_would(exact):
         expected = mean + std / size * (x_s - s * mean)
         x_0 = (x_s - s * expected) / (1 - s)  # the chord from here begins elsewhere
     start = Draws(0, range(3)).start(exact.noise_shape)
-    found = exact.generate(start, sampler=Sampler("chord", 4), draws=Draws(0, range(3)))
+    found = exact(start, sampler=build_sampler("chord", steps=4, grid="uniform"), draws=Draws(0, range(3)))
     torch.testing.assert_close(found.x, expected, rtol=0, atol=1e-5)
     assert found.evaluations.tolist() == [4, 4, 4]
-    whole = exact.generate(start, sampler=Sampler("chord", 1)).x
-    assert torch.equal(whole, exact.generate(start, sampler=Sampler("jump", 1)).x)
+    whole = exact(start, sampler=build_sampler("chord", steps=1)).x
+    assert torch.equal(whole, exact(start, sampler=build_sampler("jump", steps=1)).x)
 
 
 def test_chords_of_a_map_that_has_not_learned_jumps_are_euler_s_steps(grown):
     x_0 = Draws(0, range(2)).start(grown.noise_shape)
     for begin, end in ((0.0, 1.0), (1.0, 0.0)):
-        walked = parent().solve(x_0, begin, end, sampler=Sampler("euler", 3, grid="power:2"))
-        found = grown.solve(x_0, begin, end, sampler=Sampler("chord", 3, grid="power:2"))
+        walked = parent().solve(x_0, begin, end, sampler=build_sampler("euler", steps=3, grid="power:2"))
+        found = grown.solve(x_0, begin, end, sampler=build_sampler("chord", steps=3, grid="power:2"))
         torch.testing.assert_close(found.x, walked.x, rtol=0, atol=1e-5)
 
 
 def test_renoised_samples_of_an_exact_map_have_the_data_s_distribution(exact):
     draws = Draws(5, range(64))
     x_0 = draws.start(exact.noise_shape)
-    found = exact.generate(x_0, sampler=Sampler("renoise", 3), draws=draws).x
+    found = exact(x_0, sampler=build_sampler("renoise", steps=3), draws=draws).x
     count = found.numel()  # 32,768 values of N(0.7, 0.25^2)
     assert float(found.mean()) == pytest.approx(0.7, abs=5 * 0.25 / count**0.5)
     assert float(found.std()) == pytest.approx(0.25, abs=5 * 0.25 / (2 * count) ** 0.5)
-    twice = exact.generate(x_0, sampler=Sampler("renoise", 2), draws=draws).x
+    twice = exact(x_0, sampler=build_sampler("renoise", steps=2), draws=draws).x
     between = 0.5 * draws.step(exact.noise_shape, 1) + 0.5 * (0.7 + 0.25 * x_0)
     expected = 0.7 + 0.25 / (0.25 + 0.25 * 0.25**2) ** 0.5 * (between - 0.5 * 0.7)
     torch.testing.assert_close(twice, expected, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("method", ["renoise:0.5", "renoise:4"])
+@pytest.mark.parametrize("method", ["renoise"])
 def test_any_share_of_fresh_noise_leaves_the_law_of_an_exact_map_s_samples(exact, method):
     draws, count = Draws(5, range(64)), 64 * 512
-    found = exact.generate(draws.start(exact.noise_shape), sampler=Sampler(method, 4), draws=draws).x
+    found = exact(draws.start(exact.noise_shape), sampler=build_sampler(method, steps=4), draws=draws).x
     assert float(found.mean()) == pytest.approx(0.7, abs=5 * 0.25 / count**0.5)
     assert float(found.std()) == pytest.approx(0.25, abs=5 * 0.25 / (2 * count) ** 0.5)
-    apart = exact.generate(draws.start(exact.noise_shape), sampler=Sampler("jump", 4)).x
+    apart = exact(draws.start(exact.noise_shape), sampler=build_sampler("jump", steps=4)).x
     assert float((found - apart).std()) > 0.1  # another scan than that of its first noise alone
-    same = exact.generate(draws.start(exact.noise_shape), sampler=Sampler("renoise:0", 4), draws=draws).x
-    assert torch.equal(same, apart)
 
 
-@pytest.mark.parametrize("method", ["renoise", "renoise:2"])
+@pytest.mark.parametrize("method", ["renoise"])
 def test_a_part_is_renoised_with_the_noise_of_the_whole(exact, method):
-    region, draws, sampler = Region((8, 32), 0, 8, 8, 16), Draws(5, [0]), Sampler(method, 3)
+    region, draws, sampler = Region((8, 32), 0, 8, 8, 16), Draws(5, [0]), build_sampler(method, steps=3)
     x_0 = draws.start(exact.noise_shape)
-    whole = exact.generate(x_0, sampler=sampler, draws=draws)
-    part = exact.part(region).generate(region.crop(x_0), sampler=sampler, draws=draws)
+    whole = exact(x_0, sampler=sampler, draws=draws)
+    part = exact.part(region)(region.crop(x_0), sampler=sampler, draws=draws)
     torch.testing.assert_close(part.x, region.crop(whole.x), rtol=0, atol=1e-6)
 
 
 def test_it_can_also_be_solved_as_the_flow_that_it_is(grown):
     x_0 = Draws(0, range(2)).start(grown.noise_shape)
-    how = Sampler("adams3", 4)
-    assert torch.equal(grown.generate(x_0, sampler=how).x, parent().generate(x_0, sampler=how).x)
+    how = build_sampler("adams3", steps=4)
+    assert torch.equal(grown(x_0, sampler=how).x, parent()(x_0, sampler=how).x)
 
 
 def test_a_scan_that_leaves_the_numbers_is_flagged_and_keeps_its_last_state(exact):
     x_0 = Draws(0, range(2)).start(exact.noise_shape)
     x_0[1, 0, 0, 0] = float("inf")
-    assert exact.generate(x_0, sampler=Sampler("jump", 2)).converged.tolist() == [True, False]
+    assert exact(x_0, sampler=build_sampler("jump", steps=2)).converged.tolist() == [True, False]
 
 
-@pytest.mark.parametrize(
-    ("sampler", "said"),
-    [
-        (Sampler("jump", 4, finish=0.1), "no finish"),
-        (Sampler("jump", 4, grid=(0.0, 0.5)), "time grid"),
-        (Sampler("jumps", 4), "no solver named 'jumps'; known: jump, chord, renoise, sde, ab2, "),
-    ],
-)
-def test_samplers_that_jumps_do_not_have_are_refused(grown, sampler, said):
-    with pytest.raises(InputError, match=said):
-        grown.check_sampler(sampler)
+def test_samplers_that_jumps_do_not_have_are_refused():
+    for wrong in ("jump:finish=0.1", "jump:grid=[0,0.5]", "jumps", "jump:steps=0"):
+        with pytest.raises(InputError):
+            build_sampler(wrong)
+    with pytest.raises(InputError, match="map"):
+        parent().choose("jump")
 
 
-OWN = Sampler("adams3", 16, grid="power:1.75", fewer="chord")
+OWN = build_sampler("adams3", steps=16, grid="power:1.75")
 
 
 @pytest.mark.parametrize(
     ("asked", "expected"),
     [
-        ({"steps": 2}, ("chord", 2, "late:32")),
-        ({"steps": 15}, ("chord", 15, "late:32")),
-        ({"steps": 2, "grid": "power:3"}, ("chord", 2, "power:3")),
-        ({"steps": 16}, ("adams3", 16, "power:1.75")),
-        ({"steps": 32}, ("adams3", 32, "power:1.75")),
-        ({"steps": 4, "method": "adams3"}, ("adams3", 4, "power:1.75")),
-        ({"steps": 4, "method": "euler"}, ("euler", 4, "uniform")),
-        ({"precision": "bf16-mixed"}, ("adams3", 16, "power:1.75")),
+        ({"steps": 2}, build_sampler("chord", steps=2)),
+        ({"steps": 15}, build_sampler("chord", steps=15)),
+        ({"steps": 2, "grid": "power:3"}, build_sampler("chord", steps=2, grid="power:3")),
+        ({"steps": 16}, OWN),
+        ({"steps": 32}, build_sampler("adams3", steps=32, grid="power:1.75")),
+        ({"steps": 4, "name": "adams3"}, build_sampler("adams3", steps=4, grid="power:1.75")),
+        ({"steps": 4, "name": "euler"}, build_sampler("euler", steps=4)),
+        ({"name": "chord"}, build_sampler("chord")),
+        ({}, OWN),
     ],
 )
-def test_fewer_steps_alone_go_over_to_the_method_for_these(asked, expected):
-    found = OWN.changed(**asked)
-    assert (found.method, found.steps, found.grid) == expected
-    assert (found.fewer is None) == (found.method == "chord" or "method" in asked)
+def test_fewer_steps_alone_go_over_to_the_sampler_for_few(grown, asked, expected):
+    grown.run_by(OWN, build_sampler("chord"))
+    assert grown.choose(**asked) == expected
 
 
-def test_pairs_by_chord_have_the_grid_that_it_is_drawn_on():
-    drawn = OWN.changed(steps=2)
-    assert PairOptions(method="chord", steps=2).recipe((2, 8, 64)).grid == drawn.grid == "late:32"
+def test_the_chord_s_own_grid_is_late():
+    torch.testing.assert_close(build_sampler("chord", steps=2).times(), torch.tensor([0, 31 / 32, 1]).double())
+    expected = [0, 1 - 2**0.75 / 32, 1 - 2**0.25 / 32, 1 - 2**-0.25 / 32, 1 - 2**-0.75 / 32, 1]
+    torch.testing.assert_close(build_sampler("chord", steps=5).times(), torch.tensor(expected).double())
 
 
-def test_a_map_drawn_as_a_flow_draws_two_steps_by_jumps(grown):
-    grown.sampler, x_0 = OWN, Draws(0, range(2)).start(grown.noise_shape)
-    few = grown.generate(x_0, sampler=OWN.changed(steps=2))
-    assert torch.equal(few.x, grown.generate(x_0, sampler=Sampler("chord", 2, grid="late:32")).x)
-    assert few.evaluations.tolist() == [2, 2]
-    assert grown.in_steps(2) == OWN.changed(steps=2)
-
-
-def test_a_file_says_which_method_is_for_fewer_steps_where_there_is_one():
-    assert Sampler.of(OWN.asdict()) == OWN
-    assert "fewer" not in Sampler("adams3", 16).asdict()
+def test_a_run_notes_the_sampler_for_few(grown):
     config = {"stage": {"name": "flow_map"}, "data": DATA, "seed": 0}
-    assert build_stage({**config, "sampler": {"fewer": "chord"}}, flow_map()).generator.sampler.fewer == "chord"
-    with pytest.raises(InputError, match="no solver named 'cord'"):
-        build_stage({**config, "sampler": {"fewer": "cord"}}, flow_map())
+    stage = build_stage({**config, "few": {"name": "chord"}}, flow_map())
+    assert stage.generator.few == build_sampler("chord")
+    with pytest.raises(InputError, match="cord"):
+        build_stage({**config, "few": {"name": "cord"}}, flow_map())
 
 
 def test_renoising_needs_draws(grown):
     noise = torch.zeros(1, *grown.noise_shape)
     with pytest.raises(InputError, match="give draws"):
-        grown.generate(noise, sampler=Sampler("renoise", 2))
+        grown(noise, sampler=build_sampler("renoise", steps=2))
 
 
 @pytest.mark.parametrize("method", ["jump", "chord", "renoise", "euler"])
 def test_a_condition_that_it_has_not_learned_is_refused(grown, method):
     noise = torch.zeros(1, *grown.noise_shape)
     with pytest.raises(InputError, match="condition"):
-        grown.generate(noise, {"image": noise}, sampler=Sampler(method, 2), draws=Draws(0, [0]))
+        grown(noise, {"image": noise}, sampler=build_sampler(method, steps=2), draws=Draws(0, [0]))
 
 
 # ---- the stage
@@ -294,7 +280,7 @@ def test_on_pairs_alone_the_path_is_the_straight_line_between_them():
 
 def test_the_knots_of_pairs_on_disk_are_the_path_of_the_flow_that_drew_them(tmp_path: Path):
     """dx/dt = x: x_t = e^t x_0, and the mean velocity (e^s - e^t) / (s - t) x_0."""
-    options = PairOptions(num=6, method="adams3", steps=64, knots=7, batch_size=2, parent="a")
+    options = PairOptions(sampler={"name": "adams3", "steps": 64}, num=6, knots=7, batch_size=2, parent="a")
     store = PairStore(tmp_path, options.recipe((2, 4, 8)))
     make_pairs(store, Field(lambda t, x: x, (2, 4, 8)), 6)
     dataset = PairDataset(PairSource(store, 6), 0, "training")
@@ -310,7 +296,9 @@ def test_the_knots_of_pairs_on_disk_are_the_path_of_the_flow_that_drew_them(tmp_
 
 
 def test_renoised_pairs_are_one_jump_and_what_the_map_makes_of_it_later(exact, tmp_path: Path):
-    options = PairOptions(num=6, method="renoise", steps=2, grid="power:5", batch_size=2, seed=3, parent="a")
+    options = PairOptions(
+        sampler={"name": "renoise", "steps": 2, "grid": "power:5"}, num=6, batch_size=2, seed=3, parent="a"
+    )
     store = PairStore(tmp_path, options.recipe(exact.space.shape))
     make_pairs(store, exact, 6)
     mean, std = exact.problem.mean, exact.problem.std
@@ -322,13 +310,15 @@ def test_renoised_pairs_are_one_jump_and_what_the_map_makes_of_it_later(exact, t
         x_t = late * guess + (1 - late) * fresh
         expected = mean + std * (x_t - late * mean) / ((1 - late) ** 2 + (late * std) ** 2) ** 0.5
         torch.testing.assert_close(x_1, expected, rtol=2**-11, atol=2e-5)
-    other = PairOptions(num=6, method="renoise:3", steps=2, parent="a").recipe(exact.space.shape)
-    with pytest.raises(InputError, match="renoise:3 draws noise on the way; give a solver, as adams3, or of a flow"):
+    other = PairOptions(num=6, sampler={"name": "sde"}, parent="a").recipe(exact.space.shape)
+    with pytest.raises(InputError, match="sde"):
         make_pairs(PairStore(tmp_path / "other", other), exact, 6)
 
 
 def test_pairs_by_the_chord_are_its_samples(exact, tmp_path: Path):
-    options = PairOptions(num=4, method="chord", steps=2, grid="power:5", batch_size=2, seed=3, parent="a")
+    options = PairOptions(
+        sampler={"name": "chord", "steps": 2, "grid": "power:5"}, num=4, batch_size=2, seed=3, parent="a"
+    )
     store = PairStore(tmp_path, options.recipe(exact.space.shape))
     make_pairs(store, exact, 4)
     mean, std, late = exact.problem.mean, exact.problem.std, 1 - 0.5**5
@@ -340,13 +330,15 @@ def test_pairs_by_the_chord_are_its_samples(exact, tmp_path: Path):
 
 @pytest.mark.parametrize("method", ["chord", "renoise"])
 def test_a_map_s_own_pairs_need_no_knots(method):
-    data = {**DATA, "pairs": {"method": method}}
+    data = {**DATA, "pairs": {"sampler": {"name": method}}}
     assert stage(data, objective="knots").objective is OBJECTIVES["knots"]
 
 
 @pytest.mark.parametrize("ranks", [2, 3])
 def test_pairs_with_knots_are_the_same_bytes_from_any_number_of_processes(tmp_path: Path, ranks: int):
-    options = PairOptions(num=12, method="adams3", steps=4, knots=1, batch_size=2, shard_mib=0.001, parent="a")
+    options = PairOptions(
+        sampler={"name": "adams3", "steps": 4}, num=12, knots=1, batch_size=2, shard_mib=0.001, parent="a"
+    )
     for folder, count in ((tmp_path / "one", 1), (tmp_path / "many", ranks)):
         store = PairStore(folder, options.recipe((2, 4, 8)))
         for rank in range(count):
@@ -432,7 +424,11 @@ def test_a_batch_of_pairs_with_scans_beside_is_a_function_of_its_number(tmp_path
     flow = flow_map()
     keys = {"name": "pairs", "root": str(tmp_path), "batch_size": 4, "scans": {"name": "simulated", "scenes": 5}}
     data = ScanDataModule(
-        flow.space.sensor, flow.space.encoding, 3, pairs={"num": 10, "steps": 1, "batch_size": 2, "parent": "a"}, **keys
+        flow.space.sensor,
+        flow.space.encoding,
+        3,
+        pairs={"sampler": {"name": "adams3", "steps": 1}, "num": 10, "batch_size": 2, "parent": "a"},
+        **keys,
     )
     make_pairs(data.pair_store, Field(lambda t, x: x, flow.noise_shape), 10)
     data.setup()
@@ -464,12 +460,8 @@ def test_a_stage_of_jumps_says_what_it_lacks():
 
 def test_a_map_is_drawn_on_the_grid_that_it_learned():
     found = stage(jumps={"grid": "power:3"}).generator
-    assert (found.sampler.method, found.sampler.grid) == ("jump", "power:3")
-    assert found.in_steps(2) == Sampler("jump", 2, grid="power:3")
-    found.sampler = Sampler("renoise", 8, grid="power:2")
-    assert found.in_steps(2) == Sampler("jump", 2, grid="power:2")
-    found.sampler = Sampler("adams3", 16, grid="power:1.5")
-    assert found.in_steps(2) == Sampler("jump", 2)
+    assert found.sampler == build_sampler("jump", steps=4, grid="power:3")
+    assert found.choose(steps=2) == build_sampler("jump", steps=2, grid="power:3")
 
 
 def test_the_stage_s_options_are_those_of_its_config():
@@ -487,9 +479,4 @@ def test_a_way_of_no_length_and_no_scans_need_no_jump(grown):
 
 def test_jumps_of_half_precision_noise_are_taken_in_float32(grown):
     x_0 = Draws(0, range(2)).start(grown.noise_shape).bfloat16()
-    assert torch.equal(grown.generate(x_0).x, grown.generate(x_0.float()).x)
-
-
-def test_jumps_take_no_number(grown):
-    with pytest.raises(InputError, match="jump takes no number, found jump:2; renoise:C does"):
-        grown.check_sampler(Sampler("jump:2", 2))
+    assert torch.equal(grown(x_0).x, grown(x_0.float()).x)

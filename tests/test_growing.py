@@ -6,9 +6,10 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.maps import jump
-from r2flow.generators import FlowMap, Sampler, build_generator
+from r2flow.generators import FlowMap, build_generator
 from r2flow.growing import grown
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, weights_hash
+from r2flow.samplers import build_sampler
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 
@@ -67,7 +68,13 @@ def test_a_grown_map_learns_on_as_a_map(r2flow, tmp_path):  # noqa: F811
     save_checkpoint(grown(small, (16, 128)), out)
     said = r2flow(
         *("train", "experiment=flow_map", f"stage.init={out}", f"run_dir={run}", "data.pairs.num=4", "trainer=cpu"),
-        *("data.pairs.steps=2", "trainer.max_steps=2", "data.batch_size=2", "samples.num=0", "callbacks.pictures=null"),
+        *(
+            "data.pairs.sampler.steps=2",
+            "trainer.max_steps=2",
+            "data.batch_size=2",
+            "samples.num=0",
+            "callbacks.pictures=null",
+        ),
     )
     assert said[0] == 0, said
     found = load_checkpoint(run)
@@ -96,7 +103,7 @@ def test_other_generators_do_not_grow():
 
 def test_flows_that_know_some_times_alone_do_not_grow():
     small = flow()
-    small.generator.sampler = Sampler("euler", 2, fixed=True)
+    small.generator.sampler = build_sampler("euler", steps=2)
     with pytest.raises(InputError, match="grow the flow that it was distilled from"):
         grown(small, (16, 128))
 

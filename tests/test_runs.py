@@ -89,4 +89,4 @@ def test_settings_of_pairs_matter_only_to_a_run_on_pairs():
 
     assert contradictions(config("simulated", "dopri5"), config("simulated", "adams3")) == []
     told = contradictions(config("pairs", "dopri5"), config("pairs", "adams3"))
-    assert told == ["data.pairs.method=dopri5 there, adams3 here"]
+    assert told == ["data.pairs.sampler.name=dopri5 there, adams3 here"]

@@ -48,23 +48,23 @@ sample -c run -o out --num a
 sample -c run -o out --num 1.5
 sample -c run -o out --steps 0
 sample -c run -o out --steps a
-sample -c run -o out --solver nope
+sample -c run -o out --sampler nope
 sample -c run -o out --precision 16-mixed # precision must be '32-true' or 'bf16-mixed'
 pairs -c run --precision bf16 # precision must be '32-true' or 'bf16-mixed'
 evaluate simulated:1 run --precision half # precision must be '32-true' or 'bf16-mixed'
 complete scans -c run -o out --precision half # precision must be '32-true' or 'bf16-mixed'
-sample -c run -o out --solver torchdiffeq:nope
+sample -c run -o out --sampler torchdiffeq:nope
 sample -c run -o out --tolerance 0
 sample -c run -o out --tolerance nan
 sample -c run -o out --tolerance a
 sample -c run -o out --tolerance -1
-sample -c run -o out --solver euler --tolerance 0.1 # --tolerance is for an adaptive solver, as dopri5, and euler is
-sample -c run -o out --solver nope --tolerance 0.1 # --tolerance is for an adaptive solver
-sample -c run -o out --solver sde:2 --tolerance 0.1 # --tolerance is for an adaptive solver
-sample -c run -o out --solver torchdiffeq:rk4 --tolerance 0.1 # --tolerance is for an adaptive solver
-sample -c run -o out --solver torchdiffeq:nope --tolerance 0.1 # torchdiffeq has no method 'nope'
-sample -c run -o out --solver dopri5 --steps 50 # --steps is for a solver of fixed steps, and dopri5 chooses its own
-sample -c run -o out --solver torchdiffeq:bosh3 --steps 50 # --steps is for a solver of fixed steps
+sample -c run -o out --sampler euler --tolerance 0.1 # --tolerance is for an adaptive solver, as dopri5, and euler is
+sample -c run -o out --sampler nope --tolerance 0.1 # --tolerance is for an adaptive solver
+sample -c run -o out --sampler sde:2 --tolerance 0.1 # --tolerance is for an adaptive solver
+sample -c run -o out --sampler torchdiffeq:rk4 --tolerance 0.1 # --tolerance is for an adaptive solver
+sample -c run -o out --sampler torchdiffeq:nope --tolerance 0.1 # torchdiffeq has no method 'nope'
+sample -c run -o out --sampler dopri5 --steps 50 # --steps is for a solver of fixed steps, and dopri5 chooses its own
+sample -c run -o out --sampler torchdiffeq:bosh3 --steps 50 # --steps is for a solver of fixed steps
 sample -c run -o out --seed -1
 sample -c run -o out --seed 99999999999999999999999
 sample -c run -o out --seed a
@@ -96,11 +96,11 @@ sample -c run -o out --grid nowhere.json
 sample -c run -o out --grid bad.json
 sample -c run -o out --grid file.txt
 sample -c run -o out --grid empty
-sample -c run -o out --solver dopri5 --grid power:2
+sample -c run -o out --sampler dopri5 --grid power:2
 sample -c run -o out --grid power:0
 sample -c run -o out --grid power:10 --steps 64 # 64 steps do not fit under power:10 in double precision
 sample -c run -o out --grid power:3 --steps 1000000 # fewer steps or a smaller power
-sample -c run -o out --margin 10 --solver nope
+sample -c run -o out --margin 10 --sampler nope
 sample -c run -o out --plugin nope
 sample -c run -o out --plugin plugin.py
 sample -c run -o out --plugin empty
@@ -118,7 +118,7 @@ info run --json --card # --card and --json are two forms of one answer
 sample -c run -o out --num 1e9 # --num must be a valid integer, found 1e9
 sample -c run -o out --num=0 # --num must be greater than or equal to 1, found 0
 sample -c run -o out --steps 10000000 # a sampler takes 1 to 1,000,000 steps, found 10,000,000
-sample -c run -o out --solver jump:2 # jump:2 is for flow maps
+sample -c run -o out --sampler jump:2 # jump:2 is for flow maps
 view scans --seed 3 -o v.html # --seed and --device are of a run
 view scans --device cpu -o v.html # --seed and --device are of a run
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
@@ -142,8 +142,8 @@ complete scans/000000.bin -c run -o out --num 0
 complete scans/000000.bin -c run -o out --mask nope # no mask
 complete scans/000000.bin -c run -o out --from nope
 complete scans/000000.bin -c run -o out --to os1_64
-complete scans/000000.bin -c run -o out --solver nope
-complete scans/000000.bin -c run -o file.txt --mask rows:2 --solver euler
+complete scans/000000.bin -c run -o out --sampler nope
+complete scans/000000.bin -c run -o file.txt --mask rows:2 --sampler euler
 view # Missing
 view nowhere
 view scans -o out # ends in .html
@@ -186,7 +186,7 @@ interpolate scans/000000.bin -c run -o out # Missing
 interpolate scans/000000.bin nowhere.bin -c run -o out
 interpolate scans/000000.bin bad.bin -c run -o out
 interpolate scans/000000.bin scans/000001.bin -c run -o out --frames 1
-interpolate scans/000000.bin scans/000001.bin -c run -o out --solver nope
+interpolate scans/000000.bin scans/000001.bin -c run -o out --sampler nope
 interpolate scans/000000.bin scans/000001.bin -c run -o file.txt
 interpolate scans scans -c run -o out # scan
 show scans/000000.bin -o out --format nope # png or npy
@@ -261,7 +261,7 @@ pairs -c empty
 pairs -c stopped
 pairs -c bad.ckpt
 pairs -c run --num 0
-pairs -c run --num 1 --solver nope
+pairs -c run --num 1 --sampler nope
 pairs -c run --num 1 --steps 0
 pairs -c run --num 1 --tolerance 0
 pairs -c run --num 1 --tolerance nan
@@ -307,7 +307,7 @@ evaluate scans scans --real-num 0
 evaluate scans scans --split train # no split named 'train'
 evaluate scans scans --generated-split train # no split named 'train'
 evaluate scans scans --generated-scale 0
-evaluate scans scans --steps 4 --solver nope # are of a run, a checkpoint or a model to sample; found none
+evaluate scans scans --steps 4 --sampler nope # are of a run, a checkpoint or a model to sample; found none
 evaluate scans scans --tolerance 1 # found none
 evaluate scans scans --seed 3 # found none
 evaluate scans --reference --steps 4 # found none
@@ -332,13 +332,13 @@ evaluate scans -c run -o out --reference
 evaluate scans -c run -o out --steps 0
 evaluate scans -c run -o out --steps a
 evaluate scans -c run -o out --steps 1,,2
-evaluate scans -c run -o out --solver nope
+evaluate scans -c run -o out --sampler nope
 evaluate scans -c run -o out --tolerance 0
-evaluate scans -c run -o out --solver euler,heun2 --tolerance 0.1 # --tolerance is for an adaptive solver
+evaluate scans -c run -o out --sampler euler,heun2 --tolerance 0.1 # --tolerance is for an adaptive solver
 evaluate scans run --steps 1,2
-evaluate scans run --steps 2 --solver dopri5 # --steps is for a solver of fixed steps
+evaluate scans run --steps 2 --sampler dopri5 # --steps is for a solver of fixed steps
 evaluate scans run --tolerance 0.1 # --tolerance is for an adaptive solver
-evaluate scans run --solver nope
+evaluate scans run --sampler nope
 evaluate scans run --sensor vlp16
 evaluate scans run --size 16x64
 evaluate scans run --seed -1
@@ -355,7 +355,7 @@ report curvature -c run -o file.txt
 report curvature -c run -o out --device nope
 report solvers # Missing
 report solvers -c nowhere -o out
-report solvers -o out --solvers nope
+report solvers -o out --samplers nope
 report solvers -o out --budgets 0
 report solvers -o out --budgets a
 report solvers -o out --budgets '' # an argument is empty
@@ -399,16 +399,16 @@ name=x samples.num=-1
 name=x samples.num=1.5
 name=x +samples.steps=3
 name=x samples=3
-name=x sampler.method=3
-name=x sampler.method=null sampler.steps=0
-name=x sampler.method=torchdiffeq:foo
+name=x sampler.name=3
+name=x sampler.name=null sampler.steps=0
+name=x sampler.name=torchdiffeq:foo
 name=x sampler.tolerance=0
 name=x sampler.tolerance=a
 name=x sampler.grid=wave
 name=x sampler.grid=[0,0.5]
 name=x sampler.grid=[1,0]
 name=x +sampler.foo=1
-name=x sampler.method=dopri5 sampler.grid=power:2
+name=x sampler.name=dopri5 sampler.grid=power:2
 name=x backbone.base_channels=7
 name=x backbone.depths=[]
 name=x backbone.depths=[0,0]
@@ -517,10 +517,10 @@ name=x stage=reflow stage.init=bad.ckpt
 name=x stage=reflow stage.init=stopped
 name=x stage=reflow stage.init=run
 name=x stage=reflow data=pairs stage.init=run data.pairs.num=0
-name=x stage=reflow data=pairs stage.init=run data.pairs.method=eulr
-name=x stage=reflow data=pairs stage.init=run data.pairs.steps=0
+name=x stage=reflow data=pairs stage.init=run data.pairs.sampler.name=eulr
+name=x stage=reflow data=pairs stage.init=run data.pairs.sampler.steps=0
 name=x stage=reflow data=pairs stage.init=run data.pairs.precision=half
-name=x stage=reflow data=pairs stage.init=run data.pairs.tolerance=0
+name=x stage=reflow data=pairs stage.init=run data.pairs.sampler.tolerance=0
 name=x stage=reflow data=pairs stage.init=run data.pairs.shard_mib=0
 name=x stage=reflow data=pairs stage.init=run data.pairs.batch_size=0
 name=x stage=reflow data=pairs stage.init=run data.pairs.seed=-1

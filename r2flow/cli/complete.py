@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.groups import SolverOptions, grouped
+from r2flow.cli.groups import SamplerOptions, grouped
 from r2flow.cli.options import (
     SETS,
     ColumnsOption,
@@ -66,7 +66,7 @@ def complete(
     out: OutOption,
     known: KnownOptions,
     answers: AnswerOptions,
-    solver: SolverOptions,
+    how: SamplerOptions,
     checkpoint: Annotated[
         Path | None,
         typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model; street if left out."),
@@ -96,7 +96,7 @@ def complete(
     loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(answers.device))
     reading = replace(reading_for([], loaded), columns=named_columns(known.columns))
     scans, said = open_partial(what, reading, source, known.reflectance_scale, answers.scans)
-    sampler = completing(loaded.generator, solver.change(completing(loaded.generator), precision=precision))
+    sampler = completing(loaded.generator, **how.given)
     for line in said:
         print(line)
     for ending in sorted({scan.ending for scan in scans if answer_ending(loaded, scan) != scan.ending}):
@@ -105,7 +105,10 @@ def complete(
         print("the model is of range alone: answers have no reflectance")
     rows, columns = loaded.sensor.shape
     print(f"an answer has at most one point in each pixel of the model's image, {rows}x{columns}")
-    job = Job(answers.num, answers.seed, mask, known.fill_gaps, answers.batch_size, known.surfaces, answers.pictures)
+    job = Job(
+        answers.num, answers.seed, mask, known.fill_gaps, answers.batch_size, known.surfaces, answers.pictures,
+        precision or "32-true",
+    )  # fmt: skip
     about = {
         "mask": known.mask and mask_identity(known.mask), "from": known.source,
         "reflectance_scale": known.reflectance_scale, "columns": known.columns,

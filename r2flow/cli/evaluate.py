@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.groups import ReadingOptions, SolverOptions, WorkOptions, grouped
+from r2flow.cli.groups import ReadingOptions, SamplerOptions, WorkOptions, grouped
 from r2flow.cli.options import SETS, PrecisionOption, choose_device, choose_reading
 from r2flow.errors import InputError
 
@@ -89,11 +89,11 @@ class SamplingOptions:
     steps: Annotated[
         str | None, typer.Option(help="Of the sampled flow, its own if left out; of a curve, 1,2,4,...,256.")
     ] = None
-    solver: Annotated[
+    sampler: Annotated[
         str | None,
         typer.Option(help="Of the sampled flow: euler, heun2, dopri5, ...; of a curve, several as ddpm,adams3."),
     ] = None
-    tolerance: Annotated[float | None, typer.Option(help="Of an adaptive solver.")] = None
+    tolerance: Annotated[float | None, typer.Option(help="Of an adaptive sampler.")] = None
     precision: PrecisionOption = None
     seed: Annotated[int, typer.Option(min=0, help="Of sampled scans.")] = 0
 
@@ -232,7 +232,7 @@ def _check_used(files: bool, flows: bool, scans: SetOptions, sampling: SamplingO
     """Refuse options of generated files, or of flows, where there are none."""
     if not flows and sampling != SamplingOptions():
         raise InputError(
-            "--steps, --solver, --tolerance, --precision and --seed are of a run, a checkpoint or a model to sample; "
+            "--steps, --sampler, --tolerance, --precision and --seed are of a run, a checkpoint or a model to sample; "
             "found none."
         )
     if not files and (scans.generated_split is not None or scans.generated_scale is not None):
@@ -310,19 +310,16 @@ def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOption
     """What is drawn for each line of a curve, and the numbers of steps; what they cannot be is refused before anything
     is read.
     """
-    from r2flow.generators.base import takes_tolerance
     from r2flow.reports.speed_quality import Drawing, steps_of
+    from r2flow.samplers import parse_sampler
 
-    solvers: list[str | None] = [*dict.fromkeys(sampling.solver.split(","))] if sampling.solver else [None]
-    drawings = [Drawing(num, sampling.seed, solver, sampling.tolerance, sampling.precision) for solver in solvers]
+    names = [*dict.fromkeys(sampling.sampler.split(","))] if sampling.sampler else []
+    ways = [parse_sampler(name) for name in names] or [{}]
+    fixed = {} if sampling.tolerance is None else {"tolerance": sampling.tolerance}
+    drawings = [Drawing(num, sampling.seed, {**way, **fixed}, sampling.precision or "32-true") for way in ways]
     steps = _many(sampling.steps)
     for (label, flow), drawing in product(flows.items(), drawings):
         steps_of(flow, label, steps, drawing)
-    methods = {drawing.method or flow.generator.sampler.method for flow in flows.values() for drawing in drawings}
-    if sampling.steps and all(map(takes_tolerance, methods)):
-        raise InputError(f"--steps is for a solver of fixed steps; {', '.join(sorted(methods))} chooses its own.")
-    if sampling.tolerance is not None and not any(map(takes_tolerance, methods)):
-        raise InputError(f"--tolerance is for an adaptive solver, as dopri5; found {', '.join(sorted(methods))}.")
     return drawings, steps
 
 
@@ -378,9 +375,8 @@ def _sampled(label: str, flow: "Checkpoint", num: int, sampling: SamplingOptions
         raise InputError(
             f"one comparison takes one number of --steps, found {sampling.steps}; --checkpoint makes a curve."
         )
-    asked = SolverOptions(sampling.solver, steps[0], sampling.tolerance)
-    how = asked.change(flow.generator.sampler, precision=sampling.precision)
-    return sampled_set(flow, label, num, how, sampling.seed)
+    how = flow.generator.choose(**SamplerOptions(sampling.sampler, steps[0], sampling.tolerance).given)
+    return sampled_set(flow, label, num, how, sampling.seed, sampling.precision or "32-true")
 
 
 def _build(names: Sequence[str], bootstrap: int, place: "Process") -> "dict[str, ScanMetric]":

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.groups import SolverOptions, grouped
+from r2flow.cli.groups import SamplerOptions, grouped
 from r2flow.errors import InputError
 
 
@@ -15,14 +15,11 @@ from r2flow.errors import InputError
 @grouped
 def export(
     checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file, a run folder or a model.")],
-    solver: SolverOptions,
+    how: SamplerOptions,
     to: Annotated[
         str, typer.Option(help="onnx for onnxruntime and its like, pt2 for torch, or safetensors for r2flow.")
     ] = "onnx",
     what: Annotated[str, typer.Option(help="sampler: noise in, scan out; or network: v(t, x) alone.")] = "sampler",
-    grid: Annotated[
-        str | None, typer.Option(help="Where the steps fall: uniform, power:P, power-start:P or late:K.")
-    ] = None,
     half: Annotated[
         bool, typer.Option("--half", help="Large weights of a .safetensors in float16: half the size.")
     ] = False,
@@ -33,7 +30,6 @@ def export(
     The number of steps is fixed by the file. The file is run and compared with the flow. With --to safetensors: the
     averaged weights, config and sampler of any generator, to share; the same bytes each time.
     """
-    from r2flow.generators import Sampler
     from r2flow.model import export as writing
     from r2flow.model.checkpoint import load_checkpoint
 
@@ -42,7 +38,7 @@ def export(
     elif out.suffix != f".{to}":
         raise InputError(f"--to {to} writes a .{to}, found --out {out}.")
     if to == "safetensors":
-        _write_weights(checkpoint, out, half, solver == SolverOptions() and not grid)
+        _write_weights(checkpoint, out, half, how == SamplerOptions())
         return
     writing.FORMATS[to]
     if half:
@@ -50,17 +46,17 @@ def export(
     if what not in ("sampler", "network"):
         raise InputError(f"--what must be sampler or network, found {what!r}.")
     network = what == "network"
-    if network and (solver != SolverOptions() or grid):
-        raise InputError("--what network has no sampler: leave solver, steps, tolerance and grid out.")
+    if network and how != SamplerOptions():
+        raise InputError("--what network has no sampler: leave sampler, steps, tolerance and grid out.")
     loaded = load_checkpoint(checkpoint)
-    sampler: Sampler = solver.change(writing.flow_of(loaded).sampler, grid=grid)
+    sampler = writing.flow_of(loaded).choose(**how.given)
     written = writing.export(loaded, out, sampler, network)
     size = f"{out.stat().st_size / 1e6:.1f} MB"
     batch = "any batch" if written.any_batch else "one scan at a time, torch could not free its batch"
     if network:
         print(f"{out}: {size}, the network v(t, x), {batch}")
         return
-    print(f"{out}: {size}, {sampler.method} with {sampler.steps} steps, {batch}")
+    print(f"{out}: {size}, {sampler}, {batch}")
     try:
         apart = writing.compare(loaded, written, sampler)
     except InputError as missing:

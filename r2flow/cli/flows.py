@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.groups import DrawOptions, SolverOptions, grouped
+from r2flow.cli.groups import DrawOptions, SamplerOptions, grouped
 from r2flow.cli.options import (
     OutOption,
     PrecisionOption,
@@ -72,15 +72,11 @@ def _pair(option: str, text: str, between: str, kind: type, meaning: str) -> tup
 def sample(
     out: OutOption,
     draw: DrawOptions,
-    solver: SolverOptions,
+    how: SamplerOptions,
     part: RegionOptions,
     checkpoint: Annotated[
         Path | None,
         typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model; street if left out."),
-    ] = None,
-    grid: Annotated[
-        str | None,
-        typer.Option(help="Where fixed steps fall: uniform, power:P, power-start:P or late:K, as power:1.75."),
     ] = None,
     precision: PrecisionOption = None,
     format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
@@ -88,7 +84,7 @@ def sample(
 ) -> None:
     """Draw scans from a trained generator: point clouds, range images and pictures.
 
-    Solver, steps and tolerance are the generator's own if left out.
+    The sampler is the generator's own if left out.
     """
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.models import DEFAULT, MODELS, find_model
@@ -97,10 +93,12 @@ def sample(
     if checkpoint is None:
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
     loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(draw.device))
-    sampler = solver.change(loaded.generator.sampler, grid=grid, precision=precision)
+    sampler = loaded.generator.choose(**how.given)
     formats = [*dict.fromkeys(map(str.strip, format.split(",")))] if format else formats_of(loaded, part.channels)
     region = part.region(loaded)
-    write_samples(loaded, out, draw.num, draw.seed, sampler, formats, pictures, draw.batch_size, region, part.channels)
+    write_samples(loaded, out, draw.num, draw.seed, sampler, formats, pictures, draw.batch_size, region, part.channels,
+        precision=precision or "32-true",
+    )  # fmt: skip
     seen = f", pictures in {out / 'samples.png'}" if pictures else ""
     seen += f", in 3-D in {out / 'samples.html'}" if pictures and part.channels != "reflectance" else ""
     print(f"{draw.num} scan{'s' * (draw.num != 1)} ({', '.join(formats)}) in {out}{seen}")

@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
@@ -17,9 +17,6 @@ from r2flow.cli.options import (
     SensorChoice,
     SizeOption,
 )
-
-if TYPE_CHECKING:
-    from r2flow.generators import Sampler
 
 
 def grouped(verb: Callable[..., None]) -> Callable[..., None]:
@@ -76,33 +73,31 @@ class WorkOptions:
 
 
 @dataclass(frozen=True)
-class SolverOptions:
-    """How a generator is run: its own settings, or the verb's, where an option is left out."""
+class SamplerOptions:
+    """How a generator is run: by its own sampler where an option is left out."""
 
-    solver: Annotated[
+    sampler: Annotated[
         str | None,
         typer.Option(
-            help="adams2-4, euler, midpoint, heun2-3, rk4, ab2; adaptive: dopri5, bosh3, auto, torchdiffeq:NAME; with "
-            "fresh noise on the way: sde, sde:C; of flow maps alone: jump, chord, renoise, renoise:C. "
-            "Other systems have their own (docs/systems.md), and so has completion (docs/completion.md)."
+            help="NAME or NAME:FIELD=VALUE:...: adams2-4, euler, midpoint, heun2-3, rk4, ab2; adaptive: dopri5, bosh3, "
+            "auto, torchdiffeq; with fresh noise: sde; of flow maps: jump, chord, renoise; to complete: mmps, replace, "
+            "repaint. Other systems have their own (docs/systems.md)."
         ),
     ] = None
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps from noise to data, of a solver of fixed steps.")] = (
-        None
-    )
-    tolerance: Annotated[float | None, typer.Option(help="Largest error of a step, of an adaptive solver.")] = None
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps from noise to data, of fixed steps.")] = None
+    tolerance: Annotated[float | None, typer.Option(help="Largest error of a step, of an adaptive sampler.")] = None
+    grid: Annotated[
+        str | None, typer.Option(help="Where fixed steps fall: uniform, power:P or power-start:P, as power:1.75.")
+    ] = None
 
-    def change(self, sampler: "Sampler", **more: Any) -> "Sampler":
-        """A sampler with what was asked for, and `more` of its settings.
+    @property
+    def given(self) -> dict[str, Any]:
+        """Name and fields that were given, as `Generator.choose` takes them."""
+        from r2flow.samplers import parse_sampler
 
-        Raises:
-            InputError: a tolerance for fixed steps, or a number of steps for an adaptive solver.
-        """
-        from r2flow.generators.base import check_control
-
-        found = sampler.changed(method=self.solver, steps=self.steps, tolerance=self.tolerance, **more)
-        check_control(found.method, {"steps": self.steps, "tolerance": self.tolerance}, "--{}")
-        return found
+        fields = {"steps": self.steps, "tolerance": self.tolerance, "grid": self.grid}
+        given = {**(parse_sampler(self.sampler) if self.sampler else {}), **fields}
+        return {key: value for key, value in given.items() if value is not None}
 
 
 @dataclass(frozen=True)

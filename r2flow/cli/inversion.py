@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.groups import SolverOptions, grouped
+from r2flow.cli.groups import SamplerOptions, grouped
 from r2flow.cli.options import CheckpointOption, DeviceOption, OutOption, choose_device
 
 
@@ -29,7 +29,7 @@ def interpolate(
     last: Annotated[str, typer.Argument(help="Another.")],
     checkpoint: CheckpointOption,
     out: OutOption,
-    solver: SolverOptions,
+    sampling: SamplerOptions,
     how: ScanOptions,
     frames: Annotated[int, typer.Option(min=2, help="Scans in all, the two ends included.")] = 6,
 ) -> None:
@@ -38,15 +38,16 @@ def interpolate(
     The solver is dopri5 at a tolerance of 1e-4 if left out.
     """
     from r2flow.cli.output import command
-    from r2flow.inversion import TIGHT
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.interpolation import interpolation
     from r2flow.reports.inversion import real_scans
     from r2flow.reports.pages import write_page
+    from r2flow.samplers import build_sampler
 
     loaded = load_checkpoint(checkpoint, choose_device(how.device))
     ends = real_scans(loaded, [first, last], how.reflectance_scale)
-    sampler = solver.change(TIGHT.changed(tolerance=1e-4))
+    given = sampling.given
+    sampler = build_sampler(given if "name" in given else {"name": "dopri5", "tolerance": 1e-4, **given})
     written = write_page(interpolation(loaded, ends, frames, out, sampler, how.batch_size, command()), out)
     pages = ", ".join(map(str, [*written, out / "interpolation.html"]))
     print(f"{frames} scans in {out / 'frames'}; {pages}")

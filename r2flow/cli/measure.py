@@ -28,8 +28,8 @@ def completion(
     tasks: Annotated[
         str | None, typer.Option(help="Masks, as rows:4, a space between them; five masks if left out.")
     ] = None,
-    solvers: Annotated[str | None, typer.Option(help="Methods for the models, as mmps,replace.")] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps of each method.")] = None,
+    samplers: Annotated[str | None, typer.Option(help="Samplers for the models, as mmps,replace.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps of each sampler.")] = None,
     num: Annotated[int, typer.Option(min=1, help="The most scans of a set, evenly spread over it.")] = 16,
     answers: Annotated[int, typer.Option(min=1, help="Answers to each scan; 19 give intervals of 90 %.")] = 8,
     seed: Annotated[int, typer.Option(min=0, help="Of the noise. What is hidden of a scan does not depend on it.")] = 0,
@@ -42,8 +42,8 @@ def completion(
     """Hide a part of scans and complete them, by models and by plain interpolation: errors against evaluations."""
     import numpy as np
 
+    from r2flow.cli.groups import SamplerOptions
     from r2flow.cli.output import command, finish
-    from r2flow.flow.posterior import methods_in
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.model.completion import completing
     from r2flow.progress import Bar
@@ -53,9 +53,9 @@ def completion(
 
     loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in (checkpoint, *(also or []))}
     ways = [
-        Way(name, one, completing(one.generator, method=method, steps=steps))
+        Way(name, one, completing(one.generator, **SamplerOptions(sampler, steps).given))
         for name, one in loaded.items()
-        for method in (methods_in(solvers) if solvers else [None])
+        for sampler in (samplers.split(",") if samplers else [None])
     ]
     first = ways[0].checkpoint
     masks = tasks.split() if tasks else list(TASKS)
@@ -66,7 +66,7 @@ def completion(
     if not truths:
         raise InputError(f"{real}: no scan has a return, so there is nothing to hide.")
     prepare_folder(out)
-    cost = sum(way.checkpoint.generator.evaluations_of(way.sampler) for way in ways) * len(masks)
+    cost = sum(way.sampler.evaluations(way.checkpoint.generator) or 0 for way in ways) * len(masks)
     with Bar("completing", len(truths) * -(-answers // batch_size) * cost, "evaluations") as advance:
         shown = list(
             completion_rows(truths, first.sensor, ways, masks, answers, seed, batch_size, surfaces, progress=advance)

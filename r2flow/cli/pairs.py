@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.groups import SolverOptions, grouped
+from r2flow.cli.groups import SamplerOptions, grouped
 from r2flow.cli.options import CheckpointOption, DeviceOption, PrecisionOption, choose_device
 from r2flow.errors import InputError
 
@@ -52,7 +52,7 @@ class ShareOptions:
 @grouped
 def pairs(
     checkpoint: CheckpointOption,
-    solver: SolverOptions,
+    how: SamplerOptions,
     share: ShareOptions,
     num: Annotated[int, typer.Option(min=1, help="Pairs in all.")] = 1000,
     out: Annotated[
@@ -64,22 +64,18 @@ def pairs(
     first: Annotated[
         int | None, typer.Option(min=0, help="Index of the first pair; behind the flow's own pairs if left out.")
     ] = None,
-    grid: Annotated[
-        str | None, typer.Option(help="Where fixed steps fall; the solver's usual grid if left out.")
-    ] = None,
     precision: PrecisionOption = None,
     knots: Annotated[int | None, typer.Option(min=1, help="Inner states to keep of each path, for a flow map.")] = None,
 ) -> None:
     """Draw reflow pairs from a flow: what is missing or damaged, as one of any number of processes.
 
     `python train.py experiment=reflow stage.init=RUN` makes them itself; this makes them alone, under torchrun or as a
-    SLURM array, with the settings of `data.pairs`. The solver is adams3 in 32 steps if left out; --solver dopri5 is the
-    paper's; --solver chord or renoise gives a flow map's first jump as its later ones correct it.
+    SLURM array, with the settings of `data.pairs`. The sampler is adams3 in 32 steps if left out;
+    --sampler dopri5 is the paper's; chord or renoise gives a flow map's first jump as its later ones correct it.
     """
     from r2flow.data.options import PairOptions
     from r2flow.data.pairs import default_folder
     from r2flow.data.shards import PairStore
-    from r2flow.generators.base import check_control
     from r2flow.model.checkpoint import load_checkpoint, weights_hash
     from r2flow.reports.pairs import make_and_tell
     from r2flow.runs.lineage import check_finished, pairs_of
@@ -87,16 +83,14 @@ def pairs(
     rank, ranks, where = share.place()
     flow = load_checkpoint(checkpoint)
     check_finished(checkpoint, flow)
-    asked = {"method": solver.solver, "steps": solver.steps, "tolerance": solver.tolerance, "precision": precision}
     options = {
-        **{key: value for key, value in asked.items() if value is not None},
+        "sampler": {"name": "adams3", **how.given}, "precision": precision or "32-true",
         "num": num, "batch_size": batch_size, "shard_mib": shard_mib, "seed": seed, "first": first,
-        "knots": knots, "grid": grid,
+        "knots": knots,
     }  # fmt: skip
     recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(
         flow.encoding.shape, flow.generator.noise_shape
     )
-    check_control(recipe.sampler.method, {"steps": solver.steps, "tolerance": solver.tolerance}, "--{}")
     store = PairStore(out or default_folder(flow.path), recipe)
     make_and_tell(store, flow, num, rank, ranks, where)
     lacking = store.missing_pairs(num)

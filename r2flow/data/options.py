@@ -2,15 +2,15 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
 from r2flow.data.shards import PairRecipe
 from r2flow.errors import InputError
-from r2flow.flow.solvers import check_knots, check_tolerance, named_grid
-from r2flow.generators.base import Precision, usual_steps
+from r2flow.generators.base import Precision
 from r2flow.lidar.scan_files import check_columns
 from r2flow.registry import NonNegative, Positive, check_options
+from r2flow.samplers import build_sampler, knot_times
 
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # in the table `r2flow.data.opening.SOURCES`
 MIXED, PAIRS = "mixed", "pairs"  # what `data.name` may be besides: several sets of scans, and pairs drawn by a flow
@@ -83,10 +83,7 @@ class PairOptions:
     """The choices behind a set of pairs (`data.pairs`)."""
 
     num: int = 1000
-    method: str = "adams3"  # of the parent, like steps and tolerance: `r2flow.flow.solvers.solve`
-    steps: int = 32
-    grid: str | None = None  # where fixed steps fall; None: the method's usual one
-    tolerance: float = 1e-5
+    sampler: Mapping[str, Any] = field(default_factory=lambda: {"name": "adams3"})  # of the flow that draws them
     batch_size: int = 16  # pairs solved together; the last bits of a pair depend on it
     shard_mib: float = 16.0  # of a shard, which a killed process begins again
     seed: int = 0  # of the noise; not the run's: runs of several seeds can share one set of pairs
@@ -102,28 +99,24 @@ class PairOptions:
         Raises:
             InputError: a number out of its range.
         """
-        if min(self.num, self.batch_size, self.steps) < 1 or not 0 < self.shard_mib < math.inf:
+        if min(self.num, self.batch_size) < 1 or not 0 < self.shard_mib < math.inf:
             raise InputError(
-                "data.pairs: num, batch_size, steps must be at least 1 and shard_mib positive; "
-                f"found {self.num}, {self.batch_size}, {self.steps} and {self.shard_mib}."
+                "data.pairs: num and batch_size must be at least 1 and shard_mib positive; "
+                f"found {self.num}, {self.batch_size} and {self.shard_mib}."
             )
         first = self.first or 0
         if not (0 <= self.seed < 2**63 and 0 <= first < 2**63):
             raise InputError(
                 f"data.pairs: seed and first must be at least 0 and below 2^63, found {self.seed} and {first}."
             )
-        check_tolerance(self.tolerance)
-        grid = self.grid or usual_steps(self.method)["grid"]
-        named_grid(grid)
+        sampler = build_sampler(self.sampler).asdict()
         if self.knots:
-            check_knots(self.method, self.steps, self.knots)
+            knot_times(sampler, self.knots)
         size = self.batch_size * 2 * math.prod(shape) * (1 + (self.knots or 0))
         shard_batches = max(round(self.shard_mib * 2**20 / size), 1)
-        tolerance = float(self.tolerance)  # 1 and 1.0 are one recipe
         return PairRecipe(
-            self.parent or "", shape, self.seed, first, self.method, self.steps, tolerance, self.batch_size,
-            shard_batches, None if noise_shape == shape else noise_shape, grid, self.knots or 0,
-            self.precision,
+            self.parent or "", shape, self.seed, first, sampler, self.batch_size, shard_batches,
+            None if noise_shape == shape else noise_shape, self.knots or 0, self.precision,
         )  # fmt: skip
 
 

@@ -17,10 +17,11 @@ from r2flow import noise
 from r2flow.data.loader import Item, Order
 from r2flow.data.shards import Block, PairRecipe, PairStore
 from r2flow.errors import InputError
-from r2flow.flow.solvers import Solution, knot_times
-from r2flow.generators import Flow, Generated, Generator, Sampler, as_flow
-from r2flow.generators.base import RENOISE
+from r2flow.flow.solvers import Solution
+from r2flow.generators import Generated, Generator, as_flow
+from r2flow.generators.base import autocast
 from r2flow.models import name_of
+from r2flow.samplers import build_sampler, knot_times
 from r2flow.store import PATIENCE
 
 
@@ -37,16 +38,6 @@ class Made:
     evaluations: int = 0
     unusable: int = 0  # pairs that are left out
     seconds: float = 0.0
-
-
-def _refuse_unlearned_times(own: Sampler, how: Sampler) -> None:
-    """A k-TD knows the velocity where its own steps begin, and nowhere else."""
-    if own.fixed and (own.method, own.steps, own.grid) != (how.method, how.steps, how.grid):
-        raise InputError(
-            f"this generator has learned {own.method} in {own.steps} steps, grid {own.grid}, and draws no pairs by "
-            f"{how.method} in {how.steps} steps, grid {how.grid}: give data.pairs.method={own.method} "
-            f"data.pairs.steps={own.steps} data.pairs.grid={own.grid}, or pairs of the flow that it comes from."
-        )
 
 
 def make_pairs(
@@ -74,14 +65,15 @@ def make_pairs(
     """
     if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
         raise InputError(f"these pairs are of another noise than the generator's {generator.noise_shape}.")
-    generator.check_sampler(store.recipe.sampler)
-    drawn = store.recipe.sampler.method
-    if isinstance(generator, Flow) and generator.draws_noise(store.recipe.sampler) and drawn != RENOISE:
+    sampler = build_sampler(store.recipe.sampler)
+    sampler.check(generator)
+    if not sampler.paired:
+        raise InputError(f"a pair is the ends of one path, which sampler {sampler.name} leaves: give a solver.")
+    if generator.fixed and sampler != generator.sampler:
         raise InputError(
-            f"a pair is one path's ends, and {drawn} draws noise on the way; give a solver, as adams3, or of a flow "
-            "map renoise, whose first jump goes to the end."
+            f"this generator was distilled for {generator.sampler} and draws no pairs by {sampler}: give the same "
+            "data.pairs.sampler, or pairs of the flow that it comes from."
         )
-    _refuse_unlearned_times(generator.sampler, store.recipe.sampler)
     store.begin()
     shards, made, start = store.shards(num), Made(), time.monotonic()
     store.mend(shards[rank::ranks])
@@ -123,8 +115,8 @@ def _make_shard(
         progress(made)
     if made.pairs and made.unusable == made.pairs:
         raise InputError(
-            f"none of {made.pairs} pairs came to an end with {store.recipe.method} at tolerance "
-            f"{store.recipe.tolerance:g}: the flow is broken, or the tolerance out of its reach."
+            f"none of {made.pairs} pairs came to an end with sampler {store.recipe.sampler['name']}: the flow is "
+            "broken, or the tolerance out of its reach."
         )
     if blocks:
         store.append(shard, blocks)
@@ -136,13 +128,13 @@ def solve_batch(recipe: PairRecipe, generator: Generator, batch: int) -> Block:
     x_0 = torch.stack([pair_noise(recipe, index) for index in range(first, first + recipe.batch_size)])
     x_0 = x_0.to(generator.device)
     end: Generated | Solution
-    with recipe.sampler.autocast(generator.device):
-        if recipe.knots:
-            end = as_flow(generator, "data.pairs.knots").solve(x_0, sampler=recipe.sampler, knots=recipe.knots)
-        else:
-            fresh = noise.Draws(recipe.seed, range(first, first + recipe.batch_size), "pairs")
-            draws = fresh if recipe.method == RENOISE else None
-            end = generator.generate(x_0, sampler=recipe.sampler, draws=draws)
+    how = build_sampler(recipe.sampler)
+    if recipe.knots:
+        with autocast(generator.device, recipe.precision):
+            end = as_flow(generator, "data.pairs.knots").solve(x_0, sampler=how, knots=recipe.knots)
+    else:
+        fresh = noise.Draws(recipe.seed, range(first, first + recipe.batch_size), "pairs")
+        end = generator(x_0, sampler=how, draws=fresh if how.draws else None, precision=recipe.precision)
     x_1, usable = end.x.to(torch.float16).cpu(), end.converged.cpu()
     usable = usable & x_1.isfinite().flatten(1).all(1)
     block = Block(x_1.numpy(), end.evaluations.cpu().numpy().astype(np.int32), usable.numpy())
@@ -218,7 +210,7 @@ class PairDataset(Dataset[Item]):
         self.source, self.seed, self.purpose = source, seed, purpose
         self.scans, self.order = scans, order
         recipe = source.store.recipe
-        self.times = knot_times(recipe.method, recipe.grid, recipe.knots).float() if recipe.knots else None
+        self.times = knot_times(recipe.sampler, recipe.knots).float() if recipe.knots else None
 
     def __len__(self) -> int:
         return len(self.source)

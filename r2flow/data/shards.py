@@ -2,13 +2,12 @@
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.store import Damaged, Store
 
@@ -23,20 +22,12 @@ class PairRecipe:
     shape: tuple[int, int, int]  # (C, H, W) of a scan in model space
     seed: int  # x_0 of index i is the noise of (seed, "pairs", i); it is never stored
     first: int  # index of the first pair
-    method: str  # the solver's, like steps and tolerance
-    steps: int
-    tolerance: float
+    sampler: dict[str, Any]  # name and fields of the flow's
     batch_size: int  # consecutive indices that are solved together
     shard_batches: int  # batches in a shard
     noise_shape: tuple[int, ...] | None = None  # of x_0, where it is not the scan's
-    grid: str = "uniform"  # where fixed steps fall
     knots: int = 0  # inner states of each path that are kept with it
     precision: Precision = "32-true"  # of the network
-
-    @property
-    def sampler(self) -> Sampler:
-        """How the generator is run."""
-        return Sampler(self.method, self.steps, self.tolerance, self.grid).changed(precision=self.precision)
 
 
 NO_KNOTS = np.empty(0, np.float16)

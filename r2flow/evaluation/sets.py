@@ -11,6 +11,7 @@ from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
 from r2flow.generators import Sampler
+from r2flow.generators.base import Precision
 from r2flow.model.checkpoint import Checkpoint, checkpoints_of, weights_hash
 from r2flow.model.sampling import draw
 from r2flow.models import MODELS
@@ -28,7 +29,14 @@ def is_checkpoint(text: str) -> bool:
     return path.suffix in CHECKPOINTS or (not path.exists() and text in MODELS)
 
 
-def sampled_set(flow: Checkpoint, label: str, num: int, sampler: Sampler | None = None, seed: int = 0) -> ScanSet:
+def sampled_set(
+    flow: Checkpoint,
+    label: str,
+    num: int,
+    sampler: Sampler | None = None,
+    seed: int = 0,
+    precision: Precision = "32-true",
+) -> ScanSet:
     """Scans 0 to num - 1 of a generator's seed, drawn when they are asked for.
 
     Their noise is that of (seed, "evaluation", i), which no training step and no reflow pair has seen.
@@ -39,15 +47,13 @@ def sampled_set(flow: Checkpoint, label: str, num: int, sampler: Sampler | None 
     if num < 1:
         raise InputError(f"needs at least one scan to sample, found {num}.")
     sampler = sampler or flow.generator.sampler
-    flow.generator.check_sampler(sampler)
+    sampler.check(flow.generator)
     about = {
-        "kind": "sampled", "weights": weights_hash(flow), "step": flow.step, "num": num, "solver": sampler.method,
-        "steps": sampler.steps, "grid": sampler.grid, "finish": sampler.finish, "seed": seed, "noise": "evaluation",
+        "kind": "sampled", "weights": weights_hash(flow), "step": flow.step, "num": num,
+        "sampler": sampler.asdict(), "precision": precision, "seed": seed, "noise": "evaluation",
         "reflectance": flow.encoding.reflectance,
     }  # fmt: skip
-    usual, more = Sampler().asdict(), ("tolerance", "levels", "limits", "precision")
-    about |= {key: value for key, value in sampler.asdict().items() if key in more and value != usual.get(key)}
-    return ScanSet(label, SampledScans(flow, range(num), sampler, seed), flow.sensor, about)
+    return ScanSet(label, SampledScans(flow, range(num), sampler, seed, precision), flow.sensor, about)
 
 
 class SampledScans(ScanSource):
@@ -55,8 +61,10 @@ class SampledScans(ScanSource):
 
     drawn = True
 
-    def __init__(self, flow: Checkpoint, numbers: Sequence[int], sampler: Sampler, seed: int) -> None:
-        self.flow, self.numbers, self.sampler, self.seed = flow, numbers, sampler, seed
+    def __init__(
+        self, flow: Checkpoint, numbers: Sequence[int], sampler: Sampler, seed: int, precision: Precision = "32-true"
+    ) -> None:
+        self.flow, self.numbers, self.sampler, self.seed, self.precision = flow, numbers, sampler, seed, precision
         self.unsolved = 0  # of those drawn so far, how many are no solution to the tolerance
         self.evaluations: list[int] = []  # of the network, of each
         self.seconds: list[float] = []  # a scan, of each batch
@@ -78,7 +86,9 @@ class SampledScans(ScanSource):
 
     def batch(self, indices: Sequence[int]) -> Tensor:
         """The scans of a batch together, (B, 2 or 1, H, W). One that is not solved is taken as it is, and counted."""
-        made = draw(self.flow.generator, [self.numbers[i] for i in indices], self.seed, self.sampler)
+        made = draw(
+            self.flow.generator, [self.numbers[i] for i in indices], self.seed, self.sampler, precision=self.precision
+        )
         self.seconds.append(made.seconds / len(indices))
         self.evaluations += made.evaluations.tolist()
         self.unsolved += int((~made.converged).sum())

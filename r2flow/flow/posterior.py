@@ -1,26 +1,21 @@
 """Samples given a part of x_1, by a flow that was trained without a condition.
 
-A method of `METHODS` takes the states x_t of a flow from noise at t = 0 to x_1 at t = 1, where the values of a mask are
+A method takes the states x_t of a flow from noise at t = 0 to x_1 at t = 1, where the values of a mask are
 known. With u = v(t, x_t), x_1hat = x_t + (1 - t) u is the mean E[x_1 | x_t]. With a flow map, `replace` and `repaint`
 jump to the next time; `mmps` needs that mean and takes the map's velocity u(x, t, t). docs/completion.md has how far
 each is from the posterior where that is known.
 
-    x_1 = sample_posterior(u, x_0, y, known, "mmps", times, noise)
+    x_1 = mmps(u, x_0, y, known, times, noise)
 """
 
-import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.flow.stochastic import Noise, back, sde
-from r2flow.registry import Registry
 
 Linear = Callable[[Tensor], Tensor]
 
@@ -149,109 +144,3 @@ def _solved(multiply: Callable[[Tensor], tuple[Tensor, Tensor]], r: Tensor, step
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     """Sum of a b over each scan, (B, 1, ...)."""
     return (a * b).flatten(1).sum(1).view(-1, *(1,) * (a.ndim - 1))
-
-
-class Number(NamedTuple):
-    """A number of a method: what it is if it is left out, and the least that it may be."""
-
-    usual: int | float
-    least: int | float
-
-
-@dataclass(frozen=True)
-class Method:
-    """A way to sample given a part of x_1.
-
-    Attributes:
-        run: `run(u, x_0, y, known, times, noise, *numbers)` to x_1.
-        evaluations: Network evaluations of a number of steps and the numbers.
-        numbers: What may follow the name, as in `repaint:10,2`.
-    """
-
-    run: Callable[..., Tensor]
-    evaluations: Callable[..., int]
-    numbers: tuple[Number, ...] = ()
-
-
-METHODS: Registry[Method] = Registry(
-    "method of completion",
-    replace=Method(replace, lambda n: n),
-    repaint=Method(
-        repaint,
-        lambda n, repeats, length: n + (repeats - 1) * max(n - length, 0),
-        (Number(4, 1), Number(1, 1)),
-    ),
-    mmps=Method(mmps, lambda n, products, _: n * (1 + products), (Number(2, 1), Number(1.0, 0.0))),
-)
-
-
-class Chosen(NamedTuple):
-    """A method with its numbers."""
-
-    method: Method
-    numbers: tuple[int | float, ...]
-
-    def evaluations(self, steps: int) -> int:
-        """Network evaluations of a scan, a vector-Jacobian product counting as one."""
-        return self.method.evaluations(steps, *self.numbers)
-
-
-def completes(text: str) -> bool:
-    """Whether a sampler's method is one of `METHODS`."""
-    return text.partition(":")[0] in METHODS
-
-
-def methods_in(text: str) -> list[str]:
-    """The methods of a list with commas between them, `NAME,NAME:NUMBER,NUMBER,NAME`: no name begins with a number."""
-    return re.split(r",\s*(?=[A-Za-z])", text)
-
-
-def parse_method(text: str) -> Chosen:
-    """A method by its text, `NAME` or `NAME:NUMBER,...`.
-
-    Raises:
-        InputError: no such method, or numbers that it does not take.
-    """
-    name, _, given = text.partition(":")
-    method = METHODS[name]
-    words = given.split(",") if given else []
-    try:
-        numbers = [type(n.usual)(word) for n, word in zip(method.numbers, words, strict=False)]
-        right = len(numbers) == len(words) and all(
-            n.least <= number < float("inf") for n, number in zip(method.numbers, numbers, strict=False)
-        )
-    except ValueError:
-        right = False
-    if not right:
-        usual = ",".join(f"{n.usual:g}" for n in method.numbers)
-        raise InputError(f"{name} does not take the numbers of {text!r}: give {name}{usual and ':' + usual}.")
-    return Chosen(method, (*numbers, *(n.usual for n in method.numbers[len(numbers) :])))
-
-
-def sample_posterior(
-    u: MeanVelocity, x_0: Tensor, y: Tensor, known: Tensor, method: str, times: Tensor, noise: Noise | None = None
-) -> Tensor:
-    """x_1 given y, (B, ...); known values as they were given.
-
-    Args:
-        u: Mean velocity u(t, x, s) of the flow, at times of shape (): v(t, x) of one that knows no other.
-        x_0: Noise, (B, ...).
-        y: Known values of x_1, (B, ...); any where `known` is False.
-        known: Which values are known, (B, ...) bool.
-        method: A name of `METHODS`, with its numbers or without.
-        times: Rising from 0 to 1, (N + 1,).
-        noise: Further noise; not needed by a method that draws none.
-
-    Raises:
-        InputError: no such method, or one that needs noise and has none.
-    """
-    if torch.is_inference_mode_enabled():  # products with a Jacobian need tensors that autograd may keep
-        with torch.inference_mode(False), torch.no_grad():
-            return sample_posterior(u, x_0.clone(), y.clone(), known.clone(), method, times.clone(), noise)
-    chosen = parse_method(method)
-
-    def missing(j: int) -> Tensor:
-        raise InputError(f"{method} draws further noise: give draws.")
-
-    x_1 = chosen.method.run(u, x_0, y, known, times.to(x_0), noise or missing, *chosen.numbers)
-    return torch.where(known, y, x_1)

@@ -20,31 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
-
 Estimate = Callable[[Tensor, Tensor], Tensor]  # x_1hat of t, of shape (), and x_t
 Noise = Callable[[int], Tensor]  # N(0, 1) of the j-th draw, j = 1, 2, ..., in the state's shape
 
-SDE, CHURN = "sde", 1.0  # the sampler's name, and its C where none is given: the reversed diffusion
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
-
-
-def churn_of(method: str, name: str = SDE, usual: float = CHURN) -> float | None:
-    """c of a sampler's text, `NAME` or `NAME:c`; None of another method.
-
-    Raises:
-        InputError: a c that is no finite number of at least 0.
-    """
-    kind, colon, text = method.partition(":")
-    if kind != name:
-        return None
-    try:
-        c = float(text) if colon else usual
-    except ValueError:
-        c = math.nan
-    if not (0 <= c < math.inf or not colon):
-        raise InputError(f"the share of fresh noise in {name}:C must be a number of at least 0, found {method!r}.")
-    return c
 
 
 class Step(NamedTuple):
@@ -109,20 +88,6 @@ def sde(estimate: Estimate, x: Tensor, times: Tensor, c: float, noise: Noise) ->
             x = x + step.fresh * noise(j)
         former = t, x_1
         yield x
-
-
-def ahead(t: float, s: float, c: float) -> float:
-    """The time r to jump to from t, so that fresh noise from there back to s replaces the SDE's share from t to s.
-
-    Going back leaves e^(l_s - l_r) of the noise's own share, so that l_r = l_s + c (l_s - l_t), l = log(t / (1 - t)).
-    From t = 0, where all is noise, r = s for any finite c; c = inf is r = 1.
-    """
-    if s >= 1 or math.isinf(c):
-        return 1.0
-    if t <= 0 or c == 0:
-        return s
-    inverse = (1 - s) / s * ((1 - s) / s / ((1 - t) / t)) ** c
-    return 1 / (1 + inverse)
 
 
 def back(x: Tensor, r: float, s: float, e: Tensor) -> Tensor:

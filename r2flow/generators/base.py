@@ -1,33 +1,25 @@
 """What every generator has in common: noise in, scan out."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
-from r2flow.flow.solvers import TORCHDIFFEQ, adapts, check_method, usual_grid
-from r2flow.flow.solvers.solution import finite, wide
-from r2flow.flow.stochastic import SDE
+from r2flow.flow.solvers.solution import wide
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
-from r2flow.registry import Count, Portion, Positive, check_options
-
-Condition = Mapping[str, Tensor]
-"""What is known of each scan, by name: tensors of shape (B, ...). Which names there are, the generator says."""
-
-Progress = Callable[[], None] | None
+from r2flow.registry import options_of
+from r2flow.samplers import SAMPLERS, FixedSteps, build_sampler
+from r2flow.samplers.base import Condition, Generated, Progress, Sampler
 
 Precision = Literal["32-true", "bf16-mixed"]  # words of Lightning's trainer
 
 IMAGE, KNOWN = "image", "known"  # the names of what is known of a part of a scan
 LOGIT, SIGMA = "logit", "sigma"  # and of what a conditional flow finds of these once (`r2flow.generators.conditional`)
-
-JUMP, CHORD, RENOISE = WAYS = "jump", "chord", "renoise"  # of a flow map, on the same steps
 
 WHOLE_ONLY = "a {} makes whole images and no part of one; leave the region out."
 
@@ -48,193 +40,30 @@ def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor]:
     return image, known
 
 
-@dataclass(frozen=True)
-class Sampler:
-    """How a generator is run; saved with it.
-
-    Attributes:
-        method: A solver's name for a flow (`r2flow.flow.solvers`), or what completes a scan with it
-            (`r2flow.flow.posterior`); other families have names of their own.
-        steps: Steps from noise to data, of a method of fixed steps.
-        tolerance: Absolute and relative tolerance of an adaptive method.
-        grid: Where fixed steps fall: a name (`r2flow.flow.solvers.named_grid`), or the times themselves.
-        finish: Length of the last part of the way to t = 1, which the last step takes by Euler's rule. That smooths
-            what a flow leaves rough that was not trained to the end.
-        fixed: Whether the generator was trained for this number of steps and is worse at any other.
-        doubt: Standard deviation, in model space, of the error of a doubtful value, for a method of
-            `r2flow.flow.posterior`. Model space is 2 wide: false returns are further off than a tenth of that, the
-            noise of a ranging sensor is far less.
-        precision: Of the network, as `trainer.precision`: `bf16-mixed` computes its products in bfloat16, by
-            `torch.autocast`. States and steps stay as they are.
-        fewer: Method in fewer steps than `steps`, where another is better there; a flow map may have `chord`.
-    """
-
-    method: str = "euler"
-    steps: Count = 32
-    tolerance: Positive = 1e-5
-    grid: str | tuple[float, ...] = "uniform"
-    finish: Portion = 0.0
-    fixed: bool = False
-    doubt: Positive = 0.2
-    precision: Precision = "32-true"
-    fewer: str | None = None
-
-    @classmethod
-    def of(cls, options: Mapping[str, Any]) -> Self:
-        """From plain values, as a config or a checkpoint holds them.
-
-        Raises:
-            InputError: an unknown option, or a value of the wrong type.
-        """
-        known = dict(options)
-        check_options("sampler", cls, known)
-        grid = known.get("grid", "uniform")
-        known["grid"] = grid if isinstance(grid, str) else tuple(grid)
-        return cls(**known)
-
-    def changed(self, **options: Any) -> Self:
-        """The same with the options that are not None. Given times decide the number of steps.
-
-        Fewer steps alone go over to the method `fewer`, if there is one.
-        Another method starts from its usual grid and `finish`. The same
-        one with other numbers, as `sde:2` for `sde`, keeps them.
-
-        Raises:
-            InputError: an unknown option or a value of the wrong type, fewer than one step, or times and a number of
-                steps that contradict.
-        """
-        given = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in options.items() if v is not None}
-        own = vars(self)  # the range of a number is judged with the method that takes it
-        odd = {k: v for k, v in given.items() if isinstance(v, tuple) or type(v) is not type(own.get(k))}
-        odd |= {k: v for k, v in given.items() if k in ("precision", "finish", "doubt")}
-        check_options("sampler", type(self), odd)
-        if self.fewer and "method" not in given and given.get("steps", self.steps) < self.steps:
-            given["method"] = self.fewer
-        if "method" in given:
-            given = {"fewer": None, **given}
-        if _kind(given.get("method", self.method)) != _kind(self.method):
-            given = {**usual_steps(given["method"]), **given}
-        grid = given.get("grid", "uniform")
-        if not isinstance(grid, str):
-            given |= {"finish": options.get("finish") or 0.0, "grid": tuple(float(t) for t in grid)}
-            if given.setdefault("steps", len(given["grid"]) - 1) != len(given["grid"]) - 1:
-                raise InputError(f"the time grid has {len(given['grid']) - 1} steps, found steps={given['steps']}.")
-        elif "steps" in given and "grid" not in given and not isinstance(self.grid, str):
-            given["grid"] = "uniform"  # the times were those of another number of steps
-        found = replace(self, **given)
-        if not 1 <= found.steps <= MOST_STEPS:
-            raise InputError(f"a sampler takes 1 to {MOST_STEPS:,} steps, found {found.steps:,}.")
-        return found
-
-    @property
-    def times(self) -> str | Tensor:
-        """The grid as solvers take it: by name, or its times in float64."""
-        return self.grid if isinstance(self.grid, str) else torch.tensor(self.grid, dtype=torch.float64)
-
-    def autocast(self, device: torch.device) -> AbstractContextManager[Any]:
-        """In which the network is computed with `precision`."""
-        return nullcontext() if self.precision == "32-true" else torch.autocast(device.type, torch.bfloat16)
-
-    def unlike(self, other: Self) -> str:
-        """What is another one's setting, in words: "steps 5, tolerance 0.1"."""
-        return ", ".join(f"{key} {value}" for key, value in asdict(self).items() if value != getattr(other, key))
-
-    def asdict(self) -> dict[str, Any]:
-        """Plain values, as a config or a checkpoint holds them; those that are younger than this format if given."""
-        found = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
-        return {key: value for key, value in found.items() if (key, value) not in YOUNGER}
-
-
-MOST_STEPS = 10**6  # more are a slip of the finger
-YOUNGER = ("precision", "32-true"), ("fewer", None)  # what files without these keys mean by it
-
-
-def _kind(method: str) -> str:
-    """A method's name without its numbers; torchdiffeq's have their own after the colon. A map's ways are one."""
-    name = method if method.startswith(TORCHDIFFEQ) else method.partition(":")[0]
-    return JUMP if name in WAYS else name
-
-
-def takes_tolerance(method: str) -> bool:
-    """Whether a generator's method is an adaptive solver; what is no solver is none.
-
-    Raises:
-        InputError: torchdiffeq has no such method.
-    """
-    if method.startswith(TORCHDIFFEQ):
-        check_method(method)
-    return adapts(method)
-
-
-def check_control(method: str, given: Mapping[str, Any], called: str = "{}") -> None:
-    """Check what is given to say how exact a method shall be; None counts as left out.
-
-    Args:
-        given: Options of a sampler, by name.
-        called: What an option is called where it was given, as `--{}`.
-
-    Raises:
-        InputError: a tolerance for fixed steps, or a number of steps for an adaptive solver.
-    """
-    steps, tolerance = called.format("steps"), called.format("tolerance")
-    adaptive = takes_tolerance(method)
-    if adaptive and given.get("steps") is not None:
-        raise InputError(f"{steps} is for a solver of fixed steps, and {method} chooses its own; give {tolerance}.")
-    if not adaptive and given.get("tolerance") is not None:
-        raise InputError(f"{tolerance} is for an adaptive solver, as dopri5, and {method} is none; give {steps}.")
-
-
-def usual_steps(method: str) -> Mapping[str, Any]:
-    """Its usual `grid` and `finish`; of `sde` and `chord` what was best, or nearly so, of the package's models."""
-    if _kind(method) == SDE:
-        return {"grid": "power:2.5", "finish": 1 / 128}
-    if method == CHORD:
-        return {"grid": "late:32", "finish": 0.0}
-    return {"grid": usual_grid(method), "finish": 0.0}
-
-
-@dataclass(frozen=True)
-class Generated:
-    """Scans in model space.
-
-    Attributes:
-        x: x_1, (B, C, H, W), on the generator's device, float32 or float64.
-        evaluations: Network evaluations of each, (B,) int64.
-        converged: Whether each is a scan of the generator, (B,) bool: finite and, for an adaptive method, solved.
-    """
-
-    x: Tensor
-    evaluations: Tensor
-    converged: Tensor
-
-    @classmethod
-    def after(cls, x: Tensor, evaluations: int, converged: Tensor | None = None) -> Self:
-        """Scans of a method that always comes to its end, after the same number of evaluations for all.
-
-        Args:
-            converged: Whether each was finite all the way, (B,) bool; None: where x is. An x that was clamped, or
-                kept from an earlier step, does not tell.
-        """
-        counted = torch.full((len(x),), evaluations, dtype=torch.int64, device=x.device)
-        x = wide(x)
-        return cls(x, counted, finite(x) if converged is None else converged)
+def autocast(device: torch.device, precision: Precision) -> AbstractContextManager[Any]:
+    """In which a network is computed with `precision`."""
+    return nullcontext() if precision == "32-true" else torch.autocast(device.type, torch.bfloat16)
 
 
 class Generator(nn.Module):
     """Noise in, scan out. What training makes, a checkpoint holds and every verb, report and callback runs.
 
-    A subclass implements `generate` and enters `GENERATORS`. Its constructor takes the model space and the config's
-    `backbone`, which it may ignore, and then options of its own, which are those of the config's `generator`.
+    A subclass has what its samplers need (`r2flow.samplers.base.Sampler.needs`) and enters `GENERATORS`. Its
+    constructor takes the model space, the config's `backbone`, which it may ignore, and the options of `generator`.
 
     Attributes:
         space: The images it makes.
-        noise_shape: What one scan is made of: (C, H, W) for a flow, (latent,) for a GAN.
-        sampler: How it is run when nobody says otherwise.
+        noise_shape: Noise of one scan: (C, H, W) for a flow, (latent,) for a GAN.
+        sampler: How it is run by default.
+        few: Sampler for fewer steps than the sampler's; None: the same.
+        fixed: True for a distilled model: it is run by `sampler` and nothing else.
+        plain: Name of the sampler by which generators are compared at equal steps; None: its own.
         draws: Whether it makes scans of noise; an autoencoder by itself does not, and no picture or sample is drawn.
-        told: Whether it takes a condition of `r2flow.generators.condition_of` by its own sampler.
-        goes_on_as: The family that a stage for any flow makes of it; None for its own.
+        told: Whether it takes a condition of `r2flow.generators.condition_of`.
+        goes_on_as: Generator class used when fine-tuned with a velocity loss; None: same class.
     """
 
+    plain: ClassVar[str | None] = None
     draws: ClassVar[bool] = True
     told: ClassVar[bool] = False
     goes_on_as: ClassVar[str | None] = None
@@ -243,51 +72,79 @@ class Generator(nn.Module):
         super().__init__()
         self.space = space
         self.noise_shape = space.shape if noise_shape is None else noise_shape
-        self.sampler = Sampler()
+        self.run_by(FixedSteps())
 
-    def generate(
+    def run_by(self, sampler: Sampler, few: Sampler | None = None, fixed: bool = False) -> None:
+        """Set how it is run by default."""
+        self.sampler, self.few, self.fixed = sampler, few, fixed
+
+    def drawing(self) -> dict[str, Any]:
+        """How it is run by default as plain values, as a checkpoint holds them."""
+        return {"sampler": self.sampler.asdict(), "few": self.few and self.few.asdict(), "fixed": self.fixed}
+
+    @torch.no_grad()
+    def forward(
         self,
         noise: Tensor,
         condition: Condition | None = None,
         *,
         sampler: Sampler | None = None,
         draws: Draws | None = None,
+        precision: Precision = "32-true",
         progress: Progress = None,
     ) -> Generated:
         """x_1 in model space with evaluations and convergence of each scan, (B, C, H, W).
 
         Args:
             noise: (B, *noise_shape).
-            condition: What is known of each scan; None for a scan of which nothing is known.
-            sampler: Another than the generator's own.
-            draws: Where further noise comes from, `draws.step(shape, j)` at step j = 1, 2, ...; a flow needs none.
+            condition: Condition of each scan, by name.
+            sampler: Instead of the generator's own.
+            draws: Where further noise comes from, `draws.step(shape, j)` at step j = 1, 2, ...
+            precision: `bf16-mixed` computes the network's products in bfloat16; states and steps stay as they are.
             progress: Called after every evaluation of the network.
 
         Raises:
-            InputError: a sampler or a condition that the generator does not know.
+            InputError: the sampler cannot run this generator, or needs draws or a condition.
         """
-        raise NotImplementedError
+        how = sampler or self.sampler
+        how.check(self)
+        if condition is not None and not (self.told or how.completes):
+            raise InputError(f"this {type(self).__name__} takes no condition; complete scans by --sampler mmps.")
+        if how.draws and draws is None:
+            raise InputError(f"sampler {how.name} draws noise on the way: give draws.")
+        x = wide(noise.to(self.device))
+        known = condition and {name: value.to(self.device) for name, value in condition.items()}
+        fresh = None if draws is None else lambda j: self.further_noise(draws, j).to(x)
+        with autocast(self.device, precision):
+            return how(self, x, known, fresh, progress)
 
-    def check_sampler(self, sampler: Sampler) -> None:
-        """Refuse a sampler before it is needed. A generator that can be run in several ways says in which.
+    def further_noise(self, draws: Draws, j: int) -> Tensor:
+        """The noise of step j."""
+        return draws.step(self.noise_shape, j)
+
+    def choose(self, name: str | None = None, **options: Any) -> Sampler:
+        """The generator's sampler with options that are not None: `few` for fewer steps, or another by its name.
+
+        Another sampler takes over the number of steps and has its own defaults.
 
         Raises:
-            InputError: this generator cannot be run so.
+            InputError: an unknown name or option, or a sampler that cannot run this generator.
         """
-        own = self.sampler
-        if sampler != replace(own, precision=sampler.precision):
-            raise InputError(
-                f"a {type(self).__name__} can be run in one way only, {own.method} with {own.steps} "
-                f"step{'s' * (own.steps > 1)}; found {sampler.unlike(own)}."
+        given = {key: value for key, value in options.items() if value is not None}
+        own, steps = self.sampler, getattr(self.sampler, "steps", None)
+        if self.few and (name == self.few.name if name else steps and given.get("steps", steps) < steps):
+            own, steps = self.few, None
+        if not given and name in (None, own.name):
+            return own
+        if name in (None, own.name):
+            sampler = own.changed(**given)
+        else:
+            known = options_of(SAMPLERS[name])
+            sampler = build_sampler(
+                {"name": name, **({"steps": steps} if "steps" in known and "grid" not in given else {}), **given}
             )
-
-    def evaluations_of(self, sampler: Sampler) -> int:
-        """Network evaluations of a batch, for a progress bar; 0 where they depend on the scans."""
-        return sampler.steps
-
-    def in_steps(self, steps: int) -> Sampler:
-        """The simplest sampler with this many steps, one evaluation each, by which generators are compared."""
-        return self.sampler.changed(steps=steps)
+        sampler.check(self)
+        return sampler
 
     @property
     def unit(self) -> tuple[int, int]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from copy import deepcopy
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Self, cast
 
@@ -21,8 +22,6 @@ from r2flow.generators.base import (
     SIGMA,
     Condition,
     Generated,
-    Progress,
-    Sampler,
     parts_of,
 )
 from r2flow.generators.flow import RectifiedFlow
@@ -30,7 +29,6 @@ from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import Ray
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
-from r2flow.noise import Draws
 
 LAST = 1e-5  # of the time: where a known ray's velocity stops to grow
 
@@ -131,22 +129,15 @@ class ConditionalFlow(RectifiedFlow):
         mixed = v + near.sigmoid() * given * (about - v)
         return torch.where(known > 0, (image - x) / left.clamp(min=LAST), mixed).to(v)
 
-    def generate(
-        self,
-        noise: Tensor,
-        condition: Condition | None = None,
-        *,
-        sampler: Sampler | None = None,
-        draws: Draws | None = None,
-        progress: Progress = None,
-    ) -> Generated:
+    def forward(self, noise: Tensor, condition: Condition | None = None, **how: Any) -> Generated:
         if condition is None:
-            return super().generate(noise, sampler=sampler, draws=draws, progress=progress)
+            return super().forward(noise, **how)
+        weight = next(self.parameters())
         with torch.no_grad():
-            condition = self._trusted(condition, noise.to(next(self.parameters())))
-        made = super().generate(noise, condition, sampler=sampler, draws=draws, progress=progress)
+            condition = self._trusted({name: value.to(weight) for name, value in condition.items()}, noise.to(weight))
+        made = super().forward(noise, condition, **how)
         image, known = parts_of(condition, made.x)
-        return Generated(torch.where(known > 0, image, made.x), made.evaluations, made.converged)
+        return replace(made, x=torch.where(known > 0, image, made.x))
 
     def _trusted(self, condition: Condition, like: Tensor) -> Condition:
         """The condition with the answer of `Trust`, which does not change from step to step."""
@@ -167,7 +158,8 @@ class ConditionalFlow(RectifiedFlow):
     def untold(self) -> RectifiedFlow:
         flow = RectifiedFlow.__new__(RectifiedFlow)
         nn.Module.__init__(flow)
-        flow.space, flow.noise_shape, flow.sampler = self.space, self.noise_shape, self.sampler
+        flow.space, flow.noise_shape = self.space, self.noise_shape
+        flow.run_by(self.sampler, self.few, self.fixed)
         flow.backbone = cast(Backbone, _Untold(self.backbone, self.condition_channels))
         return flow.train(self.training)
 

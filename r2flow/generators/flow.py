@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import torch
@@ -10,42 +9,27 @@ from torch import Tensor, nn
 
 from r2flow.backbones import build_backbone
 from r2flow.errors import InputError
-from r2flow.flow.posterior import METHODS, completes, parse_method, sample_posterior
-from r2flow.flow.solvers import (
-    Solution,
-    Velocity,
-    adapts,
-    check_method,
-    check_tolerance,
-    fixed_step,
-    solve,
-)
-from r2flow.flow.solvers.grids import build_grid
-from r2flow.flow.solvers.solution import finite, stepped, wide
-from r2flow.flow.stochastic import SDE, churn_of, sde
-from r2flow.generators.base import WAYS, Condition, Generated, Generator, Progress, Sampler, parts_of
+from r2flow.flow.solvers import Solution, Velocity
+from r2flow.generators.base import Condition, Generator
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
+from r2flow.samplers import FixedSteps, ODESampler, Progress, Sampler
 
-USUAL = Sampler("adams3", 16, grid="power:1.5", finish=1 / 32)  # of a new flow: docs/results.md
-UNTOLD = f"this flow was trained without a condition; a scan is completed with it by --solver {', '.join(METHODS)}."
+USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  # of a new flow: docs/results.md
 
 
 class Flow(Generator):
-    """A generator by an ODE. A subclass gives its velocity, and names what it is sampled by beside solvers.
+    """A generator by an ODE. A subclass gives its velocity."""
 
-    The sampler `sde:C` replaces noise on the way, by C times the reversed diffusion's share (`r2flow.flow.stochastic`).
-    """
-
-    other_samplers: ClassVar[tuple[str, ...]] = (SDE,)
+    plain = "euler"
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         """v(t, x), (B, C, H, W), at times t of shape () or (B,)."""
         raise NotImplementedError
 
     def mean_velocity(self, t: Tensor, x: Tensor, s: Tensor, condition: Condition | None = None) -> Tensor:
-        """u(t, x, s), what is known at time t of the mean velocity from t to s: v(t, x), but for a flow map."""
+        """u(t, x, s), the mean velocity from t to s: v(t, x), but for a flow map."""
         return self.velocity(t, x, condition)
 
     def field(self, condition: Condition | None = None) -> Velocity:
@@ -67,137 +51,13 @@ class Flow(Generator):
         """The state at t_1 of the ODE from x at t_0, (B, ...); see `r2flow.flow.solvers.solve` for the options.
 
         Raises:
-            InputError: as `solve` does.
+            InputError: the sampler does not follow the flow's paths.
         """
         how = sampler or self.sampler
-        if self.draws_noise(how):
-            raise InputError(f"{how.method} draws noise on the way: give a solver, as --solver adams3.")
-        field, x = self.field(condition), x.to(self.device)
-
-        return solve(field, x, t_0, t_1, how.method, how.steps, how.tolerance, progress, grid=how.times, **options)
-
-    def generate(
-        self,
-        noise: Tensor,
-        condition: Condition | None = None,
-        *,
-        sampler: Sampler | None = None,
-        draws: Draws | None = None,
-        progress: Progress = None,
-    ) -> Generated:
-        how = sampler or self.sampler
-        if completes(how.method):
-            if condition is None:
-                raise InputError(f"{how.method} completes a scan of which a part is known; give what is known.")
-            return self._completed(noise, condition, how, draws, progress)
-        churn = churn_of(how.method)
-        if churn is not None:
-            return self._stochastic(noise, condition, how, churn, draws, progress)
-        options: dict[str, Any] = {}
-        if how.finish and how.steps > 1:
-            how, options = replace(how, steps=how.steps - 1), {"finish": how.finish}
-        end = self.solve(noise, sampler=how, condition=condition, progress=progress, **options)
-        return Generated(end.x, end.evaluations, end.converged)
-
-    @torch.no_grad()
-    def _stochastic(
-        self,
-        noise: Tensor,
-        condition: Condition | None,
-        how: Sampler,
-        churn: float,
-        draws: Draws | None,
-        progress: Progress,
-    ) -> Generated:
-        if draws is None:
-            raise InputError(f"{how.method} draws further noise: give draws.")
-        noise = wide(noise.to(self.device))
-        x, times = noise, self._stochastic_times(how)
-        field, alive = self.field(condition), finite(x)
-
-        def estimate(t: Tensor, x: Tensor) -> Tensor:
-            return x + (1 - t) * field(t, x).to(x)
-
-        def fresh(j: int) -> Tensor:
-            return self.further_noise(draws, j).to(noise)
-
-        for following in sde(estimate, x, times, churn, fresh):
-            x, alive = stepped(x, following, alive)
-            if progress is not None:
-                progress()
-        return Generated.after(x, len(times) - 1, alive)
-
-    def _stochastic_times(self, how: Sampler) -> Tensor:
-        if not how.finish or how.steps == 1:
-            return self._times(how)
-        if how.finish == 1:
-            raise InputError("finish must be shorter than the interval from 0 to 1, found 1.")
-        times = self._times(replace(how, steps=how.steps - 1), 0.0, 1 - how.finish)
-        return torch.cat([times, times.new_ones(1)])
-
-    def draws_noise(self, sampler: Sampler) -> bool:
-        """Whether a sampler draws noise on the way, so that a scan is no function of its first noise alone."""
-        return churn_of(sampler.method) is not None
-
-    def further_noise(self, draws: Draws, j: int) -> Tensor:
-        """The noise of step j."""
-        return draws.step(self.noise_shape, j)
-
-    @torch.no_grad()
-    def _completed(
-        self, noise: Tensor, condition: Condition, how: Sampler, draws: Draws | None, progress: Progress
-    ) -> Generated:
-        """x_1 given a part of it, by a method of `r2flow.flow.posterior`."""
-        x_0 = wide(noise.to(self.device))
-        image, known = parts_of(condition, x_0)
-
-        def u(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
-            velocity = self.mean_velocity(t, x, s).to(x)
-            if progress is not None:
-                progress()
-                if velocity.requires_grad:
-                    velocity.register_hook(lambda _: progress())  # each product with the Jacobian
-            return velocity
-
-        further = None if draws is None else lambda j: self.further_noise(draws, j).to(x_0)
-        times = self._times(how)
-        x = sample_posterior(u, x_0, image, known > 0, how.method, times, further)
-        return Generated.after(x, parse_method(how.method).evaluations(len(times) - 1))
-
-    def _times(self, sampler: Sampler, t_0: float = 0.0, t_1: float = 1.0) -> Tensor:
-        return build_grid(sampler.times, t_0, t_1, sampler.steps)
-
-    def check_sampler(self, sampler: Sampler) -> None:
-        if completes(sampler.method):
-            parse_method(sampler.method)
-            if sampler.finish:
-                raise InputError(f"{sampler.method} has no finish; leave it out.")
-            self._times(sampler)
-            return
-        if churn_of(sampler.method) is not None:
-            self._stochastic_times(sampler)
-            return
-        if sampler.method.partition(":")[0] in WAYS:
-            raise InputError(
-                f"{sampler.method} is for flow maps (experiment=flow_map), and this is none: give a solver, as adams3."
-            )
-        check_method(sampler.method, self.other_samplers)
-        check_tolerance(sampler.tolerance)
-        self._times(sampler)
-        if adapts(sampler.method) and sampler.grid != "uniform":
-            raise InputError(f"a time grid is for a solver of fixed steps; {sampler.method} chooses its own.")
-
-    def in_steps(self, steps: int) -> Sampler:
-        own = self.sampler  # of a distilled flow the steps that it has learned
-        return own if own.fixed and own.steps == steps else Sampler("euler", steps)
-
-    def evaluations_of(self, sampler: Sampler) -> int:
-        if completes(sampler.method):
-            return parse_method(sampler.method).evaluations(sampler.steps)
-        if churn_of(sampler.method) is not None:
-            return len(self._stochastic_times(sampler)) - 1
-        method = fixed_step(sampler.method)
-        return 0 if method is None else method.cost(sampler.steps)
+        how.check(self)
+        if not isinstance(how, ODESampler):
+            raise InputError(f"sampler {how.name} does not follow the flow's paths: give a solver, such as adams3.")
+        return how.solve(self, x.to(self.device), t_0, t_1, condition, progress, **options)
 
 
 class NetworkFlow(Flow):
@@ -292,11 +152,10 @@ class RectifiedFlow(NetworkFlow):
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space, backbone)
-        self.sampler = USUAL
+        self.run_by(USUAL)
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
-        if condition is not None:
-            raise InputError(UNTOLD)
+        assert condition is None
         v: Tensor = self.backbone(t, x)
         return v
 
@@ -327,7 +186,8 @@ class Field(Flow):
 
     def __init__(self, function: Velocity, noise_shape: tuple[int, ...], space: ModelSpace | None = None) -> None:
         nn.Module.__init__(self)
-        self.function, self.noise_shape, self.sampler = function, noise_shape, Sampler()
+        self.function, self.noise_shape = function, noise_shape
+        self.run_by(FixedSteps())
         if space is not None:
             self.space = space
 
@@ -335,8 +195,7 @@ class Field(Flow):
         return self.function(t, x)
 
     def field(self, condition: Condition | None = None) -> Velocity:
-        if condition is not None:
-            raise InputError(UNTOLD)
+        assert condition is None
         return self.function
 
     @property
@@ -361,8 +220,8 @@ class Conditioned:
 
 
 def ode_sampler(flow: Flow) -> Sampler:
-    """A flow's own sampler, or the usual one where its own draws noise on the way."""
-    return USUAL if flow.draws_noise(flow.sampler) else flow.sampler
+    """A flow's own sampler if it follows the flow's paths, else the usual one."""
+    return flow.sampler if isinstance(flow.sampler, ODESampler) else USUAL
 
 
 def as_flow(generator: Generator, what: str) -> Flow:

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from r2flow.config import check_tree, learned
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, parse_json
-from r2flow.generators import Generator, RectifiedFlow, Sampler, build_generator
+from r2flow.generators import Generator, RectifiedFlow, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
@@ -27,6 +27,7 @@ from r2flow.model.sampling import sample
 from r2flow.models import MODELS, find_model
 from r2flow.plugins import made_with
 from r2flow.registry import did_you_mean
+from r2flow.samplers import build_sampler
 
 FOLDER = "checkpoints"
 PREFIX = "generator."  # of the generator's weights in a LightningModule
@@ -227,11 +228,11 @@ def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averag
 
 def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
     """What a file holds, as a generator on the CPU; see `load_checkpoint`."""
-    sampler: Mapping[str, Any] | None = None
     published = format_of(content)
     if published is not None:
         made = published.read(content, path, averaged)
-        config, weights, step, sampler, kind = made.config, made.weights, made.step, made.sampler, "published"
+        config, weights, step, kind = made.config, made.weights, made.step, "published"
+        drawing: Mapping[str, Any] = {"sampler": made.sampler}
     elif isinstance(content, dict) and "config" in content and "state_dict" in content:
         state = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
         config, groups = content["config"], ("sensor", "encoding", "backbone", "data", "stage", "trainer")
@@ -242,7 +243,7 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
                 raise InputError(f"its '{key}' has no named values. Is it of another program?")
         config, step, kind = dict(content["config"]), int(content.get("global_step", 0)), "r2flow"
         weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
-        sampler = content.get("sampler")
+        drawing = content
     elif isinstance(content, dict):
         systems = ", ".join(one.system for _, one in FORMATS.items())
         raise InputError(
@@ -255,7 +256,10 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
         generator = build_generator(config)
     check_weights(generator, weights, path)
     generator.load_state_dict(weights)
-    generator.sampler = Sampler.of(sampler or {})  # where none was written down, 32 Euler steps
+    if drawing.get("sampler"):
+        few = drawing.get("few")
+        with made_with(config, str(path)):
+            generator.run_by(build_sampler(drawing["sampler"]), few and build_sampler(few), bool(drawing.get("fixed")))
     if published is not None and made.finish is not None:
         made.finish(generator, config)
     return Checkpoint(generator.eval().requires_grad_(False), config, step, path, kind)
@@ -290,7 +294,7 @@ def read_safetensors(path: Path) -> dict[str, Any]:
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         notes = parse_json(kept[NOTES])
         whole = notes.pop("digest", None) == _digest(notes, weights)
-        config, step, sampler = notes["config"], int(notes["step"]), notes.get("sampler")
+        config, step = notes["config"], int(notes["step"])
     except KeyError as error:
         raise InputError(f"{path} holds weights but no r2flow config (no {error} in its metadata).") from None
     except (SafetensorError, OSError, OverflowError, ValueError) as error:
@@ -300,7 +304,8 @@ def read_safetensors(path: Path) -> dict[str, Any]:
     if not whole:
         raise InputError(f"{path} is damaged: its checksum does not fit. Copy it again, or take another checkpoint.")
     state = {PREFIX + name: value for name, value in weights.items()}
-    return {"config": config, "global_step": step, "state_dict": state, "sampler": sampler}
+    drawing = {key: notes.get(key) for key in ("sampler", "few", "fixed")}
+    return {"config": config, "global_step": step, "state_dict": state, **drawing}
 
 
 def _digest(notes: Mapping[str, Any], weights: Mapping[str, Tensor]) -> str:
@@ -331,7 +336,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
     notes = {
         "config": learned(checkpoint.config),
         "step": checkpoint.step,
-        "sampler": checkpoint.generator.sampler.asdict(),
+        **checkpoint.generator.drawing(),
     }
     # Under one key: several keys of metadata come in no fixed order.
     data = save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})})

@@ -12,22 +12,21 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.posterior import completes
 from r2flow.generators import Flow, Generator, Sampler, condition_of
-from r2flow.generators.base import Progress, check_control
-from r2flow.generators.flow import UNTOLD
+from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
 from r2flow.lidar.interpolation import surfaces
 from r2flow.lidar.known import Ray
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.sampling import HasGenerator, draw
+from r2flow.samplers import MMPS, build_sampler
 
 ROUGH = 0.015  # of its range: how far the answers of a flow lie about a surface
 EXACT = 0.004  # of its range: no surface is known better
 TAILS = 2  # so many times the error at the measured rays is that between them taken for; docs/completion.md
 SURE = 0.05  # of its range: a surface known better than that holds wherever an answer has the return
 ANSWER = 2**32  # noise numbers from one answer to the next: answer 0 of scan i has the noise of sample i
-USUAL = Sampler("mmps", 10, grid="power:2")  # of flows; docs/completion.md has others
+USUAL = MMPS()  # of flows; docs/completion.md has others
 
 
 @dataclass(frozen=True)
@@ -70,23 +69,24 @@ def spread_of(images: Tensor) -> Tensor:
     return torch.stack([(squares / (count - 1).clamp(min=1)).sqrt(), returned.double().mean(0)]).float()
 
 
-def completing(generator: Generator, sampler: Sampler | None = None, **changes: Any) -> Sampler:
+def completing(generator: Generator, name: str | None = None, **changes: Any) -> Sampler:
     """The sampler by which a generator completes scans: its own if it takes a condition, `USUAL` for another flow.
 
     Args:
-        changes: Single settings of the sampler.
+        name: Of another sampler.
+        changes: Fields of the sampler.
 
     Raises:
         InputError: it cannot complete scans, or not so.
     """
     if not (generator.told or isinstance(generator, Flow)) or generator.noise_shape != generator.space.shape:
         raise InputError(f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images.")
-    usual = generator.sampler if generator.told else USUAL
-    how = (sampler or usual).changed(**changes)
-    check_control(how.method, changes)
-    generator.check_sampler(how)
-    if not generator.told and not completes(how.method):
-        raise InputError(UNTOLD)
+    if generator.told:
+        return generator.choose(name, **changes)
+    how = USUAL.changed(**changes) if name in (None, USUAL.name) else build_sampler({"name": name, **changes})
+    how.check(generator)
+    if not how.completes:
+        raise InputError(f"sampler {how.name} takes no condition: give mmps, replace or repaint.")
     return how
 
 
@@ -101,6 +101,7 @@ def complete(
     batch_size: int = 1,
     first: int = 0,
     on_surfaces: bool = True,
+    precision: Precision = "32-true",
     progress: Progress = None,
     **changes: Any,
 ) -> Iterator[Completed]:
@@ -121,16 +122,15 @@ def complete(
         first: Number of the first scan.
         on_surfaces: Whether returns of an answer are moved towards the surfaces of the known ones (`settled`).
         progress: Called after every network evaluation of a batch.
-        changes: Single settings of the sampler: steps, method, tolerance, grid.
+        changes: `name` and fields of the sampler: steps, grid, ...
 
     Raises:
         InputError: a generator that cannot complete, images or states that do not fit it, values outside the range of
             its sensor.
     """
     generator = source if isinstance(source, Generator) else source.generator
-    how = completing(generator, sampler, **changes)
-    # A method that reads the condition has nothing to do without one.
-    plain = generator.sampler.changed(precision=changes.get("precision")) if completes(how.method) else how
+    how = sampler or completing(generator, **changes)
+    plain = generator.sampler if how.completes else how  # of a scan without a known ray
     images = torch.as_tensor(images).detach().float().cpu()
     if state is None:
         state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.UNKNOWN)).to(torch.uint8)
@@ -152,7 +152,15 @@ def complete(
             numbers = [first + i + a * ANSWER for a in range(start, min(start + batch_size, num))]
             given = {name: value.expand(len(numbers), -1, -1, -1) for name, value in condition.items()}
             parts.append(
-                draw(generator, numbers, seed, how if some else plain, given if some else None, progress=progress)
+                draw(
+                    generator,
+                    numbers,
+                    seed,
+                    how if some else plain,
+                    given if some else None,
+                    precision=precision,
+                    progress=progress,
+                )
             )
         answers = torch.cat([part.images for part in parts])
         if on_surfaces:

@@ -67,23 +67,22 @@ def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
     Raises:
         InputError: its number of evaluations depends on the scan, or it needs more than the noise.
     """
-    flow.check_sampler(sampler)
-    count = flow.evaluations_of(sampler)
-    if count == 0:
+    sampler.check(flow)
+    count = sampler.evaluations(flow)
+    if count is None or sampler.draws or sampler.completes:
+        what = "a condition" if sampler.completes else "noise on the way" if sampler.draws else "steps that it chooses"
         raise InputError(
-            f"an exported sampler takes a fixed number of steps by a solver of ours, found {sampler.method}: give "
-            f"--solver {USUAL.method} --steps {USUAL.steps}."
+            f"sampler {sampler.name} needs {what} and cannot be exported: give --sampler {USUAL.name} --steps "
+            f"{USUAL.steps}."
         )
-    if flow.draws_noise(sampler):
-        raise InputError(f"{sampler.method} cannot be exported, it draws noise on the way: give another --solver.")
     recorder, shadow = _Recorder(), copy(flow)
     shadow._modules = {**flow._modules, "backbone": recorder}
     basis = torch.eye(count + 1, dtype=torch.float64)[:, :1, None, None]  # x_0 is the first unit vector
     try:
-        x_1 = shadow.generate(basis, sampler=sampler).x
+        x_1 = shadow(basis, sampler=sampler).x
     except InputError as error:  # it needs more than the noise
         problem = str(error).rstrip(".")
-        raise InputError(f"{sampler.method} cannot be exported, {problem!r}: give another --solver.") from None
+        raise InputError(f"sampler {sampler.name} cannot be exported, {problem!r}: give another one.") from None
     times, states, second = zip(*recorder.calls, strict=True)
     rows = torch.stack([*states, x_1]).reshape(-1, count + 1)[:, : len(times) + 1]  # a `finish` takes fewer than count
     others = [float(s) for s in second] if flow.second_time else None
@@ -306,7 +305,7 @@ def compare(checkpoint: Checkpoint, exported: Exported, sampler: Sampler | None 
     """
     flow = checkpoint.generator
     noise = Draws(0, range(num if exported.any_batch else 1)).start(flow.noise_shape)
-    x_1 = flow.generate(noise, sampler=sampler).x
+    x_1 = flow(noise, sampler=sampler).x
     mine, _ = Decoded(flow.space)(x_1)
     theirs = run(exported.path, noise)["scan"]
     one, other = mine[:, 0] > 0, theirs[:, 0] > 0

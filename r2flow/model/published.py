@@ -33,7 +33,7 @@ class Published:
         config: `r2flow.generators.build_generator` makes the generator of it; the file's own config under `published`.
         weights: Of that generator, by our names.
         step: Optimiser steps taken.
-        sampler: Options of its `Sampler`, as published; None for 32 Euler steps.
+        sampler: Name and fields of its sampler, as published; None for the generator's own.
         finish: Called with the generator, which has its weights, and the config.
     """
 
@@ -71,7 +71,7 @@ def holds(content: Any) -> bool:
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
     """A published flow; the file holds its averaged weights alone."""
     weights = {BACKBONE + name: value for name, value in content["weights"].items()}
-    return Published(published_config(content["cfg"], path), weights, _step(content), finish=follow_rings)
+    return Published(published_config(content["cfg"], path), weights, _step(content), {"name": "euler"}, follow_rings)
 
 
 def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.generators import Condition, Generator, Sampler
-from r2flow.generators.base import Progress, check_control
+from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.region import Region
 from r2flow.noise import Draws
 
@@ -54,6 +54,7 @@ def sample(
     condition: Condition | None = None,
     region: Region | None = None,
     channels: str = "both",
+    precision: Precision = "32-true",
     progress: Progress = None,
     **changes: Any,
 ) -> Iterator[Samples]:
@@ -67,8 +68,9 @@ def sample(
         region: The part of the image that is asked for. The network sees `evaluated_region` alone, with the same
             noise as in the whole image.
         channels: `range` or `reflectance` skips the decoding of the other one; `both` takes what the model has.
+        precision: Of the network, see `Generator.forward`.
         progress: Called after every network evaluation of a batch.
-        changes: Single settings of the sampler: steps, method, tolerance, grid, precision.
+        changes: `name` and fields of the sampler (`Generator.choose`): steps, tolerance, grid, ...
 
     Raises:
         InputError: num or batch_size below 1, a sampler or a channel that the generator does not have, steps of an
@@ -78,9 +80,7 @@ def sample(
     generator = source if isinstance(source, Generator) else source.generator
     if not (isinstance(num, Integral) and isinstance(batch_size, Integral) and num >= 1 and batch_size >= 1):
         raise InputError(f"needs at least one scan and a batch of at least one; found {num!r} and {batch_size!r}.")
-    how = (sampler or generator.sampler).changed(**changes)
-    check_control(how.method, changes)
-    generator.check_sampler(how)
+    how = sampler.changed(**changes) if sampler else generator.choose(**changes)
     generator.space.check_channels(channels)
     for name, value in (condition or {}).items():
         if len(value) != num:
@@ -88,7 +88,7 @@ def sample(
     for first in range(0, num, batch_size):
         numbers = range(first, min(first + batch_size, num))
         known = condition and {name: value[first : numbers.stop] for name, value in condition.items()}
-        yield draw(generator, numbers, seed, how, known, region, channels, progress)
+        yield draw(generator, numbers, seed, how, known, region, channels, precision, progress)
 
 
 @torch.no_grad()
@@ -100,6 +100,7 @@ def draw(
     condition: Condition | None = None,
     region: Region | None = None,
     channels: str = "both",
+    precision: Precision = "32-true",
     progress: Progress = None,
 ) -> Samples:
     """The scans of these numbers together; every image that this project generates is made here.
@@ -109,7 +110,7 @@ def draw(
 
     See `sample` for the others.
     """
-    draws, space, how = Draws(seed, numbers), generator.space, sampler or generator.sampler
+    draws, space = Draws(seed, numbers), generator.space
     noise = draws.start(generator.noise_shape)
     seen = None if region is None or region.share == 1 else evaluated_region(generator, region)
     if seen is not None:
@@ -117,12 +118,8 @@ def draw(
         generator, noise = generator.part(seen), seen.crop(noise)
         if condition is not None:  # what is known of each pixel
             condition = {n: seen.crop(value) if value.shape[-2:] == whole else value for n, value in condition.items()}
-    noise = noise.to(generator.device)
-    if condition is not None:
-        condition = {name: value.to(generator.device) for name, value in condition.items()}
     start = time.perf_counter()
-    with how.autocast(generator.device):
-        made = generator.generate(noise, condition, sampler=sampler, draws=draws, progress=progress)
+    made = generator(noise, condition, sampler=sampler, draws=draws, precision=precision, progress=progress)
     x_1 = made.x.cpu()  # which also waits for a GPU
     seconds = time.perf_counter() - start
     images = generator.space.decode(x_1, channels)

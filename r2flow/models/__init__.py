@@ -37,11 +37,11 @@ MODELS: Registry[Model] = Registry(
     "model",
     street=Model(
         "street scenes in any number of evaluations, learned from simulated scans",
-        "e67a73b3a8574f51772b5166aac72ba136360a733808558aaf649a9fdad3b7af",
+        "211cf04c4c10227a0504f1e323af2e6b2a6562caa377ba2c95f8f689ed99c4b5",
     ),
     street_full=Model(
         "street scenes at 64 x 1024, learned from simulated scans",
-        "149abed5b6b796ee5eb5cac9e7caa21a2799bff45bbdaf1173a061790e720378",
+        "c4641b71eecd2086f1851cbb9816ae063bf27c1325a2ea45dfa06b378c766776",
         page="release/street_full.safetensors in the source of r2flow",
     ),
 )

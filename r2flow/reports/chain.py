@@ -92,10 +92,9 @@ flows         {", ".join(str(run) for run in runs.values())}
 
 def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
     """A generator for fixed steps at these; the others at all of these and at many."""
-    own = flow.generator.sampler
-    if own.fixed:
-        return [own.steps]
-    return sorted({1, *(other.generator.sampler.steps for other in flows if other.generator.sampler.fixed), MANY})
+    if flow.generator.fixed:
+        return [flow.generator.sampler.steps]
+    return sorted({1, *(other.generator.sampler.steps for other in flows if other.generator.fixed), MANY})
 
 
 def held_out(flow: Checkpoint, run: Path) -> np.ndarray:

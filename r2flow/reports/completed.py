@@ -16,6 +16,7 @@ from r2flow.data.partial import PartialScan
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, read_json
 from r2flow.generators import Sampler
+from r2flow.generators.base import Precision
 from r2flow.lidar.known import Mask, Ray
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
@@ -51,6 +52,7 @@ class Job:
     batch_size: int = 1
     on_surfaces: bool = True
     pictures: int = 8
+    precision: Precision = "32-true"
 
 
 def write_completed(
@@ -81,13 +83,13 @@ def write_completed(
             raise InputError(f"{out} is the folder of the scans; give another --out.")
     settings = {
         "num": job.num, "seed": job.seed, "surfaces": job.on_surfaces, "fill_gaps": job.fill_gaps,
-        "weights": weights_hash(checkpoint), **about, "sampler": sampler.asdict(),
+        "weights": weights_hash(checkpoint), **about, "sampler": sampler.asdict(), "precision": job.precision,
     }  # fmt: skip
     inputs = {scan.name: scan.identity() for scan in scans}
     settings["inputs"] = _check_folder(out, settings, inputs, files) | inputs
     left = [number for number, scan in enumerate(scans) if not all(path.is_file() for path in files[scan.name])]
     done: dict[str, dict[str, float] | None] = {}
-    batches = math.ceil(job.num / job.batch_size) * checkpoint.generator.evaluations_of(sampler)
+    batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
     with ScanBar("completing", len(left), len(left) * batches) as bar:
         for number in left:
             scan = scans[number]
@@ -99,7 +101,7 @@ def write_completed(
             images, state = torch.from_numpy(given.image)[None], torch.from_numpy(given.state)[None]
             (completed,) = complete(
                 checkpoint, images, state, job.num, job.seed, sampler=sampler, batch_size=job.batch_size, first=number,
-                on_surfaces=job.on_surfaces, progress=bar.evaluated,
+                on_surfaces=job.on_surfaces, precision=job.precision, progress=bar.evaluated,
             )  # fmt: skip
             if not done:  # the first answer shows that the settings can be used
                 write_samples_note(out, note_of(checkpoint, job.seed, {"completion": settings}, **sampler.asdict()))

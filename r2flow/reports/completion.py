@@ -40,7 +40,7 @@ class Way:
 
     @property
     def name(self) -> str:
-        return f"{self.model}, {self.sampler.method} {self.sampler.steps}"
+        return f"{self.model}, {self.sampler}"
 
 
 def measured_by(task: str, sensor: Sensor, number: int) -> np.ndarray:

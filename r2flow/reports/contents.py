@@ -6,7 +6,6 @@ from typing import Any
 
 from r2flow.backbones import Backbone
 from r2flow.config import flatten
-from r2flow.generators import Sampler
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.models import MODELS, name_of
 from r2flow.reports.tables import print_table, table
@@ -35,7 +34,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "sensor": loaded.sensor.name,
         "range_m": [loaded.sensor.min_range, loaded.sensor.max_range],
         "encoding": loaded.config["encoding"],
-        "sampler": loaded.generator.sampler.asdict(),
+        **loaded.generator.drawing(),
         "config": loaded.config,
     }
 
@@ -53,8 +52,8 @@ def card(contents: dict[str, Any]) -> str:
         "sensor": contents["sensor"],
         "network": f"{contents['backbone'] or contents['generator']}, {contents['parameters']:,} parameters",
         "file": f"{contents['bytes'] / 1e6:.1f} MB",
-        "drawn with": f"{sampler['method']}, {sampler['steps']} steps"
-        + (f"; {sampler['fewer']} in fewer" if sampler.get("fewer") else ""),
+        "drawn with": f"{sampler['name']}, {sampler.get('steps', 'adaptive')} steps"
+        + (f"; {contents['few']['name']} in fewer" if contents.get("few") else ""),
         "learned from": ", ".join(filter(None, learned_from)) or None,
         "stage": ", ".join([contents["stage"], *_said({key: stage.get(key) for key in ("loss", "time")})]),
         "starts from": parent and _lineage(parent),
@@ -82,9 +81,9 @@ def print_contents(contents: dict[str, Any]) -> None:
     """Print them as two short tables."""
     summary = {key: value for key, value in contents.items() if key != "config"}
     summary["image"] = " x ".join(map(str, contents["image"]))
-    usual = {key: value for key, value in Sampler().asdict().items() if key not in ("method", "steps", "grid")}
-    sampler = {key: value for key, value in contents["sampler"].items() if value != usual.get(key)}
-    for name, options in (("encoding", contents["encoding"]), ("sampler", sampler)):
+    for name, options in contents.items():
+        if name not in ("encoding", "sampler", "few") or not options:
+            continue
         summary[name] = ", ".join(f"{key} {value}" for key, value in options.items())
     summary |= {key: f"{value:,}" for key, value in summary.items() if isinstance(value, int)}
     print_table([(key, str(value)) for key, value in summary.items()], ("", ""))

@@ -57,7 +57,7 @@ def interpolation(
     Raises:
         InputError: a scan or a solver that cannot be used, before anything is written; a scan without its noise.
     """
-    as_flow(checkpoint.generator, "interpolation").check_sampler(sampler)
+    sampler.check(as_flow(checkpoint.generator, "interpolation"))
     if len(scans) != 2:
         raise InputError(f"needs the two scans to go between, found {len(scans)}; name two files.")
     pair = torch.stack([scan.image for scan in scans])
@@ -65,7 +65,7 @@ def interpolation(
     names = [scan.name for scan in scans]
     rays = checkpoint.sensor.rays()
     # both ends go there and back
-    with ScanBar("interpolating", frames, (frames + 2) * checkpoint.generator.evaluations_of(sampler)) as bar:
+    with ScanBar("interpolating", frames, (frames + 2) * (sampler.evaluations(checkpoint.generator) or 0)) as bar:
         found = interpolate_scans(checkpoint, pair, frames, sampler, batch_size, bar.evaluated, bar.finished)
     warn_unsolved(found.converged)
     images = found.images.nan_to_num(0.0).numpy()

@@ -17,6 +17,7 @@ from r2flow.data.opening import SAMPLES, reading_for, samples_note, write_sample
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, read_json
 from r2flow.generators import Sampler
+from r2flow.generators.base import Precision
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.region import Region
 from r2flow.lidar.scan_files import FIRM_ENDINGS, write_points
@@ -51,6 +52,7 @@ def write_samples(
     region: Region | None = None,
     channels: str = "both",
     replace: bool = False,
+    precision: Precision = "32-true",
 ) -> list[np.ndarray]:
     """Draw scans and write each as `out/NNNNNN.FORMAT`, the first ones also as pictures and in 3-D (`samples.html`).
 
@@ -78,10 +80,11 @@ def write_samples(
     generator.space.check_channels(channels)
     formats = formats_of(checkpoint, channels) if formats is None else formats
     check_formats(checkpoint, formats, channels)
-    generator.check_sampler(sampler)
+    sampler.check(generator)
     out, rays = Path(out), checkpoint.sensor.rays()
     part: dict[str, Any] = {} if region is None else {"region": asdict(region)}
     part |= {} if channels == "both" else {"channels": channels}
+    part |= {} if precision == "32-true" else {"precision": precision}
     about = note_of(checkpoint, seed, part, **sampler.asdict())
     former = _former(out, about, num, replace)
     ending = "reflectance.npy" if channels == "reflectance" else ""
@@ -93,14 +96,17 @@ def write_samples(
             "through their middles, where returns lie nearer (docs/data.md, Projection)"
         )
     shown: list[np.ndarray] = []
-    with ScanBar("sampling", num, batches(num, batch_size) * generator.evaluations_of(sampler)) as bar:
+    with ScanBar("sampling", num, batches(num, batch_size) * (sampler.evaluations(generator) or 0)) as bar:
         for first in range(0, num, batch_size):
             numbers = range(first, min(first + batch_size, num))
             files = [out / f"{number:06d}.{ending or one}" for number in numbers for one in formats]
             if former and first >= pictures and all(file.is_file() for file in files):
                 bar.finished(numbers.stop)
                 continue
-            drawn = draw(generator, numbers, seed, sampler, region=region, channels=channels, progress=bar.evaluated)
+            drawn = draw(
+                generator, numbers, seed, sampler, region=region, channels=channels, precision=precision,
+                progress=bar.evaluated,
+            )  # fmt: skip
             lost = warn_unsolved(drawn.converged, drawn.first)
             if former is None and (out / SAMPLES).is_file():
                 for file in out.glob("*"):

@@ -1,7 +1,6 @@
 """The paper's tables I and II and figures 3 and 5 to 8 from runs: the printed numbers next to evaluated ones."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,7 +102,7 @@ def paper_page(
     if paths and flows:
         straight = [
             measure_paths(run.checkpoint, run.label, paths, steps, batch_size=paths)
-            for run in track([run for run in flows if not run.checkpoint.generator.sampler.fixed], "following paths")
+            for run in track([run for run in flows if not run.checkpoint.generator.fixed], "following paths")
         ]
         if straight:
             figures |= {"figure_8a": curvature_figure(straight), "figure_8b": trajectories_figure(straight)}
@@ -248,5 +247,5 @@ def scans_figure(runs: Sequence[PaperRun], drawn: Mapping[str, np.ndarray], real
 
 def _nfe(checkpoint: Checkpoint) -> str:
     generator = checkpoint.generator
-    count = generator.evaluations_of(generator.sampler)
-    return f"NFE {count}" if count and math.isfinite(count) else "adaptive steps"
+    count = generator.sampler.evaluations(generator)
+    return f"NFE {count}" if count else "adaptive steps"

@@ -69,8 +69,8 @@ class Configuration:
     def options(self) -> str:
         """As options of `r2flow sample`."""
         if self.steps is None:
-            return f"--solver {self.method} --tolerance {self.tolerance:g}"
-        return f"--solver {self.method} --steps {self.steps} --grid {usual_grid(self.method)}"
+            return f"--sampler {self.method} --tolerance {self.tolerance:g}"
+        return f"--sampler {self.method} --steps {self.steps} --grid {usual_grid(self.method)}"
 
     def solve(self, velocity: Velocity, x_0: Tensor, **options: Any) -> Solution:
         """x_1 from x_0."""

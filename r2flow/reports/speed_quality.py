@@ -3,7 +3,7 @@
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import cycle, product
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ from r2flow.errors import InputError
 from r2flow.evaluation.measuring import Gathered, Work, measure, point_key
 from r2flow.evaluation.sets import SampledScans, ScanSet, sampled_set
 from r2flow.files import read_json
-from r2flow.flow.solvers import adapts
 from r2flow.generators import Sampler
+from r2flow.generators.base import Precision
 from r2flow.metrics.base import ScanMetric
 from r2flow.model.checkpoint import Checkpoint, weights_hash
 from r2flow.reports.evaluation import heading
@@ -30,18 +30,17 @@ AXES = (("evaluations", "network evaluations a scan"), ("seconds", "seconds a sc
 
 @dataclass(frozen=True)
 class Drawing:
-    """What is drawn at each point of a curve; None for each generator's own method or tolerance."""
+    """What is drawn at each point of a curve: scans, by each generator's own sampler with these name and fields."""
 
     num: int
     seed: int
-    method: str | None = None
-    tolerance: float | None = None
-    precision: str | None = None
+    sampler_options: Mapping[str, Any] = field(default_factory=dict)
+    precision: Precision = "32-true"
 
     def sampler(self, flow: Checkpoint, steps: int) -> Sampler:
         """How a flow is run at this number of steps."""
-        more = {"method": self.method, "tolerance": self.tolerance, "precision": self.precision}
-        return flow.generator.sampler.changed(steps=steps, **more)
+        how = flow.generator.choose(**self.sampler_options)
+        return flow.generator.choose(**{"steps": steps, **self.sampler_options}) if hasattr(how, "steps") else how
 
 
 @dataclass(frozen=True)
@@ -67,10 +66,9 @@ class Curve:
         """Of a point; when it changes, the point is measured again."""
         how = drawing.sampler(flow, steps)
         more: dict[str, Any] = {"bootstrap": self.bootstrap} if self.bootstrap else {}
-        more |= {} if how.precision == "32-true" else {"precision": how.precision}
         return point_key(
             self.real, self.metrics, **more, weights=weights_hash(flow), steps=steps, num=drawing.num,
-            seed=drawing.seed, method=how.method, grid=how.grid, finish=how.finish, tolerance=how.tolerance,
+            seed=drawing.seed, sampler=how.asdict(), precision=drawing.precision,
             device=self.device, protocol=self.gathered.protocol.name,
         )  # fmt: skip
 
@@ -86,14 +84,13 @@ def steps_of(flow: Checkpoint, label: str, steps: Sequence[int], drawing: Drawin
     found, refused = [], ""
     for count in steps:
         try:
-            flow.generator.check_sampler(drawing.sampler(flow, count))
+            how = drawing.sampler(flow, count)
             found.append(count)
         except InputError as error:
             refused = str(error)
     if not found:
         raise InputError(f"{label}: {refused}")
-    own = flow.generator.sampler
-    return [own.steps] if adapts(drawing.method or own.method) else found
+    return found if hasattr(how, "steps") else found[:1]
 
 
 def measure_curve(
@@ -117,7 +114,7 @@ def measure_curve(
     known = {row["key"]: dict(row) for row in done}
     rows: list[dict[str, Any]] = []
     for (name, flow), drawing in product(flows.items(), curve.drawings):
-        label = f"{name}, {drawing.method}" if len(curve.drawings) > 1 else name
+        label = f"{name}, {drawing.sampler_options['name']}" if len(curve.drawings) > 1 else name
         for count in steps_of(flow, label, steps, drawing):
             key = curve.key(flow, count, drawing)
             if key in known:
@@ -129,8 +126,8 @@ def measure_curve(
 
 
 def _point(curve: Curve, flow: Checkpoint, label: str, steps: int, drawing: Drawing, work: Work) -> dict[str, Any]:
-    own, how = flow.generator.sampler, drawing.sampler(flow, steps)
-    drawn = sampled_set(flow, label, drawing.num, how, drawing.seed)
+    how = drawing.sampler(flow, steps)
+    drawn = sampled_set(flow, label, drawing.num, how, drawing.seed, drawing.precision)
     measured = measure(curve.metrics, curve.gathered, drawn, work, curve.bootstrap)
     assert isinstance(drawn.source, SampledScans)
     # A process without a batch has none; the first one, which writes the page, always has some.
@@ -143,8 +140,8 @@ def _point(curve: Curve, flow: Checkpoint, label: str, steps: int, drawing: Draw
     remarks = dict.fromkeys(remark for m in measured for remark in m.remarks)
     return {
         "flow": label, "weights": weights_hash(flow), "steps": steps,
-        "distilled_for": own.steps if own.fixed else None,
-        "solver": how.method, "evaluations": statistics.fmean(evaluations),
+        "distilled_for": how.steps if flow.generator.fixed else None,  # type: ignore[attr-defined]
+        "solver": how.name, "evaluations": statistics.fmean(evaluations),
         "seconds": statistics.median(seconds), "batch_size": work.batch_size,
         "scans": drawing.num, "seed": drawing.seed, **figures, "remarks": BETWEEN.join(remarks),
     }  # fmt: skip

@@ -80,6 +80,7 @@ class Keys:
     experiment: str | Sequence[str] | None = None
     generator: Mapping[str, Any] | str | None = None
     sampler: Mapping[str, Any] | None = None
+    few: Mapping[str, Any] | None = None
     chain: Mapping[str, Any] | None = None
     preview: str | None = None
     loggers: Sequence[str] | str | None = None  # a word is answered by `build_loggers`

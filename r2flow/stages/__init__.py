@@ -1,15 +1,13 @@
 """LightningModules: how a generator is learned."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 from r2flow.data.augment import Augmentation
 from r2flow.errors import InputError
-from r2flow.flow.posterior import completes
-from r2flow.generators import Generator, Sampler
-from r2flow.generators.base import check_control
-from r2flow.registry import Registry, check_options, lazy
+from r2flow.generators import Generator
+from r2flow.registry import Registry, lazy
+from r2flow.samplers import build_sampler
 from r2flow.stages.base import Stage
 from r2flow.stages.conditional import Conditional
 from r2flow.stages.flow_map import LearnFlowMap
@@ -59,32 +57,26 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
     stage: Stage = STAGES.build(options, generator)
     stage.config = dict(config)
     stage.check_data(options["name"], config["data"])
-    wanted = {key: value for key, value in (config.get("sampler") or {}).items() if value is not None}
-    check_options("sampler", Sampler, wanted)
-    generator.sampler = _sampler(generator, wanted)
+    _choose(generator, config)
     return stage
 
 
-def _sampler(generator: Generator, wanted: Mapping[str, Any]) -> Sampler:
-    """A generator's own sampler with what a config asks for.
+def _choose(generator: Generator, config: Mapping[str, Any]) -> None:
+    """Give a generator the samplers of a config's `sampler` and `few`.
 
     Raises:
-        InputError: it cannot be run so, it has learned the steps of its own sampler alone, or an option has no effect.
+        InputError: it cannot be run so, or it was distilled for its own sampler alone.
     """
-    own = generator.sampler
-    found = own.changed(**wanted)
-    if own.fixed and replace(found, precision=own.precision) != own:
+    own, asked = generator.sampler, dict(config.get("sampler") or {})
+    sampler, few = generator.choose(**asked), config.get("few")
+    if generator.fixed and sampler != own:
         raise InputError(
-            f"this stage trains for one sampler alone, {own.method} with steps {own.steps}: leave sampler.* out; in a "
-            "chain give it to one link, as chain.rf1.sampler.steps=32."
+            f"this stage trains for one sampler alone, {own}: leave sampler.* out; in a chain give it to one link, as "
+            "chain.rf1.sampler.steps=32."
         )
-    if completes(found.method):
-        raise InputError(
-            f"sampler.method={found.method} completes a scan of which a part is known; give it to r2flow complete by "
-            "--solver."
-        )
-    check_control(found.method, wanted, "sampler.{}")
-    generator.check_sampler(found)
-    if found.fewer is not None:
-        generator.check_sampler(found.changed(method=found.fewer))
-    return found
+    if sampler.completes:
+        raise InputError(f"sampler.name={sampler.name} completes scans: give it to r2flow complete by --sampler.")
+    if few is not None:
+        generator.few = build_sampler(few)
+        generator.few.check(generator)
+    generator.run_by(sampler, generator.few, generator.fixed)

@@ -164,7 +164,7 @@ class Stage(L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["config"] = self.config
-        checkpoint["sampler"] = self.generator.sampler.asdict()
+        checkpoint |= self.generator.drawing()
 
 
 class SingleLoss(Stage):

@@ -12,8 +12,8 @@ from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots, sol
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import FlowMap, Generator
-from r2flow.generators.base import CHORD, JUMP, RENOISE, Sampler
 from r2flow.registry import Positive, check_options
+from r2flow.samplers import Chord, Jump, Renoise, build_sampler
 from r2flow.stages.base import Batch
 from r2flow.stages.reflow import Reflow
 
@@ -55,12 +55,12 @@ class LearnFlowMap(Reflow):
         self.jumps = JumpTimes(**(jumps or {}))
         self.on_pairs = True
         self._parent = _Kept([deepcopy(generator).eval().requires_grad_(False)] if self.objective is solved else [])
-        generator.sampler = Sampler(JUMP, 4, grid=self.jumps.grid)
+        generator.run_by(Jump(grid=self.jumps.grid))
 
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
         self.on_pairs = data["name"] == "pairs"
         pairs = (data.get("pairs") or {}) if self.on_pairs else {}
-        refined = self.objective is along_knots and pairs.get("method") in (CHORD, RENOISE)
+        refined = isinstance(build_sampler(pairs.get("sampler") or "adams3"), Chord | Renoise)
         if self.objective is along_knots and not (pairs.get("knots") or refined):
             raise InputError(
                 f"stage.objective={self.objective_name} learns from inner states of paths: give data=pairs "

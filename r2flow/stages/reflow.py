@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from r2flow.errors import InputError
-from r2flow.generators import Flow, Generator, Sampler
+from r2flow.generators import Flow, Generator
 from r2flow.generators.flow import ode_sampler
 from r2flow.registry import Count
+from r2flow.samplers import FixedSteps
 from r2flow.stages.rectify import Rectify
 
 
@@ -24,7 +25,7 @@ class Reflow(Rectify):
     ) -> None:
         super().__init__(generator, loss, time or {"name": "u_shaped", "a": 4.0}, **options)
         if isinstance(generator, Flow):  # of pairs that belong together, noise drawn on the way would part them
-            generator.sampler = ode_sampler(generator)
+            generator.run_by(ode_sampler(generator), generator.few)
 
 
 class Distill(Reflow):
@@ -48,4 +49,4 @@ class Distill(Reflow):
                 f"a distilled flow trains at the {steps} times that its steps visit; leave stage.time out."
             )
         super().__init__(generator, loss, {"name": "discrete", "k": steps, "grid": grid}, **options)
-        generator.sampler = Sampler("euler", steps, grid=grid, fixed=True)
+        generator.run_by(FixedSteps(steps, grid), fixed=True)

@@ -17,6 +17,7 @@ from r2flow.backbones import BACKBONES
 from r2flow.callbacks import CALLBACKS
 from r2flow.generators import GENERATORS
 from r2flow.runs.composing import REGISTRIES
+from r2flow.samplers import SAMPLERS
 from r2flow.stages import STAGES
 from tests.training.conftest import Done
 
@@ -57,7 +58,7 @@ ALL = (GAN, DDPM, COMPLETION, BACKBONE)
 @contextlib.contextmanager
 def loaded(*families: Family) -> Iterator[None]:
     """Families' files imported for the length of a block: what comes after is as if in a process of its own."""
-    tables, store = (GENERATORS, STAGES, BACKBONES, CALLBACKS), ConfigStore.instance()
+    tables, store = (GENERATORS, STAGES, BACKBONES, CALLBACKS, SAMPLERS), ConfigStore.instance()
     choices = {group: copy.deepcopy(store.repo.get(group, {})) for group in REGISTRIES}  # Hydra's own stay
     before, known = [dict(table.items()) for table in tables], set(plugins._loaded)
     try:

@@ -6,13 +6,14 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.generators import GENERATORS, Sampler
+from r2flow.generators import GENERATORS
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws
+from r2flow.samplers import build_sampler
 from tests.extension.conftest import BACKBONE, COMPLETION, DDPM, GAN, loaded
 
 M, S = 0.1, 0.2  # x_1 ~ N(M, S^2) in every pixel
@@ -40,7 +41,7 @@ def gaussian_ddpm():
 
 def test_ddim_follows_the_path_that_carries_noise_to_data(gaussian_ddpm):
     x_0 = Draws(0, range(2)).start(gaussian_ddpm.noise_shape)
-    found = gaussian_ddpm.generate(x_0, sampler=Sampler("ddim", 400))
+    found = gaussian_ddpm(x_0, sampler=build_sampler("ddim", steps=400))
     torch.testing.assert_close(found.x, M + S * x_0, rtol=0, atol=0.01)
     assert found.evaluations.tolist() == [400, 400]
 
@@ -48,7 +49,7 @@ def test_ddim_follows_the_path_that_carries_noise_to_data(gaussian_ddpm):
 def test_ddpm_draws_from_the_data(gaussian_ddpm):
     draws = Draws(0, range(8))
     x_0 = draws.start(gaussian_ddpm.noise_shape)
-    x = gaussian_ddpm.generate(x_0, sampler=Sampler("ddpm", 400), draws=draws).x
+    x = gaussian_ddpm(x_0, sampler=build_sampler("ddpm", steps=400), draws=draws).x
     assert x.mean().item() == pytest.approx(M, abs=0.01)  # of 16,384 draws: 6 standard errors
     assert x.std().item() == pytest.approx(S, rel=0.05)
     assert torch.corrcoef(torch.stack([x.flatten(), x_0.flatten()]))[0, 1].abs() < 0.1  # the start is forgotten

@@ -10,21 +10,19 @@ from benchmarks.completion import Case, bures, gaussian, map_of, moments, ring, 
 from r2flow.errors import InputError
 from r2flow.flow.posterior import (
     GROWN,
-    METHODS,
     _solved,
     mmps,
-    parse_method,
     repaint,
-    sample_posterior,
 )
 from r2flow.flow.problems import Correlated
 from r2flow.flow.solvers import named_grid
-from r2flow.generators import Field, Sampler, build_generator
+from r2flow.generators import Field, build_generator
 from r2flow.noise import Draws
+from r2flow.samplers import build_sampler
 
 WIDTH = 32
 ROWS = torch.arange(WIDTH) % 4 == 0
-ALL = ["replace", "repaint:3,2", "mmps:2"]
+ALL = ["replace", "repaint:repeats=3:length=2", "mmps"]
 
 
 def draws(seed: int = 0) -> torch.Generator:
@@ -37,6 +35,10 @@ def randn(*shape: int, seed: int = 0) -> Tensor:
 
 def times(steps: int, grid: str = "uniform") -> Tensor:
     return named_grid(grid)(0.0, 1.0, steps)
+
+
+def sample_posterior(u, x_0: Tensor, y: Tensor, known: Tensor, method: str, times: Tensor, noise=None) -> Tensor:
+    return build_sampler(method).given(u, x_0, y, known, times, noise)
 
 
 def numbered(shape: tuple[int, ...]):
@@ -193,7 +195,7 @@ def test_mmps_takes_a_flow_map_s_velocity():
 def test_mmps_samples_the_posterior_of_a_gaussian():
     prior, case = gaussian(), Case(ROWS)
     y = case.measure(prior.sample(3, draws(4)))
-    means, covariance = moments(velocity_of(prior), "mmps:12", case, y, times(64, "power:1.5"))
+    means, covariance = moments(velocity_of(prior), "mmps:products=12", case, y, times(64, "power:1.5"))
     total = 0.0
     for one, mean in zip(y, means, strict=True):
         posterior = prior.posterior(case.matrix, one, 0.0)
@@ -215,7 +217,7 @@ def test_replacement_s_mean_is_biased_by_what_quadrature_says():
     assert expected < 0.75 * c
     x_0 = torch.zeros(1, 2).double()
     y = torch.tensor([[1.0, 0.0]]).double()
-    for method in ("replace", "repaint:1"):
+    for method in ("replace", "repaint:repeats=1"):
         found = sample_posterior(velocity_of(prior), x_0, y, y > 0, method, times(400), lambda j: x_0)
         assert float(found[0, 1]) == pytest.approx(expected, abs=5e-3)
 
@@ -233,7 +235,7 @@ def test_repaint_leaves_less_of_replacement_s_bias_the_more_often_it_repeats():
     assert off[2] < 0.6 * off[1]
 
 
-@pytest.mark.parametrize("method", ["replace", "repaint:3", "mmps"])
+@pytest.mark.parametrize("method", ["replace", "repaint:repeats=3", "mmps"])
 def test_with_nothing_measured_it_draws_from_the_prior(method):
     prior, case = Correlated(torch.full((1, 4), 0.3).double(), ring(4)[None]), Case(torch.zeros(4))
     means, covariance = moments(velocity_of(prior), method, case, torch.zeros(1, 0).double(), times(100, "power:1.5"))
@@ -274,7 +276,7 @@ def test_it_evaluates_within_the_flow_as_often_as_it_says(method):
         seen.clear()
         products[0] = 0
         sample_posterior(u, randn(2, WIDTH), *measured, method, times(steps), numbered((2, WIDTH)))
-        assert len(seen) + products[0] == parse_method(method).evaluations(steps)
+        assert len(seen) + products[0] == build_sampler(method, steps=steps).evaluations()
         assert 0 <= min(seen) <= max(seen) < 1
 
 
@@ -296,14 +298,13 @@ def test_a_scan_s_answer_does_not_depend_on_its_batch(method):
     flow, y = Field(gaussian(), (WIDTH,)), randn(4, WIDTH).float()
     known = (torch.rand(4, WIDTH, generator=draws(1)) < 0.4).float()
     known[2] = 1
-    condition, how = {"image": y, "known": known}, Sampler(method, 4)
-    flow.check_sampler(how)
-    whole = flow.generate(Draws(3, range(4)).start((WIDTH,)), condition, sampler=how, draws=Draws(3, range(4)))
-    assert whole.evaluations.tolist() == [flow.evaluations_of(how)] * 4
+    condition, how = {"image": y, "known": known}, build_sampler(method, steps=4)
+    whole = flow(Draws(3, range(4)).start((WIDTH,)), condition, sampler=how, draws=Draws(3, range(4)))
+    assert whole.evaluations.tolist() == [how.evaluations()] * 4
     assert torch.equal(whole.x[2], y[2])
     for i in range(4):
         own = {name: value[i : i + 1] for name, value in condition.items()}
-        alone = flow.generate(Draws(3, [i]).start((WIDTH,)), own, sampler=how, draws=Draws(3, [i]))
+        alone = flow(Draws(3, [i]).start((WIDTH,)), own, sampler=how, draws=Draws(3, [i]))
         torch.testing.assert_close(alone.x[0], whole.x[i])
 
 
@@ -318,40 +319,42 @@ TINY = {
 @pytest.mark.parametrize("method", ["repaint", "mmps"])
 def test_every_flow_completes_a_scan(family, method):
     flow, seen = build_generator({**TINY, "generator": {"name": family}}).eval(), []
-    x_0, how, who = Draws(0, range(2)).start(flow.noise_shape), Sampler(method, 3), Draws(0, range(2))
+    x_0, how, who = (
+        Draws(0, range(2)).start(flow.noise_shape),
+        build_sampler(method, steps=3),
+        Draws(0, range(2)),
+    )
     known = torch.zeros_like(x_0)
     known[:, :, ::2] = 1
     y = torch.rand(x_0.shape, generator=draws(1))
     condition = {"image": y, "known": known}
-    made = flow.generate(x_0, condition, sampler=how, draws=who, progress=lambda: seen.append(1))
+    made = flow(x_0, condition, sampler=how, draws=who, progress=lambda: seen.append(1))
     assert made.converged.all()
     assert torch.equal(made.x[known > 0], y[known > 0])
-    assert len(seen) == flow.evaluations_of(how)
-    with pytest.raises(InputError, match="give what is known"):
-        flow.generate(x_0, sampler=how, draws=who)
+    assert len(seen) == how.evaluations()
+    with pytest.raises(InputError, match="condition"):
+        flow(x_0, sampler=how, draws=who)
     if family != "conditional_flow":
         for plain in ("euler", "jump")[: 2 if family == "flow_map" else 1]:
-            with pytest.raises(InputError, match=f"{', '.join(METHODS)}"):
-                flow.generate(x_0, condition, sampler=Sampler(plain, 2))
+            with pytest.raises(InputError, match="mmps"):
+                flow(x_0, condition, sampler=build_sampler(plain, steps=2))
+
+
+@pytest.mark.parametrize("text", ["repaint:repeats=0", "repaint:many=1", "mmps:products=x", "mmps:finish=0.1"])
+def test_numbers_that_a_sampler_does_not_have_are_refused(text):
+    with pytest.raises(InputError, match=text.split(":")[1].split("=")[0]):
+        build_sampler(text)
 
 
 def test_what_does_not_fit_is_said_in_one_line():
     flow, x_0 = Field(gaussian(), (WIDTH,)), torch.zeros(1, WIDTH)
     part = {"image": x_0, "known": torch.ones_like(x_0).tril()}
-    for how, words in (
-        (Sampler("repaint:0"), "give repaint:4,1"),
-        (Sampler("repaint:1,2,3"), "give repaint:4,1"),
-        (Sampler("mmps:x"), "give mmps:2,1"),
-        (Sampler("replace:3"), "give replace"),
-        (Sampler("mmps", finish=0.1), "finish"),
-        (Sampler("mmps", grid=(0.0, 2.0)), "time grid"),
-    ):
-        with pytest.raises(InputError, match=words):
-            flow.check_sampler(how)
-    with pytest.raises(InputError, match="trained without a condition"):
-        flow.generate(x_0, part, sampler=Sampler("euler", 2))
-    with pytest.raises(InputError, match="draws further noise"):
-        flow.generate(x_0, part, sampler=Sampler("repaint", 2))
+    with pytest.raises(InputError, match="time grid"):
+        build_sampler("mmps", grid=(0.0, 2.0))
+    with pytest.raises(InputError, match="condition"):
+        flow(x_0, part, sampler=build_sampler("euler", steps=2))
+    with pytest.raises(InputError, match="give draws"):
+        flow(x_0, part, sampler=build_sampler("repaint", steps=2))
 
 
 @pytest.mark.parametrize("method", ALL)

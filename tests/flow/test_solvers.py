@@ -8,7 +8,7 @@ import torch
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, RayDrop
-from r2flow.flow.solvers import SOLVERS, EmbeddedMethod, FixedStep, knot_times, named_grid, solve, usual_grid
+from r2flow.flow.solvers import SOLVERS, EmbeddedMethod, FixedStep, named_grid, solve, usual_grid
 from r2flow.flow.solvers.external import is_fixed, torchdiffeq_methods
 from r2flow.flow.solvers.multistep import weights
 
@@ -113,12 +113,9 @@ def test_a_power_grid_is_denser_towards_one_end_and_the_same_backward():
         "power-start:3": torch.tensor([0, 1 / 64, 1 / 8, 27 / 64, 1], dtype=torch.float64),
         "power:1": torch.tensor([0, 0.25, 0.5, 0.75, 1], dtype=torch.float64),
         # 1 - t = 2^(2/3) / 16, 1 / 16 and 2^(-2/3) / 16
-        "late:16": 1 - torch.tensor([1, 0.09921256574801247, 0.0625, 0.03937253280921478, 0], dtype=torch.float64),
     }.items():
         torch.testing.assert_close(named_grid(name)(0.0, 1.0, 4), times)
         torch.testing.assert_close(named_grid(name)(1.0, 0.0, 4), times.flip(0))
-    for steps, times in {1: [0, 1], 2: [0, 31 / 32, 1]}.items():
-        torch.testing.assert_close(named_grid("late:32")(0.0, 1.0, steps), torch.tensor(times, dtype=torch.float64))
     # A part of the way: equal steps of (1 - t)^(1/2) from .8 to .4.
     torch.testing.assert_close(
         named_grid("power:2")(0.36, 0.84, 2), torch.tensor([0.36, 0.64, 0.84], dtype=torch.float64)
@@ -194,11 +191,8 @@ def test_an_unknown_or_wrong_grid_is_refused():
         "power:11",
         "power-start:",
         "start-power:2",
-        "late",
-        "late:3",
-        "late:inf",
     ):
-        with pytest.raises(InputError, match=f"P from 1 to 10, or late:K with K from 4 to 1e6; found '{grid}'"):
+        with pytest.raises(InputError, match=f"P from 1 to 10; found '{grid}'"):
             solve(logistic, X_0, grid=grid)
     with pytest.raises(InputError, match="must be \\(N \\+ 1,\\) times that run in one direction"):
         solve(logistic, X_0, grid=torch.tensor([0.0, 0.6, 0.5, 1.0]))
@@ -288,7 +282,7 @@ def test_knots_are_states_of_the_path(method):
     x_0 = torch.tensor([[1.0, -2.0], [0.5, 3.0]], dtype=torch.float64)
     grid = "uniform" if method == "euler" else usual_grid(method)
     found = solve(lambda t, x: x, x_0, method=method, steps=64, tolerance=1e-9, grid=grid, knots=3)
-    times = knot_times(method, grid, 3)[1:-1]
+    times = named_grid(grid if method in ("euler", "adams3") else "uniform")(0.0, 1.0, 4)[1:-1]
     growth = (1 + 1 / 64) ** (64 * times) if method == "euler" else times.exp()
     assert found.knots is not None
     error = 1e-4 if method == "adams3" else 1e-7

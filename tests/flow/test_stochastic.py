@@ -10,15 +10,15 @@ from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.posterior import methods_in
-from r2flow.flow.solvers import check_method, named_grid
-from r2flow.flow.stochastic import ahead, back, churn_of, sde, sde_step
-from r2flow.generators import USUAL, Field, Sampler, build_generator
+from r2flow.flow.solvers import named_grid
+from r2flow.flow.stochastic import back, sde, sde_step
+from r2flow.generators import USUAL, Field, build_generator
 from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.region import Region
 from r2flow.model.export import tableau
 from r2flow.model.sampling import draw
 from r2flow.noise import Draws
+from r2flow.samplers import build_sampler
 
 STD = 0.4  # of x_1 ~ N(0, STD^2), where everything is linear
 
@@ -76,35 +76,12 @@ def test_the_first_step_is_euler_s_and_the_last_one_goes_to_the_estimate():
     assert sde_step(0.6, 1.0, 2.0, 0.5) == (0.0, 1.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("c", [0.0, 0.7, 4.0])
-def test_a_jump_ahead_and_back_keeps_the_law_and_replaces_the_sde_s_share(c):
-    t, s = 0.3, 0.55
-    r = ahead(t, s, c)
-    assert r >= s
-    units = torch.eye(2, dtype=torch.float64)[:, :, None]
+@pytest.mark.parametrize("r", [0.55, 0.8, 1.0])
+def test_going_back_by_fresh_noise_keeps_the_law(r):
+    units, s = torch.eye(2, dtype=torch.float64)[:, :, None], 0.55
     there = math.sqrt(variance(r)) * units[0]  # the flow map of a Gaussian scales its deviation
     found = back(there, r, s, units[1])
     assert float(found.square().sum()) == pytest.approx(variance(s), rel=1e-12)
-    noise_kept = s / r * (1 - r) / (1 - s)
-    odds = t / (1 - t) / (s / (1 - s))
-    assert noise_kept == pytest.approx(odds**c, rel=1e-12)
-    assert noise_kept * (1 - s) / (1 - t) == pytest.approx(sde_step(t, s, c).keep, rel=1e-12)
-
-
-def test_where_all_is_noise_a_jump_goes_no_farther_and_without_end_to_the_end():
-    assert ahead(0.0, 0.4, 2.0) == 0.4
-    assert ahead(0.2, 0.4, 0.0) == 0.4
-    assert ahead(0.2, 0.4, math.inf) == ahead(0.2, 1.0, 1.0) == 1.0
-
-
-def test_the_share_is_in_the_name():
-    assert churn_of("sde", "sde", 1.0) == 1.0
-    assert churn_of("sde:0.25", "sde", 1.0) == 0.25
-    assert churn_of("euler", "sde", 1.0) is None
-    assert churn_of("renoise", "renoise", math.inf) == math.inf
-    for wrong in ("sde:", "sde:x", "sde:-1", "sde:inf", "sde:nan"):
-        with pytest.raises(InputError, match=r"sde:C must be a number of at least 0, found 'sde:"):
-            churn_of(wrong, "sde", 1.0)
 
 
 CONFIG = {
@@ -118,69 +95,65 @@ def normal() -> Field:
     return Field(lambda t, x: (estimate(t, x) - x) / (1 - t), (2, 8, 32), build_generator(CONFIG).space)
 
 
-@pytest.mark.parametrize("method", ["sde", "sde:3"])
+@pytest.mark.parametrize("method", ["sde", "sde:churn=3"])
 def test_a_flow_draws_the_data_s_distribution(method):
     flow, who = normal(), Draws(3, range(48))
-    how = Sampler(method, 32, grid="power:2", finish=1 / 64)
-    made = flow.generate(who.start(flow.noise_shape), sampler=how, draws=who)
+    how = build_sampler(method, steps=32, grid="power:2", finish=1 / 64)
+    made = flow(who.start(flow.noise_shape), sampler=how, draws=who)
     count = made.x.numel()  # 24,576 values
     # Of an Euler step over 1/64 the deviation lacks (1/64)^2 / (2 STD^2), the rest is the steps' error of order 2.
     assert float(made.x.std()) == pytest.approx(STD, abs=5 * STD / (2 * count) ** 0.5 + 0.004)
     assert float(made.x.mean()) == pytest.approx(0, abs=5 * STD / count**0.5)
     assert made.evaluations.tolist() == [32] * 48
-    assert flow.evaluations_of(how) == 32
+    assert how.evaluations(flow) == 32
     assert made.converged.all()
 
 
 def test_a_scan_is_a_function_of_its_number_and_what_fails_does_not_touch_the_others():
-    flow, how = normal(), Sampler("sde", 5)
+    flow, how = normal(), build_sampler("sde", steps=5)
     whole = draw(flow, range(3), 7, how).images
     for i in range(3):
         torch.testing.assert_close(draw(flow, [i], 7, how).images[0], whole[i])
     x_0 = Draws(7, range(3)).start(flow.noise_shape)
-    fine = flow.generate(x_0, sampler=how, draws=Draws(7, range(3))).x
+    fine = flow(x_0, sampler=how, draws=Draws(7, range(3))).x
     x_0[1, 0, 0, 0] = math.inf
-    made = flow.generate(x_0, sampler=how, draws=Draws(7, range(3)))
+    made = flow(x_0, sampler=how, draws=Draws(7, range(3)))
     assert made.converged.tolist() == [True, False, True]
     assert torch.equal(made.x[::2], fine[::2])
 
 
 def test_a_part_has_the_noise_of_the_whole():
     flow = build_generator(CONFIG).eval()  # untrained, its velocity is 0 and nothing is seen of other rays
-    region, who, how = Region((8, 32), 0, 8, 8, 16), Draws(5, [0]), Sampler("sde", 4)
+    region, who, how = Region((8, 32), 0, 8, 8, 16), Draws(5, [0]), build_sampler("sde", steps=4)
     x_0 = who.start(flow.noise_shape)
-    whole = flow.generate(x_0, sampler=how, draws=who).x
-    part = flow.part(region).generate(region.crop(x_0), sampler=how, draws=who).x
+    whole = flow(x_0, sampler=how, draws=who).x
+    part = flow.part(region)(region.crop(x_0), sampler=how, draws=who).x
     torch.testing.assert_close(part, region.crop(whole), rtol=0, atol=1e-6)
 
 
 def test_what_needs_the_ode_says_so():
     flow = build_generator(CONFIG).eval()
     x_0 = torch.zeros(1, *flow.noise_shape)
-    with pytest.raises(InputError, match="sde draws further noise: give draws"):
-        flow.generate(x_0, sampler=Sampler("sde", 2))
-    with pytest.raises(InputError, match="sde:2 draws noise on the way: give a solver, as --solver adams3"):
-        flow.solve(x_0, sampler=Sampler("sde:2", 2))
-    with pytest.raises(InputError, match="sde cannot be exported, it draws noise on the way"):
-        tableau(flow, Sampler("sde", 2))
-    with pytest.raises(InputError, match="mmps cannot be exported, 'mmps completes a scan"):
-        tableau(flow, Sampler("mmps", 2))
+    with pytest.raises(InputError, match="give draws"):
+        flow(x_0, sampler=build_sampler("sde", steps=2))
+    with pytest.raises(InputError, match="paths"):
+        flow.solve(x_0, sampler=build_sampler("sde", churn=2, steps=2))
+    with pytest.raises(InputError, match="cannot be exported"):
+        tableau(flow, build_sampler("sde", steps=2))
+    with pytest.raises(InputError, match="cannot be exported"):
+        tableau(flow, build_sampler("mmps", steps=2))
 
 
-def test_another_method_starts_from_its_usual_steps_and_another_number_of_the_same_keeps_them():
-    usual = Sampler("adams3", 16, grid="power:1.5", finish=1 / 32).changed(method="sde", steps=32)
-    assert usual == Sampler("sde", 32, grid="power:2.5", finish=1 / 128)
-    own = Sampler("renoise", 8, grid="power:3")
-    assert own.changed(method="renoise:3") == Sampler("renoise:3", 8, grid="power:3")
-    assert own.changed(method="euler").grid == "uniform"
-    learned = Sampler("jump", 4, grid="power:3")  # the steps of a map are those that it has learned, in both its ways
-    assert learned.changed(method="renoise:3", steps=16) == Sampler("renoise:3", 16, grid="power:3")
-    assert Sampler("torchdiffeq:rk4", grid="power:2").changed(method="torchdiffeq:euler").grid == "uniform"
-    timed = own.changed(method="sde", grid=(0.0, 0.5, 1.0))
-    assert (timed.finish, timed.steps) == (0.0, 2)
+def test_another_sampler_has_its_own_defaults_and_the_number_of_steps():
+    flow = build_generator(CONFIG)
+    assert flow.sampler == USUAL
+    assert flow.choose("sde") == build_sampler("sde", steps=16, grid="power:2.5", finish=1 / 128)
+    assert flow.choose("dopri5") == build_sampler("dopri5")
+    assert flow.choose("adams3", steps=8) == build_sampler("adams3", steps=8, grid="power:1.5", finish=1 / 32)
+    assert flow.choose("euler", grid=(0.0, 0.5, 1.0), steps=None).times().tolist() == [0, 0.5, 1]
 
 
-@pytest.mark.parametrize("method", ["mmps", "repaint:2"])
+@pytest.mark.parametrize("method", ["mmps", "repaint:repeats=2"])
 def test_a_part_is_completed_with_the_noise_of_the_whole(method):
     flow = build_generator(CONFIG).eval()
     region, who = Region((8, 32), 0, 8, 8, 16), Draws(5, [0])
@@ -188,9 +161,9 @@ def test_a_part_is_completed_with_the_noise_of_the_whole(method):
     known = torch.zeros_like(x_0)
     known[:, :, ::2] = 1
     told = {"image": 0.3 * known, "known": known}
-    whole = flow.generate(x_0, told, sampler=Sampler(method, 3), draws=who).x
+    whole = flow(x_0, told, sampler=build_sampler(method, steps=3), draws=who).x
     cut = {name: region.crop(value) for name, value in told.items()}
-    part = flow.part(region).generate(region.crop(x_0), cut, sampler=Sampler(method, 3), draws=who).x
+    part = flow.part(region)(region.crop(x_0), cut, sampler=build_sampler(method, steps=3), draws=who).x
     torch.testing.assert_close(part, region.crop(whole), rtol=0, atol=1e-6)
 
 
@@ -199,9 +172,9 @@ def test_a_method_asks_for_draws_where_it_needs_them():
     known = torch.zeros_like(x_0)
     known[:, :, ::2] = 1
     told = {"image": 0.3 * known, "known": known}
-    assert flow.generate(x_0, told, sampler=Sampler("mmps:1,0", 2)).converged.all()
-    with pytest.raises(InputError, match="mmps:1 draws further noise: give draws"):
-        flow.generate(x_0, told, sampler=Sampler("mmps:1", 3))
+    assert flow(x_0, told, sampler=build_sampler("mmps", products=1, churn=0, steps=2)).converged.all()
+    with pytest.raises(InputError, match="give draws"):
+        flow(x_0, told, sampler=build_sampler("mmps", steps=3))
 
 
 def test_what_is_known_arrives_as_it_was_given():
@@ -212,38 +185,17 @@ def test_what_is_known_arrives_as_it_was_given():
     known = torch.zeros_like(x_0)
     known[:, :, ::2] = 1
     told = {"image": x_0.roll(1, 3) * known, "known": known}
-    made = flow.generate(x_0, told, sampler=Sampler("sde", 6), draws=who)
+    made = flow(x_0, told, sampler=build_sampler("sde", steps=6), draws=who)
     assert made.converged.all()
     assert torch.equal(made.x[known > 0], told["image"][known > 0])
 
 
 def test_pairs_are_the_ends_of_paths():
-    with pytest.raises(InputError, match="sde:2 draws noise on the way; give a solver of the ODE, such as adams3"):
-        check_method("sde:2")
     flow = build_generator({**CONFIG, "generator": {"name": "flow_map"}})
-    ways = "sde", "renoise:3", "renoise", "jump", "adams3"
-    assert [flow.draws_noise(Sampler(way)) for way in ways] == [True, True, True, False, False]
-    with pytest.raises(InputError, match="renoise:3 draws noise on the way: give a solver"):
-        flow.solve(torch.zeros(1, *flow.noise_shape), sampler=Sampler("renoise:3", 2))
-    flow.sampler = Sampler("renoise:3", 4)
+    ways = [build_sampler(way) for way in ("sde", "renoise", "jump", "adams3")]
+    assert [way.draws for way in ways] == [True, True, False, False]
+    assert [way.paired for way in ways] == [False, True, True, True]
+    flow.sampler = ways[1]
     assert ode_sampler(flow) == USUAL
-    flow.sampler = Sampler("euler", 3)
+    flow.sampler = ways[3]
     assert ode_sampler(flow) == flow.sampler
-
-
-def test_the_steps_that_are_taken_are_those_that_were_checked():
-    flow, x_0, who = normal(), Draws(1, [0]).start((2, 8, 32)), Draws(1, [0])
-    timed = Sampler("sde", 3, grid=(0.0, 0.5, 0.8, 0.9), finish=0.1).changed(steps=None)
-    with pytest.raises(InputError, match="shorter than the interval"):
-        flow.check_sampler(Sampler("sde", 3, finish=1.0))
-    flow.check_sampler(timed)
-    assert flow.evaluations_of(timed) == 4
-    assert flow.generate(x_0, sampler=timed, draws=who).evaluations.tolist() == [4]
-    with pytest.raises(InputError, match="this time grid runs from 0 to 1, the solution from 0"):
-        flow.check_sampler(Sampler("sde", 3, grid=(0.0, 0.5, 0.8, 1.0), finish=0.1))
-
-
-def test_a_list_of_methods_may_hold_numbers():
-    assert methods_in("replace/32, mmps:2,0/10,mmps:2,.5,repaint:4,1/9") == [
-        "replace/32", "mmps:2,0/10", "mmps:2,.5", "repaint:4,1/9",
-    ]  # fmt: skip

@@ -9,11 +9,12 @@ import torch
 
 from r2flow.cli import main
 from r2flow.errors import InputError
-from r2flow.generators import Generated, Sampler, build_generator
+from r2flow.generators import Generated, build_generator
 from r2flow.lidar.interpolation import INTERPOLATIONS, interpolated
 from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.reports.completion import Way, completion_rows, measured_by
+from r2flow.samplers import build_sampler
 from tests.stages.test_conditional import CONFIG
 
 
@@ -41,7 +42,7 @@ def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(
         return Generated.after(encoding.encode(torch.cat([moved, truth[:, 1:]], 1)), 7)
 
     monkeypatch.setattr(checkpoint.generator, "generate", answer)
-    ways = [Way("truth", checkpoint, Sampler("euler", 7))]
+    ways = [Way("truth", checkpoint, build_sampler("euler", steps=7))]
     options = {"tasks": ["rows:4"], "num": 1, "on_surfaces": False}
     *plain, (row, _) = completion_rows(truths, sensor, ways, **options)
     assert [one["method"] for one, _ in plain] == list(INTERPOLATIONS)
@@ -83,7 +84,7 @@ def test_the_verb_writes_a_page_with_its_picture(checkpoint, tmp_path: Path, mon
     out = tmp_path / "out"
     monkeypatch.setattr("sys.argv", [
         "r2flow", "report", "completion", "simulated:3", "-c", str(tmp_path / "model.safetensors"), "--num", "2",
-        "--answers", "2", "--solvers", "euler,mmps:1,0", "--steps", "1", "--tasks", "rows:4 rows:2", "--out", str(out),
+        "--answers", "2", "--samplers", "euler,mmps:1,0", "--steps", "1", "--tasks", "rows:4 rows:2", "--out", str(out),
     ])  # fmt: skip
     with pytest.raises(SystemExit) as ended:
         main()

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.generators import Sampler
 from r2flow.inversion import interpolate_scans
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
@@ -13,6 +12,7 @@ from r2flow.lidar.space import ModelSpace
 from r2flow.reports.interpolation import interpolation, interpolation_figure
 from r2flow.reports.inversion import real_scans, unique_names
 from r2flow.reports.pictures import figure_pixels
+from r2flow.samplers import build_sampler
 from tests.test_sampling import SENSOR, GaussianFlow, flow, scans
 
 
@@ -45,7 +45,7 @@ def test_a_page_says_what_was_measured(tmp_path):
     paths = [tmp_path / "one.npy", tmp_path / "two.npy"]
     for path, image in zip(paths, scans(2).numpy(), strict=True):
         np.save(path, image)
-    sampler = Sampler("dopri5", tolerance=1e-4)
+    sampler = build_sampler("dopri5", tolerance=1e-4)
     page = interpolation(flow(), real_scans(flow(), paths), 3, tmp_path / "o", sampler, batch_size=2)
     assert [row["frame"] for row in page.rows] == [0, 1, 2]
     assert page.rows[1]["evaluations"] < page.rows[0]["evaluations"]
@@ -67,7 +67,14 @@ def test_a_frame_that_is_not_solved_is_reported(tmp_path, caplog):
     for path, image in zip(paths, scans(2).numpy(), strict=True):
         np.save(path, image)
     checkpoint = flow(LostBetween())
-    page = interpolation(checkpoint, real_scans(checkpoint, paths), 4, tmp_path / "o", Sampler("rk4", 4), batch_size=2)
+    page = interpolation(
+        checkpoint,
+        real_scans(checkpoint, paths),
+        4,
+        tmp_path / "o",
+        build_sampler("rk4", steps=4),
+        batch_size=2,
+    )
     assert [row["converged"] for row in page.rows] == [True, False, False, True]
     assert "not solved, so no scans of this flow: 1, 2;" in caplog.text
     assert "| no |" in page.text[2]
@@ -77,7 +84,7 @@ def test_an_end_without_its_noise_is_refused(tmp_path):
     bad = scans(2)
     bad[1, 0, 0, 0] = math.nan
     with pytest.raises(InputError, match="the last scan cannot be carried to its noise"):
-        interpolate_scans(flow(), bad, 3, Sampler("rk4", 4))
+        interpolate_scans(flow(), bad, 3, build_sampler("rk4", steps=4))
     with pytest.raises(InputError, match="the first scan cannot be carried to its noise"):
         interpolate_scans(flow(), bad.flip(0), 3)
 

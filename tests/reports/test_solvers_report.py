@@ -146,7 +146,7 @@ def test_the_exact_problems_are_reported_with_what_was_not_solved():
 def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
     out = tmp_path / "reports"
     code, said, _ = r2flow(
-        "report", "solvers", "-c", saved[0], "-o", out, "--num", 2, "--solvers", "euler,heun2,dopri5",
+        "report", "solvers", "-c", saved[0], "-o", out, "--num", 2, "--samplers", "euler,heun2,dopri5",
         "--budgets", "2,4", "--tolerances", "1e-2", "--problems", "gaussian,rotating", "--repeats", 1,
     )  # fmt: skip
     assert code == 0
@@ -165,10 +165,10 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
 def test_bad_input_is_one_line(r2flow, tmp_path):  # noqa: F811
     out = tmp_path / "o"
     for arguments, words in (
-        (("--solvers", "eulr"), "'euler'"),
+        (("--samplers", "eulr"), "'euler'"),
         (("--budgets", "4,x"), "--budgets"),
         (("--tolerances", "-1"), "--tolerances"),
-        (("--budgets", "1", "--solvers", "rk4"), "--budgets"),
+        (("--budgets", "1", "--samplers", "rk4"), "--budgets"),
         (("--problems", "none"), "nothing to measure"),
         (("--problems", "gausian"), "'gaussian'"),
         (("-c", tmp_path / "none"), "no checkpoint"),

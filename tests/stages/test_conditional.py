@@ -13,9 +13,10 @@ from r2flow.data.loader import FlowDataset
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
 from r2flow.flow.problems import Gaussian
-from r2flow.generators import ConditionalFlow, Sampler, build_generator, condition_of
+from r2flow.generators import ConditionalFlow, build_generator, condition_of
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.noise import Draws
+from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
 from r2flow.stages.conditional import Conditional, Tasks
 
@@ -94,26 +95,26 @@ def test_known_values_arrive_as_given_and_on_their_line(flow, scans, steps):
     told = condition_of(flow.space, scans, measured(scans))
     draws = Draws(0, range(3))
     x_0, known = draws.start((2, 8, 32)), told["known"] > 0
-    made = flow.generate(x_0, told, sampler=Sampler("euler", steps))
+    made = flow(x_0, told, sampler=build_sampler("euler", steps=steps))
     assert torch.equal(made.x[known], told["image"][known])
     # half-way the known values are on the straight line between noise and scan
-    half = flow.solve(x_0, 0.0, 0.5, sampler=Sampler("euler", steps), condition=told).x
+    half = flow.solve(x_0, 0.0, 0.5, sampler=build_sampler("euler", steps=steps), condition=told).x
     assert torch.allclose(half[known], ((x_0 + told["image"]) / 2)[known], atol=1e-5)
 
 
 @pytest.mark.parametrize("method", ["euler", "dopri5", "sde"])
 def test_how_far_the_guess_holds_is_found_once(flow, scans, method, monkeypatch):
     told, draws, calls = condition_of(flow.space, scans, measured(scans)), Draws(0, range(3)), []
-    how, x_0 = Sampler(method, 3, 1e-3), draws.start((2, 8, 32))
-    made = flow.generate(x_0, told, sampler=how, draws=draws).x
+    how, x_0 = build_sampler(method, steps=3, tolerance=1e-3), draws.start((2, 8, 32))
+    made = flow(x_0, told, sampler=how, draws=draws).x
     forward = flow.trust.forward
     monkeypatch.setattr(flow.trust, "forward", lambda x: calls.append(1) or forward(x))
-    assert torch.equal(flow.generate(x_0, told, sampler=how, draws=draws).x, made)
+    assert torch.equal(flow(x_0, told, sampler=how, draws=draws).x, made)
     assert len(calls) == 1
     monkeypatch.setattr(
         flow, "_trusted", lambda condition, x: type(flow)._trusted(flow, {n: condition[n] for n in told}, x)
     )
-    again = flow.generate(x_0, told, sampler=how, draws=draws).x
+    again = flow(x_0, told, sampler=how, draws=draws).x
     assert len(calls) > 3  # at every evaluation
     assert torch.equal(again, made)
 
@@ -121,14 +122,18 @@ def test_how_far_the_guess_holds_is_found_once(flow, scans, method, monkeypatch)
 @pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
 def test_noise_of_half_precision_is_completed(flow, scans, kind):
     told, x_0 = condition_of(flow.space, scans, measured(scans)), Draws(0, range(3)).start((2, 8, 32)).to(kind)
-    half, single = (flow.generate(x, told, sampler=Sampler("euler", 2)).x for x in (x_0, x_0.float()))
+    half, single = (flow(x, told, sampler=build_sampler("euler", steps=2)).x for x in (x_0, x_0.float()))
     torch.testing.assert_close(half.float(), single, atol=0.05, rtol=0.05)
 
 
 @pytest.mark.parametrize("method", ["dopri5", "heun2", "rk4", "adams3"])
 def test_solvers_that_look_at_the_end_find_no_infinity_there(flow, scans, method):
     told = condition_of(flow.space, scans, measured(scans))
-    made = flow.generate(Draws(0, range(3)).start((2, 8, 32)), told, sampler=Sampler(method, 4, 1e-3))
+    made = flow(
+        Draws(0, range(3)).start((2, 8, 32)),
+        told,
+        sampler=build_sampler(method, steps=4, tolerance=1e-3),
+    )
     assert made.x.isfinite().all()
     assert made.converged.all()
 
@@ -137,8 +142,8 @@ def test_a_rolled_scan_has_rolled_answers(flow, scans):
     x_0 = Draws(0, range(3)).start((2, 8, 32))
     told = condition_of(flow.space, scans, measured(scans, "rows:2+sector:10,80"))
     turned = {name: value.roll(8, -1) for name, value in told.items()}
-    plain = flow.generate(x_0, told, sampler=Sampler("euler", 2)).x
-    rolled = flow.generate(x_0.roll(8, -1), turned, sampler=Sampler("euler", 2)).x
+    plain = flow(x_0, told, sampler=build_sampler("euler", steps=2)).x
+    rolled = flow(x_0.roll(8, -1), turned, sampler=build_sampler("euler", steps=2)).x
     assert torch.allclose(rolled, plain.roll(8, -1), atol=1e-4)
 
 
@@ -252,7 +257,7 @@ def test_told_nothing_it_is_a_plain_flow(flow):
     x, t, x_0 = torch.randn(2, 2, 8, 32), torch.tensor([0.2, 0.7]), Draws(0, range(2)).start((2, 8, 32))
     plain = flow.untold()
     assert torch.equal(plain.velocity(t, x), flow.velocity(t, x))
-    assert torch.equal(plain.generate(x_0).x, flow.generate(x_0).x)
+    assert torch.equal(plain(x_0).x, flow(x_0).x)
 
 
 def test_a_plain_flow_that_starts_from_it_forgets_the_condition(flow):

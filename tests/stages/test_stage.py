@@ -33,7 +33,7 @@ class Automatic(Stage):
         self.other = nn.Linear(4, 1)
 
     def training_step(self, batch, batch_idx):
-        return self.generator.generate(batch).x.square().sum()
+        return self.generator(batch).x.square().sum()
 
     def on_train_batch_end(self, outputs, batch, batch_idx) -> None:
         schedules = self.lr_schedulers()
@@ -53,7 +53,7 @@ class Manual(Automatic):
 
     def training_step(self, batch, batch_idx):
         first, second = self.own_optimizers()
-        self.take_step(second, (self.other(batch) * self.generator.generate(batch).x).sum())
+        self.take_step(second, (self.other(batch) * self.generator(batch).x).sum())
         self.take_step(first, super().training_step(batch, batch_idx))
 
 

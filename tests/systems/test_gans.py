@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from r2flow.callbacks import HalfLifeEMA
 from r2flow.errors import InputError
-from r2flow.generators import Sampler, build_generator
+from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import SENSORS
@@ -25,6 +25,7 @@ from r2flow.model.checkpoint import load_checkpoint, read_checkpoint
 from r2flow.model.published import inert
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws
+from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
 from r2flow.systems.gan import dcgan, losses, style_gan
 from r2flow.systems.gan.augment import TRANSFORMATIONS, AdaptiveAugment, Draw, affine, colour, coloured, transformed
@@ -391,8 +392,8 @@ def test_a_published_file_holds_its_discriminator_by_our_names(cases: Any, share
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_a_published_file_samples_whatever_the_batch(shared: Path, name: str):
     checkpoint = load_checkpoint(shared / "oracle_baselines" / f"{name}_published.pth")
-    together = checkpoint.sample(3, seed=1, batch_size=3, method="truncate:0.7")
-    alone = checkpoint.sample(3, seed=1, method="truncate:0.7")
+    together = checkpoint.sample(3, seed=1, batch_size=3, truncation=0.7)
+    alone = checkpoint.sample(3, seed=1, truncation=0.7)
     assert together.shape == (3, 1, 64, 64)
     kept = together[together > 0]
     assert kept.min() >= 1.45
@@ -482,12 +483,12 @@ def test_truncation_by_0_is_refused_and_by_less_draws_codes_together():
     generator.network.w_avg.copy_(torch.randn(1, 8))
     whole, half = (generator.made(z, torch.rand(16, 1, 16, 32), truncation=psi)["w"] for psi in (1.0, 0.5))
     torch.testing.assert_close(half, generator.network.w_avg + 0.5 * (whole - generator.network.w_avg))
-    for method in ("truncate:0", "truncate:2", "truncate:x", "truncate:nan", "euler"):
+    for truncation in (0.0, 2.0, "x", float("nan")):
+        with pytest.raises(InputError, match="truncation"):
+            generator.choose(truncation=truncation)
+    for wrong in ({"name": "euler"}, {"steps": 2}):
         with pytest.raises(InputError):
-            generator.check_sampler(generator.sampler.changed(method=method))
-    generator.check_sampler(generator.sampler.changed(method="truncate:0.7"))
-    with pytest.raises(InputError, match=r"1 step.*; found steps 2\.$"):
-        generator.check_sampler(generator.sampler.changed(steps=2))
+            generator.choose(**wrong)
 
 
 def test_a_generator_with_a_mask_needs_draws():
@@ -495,8 +496,8 @@ def test_a_generator_with_a_mask_needs_draws():
     assert isinstance(generator, DustyV1)
     noise = Draws(0, range(2)).start(generator.noise_shape)
     with pytest.raises(InputError, match="draws"):
-        generator.generate(noise)
-    made = generator.generate(noise, draws=Draws(0, range(2)), sampler=Sampler("truncate:0.7", 1))
+        generator(noise)
+    made = generator(noise, draws=Draws(0, range(2)), sampler=build_sampler("direct", truncation=0.7))
     assert made.evaluations.tolist() == [1, 1]
     assert float(made.x.abs().max()) <= 1
 

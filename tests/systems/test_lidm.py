@@ -24,6 +24,7 @@ from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws
 from r2flow.registry import options_of
+from r2flow.samplers import build_sampler
 from r2flow.systems.diffusion.sampling import noised
 from r2flow.systems.latent.autoencoder import Autoencoder
 from r2flow.systems.latent.ddim import Tables, ddim, ddim_walk, noise_loss, square_root_linear, tables
@@ -318,7 +319,7 @@ def test_a_published_diffusion_gives_its_noise_and_images(published: tuple[Path,
     assert isinstance(generator, LatentDiffusion)
     assert generator.space.shape == (1, 16, 32)
     assert loaded.step == 1234
-    assert (generator.sampler.method, generator.sampler.steps) == ("ddim:1", 50)
+    assert generator.sampler == build_sampler("latent_ddim", steps=50, eta=1.0)
     with torch.no_grad():
         noise = generator.unet(io["z"], io["t"])
         assert_near(noise, io["output_ema" if averaged else "output_weights"], 5e-5)
@@ -427,35 +428,28 @@ def test_a_scan_is_a_function_of_its_number_alone():
     generator.sampler = generator.sampler.changed(steps=7)
     shape = generator.noise_shape
     three, one = Draws(0, [4, 5, 6]), Draws(0, [5])
-    many = generator.generate(three.start(shape), draws=three)
-    alone = generator.generate(one.start(shape), draws=one)
+    many = generator(three.start(shape), draws=three)
+    alone = generator(one.start(shape), draws=one)
     torch.testing.assert_close(many.x[1:2], alone.x, rtol=0, atol=1e-4)
     assert many.x.shape == (3, 1, 8, 32)
     assert many.evaluations.tolist() == [8] * 3  # 1000 // 7 = 142 goes 8 times into 1000
-    assert generator.evaluations_of(generator.sampler) == 8
+    assert generator.sampler.evaluations(generator) == 8
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"method": "euler"}, "sampled by ddim:ETA"),
-        ({"method": "ddim:2"}, "eta of ddim:ETA must lie in"),
-        ({"method": "ddpm"}, "sampled by ddim:ETA"),
+        ({"name": "euler"}, "velocity"),
+        ({"eta": 2.0}, "eta"),
+        ({"name": "ddpm"}, "denoise"),
         ({"steps": 1000}, "in 1 to 999"),
-        ({"grid": "power:2"}, "steps are its own"),
+        ({"grid": "power:2"}, "grid"),
     ],
 )
 def test_a_sampler_that_a_latent_diffusion_does_not_have_is_refused(changes: dict[str, Any], said: str):
     generator = build_generator(DIFFUSION)
     with pytest.raises(InputError, match=said):
-        generator.check_sampler(generator.sampler.changed(**changes))
-
-
-def test_a_latent_diffusion_names_what_is_other_and_takes_any_precision():
-    generator = build_generator(DIFFUSION)
-    generator.check_sampler(generator.sampler.changed(precision="bf16-mixed"))
-    with pytest.raises(InputError, match=r"leave out what is other, finish 0\.1\.$"):
-        generator.check_sampler(generator.sampler.changed(precision="bf16-mixed", finish=0.1))
+        generator.choose(**changes)
 
 
 def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():

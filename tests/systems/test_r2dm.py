@@ -18,7 +18,7 @@ from r2flow.backbones import Backbone, build_backbone
 from r2flow.callbacks.ema import ema_decay
 from r2flow.cli.verbs import app
 from r2flow.errors import InputError
-from r2flow.generators import Sampler, build_generator
+from r2flow.generators import build_generator
 from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import unproject
@@ -27,12 +27,13 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint
 from r2flow.noise import Draws
 from r2flow.reports.outputs import write_samples
+from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
 from r2flow.stages.base import learning_rate_factor
 from r2flow.systems.diffusion.generator import Diffusion
 from r2flow.systems.diffusion.log_snr import SCHEDULES, Cosine, alpha_sigma, log_snr_of, straight_time
 from r2flow.systems.diffusion.objectives import ERRORS, PREDICTIONS, mean_errors, weighted_mean
-from r2flow.systems.diffusion.sampling import eta_of, forward_step, noised, repaint, step, walk
+from r2flow.systems.diffusion.sampling import forward_step, noised, repaint, step, walk
 from r2flow.training import build, compose, fit
 
 CONFIG: dict[str, Any] = {
@@ -268,7 +269,7 @@ def test_a_published_checkpoint_predicts_what_its_authors_did(shared, averaged):
     assert sum(p.numel() for p in diffusion.parameters()) == expected["parameters"]
     assert (found.format, found.step, found.sensor.min_range, found.sensor.max_range) == ("published", 3, 1.45, 80.0)
     assert found.encoding.limits == "open"
-    assert diffusion.sampler == Sampler("ddpm", 256)
+    assert diffusion.sampler == build_sampler("ddpm", steps=256)
 
 
 def r2flow(*words: Any) -> None:
@@ -283,7 +284,7 @@ def test_a_published_checkpoint_is_sampled_and_evaluated(shared, tmp_path):
     with torch.no_grad():
         diffusion = load_checkpoint(path).generator
         noise = Draws(0, [1]).start(diffusion.noise_shape)
-        made = diffusion.generate(noise, sampler=Sampler("ddpm", 2), draws=Draws(0, [1]))
+        made = diffusion(noise, sampler=build_sampler("ddpm", steps=2), draws=Draws(0, [1]))
     np.testing.assert_allclose(images[1], diffusion.space.decode(made.x)[0], rtol=0, atol=1e-3)
     few = ["--num", 2, "--real-num", 2, "--workers", 0, "--no-cache", "--metrics", "jsd"]
     r2flow("evaluate", "simulated:7", "-c", path, *few, "--steps", "1,2", "-o", tmp_path)
@@ -293,8 +294,8 @@ def test_a_published_checkpoint_is_sampled_and_evaluated(shared, tmp_path):
 
 def test_a_sampler_is_refused_before_anything_is_said(shared, tmp_path, caplog):
     loaded = load_checkpoint(shared / "oracle_baselines" / "r2dm_published.pth")
-    with pytest.raises(InputError, match="no solver named 'langevin'; known: ddpm, ddim:ETA"):
-        write_samples(loaded, tmp_path / "out", 1, 0, Sampler("langevin", 2))
+    with pytest.raises(InputError, match="langevin"):
+        write_samples(loaded, tmp_path / "out", 1, 0, build_sampler("langevin", steps=2))
     assert not caplog.records
     assert not (tmp_path / "out").exists()
 
@@ -379,13 +380,6 @@ def test_forward_steps_add_up_to_the_noise_of_their_end():
     torch.testing.assert_close(variance, last_sigma.square() * one)
 
 
-def test_names_of_samplers_say_eta():
-    assert [eta_of(name) for name in ("ddpm", "ddim", "ddim:0.25", "adams3")] == [1.0, 0.0, 0.25, None]
-    for name in ("ddim:2", "ddim:", "ddim:nan"):
-        with pytest.raises(InputError, match=r"must lie in \[0, 1\]"):
-            eta_of(name)
-
-
 class Exact(Diffusion):
     """Of data ~ N(mean, std^2): E[eps | z] = sigma (z - alpha mean) / (alpha^2 std^2 + sigma^2)."""
 
@@ -408,8 +402,11 @@ def exact() -> Exact:
 def test_a_diffusion_is_the_flow_of_its_own_data(exact):
     """The straight flow of N(m, s^2) carries x_0 to m + s x_0; the schedule ends where sigma is 6e-4."""
     noise = Draws(0, [0]).start(exact.noise_shape)
-    for sampler in (Sampler("dopri5", tolerance=1e-7), Sampler("ddim", 1000)):
-        found = exact.generate(noise, sampler=sampler)
+    for sampler in (
+        build_sampler("dopri5", tolerance=1e-7),
+        build_sampler("ddim", steps=1000),
+    ):
+        found = exact(noise, sampler=sampler)
         torch.testing.assert_close(found.x, exact.mean + exact.std * noise, rtol=0, atol=2e-3)
     s = torch.tensor([0.1, 0.5, 0.9])
     torch.testing.assert_close(straight_time(log_snr_of(s)), s)
@@ -422,7 +419,7 @@ def test_a_scan_is_completed_with_a_diffusion_as_with_any_flow(exact):
     known = torch.zeros_like(noise)
     known[..., ::2] = 1
     condition = {"image": image * known, "known": known}
-    found = exact.generate(noise, condition, sampler=Sampler("replace", 500), draws=draws).x
+    found = exact(noise, condition, sampler=build_sampler("replace", steps=500), draws=draws).x
     torch.testing.assert_close(found * known, image * known, rtol=0, atol=0)
     torch.testing.assert_close(found[..., 1::2], (exact.mean + exact.std * noise)[..., 1::2], rtol=0, atol=0.01)
 
@@ -431,7 +428,7 @@ def test_a_scan_is_completed_with_a_diffusion_as_with_any_flow(exact):
 def test_ancestral_scans_have_the_spread_that_their_steps_leave(exact):
     """Each step is affine in z, and its variance that of Ho et al. 2020, eq. 7, with the expected data in it."""
     draws, steps = Draws(0, range(16)), 32
-    found = exact.generate(draws.start(exact.noise_shape), sampler=Sampler("ddpm", steps), draws=draws)
+    found = exact(draws.start(exact.noise_shape), sampler=build_sampler("ddpm", steps=steps), draws=draws)
     signal = Cosine()(torch.linspace(1, 0, steps + 1, dtype=torch.float64)).sigmoid().tolist()
     mean, variance, m, v = 0.0, 1.0, exact.mean, exact.std**2
     for here, there in pairwise(signal):
@@ -448,57 +445,51 @@ def test_ancestral_scans_have_the_spread_that_their_steps_leave(exact):
 @torch.no_grad()
 def test_evaluations_are_counted_and_scans_do_not_depend_on_their_batch(exact):
     calls = []
-    sampler = Sampler("ddim:0.5", 5)
+    sampler = build_sampler("ddim", eta=0.5, steps=5)
     noise = Draws(0, [0, 1]).start(exact.noise_shape)
-    two = exact.generate(noise, sampler=sampler, draws=Draws(0, [0, 1]), progress=lambda: calls.append(1))
-    one = exact.generate(noise[1:], sampler=sampler, draws=Draws(0, [1]))
+    two = exact(noise, sampler=sampler, draws=Draws(0, [0, 1]), progress=lambda: calls.append(1))
+    one = exact(noise[1:], sampler=sampler, draws=Draws(0, [1]))
     torch.testing.assert_close(one.x, two.x[1:], rtol=0, atol=1e-6)
-    assert len(calls) == exact.evaluations_of(sampler) == int(two.evaluations[0]) == 5
-    assert exact.evaluations_of(Sampler("heun2", 5)) == 10
-    assert exact.in_steps(8) == Sampler("ddpm", 8)
+    assert len(calls) == sampler.evaluations(exact) == int(two.evaluations[0]) == 5
+    assert build_sampler("heun2", steps=5).evaluations(exact) == 10
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("method", ["ddpm", "euler"])
 def test_a_part_of_the_image_has_the_noise_of_the_whole(exact, method):
     """The expected noise of a pixel is a function of that pixel here, and so is the scan."""
-    region, draws, sampler = Region((8, 32), 0, 8, 8, 16), Draws(0, [4]), Sampler(method, 3)
+    region, draws, sampler = Region((8, 32), 0, 8, 8, 16), Draws(0, [4]), build_sampler(method, steps=3)
     noise = draws.start(exact.noise_shape)
-    whole = exact.generate(noise, sampler=sampler, draws=draws)
-    part = exact.part(region).generate(region.crop(noise), sampler=sampler, draws=draws)
+    whole = exact(noise, sampler=sampler, draws=draws)
+    part = exact.part(region)(region.crop(noise), sampler=sampler, draws=draws)
     torch.testing.assert_close(part.x, region.crop(whole.x), rtol=0, atol=1e-6)
 
 
-REFUSED = {
-    "ddim:1.5": "must lie in",
-    "ddpm finish": "finish",
-    "jump": "jump is for flow maps",
-}
+def test_a_sampler_that_a_diffusion_does_not_have_is_refused(exact):
+    for wrong in ("ddim:eta=1.5", "ddpm:finish=0.1"):
+        with pytest.raises(InputError, match=wrong.split(":")[1].split("=")[0]):
+            build_sampler(wrong)
+    with pytest.raises(InputError, match="map"):
+        exact.choose("jump")
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_a_sampler_that_a_diffusion_does_not_have_is_refused(exact, case):
-    method, _, finish = case.partition(" ")
-    with pytest.raises(InputError, match=REFUSED[case]):
-        exact.check_sampler(Sampler(method, 4, finish=0.1 if finish else 0.0))
-
-
-@pytest.mark.parametrize(("method", "draws"), [("ddpm", True), ("ddim:0.3", True), ("ddim", False), ("adams3", False)])
-def test_which_samplers_draw_noise_on_the_way(exact, method, draws):
-    """What is straightened is drawn by none of them: its pairs belong to their first noise."""
-    exact.sampler = Sampler(method, 4)
-    assert exact.draws_noise(exact.sampler) is draws
-    assert not exact.draws_noise(ode_sampler(exact))
+@pytest.mark.parametrize(
+    ("text", "draws"), [("ddpm", True), ("ddim:eta=0.3", True), ("ddim", False), ("adams3", False)]
+)
+def test_which_samplers_draw_noise_on_the_way(exact, text, draws):
+    exact.sampler = build_sampler(text, steps=4)
+    assert exact.sampler.draws is draws
+    assert ode_sampler(exact).paired
 
 
 def test_what_a_diffusion_cannot_do_is_said(exact):
     noise = torch.zeros(1, *exact.noise_shape)
-    with pytest.raises(InputError, match="ddpm draws further noise"):
-        exact.generate(noise)
-    with pytest.raises(InputError, match="goes from noise to data alone"):
+    with pytest.raises(InputError, match="give draws"):
+        exact(noise)
+    with pytest.raises(InputError, match="paths"):
         exact.solve(noise)
-    with pytest.raises(InputError, match="trained without a condition"):
-        exact.generate(noise, {"image": noise}, draws=Draws(0, [0]))
+    with pytest.raises(InputError, match="condition"):
+        exact(noise, {"image": noise}, draws=Draws(0, [0]))
     with pytest.raises(InputError, match="highest to lowest"):
         Cosine(3, 3)
     flow = build_generator({**CONFIG, "generator": {"name": "rectified_flow"}})
@@ -533,7 +524,7 @@ def test_a_run_goes_on_bit_by_bit_and_is_sampled_as_its_config_says(tmp_path):
         assert all(torch.equal(value, found[1][key][name]) for name, value in found[0][key].items())
     trained = load_checkpoint(whole).generator
     assert isinstance(trained, Diffusion)
-    assert trained.sampler == Sampler("ddpm", 2)
+    assert trained.sampler == build_sampler("ddpm", steps=2)
     image = np.load(whole / "samples" / "000000.npy")
     assert image.shape == (2, 8, 32)
     assert np.isfinite(image).all()

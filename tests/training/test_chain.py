@@ -180,8 +180,8 @@ def test_a_killed_chain_ends_as_the_one_left_alone(
         (["experiment=reflow", "stage.init=RF1", "sensor=vlp16"], "the sensor is the parent's"),
         (["experiment=reflow", "stage.init=RF1", "data.augment.flip=true"], "data.augment changes scans"),
         (["experiment=reflow", "stage.init=RF1", "data.pairs.num=0"], "num, batch_size, steps must be at least 1"),
-        (["experiment=reflow", "stage.init=RF1", "data.pairs.method=dopri"], "Did you mean 'dopri5'"),
-        (["experiment=reflow", "stage.init=RF1", "data.pairs.method=jump"], "no solver named 'jump'"),
+        (["experiment=reflow", "stage.init=RF1", "data.pairs.sampler.name=dopri"], "Did you mean 'dopri5'"),
+        (["experiment=reflow", "stage.init=RF1", "data.pairs.sampler.name=jump"], "no solver named 'jump'"),
         (["experiment=reflow", "stage.init=RF1"], "holds other pairs: method is midpoint there, adams3 here"),
         (
             ["experiment=distill", "stage.init=RF1", "stage.steps=0", "data.root=x"],
@@ -216,7 +216,13 @@ def test_an_unfinished_parent_is_refused_and_its_checkpoint_taken(chained: tuple
 
 def test_pairs_of_a_flow_map_can_be_its_jumps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    given = ["stage.init=street", "data.root=pairs", "data.pairs.method=jump", "data.pairs.steps=4", "trainer=cpu"]
+    given = [
+        "stage.init=street",
+        "data.root=pairs",
+        "data.pairs.sampler.name=jump",
+        "data.pairs.sampler.steps=4",
+        "trainer=cpu",
+    ]
     run = build(compose(["experiment=reflow", *given]))
     assert run.data.pairs.recipe(run.data.encoding.shape).method == "jump"
 
@@ -226,8 +232,8 @@ def test_two_devices_make_the_pairs_that_one_makes(chained: tuple[Path, str], tm
     # Lightning starts the second device by the process's own command line, which must not be that of these tests.
     options = of_a_child(
         "experiment=reflow", f"stage.init={chained[0] / 'rf1'}", "trainer.strategy=ddp", "trainer.devices=2",
-        f"data.root={tmp_path / 'pairs'}", "data.pairs.num=8", "data.pairs.batch_size=4", "data.pairs.method=midpoint",
-        "data.pairs.steps=8", "trainer.max_steps=2",
+        f"data.root={tmp_path / 'pairs'}", "data.pairs.num=8", "data.pairs.batch_size=4",
+        "data.pairs.sampler.name=midpoint", "data.pairs.sampler.steps=8", "trainer.max_steps=2",
     )  # fmt: skip
     process = start(tmp_path, options)
     said, _ = process.communicate(timeout=200)
@@ -303,7 +309,7 @@ def test_the_command_line_cannot_bypass_a_link():
         # What only building finds out, in links that would run last.
         (["+chain.td2.stage.loss=l3"], "chain.td2: no loss named 'l3'"),
         (["chain.td2.stage.steps=0"], "chain.td2: stage 'distill': steps must be a whole number of at least 1"),
-        (["chain.rf2.data.pairs.method=dopri"], "chain.rf2: no solver named 'dopri'"),
+        (["chain.rf2.data.pairs.sampler.name=dopri"], "chain.rf2: no solver named 'dopri'"),
         (["+chain.td2.data.augment.flip=true"], "chain.td2: data.augment changes scans"),
         (["+chain.rf2.backbone.depths=[1,2]"], "chain.rf2: backbone.depths is [1, 2] here"),
         (["+chain.td2.callbacks.ema.every=0"], "chain.td2: callbacks.ema: every must be a whole number of at least 1"),

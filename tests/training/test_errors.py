@@ -35,7 +35,7 @@ from tests.training.conftest import Run
         (["stage.time.name=discrete"], ["needs the option 'k'"]),
         (["backbone.depths=3"], ["depths must be a list"]),
         (["seed=-1"], ["seed must be a whole number", "-1"]),
-        (["sampler.method=eulr"], ["Did you mean 'euler'?"]),
+        (["sampler.name=eulr"], ["Did you mean 'euler'?"]),
         (["sampler.steps=0"], ["steps must be a whole number of at least 1"]),
         (["callbacks.ema.every=0"], ["callbacks.ema: every must be a whole number of at least 1"]),
         (["+data.validation.data={name: folder, root: x, splt: test}"], ["no option 'splt'", "Did you mean 'split'?"]),

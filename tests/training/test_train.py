@@ -180,9 +180,9 @@ def test_a_moved_run_goes_on(train: Run, alone: tuple[Path, str], copied: Path):
 
 def test_another_sampler_for_a_finished_run_is_refused(train: Run, copied: Path):
     before = (copied / "config.yaml").read_text()
-    done = train("name=copied", "sampler.method=euler", check=False)
+    done = train("name=copied", "sampler.name=euler", check=False)
     assert done.returncode == 2
-    assert "runs/copied is finished and keeps its sampler: sampler.method=None there, euler here" in done.stderr
+    assert "runs/copied is finished and keeps its sampler: sampler.name=None there, euler here" in done.stderr
     assert (copied / "config.yaml").read_text() == before
 
 

@@ -1,7 +1,7 @@
 """ODE solvers: dx/dt = v(t, x) from one end of the flow to the other."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -25,12 +25,11 @@ from r2flow.flow.solvers.grids import build_grid, extended, halved, named_grid, 
 from r2flow.flow.solvers.multistep import adams
 from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite, flat, wide
 from r2flow.flow.solvers.step_size import Limits
-from r2flow.flow.stochastic import churn_of
-from r2flow.registry import Registry, did_you_mean
+from r2flow.registry import Registry
 
 __all__ = [
     "LEAST_TOLERANCE", "SOLVERS", "TORCHDIFFEQ", "EmbeddedMethod", "FixedStep", "Solution", "Velocity", "adapts",
-    "check_knots", "check_method", "check_tolerance", "fixed_step", "knot_times", "named_grid", "solve", "usual_grid",
+    "check_method", "check_tolerance", "fixed_step", "named_grid", "solve", "usual_grid",
 ]  # fmt: skip
 
 SOLVERS: Registry[FixedStep | EmbeddedMethod | ExponentialMethod] = Registry(
@@ -92,8 +91,7 @@ def solve(
             warning.
         progress: Called after every evaluation.
         grid: Time grid of a fixed-step method: `uniform`, `power:P` (t = 1 - (1 - u)^P), `power-start:P` (t = u^P),
-            `late:K` (`r2flow.flow.solvers.grids.late`) or the times themselves, (N + 1,) from t_0 to where `finish`
-            begins.
+            or the times themselves, (N + 1,) from t_0 to where `finish` begins.
         finish: Length of the last part of the interval, which one Euler step takes: 1e-3 avoids a velocity that is
             singular at t_1.
         max_evaluations: Budget of a scene in an adaptive method.
@@ -102,7 +100,7 @@ def solve(
             longer than a 128th.
         global_error: Estimate the error at t_1 by a second solution, with half the steps' lengths or a sixtieth of the
             tolerance (a tenth, where the budget ends before) and of `finish`; its evaluations are counted.
-        knots: Inner states to keep, at `knot_times`, of a method of fixed steps on a named grid or of an adaptive one,
+        knots: Inner states to keep, of a method of fixed steps on a named grid or of an adaptive one,
             which is solved from each to the next. Not with `finish`.
 
     Raises:
@@ -206,22 +204,16 @@ def _with_global_error(solution: Solution, run: _Run, velocity: Velocity, x: Ten
     return replace(solution, evaluations=evaluations, global_error=error, estimate_evaluations=extra)
 
 
-def check_method(method: str, others: Iterable[str] = ()) -> None:
+def check_method(method: str) -> None:
     """Check the name of a solver.
-
-    Args:
-        others: What may stand in its place here, to be named with the solvers.
 
     Raises:
         InputError: an unknown method.
     """
     if method.startswith(TORCHDIFFEQ):
         check_torchdiffeq(method.removeprefix(TORCHDIFFEQ))
-    elif churn_of(method) is not None:
-        raise InputError(f"{method} draws noise on the way; give a solver of the ODE, such as adams3.")
     elif method not in SOLVERS:
-        known = [*others, *sorted(SOLVERS)]
-        raise InputError(f"no solver named {method!r}; known: {', '.join(known)}.{did_you_mean(method, known)}")
+        SOLVERS[method]  # which refuses it
 
 
 def check_knots(method: str, steps: int, knots: int) -> None:
@@ -236,14 +228,6 @@ def check_knots(method: str, steps: int, knots: int) -> None:
         raise InputError(f"{method} keeps no knots; take one of our own solvers, such as adams3.")
     if not adapts(method) and steps % (knots + 1):
         raise InputError(f"{steps} steps have no {knots} inner knots: the steps must be a multiple of {knots + 1}.")
-
-
-def knot_times(method: str, grid: str, knots: int) -> Tensor:
-    """The times from 0 to 1 of both ends and of the inner knots that a method keeps, (K + 2,) float64.
-
-    They are equally many fixed steps apart, or equally long times for an adaptive method.
-    """
-    return named_grid("uniform" if adapts(method) else grid)(0.0, 1.0, knots + 1)
 
 
 def check_tolerance(tolerance: float) -> None:

@@ -28,30 +28,16 @@ def power_start(t_0: float, t_1: float, steps: int, p: float) -> Tensor:
     return _powers(t_0, t_1, steps, p)
 
 
-def late(t_0: float, t_1: float, steps: int, k: float) -> Tensor:
-    """One long step, the rest near t = 1: there 1 - t falls evenly on a log scale about 1 / k, from at most 2 / k.
-
-    1 - t_j = 2^(1 - (2 j - 1) / (N - 1)) / k for j = 1 to N - 1 of N steps from 0 to 1; in two steps the one inner time
-    is 1 - 1 / k. Of another interval they are the same shares.
-    """
-    share = (2 * torch.arange(1, steps, dtype=torch.float64) - 1) / max(steps - 1, 1)
-    rising = torch.cat([torch.zeros(1), 1 - 2 ** (1 - share) / k, torch.ones(1)])
-    return t_0 + (t_1 - t_0) * rising if t_0 <= t_1 else (t_1 + (t_0 - t_1) * rising).flip(0)
-
-
 def _powers(start: float, end: float, steps: int, p: float) -> Tensor:
     """The p-th powers of equal steps, from `start` to `end`."""
     return uniform(start ** (1 / p), end ** (1 / p), steps) ** p
 
 
-# each with the range of its number
-NAMED: dict[str, tuple[Callable[[float, float, int, float], Tensor], float, float]] = {
-    "power": (power, 1, 10), "power-start": (power_start, 1, 10), "late": (late, 4, 1e6),
-}  # fmt: skip
+NAMED = {"power": power, "power-start": power_start}
 
 
 def named_grid(name: str) -> Callable[[float, float, int], Tensor]:
-    """The times of a grid by its name: uniform, power:P or power-start:P with 1 <= P <= 10, late:K with 4 <= K <= 1e6.
+    """The times of a grid by its name: uniform, power:P or power-start:P with 1 <= P <= 10.
 
     Forward and backward in time they are the same.
 
@@ -62,16 +48,12 @@ def named_grid(name: str) -> Callable[[float, float, int], Tensor]:
         return uniform
     kind, _, text = name.partition(":")
     try:
-        number = float(text)
+        p = float(text)
     except ValueError:
-        number = math.nan
-    if kind not in NAMED or not NAMED[kind][1] <= number <= NAMED[kind][2]:
-        raise InputError(
-            f"a time grid is uniform, power:P or power-start:P with P from 1 to 10, or late:K with K from 4 to 1e6; "
-            f"found {name!r}."
-        )
-    times = NAMED[kind][0]
-    return lambda t_0, t_1, steps: times(t_0, t_1, steps, number)
+        p = math.nan
+    if kind not in NAMED or not 1 <= p <= 10:
+        raise InputError(f"a time grid is uniform, power:P or power-start:P with P from 1 to 10; found {name!r}.")
+    return lambda t_0, t_1, steps: NAMED[kind](t_0, t_1, steps, p)
 
 
 def build_grid(grid: str | Tensor, t_0: float, t_1: float, steps: int) -> Tensor:

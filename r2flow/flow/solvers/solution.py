@@ -29,7 +29,7 @@ class Solution:
         global_error: Estimated root mean square error over a scene's elements, (B,) float64; inf where there is no
             estimate; None when not asked for.
         estimate_evaluations: Those of the evaluations that the estimate took, (B,) int64; None when not asked for.
-        knots: Inner states that were asked for, (B, K, ...), at the times of `knot_times`; None when not asked for.
+        knots: Inner states that were asked for, (B, K, ...); None when not asked for.
     """
 
     x: Tensor

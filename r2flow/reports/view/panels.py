@@ -21,6 +21,7 @@ from r2flow.noise import Draws
 from r2flow.reports.outputs import ScanBar, warn_unsolved
 from r2flow.reports.view import write_page
 from r2flow.reports.views import View
+from r2flow.samplers import OnGrid
 
 
 @dataclass(frozen=True)
@@ -80,12 +81,9 @@ def sample_panels(flow: Checkpoint, label: str, num: int, seed: int = 0, steps: 
     Raises:
         InputError: numbers of steps that the generator cannot take.
     """
-    own = flow.generator.sampler
-    samplers = [own.changed(steps=count) for count in steps] or [own]
-    for one in samplers:
-        flow.generator.check_sampler(one)
+    samplers = [flow.generator.choose(steps=count) for count in steps] or [flow.generator.sampler]
     drawn = []
-    evaluations = num * sum(flow.generator.evaluations_of(one) for one in samplers)
+    evaluations = num * sum(one.evaluations(flow.generator) or 0 for one in samplers)
     with ScanBar("sampling", num * len(samplers), evaluations) as bar:
         for one in samplers:
             images = []
@@ -115,13 +113,13 @@ def way_panels(
     if times < 2:
         raise InputError(f"a way has two ends: --times must be at least 2, found {times}.")
     solved = as_flow(flow.generator, "x_t")
-    how = ode_sampler(solved).changed(steps=steps)
-    share = how.changed(steps=math.ceil(how.steps / (times - 1)), grid="uniform", finish=0.0)
-    solved.check_sampler(share)
+    share = ode_sampler(solved).changed(steps=steps)
+    if isinstance(share, OnGrid):
+        share = share.changed(steps=math.ceil(share.steps / (times - 1)), grid="uniform")
     x = Draws(seed, range(num)).start(solved.noise_shape)
     at = [i / (times - 1) for i in range(times)]
     decoded = [flow.encoding.decode(x)]
-    with ScanBar("solving", times - 1, (times - 1) * solved.evaluations_of(share)) as bar:
+    with ScanBar("solving", times - 1, (times - 1) * (share.evaluations(solved) or 0)) as bar:
         for t_0, t_1 in pairwise(at):
             x = solved.solve(x, t_0, t_1, sampler=share, progress=bar.evaluated).x
             decoded.append(flow.encoding.decode(x.cpu()))

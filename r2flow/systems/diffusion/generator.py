@@ -1,33 +1,29 @@
 """A diffusion: a network that predicts noise or data, sampled step by step or as the flow that it also is."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import count
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from r2flow.backbones import Pyramid
 from r2flow.errors import InputError
-from r2flow.flow.solvers import Solution
-from r2flow.flow.solvers.solution import finite, wide
-from r2flow.generators.base import Condition, Generated, Progress, Sampler
-from r2flow.generators.flow import UNTOLD, NetworkFlow
+from r2flow.flow.solvers.solution import finite
+from r2flow.generators.flow import NetworkFlow
 from r2flow.lidar.space import ModelSpace
-from r2flow.noise import Draws
-from r2flow.registry import Positive
+from r2flow.registry import Bound, Positive
+from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Steps
 from r2flow.systems.diffusion.log_snr import SCHEDULES, alpha_sigma, for_images, log_snr_of, straight_time
 from r2flow.systems.diffusion.objectives import PREDICTIONS
-from r2flow.systems.diffusion.sampling import DDIM, DDPM, eta_of, walk
+from r2flow.systems.diffusion.sampling import walk
 
 
 class Diffusion(NetworkFlow):
     """y(z_t, lambda_t) by a backbone whose time is the log-SNR lambda, as R2DM (Nakashima and Kurazume 2024).
 
-    Samplers beside a flow's solvers:
-
-    - `ddpm`: ancestral steps;
-    - `ddim`, `ddim:ETA`: without new noise, or with the share ETA of it.
+    Its samplers are `DDPM`, `DDIM` and a flow's.
 
     As a flow it follows the diffusion's probability-flow ODE along straight lines: a line's state x_s = s x_1 +
     (1 - s) x_0 is z_t / (alpha_t + sigma_t) at the t where alpha_t / (alpha_t + sigma_t) = s, so that
@@ -44,7 +40,7 @@ class Diffusion(NetworkFlow):
         clip: Expected data are clamped to [-clip, clip] whenever scans are made; null leaves them as they are.
     """
 
-    other_samplers = DDPM, f"{DDIM}:ETA", *NetworkFlow.other_samplers
+    plain = "ddpm"
 
     def __init__(
         self,
@@ -59,7 +55,7 @@ class Diffusion(NetworkFlow):
             raise InputError("a pyramid needs the time of straight lines, and a diffusion has another: choose hdit.")
         self.prediction, self.clip, self.answer = PREDICTIONS[prediction], clip, f"{prediction}(z, log-SNR)"
         self.schedule = SCHEDULES.build(schedule or {"name": "cosine"})
-        self.sampler = Sampler(DDPM, 256)  # as the published scripts
+        self.run_by(DDPM(256))  # as the published scripts
         ends = torch.tensor([1.0, 0.0], dtype=torch.float64, device="cpu")  # numbers, also under the meta device
         self._ends = straight_time(self.schedule(ends)).tolist()
 
@@ -74,74 +70,51 @@ class Diffusion(NetworkFlow):
         return x if self.clip is None else x.clamp(-self.clip, self.clip) + 0 * x  # NaN of what is not finite
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
-        if condition is not None:
-            raise InputError(UNTOLD)
+        assert condition is None
         log_snr = log_snr_of(torch.as_tensor(t, device=x.device).clamp(*self._ends))
         alpha, sigma = alpha_sigma(for_images(log_snr, x))
         z = (alpha + sigma) * x
         clean = self.denoise(z, log_snr)
         return clean - (z - alpha * clean) / sigma
 
-    @torch.no_grad()
-    def solve(
-        self, x: Tensor, t_0: float = 0.0, t_1: float = 1.0, *, sampler: Sampler | None = None, **options: Any
-    ) -> Solution:
-        how = sampler or self.sampler
-        if eta_of(how.method) is not None:
-            raise InputError(f"{how.method} goes from noise to data alone: give a flow's solver, as --solver adams3.")
-        return super().solve(x, t_0, t_1, sampler=how, **options)
 
-    def generate(
+@dataclass(frozen=True)
+class DDIM(OnGrid):
+    """Steps from log-SNR to log-SNR of the schedule (Song et al. 2021).
+
+    Attributes:
+        eta: Share of fresh noise: 0 without, 1 for ancestral steps.
+    """
+
+    paired: ClassVar[bool] = False
+    needs: ClassVar[str] = "denoise"
+
+    steps: Steps = 256
+    eta: Annotated[float, Bound("in [0, 1]", lambda eta: 0 <= eta <= 1)] = 0.0
+
+    @property
+    def draws(self) -> bool:  # type: ignore[override]
+        return self.eta > 0
+
+    def __call__(
         self,
+        generator: Any,
         noise: Tensor,
         condition: Condition | None = None,
-        *,
-        sampler: Sampler | None = None,
-        draws: Draws | None = None,
+        draws: Noise | None = None,
         progress: Progress = None,
     ) -> Generated:
-        how = sampler or self.sampler
-        eta = eta_of(how.method)
-        if eta is None:
-            return super().generate(noise, condition, sampler=how, draws=draws, progress=progress)
-        if condition is not None:
-            raise InputError(UNTOLD)
-        if eta and draws is None:
-            raise InputError(f"{how.method} draws further noise: give draws.")
-        z, steps = wide(noise.to(self.device)), count(1)
+        lambdas, z, j = generator.schedule(1 - self.times()).to(noise), noise, count(1)
+        for following in walk(generator.denoise, z, lambdas, self.eta, lambda: draws(next(j))):  # type: ignore[misc]
+            z = following
+            if progress is not None:
+                progress()
+        clip = generator.clip
+        return Generated.after(z if clip is None else z.clamp(-clip, clip), self.steps, finite(z))
 
-        def drawn() -> Tensor:
-            assert draws is not None
-            return self.further_noise(draws, next(steps)).to(z)
 
-        with torch.no_grad():
-            for following in walk(self.denoise, z, self._log_snrs(how).to(z), eta, drawn):
-                z = following
-                if progress is not None:
-                    progress()
-        return Generated.after(z if self.clip is None else z.clamp(-self.clip, self.clip), how.steps, finite(z))
+@dataclass(frozen=True)
+class DDPM(DDIM):
+    """Ancestral steps."""
 
-    def _log_snrs(self, how: Sampler) -> Tensor:
-        """Of the sampler's grid, whose times run from noise to data, (N + 1,) float64."""
-        log_snrs: Tensor = self.schedule(1 - self._times(how))
-        return log_snrs
-
-    def check_sampler(self, sampler: Sampler) -> None:
-        if eta_of(sampler.method) is None:
-            try:
-                super().check_sampler(sampler)
-            except InputError as error:
-                raise InputError(f"a diffusion has ddpm, ddim:ETA and a flow's solvers: {error}") from None
-            return
-        if sampler.finish:
-            raise InputError(f"{sampler.method} has no finish; leave it out, or give a solver.")
-        self._log_snrs(sampler)
-
-    def draws_noise(self, sampler: Sampler) -> bool:
-        return bool(eta_of(sampler.method)) or super().draws_noise(sampler)
-
-    def evaluations_of(self, sampler: Sampler) -> int:
-        return super().evaluations_of(sampler) if eta_of(sampler.method) is None else sampler.steps
-
-    def in_steps(self, steps: int) -> Sampler:
-        return Sampler(DDPM if eta_of(self.sampler.method) is None else self.sampler.method, steps)
+    eta: Annotated[float, Bound("in [0, 1]", lambda eta: 0 <= eta <= 1)] = 1.0

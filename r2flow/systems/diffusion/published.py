@@ -24,7 +24,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     weights = {
         BACKBONE + name.removeprefix(NETWORK): value for name, value in state.items() if name.startswith(NETWORK)
     }
-    sampler = {"method": "ddpm", "steps": 256}
+    sampler = {"name": "ddpm", "steps": 256}
     return Published(config, weights, int(content.get("global_step", 0)), sampler, follow_rings)
 
 

@@ -9,28 +9,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
 from r2flow.systems.diffusion.log_snr import alpha_sigma, for_images
 
 Denoise = Callable[[Tensor, Tensor], Tensor]  # x of (z, log-SNR), the latter of shape ()
 Noise = Callable[[], Tensor]  # the next draw of N(0, I), in the shape of z
-
-DDPM, DDIM = "ddpm", "ddim"
-
-
-def eta_of(method: str) -> float | None:
-    """eta of a sampler's name: `ddpm` is 1, `ddim` is 0, `ddim:ETA` is what it says; None for another method."""
-    if method in (DDPM, DDIM):
-        return float(method == DDPM)
-    if not method.startswith(f"{DDIM}:"):
-        return None
-    try:
-        eta = float(method.removeprefix(f"{DDIM}:"))
-    except ValueError:
-        eta = -1.0
-    if not 0 <= eta <= 1:
-        raise InputError(f"the eta of {DDIM}:ETA must lie in [0, 1], as {DDIM}:0.5; found {method!r}.")
-    return eta
 
 
 def noised(x: Tensor, log_snr: Tensor, eps: Tensor) -> Tensor:

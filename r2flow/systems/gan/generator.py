@@ -1,30 +1,29 @@
 """GANs: x = G(z) in one evaluation, with a mask of dropped rays or without."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.solvers.solution import finite
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
+from r2flow.generators.base import Generator
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
-from r2flow.registry import Count, Positive
+from r2flow.registry import Bound, Count, Positive
+from r2flow.samplers.base import Condition, Generated, Noise, Progress, Sampler
 from r2flow.systems.gan import dcgan, style_gan
 from r2flow.systems.gan.layers import LatentGenerator
 
-DIRECT, TRUNCATE = "direct", "truncate:"
 DROPPED = -1.0  # a dropped ray in model space
 
 
 class Gan(Generator):
     """x = G(z) clamped to [-1, 1], with z of N(0, I).
 
-    Samplers: `direct`; `truncate:PSI` moves each code towards the mean one, w <- w_avg + PSI (w - w_avg) with PSI in
-    (0, 1], for plainer scans that are closer to each other (0.7 in DUSty's published demo).
+    Its sampler is `Direct`.
 
     Args:
         space: The images it makes.
@@ -39,7 +38,7 @@ class Gan(Generator):
         channels, h, w = space.shape
         network = build((h, w), channels)
         super().__init__(space, noise_shape=(network.latent,))
-        self.sampler = Sampler(DIRECT, 1, fixed=True)
+        self.run_by(Direct())
         self.network = network
 
     @property
@@ -53,61 +52,43 @@ class Gan(Generator):
         made: dict[str, Tensor] = self.network(z, truncation=truncation, uniform=uniform)
         return made
 
-    @torch.no_grad()
-    def generate(
-        self,
-        noise: Tensor,
-        condition: Condition | None = None,
-        *,
-        sampler: Sampler | None = None,
-        draws: Draws | None = None,
-        progress: Progress = None,
-    ) -> Generated:
-        if condition is not None:
-            raise InputError(f"a {type(self).__name__} takes no condition; leave it out.")
-        z, uniform = noise.to(self.device), None
-        if self.drops:
-            if draws is None:
-                raise InputError(f"a {type(self).__name__} draws a mask, whose noise is of draws: give them.")
-            normal = draws.step((1, *self.space.shape[1:]), 1)
-            uniform = torch.special.ndtr(normal.double()).to(z)
-        made = self.made(z, uniform, truncation=truncation_of(sampler or self.sampler))
-        if progress is not None:
-            progress()
-        return Generated.after(made["image"].clamp(-1, 1), 1, finite(made["image"]))
+    def further_noise(self, draws: Draws, j: int) -> Tensor:
+        return draws.step((1, *self.space.shape[1:]), j)
 
-    def check_sampler(self, sampler: Sampler) -> None:
-        known = sampler.method == DIRECT or sampler.method.startswith(TRUNCATE)
-        if not known or replace(sampler, method=self.sampler.method) != self.sampler:
-            raise InputError(
-                f"a {type(self).__name__} makes a scan in 1 step, by {DIRECT} or {TRUNCATE}PSI, without a tolerance or "
-                f"a time grid; found {sampler.unlike(self.sampler)}."
-            )
-        truncation_of(sampler)
 
-    def evaluations_of(self, sampler: Sampler) -> int:
+@dataclass(frozen=True)
+class Direct(Sampler):
+    """One evaluation.
+
+    Attributes:
+        truncation: psi of w <- w_avg + psi (w - w_avg): less makes plainer scans that are closer to each other (0.7 in
+            DUSty's published demo).
+    """
+
+    needs: ClassVar[str] = "made"
+
+    truncation: Annotated[float, Bound("in (0, 1]", lambda psi: 0 < psi <= 1)] = 1.0
+
+    def evaluations(self, generator: Any) -> int:
         return 1
 
-    def in_steps(self, steps: int) -> Sampler:
-        return self.sampler
-
-
-def truncation_of(sampler: Sampler) -> float:
-    """psi of a sampler.
-
-    Raises:
-        InputError: none of (0, 1].
-    """
-    if sampler.method == DIRECT:
-        return 1.0
-    said = sampler.method.removeprefix(TRUNCATE)
-    try:
-        psi = float(said)
-    except ValueError:
-        psi = 0.0
-    if not 0 < psi <= 1:
-        raise InputError(f"a truncation must lie in (0, 1], as {TRUNCATE}0.7; found {sampler.method!r}.")
-    return psi
+    def __call__(
+        self,
+        generator: Any,
+        noise: Tensor,
+        condition: Condition | None = None,
+        draws: Noise | None = None,
+        progress: Progress = None,
+    ) -> Generated:
+        uniform = None
+        if generator.drops:
+            if draws is None:
+                raise InputError(f"a {type(generator).__name__} draws a mask: give draws.")
+            uniform = torch.special.ndtr(draws(1).double()).to(noise)
+        x = generator.made(noise, uniform, truncation=self.truncation)["image"]
+        if progress is not None:
+            progress()
+        return Generated.after(x.clamp(-1, 1), 1, finite(x))
 
 
 class VanillaGan(Gan):

@@ -57,7 +57,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     def follow(generator: Generator, config: Mapping[str, Any]) -> None:
         _follow(generator, angle)
 
-    return Published(config, weights, step, {"method": "direct", "steps": 1, "fixed": True}, follow)
+    return Published(config, weights, step, None, follow)
 
 
 def _outputs(synthesis: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:

@@ -1,17 +1,17 @@
 """Generators in a smaller space than the image's: LiDM's autoencoder, and the diffusion of its latents."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler
+from r2flow.generators.base import Generator
 from r2flow.lidar.space import ModelSpace
-from r2flow.noise import Draws
-from r2flow.registry import Bound, check_options
-from r2flow.systems.diffusion.sampling import DDPM, eta_of
+from r2flow.registry import Bound, Count, check_options
+from r2flow.samplers.base import Condition, Generated, Noise, Progress, Sampler
 from r2flow.systems.latent.autoencoder import Autoencoder
 from r2flow.systems.latent.ddim import ddim, ddim_walk, square_root_linear, tables
 from r2flow.systems.latent.unet import LatentUNet
@@ -44,7 +44,7 @@ class VQAutoencoder(Generator):
         self.first_stage_model = build_autoencoder(space, autoencoder)
         self.noise_shape = self.first_stage_model.latent_shape(*space.shape[1:])
 
-    def generate(self, noise: Tensor, condition: Condition | None = None, **options: Any) -> Generated:
+    def forward(self, noise: Tensor, condition: Condition | None = None, **how: Any) -> Generated:
         raise InputError(
             "an autoencoder turns scans into latents and back and makes none of noise: give the checkpoint of a latent "
             "diffusion, or train one with experiment=lidm stage.init=FILE."
@@ -54,8 +54,7 @@ class VQAutoencoder(Generator):
 class LatentDiffusion(Generator):
     """eps(z_t, t) by a U-Net on an autoencoder's latents, sampled by DDIM and decoded: LiDM (Ran et al. 2024).
 
-    Latents become codes when they are decoded, not before. The sampler `ddim:ETA` takes every (N // steps)-th of the
-    diffusion's N steps, `r2flow.systems.latent.ddim.ddim_walk`.
+    Latents become codes when they are decoded, not before. Its sampler is `LatentDDIM`.
 
     Args:
         space: The images it makes.
@@ -79,7 +78,7 @@ class LatentDiffusion(Generator):
         diffusion_steps: Steps = 1000,
     ) -> None:
         super().__init__(space)
-        self.sampler = Sampler("ddim:1", 50)
+        self.run_by(LatentDDIM())
         self.first_stage_model = build_autoencoder(space, autoencoder)
         self.noise_shape = shape = self.first_stage_model.latent_shape(*space.shape[1:])
         check_options("generator.unet", LatentUNet, unet or {}, given=1)
@@ -95,46 +94,6 @@ class LatentDiffusion(Generator):
         assert isinstance(network, LatentUNet)
         return network
 
-    @torch.no_grad()
-    def generate(
-        self,
-        noise: Tensor,
-        condition: Condition | None = None,
-        *,
-        sampler: Sampler | None = None,
-        draws: Draws | None = None,
-        progress: Progress = None,
-    ) -> Generated:
-        if condition is not None:
-            raise InputError("a latent diffusion was trained without a condition and cannot take one.")
-        how, z = sampler or self.sampler, noise.to(self.device)
-        eta = _eta(how.method)
-        if eta and draws is None:
-            raise InputError(f"{how.method} draws noise in every step: give draws.")
-
-        def fresh(step: int) -> Tensor:
-            assert draws is not None
-            return draws.step(self.noise_shape, step).to(z)
-
-        walk = ddim_walk(self.alpha_bar.double(), how.steps, eta)
-        for state, _ in ddim(self.unet, z, walk, fresh):
-            z = state
-            if progress is not None:
-                progress()
-        with torch.autocast(z.device.type, enabled=False):  # what it answers is the scan, and no step follows
-            scans = self.first_stage_model.decode(z)
-        return Generated.after(scans, len(walk.times))
-
-    def check_sampler(self, sampler: Sampler) -> None:
-        ddim_walk(self.alpha_bar, sampler.steps, _eta(sampler.method))
-        plain = Sampler(sampler.method, sampler.steps, sampler.tolerance, precision=sampler.precision)
-        if sampler != plain:
-            other = sampler.unlike(plain)
-            raise InputError(f"a latent diffusion's steps are its own: leave out what is other, {other}.")
-
-    def evaluations_of(self, sampler: Sampler) -> int:
-        return len(ddim_walk(self.alpha_bar, sampler.steps, 0.0).times)
-
     def start_from(self, parent: Generator) -> None:
         """Take over an autoencoder's weights, or another latent diffusion's.
 
@@ -145,8 +104,44 @@ class LatentDiffusion(Generator):
         self._take(parent, {**new, **parent.state_dict()})
 
 
-def _eta(method: str) -> float:
-    eta = eta_of(method)
-    if eta is None or method == DDPM:
-        raise InputError(f"a latent diffusion is sampled by ddim:ETA with ETA in [0, 1], as ddim:1; found {method!r}.")
-    return eta
+@dataclass(frozen=True)
+class LatentDDIM(Sampler):
+    """Every (N // steps)-th of the diffusion's N steps (`r2flow.systems.latent.ddim.ddim_walk`), and the decoder.
+
+    Attributes:
+        eta: Share of fresh noise.
+    """
+
+    paired: ClassVar[bool] = False
+    needs: ClassVar[str] = "unet"
+
+    steps: Count = 50
+    eta: Annotated[float, Bound("in [0, 1]", lambda eta: 0 <= eta <= 1)] = 1.0
+
+    @property
+    def draws(self) -> bool:  # type: ignore[override]
+        return self.eta > 0
+
+    def evaluations(self, generator: Any) -> int:
+        return len(ddim_walk(generator.alpha_bar, self.steps, 0.0).times)
+
+    def check(self, generator: Any) -> None:
+        super().check(generator)
+        self.evaluations(generator)
+
+    def __call__(
+        self,
+        generator: Any,
+        noise: Tensor,
+        condition: Condition | None = None,
+        draws: Noise | None = None,
+        progress: Progress = None,
+    ) -> Generated:
+        walk, z = ddim_walk(generator.alpha_bar.double(), self.steps, self.eta), noise
+        for state, _ in ddim(generator.unet, z, walk, draws):  # type: ignore[arg-type]
+            z = state
+            if progress is not None:
+                progress()
+        with torch.autocast(z.device.type, enabled=False):  # what it answers is the scan, and no step follows
+            scans = generator.first_stage_model.decode(z)
+        return Generated.after(scans, len(walk.times))

@@ -61,7 +61,7 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise _garbled(error, path) from None
     weights = average if averaged else raw
-    return Published(config, dict(weights), _step(content), {"method": "ddim:1", "steps": 50})
+    return Published(config, dict(weights), _step(content), {"name": "latent_ddim"})
 
 
 def read_autoencoder(content: Any, path: Path, averaged: bool = True) -> Published:

@@ -1,21 +1,20 @@
 """Generators that follow a score down a ladder of noise levels: LiDARGen."""
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.solvers.solution import finite
-from r2flow.generators.base import Condition, Generated, Generator, Progress, Sampler, parts_of
+from r2flow.generators.base import Generator, parts_of
 from r2flow.lidar.space import ModelSpace
-from r2flow.noise import Draws
 from r2flow.registry import Count, Positive
+from r2flow.samplers.base import Condition, Generated, Noise, Progress, Sampler
 from r2flow.systems.score.langevin import annealed_langevin, noise_levels, toward
 from r2flow.systems.score.refinenet import RefineNet
-
-LANGEVIN = "langevin"
 
 
 class ScoreModel(Generator):
@@ -54,54 +53,48 @@ class ScoreModel(Generator):
         spacing: str = "geometric",
     ) -> None:
         super().__init__(space)
-        self.sampler = Sampler(LANGEVIN, 5)
+        self.run_by(Langevin())
         self.rate, self.denoise, self.pull = rate, denoise, pull
         channels, rows, columns = space.shape
         if rows % 2 or columns % 2:
             raise InputError(f"RefineNet halves the image: its height and width must be even, found {rows}x{columns}.")
         self.network = RefineNet(noise_levels(sigma_first, sigma_last, levels, spacing), channels, width)
 
-    @torch.no_grad()
-    def generate(
+
+@dataclass(frozen=True)
+class Langevin(Sampler):
+    """Annealed Langevin dynamics; a condition pulls the scan to the known rays.
+
+    Attributes:
+        steps: Steps at each noise level.
+    """
+
+    draws: ClassVar[bool] = True
+    paired: ClassVar[bool] = False
+    needs: ClassVar[str] = "pull"
+
+    steps: Count = 5
+
+    def evaluations(self, generator: Any) -> int:
+        return len(generator.network.sigmas) * self.steps + int(generator.denoise)
+
+    def __call__(
         self,
+        generator: Any,
         noise: Tensor,
         condition: Condition | None = None,
-        *,
-        sampler: Sampler | None = None,
-        draws: Draws | None = None,
+        draws: Noise | None = None,
         progress: Progress = None,
     ) -> Generated:
-        if draws is None:
-            raise InputError("annealed Langevin dynamics draws noise in every step: give draws.")
-        how = sampler or self.sampler
-        x = torch.special.ndtr(noise.to(self.device))
-
-        def fresh(step: int) -> Tensor:
-            return draws.step(self.noise_shape, step).to(x)
-
-        pull = self._pulled(condition, x)
-        steps = annealed_langevin(
-            self.network, x, self.network.sigmas, fresh, self.rate, how.steps, self.denoise, pull
-        )  # fmt: skip
-        for end in steps:
+        x, pull = torch.special.ndtr(noise), None
+        if condition is not None:
+            image, known = parts_of(condition, x)
+            pull = toward((image + 1) / 2, known, generator.pull)
+        network = generator.network
+        for end in annealed_langevin(
+            network, x, network.sigmas, draws, generator.rate, self.steps, generator.denoise, pull  # type: ignore[arg-type]
+        ):  # fmt: skip
             x = end
             if progress is not None:
                 progress()
-        return Generated.after(2 * x.clamp(0, 1) - 1, self.evaluations_of(how), finite(x))
-
-    def _pulled(self, condition: Condition | None, x: Tensor) -> Callable[[Tensor], Tensor] | None:
-        if condition is None:
-            return None
-        image, known = parts_of(condition, x)
-        return toward((image + 1) / 2, known, self.pull)
-
-    def check_sampler(self, sampler: Sampler) -> None:
-        plain = Sampler(LANGEVIN, sampler.steps)
-        if sampler != plain:
-            raise InputError(
-                f"a score model is sampled by {LANGEVIN}, in steps at each noise level and without other settings; "
-                f"found {sampler.unlike(plain)}."
-            )
-
-    def evaluations_of(self, sampler: Sampler) -> int:
-        return len(self.network.sigmas) * sampler.steps + int(self.denoise)
+        return Generated.after(2 * x.clamp(0, 1) - 1, self.evaluations(generator), finite(x))

@@ -54,7 +54,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
         config,
         {NETWORK + name: value for name, value in weights.items()},
         step,
-        {"method": "langevin", "steps": 5},
+        {"name": "langevin", "steps": 5},
     )
 
 

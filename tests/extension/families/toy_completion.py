@@ -25,8 +25,10 @@ class Completion(RectifiedFlow):
         image, mask = (known[name].to(x) for name in ("image", "mask"))
         return self.backbone(t, torch.cat([x, image * mask, mask], dim=1))
 
-    def generate(self, noise, condition=None, **options):
-        made = super().generate(noise, condition, **options)
+    told = True
+
+    def forward(self, noise, condition=None, **options):
+        made = super().forward(noise, condition, **options)
         if condition:
             made.x.copy_(torch.where(condition["mask"].to(made.x) > 0, condition["image"].to(made.x), made.x))
         return made

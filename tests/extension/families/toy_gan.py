@@ -1,25 +1,32 @@
 """A GAN: x = G(z), learned against a discriminator with the non-saturating loss (Goodfellow et al. 2014)."""
 
+from dataclasses import dataclass
 from math import prod
 
 from torch import nn
 from torch.nn.functional import softplus
 
-from r2flow.generators import GENERATORS, Generated, Generator, Sampler
+from r2flow.generators import GENERATORS, Generated, Generator
+from r2flow.samplers import SAMPLERS, Sampler
 from r2flow.stages import STAGES, Stage
 
 
 class ToyGenerator(Generator):
     def __init__(self, space, backbone, latent: int = 8, width: int = 32):
         super().__init__(space, noise_shape=(latent,))
-        self.sampler = Sampler("direct", steps=1, fixed=True)
+        self.run_by(OneEvaluation())
         self.network = nn.Sequential(
             nn.Linear(latent, width), nn.SiLU(), nn.Linear(width, prod(space.shape)), nn.Tanh(),
             nn.Unflatten(1, space.shape),
         )  # fmt: skip
 
-    def generate(self, noise, condition=None, *, sampler=None, draws=None, progress=None):
-        return Generated.after(self.network(noise), evaluations=1)
+
+@dataclass(frozen=True)
+class OneEvaluation(Sampler):
+    needs = "network"
+
+    def __call__(self, generator, noise, condition=None, draws=None, progress=None):
+        return Generated.after(generator.network(noise), evaluations=1)
 
 
 class ToyGAN(Stage):
@@ -45,5 +52,6 @@ class ToyGAN(Stage):
         self.log("train/loss", loss)
 
 
+SAMPLERS.add("one_evaluation", OneEvaluation)
 GENERATORS.add("toy_gan", ToyGenerator)
 STAGES.add("toy_gan", ToyGAN)

@@ -1,0 +1,110 @@
+"""How a generator is run: a frozen dataclass a way, by name.
+
+    build_sampler({"name": "adams3", "steps": 16})
+    build_sampler("chord", steps=2)
+
+A new one is a dataclass of `Sampler` with `SAMPLERS.add(name, cls)`; a solver in `r2flow.flow.solvers.SOLVERS` is one.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import Any
+
+import yaml
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.flow.solvers import SOLVERS, FixedStep, usual_grid
+from r2flow.registry import Registry, lazy
+from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Sampler, _with_steps
+from r2flow.samplers.maps import Chord, Jump, Renoise
+from r2flow.samplers.ode import Adaptive, FixedSteps, ODESampler, TorchDiffEq
+from r2flow.samplers.posterior import MMPS, Posterior, Repaint, Replace
+from r2flow.samplers.stochastic import SDE
+
+__all__ = [
+    "MMPS", "SAMPLERS", "SDE", "Adaptive", "Chord", "Condition", "FixedSteps", "Generated", "Jump", "Noise",
+    "ODESampler", "OnGrid", "Posterior", "Progress", "Renoise", "Repaint", "Replace", "Sampler", "TorchDiffEq",
+    "build_sampler", "knot_times", "parse_sampler",
+]  # fmt: skip
+
+
+class _Samplers(Registry[Any]):
+    """The solvers by their names, and everything else."""
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in SOLVERS or name in self._entries:
+            return super().__getitem__(name)
+        solver = SOLVERS[name]
+        if not isinstance(solver, FixedStep):
+            return partial(Adaptive, method=name)
+        return partial(FixedSteps, method=name, grid=usual_grid(name))
+
+    def __contains__(self, name: object) -> bool:
+        return name in SOLVERS or super().__contains__(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([*SOLVERS, *self._entries])
+
+    def name_of(self, kind: type[Sampler]) -> str:
+        """The name that a class has here."""
+        unread = lazy(f"{kind.__module__}:{kind.__qualname__}")
+        return next(name for name, entry in self._entries.items() if entry is kind or entry == unread)
+
+
+SAMPLERS = _Samplers(
+    "sampler",
+    torchdiffeq=TorchDiffEq,
+    sde=SDE,
+    jump=Jump,
+    chord=Chord,
+    renoise=Renoise,
+    replace=Replace,
+    repaint=Repaint,
+    mmps=MMPS,
+    ddpm=lazy("r2flow.systems.diffusion.generator:DDPM"),
+    ddim=lazy("r2flow.systems.diffusion.generator:DDIM"),
+    latent_ddim=lazy("r2flow.systems.latent.generator:LatentDDIM"),
+    langevin=lazy("r2flow.systems.score.generator:Langevin"),
+    direct=lazy("r2flow.systems.gan.generator:Direct"),
+)
+
+
+def parse_sampler(text: str) -> dict[str, Any]:
+    """Name and fields of `NAME[:FIELD=VALUE]...`, as `sde:steps=16:grid=power:2`."""
+    name, *given = re.split(r":(?=\w+=)", text)
+    words = (word.partition("=") for word in given)
+    return {"name": name, **{key: _plain(value) for key, _, value in words}}
+
+
+def _plain(text: str) -> Any:
+    try:
+        return yaml.safe_load(text) if text.lstrip("-").isdigit() else float(text)
+    except ValueError:
+        return yaml.safe_load(text)
+
+
+def build_sampler(options: str | Mapping[str, Any], **fields: Any) -> Sampler:
+    """A sampler by its name and fields; a text is that of `parse_sampler`. Given times decide the number of steps.
+
+    Raises:
+        InputError: an unknown name, an unknown field, or a value that a field cannot have.
+    """
+    options = parse_sampler(options) if isinstance(options, str) else options
+    if not isinstance(options, Mapping) or not isinstance(options.get("name"), str):
+        raise InputError(f"a sampler needs a 'name' and its fields, found {options!r}.")
+    sampler: Sampler = SAMPLERS.build(_with_steps({k: v for k, v in {**options, **fields}.items() if v is not None}))
+    return sampler
+
+
+def knot_times(options: Mapping[str, Any], knots: int) -> Tensor:
+    """Times of both ends and of the inner states that a sampler keeps, (knots + 2,) float64.
+
+    Raises:
+        InputError: it keeps no such states.
+    """
+    sampler = build_sampler(options)
+    if not isinstance(sampler, ODESampler):
+        raise InputError(f"sampler {sampler.name} keeps no inner states; give a solver of r2flow, such as adams3.")
+    return sampler.knot_times(knots)

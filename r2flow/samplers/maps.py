@@ -1,0 +1,113 @@
+"""Samplers of a flow map X_{t->s}(x) = x + (s - t) u(x, t, s): one evaluation a step."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from r2flow.errors import InputError
+from r2flow.flow.maps import MeanVelocity, jump
+from r2flow.flow.solvers import Solution
+from r2flow.flow.solvers.solution import finite, stepped
+from r2flow.samplers.base import Condition, Generated, Grid, Noise, OnGrid, Progress, Steps
+from r2flow.samplers.ode import ODESampler
+
+
+@dataclass(frozen=True)
+class Jump(OnGrid, ODESampler):
+    """X_{t->s} from each time of the grid to the next."""
+
+    needs: ClassVar[str] = "map"
+
+    steps: Steps = 4
+
+    def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, end: Tensor) -> Tensor:
+        """x_s."""
+        return jump(u, t, x, s)
+
+    def solve(
+        self,
+        generator: Any,
+        x: Tensor,
+        t_0: float = 0.0,
+        t_1: float = 1.0,
+        condition: Condition | None = None,
+        progress: Progress = None,
+        **options: Any,
+    ) -> Solution:
+        if any(options.values()):
+            raise InputError(f"{self.name} has no {', '.join(options)}; give a solver, such as adams3.")
+        u, alive = generator.map(condition), finite(x)
+        times = (self.times(t_0, t_1) if t_0 != t_1 and len(x) else torch.empty(0)).to(x)
+        for t, s in pairwise(times):
+            x, alive = stepped(x, self.step(u, t, x, s, times[-1]), alive)
+            if progress is not None:
+                progress()
+        count = max(len(times) - 1, 0)
+        evaluations = torch.full((len(x),), count).numpy()
+        return Solution.build(x, evaluations, count, 0, False, alive.cpu().numpy())
+
+
+@dataclass(frozen=True)
+class Chord(Jump):
+    """x_s = x_t + (s - t) u(x_t, t, 1), on the straight line to the end of a jump.
+
+    The next jump sees that end under less of the same noise and corrects it. This is DDIM's step (Song et al. 2021)
+    with X_{t->1}(x_t) for the estimate of the scan; exact where paths are straight.
+
+    Attributes:
+        grid: None for `late`.
+    """
+
+    steps: Steps = 2
+    grid: Grid | None = None  # type: ignore[assignment]
+
+    def times(self, t_0: float = 0.0, t_1: float = 1.0, fewer: int = 0) -> Tensor:
+        return late(t_0, t_1, self.steps) if self.grid is None else super().times(t_0, t_1, fewer)
+
+    def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, end: Tensor) -> Tensor:
+        return x + (s - t) * u(t, x, end)
+
+
+@dataclass(frozen=True)
+class Renoise(OnGrid):
+    """x_s = (1 - s) e + s X_{t->1}(x_t) with fresh noise e (Song et al. 2023, consistency models, algorithm 1).
+
+    A sample of the same distribution where the map is exact, and not the end of this noise's own path.
+    """
+
+    needs: ClassVar[str] = "map"
+    draws: ClassVar[bool] = True
+
+    steps: Steps = 4
+
+    def __call__(
+        self,
+        generator: Any,
+        noise: Tensor,
+        condition: Condition | None = None,
+        draws: Noise | None = None,
+        progress: Progress = None,
+    ) -> Generated:
+        assert draws is not None
+        u, x, alive, times = generator.map(condition), noise, finite(noise), self.times().to(noise)
+        for j, (t, s) in enumerate(pairwise(times), start=1):
+            following = jump(u, t, x, times[-1])
+            if s < 1:
+                following = s * following + (1 - s) * draws(j)
+            x, alive = stepped(x, following, alive)
+            if progress is not None:
+                progress()
+        return Generated.after(x, self.steps, alive)
+
+
+def late(t_0: float, t_1: float, steps: int, k: float = 32.0) -> Tensor:
+    """One long step, the rest near t = 1: 1 - t falls evenly on a log scale about 1 / k, from at most 2 / k.
+
+    1 - t_j = 2^(1 - (2 j - 1) / (N - 1)) / k for j = 1 to N - 1 of N steps from 0 to 1.
+    """
+    share = (2 * torch.arange(1, steps, dtype=torch.float64) - 1) / max(steps - 1, 1)
+    rising = torch.cat([torch.zeros(1), 1 - 2 ** (1 - share) / k, torch.ones(1)])
+    return t_0 + (t_1 - t_0) * rising if t_0 <= t_1 else (t_1 + (t_0 - t_1) * rising).flip(0)
