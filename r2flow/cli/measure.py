@@ -51,7 +51,9 @@ def completion(
     from r2flow.reports.inversion import real_scans
     from r2flow.reports.pages import prepare_folder
 
-    loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in (checkpoint, *(also or []))}
+    loaded = {
+        Path(name).stem: load_checkpoint(name, choose_device(device)) for name in [checkpoint, *map(Path, also or [])]
+    }
     ways = [
         Way(name, one, completing(one.generator, **SamplerOptions(sampler, steps).given))
         for name, one in loaded.items()

@@ -224,11 +224,11 @@ def birds_eye_figure(made: Mapping[str, np.ndarray], real: np.ndarray | None) ->
         axes.set(xlabel="y, m", ylabel="x, m" if place == 0 else "", xticks=(60, 0, -60), yticks=(-60, 0, 60))
         axes.tick_params(labelsize=7, labelleft=place == 0)
         above, beside = figure.add_subplot(grid[0, 0], sharex=axes), figure.add_subplot(grid[1, 1], sharey=axes)
-        for histogram, style in ((counts, {"color": "#1f6fb4", "ls": "-"}), (real, {"color": "0.2", "ls": ":"})):
+        for histogram, colour, dash in ((counts, "#1f6fb4", "-"), (real, "0.2", ":")):
             if histogram is not None:
                 along_x, along_y = (m / max(m.sum(), 1) for m in marginals(histogram))
-                above.plot(centres, along_y, lw=0.9, **style)
-                beside.plot(along_x, centres, lw=0.9, **style)
+                above.plot(centres, along_y, lw=0.9, color=colour, ls=dash)
+                beside.plot(along_x, centres, lw=0.9, color=colour, ls=dash)
         for panel in (above, beside):
             panel.tick_params(labelbottom=False, labelleft=False, bottom=False, left=False)
             panel.spines[:].set_visible(False)

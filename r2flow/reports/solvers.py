@@ -75,6 +75,7 @@ class Configuration:
     def solve(self, velocity: Velocity, x_0: Tensor, **options: Any) -> Solution:
         """x_1 from x_0."""
         if self.steps is None:
+            assert self.tolerance is not None
             return solve(velocity, x_0, method=self.method, tolerance=self.tolerance, **options)
         return solve(velocity, x_0, method=self.method, steps=self.steps, grid=usual_grid(self.method), **options)
 
@@ -439,8 +440,8 @@ def estimates_figure(rows: Sequence[Row]) -> Figure:
     axes.fill_between(ends, ends / HONEST_WITHIN, ends * HONEST_WITHIN, color="0.9")
     for style, (verdict, own) in zip(STYLES, _by(rows, "verdict").items(), strict=False):
         known = [row for row in own if row["estimate"] is not None]
-        points = [[max(row[key], ends[0]) for row in known] for key in ("error", "estimate")]
-        axes.scatter(*points, s=24, marker=style["marker"], color=style["color"], label=f"{verdict} ({len(own)})")
+        x, y = ([max(row[key], ends[0]) for row in known] for key in ("error", "estimate"))
+        axes.scatter(x, y, s=24, marker=style["marker"], color=style["color"], label=f"{verdict} ({len(own)})")
     axes.set(xscale="log", yscale="log", xlabel="true error", ylabel="global estimate")
     axes.legend(fontsize=8)
     return figure
