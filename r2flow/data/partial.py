@@ -118,7 +118,7 @@ def _files(
     target, lines = reading.sensor, list[str]()
     noted = own_reading(folder)
     source = source or (noted.sensor if noted else None)
-    images = {path for path in paths if path.suffix.lower() == ".npy" and read_range_image(path) is not None}
+    images = {path for path in paths if path.suffix.lower() == ".npy" and read_numbers(path).ndim == 3}
     read_image: Callable[[Path], Partial] = partial(_read_image, source=source, target=target)
     by_points = read_image
     if points := [path for path in paths if path not in images]:
@@ -204,13 +204,20 @@ def _read_points(path: Path, reading: Reading, fired: Fired | None, scale: float
 
 
 def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
-    image, stored = read_range_image(path), read_numbers(path)
-    assert image is not None
+    stored = read_numbers(path)
+    r = stored[0]
     if not (stored >= 0).all() or not (stored[1:] <= 1).all() or not np.isfinite(stored).all():
         raise InputError(
             f"{path} must hold ranges in metres, of 0 or more, and reflectances of [0, 1]. Divide the reflectances by "
             "what means full reflectance; give 0 for NaN and infinity, and --mask FILE.npy for what was not measured."
         )
+    if r.any() and not ((r >= target.min_range) & (r <= target.max_range)).any():
+        raise InputError(
+            f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m. Are they metres?"
+        )
+    image = read_range_image(path)
+    if image is None:
+        raise InputError(f"{path} must be a range image of floats (2 or 1, H, W), found {stored.dtype} {stored.shape}.")
     size = "x".join(map(str, image.shape[1:]))
     if source is not None and image.shape[1] == source.shape[0]:
         return _seen(image, source.resized(columns=image.shape[2]), target)
@@ -218,12 +225,7 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
         advice = f"--from {source.name} has {source.shape[0]} rows" if source else "name its sensor by --from"
         model = "x".join(map(str, target.shape))
         raise InputError(f"{path} is a range image of {size}, those of the model are {model}: {advice}.")
-    known = image_of_same(image, target)
-    if image[0].any() and not known.image[0].any():
-        raise InputError(
-            f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m. Are they metres?"
-        )
-    return known
+    return image_of_same(image, target)
 
 
 def _read_set(scans: ScanSource, number: int, source: Sensor, target: Sensor) -> Partial:
