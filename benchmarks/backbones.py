@@ -131,8 +131,8 @@ def trained(experiment: str, repeats: int, more: list[str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         options = [
             f"experiment={experiment}", "data=simulated", "data.scenes=8", "data.workers=0", "data.drives=null",
-            "data.validation.data=null", "data.projection=spherical",
-            "data.convention=centre",
+            "data.validation.data=null", "data.reading.projection=spherical",
+            "data.reading.convention=centre",
             "trainer.accelerator=cpu", f"trainer.max_steps={repeats + 1}", f"trainer.val_check_interval={repeats + 1}",
             "trainer.enable_progress_bar=false", "callbacks.pictures=null", "samples.num=0", f"run_dir={folder}/run",
             *more,

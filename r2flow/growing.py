@@ -76,13 +76,12 @@ def _fresh(config: dict[str, Any]) -> Generator:
 
 def _reading(checkpoint: Checkpoint) -> dict[str, Any]:
     """How its scans became images, which those that it is measured with will become too."""
-    data = checkpoint.config.get("data") or {}
-    known = {key: data[key] for key in ("projection", "convention", "reflectance_scale") if key in data}
-    return {"data": known} if known else {}
+    reading = (checkpoint.config.get("data") or {}).get("reading")
+    return {"data": {"reading": dict(reading)}} if reading else {}
 
 
 def _refuse_rings(checkpoint: Checkpoint) -> None:
-    if "published" in checkpoint.config and checkpoint.config["data"]["projection"] == "unfolding":
+    if "published" in checkpoint.config and checkpoint.config["data"]["reading"]["projection"] == "unfolding":
         raise InputError(
             f"{checkpoint.path} was trained on unfolded scans, whose rings have no rows between them and whose "
             "lasers a new run's sensor does not carry."

@@ -26,7 +26,7 @@ from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override, key_of
 from r2flow.data.contents import check_contents, record_contents
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.opening import SOURCES, Layout, Prepared, resolve_reflectance
+from r2flow.data.opening import SOURCES, Layout, Prepared, resolve_reflectance, whole
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, SourceOptions
 from r2flow.data.reading import AUTO
 from r2flow.errors import InputError
@@ -38,7 +38,7 @@ from r2flow.registry import Bound, Count, Natural, NonNegative, Positive, check_
 from r2flow.reports.training import finish, read_curves
 from r2flow.runs.composing import check_keys, compose
 from r2flow.runs.folder import check_run, open_run, read_config, run_lock
-from r2flow.runs.lineage import READING, Parent, find_parent, inherit, with_scales
+from r2flow.runs.lineage import Parent, find_parent, inherit
 from r2flow.stages import build_stage, check_roll
 from r2flow.stages.base import Stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
@@ -193,7 +193,7 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
     check_trainer(config["trainer"])
     check_options("samples", SampleOptions, config["samples"])
     with made_with(parent.config if parent else {}, "the run that it starts from"):
-        config = with_scales(inherit(config, asked, parent), asked)
+        config = inherit(config, asked, parent)
     check_options("data", DataOptions, config["data"])
     _refuse_cache(config["data"], asked)
     drawn = sorted(key for key in map(key_of, asked) if f"{key}.".startswith("data.pairs."))
@@ -228,12 +228,12 @@ def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
     Raises:
         InputError: the options of files with simulated scans, those of scans with pairs, and the like.
     """
-    name, usual = data.get("name"), SourceOptions()
+    name, usual = data.get("name"), whole(SourceOptions())
     every = {f.name for f in fields(usual)} - {"name"}
     if name == SIMULATED:
         what, unread = "simulated scans are no files", every - {"root", "scenes"}
     elif name == PAIRS:
-        what, unread = "pairs are drawn, not read", every - {"root", *READING}
+        what, unread = "pairs are drawn, not read", every - {"root", "reading"}
     elif name == MIXED:
         what, unread = "each of data.parts has its own", {"split", "drives"}
     elif name is not None and isinstance(SOURCES[name], Layout | Prepared):

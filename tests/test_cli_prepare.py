@@ -183,7 +183,7 @@ def test_a_run_is_told_the_columns_too(numbered, tmp_path):  # noqa: F811
         x, y, z, reflectance = np.fromfile(path, np.float32).reshape(-1, 4).T
         np.save(wide / f"{path.stem}.npy", np.column_stack([z, y, x, reflectance, x * 0]))
     given = [*TINY, f"data.root={wide}", "trainer.max_steps=1", "trainer.fast_dev_run=true"]
-    in_process(tmp_path, [*given, "data.columns=[z,y,x,intensity,_]"])
+    in_process(tmp_path, [*given, "data.reading.columns=[z,y,x,intensity,_]"])
     done = in_process(tmp_path, given, check=False)
     assert done.returncode == 2
     assert "5 columns without names" in done.stderr.splitlines()[-1]

@@ -94,7 +94,7 @@ def test_conf_says_every_option_of_a_constructor(group: str, constructor, option
 def test_where_conf_and_a_constructor_say_a_default_it_is_the_same(group: str):
     own = {
         "callbacks.ema": {"every"},
-        "data": {"batch_size", "name", "validation", "augment", "pairs"},
+        "data": {"batch_size", "name", "validation", "augment", "pairs", "reading"},
     }  # of the budget
     for name, constructor, options, added in ENTRIES:
         if name == group or name == f"backbone={group}" or (name.startswith(f"{group}.") and group == "callbacks"):

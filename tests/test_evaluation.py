@@ -260,9 +260,12 @@ class TestSets:
         np.testing.assert_array_equal(found.source[1], open_scans("simulated:3", READING, num=3).source[1])
 
     def test_scans_are_read_as_all_parts_of_a_mixture_were(self):
-        parts = [{"convention": "reference", "reflectance_scale": 255.0}, {"convention": "reference"}]
+        parts = [
+            {"reading": {"convention": "reference", "reflectance_scale": 255.0}},
+            {"reading": {"convention": "reference"}},
+        ]
         learned = flow()
-        learned.config["data"] = {"name": "mixed", "convention": "centre", "reflectance_scale": 1.0, "parts": parts}
+        learned.config["data"] = {"name": "mixed", "parts": parts}
         found = reading_for([], learned)
         assert (found.projection, found.convention, found.reflectance_scale) == ("spherical", "reference", 1.0)
 

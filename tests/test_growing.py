@@ -110,7 +110,9 @@ def test_flows_that_know_some_times_alone_do_not_grow():
 
 def test_rings_do_not_grow():
     small = flow()
-    published = Checkpoint(small.generator, {**small.config, "published": {}, "data": {"projection": "unfolding"}})
+    published = Checkpoint(
+        small.generator, {**small.config, "published": {}, "data": {"reading": {"projection": "unfolding"}}}
+    )
     with pytest.raises(InputError, match="whose rings have no rows between them"):
         grown(published, (16, 128))
 

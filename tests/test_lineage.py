@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from r2flow.data.opening import with_readings
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
-from r2flow.runs.lineage import Parent, drawn_by, find_parent, inherit, with_scales
+from r2flow.runs.lineage import Parent, drawn_by, find_parent, inherit
 from r2flow.stages import build_stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 
@@ -82,13 +83,12 @@ def test_pairs_are_images_of_the_parents_sensor(parent: Path):
 
 def test_what_is_learned_from_pairs_reads_real_scans_as_the_flow_that_drew_them(tmp_path: Path):
     read = {"projection": "unfolding", "convention": "reference", "reflectance_scale": 255.0}
-    config = {**CONFIG, "data": {**CONFIG["data"], **read}}
+    config = {**CONFIG, "data": {**CONFIG["data"], "reading": read}}
     state, path = build_stage(config, build_generator(config)).state_dict(), tmp_path / "parent.ckpt"
     AtomicCheckpointIO().save_checkpoint({"state_dict": state, "config": config, "global_step": 7}, path)
-    usual = {"projection": "spherical", "convention": "centre", "reflectance_scale": None}
-    data = {"name": "pairs", "root": None, "pairs": {}, **usual}
+    data = {"name": "pairs", "root": None, "pairs": {}, "reading": dict.fromkeys(read)}
     child = completed({**CONFIG, "data": data, "stage": {"name": "reflow", "init": str(path)}}, [])
-    assert {key: child["data"][key] for key in read} == read
+    assert {key: child["data"]["reading"][key] for key in read} == read
 
 
 def test_pairs_can_be_those_of_another_flow(parent: Path, tmp_path: Path):
@@ -155,72 +155,61 @@ def test_weights_that_belong_to_a_place_do_not_move():
 OWN = {"name": "own", "reflectance_scale": 0.012}
 
 
-@pytest.mark.parametrize(
-    ("data", "asked", "expected"),
-    [
-        ({"name": "folder", "root": "scans", "reflectance_scale": 1.0}, [], 0.012),
-        ({"name": "folder", "root": "scans", "reflectance_scale": 255.0}, [], 255.0),
-        ({"name": "folder", "root": "scans", "reflectance_scale": 1.0}, ["data.reflectance_scale=1"], 1.0),
-        ({"name": "folder", "root": "drawn", "reflectance_scale": 1.0}, [], 1.0),
-        ({"name": "folder", "root": "simulated", "reflectance_scale": 1.0}, [], 1.0),
-        ({"name": "kitti_raw", "root": "scans", "reflectance_scale": 1.0}, [], 1.0),
-    ],
-)
-def test_full_reflectance_in_a_folder_is_the_inherited_sensors(tmp_path: Path, data, asked, expected):
-    for name, note in (("drawn", "scans.json"), ("simulated", "simulated.json"), ("scans", "other.json")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / note).touch()
-    data["root"] = str(tmp_path / data["root"])
-    found = with_scales({"sensor": OWN, "data": data}, asked)
-    assert found["data"]["reflectance_scale"] == expected
-
-
-def test_full_reflectance_in_the_folders_of_a_mixture_and_of_those_held_out_is_the_sensors():
-    part, said = {"name": "folder", "root": "a"}, {"name": "folder", "root": "b", "reflectance_scale": 255.0}
-    simulated = {"name": "simulated", "scenes": 2}
-    mixed = {"name": "mixed", "parts": [part, said, simulated], "validation": {"data": part, "scans": 4}}
-    config = {"sensor": {**OWN, "reflectance_scale": 255.0}, "data": {**mixed, "reflectance_scale": 1.0}}
-    found = with_scales(config, [])["data"]
-    assert [one.get("reflectance_scale") for one in found["parts"]] == [255.0, 255.0, None]
-    assert found["validation"] == {"data": {**part, "reflectance_scale": 255.0}, "scans": 4}
-    pairs = {"name": "pairs", "reflectance_scale": 1.0, "scans": part}
-    assert with_scales({"sensor": OWN, "data": pairs}, [])["data"]["scans"]["reflectance_scale"] == 0.012
+def reading_in(data, root: str | None = None, of_sensor: float | None = 0.012):
+    return with_readings({"sensor": {**OWN, "reflectance_scale": of_sensor}, "data": {**data, "root": root}})["data"]
 
 
 @pytest.mark.parametrize(
-    ("held", "said", "expected"),
+    ("name", "root", "given", "expected"),
     [
-        ("simulated", 255.0, 1.0),
-        ("simulated", 1.0, 1.0),
-        ("real", 255.0, 255.0),
-        ("real", 1.0, 0.012),
-        ("drives", 1.0, 1.0),
+        ("folder", "scans", None, 0.012),
+        ("folder", "scans", 255.0, 255.0),
+        ("folder", "drawn", None, 1.0),
+        ("folder", "drawn", 255.0, 1.0),
+        ("folder", "simulated", None, 1.0),
+        ("kitti_raw", "scans", None, 1.0),
+        ("nuscenes", "scans", None, 255.0),
     ],
 )
-def test_full_reflectance_in_a_folder_held_out_beside_a_folder(tmp_path: Path, held, said, expected):
-    """What was said of one folder of real scans holds for the other; what was right stays as it is."""
-    for name in ("simulated", "real", "drives/a"):
-        (tmp_path / name).mkdir(parents=True)
-        if name != "real":
-            (tmp_path / name / "simulated.json").touch()
-    data = {"name": "folder", "root": "scans", "reflectance_scale": said}
-    data["validation"] = {"data": {"root": str(tmp_path / held)}}
-    found = with_scales({"sensor": OWN, "data": data}, [])["data"]
-    other = found["validation"]["data"]
-    assert other.get("reflectance_scale", found["reflectance_scale"]) == expected
-    assert (other == {"root": str(tmp_path / held)}) == (expected == found["reflectance_scale"])
+def test_full_reflectance_is_what_was_given_else_the_sensors_and_one_in_what_r2flow_wrote(
+    tmp_path: Path, name, root, given, expected
+):
+    for folder, note in (("drawn", "scans.json"), ("simulated", "manifest.json"), ("scans", "other.json")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / note).touch()
+    data = {"name": name, "reading": {"reflectance_scale": given}}
+    assert reading_in(data, str(tmp_path / root))["reading"]["reflectance_scale"] == expected
+
+
+def test_each_set_of_scans_says_its_whole_reading():
+    part, other = (
+        {"name": "folder", "root": "a"},
+        {"name": "folder", "root": "b", "reading": {"reflectance_scale": 2.0}},
+    )
+    data = {"name": "mixed", "parts": [part, other], "validation": {"data": part, "scans": 4}}
+    found = reading_in({**data, "reading": {"convention": "reference", "columns": None}})
+    scales = [one["reading"]["reflectance_scale"] for one in (*found["parts"], found["validation"]["data"])]
+    assert scales == [0.012, 2.0, 0.012]
+    whole = {"projection", "convention", "reflectance_scale", "columns", "on_bad_scan"}
+    for one in (found, *found["parts"], found["validation"]["data"]):
+        assert set(one["reading"]) == whole
+        assert one["reading"]["convention"] == "reference"
+    assert reading_in(found) == found  # a run that is resumed says the same
+    pairs = reading_in({"name": "pairs", "scans": part})
+    assert pairs["scans"]["reading"]["reflectance_scale"] == 0.012
 
 
 def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Path):
-    there = Parent({**CONFIG, "data": {"name": "folder", "projection": "unfolding", "convention": "reference"}}, parent)
-    files = {"name": "folder", "root": "scans", "projection": "spherical", "convention": "centre"}
-    config = {**child(parent, False), "data": files}
-    found = inherit(config, [], there)["data"]
-    assert (found["projection"], found["convention"]) == ("unfolding", "reference")
-    found = inherit(config, ["data.projection=spherical"], there)["data"]
-    assert (found["projection"], found["convention"]) == ("spherical", "reference")
-    simulated = {**files, "name": "simulated", "root": None}
-    assert inherit({**config, "data": simulated}, [], there)["data"]["projection"] == "spherical"
+    there = Parent({**CONFIG, "data": {"reading": {"projection": "unfolding", "convention": "reference"}}}, parent)
+    config = {**child(parent, False), "data": {"name": "folder", "root": "scans"}}
+
+    def found(**data) -> tuple[str, str]:
+        reading = inherit({**config, "data": {**config["data"], **data}}, [], there)["data"]["reading"]
+        return reading["projection"], reading["convention"]
+
+    assert found() == ("unfolding", "reference")
+    assert found(reading={"projection": "spherical"}) == ("spherical", "reference")
+    assert found(name="simulated", root=None) == ("spherical", "centre")
 
 
 @pytest.mark.parametrize("asked", ["backbone.inner.dropout", "backbone.inner"])
@@ -237,8 +226,9 @@ def test_of_a_network_inside_another_that_may_change_which_is_no_weight(parent: 
 
 
 def test_pairs_are_read_as_the_flow_that_draws_them_says(parent: Path):
-    config = {**child(parent, False), "data": {"name": "pairs", "root": None, "pairs": {}, "projection": "unfolding"}}
-    there = {**CONFIG, "data": {"name": "folder", "projection": "spherical", "convention": "centre"}}
-    assert inherit(config, [], Parent(there, parent))["data"]["projection"] == "spherical"
-    with pytest.raises(InputError, match="data.projection is that of the flow that draws the pairs, spherical"):
-        inherit(config, ["data.projection"], Parent(there, parent))
+    data = {"name": "pairs", "root": None, "pairs": {}, "reading": {"projection": "unfolding"}}
+    config = {**child(parent, False), "data": data}
+    there = Parent({**CONFIG, "data": {"reading": {"projection": "spherical", "convention": "centre"}}}, parent)
+    assert inherit(config, [], there)["data"]["reading"]["projection"] == "spherical"
+    with pytest.raises(InputError, match=r"data\.reading\.projection"):
+        inherit(config, ["data.reading.projection"], there)

@@ -17,7 +17,7 @@ from r2flow import simulator
 from r2flow.data.augment import Augmentation
 from r2flow.data.loader import FlowDataset, Further, Item, Order, Permutations, RunLoader, RunSampler, fixed_batches
 from r2flow.data.mixture import MixedOrder, Mixture
-from r2flow.data.opening import held_out_options, open_source, split_parts
+from r2flow.data.opening import held_out_options, open_source, split_parts, whole
 from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
 from r2flow.data.pairs import PairDataset, PairSource
 from r2flow.data.reading import Reading
@@ -58,7 +58,7 @@ class ScanDataModule(L.LightningDataModule):
         self.noise_shape = tuple(noise_shape or encoding.shape)
         self.options = DataOptions(**keys)
         self.batch_size = self.options.batch_size
-        self.parts = split_parts(self.options)
+        self.parts = split_parts(self.options, sensor.reflectance_scale)
         augment = self.options.augment or {}
         check_options("data.augment", Augmentation, augment)
         self.augment = Augmentation(**augment)
@@ -94,7 +94,7 @@ class ScanDataModule(L.LightningDataModule):
         if self.pairs is not None:
             _ = self.pair_store  # other pairs in its folder are refused now; missing ones are made later
             if self.options.beside is not None:
-                source = self._open(self.options.beside)
+                source = self._open(whole(self.options.beside, self.sensor.reflectance_scale))
                 self.names, self.files = list(source.names), dict(source.files())
                 self.scans = self._kept(source, "scans beside the pairs")
             return
@@ -115,7 +115,7 @@ class ScanDataModule(L.LightningDataModule):
         for label, source in zip(labels, whole, strict=True):
             self.names += [f"{label}{name}" for name in source.names]
             self.files |= {f"{label}{name}": file for name, file in source.files().items()}
-        other = held_out_options(self.options)
+        other = held_out_options(self.options, self.sensor.reflectance_scale)
         if not other:
             training, held = [], []
             for source in whole:
@@ -140,11 +140,8 @@ class ScanDataModule(L.LightningDataModule):
         return _joined(training), validation.subset(spread(len(validation), self.validation.scans))
 
     def _open(self, options: SourceOptions, first_scene: int = 0) -> ScanSource:
-        reading = Reading(
-            self.sensor, options.projection, options.convention, options.reflectance_scale,  # type: ignore[arg-type]
-            self.encoding.reflectance, options.on_bad_scan, within_limits=True,
-            columns=None if options.columns is None else tuple(options.columns),
-        )  # fmt: skip
+        images = {"reflectance": self.encoding.reflectance, "within_limits": True}
+        reading = Reading.of({**options.chosen, **images, "sensor": self.sensor.described()})
         return open_source(options, reading, self.seed, first_scene)
 
     def _order(self, source: ScanSource | PairSource) -> Order:

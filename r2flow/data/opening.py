@@ -27,7 +27,6 @@ from r2flow.data.options import (
     PREPARED,
     SIMULATED,
     DataOptions,
-    PartOptions,
     SourceOptions,
 )
 from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_images
@@ -104,7 +103,7 @@ def open_scans(
     reading = reading or reading_for([label])
     if file is None:
         columns = None if reading.columns is None else list(reading.columns)
-        options = replace(options, split=split, scenes=num or SCENES, columns=columns)
+        options = replace(options, split=split, scenes=num or SCENES, reading={"columns": columns})
         if options.name == SIMULATED:
             seed = int(options.folder)
             return ScanSet(label, open_source(replace(options, root=None), reading, seed), reading.sensor)
@@ -244,14 +243,12 @@ def reading_for(
 
 
 def _reading_of(model: Model) -> Reading:
-    """How a model's training scans became images; of a mixture, what all its parts say, else what the run says."""
+    """How a model's training scans became images; of a mixture, what all its parts say."""
     data = model.config.get("data", {})
-    usual = {"projection": "spherical", "convention": "centre", "reflectance_scale": 1.0}
-    own = {key: data.get(key, value) for key, value in usual.items()}
-    for key, value in own.items():
-        parts = {part.get(key, value) for part in data.get("parts") or ()}
-        own[key] = parts.pop() if len(parts) == 1 else value
-    return Reading(model.sensor, **own)
+    readings = [part.get("reading") for part in data.get("parts") or ()] or [data.get("reading")]
+    fields = ("projection", "convention", "reflectance_scale")
+    agreed = {key: values.pop() for key in fields if len(values := {(one or {}).get(key) for one in readings}) == 1}
+    return Reading(model.sensor, **{key: value for key, value in agreed.items() if value is not None})
 
 
 def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> Sensor:
@@ -380,8 +377,11 @@ def _check_split(what: str, given: Mapping[str, Any]) -> None:
         raise InputError(f"{what}: {given['name']} has a standard split: give split, one of {known}, or null for all.")
 
 
-def split_parts(options: DataOptions) -> list[PartOptions]:
+def split_parts(options: DataOptions, scale: float | None = None) -> list[SourceOptions]:
     """The sets of scans to train on; none of pairs. What a part does not say is the run's, but for root, split, drives.
+
+    Args:
+        scale: The value that means full reflectance in files of the sensor.
 
     Raises:
         InputError: a mixture without parts, an option that a part does not know, weights on some alone, or a part of
@@ -392,7 +392,7 @@ def split_parts(options: DataOptions) -> list[PartOptions]:
             _check_split("data.scans", options.scans or {})
         return []
     if options.name != MIXED:
-        return [PartOptions(**options.common)]
+        return [whole(SourceOptions(**options.common), scale)]
     if not options.parts:
         example = "[{name: kitti_360, root: FOLDER, split: train, weight: 3}, {name: folder, root: FOLDER, weight: 1}]"
         raise InputError(f"data=mixed needs its parts: data.parts='{example}'.")
@@ -401,12 +401,11 @@ def split_parts(options: DataOptions) -> list[PartOptions]:
         what = f"data.parts[{number}]"
         if not isinstance(part, Mapping):
             raise InputError(f"{what} must be a group of keys, as {{name: folder, root: FOLDER}}; found {part!r}.")
-        check_options(what, PartOptions, part)
+        check_options(what, SourceOptions, part)
         if "name" not in part or part["name"] in (MIXED, PAIRS):
             raise InputError(f"{what} needs the name of a data set, found {part.get('name')!r}.")
         _check_split(what, part)
-        own = {"root": None, "split": None, "drives": None, "reflectance_scale": _scale(options, part["name"])}
-        made.append(PartOptions(**{**options.common, **own, **part}))
+        made.append(whole(SourceOptions(**{"scenes": options.scenes, **part}), scale, options.chosen))
     if len({part.weight is None for part in made}) > 1:
         raise InputError("data.parts: give every part a weight, or none, for shares by size.")
     if sum(part.name == SIMULATED for part in made) > 1:
@@ -414,30 +413,66 @@ def split_parts(options: DataOptions) -> list[PartOptions]:
     return made
 
 
-def _scale(options: DataOptions, name: Any) -> float:
-    """What means full reflectance in a part of a run's scans that is of this kind and does not say."""
-    said_for_all = options.name == MIXED and options.reflectance_scale != 1
-    if said_for_all or name not in SOURCES:
-        return options.reflectance_scale
-    return SOURCES[name].reflectance_scale
-
-
-def held_out_options(options: DataOptions) -> list[SourceOptions]:
+def held_out_options(options: DataOptions, scale: float | None = None) -> list[SourceOptions]:
     """`data.validation.data`, where there is one: what it does not say is the run's, but for split and drives."""
     other = options.held.data
     if other is None or options.name == PAIRS:
         return []
     check_options("data.validation.data", SourceOptions, other)
-    common = {**options.common, "split": None, "drives": None}
+    common = {**options.common, "split": None, "drives": None, "reading": None, "weight": None}
+    theirs = options.chosen
     kinds = {options.name, other.get("name", options.name)}
     if len(kinds) == 2:  # other files, with columns and a scale of their own
-        common |= {"columns": None, "reflectance_scale": _scale(options, other["name"])}
+        theirs = {key: value for key, value in theirs.items() if key not in ("columns", "reflectance_scale")}
         if SIMULATED in kinds:
             common["root"] = None  # where simulated scans are kept, no others lie
     held = SourceOptions(**{**common, **other})
     if held.name in (MIXED, PAIRS):
         raise InputError(f"data.validation.data must name one data set, found {held.name}; hold out a part of it.")
-    return [held]
+    return [whole(held, scale, theirs)]
+
+
+def whole(options: SourceOptions, scale: float | None = None, theirs: Mapping[str, Any] | None = None) -> SourceOptions:
+    """A set of scans with every field of its reading.
+
+    Args:
+        scale: The value that means full reflectance in files of the sensor.
+        theirs: What is the case where the options do not say.
+    """
+    of_kind = SOURCES[options.name].reflectance_scale if options.name in SOURCES else 1.0
+    usual = {
+        "projection": "spherical", "convention": "centre", "columns": None, "on_bad_scan": "error",
+        "reflectance_scale": (scale or 1.0) if options.name == FOLDER else of_kind,
+    }  # fmt: skip
+    written = options.name == FOLDER and options.root is not None and made_here(str(options.root))
+    believed = {"reflectance_scale": 1.0} if written else {}
+    return replace(options, reading={**usual, **(theirs or {}), **options.chosen, **believed})
+
+
+def with_readings(config: Mapping[str, Any], parent: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """A config in which each set of scans says every field of its reading.
+
+    Args:
+        parent: The reading of the run that this one starts from, or of the flow that draws its pairs.
+    """
+    data, scale = dict(config["data"]), config["sensor"].get("reflectance_scale")
+    check_options("data", DataOptions, data)
+    options = DataOptions.of(data)
+    theirs = {key: value for key, value in (parent or {}).items() if value is not None}
+    if options.name != PAIRS:
+        theirs = {key: value for key, value in theirs.items() if key in ("projection", "convention")}
+    if options.name == SIMULATED:
+        theirs = {}
+    said = replace(options, reading={**theirs, **options.chosen})
+    if options.name == MIXED and options.parts:
+        parts = zip(options.parts, split_parts(said, scale), strict=True)
+        data["parts"] = [{**part, "reading": of_part.reading} for part, of_part in parts]
+    for held in held_out_options(said, scale):
+        data["validation"] = {**data["validation"], "data": {**data["validation"]["data"], "reading": held.reading}}
+    if options.beside is not None:
+        data["scans"] = {**data["scans"], "reading": whole(options.beside, scale).reading}
+    data["reading"] = whole(said, scale).reading
+    return {**config, "data": data}
 
 
 def resolve_reflectance(wanted: Any, data: Mapping[str, Any]) -> bool:

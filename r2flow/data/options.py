@@ -3,17 +3,29 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from r2flow.data.shards import PairRecipe
 from r2flow.errors import InputError
 from r2flow.generators.base import Precision
+from r2flow.lidar.projection import Convention, Projection
 from r2flow.lidar.scan_files import check_columns
 from r2flow.registry import NonNegative, Positive, check_options
 from r2flow.samplers import build_sampler, knot_times
 
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # in the table `r2flow.data.opening.SOURCES`
 MIXED, PAIRS = "mixed", "pairs"  # what `data.name` may be besides: several sets of scans, and pairs drawn by a flow
+
+
+@dataclass(frozen=True)
+class ReadingOptions:
+    """The fields of a `Reading` that a config chooses (`data.reading`); None: the parent's, the scans' or the usual."""
+
+    projection: Projection | None = None
+    convention: Convention | None = None
+    reflectance_scale: Positive | None = None
+    columns: list[str] | None = None
+    on_bad_scan: Literal["error", "skip"] | None = None
 
 
 @dataclass(frozen=True)
@@ -25,20 +37,28 @@ class SourceOptions:
     split: str | None = None  # part of the data set's standard split; None takes all
     drives: list[str | int] | None = None  # names or numbers of the drives to take; None takes all
     scenes: int = 512  # number of simulated scenes
-    projection: str = "spherical"  # or unfolding
-    convention: str = "centre"  # or reference
-    reflectance_scale: float = 1.0  # the value in the files that means full reflectance
-    on_bad_scan: str = "error"  # or skip: the next usable scan takes the place of one that cannot be used
-    columns: list[str] | None = None  # what the columns of files without names hold: [x, y, z, intensity, _]
+    reading: Mapping[str, Any] | None = None  # fields of `r2flow.data.reading.Reading`: projection, convention, ...
+    weight: Positive | None = None  # of one of several sets: its share of a run's images
 
     def __post_init__(self) -> None:
-        if not 0 < self.reflectance_scale < math.inf:
-            raise InputError(f"data.reflectance_scale must be a positive number, found {self.reflectance_scale}.")
         if self.scenes < 1:
             raise InputError(f"data.scenes must be at least 1, found {self.scenes}.")
-        if self.on_bad_scan not in ("error", "skip"):
-            raise InputError(f"data.on_bad_scan must be 'error' or 'skip', found {self.on_bad_scan!r}.")
+        check_options("data.reading", ReadingOptions, self.reading or {})
         check_columns(self.columns)
+
+    @property
+    def chosen(self) -> dict[str, Any]:
+        """What `reading` says."""
+        return {key: value for key, value in (self.reading or {}).items() if value is not None}
+
+    @property
+    def columns(self) -> list[str] | None:
+        return self.chosen.get("columns")
+
+    @property
+    def on_bad_scan(self) -> str:
+        found: str = self.chosen.get("on_bad_scan", "error")
+        return found
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:
@@ -56,13 +76,6 @@ class SourceOptions:
         if self.root is None:
             raise InputError(f"data={self.name} needs the folder of its scans: data.root=FOLDER.")
         return str(self.root)
-
-
-@dataclass(frozen=True)
-class PartOptions(SourceOptions):
-    """One of several sets of scans."""
-
-    weight: Positive | None = None  # its share of the images of a run, beside the other parts' weights
 
 
 @dataclass(frozen=True)

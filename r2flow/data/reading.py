@@ -179,7 +179,7 @@ def _scaled_reflectance(path: str | Path, points: Points, scale: float | None) -
     if not (float(scaled.max(initial=0)) <= 1 + 1e-3 and float(scaled.min(initial=0)) >= 0):
         raise InputError(
             f"{path}: reflectance must lie in [0, {scale:g}], found up to {highest:g}. "
-            "Say what means full reflectance there, often 255: data.reflectance_scale=255, or the reflectance_scale of "
+            "Say what means full reflectance there, often 255: data.reading.reflectance_scale=255, that of "
             "its part of data.parts, or --reflectance-scale 255."
         )
     return scaled

@@ -92,8 +92,7 @@ def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
             "backbone": backbone_of(model, path),
             "data": {
                 "name": data["dataset"],
-                "projection": str(data["projection"]).split("-")[0],
-                "convention": "reference",
+                "reading": {"projection": str(data["projection"]).split("-")[0], "convention": "reference"},
             },
             "published": dict(cfg),
         }
@@ -140,7 +139,7 @@ def _step(content: Mapping[str, Any]) -> int:
 
 def follow_rings(generator: Generator, config: Mapping[str, Any]) -> None:
     """Let the sensor of unfolded scans look along the rings that the weights carry."""
-    if config["data"]["projection"] == "unfolding":
+    if config["data"]["reading"]["projection"] == "unfolding":
         sensor = published_rings(generator.space.sensor, generator.state_dict()[BACKBONE + "coords"])
         generator.space = replace(generator.space, sensor=sensor)
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.config import groups_of, key_of, rule
-from r2flow.data.opening import made_here, scale_of_folder
-from r2flow.data.options import FOLDER, MIXED, SIMULATED, PairOptions, SourceOptions
+from r2flow.data.opening import with_readings
+from r2flow.data.options import MIXED, PairOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
 from r2flow.errors import InputError
@@ -35,10 +35,6 @@ class Parent:
     weights: str | None = None
 
 
-# How scans became the images that pairs are of; real scans are read so beside what is learned from pairs.
-READING = ("projection", "convention", "reflectance_scale")
-
-
 def find_parent(config: Mapping[str, Any]) -> tuple[Parent, Checkpoint] | None:
     """The trained flow that a config's `stage.init` names, if it names one.
 
@@ -50,7 +46,7 @@ def find_parent(config: Mapping[str, Any]) -> tuple[Parent, Checkpoint] | None:
         return None
     found = load_checkpoint(str(init))
     check_finished(Path(str(init)), found)
-    if "published" in found.config and found.config["data"]["projection"] == "unfolding":
+    if "published" in found.config and found.config["data"]["reading"]["projection"] == "unfolding":
         raise InputError(
             f"{init} was trained on unfolded scans, whose rings a new run's sensor does not carry; "
             "start from a flow trained on spherical images."
@@ -79,7 +75,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         if STAGES[config["stage"]["name"]].needs_parent:
             raise InputError(f"stage={config['stage']['name']} starts from another run: give stage.init=RUN.")
         config["generator"] = generator_of(config, parent)
-        return config
+        return with_readings(config)
     keys = [key_of(one) for one in asked]
     for group in (*groups_of(inherited="always"), *groups_of(inherited="with_pairs")):
         config[group] = _chosen(group, parent.config.get(group), config.get(group), keys, config, parent)
@@ -90,16 +86,14 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         drawer = _drawer(config, parent)
         data["root"] = data["root"] or str(default_folder(drawer.path))
         data["pairs"] = pairs_of(drawer, data["pairs"] or {}, drawer.weights)
-        theirs = {key: value for key, value in drawer.config.get("data", {}).items() if key in READING}
-        other = next((key for key in theirs if f"data.{key}" in keys and data.get(key) != theirs[key]), None)
-        if other:
-            raise InputError(f"data.{other} is that of the flow that draws the pairs, {theirs[other]}: leave it out.")
-        data |= theirs
-    elif data["name"] not in (SIMULATED, MIXED):  # other images than the parent's would not be what it has learned
-        theirs = {key: parent.config.get("data", {}).get(key) for key in ("projection", "convention")}
-        unsaid = {key for key in theirs if f"data.{key}" not in keys and data.get(key) == getattr(SourceOptions, key)}
-        data |= {key: value for key, value in theirs.items() if value is not None and key in unsaid}
-    return config
+        theirs = drawer.config.get("data", {}).get("reading") or {}
+        for key, value in (data.get("reading") or {}).items():
+            if value not in (None, theirs.get(key)) and f"data.reading.{key}" in keys:
+                raise InputError(f"data.reading.{key} is that of the flow that draws the pairs: leave it out.")
+        data["reading"] = theirs
+    elif data["name"] != MIXED:
+        return with_readings(config, parent.config.get("data", {}).get("reading"))
+    return with_readings(config)
 
 
 ABSENT = object()
@@ -128,42 +122,6 @@ def _chosen(key: str, theirs: Any, ours: Any, asked: Sequence[str], config: Mapp
             f"this run starts from. Leave it out: the {group} is the parent's."
         )
     return theirs
-
-
-def with_scales(config: dict[str, Any], asked: Sequence[str]) -> dict[str, Any]:
-    """The config with what means full reflectance in each folder of scan files where nobody said it: what its sensor
-    says, which may be the parent's.
-
-    Args:
-        config: Of `inherit`.
-        asked: See there.
-    """
-    data, of_sensor = config["data"], config["sensor"].get("reflectance_scale")
-    said = data.get("reflectance_scale", 1.0) != 1 or "data.reflectance_scale" in map(key_of, asked)
-    if data["name"] == FOLDER and data.get("root") is not None and not said:
-        config["data"] = data = {**data, "reflectance_scale": scale_of_folder(str(data["root"]), of_sensor)}
-
-    def told(scans: Any) -> Any:
-        unsaid = isinstance(scans, Mapping) and scans.get("name") == FOLDER and "reflectance_scale" not in scans
-        if not unsaid or scans.get("root") is None:
-            return scans
-        return {**scans, "reflectance_scale": scale_of_folder(str(scans["root"]), of_sensor)}
-
-    if data["name"] == MIXED and not said and isinstance(data.get("parts"), Sequence):
-        data["parts"] = [told(part) for part in data["parts"]]
-    if data.get("scans") is not None:
-        data["scans"] = told(data["scans"])
-    held = data.get("validation") or {}
-    other = held.get("data")
-    if data["name"] != FOLDER:
-        if other is not None:
-            data["validation"] = {**held, "data": told(other)}
-    elif isinstance(other, Mapping) and other.get("root") is not None and (not said or made_here(str(other["root"]))):
-        # What was said of the run's own folder holds for another of real scans; r2flow writes reflectances of [0, 1].
-        scale = told({"name": FOLDER, **other}).get("reflectance_scale")
-        if scale not in (None, other.get("reflectance_scale", data.get("reflectance_scale", 1.0))):
-            data["validation"] = {**held, "data": {**other, "reflectance_scale": scale}}
-    return config
 
 
 def drawn_by(config: Mapping[str, Any]) -> str | None:

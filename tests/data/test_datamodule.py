@@ -81,7 +81,7 @@ def test_what_cannot_be_is_refused(numbered: Path):
     with pytest.raises(InputError, match="no standard split"):
         module(name="folder", root=str(numbered), split="train")
     with pytest.raises(InputError, match="on_bad_scan"):
-        module(name="folder", root=str(numbered), on_bad_scan="ignore")
+        module(name="folder", root=str(numbered), reading={"on_bad_scan": "ignore"})
 
 
 def folder_of(folder: Path, first: int, count: int) -> Path:
@@ -174,7 +174,10 @@ def test_the_fingerprint_does_not_know_how_the_root_was_written(numbered: Path, 
         ([{"name": "folder"}], "data.root=FOLDER"),
         (["folder"], "a list, each a group of keys"),
         ([{"name": "simulated", "scenes": 0}], "data.scenes must be at least 1, found 0"),
-        ([{"name": "folder", "root": "x", "reflectance_scale": 0}], "data.reflectance_scale must be a positive number"),
+        (
+            [{"name": "folder", "root": "x", "reflectance_scale": 0}],
+            "reflectance_scale",
+        ),
     ],
 )
 def test_parts_that_cannot_be_are_refused(parts, word: str):
@@ -266,8 +269,8 @@ class TestReflectance:
     def test_a_bad_first_scan_is_passed_over_where_bad_scans_are(self, numbered: Path):
         (numbered / "000000.bin").write_bytes(b"")
         data = {"name": "folder", "root": str(numbered)}
-        assert resolve_reflectance("auto", {**data, "on_bad_scan": "skip"})
-        with pytest.raises(InputError, match=r"000000.bin is empty"):
+        assert resolve_reflectance("auto", {**data, "reading": {"on_bad_scan": "skip"}})
+        with pytest.raises(InputError, match="000000.bin: it is empty"):
             resolve_reflectance("auto", data)
 
     def test_what_is_said_is_not_asked(self):
@@ -354,4 +357,4 @@ def test_scenes_are_held_out_behind_those_that_lie_on_a_disk(tmp_path: Path, for
 def test_what_does_not_unfold_is_named(tmp_path: Path):
     write_scan(tmp_path / "one.bin", 1)
     with pytest.raises(InputError, match=r"one\.bin: the scan unfolds into"):
-        module(name="folder", root=str(tmp_path), projection="unfolding")
+        module(name="folder", root=str(tmp_path), reading={"projection": "unfolding"})

@@ -191,16 +191,16 @@ class TestKeptSimulatedScans:
         assert [one.root for one in held] == ["kept"]
 
     def test_held_out_scans_of_another_kind_have_a_scale_and_columns_of_their_own(self):
-        run = {"reflectance_scale": 255.0, "columns": ["x", "y", "z", "intensity"]}
+        run = {"reading": {"reflectance_scale": 255.0, "columns": ["x", "y", "z", "intensity"]}}
         for name, scale in (("kitti_360", 1.0), ("nuscenes", 255.0), ("folder", 255.0)):
             held = held_out_options(DataOptions("folder", "mine", **run, validation={"data": {"name": name}}))[0]
-            assert (held.reflectance_scale, held.columns is None) == (scale, name != "folder")
-        said = {"name": "kitti_360", "reflectance_scale": 2.0}
-        held = held_out_options(DataOptions("folder", "mine", **run, validation={"data": said}))[0]
-        assert held.reflectance_scale == 2
+            assert (held.chosen["reflectance_scale"], held.columns is None) == (scale, name != "folder")
+        other = {"name": "kitti_360", "reading": {"reflectance_scale": 2.0}}
+        held = held_out_options(DataOptions("folder", "mine", **run, validation={"data": other}))[0]
+        assert held.chosen["reflectance_scale"] == 2
 
     def test_so_has_a_part_unless_the_run_says_one_for_all(self):
         parts = [{"name": "kitti_360", "root": "A", "split": "train"}, {"name": "nuscenes", "root": "B"}]
-        assert [p.reflectance_scale for p in split_parts(DataOptions("mixed", parts=parts))] == [1, 255]
-        both = split_parts(DataOptions("mixed", parts=parts, reflectance_scale=100.0))
-        assert [p.reflectance_scale for p in both] == [100, 100]
+        assert [p.chosen["reflectance_scale"] for p in split_parts(DataOptions("mixed", parts=parts))] == [1, 255]
+        both = split_parts(DataOptions("mixed", parts=parts, reading={"reflectance_scale": 100.0}))
+        assert [p.chosen["reflectance_scale"] for p in both] == [100, 100]

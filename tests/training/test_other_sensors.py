@@ -12,9 +12,9 @@ from tests.training.conftest import TINY, in_process
 
 CASES = {
     "vlp16": ["sensor=vlp16", "encoding.reflectance=false"],
-    "nuscenes_hdl32e": ["sensor=hdl32e", "data.reflectance_scale=255"],
-    "rellis_vlp32c": ["sensor=vlp32c", "data.reflectance_scale=255"],
-    "rellis_os1_64": ["sensor=os1_64", "data.reflectance_scale=0.012", "data.projection=unfolding"],
+    "nuscenes_hdl32e": ["sensor=hdl32e", "data.reading.reflectance_scale=255"],
+    "rellis_vlp32c": ["sensor=vlp32c", "data.reading.reflectance_scale=255"],
+    "rellis_os1_64": ["sensor=os1_64", "data.reading.reflectance_scale=0.012", "data.reading.projection=unfolding"],
 }
 # The sensors' own sizes, of TINY only the small network and what a test need not wait for.
 SMALL = [part for part in TINY if not part.startswith(("sensor.", "data.validation", "trainer.val"))]

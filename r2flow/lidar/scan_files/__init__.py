@@ -103,7 +103,7 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
             raise NoPointsError("it is empty (0 bytes); fetch or write it again.")
         refuse_unreadable(path, LARGEST_FILE, "scan file")
         names, arrays = _READERS[ending](path, columns)
-        check(names is None or columns is None, "it names its columns itself: leave --columns (data.columns) out.")
+        check(names is None or columns is None, "it names its columns: leave --columns (data.reading.columns) out.")
         if names is None and columns is None and ending == ".pcd.bin":
             columns = ("x", "y", "z", "intensity", "ring")
         return column_points(names or usual_names(len(arrays), columns), arrays, ending in (".bin", ".pcd.bin"))

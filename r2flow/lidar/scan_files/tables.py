@@ -192,6 +192,7 @@ def usual_names(width: int, columns: Sequence[str] | None) -> Sequence[str]:
         return columns
     example = ",".join(["x", "y", "z", "intensity", *("_" * width)][:width])
     check(
-        width in (3, 4), f"it has {width} columns without names: give --columns {example} (data.columns=[{example}])."
+        width in (3, 4),
+        f"{width} columns without names: give --columns {example} (data.reading.columns=[{example}]).",
     )
     return ("x", "y", "z", "reflectance")[:width]

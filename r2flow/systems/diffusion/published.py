@@ -59,8 +59,7 @@ def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
             },
             "data": {
                 "name": data["dataset"],
-                "projection": str(data["projection"]).split("-")[0],
-                "convention": "reference",
+                "reading": {"projection": str(data["projection"]).split("-")[0], "convention": "reference"},
             },
             "published": dict(cfg),
         }

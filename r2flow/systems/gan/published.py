@@ -40,7 +40,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
             "encoding": {"format": "inverse_depth", "reflectance": channels == 2},
             "generator": {"name": name, **own},
             "backbone": None,
-            "data": {"name": str(dataset["name"]), "projection": "unfolding", "convention": "reference"},
+            "data": {"name": str(dataset["name"]), "reading": {"projection": "unfolding", "convention": "reference"}},
             "published": cfg,
         }
         step = int(content["step"]) // max(int(cfg["training"]["batch_size"]), 1)

@@ -181,7 +181,7 @@ def _config(generator: dict[str, Any], path: Path) -> dict[str, Any]:
         "encoding": {"format": "shifted_log" if logarithmic else "metric", "reflectance": False, "limits": "open"},
         "backbone": {"name": "latent_unet"},
         "generator": generator,
-        "data": {"name": "kitti_360", "projection": "spherical", "convention": "reference"},
+        "data": {"name": "kitti_360", "reading": {"projection": "spherical", "convention": "reference"}},
         "published": {"system": "LiDM"},
     }
 

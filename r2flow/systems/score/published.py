@@ -44,7 +44,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
                 "sigma_last": float(f"{sigmas[-1]:.6g}"),
                 "levels": len(sigmas),
             },
-            "data": {"name": "kitti_360", "projection": "spherical", "convention": "reference"},
+            "data": {"name": "kitti_360", "reading": {"projection": "spherical", "convention": "reference"}},
             "published": {"system": "LiDARGen"},
         }
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
