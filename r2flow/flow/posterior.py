@@ -42,17 +42,17 @@ def repaint(
     times: Tensor,
     noise: Noise,
     repeats: int = 4,
-    length: int = 1,
+    parts: int = 1,
 ) -> Tensor:
-    """`replace` with new noise, which takes every `length` steps `repeats` times (Lugmayr et al. 2022, algorithm 1).
+    """`replace` with new noise, which takes every step of `parts` parts `repeats` times (Lugmayr et al. 2022, alg. 1).
 
     Before it takes them again it goes back from t' to t by new noise, x_t = (t / t') x_t' + sqrt((1 - t)^2 -
-    (t / t')^2 (1 - t')^2) e, which leaves the law of the flow's x_t as it is. The first steps are taken once: at t = 0
-    nothing of x_t' is left. Evaluations: N + (repeats - 1) (N - length) for N steps.
+    (t / t')^2 (1 - t')^2) e, which leaves the law of the flow's x_t as it is. The first step is taken once: at t = 0
+    nothing of x_t' is left. Evaluations: parts (1 + repeats (N - 1)) for N steps.
     """
     j = 0
-    for first in range(0, len(times) - 1, length):
-        part = times[first : first + length + 1]
+    for first in range(0, len(times) - 1, parts):
+        part = times[first : first + parts + 1]
         for again in range(repeats if first else 1):
             if again:
                 j += 1

@@ -14,15 +14,20 @@ from r2flow.generators.base import Condition, Generator
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
-from r2flow.samplers import FixedSteps, ODESampler, Progress, Sampler
+from r2flow.samplers import MMPS, FixedSteps, ODESampler, Progress, Sampler
 
 USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  # of a new flow: docs/results.md
 
 
 class Flow(Generator):
-    """A generator by an ODE. A subclass gives its velocity."""
+    """A generator by an ODE. A subclass gives its velocity.
+
+    Attributes:
+        completers: Samplers that complete scans, with the settings they have by default; the first one is the default.
+    """
 
     plain = "euler"
+    completers: ClassVar[tuple[Sampler, ...]] = (MMPS(),)
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         """v(t, x), (B, C, H, W), at times t of shape () or (B,)."""

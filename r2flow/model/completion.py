@@ -19,14 +19,13 @@ from r2flow.lidar.interpolation import surfaces
 from r2flow.lidar.known import Ray
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.sampling import HasGenerator, draw
-from r2flow.samplers import MMPS, build_sampler
+from r2flow.samplers import build_sampler
 
 ROUGH = 0.015  # of its range: how far the answers of a flow lie about a surface
 EXACT = 0.004  # of its range: no surface is known better
 TAILS = 2  # so many times the error at the measured rays is that between them taken for; docs/completion.md
 SURE = 0.05  # of its range: a surface known better than that holds wherever an answer has the return
 ANSWER = 2**32  # noise numbers from one answer to the next: answer 0 of scan i has the noise of sample i
-USUAL = MMPS()  # of flows; docs/completion.md has others
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ def spread_of(images: Tensor) -> Tensor:
 
 
 def completing(generator: Generator, name: str | None = None, **changes: Any) -> Sampler:
-    """The sampler by which a generator completes scans: its own if it takes a condition, `USUAL` for another flow.
+    """The sampler by which a generator completes scans: its own if it takes a condition, else a flow's completer.
 
     Args:
         name: Of another sampler.
@@ -83,7 +82,9 @@ def completing(generator: Generator, name: str | None = None, **changes: Any) ->
         raise InputError(f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images.")
     if generator.told:
         return generator.choose(name, **changes)
-    how = USUAL.changed(**changes) if name in (None, USUAL.name) else build_sampler({"name": name, **changes})
+    completers = {completer.name: completer for completer in generator.completers}
+    completer = completers.get(name or next(iter(completers)))
+    how = build_sampler({"name": name, **changes}) if completer is None else completer.changed(**changes)
     how.check(generator)
     if not how.completes:
         raise InputError(f"sampler {how.name} takes no condition: give mmps, replace or repaint.")

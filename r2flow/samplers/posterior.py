@@ -73,22 +73,44 @@ class Replace(Posterior):
 
 @dataclass(frozen=True)
 class Repaint(Posterior):
-    """`Replace` with fresh noise and repeated steps (Lugmayr et al. 2022): `r2flow.flow.posterior.repaint`.
+    """Known values with fresh noise after every step, and repeated steps (Lugmayr et al. 2022, RePaint).
+
+    A generator with a `repaint` of its own, as a diffusion, is run by that; a flow by `r2flow.flow.posterior.repaint`.
 
     Attributes:
-        repeats: How often every `length` steps are taken.
+        repeats: How often a step is taken.
+        jump: Equal parts of a step.
     """
 
     draws: ClassVar[bool] = True
 
     repeats: Count = 4
-    length: Count = 1
+    jump: Count = 1
+
+    def times(self, *args: Any, **options: Any) -> Tensor:
+        times = super().times(*args, **options)
+        inner = torch.arange(self.jump, dtype=times.dtype, device=times.device) / self.jump
+        return torch.cat([(times[:-1, None] + times.diff()[:, None] * inner).flatten(), times[-1:]])
 
     def evaluations(self, generator: Any = None) -> int:
-        return self.steps + (self.repeats - 1) * max(self.steps - self.length, 0)
+        return self.jump * (1 + self.repeats * (self.steps - 1))
 
     def run(self, u: MeanVelocity, x: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Any) -> Tensor:
-        return posterior.repaint(u, x, y, known, times, noise, self.repeats, self.length)
+        return posterior.repaint(u, x, y, known, times, noise, self.repeats, self.jump)
+
+    def __call__(
+        self,
+        generator: Any,
+        noise: Tensor,
+        condition: Condition | None = None,
+        draws: Noise | None = None,
+        progress: Progress = None,
+    ) -> Generated:
+        if condition is None or not hasattr(generator, "repaint"):
+            return super().__call__(generator, noise, condition, draws, progress)
+        y, known = condition["image"].to(noise), condition["known"].to(noise) > 0
+        x = generator.repaint(noise, y, known, self.times(), draws, self.repeats, self.jump, progress)
+        return Generated.after(torch.where(known, y, x), self.evaluations())
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from r2flow.samplers import build_sampler
 
 WIDTH = 32
 ROWS = torch.arange(WIDTH) % 4 == 0
-ALL = ["replace", "repaint:repeats=3:length=2", "mmps"]
+ALL = ["replace", "repaint:repeats=3:jump=2", "mmps"]
 
 
 def draws(seed: int = 0) -> torch.Generator:
@@ -275,8 +275,9 @@ def test_it_evaluates_within_the_flow_as_often_as_it_says(method):
     for steps in (1, 2, 5, 8):
         seen.clear()
         products[0] = 0
-        sample_posterior(u, randn(2, WIDTH), *measured, method, times(steps), numbered((2, WIDTH)))
-        assert len(seen) + products[0] == build_sampler(method, steps=steps).evaluations()
+        sampler = build_sampler(method, steps=steps)
+        sampler.given(u, randn(2, WIDTH), *measured, sampler.times(), numbered((2, WIDTH)))
+        assert len(seen) + products[0] == sampler.evaluations()
         assert 0 <= min(seen) <= max(seen) < 1
 
 
@@ -340,7 +341,7 @@ def test_every_flow_completes_a_scan(family, method):
                 flow(x_0, condition, sampler=build_sampler(plain, steps=2))
 
 
-@pytest.mark.parametrize("text", ["repaint:repeats=0", "repaint:many=1", "mmps:products=x", "mmps:finish=0.1"])
+@pytest.mark.parametrize("text", ["repaint:repeats=0", "repaint:length=1", "mmps:products=x", "mmps:finish=0.1"])
 def test_numbers_that_a_sampler_does_not_have_are_refused(text):
     with pytest.raises(InputError, match=text.split(":")[1].split("=")[0]):
         build_sampler(text)

@@ -25,6 +25,7 @@ from r2flow.lidar.projection import unproject
 from r2flow.lidar.region import Region
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import checkpoints_of, load_checkpoint
+from r2flow.model.completion import completing
 from r2flow.noise import Draws
 from r2flow.reports.outputs import write_samples
 from r2flow.samplers import build_sampler
@@ -213,6 +214,41 @@ def test_repaint_is_the_published(shared):
         states = torch.stack([start, *found])
         assert_near(states, one["trajectory"], 1e-3)
         assert_near(states[-1], one["output"], 1e-3)
+
+
+class Given:
+    """Draws that were given, in their order."""
+
+    def __init__(self, noise: list[Tensor]) -> None:
+        self.noise = noise
+
+    def step(self, shape: tuple[int, ...], j: int) -> Tensor:
+        return self.noise[j - 1]
+
+
+def test_a_scan_is_completed_by_the_published_repaint(shared):
+    case = load_case(shared, "r2dm_repaint.pt")
+    model, (one,) = network(case), case["cases"].values()
+    generator = build_generator({**CONFIG, "sensor": {"name": "hdl64e", "rows": 16, "columns": 32}})
+    generator.backbone = model.eval()
+    start, *draws = one["noise"]
+    how = build_sampler("repaint", steps=4, repeats=one["num_resample_steps"], grid="uniform")
+    evaluated: list[int] = []
+    made = generator(
+        start, {"image": case["known"], "known": case["mask"]}, sampler=how, draws=Given(draws),
+        progress=lambda: evaluated.append(1),
+    )  # fmt: skip
+    assert_near(made.x, torch.where(case["mask"] > 0, case["known"], one["output"].clamp(-1, 1)), 1e-3)
+    assert made.evaluations.tolist() == [len(evaluated)] * 2 == [7, 7]
+
+
+def test_repaint_has_the_settings_of_the_published_script():
+    generator = build_generator(CONFIG)
+    assert completing(generator).name == "mmps"
+    assert completing(generator, "repaint").asdict() == {
+        "name": "repaint", "steps": 32, "grid": "uniform", "repeats": 16, "jump": 1,
+    }  # fmt: skip
+    assert completing(generator, "repaint", steps=4).evaluations() == 1 + 16 * 3
 
 
 def test_repaint_draws_as_often_as_its_steps_parts_and_repeats_say():

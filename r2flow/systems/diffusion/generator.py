@@ -14,16 +14,17 @@ from r2flow.flow.solvers.solution import finite
 from r2flow.generators.flow import NetworkFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Bound, Positive
+from r2flow.samplers import MMPS, Repaint
 from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Steps
 from r2flow.systems.diffusion.log_snr import SCHEDULES, alpha_sigma, for_images, log_snr_of, straight_time
 from r2flow.systems.diffusion.objectives import PREDICTIONS
-from r2flow.systems.diffusion.sampling import walk
+from r2flow.systems.diffusion.sampling import repaint, walk
 
 
 class Diffusion(NetworkFlow):
     """y(z_t, lambda_t) by a backbone whose time is the log-SNR lambda, as R2DM (Nakashima and Kurazume 2024).
 
-    Its samplers are `DDPM`, `DDIM` and a flow's.
+    Its samplers are `DDPM`, `DDIM` and a flow's; `Repaint` completes scans by ancestral steps.
 
     As a flow it follows the diffusion's probability-flow ODE along straight lines: a line's state x_s = s x_1 +
     (1 - s) x_0 is z_t / (alpha_t + sigma_t) at the t where alpha_t / (alpha_t + sigma_t) = s, so that
@@ -41,6 +42,7 @@ class Diffusion(NetworkFlow):
     """
 
     plain = "ddpm"
+    completers = MMPS(), Repaint(steps=32, grid="uniform", repeats=16)  # the latter as the published script
 
     def __init__(
         self,
@@ -76,6 +78,35 @@ class Diffusion(NetworkFlow):
         z = (alpha + sigma) * x
         clean = self.denoise(z, log_snr)
         return clean - (z - alpha * clean) / sigma
+
+    def repaint(
+        self,
+        z: Tensor,
+        image: Tensor,
+        known: Tensor,
+        times: Tensor,
+        noise: Noise,
+        repeats: int,
+        jump: int,
+        progress: Progress = None,
+    ) -> Tensor:
+        """x_1 from noise z, (B, C, H, W), given the image where it is known, by the published RePaint.
+
+        Args:
+            times: From noise, 0, to data, 1, (N jump + 1,).
+            noise: Of the j-th draw.
+        """
+        j = count(1)
+
+        def denoise(z: Tensor, log_snr: Tensor) -> Tensor:
+            x = self.denoise(z, log_snr)
+            if progress is not None:
+                progress()
+            return x
+
+        lambdas = self.schedule(1 - times).to(z)
+        *_, z = repaint(denoise, z, image, known, lambdas, lambda: noise(next(j)), repeats, jump)
+        return z if self.clip is None else z.clamp(-self.clip, self.clip)
 
 
 @dataclass(frozen=True)
