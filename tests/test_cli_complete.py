@@ -178,6 +178,17 @@ def test_a_model_of_range_alone_leaves_reflectance_out(r2flow, tmp_path):  # noq
     assert read_points(tmp_path / "out" / "one.ply").reflectance is None
 
 
+def test_a_diffusion_completes_by_its_own_repaint(r2flow, tmp_path):  # noqa: F811
+    path = write_run(tmp_path / "run", name="diffusion")
+    image = full_scan(tmp_path / "one.npy")
+    asked = *COMPLETE, tmp_path / "one.npy", "-c", path, "--mask", "rows:2", "--out", tmp_path / "out"
+    code, _, error = r2flow(*asked, "--sampler", "repaint", "--steps", 2)
+    assert (code, error) == (0, "")
+    assert np.array_equal(np.load(tmp_path / "out" / "one.npy")[:, ::2], image[:, ::2])
+    note = json.loads((tmp_path / "out" / "scans.json").read_text())["completion"]["sampler"]
+    assert (note["name"], note["steps"], note["repeats"]) == ("repaint", 2, 16)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
