@@ -180,9 +180,9 @@ def test_a_generator_that_cannot_complete_is_refused():
 
 
 def test_a_flow_without_a_condition_says_what_completes_with_it():
-    with pytest.raises(InputError, match="a scan is completed with it by --sampler replace, repaint, "):
-        completing(network("rectified_flow").generator, method="euler")
-    assert completing(network().generator, method="euler").method == "euler"
+    with pytest.raises(InputError, match="repaint"):
+        completing(network("rectified_flow").generator, "euler")
+    assert completing(network().generator, "euler").name == "euler"
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,7 @@ def test_a_flow_without_a_condition_says_what_completes_with_it():
         ({"state": torch.full((1, 8, 64), -1)}, "Ray.UNKNOWN"),
         ({"state": torch.full((1, 8, 64), 0.5)}, "Ray.UNKNOWN"),
         ({"state": torch.full((1, 8, 64), int(Ray.RETURN))}, "Ray.UNKNOWN"),
-        ({"steps": 0}, "1 to 1,000,000 steps, found 0"),
+        ({"steps": 0}, "1,000,000"),
     ],
 )
 def test_what_fits_nothing_is_refused(changed, message):
@@ -225,7 +225,7 @@ def test_settled_answers_far_off_stay_unless_the_surface_is_sure():
     assert settled(r, surface, error).tolist() == [40, 20, 0, 21]
 
 
-@pytest.mark.parametrize(("kind", "method"), [("rectified_flow", "mmps:1"), ("conditional_flow", "euler")])
+@pytest.mark.parametrize(("kind", "method"), [("rectified_flow", "mmps"), ("conditional_flow", "euler")])
 def test_answers_of_a_flow_are_moved_to_surfaces(kind, method):
     images = scans()
     images[:, 0] = torch.where(images[:, 0] > 0, 7.0, 0)  # walls around the sensor

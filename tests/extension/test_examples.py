@@ -1,5 +1,6 @@
 """The examples do what they say: answers by formula."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,6 @@ from r2flow.lidar.space import ModelSpace
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws
-from r2flow.samplers import build_sampler
 from tests.extension.conftest import BACKBONE, COMPLETION, DDPM, GAN, loaded
 
 M, S = 0.1, 0.2  # x_1 ~ N(M, S^2) in every pixel
@@ -41,7 +41,7 @@ def gaussian_ddpm():
 
 def test_ddim_follows_the_path_that_carries_noise_to_data(gaussian_ddpm):
     x_0 = Draws(0, range(2)).start(gaussian_ddpm.noise_shape)
-    found = gaussian_ddpm(x_0, sampler=build_sampler("ddim", steps=400))
+    found = gaussian_ddpm(x_0, sampler=replace(gaussian_ddpm.sampler, steps=400, ancestral=False))
     torch.testing.assert_close(found.x, M + S * x_0, rtol=0, atol=0.01)
     assert found.evaluations.tolist() == [400, 400]
 
@@ -49,7 +49,7 @@ def test_ddim_follows_the_path_that_carries_noise_to_data(gaussian_ddpm):
 def test_ddpm_draws_from_the_data(gaussian_ddpm):
     draws = Draws(0, range(8))
     x_0 = draws.start(gaussian_ddpm.noise_shape)
-    x = gaussian_ddpm(x_0, sampler=build_sampler("ddpm", steps=400), draws=draws).x
+    x = gaussian_ddpm(x_0, sampler=replace(gaussian_ddpm.sampler, steps=400), draws=draws).x
     assert x.mean().item() == pytest.approx(M, abs=0.01)  # of 16,384 draws: 6 standard errors
     assert x.std().item() == pytest.approx(S, rel=0.05)
     assert torch.corrcoef(torch.stack([x.flatten(), x_0.flatten()]))[0, 1].abs() < 0.1  # the start is forgotten
@@ -58,7 +58,7 @@ def test_ddpm_draws_from_the_data(gaussian_ddpm):
 def test_scan_i_is_a_function_of_noise_of_the_generator_s_own_shape():
     with loaded(GAN):
         gan = GENERATORS["toy_gan"](space(), {}, latent=5)
-    drawn = next(sample(gan, 2, seed=3, batch_size=2))
+        drawn = next(sample(gan, 2, seed=3, batch_size=2))
     expected = gan.space.decode(gan.network(Draws(3, [0, 1]).start((5,))))
     torch.testing.assert_close(drawn.images, expected.detach())
     assert not drawn.images.requires_grad

@@ -30,6 +30,10 @@ CONFIG = {
 }  # fmt: skip
 
 
+def _by(method: str, steps: int):
+    return build_sampler(method, **({"tolerance": 1e-3} if method == "dopri5" else {"steps": steps}))
+
+
 def built(name: str, **backbone):
     torch.manual_seed(1)
     found = build_generator({**CONFIG, "backbone": CONFIG["backbone"] | backbone, "generator": {"name": name}})
@@ -105,7 +109,7 @@ def test_known_values_arrive_as_given_and_on_their_line(flow, scans, steps):
 @pytest.mark.parametrize("method", ["euler", "dopri5", "sde"])
 def test_how_far_the_guess_holds_is_found_once(flow, scans, method, monkeypatch):
     told, draws, calls = condition_of(flow.space, scans, measured(scans)), Draws(0, range(3)), []
-    how, x_0 = build_sampler(method, steps=3, tolerance=1e-3), draws.start((2, 8, 32))
+    how, x_0 = _by(method, 3), draws.start((2, 8, 32))
     made = flow(x_0, told, sampler=how, draws=draws).x
     forward = flow.trust.forward
     monkeypatch.setattr(flow.trust, "forward", lambda x: calls.append(1) or forward(x))
@@ -132,7 +136,7 @@ def test_solvers_that_look_at_the_end_find_no_infinity_there(flow, scans, method
     made = flow(
         Draws(0, range(3)).start((2, 8, 32)),
         told,
-        sampler=build_sampler(method, steps=4, tolerance=1e-3),
+        sampler=_by(method, 4),
     )
     assert made.x.isfinite().all()
     assert made.converged.all()
