@@ -189,5 +189,5 @@ class Generator(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where its weights are."""
-        return next(self.parameters()).device
+        """Where its weights are; the CPU without any."""
+        return next((p.device for p in self.parameters()), torch.device("cpu"))

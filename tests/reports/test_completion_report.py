@@ -41,7 +41,7 @@ def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(
         moved = torch.where(truth[:, :1] > 0, (truth[:, :1] + by).clamp(max=79.9), 0)
         return Generated.after(encoding.encode(torch.cat([moved, truth[:, 1:]], 1)), 7)
 
-    monkeypatch.setattr(checkpoint.generator, "generate", answer)
+    monkeypatch.setattr(checkpoint.generator, "forward", answer)
     ways = [Way("truth", checkpoint, build_sampler("euler", steps=7))]
     options = {"tasks": ["rows:4"], "num": 1, "on_surfaces": False}
     *plain, (row, _) = completion_rows(truths, sensor, ways, **options)
@@ -84,13 +84,13 @@ def test_the_verb_writes_a_page_with_its_picture(checkpoint, tmp_path: Path, mon
     out = tmp_path / "out"
     monkeypatch.setattr("sys.argv", [
         "r2flow", "report", "completion", "simulated:3", "-c", str(tmp_path / "model.safetensors"), "--num", "2",
-        "--answers", "2", "--samplers", "euler,mmps:1,0", "--steps", "1", "--tasks", "rows:4 rows:2", "--out", str(out),
+        "--answers", "2", "--samplers", "euler,mmps", "--steps", "1", "--tasks", "rows:4 rows:2", "--out", str(out),
     ])  # fmt: skip
     with pytest.raises(SystemExit) as ended:
         main()
     assert not ended.value.code
     assert (out / "completion.png").stat().st_size > 10_000
     rows = json.loads((out / "completion.json").read_text())["rows"]
-    ways = "model, euler 1", "model, mmps:1,0 1"
+    ways = "model, euler, 1 step", "model, mmps, 1 step"
     assert [row["method"] for row in rows] == [*INTERPOLATIONS, *ways, *INTERPOLATIONS, *ways]
     assert "coverage" in (out / "completion.md").read_text()
