@@ -49,22 +49,22 @@ sample -c run -o out --num 1.5
 sample -c run -o out --steps 0
 sample -c run -o out --steps a
 sample -c run -o out --sampler nope
-sample -c run -o out --precision 16-mixed # precision must be '32-true' or 'bf16-mixed'
-pairs -c run --precision bf16 # precision must be '32-true' or 'bf16-mixed'
-evaluate simulated:1 run --precision half # precision must be '32-true' or 'bf16-mixed'
-complete scans -c run -o out --precision half # precision must be '32-true' or 'bf16-mixed'
+sample -c run -o out --precision 16-mixed # precision
+pairs -c run --precision bf16 # precision
+evaluate simulated:1 run --precision half # precision
+complete scans -c run -o out --precision half # precision
 sample -c run -o out --sampler torchdiffeq:nope
 sample -c run -o out --tolerance 0
 sample -c run -o out --tolerance nan
 sample -c run -o out --tolerance a
 sample -c run -o out --tolerance -1
-sample -c run -o out --sampler euler --tolerance 0.1 # --tolerance is for an adaptive solver, as dopri5, and euler is
-sample -c run -o out --sampler nope --tolerance 0.1 # --tolerance is for an adaptive solver
-sample -c run -o out --sampler sde:2 --tolerance 0.1 # --tolerance is for an adaptive solver
-sample -c run -o out --sampler torchdiffeq:rk4 --tolerance 0.1 # --tolerance is for an adaptive solver
-sample -c run -o out --sampler torchdiffeq:nope --tolerance 0.1 # torchdiffeq has no method 'nope'
-sample -c run -o out --sampler dopri5 --steps 50 # --steps is for a solver of fixed steps, and dopri5 chooses its own
-sample -c run -o out --sampler torchdiffeq:bosh3 --steps 50 # --steps is for a solver of fixed steps
+sample -c run -o out --sampler euler --tolerance 0.1 # tolerance
+sample -c run -o out --sampler nope --tolerance 0.1 # no sampler named
+sample -c run -o out --sampler sde:2 --tolerance 0.1 # no sampler named
+sample -c run -o out --sampler torchdiffeq:rk4 --tolerance 0.1 # no sampler named
+sample -c run -o out --sampler torchdiffeq:nope --tolerance 0.1 # no sampler named
+sample -c run -o out --sampler dopri5 --steps 50 # steps
+sample -c run -o out --sampler torchdiffeq:bosh3 --steps 50 # no sampler named
 sample -c run -o out --seed -1
 sample -c run -o out --seed 99999999999999999999999
 sample -c run -o out --seed a
@@ -117,8 +117,8 @@ info run --jsn
 info run --json --card # --card and --json are two forms of one answer
 sample -c run -o out --num 1e9 # --num must be a valid integer, found 1e9
 sample -c run -o out --num=0 # --num must be greater than or equal to 1, found 0
-sample -c run -o out --steps 10000000 # a sampler takes 1 to 1,000,000 steps, found 10,000,000
-sample -c run -o out --sampler jump:2 # jump:2 is for flow maps
+sample -c run -o out --steps 10000000 # 1,000,000
+sample -c run -o out --sampler jump:2 # no sampler named
 view scans --seed 3 -o v.html # --seed and --device are of a run
 view scans --device cpu -o v.html # --seed and --device are of a run
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
@@ -180,7 +180,7 @@ simulate -o out --format '' # an argument is empty
 simulate -o out --format npy --labels
 simulate -o out --workers 0
 simulate -o file.txt --num 1 --size 8x64
-simulate -o scans --num 1 --size 8x64 # holds scans already
+simulate -o scans --num 1 --size 8x64 # holds scans
 simulate -o file.txt/a --num 1 --size 8x64
 interpolate scans/000000.bin -c run -o out # Missing
 interpolate scans/000000.bin nowhere.bin -c run -o out
@@ -334,10 +334,10 @@ evaluate scans -c run -o out --steps a
 evaluate scans -c run -o out --steps 1,,2
 evaluate scans -c run -o out --sampler nope
 evaluate scans -c run -o out --tolerance 0
-evaluate scans -c run -o out --sampler euler,heun2 --tolerance 0.1 # --tolerance is for an adaptive solver
+evaluate scans -c run -o out --sampler euler,heun2 --tolerance 0.1 # tolerance
 evaluate scans run --steps 1,2
-evaluate scans run --steps 2 --sampler dopri5 # --steps is for a solver of fixed steps
-evaluate scans run --tolerance 0.1 # --tolerance is for an adaptive solver
+evaluate scans run --steps 2 --sampler dopri5 # steps
+evaluate scans run --tolerance 0.1 # tolerance
 evaluate scans run --sampler nope
 evaluate scans run --sensor vlp16
 evaluate scans run --size 16x64
