@@ -91,7 +91,7 @@ class PlainFormatter(logging.Formatter):
 class _Unbroken(io.FileIO):
     """A descriptor that takes everything, also after its reader (`| head`) has ended."""
 
-    def write(self, data: Any) -> int | None:
+    def write(self, data: Any) -> int:
         try:
             return super().write(data)
         except BrokenPipeError:

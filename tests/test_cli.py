@@ -167,7 +167,7 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("content", "words"),
         [
-            (b"\0" * 30, ("bad.bin", "14 bytes more")),
+            (b"\0" * 30, ("bad.bin", "14 bytes")),
             (b"", ("bad.bin", "empty")),
             (np.full((9, 4), np.nan, np.float32).tobytes(), ("bad.bin",)),
             (np.full((9, 4), [500, 0, 0, 0.5], np.float32).tobytes(), ("bad.bin", "none of its 9 points", "500")),

@@ -179,11 +179,3 @@ def test_the_files_of_the_release_are_the_models_that_they_are_named_after(tmp_p
         assert MODELS[name].page == f"release/{file.name} in the source of r2flow"
         assert add_model(name, file) == find_model(name)
         assert card(describe(name)) in (release.parent / "docs" / "models" / f"{name}.md").read_text()
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_a_model_card_says_what_the_file_says(name):
-    path = Path(__file__).parents[1] / "docs" / "models" / f"{name}.md"
-    if not model_file(name).is_file():
-        pytest.skip(f"{name} does not come with the package")
-    assert card(describe(name)) in path.read_text(), f"r2flow info {name} --card, into {path}"

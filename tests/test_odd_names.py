@@ -43,7 +43,7 @@ def test_a_mistake_in_a_scan_of_any_name_is_one_line(r2flow, tmp_path, monkeypat
     code, _, err = r2flow("show", f"./{name}.bin", "-o", "out")
     assert code == 2
     (line,) = err.splitlines()
-    assert "bin is not a whole number" in line
+    assert "14 bytes" in line
     assert name.partition("\n")[0].encode("utf-8", "backslashreplace").decode() in line
 
 

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -20,7 +20,10 @@ CheckpointOption = Annotated[
 ]
 DeviceOption = Annotated[str, typer.Option(help="Where to compute: auto, cpu, cuda, cuda:1, ...")]
 PrecisionOption = Annotated[
-    str | None, typer.Option(help="Of the network: 32-true or, faster where there is bfloat16, bf16-mixed.")
+    Literal["32-true", "bf16-mixed"] | None,
+    typer.Option(
+        help="Precision of the network; bf16-mixed is faster where there is bfloat16.",
+    ),
 ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", show_default=False)]
 SensorOption = Annotated[str, typer.Option(help="Name of the sensor, or the YAML file of your own (r2flow sensor).")]

@@ -54,7 +54,7 @@ def curvature(
 class SolversOptions:
     """What is compared, and on which exact problems."""
 
-    solvers: Annotated[str | None, typer.Option(help="Solvers, separated by commas; all of ours if left out.")] = None
+    samplers: Annotated[str | None, typer.Option(help="Solvers, separated by commas; all of ours if left out.")] = None
     budgets: Annotated[str, typer.Option(help="Evaluations of the fixed-step solvers.")] = "4,8,16,32,64"
     tolerances: Annotated[str, typer.Option(help="Of the adaptive solvers.")] = "1e-2,1e-3,1e-4,1e-5"
     problems: Annotated[str | None, typer.Option(help="Exact problems by name; all if left out, or none.")] = None
@@ -85,7 +85,7 @@ def solvers(
     from r2flow.reports.pages import prepare_folder
 
     where = choose_device(draw.device)
-    methods = options.solvers.split(",") if options.solvers else list(measuring.METHODS)
+    methods = options.samplers.split(",") if options.samplers else list(measuring.METHODS)
     for method in methods:
         check_method(method)
     problems = [] if options.problems == "none" else options.problems.split(",") if options.problems else list(PROBLEMS)

@@ -194,7 +194,8 @@ def samples_of(run: Path) -> Path | None:
 class Model(Protocol):
     """A trained generator, as far as its images are concerned."""
 
-    config: Mapping[str, Any]
+    @property
+    def config(self) -> Mapping[str, Any]: ...
 
     @property
     def sensor(self) -> Sensor: ...

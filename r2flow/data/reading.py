@@ -58,7 +58,7 @@ class Reading:
     @classmethod
     def of(cls, described: Mapping[str, Any]) -> "Reading":
         """The reading that a manifest describes; what it does not say is the default."""
-        plain = {key: tuple(v) if isinstance(v, list) else v for key, v in described["sensor"].items()}
+        plain: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in described["sensor"].items()}
         columns = described.get("columns")
         return cls(**{**described, "sensor": Sensor(**plain), "columns": columns and tuple(columns)})
 

@@ -236,7 +236,7 @@ def _beams(scans: Sequence[Points]) -> Beams:
         beams = _by_laser(elevations, rings, RING_AFTER_RING)
         # A ring with few returns may be taken as part of the next; exact elevations separate the two.
         more = peaks is not None and len(peaks.elevations) > len(beams.elevations)
-        return replace(peaks, order=RING_AFTER_RING) if more else beams
+        return replace(peaks, order=RING_AFTER_RING) if more and peaks is not None else beams
     if peaks is None and all(map(_is_scattered, scans)):
         raise NoBeamsError(
             "their points lie on no beams, as those of a Livox or another scanner whose pattern does not repeat, or of "

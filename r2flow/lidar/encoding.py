@@ -67,7 +67,7 @@ class Inverse(RangeFormat):
     def forward(self, r: Tensor) -> Tensor:
         return torch.where(r > 0, self.min_range / r.clamp(min=1e-12), 0.0)
 
-    inverse = forward
+    inverse = forward  # type: ignore[assignment]
 
 
 class InverseDepth(Inverse):

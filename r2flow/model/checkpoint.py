@@ -163,7 +163,7 @@ def _read(path: str | Path, map_location: Any = "cpu") -> Any:
             if not isinstance(content, dict):
                 return content
             content = {key: plain(value) for key, value in content.items()}
-            check_tree(content.get("config"))
+            check_tree(content.get("config") or {})
             return content
     except pickle.UnpicklingError as error:
         if "Unsupported global" in str(error) or "Unsupported class" in str(error):
@@ -242,6 +242,7 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
             if not isinstance(entry, Mapping):
                 raise InputError(f"its '{key}' has no named values. Is it of another program?")
         config, step, kind = dict(content["config"]), int(content.get("global_step", 0)), "r2flow"
+        assert isinstance(state, Mapping)
         weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
         drawing = content
     elif isinstance(content, dict):

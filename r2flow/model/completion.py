@@ -82,7 +82,7 @@ def completing(generator: Generator, name: str | None = None, **changes: Any) ->
         raise InputError(f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images.")
     if generator.told:
         return generator.choose(name, **changes)
-    completers = {completer.name: completer for completer in generator.completers}
+    completers = {completer.name: completer for completer in getattr(generator, "completers", ())}
     completer = completers.get(name or next(iter(completers)))
     how = build_sampler({"name": name, **changes}) if completer is None else completer.changed(**changes)
     how.check(generator)

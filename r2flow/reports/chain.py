@@ -90,11 +90,15 @@ flows         {", ".join(str(run) for run in runs.values())}
     return written
 
 
+def _steps(flow: Checkpoint) -> int:
+    return int(flow.generator.sampler.steps)  # type: ignore[attr-defined]
+
+
 def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
     """A generator for fixed steps at these; the others at all of these and at many."""
     if flow.generator.fixed:
-        return [flow.generator.sampler.steps]
-    return sorted({1, *(other.generator.sampler.steps for other in flows if other.generator.fixed), MANY})
+        return [_steps(flow)]
+    return sorted({1, *(_steps(other) for other in flows if other.generator.fixed), MANY})
 
 
 def held_out(flow: Checkpoint, run: Path) -> np.ndarray:

@@ -116,7 +116,7 @@ class Sampler(ABC):
         grid = getattr(self, "grid", None)
         if isinstance(grid, tuple) and options.get("steps", len(grid) - 1) != len(grid) - 1:
             options.setdefault("grid", options_of(type(self))["grid"])
-        return replace(self, **_with_steps(options))
+        return replace(self, **_with_steps(options))  # type: ignore[type-var]
 
     def asdict(self) -> dict[str, Any]:
         """Name and fields as plain values, as a config or a checkpoint holds them."""

@@ -39,6 +39,7 @@ class SDE(OnGrid):
         draws: Noise | None = None,
         progress: Progress = None,
     ) -> Generated:
+        assert draws is not None
         field, x, alive, times = generator.field(condition), noise, finite(noise), self.times()
         if self.finish and self.steps > 1:
             times = torch.cat([self.times(0.0, 1 - self.finish, fewer=1), times[-1:]])

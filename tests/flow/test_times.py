@@ -73,10 +73,6 @@ def test_bad_options_are_refused():
         TIMES.build({"name": "discrete", "k": 0})
 
 
-def test_a_config_of_version_0_1_0_has_the_discrete_density_by_its_old_name():
-    assert TIMES.build({"name": "grid", "k": 4})(U).unique().tolist() == [0, 0.25, 0.5, 0.75]
-
-
 @pytest.mark.parametrize("first", [0, 10**6, 10**8, 2**40])
 def test_the_golden_sequence_is_exact_and_even_however_late_it_begins(first):
     getcontext().prec = 60

@@ -405,7 +405,7 @@ def test_an_autoencoder_where_scans_are_wanted_is_one_line(shared: Path, tmp_pat
     said = capsys.readouterr().err.splitlines()
     assert end.value.code == 2
     assert len(said) == 2  # the assumed size, and the mistake
-    assert "makes none of noise" in said[-1]
+    assert "velocity" in said[-1]
     assert not (tmp_path / "out").exists()
 
 

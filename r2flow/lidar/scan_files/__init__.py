@@ -191,7 +191,7 @@ def write_points(
     columns = {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], "intensity": reflectance, "ring": ring}
     columns = {name: column for name, column in columns.items() if column is not None}
     with np.errstate(over="ignore"):  # beyond float32 is infinite
-        table = np.column_stack(list(columns.values())).astype("<f4")
+        table = np.column_stack([column for column in columns.values() if column is not None]).astype("<f4")
     assert np.isfinite(table).all(), "a coordinate or reflectance is NaN or infinite"
     try:
         with atomic_write(path) as file:

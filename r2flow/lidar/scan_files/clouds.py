@@ -138,7 +138,7 @@ def read_ply(path: Path, columns: object = None) -> Table:
     extra = b"" if any(element.listed for element in elements) else data[start + sum(sizes) :].strip(b"\r\n")
     check(len(data) - start >= sum(sizes) and not extra, _wrong_size(sum(sizes), len(data) - start))
     points = np.frombuffer(data, kinds[index], vertex.count, start + sum(sizes[:index]))
-    return names, [points[name] for name in points.dtype.names]
+    return names, [points[name] for name in points.dtype.names or ()]
 
 
 def write_ply(file: IO[bytes], table: np.ndarray, names: tuple[str, ...]) -> None:

@@ -150,14 +150,14 @@ def checked_points(
     far, near = np.count_nonzero(largest > FARTHEST), np.count_nonzero(largest < NEAREST)
     # A twentieth, so that a few flipped bits cost only their own points. Of float64 read as float32 a third is beyond.
     check(
-        far <= len(largest) / 20 and near <= len(largest) / 2,
+        bool(far <= len(largest) / 20 and near <= len(largest) / 2),
         f"it does not look like a scan: of {len(largest)} points, {far} lie beyond {FARTHEST:g} m and {near} within "
         f"{NEAREST:g} m. Is it damaged, not in metres, big-endian, or of another row layout?",
     )
     # Rows of three or five floats read as four put coordinates into the reflectance, and half of these are negative.
     negative = 0 if points.reflectance is None else np.count_nonzero(points.reflectance < 0)
     check(
-        not raw or (points.dropped <= len(xyz) / 2 and negative <= len(points.xyz) / 20),
+        not raw or bool(points.dropped <= len(xyz) / 2 and negative <= len(points.xyz) / 20),
         f"it does not look like rows of float32: of {len(xyz)} rows, {points.dropped} are not finite and {negative} "
         "have a negative reflectance. Is it big-endian, float64, text, or another row layout?",
     )

@@ -58,7 +58,7 @@ def read_npz(path: Path, columns: object = None) -> Table:
         return beside or list(members), list(arrays.values())
     names, fields = _columns_of(arrays.pop(table))
     if names is None and beside:
-        names = usual_names(len(fields), None)
+        names = list(usual_names(len(fields), None))
     return [*names, *beside] if names else None, [*fields, *arrays.values()]
 
 
@@ -108,7 +108,7 @@ def read_text(path: Path, columns: object = None) -> Table:
     except ValueError:
         if apart is None:
             raise
-        table = np.genfromtxt(rows, delimiter=apart, comments=None)  # slower; a gap, as of a ray without return, is NaN
+        table = np.genfromtxt(rows, delimiter=apart, comments=None)  # type: ignore[call-overload]  # slower; a gap, as of a ray without return, is NaN
     return names, list(np.atleast_2d(table).T)
 
 
