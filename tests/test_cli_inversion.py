@@ -198,15 +198,6 @@ def test_a_model_of_range_alone_has_no_reflectance_to_compute(r2flow, tmp_path):
     assert read_points(tmp_path / "o" / "000000.ply").reflectance is None
 
 
-def test_a_real_scan_goes_there_and_back(r2flow, run, shared, tmp_path):  # noqa: F811
-    scan = next(iter(sorted((shared / "real" / "object" / "training" / "velodyne").glob("*.bin"))))
-    code, _, _ = r2flow("invert", scan, "-c", run, "-o", tmp_path / "o", "--tolerance", "1e-4")
-    assert code == 0
-    (row,) = json.loads((tmp_path / "o" / "invert.json").read_text())["rows"]
-    assert row["rms"] < 1e-2
-    assert torch.from_numpy(np.load(tmp_path / "o" / f"{scan.stem}.x_0.npy")).isfinite().all()
-
-
 @pytest.mark.parametrize("method", ["jump", "chord"])
 def test_jumps_back_that_a_map_has_not_learned_are_refused(method):
     street = load_checkpoint("street")

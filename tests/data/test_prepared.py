@@ -368,7 +368,7 @@ def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(clouds: Path, tm
     for name in ("drive0/000001.bin", "drive0/000003.bin", "drive0/000004.bin", "drive0/000005.bin"):
         (root / name).write_bytes(b"")
     plan = plan_of(root)
-    with pytest.raises(InputError, match=r"000001.bin is empty \(0 bytes\)"):
+    with pytest.raises(InputError, match=r"000001.bin: it is empty \(0 bytes\)"):
         make(tmp_path / "out", plan)
     with pytest.raises(InputError, match="is not finished: the same r2flow prepare command resumes"):
         prepared_in(tmp_path / "out", SMALL)

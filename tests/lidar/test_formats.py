@@ -92,7 +92,7 @@ def test_files_that_name_their_columns_take_no_others(tmp_path: Path):
     np.savetxt(tmp_path / "a.csv", TABLE, delimiter=",", header="x,y,z,intensity", comments="")
     np.savez(tmp_path / "a.npz", x=XYZ[:, 0], y=XYZ[:, 1], z=XYZ[:, 2])
     for name in ("a.csv", "a.npz"):
-        with pytest.raises(InputError, match="names its columns itself: leave --columns"):
+        with pytest.raises(InputError, match="names its columns"):
             read_points(tmp_path / name, ("x", "y", "z", "intensity"))
 
 
@@ -178,7 +178,7 @@ def test_las_and_laz(tmp_path: Path, ending: str, version: str, form: int):
     points = read_points(path)
     np.testing.assert_array_equal(points.reflectance, INTENSITY * 256)
     np.testing.assert_array_equal(points.ring, RING)
-    with pytest.raises(InputError, match="names its columns itself"):
+    with pytest.raises(InputError, match="names its columns"):
         read_points(path, ("x", "y", "z"))
 
 
