@@ -37,7 +37,7 @@ ROOMS = {
 }
 # What all rooms stand on; lines to it would cover the others.
 GROUND = (
-    "config", "plugins", "registry", "models", "devices", "memory", "noise", "files", "hashing", "progress", "signals",
+    "config", "plugins", "store", "processes",  "registry", "models", "devices", "memory", "noise", "files", "hashing", "progress", "signals",
     "errors",
 )  # fmt: skip
 

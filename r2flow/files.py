@@ -21,12 +21,10 @@ except ImportError:  # not of every system
 
 @contextmanager
 def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
-    """Open a temporary file that takes the place of `path` when the block ends without an error.
+    """Open a temporary file that replaces `path` when the block ends without an error.
 
-    The temporary file lies in the same folder. It is flushed to the disk before the rename and the folder after it, so
-    that a reader, or a power cut, finds the old file or the new one and never a part. When the block raises, the old
-    file stays. Of a link, the file that it leads to is replaced. A character device or a pipe is never replaced: the
-    whole content is written into it.
+    It is flushed to the disk before the rename and the folder after it: a reader, or a power cut, finds the old file or
+    the whole new one. A link stays, and its target is replaced. A device or a pipe is written into.
 
     Raises:
         IsADirectoryError: `path` is a folder.

@@ -72,7 +72,7 @@ def _known(name: str) -> str:
 
 
 def _import(name: str) -> str:
-    """Import a module, unless its file has been; its file."""
+    """Import a module, unless its file has been imported; its file."""
     if not name.endswith(".py"):
         here = str(Path.cwd())
         if here not in sys.path and "" not in sys.path:
@@ -84,20 +84,19 @@ def _import(name: str) -> str:
         if file is None:
             raise ImportError("it is a folder without an __init__.py; to name a file, end it in .py")
         return _known(file)
-    path = Path(name).expanduser().resolve()
-    if not path.is_file():
+    path = _known(name)
+    if not Path(path).is_file():
         raise FileNotFoundError(f"{path} is no file")
-    known = f"r2flow_plugin_{path.stem}"
-    spec = importlib.util.spec_from_file_location(known, path)
+    module_name = f"r2flow_plugin_{Path(path).stem}"
+    spec = importlib.util.spec_from_file_location(module_name, path)
     assert spec is not None and spec.loader is not None  # noqa: PT018
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[known] = module
+    sys.modules[module_name] = module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
     except BaseException:
-        del sys.modules[known]
+        del sys.modules[module_name]
         raise
-    return str(path)
+    return path
 
 
 def load_installed() -> None:

@@ -51,18 +51,6 @@ def files(tmp_path: Path) -> list[Path]:
     return paths
 
 
-def test_a_range_image_is_a_scan_like_any_other(r2flow, run, files, tmp_path):  # noqa: F811
-    image = scans(1)[0].numpy()
-    image[0, 0, 0] = 500  # beyond the sensor's reach: a dropped ray
-    image[0, 0, 1] = np.nan
-    np.save(tmp_path / "image.npy", image)
-    code, _, _ = r2flow("invert", tmp_path / "image.npy", "-c", run, "-o", tmp_path / "o", "--sampler", "rk4")
-    assert code == 0
-    (row,) = json.loads((tmp_path / "o" / "invert.json").read_text())["rows"]
-    assert row["returns"] == int((scans(1)[0, 0].flatten()[2:] > 0).sum())
-    assert row["evaluations"] == 2 * 4 * 32
-
-
 def test_interpolate_writes_every_frame(r2flow, run, files, tmp_path):  # noqa: F811
     out = tmp_path / "between"
     code, said, _ = r2flow("interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--sampler", "rk4", "--steps", 8)

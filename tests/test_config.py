@@ -95,6 +95,7 @@ def test_where_conf_and_a_constructor_say_a_default_it_is_the_same(group: str):
     own = {
         "callbacks.ema": {"every"},
         "data": {"batch_size", "name", "validation", "augment", "pairs", "reading"},
+        "data.pairs": {"sampler"},
     }  # of the budget
     for name, constructor, options, added in ENTRIES:
         if name == group or name == f"backbone={group}" or (name.startswith(f"{group}.") and group == "callbacks"):

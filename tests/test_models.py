@@ -15,7 +15,6 @@ from r2flow.errors import InputError
 from r2flow.evaluation.sets import is_checkpoint
 from r2flow.model.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint
 from r2flow.models import MODELS, SHIPPED, Model, add_model, find_model, model_file, name_of
-from r2flow.reports.contents import card, describe
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 
@@ -178,4 +177,3 @@ def test_the_files_of_the_release_are_the_models_that_they_are_named_after(tmp_p
         name = file.stem
         assert MODELS[name].page == f"release/{file.name} in the source of r2flow"
         assert add_model(name, file) == find_model(name)
-        assert card(describe(name)) in (release.parent / "docs" / "models" / f"{name}.md").read_text()

@@ -85,7 +85,7 @@ def test_a_folder_in_which_nothing_was_learned_is_free(tmp_path: Path):
 
 def test_settings_of_pairs_matter_only_to_a_run_on_pairs():
     def config(name, method):
-        return {"data": {"name": name, "pairs": {"method": method}}}
+        return {"data": {"name": name, "pairs": {"sampler": {"name": method}}}}
 
     assert contradictions(config("simulated", "dopri5"), config("simulated", "adams3")) == []
     told = contradictions(config("pairs", "dopri5"), config("pairs", "adams3"))

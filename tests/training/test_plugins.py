@@ -128,27 +128,6 @@ def test_a_plugin_is_not_imported_because_a_file_names_it(eager: Path, tmp_path:
     assert "eager" not in STAGES
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("1 / 0", "ZeroDivisionError: division by zero"),
-        ("import nothing_of_this_name", "ModuleNotFoundError"),
-        ("def :", "SyntaxError"),
-        ("from r2flow.stages import STAGES\nSTAGES.add('rectify', None)", "exists already"),
-        (None, "is no file"),
-    ],
-)
-def test_a_plugin_that_cannot_be_imported_is_one_line(tmp_path: Path, text: str | None, words: str):
-    path = tmp_path / "broken.py"
-    if text is not None:
-        path.write_text(text)
-    done = in_process(tmp_path, [f"--plugin={path}"], check=False)
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    assert line.startswith(f"error: the plug-in {path} cannot be imported: ")
-    assert words in line
-
-
 def test_one_file_is_imported_once_however_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "counted.py").write_text("open('count', 'a').write('x')")
     monkeypatch.chdir(tmp_path)
