@@ -229,8 +229,6 @@ BACKENDS: Registry[Backend] = Registry("attention backend", dense=_dense, tiles=
 
 def backend_name(name: str) -> str:
     """The backend of a config, so that a wrong name is found when a network is built."""
-    if name == "shifts":  # a backend of version 0.1.0, of the same values
-        return "tiles"
     if name != "auto":
         BACKENDS[name]
     return name

@@ -100,8 +100,7 @@ class Backbone(ExactBuffers):
         expected = self.in_channels, *self.coords.shape[2:]
         if x.shape[1:] != expected:
             raise InputError(f"this backbone was built for images of {expected}, found {tuple(x.shape[1:])}.")
-        if s is not None and not self.second_time:
-            raise InputError("this backbone was built for one time and takes no s: build it with second_time=True.")
+        assert s is None or self.second_time, "this backbone was built for one time and takes no s"
         t, s = _times("t", t, x), None if s is None else _times("s", s, x)
         if self.data_std is None:
             return self._evaluated(t, x, s).to(x.dtype)
@@ -172,12 +171,7 @@ class Backbone(ExactBuffers):
                 f"a {type(self).__name__} cannot be evaluated on a part of its image; ask for all rows and columns."
             )
         for what, numbers, unit in zip(("rows", "columns"), (rows, columns), self.unit, strict=True):
-            if len(numbers) == 0:
-                raise InputError(f"a part of the image needs {what}, at least a unit of {unit}; found none.")
-            if len(numbers) % unit or int(numbers[0]) % unit:
-                raise InputError(
-                    f"{what} from {int(numbers[0])}, {len(numbers)} of them, are not whole units of {unit}."
-                )
+            assert len(numbers) % unit == int(numbers[0]) % unit == 0, f"{what} must be whole units of {unit}"
         part = copy.deepcopy(self, {id(parameter): parameter for parameter in self.parameters()})
         rows, columns = rows.to(self.coords.device), columns.to(self.coords.device)
         part.coords = self.coords.index_select(-2, rows).index_select(-1, columns)
@@ -189,11 +183,9 @@ class Backbone(ExactBuffers):
         return part
 
     def _check(self, rays: Tensor) -> None:
-        if rays.ndim != 3 or rays.shape[0] != 2:
-            raise InputError(f"rays must be elevation and azimuth, (2, H, W); found {tuple(rays.shape)}.")
+        assert (rays.ndim, len(rays)) == (3, 2), f"rays are elevation and azimuth, (2, H, W); not {tuple(rays.shape)}"
+        assert min(self.in_channels, self.out_channels) > 0
         name = type(self).__name__
-        if min(self.in_channels, self.out_channels) < 1:
-            raise InputError(f"{name} needs channels; found {self.in_channels} in and {self.out_channels} out.")
         if self.second_time and not self.takes_second_time:
             raise InputError(
                 f"{name} takes no second time: choose a backbone that does, such as hdit; without one, a "

@@ -1,8 +1,5 @@
 """A convolutional path at full resolution, beside a network of tokens."""
 
-from typing import Self
-
-import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -53,20 +50,6 @@ class Detail(nn.Module):
         for block in self.blocks:
             h = block(h, condition)
         return uncast(self.answer, F.silu(h))
-
-    @torch.no_grad()
-    def take_over(self, other: Self) -> None:
-        """Answer what a narrower and shallower path answers, to learn on from there.
-
-        The new channels see the old ones and have random weights of their own. No weight leads back from them yet
-        (Chen et al. 2016, Net2Net, in spirit), and new blocks add nothing.
-        """
-        new = self.state_dict()
-        for name, weight in other.state_dict().items():
-            parts = {"spread": self.patch[0] * self.patch[1], "modulation": 2}.get(name.split(".")[-2], 1)
-            into, old = (w.unflatten(0, (parts, -1)) for w in (new[name], weight))  # (parts, channels, ...)
-            into = into[:, : old.shape[1]].zero_()
-            into[tuple(map(slice, old.shape))] = old
 
 
 class DetailBlock(nn.Module):

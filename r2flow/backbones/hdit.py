@@ -148,14 +148,6 @@ class HDiT(Backbone):
         if isinstance(self.spatial_pe, FeaturePosition):
             self.spatial_pe.follow(mean_rays(self.coords, self.patch))
 
-    @torch.no_grad()
-    def start_without_position(self) -> None:
-        """Answer as without a position encoding, until it has learned what it is good for."""
-        if isinstance(self.spatial_pe, LearnablePosition):
-            self.spatial_pe.embedding.zero_()
-        elif isinstance(self.spatial_pe, FeaturePosition):
-            self.spatial_pe.vanish()
-
     @property
     def learns_directions(self) -> bool:
         return isinstance(self.spatial_pe, LearnablePosition)
@@ -224,11 +216,6 @@ class FeaturePosition(nn.Sequential):
 
     def follow(self, rays: Tensor) -> None:
         cast(RayFeatures, self[0]).follow(rays)
-
-    def vanish(self) -> None:
-        """Be 0, by the scale of the last norm alone."""
-        last = cast(nn.Sequential, self[1])[-1]
-        cast(RMSNorm, last).scale.zero_()
 
     def forward(self) -> Tensor:  # type: ignore[override]  # its input are the rays, which it holds
         features, mapping = self

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from r2flow.backbones.attention import BACKENDS, _Axis, _flex_mask, backend_name, neighbourhood_attention
+from r2flow.backbones.attention import BACKENDS, _Axis, _flex_mask, neighbourhood_attention
 from r2flow.errors import InputError
 
 EVERYWHERE = ["tiles"]  # flex and natten need CUDA kernels
@@ -139,8 +139,3 @@ def test_an_even_window_is_refused():
 
 def test_every_backend_is_tested_or_needs_a_gpu():
     assert set(BACKENDS) == {"dense", *EVERYWHERE, "flex", "natten"}
-
-
-def test_a_config_of_version_0_1_0_may_name_a_backend_that_is_gone():
-    assert backend_name("shifts") == "tiles"
-    assert [backend_name(name) for name in ("auto", "dense")] == ["auto", "dense"]

@@ -90,16 +90,3 @@ def test_units_are_patches_halved_at_every_level():
 def test_what_cannot_be_cropped_is_refused(name):
     with pytest.raises(InputError, match="cannot be evaluated on a part of its image"):
         backbone(name).cropped(torch.arange(16), torch.arange(64))
-
-
-@pytest.mark.parametrize(
-    ("rows", "columns", "message"),
-    [
-        (range(16), range(4, 20), "columns from 4, 16 of them, are not whole units of 8"),
-        (range(15), range(64), "rows from 0, 15 of them, are not whole units of 2"),
-        (range(0), range(64), "a part of the image needs rows, at least a unit of 2; found none"),
-    ],
-)
-def test_parts_that_are_not_whole_units_are_refused(rows, columns, message):
-    with pytest.raises(InputError, match=message):
-        backbone("hdit").cropped(torch.tensor(rows), torch.tensor(columns))

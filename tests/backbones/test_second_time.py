@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from tiny_backbones import NAMES, TWO_TIMES, image, rays, tiny, untrained
+from tiny_backbones import TWO_TIMES, image, rays, tiny, untrained
 
 from r2flow.backbones import Backbone
 from r2flow.errors import InputError
@@ -107,12 +107,6 @@ def test_forward_and_backward_in_time_differ(name):
 def test_a_second_time_of_another_shape_is_refused(name):
     with pytest.raises(ValueError, match=r"s must be a scalar or of shape \(2,\), found \(3,\)"):
         tiny(name, second_time=True)(0.5, image(), torch.rand(3))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_network_of_one_time_says_what_to_do_with_a_second_one(name):
-    with pytest.raises(InputError, match="takes no s: build it with second_time=True"):
-        tiny(name)(0.5, image(), 1.0)
 
 
 def test_a_backbone_that_takes_one_time_says_so_when_it_is_built():

@@ -190,8 +190,7 @@ class LatentGenerator(nn.Module):
         made = {**self.synthesise(w, angle, shift), CODE: w[:, None].expand(-1, self.num_styles, -1)}
         if self.measurement_model is None:
             return made
-        if uniform is None:
-            raise InputError("this generator draws a mask: give the uniform numbers of its noise.")
+        assert uniform is not None
         dropped: dict[str, Tensor] = self.measurement_model(made, uniform)
         return dropped
 
