@@ -37,8 +37,8 @@ ROOMS = {
 }
 # What all rooms stand on; lines to it would cover the others.
 GROUND = (
-    "config", "plugins", "store", "processes",  "registry", "models", "devices", "memory", "noise", "files", "hashing", "progress", "signals",
-    "errors",
+    "config", "plugins", "store", "processes", "registry", "models", "devices", "memory", "noise", "files", "hashing",
+    "progress", "signals", "errors",
 )  # fmt: skip
 
 WIDE, HIGH, ACROSS, DOWN, EDGE = 206, 52, 232, 88, 26  # size of a room, from one to the next, margin
