@@ -187,7 +187,7 @@ class TestBadInput:
         out = tmp_path / "out"
         self.check(r2flow("show", scan, "--size", "64", "-o", out), out, "ROWSxCOLUMNS", "'64'")
         self.check(r2flow("show", scan, "--sensor", "hdl64", "-o", out), out, "Did you mean 'hdl64e'?")
-        self.check(r2flow("show", scan, "--projection", "flat", "-o", out), out, "spherical, unfolding")
+        self.check(r2flow("show", scan, "--projection", "flat", "-o", out), out, "unfolding")
         self.check(r2flow("sample", "-c", saved[0], "--sampler", "eulr", "-o", out), out, "Did you mean 'euler'?")
         self.check(r2flow("sample", "-c", saved[0], "--format", "las", "-o", out), out, "ply, bin, npy")
         self.check(r2flow("sample", "-c", saved[0], "--num", 0, "-o", out), out, "--num")

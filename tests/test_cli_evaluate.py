@@ -129,7 +129,7 @@ def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):
     )
     assert code == 0
     about = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["generated"]
-    assert (about["kind"], about["num"], about["steps"], about["noise"]) == ("sampled", 3, 2, "evaluation")
+    assert (about["kind"], about["num"], about["sampler"]["steps"], about["noise"]) == ("sampled", 3, 2, "evaluation")
     code, _, said = r2flow("evaluate", real, run, *QUICK[:2], "--size", "16x64", "--num", 3)
     assert code == 2
     assert "8x64, not of hdl64e 16x64" in said
@@ -170,7 +170,7 @@ def test_a_curve_of_several_solvers_has_a_line_for_each_with_intervals(r2flow, s
 def test_a_curve_names_the_solver_where_a_model_has_another_in_fewer_steps(r2flow, real, tmp_path):  # noqa: F811
     config = {**CONFIG, "generator": {"name": "flow_map"}}
     generator = build_generator(config).eval()
-    generator.sampler = build_sampler("adams3", steps=2, grid="power:1.75")
+    generator.run_by(build_sampler("adams3", steps=2, grid="power:1.75"), few=build_sampler("chord", steps=1))
     save_checkpoint(Checkpoint(generator, config), tmp_path / "map.safetensors")
     code, _, err = r2flow(
         "evaluate", real, "-c", tmp_path / "map.safetensors", "--steps", "1,2", "--metrics", "jsd", "--num", 4,
@@ -190,7 +190,7 @@ def test_of_an_adaptive_solver_a_curve_has_one_point(r2flow, saved, real, tmp_pa
     rows = json.loads((tmp_path / "speed_quality.json").read_text())["rows"]
     assert [row["solver"] for row in rows] == ["dopri5", "euler", "euler"]
     code, _, said = r2flow(*measured, "--sampler", "dopri5", "--steps", "1,2")
-    assert (code, "--steps is for a solver of fixed steps; dopri5 chooses its own." in said) == (2, True)
+    assert (code, "no option 'steps'" in said) == (2, True)
 
 
 def test_a_curve_goes_on_where_it_stopped(r2flow, saved, real, tmp_path, monkeypatch):  # noqa: F811

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from r2flow.data.opening import open_prepared
+from r2flow.data.opening import SOURCES, open_prepared
 from r2flow.data.reading import Reading, read_scan
 from r2flow.lidar.sensors import SENSORS
 from r2flow.store import read_manifest
@@ -70,7 +70,7 @@ def test_nuscenes_has_its_own_sensor_and_scale(r2flow, tmp_path):  # noqa: F811
     assert (code, error.split("error")[1:]) == (0, [])
     recipe = read_manifest(tmp_path / "out")["recipe"]["reading"]
     assert {"override /sensor@_global_.sensor": recipe["sensor"]["name"]} in config["defaults"]
-    assert recipe["reflectance_scale"] == config["reflectance_scale"]
+    assert recipe["reflectance_scale"] == SOURCES["nuscenes"].reflectance_scale
     image = open_prepared(tmp_path / "out", Reading(SENSORS["hdl32e"], reflectance=True))[0]
     assert np.count_nonzero(image[0]) == 3
     assert np.array_equal(np.unique(image[1]), np.array([0, 100 / 255, 1], np.float32))

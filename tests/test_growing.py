@@ -9,7 +9,6 @@ from r2flow.flow.maps import jump
 from r2flow.generators import FlowMap, build_generator
 from r2flow.growing import grown
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint, weights_hash
-from r2flow.samplers import build_sampler
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 
@@ -99,13 +98,6 @@ def test_a_size_that_is_no_multiple(shape):
 def test_other_generators_do_not_grow():
     with pytest.raises(InputError, match="holds a ConditionalFlow; only a flow of whole scans can grow"):
         grown(flow(generator={"name": "conditional_flow"}), (16, 128))
-
-
-def test_flows_that_know_some_times_alone_do_not_grow():
-    small = flow()
-    small.generator.sampler = build_sampler("euler", steps=2)
-    with pytest.raises(InputError, match="grow the flow that it was distilled from"):
-        grown(small, (16, 128))
 
 
 def test_rings_do_not_grow():

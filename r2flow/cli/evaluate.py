@@ -310,13 +310,19 @@ def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOption
     """What is drawn for each line of a curve, and the numbers of steps; what they cannot be is refused before anything
     is read.
     """
+    from r2flow.registry import options_of
     from r2flow.reports.speed_quality import Drawing, steps_of
-    from r2flow.samplers import parse_sampler
+    from r2flow.samplers import SAMPLERS, parse_sampler
 
     names = [*dict.fromkeys(sampling.sampler.split(","))] if sampling.sampler else []
     ways = [parse_sampler(name) for name in names] or [{}]
-    fixed = {} if sampling.tolerance is None else {"tolerance": sampling.tolerance}
-    drawings = [Drawing(num, sampling.seed, {**way, **fixed}, sampling.precision or "32-true") for way in ways]
+    taken = [options_of(SAMPLERS[way["name"]]) for way in ways if way]
+    if taken and sampling.steps and not any("steps" in options for options in taken):
+        raise InputError(f"{', '.join(names)}: no option 'steps'; leave --steps out.")
+    if sampling.tolerance is not None:  # of the samplers that have one
+        for way in [way for way, options in zip(ways, taken, strict=False) if "tolerance" in options] or ways:
+            way["tolerance"] = sampling.tolerance
+    drawings = [Drawing(num, sampling.seed, way, sampling.precision or "32-true") for way in ways]
     steps = _many(sampling.steps)
     for (label, flow), drawing in product(flows.items(), drawings):
         steps_of(flow, label, steps, drawing)

@@ -16,6 +16,7 @@ from r2flow.cli.options import (
     SensorChoice,
     SizeOption,
     build_sized,
+    check_words,
     named_columns,
 )
 from r2flow.errors import InputError
@@ -49,6 +50,7 @@ def show(
     from r2flow.reports.pictures import save_figure, scan_figure
     from r2flow.reports.views import label_view
 
+    check_words(projection=projection)
     if format not in ("png", "npy"):
         raise InputError(f"--format must be png or npy, found {format!r}.")
 

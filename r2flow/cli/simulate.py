@@ -14,7 +14,7 @@ def simulate(
     num: Annotated[int, typer.Option(min=1, help="Number of scans.")] = 100,
     sensor: SensorOption = "hdl64e",
     size: SizeOption = None,
-    seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Scan i depends on the seed and on i alone.")] = 0,
     first: Annotated[int, typer.Option(min=0, max=2**63, help="Number of the first scan.")] = 0,
     format: Annotated[
         str, typer.Option(help="Any of bin,ply,pcd, or npy: the range image, (2, H, W) float32.")

@@ -179,8 +179,10 @@ def _resumable(run: str | Path) -> Iterator[tuple[Path, dict[str, Any]]]:
 def _fitting(run: str | Path, found: Iterable[tuple[Path, dict[str, Any]]], state: Mapping[str, Tensor] | None) -> Path:
     """The first checkpoint whose weights have the names and shapes of `state`."""
     for path, content in found:
+        if state is None:
+            return path
         held = {name: getattr(value, "shape", None) for name, value in content["state_dict"].items()}
-        if state is None or held == {name: value.shape for name, value in state.items()}:
+        if held == {name: value.shape for name, value in state.items()}:
             return path
         log.warning("%s does not have the weights of this run's config. Passing it over.", path)
     raise InputError(f"no checkpoint in {run} has the weights of its config; give name=OTHER for a new run.")

@@ -19,7 +19,7 @@ class Linear(Generator):
         nn.Module.__init__(self)
         self.layer = nn.Linear(4, 1)
 
-    def generate(self, noise, condition=None, **options):
+    def forward(self, noise, condition=None, **options):
         return Generated.after(self.layer(noise), 1)
 
 

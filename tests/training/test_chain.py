@@ -110,7 +110,7 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
     assert second.config["parent"]["weights"] == weights_hash(first)
     assert third.config["parent"]["weights"] == weights_hash(second)
     assert second.config["backbone"] == first.config["backbone"]
-    assert [(f.generator.sampler.steps, f.generator.sampler.fixed) for f in (first, third)] == [(2, False), (2, True)]
+    assert [(f.generator.sampler.steps, f.generator.fixed) for f in (first, third)] == [(2, False), (2, True)]
     # The noise that 2-TD learns from is none of that which 2-RF has learned from.
     assert (second.config["data"]["pairs"]["first"], third.config["data"]["pairs"]["first"]) == (0, 8)
 
@@ -224,7 +224,7 @@ def test_pairs_of_a_flow_map_can_be_its_jumps(tmp_path: Path, monkeypatch: pytes
         "trainer=cpu",
     ]
     run = build(compose(["experiment=reflow", *given]))
-    assert run.data.pairs.recipe(run.data.encoding.shape).method == "jump"
+    assert run.data.pairs.recipe(run.data.encoding.shape).sampler["name"] == "jump"
 
 
 @pytest.mark.slow

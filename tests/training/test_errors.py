@@ -36,7 +36,7 @@ from tests.training.conftest import Run
         (["backbone.depths=3"], ["depths must be a list"]),
         (["seed=-1"], ["seed must be a whole number", "-1"]),
         (["sampler.name=eulr"], ["Did you mean 'euler'?"]),
-        (["sampler.steps=0"], ["steps must be a whole number of at least 1"]),
+        (["sampler.steps=0"], ["steps must be a whole number"]),
         (["callbacks.ema.every=0"], ["callbacks.ema: every must be a whole number of at least 1"]),
         (["+data.validation.data={name: folder, root: x, splt: test}"], ["no option 'splt'", "Did you mean 'split'?"]),
         (["data.root=2011"], ["2011 is not a folder", "data.root=FOLDER"]),

@@ -74,7 +74,7 @@ def stop_held(held: Path, by: int, command: list[str]) -> tuple[int, str]:
 
 def lines_of(said: str) -> list[str]:
     """What a run says beside its progress and its log."""
-    return [line for line in said.splitlines() if not line.startswith(("INFO", "step "))]
+    return [line for line in said.splitlines() if not line.startswith(("INFO", "WARNING", "step "))]
 
 
 @pytest.mark.parametrize(("step", "workers"), [pytest.param(3, 0, marks=pytest.mark.slow), (6, 2)])

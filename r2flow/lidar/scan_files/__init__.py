@@ -115,7 +115,7 @@ def read_range_image(path: str | Path) -> np.ndarray | None:
     What is not finite is 0, a ray without return; so is a range that no LiDAR measures, with a warning.
 
     Raises:
-        InputError: the file is missing, no regular file or damaged.
+        InputError: the file is missing, no regular file or damaged, or most of its ranges are such.
     """
     if Path(path).suffix.lower() != ".npy":
         return None
@@ -126,9 +126,15 @@ def read_range_image(path: str | Path) -> np.ndarray | None:
         image = np.nan_to_num(array.astype(np.float32), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     wrong = (image[0] < 0) | (image[0] > FARTHEST_RAY)
     if wrong.any():
+        ends = f"from {image[0][wrong].min():.3g} to {image[0][wrong].max():.3g}"
+        if 2 * wrong.sum() > np.count_nonzero(image[0]):
+            raise InputError(
+                f"{path}: most of its ranges are below 0 or above {FARTHEST_RAY:g} m, {ends}. Are these millimetres, "
+                "or a scan in model space? Give metres."
+            )
         log.warning(
-            "%s: %d ranges below 0 or above %g m, from %.3g to %.3g, are taken as no return; ranges are metres",
-            path, wrong.sum(), FARTHEST_RAY, image[0][wrong].min(), image[0][wrong].max(),
+            "%s: %d ranges below 0 or above %g m, %s, are taken as no return; ranges are metres",
+            path, wrong.sum(), FARTHEST_RAY, ends,
         )  # fmt: skip
         image[:, wrong] = 0
     return image
@@ -158,7 +164,8 @@ def _door(path: Path) -> Iterator[None]:
         with naming(path):
             raise
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
+        reason = " ".join(str(error.strerror or error).split())  # pyarrow's have several lines
+        raise InputError(f"{path} cannot be read: {reason}.") from None
     except BaseException as error:  # NumPy, laspy, pyarrow and their decoders raise many kinds on damaged files
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # of Rust's decoders
             raise
