@@ -4,7 +4,10 @@ Sphinx with furo, and not mkdocs: its search works from a folder on disk, no pag
 tool holds links, docstrings and the executed notebook to account.
 """
 
+import importlib
+import pkgutil
 import re
+from pathlib import Path
 
 import r2flow
 
@@ -22,13 +25,36 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_output_stderr = "remove"
 
+suppress_warnings = ["ref.python"]  # `x` of a docstring may be several names
+
 autodoc_member_order = "bysource"
 autodoc_inherit_docstrings = False
 autodoc_typehints_format = "short"
 autodoc_class_signature = "mixed"
-autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_default_options = {"members": True, "show-inheritance": True, "ignore-module-all": True}
 python_maximum_signature_line_length = 100
 napoleon_use_ivar = True
+
+PAGES = Path(__file__).parent / "api"
+ROOMS = ("", "model", "generators", "samplers", "flow", "backbones", "systems", "lidar", "data", "simulator", "metrics",
+         "evaluation", "stages", "training", "config", "registry", "plugins", "store", "noise", "errors")  # fmt: skip
+
+
+def write_api() -> None:
+    """A page for each room with the docstrings of its modules, in api/, which git ignores."""
+    PAGES.mkdir(exist_ok=True)
+    for room in ROOMS:
+        top = importlib.import_module(".".join(filter(None, ("r2flow", room))))
+        below = pkgutil.walk_packages(top.__path__, f"{top.__name__}.") if room and hasattr(top, "__path__") else ()
+        names = [
+            top.__name__,
+            *(module.name for module in below if module.name != "r2flow.model.hub"),
+        ]
+        parts = [f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n```\n" for name in names]
+        (PAGES / f"{top.__name__}.md").write_text("\n".join([f"# {top.__name__}\n", *parts]), encoding="utf-8")
+
+
+write_api()
 
 NAME = re.compile(r"[A-Za-z_][\w.]*")
 
