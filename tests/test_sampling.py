@@ -14,7 +14,7 @@ from r2flow.evaluation.sets import sampled_set
 from r2flow.generators import Field, build_generator
 from r2flow.inversion import interpolate_scans, invert, round_trip, slerp
 from r2flow.lidar.encoding import Encoding
-from r2flow.lidar.region import Region, region
+from r2flow.lidar.region import region
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
 from r2flow.model.checkpoint import Checkpoint
@@ -298,11 +298,6 @@ def test_what_makes_whole_images_alone_makes_the_region_that_is_all():
     assert torch.equal(part.images, whole.images)
     with pytest.raises(InputError, match="whole images"):
         next(sample(gan, 1, region=region((16, 32), rows=(0, 7))))
-
-
-def test_a_part_of_nothing_is_refused():
-    with pytest.raises(InputError, match="needs columns"):
-        network().generator.part(Region((8, 64), 0, 8, 0, 0))
 
 
 def test_one_channel_is_that_of_both():

@@ -140,7 +140,7 @@ def test_weights_of_another_network_are_refused_in_a_line(tmp_path, pointnet, fo
         add("rangenet21", path)
     tensors = network.state_dict()
     torch.save({**tensors, "fc3.weight": torch.zeros(40, 256), "fc3.bias": torch.zeros(40)}, path)
-    with pytest.raises(InputError, match=r"'fc3.bias' has the shape \(40,\), not \(16,\)"):
+    with pytest.raises(InputError, match=r"'fc3.weight' has the shape \(40, 256\), not \(16, 256\)"):
         add("pointnet", path)
     torch.save({**tensors, "fc3.bias": torch.full((16,), torch.nan)}, path)
     with pytest.raises(InputError, match="'fc3.bias' has values that are not finite"):

@@ -76,7 +76,7 @@ class Extractor(nn.Module):
         given = {**{name: value for name, value in wanted.items() if name.endswith("num_batches_tracked")}, **tensors}
         problems = [f"'{name}' is missing" for name in wanted if name not in given]
         problems += [f"'{name}' is unknown" for name in given if name not in wanted]
-        for name in wanted.keys() & given.keys():
+        for name in (name for name in wanted if name in given):
             shape, expected = tuple(given[name].shape), tuple(wanted[name].shape)
             if shape != expected:
                 problems.append(f"'{name}' has the shape {shape}, not {expected}")
