@@ -36,6 +36,7 @@ python_maximum_signature_line_length = 100
 napoleon_use_ivar = True
 
 PAGES = Path(__file__).parent / "api"
+EXTRAS = ("r2flow.model.hub", "r2flow.model.onnx_graphs")  # which need further packages
 ROOMS = ("", "model", "generators", "samplers", "flow", "backbones", "systems", "lidar", "data", "simulator", "metrics",
          "evaluation", "stages", "training", "config", "registry", "plugins", "store", "noise", "errors")  # fmt: skip
 
@@ -48,7 +49,7 @@ def write_api() -> None:
         below = pkgutil.walk_packages(top.__path__, f"{top.__name__}.") if room and hasattr(top, "__path__") else ()
         names = [
             top.__name__,
-            *(module.name for module in below if module.name != "r2flow.model.hub"),
+            *(module.name for module in below if module.name not in EXTRAS),
         ]
         parts = [f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n```\n" for name in names]
         (PAGES / f"{top.__name__}.md").write_text("\n".join([f"# {top.__name__}\n", *parts]), encoding="utf-8")
