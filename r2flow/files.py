@@ -13,11 +13,6 @@ from typing import IO, Any
 
 from r2flow.errors import InputError
 
-try:
-    import fcntl
-except ImportError:  # not of every system
-    fcntl = None  # type: ignore[assignment]
-
 
 @contextmanager
 def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
@@ -129,23 +124,6 @@ def refuse_unreadable(path: Path, largest: int, what: str = "file") -> None:
     if size > largest:
         most = f"{largest / 2**30:g} GiB" if largest >= 2**30 else f"{largest / 2**20:g} MiB"
         raise InputError(f"{path} has {size:,} bytes, too many for a {what} (at most {most}). Is it another file?")
-
-
-@contextmanager
-def sole_use(path: Path) -> Iterator[bool]:
-    """Use what a file stands for, together with others; whether nobody else did when the block began.
-
-    Nobody can tell where the system has no shared locks: then others are taken to be there.
-    """
-    with path.open("rb") as file:
-        alone = False
-        if fcntl is not None:
-            with suppress(OSError):
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                alone = True
-            with suppress(OSError):
-                fcntl.flock(file, fcntl.LOCK_SH)
-        yield alone
 
 
 def _is_stream(path: Path) -> bool:

@@ -1,12 +1,15 @@
 """From scans back to their noise, and from one scan to another: what only a flow can do."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from r2flow.data.opening import open_scans, reading_for
 from r2flow.errors import InputError
 from r2flow.generators import Sampler, as_flow
 from r2flow.generators.base import Progress
@@ -14,6 +17,34 @@ from r2flow.model.checkpoint import Checkpoint
 from r2flow.samplers import Adaptive, Jump
 
 TIGHT = Adaptive(tolerance=1e-5)
+
+
+class Real(NamedTuple):
+    """A real scan as a flow sees it: its name, and its range in metres and reflectance, (2 or 1, H, W)."""
+
+    name: str
+    image: Tensor
+
+
+def real_scans(
+    checkpoint: Checkpoint, specs: Sequence[str | Path], reflectance_scale: float | None = None, most: int = 16
+) -> list[Real]:
+    """Scans projected as the checkpoint's training scans were.
+
+    Args:
+        specs: As for `r2flow.data.opening.open_scans`.
+        reflectance_scale: The value in the files that means full reflectance; None for the training's.
+        most: Scans to take of a set, evenly spread over it.
+    """
+    own = reading_for([], checkpoint)
+    scale = own.reflectance_scale if reflectance_scale is None else reflectance_scale
+    reading = replace(own, reflectance=checkpoint.encoding.reflectance, reflectance_scale=scale,
+                      on_bad_scan="error", within_limits=True)  # fmt: skip
+    sets = [open_scans(spec, reading).spread(most) for spec in specs]
+    stems = [Path(name).name.split(".")[0].replace(" ", "_") for scans in sets for name in scans.source.names]
+    names = [stem if stems.count(stem) == 1 else f"{stem}_{stems[:i].count(stem) + 1}" for i, stem in enumerate(stems)]
+    images = [torch.from_numpy(scans.source[i]) for scans in sets for i in range(len(scans))]
+    return [Real(name, image) for name, image in zip(names, images, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -46,14 +77,16 @@ def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, pro
         progress: Called after every network evaluation.
 
     Raises:
-        InputError: a generator without an ODE, images of another shape, a solver that cannot be used, or jumps of a
-            flow map that has learned none back in time.
+        InputError: a generator without an ODE, or jumps of a flow map that has learned none back in time.
     """
-    _check_way_back(checkpoint, sampler)
-    encoding, flow = checkpoint.encoding, as_flow(checkpoint.generator, "inversion")
-    if images.ndim != 4 or images.shape[2:] != checkpoint.sensor.shape:
-        raise InputError(f"the model's images are {checkpoint.sensor.shape}, found {tuple(images.shape[2:])}.")
-    x_1 = encoding.encode(images[:, : 1 + encoding.reflectance])
+    flow = as_flow(checkpoint.generator, "inversion")
+    jumps = (checkpoint.config.get("stage") or {}).get("jumps") or {}
+    if isinstance(sampler, Jump) and not jumps.get("backward"):
+        raise InputError(
+            "this flow map has learned no jumps back in time (stage.jumps.backward): give --sampler adams3."
+        )
+    assert images.shape[2:] == checkpoint.sensor.shape
+    x_1 = checkpoint.encoding.encode(images[:, : 1 + checkpoint.encoding.reflectance])
     there = flow.solve(x_1, 1.0, 0.0, sampler=sampler, progress=progress)
     # where a solver gives up, its last state is not yet noise
     x_0 = there.x.cpu().masked_fill(~there.converged.view(-1, 1, 1, 1), math.nan)
@@ -62,21 +95,12 @@ def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, pro
     return Inversion(x_1, x_0, again.x.cpu(), evaluations, converged)
 
 
-def _check_way_back(checkpoint: Checkpoint, sampler: Sampler) -> None:
-    jumps = (checkpoint.config.get("stage") or {}).get("jumps") or {}
-    if isinstance(sampler, Jump) and not jumps.get("backward"):
-        raise InputError(
-            "this flow map has learned no jumps back in time (stage.jumps.backward): give --sampler adams3."
-        )
-
-
 def round_trip(checkpoint: Checkpoint, inversion: Inversion) -> dict[str, Tensor]:
     """How far scans are from themselves after inversion and generation, each (B,).
 
     Returns:
-        `rms` in model space, whose values span [-1, 1]; `median_m`, `rms_m` and `dropped` of `metres_apart`;
-        `noise_std`, the standard deviation of x_0: far from 1, the scan is unlike what the flow was trained on. NaN for
-        a scan that is not finite.
+        `rms` in model space, [-1, 1]; `median_m`, `rms_m` and `dropped` of `metres_apart`; `noise_std`, the standard
+        deviation of x_0, far from 1 for a scan unlike the training's. NaN for a scan that is not finite.
     """
     apart = rms(inversion.again - inversion.x_1)
     median_m, rms_m, dropped = metres_apart(*(checkpoint.encoding.decode(x) for x in (inversion.x_1, inversion.again)))
@@ -99,8 +123,7 @@ def metres_apart(image: Tensor, other: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         the share of all rays that return in one alone.
     """
     before, after = image[:, 0].double(), other[:, 0].double()
-    both = (before > 0) & (after > 0)
-    apart = (after - before).abs().masked_fill(~both, math.nan).flatten(1)
+    apart = (after - before).abs().masked_fill((before <= 0) | (after <= 0), math.nan).flatten(1)
     dropped = ((before > 0) != (after > 0)).flatten(1).double().mean(1)
     return apart.nanmedian(1).values, apart.square().nanmean(1).sqrt(), dropped
 
@@ -164,24 +187,21 @@ def interpolate_scans(
     sampler: Sampler = TIGHT,
     batch_size: int = 1,
     progress: Progress = None,
-    arrived: Callable[[int], None] | None = None,
+    arrived: Callable[[int], None] = lambda done: None,
 ) -> Interpolation:
     """Invert two scans, `slerp` between their noises, generate the scans of it: the paper's figure 3.
 
     Args:
         pair: The two in metres and reflectance, (2, 2 or 1, H, W).
-        frames: Scans in all, the two ends included.
+        frames: Scans in all, the two ends included, at least 2.
         batch_size: Scans at once.
         progress: Called after every network evaluation.
         arrived: Called with the number of frames that are done, the ends first.
 
     Raises:
-        InputError: fewer than two frames, an end that is not solved, or what `invert` and `slerp` refuse.
+        InputError: an end that is not solved, or what `invert` and `slerp` refuse.
     """
-    if frames < 2 or batch_size < 1:
-        raise InputError(f"needs at least two frames and a batch of at least one; found {frames} and {batch_size}.")
     flow = as_flow(checkpoint.generator, "interpolation")
-    arrived = arrived or (lambda done: None)
     inverted = []
     for scan, which in zip(pair, ("first", "last"), strict=True):
         inverted.append(invert(checkpoint, scan[None], sampler, progress))
@@ -193,14 +213,14 @@ def interpolate_scans(
         arrived(len(inverted))
     ends = Inversion(*(torch.cat([getattr(end, name) for end in inverted]) for name in Inversion.__annotations__))
     weights = torch.linspace(0, 1, frames, dtype=torch.float64)
-    noise = slerp(ends.x_0[0], ends.x_0[1], weights[1:-1])
-    x_1, evaluations, converged = [ends.again[:1]], [ends.evaluations[:1]], [ends.converged[:1]]
-    for first in range(0, len(noise), batch_size):
-        found = flow.solve(noise[first : first + batch_size], sampler=sampler, progress=progress)
-        x_1.append(found.x.cpu())
-        evaluations.append(found.evaluations)
-        converged.append(found.converged)
-        arrived(2 + first + len(found.x))
-    images = checkpoint.encoding.decode(torch.cat([*x_1, ends.again[1:]]))
-    counted = torch.cat([*evaluations, ends.evaluations[1:]])
-    return Interpolation(ends, weights, images, counted, torch.cat([*converged, ends.converged[1:]]))
+    parts: list[Any] = []
+    for noise in slerp(ends.x_0[0], ends.x_0[1], weights[1:-1]).split(batch_size) if frames > 2 else ():
+        parts.append(flow.solve(noise, sampler=sampler, progress=progress))
+        arrived(2 + sum(len(part.x) for part in parts))
+
+    def framed(of_ends: Tensor, name: str) -> Tensor:
+        return torch.cat([of_ends[:1], *(getattr(part, name).cpu() for part in parts), of_ends[1:]])
+
+    images = checkpoint.encoding.decode(framed(ends.again, "x"))
+    evaluations = framed(ends.evaluations, "evaluations")
+    return Interpolation(ends, weights, images, evaluations, framed(ends.converged, "converged"))

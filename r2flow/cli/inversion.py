@@ -38,9 +38,9 @@ def interpolate(
     The solver is dopri5 at a tolerance of 1e-4 if left out.
     """
     from r2flow.cli.output import command
+    from r2flow.inversion import real_scans
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.interpolation import interpolation
-    from r2flow.reports.inversion import real_scans
     from r2flow.reports.pages import write_page
     from r2flow.samplers import build_sampler
 

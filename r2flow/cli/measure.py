@@ -44,11 +44,11 @@ def completion(
 
     from r2flow.cli.groups import SamplerOptions
     from r2flow.cli.output import command, finish
+    from r2flow.inversion import real_scans
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.model.completion import completing
     from r2flow.progress import Bar
     from r2flow.reports.completion import TASKS, Way, completion_page, completion_rows, measured_by, pictured
-    from r2flow.reports.inversion import real_scans
     from r2flow.reports.pages import prepare_folder
 
     loaded = {

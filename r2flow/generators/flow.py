@@ -125,7 +125,7 @@ class NetworkFlow(Flow):
                 raise InputError(
                     f"the network to start from has weights for images of {there} ('{sized[0]}'), found {here}: leave "
                     f"sensor out, give sensor.rows={parent.space.shape[1]} sensor.columns={parent.space.shape[2]}, "
-                    "or first grow it to a multiple of its size (r2flow.growing)."
+                    "or first grow it to a multiple of its size (examples/street/growing.py)."
                 )
         self._take(parent, {**new, **theirs})
 

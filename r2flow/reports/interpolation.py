@@ -11,10 +11,9 @@ from torch import Tensor
 from r2flow.data.sources import spread
 from r2flow.errors import InputError
 from r2flow.generators import Sampler, as_flow
-from r2flow.inversion import TIGHT, interpolate_scans
+from r2flow.inversion import TIGHT, Real, interpolate_scans, round_trip
 from r2flow.lidar.projection import image_to_points
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.reports.inversion import COLUMNS, Real, errors_of
 from r2flow.reports.outputs import ScanBar, warn_unsolved, write_scan
 from r2flow.reports.pages import Page, prepare_folder
 from r2flow.reports.pictures import (
@@ -37,7 +36,10 @@ PANELS = {
 }  # fmt: skip
 REAL = "#ffd479"
 BETWEEN = {"frame": "frame", "weight": "w"} | {key: key for key in ("returns", "evaluations", "converged")}
-ENDS = {key: COLUMNS[key] for key in ("scan", "rms", "median_m", "dropped", "noise_std", "converged")}
+ENDS = {
+    "scan": "scan", "rms": "RMS, model space", "median_m": "median, m", "dropped": "rays lost or gained",
+    "noise_std": "std of x_0", "converged": "converged",
+}  # fmt: skip
 
 
 def interpolation(
@@ -59,7 +61,7 @@ def interpolation(
     """
     sampler.check(as_flow(checkpoint.generator, "interpolation"))
     if len(scans) != 2:
-        raise InputError(f"needs the two scans to go between, found {len(scans)}; name two files.")
+        raise InputError(f"give two scans, found {len(scans)}.")
     pair = torch.stack([scan.image for scan in scans])
     prepare_folder(out)
     names = [scan.name for scan in scans]
@@ -75,11 +77,13 @@ def interpolation(
         row = {"frame": number, "weight": weight, "returns": int((image[0] > 0).sum())}
         row |= {"evaluations": int(found.evaluations[number]), "converged": bool(found.converged[number])}
         rows.append(row)
+    errors = round_trip(checkpoint, found.ends) | {"converged": found.ends.converged}
+    ends_rows = [{"scan": name} | {key: errors[key][i].item() for key in errors} for i, name in enumerate(names)]
     text = (
         f"Both scans were carried to their noise by the flow of {checkpoint.path.name}, step {checkpoint.step}; frames "
         "come from the spherical interpolation (slerp) of the two. The first and the last frame are the scans' round "
         "trips; their evaluations are those of both ways.",
-        table(errors_of(checkpoint, found.ends, names, pair), ENDS),
+        table(ends_rows, ENDS),
         table(rows, BETWEEN),
     )
     ends = [Panel(f"real: {name}", image[None], rays) for name, image in zip(names, pair.numpy(), strict=True)]

@@ -5,12 +5,11 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.inversion import interpolate_scans
+from r2flow.inversion import interpolate_scans, real_scans
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
 from r2flow.reports.interpolation import interpolation, interpolation_figure
-from r2flow.reports.inversion import real_scans, unique_names
 from r2flow.reports.pictures import figure_pixels
 from r2flow.samplers import build_sampler
 from tests.test_sampling import SENSOR, GaussianFlow, flow, scans
@@ -99,8 +98,3 @@ def test_a_range_image_is_limited_to_the_range_of_the_sensor(tmp_path):
     assert name == "image"
     np.testing.assert_allclose(seen[0].flatten(), [0, 1.45, 40, 80, 0, 0, 0, 0])
     np.testing.assert_allclose(seen[1].flatten(), [0, 0.5, 0, 1, 0, 0, 0, 0])
-
-
-def test_files_of_one_name_do_not_overwrite_each_other(tmp_path):
-    paths = [tmp_path / "a" / "000.bin", tmp_path / "b" / "000.bin", tmp_path / "b" / "001.pcd.bin"]
-    assert unique_names(paths) == ["000_1", "000_2", "001"]
