@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.figure import Figure
 
-from r2flow.evaluation.copies import WAYS, Nearest
+from r2flow.evaluation.copies import Nearest
 from r2flow.evaluation.measuring import MetricResult
 from r2flow.evaluation.sets import ScanSet
 from r2flow.files import atomic_write
@@ -240,21 +240,15 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
 
 
 def copies_figure(nearest: Mapping[str, Nearest], training: ScanSet, pairs: int = 4) -> Figure:
-    """The scans of each set that are nearest to training scans, whole and in parts; right the training scan as it is
-    turned.
-    """
-    chosen = [
-        (name, way, one, int(place), float(one.distances(way)[place]))
-        for name, one in nearest.items()
-        for way in WAYS
-        for place in np.argsort(one.distances(way), kind="stable")[:pairs]
-    ]
+    """The scans of each set that are nearest to training scans; right the training scan, turned as they are."""
+    chosen = [(name, one, int(i)) for name, one in nearest.items() for i in np.argsort(one.distances)[:pairs]]
     figure = blank_figure(14, 0.9 * len(chosen) + 0.2)
     figure.set_facecolor(BACKGROUND)
     panels = figure.subplots(len(chosen), 2, squeeze=False)
-    for (left, right), (name, way, one, place, distance) in zip(panels, chosen, strict=True):
+    for (left, right), (name, one, place) in zip(panels, chosen, strict=True):
         number = int(one.numbers[place])
         draw_range(left, one.scans.source[number], label=False)
-        draw_range(right, one.match(place, way, training), label=False)
-        left.set_title(f"{name} {number}: {shown(distance)} away by {WAYS[way]}", color=FOREGROUND, fontsize=8, pad=2)
+        draw_range(right, one.match(place, training), label=False)
+        title = f"{name} {number}: {shown(float(one.distances[place]))} away"
+        left.set_title(title, color=FOREGROUND, fontsize=8, pad=2)
     return figure

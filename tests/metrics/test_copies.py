@@ -1,8 +1,7 @@
-"""Copies among generated scans are found, turned, mirrored or in parts, and shown."""
+"""Copies among generated scans are found, turned or mirrored, and shown."""
 
 import json
 import math
-from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -11,26 +10,23 @@ import pytest
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
 from r2flow.errors import InputError
-from r2flow.evaluation.copies import SECTORS, copies_result, find_nearest, nearer
+from r2flow.evaluation.copies import copies_result, find_nearest
 from r2flow.evaluation.measuring import Work
 from r2flow.lidar.sensors import SENSORS
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_evaluation import folder, images
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
-PART = 64 // SECTORS
 
 
 @pytest.fixture
 def made() -> dict[str, np.ndarray]:
-    """Training scans, generated ones of which the last four are copies, and held-out ones."""
-    made = {"training": images(9, 1), "generated": images(7, 2), "held": images(7, 3)}
+    """Training scans, generated ones of which the last three are copies, and held-out ones."""
+    made = {"training": images(9, 1), "generated": images(6, 2), "held": images(7, 3)}
     copies, training = made["generated"], made["training"]
     copies[3] = training[5]
     copies[4] = np.roll(training[6], 20, -1)
     copies[5] = np.roll(training[7][..., ::-1], 13, -1)
-    copies[6] = training[2]
-    copies[6, ..., 4 * PART :] = np.roll(training[8], 3, -1)[..., 4 * PART :]
     return made
 
 
@@ -45,59 +41,36 @@ def log_range(image: np.ndarray) -> np.ndarray:
     return np.where(r > 0, 2 * np.log2(r + 1) / np.log2(81) - 1, -1)
 
 
-def by_hand(x: np.ndarray, training: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean squared difference of every sector from every training scan, (turns and mirrors, M, S), one by one."""
+def by_hand(x: np.ndarray, training: np.ndarray) -> np.ndarray:
+    """Mean squared difference from every training scan over turns and mirrors, (M,), one by one."""
     y = [np.roll(log_range(image)[:, ::flip], -u, -1) for flip in (1, -1) for u in range(64) for image in training]
-    d = (log_range(x) - np.stack(y)) ** 2
-    return d.reshape(2 * 64, len(training), 8, SECTORS, PART).mean((2, 4))
+    return ((log_range(x) - np.stack(y)) ** 2).mean((1, 2)).reshape(2 * 64, len(training)).min(0)
 
 
-def test_each_is_beside_its_nearest_over_turns_mirror_and_parts(sets, made):
+def test_each_is_beside_its_nearest_over_turns_and_mirror(sets, made):
     found = find_nearest({name: sets[name] for name in ("generated", "held")}, sets["training"], Work(2))
     for name, one in found.items():
         for i, image in enumerate(made[name]):
             d = by_hand(image, made["training"])
-            whole, parts = d.mean(2).min(0), d.min(0)
-            assert int(one.neighbours[i, 0]) == whole.argmin()
-            assert one.distances("whole")[i] == pytest.approx(math.sqrt(whole.min()), abs=1e-3)
-            assert one.distances("parts")[i] == pytest.approx(math.sqrt(parts.min(0).mean()), abs=1e-3)
-            if d.mean(2).min() > 0.01:  # a copy's sectors may lie equally near in several places
-                np.testing.assert_array_equal(one.neighbours[i, 1:], parts.argmin(0))
+            assert int(one.neighbours[i]) == d.argmin()
+            assert one.distances[i] == pytest.approx(math.sqrt(d.min()), abs=1e-3)
 
 
-def test_copies_are_found_with_their_turn_and_their_parts(sets, made):
+def test_copies_are_found_with_their_turn(sets, made):
     found = find_nearest({name: sets[name] for name in ("generated", "held")}, sets["training"], Work())
     one, real = found["generated"], found["held"]
-    assert set(np.argsort(one.distances("whole"))[:3]) == {3, 4, 5}
-    assert set(np.argsort(one.distances("parts"))[:4]) == {3, 4, 5, 6}
-    assert one.neighbours[3:6, 0].tolist() == [5, 6, 7]
-    assert (one.turns[3:6, 0] < 0).tolist() == [False, False, True]
-    # The figure draws the training scan as the sample shows it.
-    for way, places in (("whole", (3, 4, 5)), ("parts", (3, 6))):
-        for place in places:
-            np.testing.assert_array_equal(one.match(place, way, sets["training"])[0], made["generated"][place][0])
+    assert set(np.argsort(one.distances)[:3]) == {3, 4, 5}
+    assert one.neighbours[3:].tolist() == [5, 6, 7]
+    assert (one.turns[3:] < 0).tolist() == [False, False, True]
+    for place in (3, 4, 5):  # the figure draws the training scan as the sample shows it
+        np.testing.assert_array_equal(one.match(place, sets["training"])[0], made["generated"][place][0])
     result = copies_result(one, real, 9)
-    for way, remark in zip(("whole", "parts"), result.remarks, strict=True):
-        count = (one.distances(way) < min(real.distances(way))).sum()
-        assert count >= 3
-        assert f"{count} of 7 scans" in remark
-        assert result.figures[f"copies_{way}"] == np.median(one.distances(way))
-        wins = np.mean([a < b for a in one.distances(way) for b in real.distances(way)])
-        assert result.figures[f"copies_{way}_nearer"] == pytest.approx(wins)
-
-
-def test_how_unlikely_it_is_is_counted_over_all_orders():
-    """Of 3 and 4 numbers, by the 35 ways in which chance can mix them."""
-    a, b = np.array([0.1, 0.2, 0.5]), np.array([0.3, 0.4, 0.6, 0.7])
-    found = nearer(a, b)
-    orders = {tuple(order) for order in permutations("aaabbbb")}
-    first = [order.index("b") for order in orders]  # how many of a lie before every b
-    assert found.count == 2
-    assert found.expected == pytest.approx(np.mean(first)) == 3 / 5
-    assert found.p_count == pytest.approx(np.mean([k >= 2 for k in first]))
-    wins = [sum(x == "a" and y == "b" for i, x in enumerate(order) for y in order[i:]) for order in orders]
-    assert found.share == 10 / 12
-    assert found.p_share == pytest.approx(np.mean([win >= 10 for win in wins]))
+    count = (one.distances < min(real.distances)).sum()
+    assert count >= 3
+    assert f"{count} of 6 scans" in result.remarks[0]
+    assert result.figures["copies"] == np.median(one.distances)
+    wins = np.mean([a < b for a in one.distances for b in real.distances])
+    assert result.figures["copies_nearer"] == pytest.approx(wins)
 
 
 def test_scans_without_a_return_have_no_neighbour(sets, tmp_path):
@@ -123,6 +96,6 @@ def test_evaluate_has_the_copies_as_lines_and_a_picture(r2flow, sets, tmp_path):
         for one in json.loads((tmp_path / "e.json").read_text())["comparisons"]
     }
     for name, one in (("generated", found["generated"]), ("real halves", found["held"])):
-        assert figures[name]["copies_whole"] == pytest.approx(np.median(one.distances("whole")), rel=1e-6)
+        assert figures[name]["copies"] == pytest.approx(np.median(one.distances), rel=1e-6)
     assert figures["noise"] == {}
     assert (tmp_path / "page" / "evaluation_copies.png").stat().st_size > 0
