@@ -35,7 +35,6 @@ def _lazily(where: str, *given: Any) -> Callable[..., ScanMetric]:
 METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     "metric",
     jsd=_lazily("jsd:JSD"),
-    jsd_extrapolated=_lazily("jsd:JSDExtrapolated"),
     mmd=_lazily("mmd:MMD"),
     mmd_unbiased=_lazily("mmd:MMDUnbiased"),
     jsd_lidm=_lazily("lidm:JSDLiDM"),
@@ -58,8 +57,8 @@ for _network in EXTRACTORS:
 def default_metrics(reflectance: bool) -> tuple[str, ...]:
     """What is measured where nobody names metrics: all of it without a download, the headline first.
 
-    The field's JSD and MMD stand beside what they would be without the bias of few scans, and KID, which has none,
-    beside the Frechet distance of the same features. Docs: metrics.md, "The headline".
+    KID and the unbiased MMD, which few scans do not bias, stand beside the field's Frechet
+    distance and MMD. Docs: metrics.md, "The headline".
     """
     features = "handcrafted" if reflectance else "handcrafted_range"
-    return (f"kid_{features}", f"frechet_{features}", "panel", "jsd", "jsd_extrapolated", "mmd", "mmd_unbiased")
+    return (f"kid_{features}", f"frechet_{features}", "panel", "jsd", "mmd", "mmd_unbiased")

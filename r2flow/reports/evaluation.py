@@ -23,7 +23,7 @@ Kind = Literal["judged", "reference", "baseline"]
 
 # Figures that the field's tables print scaled: heading and factor. The figure itself stays what it is.
 PRINTED = {
-    "jsd": ("JSD x 10^2", 1e2), "jsd_extrapolated": ("JSD x 10^2, extrapolated", 1e2),
+    "jsd": ("JSD x 10^2", 1e2),
     "mmd": ("MMD x 10^4", 1e4), "mmd_unbiased": ("MMD x 10^4, unbiased", 1e4),
 }  # fmt: skip
 

@@ -9,7 +9,7 @@ import torch
 
 from r2flow.metrics import lidm, mmd
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
-from r2flow.metrics.jsd import JSD, JSDExtrapolated
+from r2flow.metrics.jsd import JSD
 from r2flow.metrics.lidm import JSDLiDM, MMDLiDM, squared_distance_map
 from r2flow.metrics.mmd import MMD, MMDUnbiased
 from r2flow.metrics.scans import Scans
@@ -57,36 +57,6 @@ def test_mmd_is_the_mean_over_all_pairs_in_blocks_of_any_size(monkeypatch):
         sets = Seen(counts[:10]), Seen(counts[10:])
         assert figure(MMD(), *sets)["mmd"] == pytest.approx(expected, rel=1e-9)
         assert figure(MMDUnbiased(), *sets)["mmd_unbiased"] == pytest.approx(unbiased, rel=1e-9)
-
-
-@pytest.mark.parametrize("apart", [0.0, 0.6])
-def test_the_extrapolated_distance_is_that_of_the_distributions_and_the_published_one_is_not(apart):
-    # Known distributions; 40 real and 60 generated scans of 60 points each, two at a time in a cell, and perhaps one.
-    draw = np.random.default_rng(0)
-
-    def scans(p, n):
-        counts = 2 * draw.multinomial(30, p, n) + draw.multinomial(draw.integers(0, 2, n), p)
-        return Seen(counts.reshape(n, 100, 100))
-
-    p = np.zeros((2, 10000))
-    p[:, :400] = 1 + apart * draw.uniform(-1, 1, (2, 400))
-    p /= p.sum(1, keepdims=True)
-    truth = js_distance(*p)
-    found = {"jsd": [], "jsd_extrapolated": []}
-    for _ in range(4):
-        sets = scans(p[0], 40), scans(p[1], 60)
-        for metric in (JSD(), JSDExtrapolated()):
-            for name, value in figure(metric, *sets).items():
-                found[name].append(value)
-    errors = {name: abs(np.sqrt(np.mean(np.square(values))) - truth) for name, values in found.items()}
-    assert errors["jsd"] > 0.05
-    assert errors["jsd_extrapolated"] < 0.4 * errors["jsd"]
-
-
-def test_too_few_scans_for_halves_have_no_extrapolated_distance():
-    metric = JSDExtrapolated()
-    assert math.isnan(figure(metric, Seen(np.ones((1, 100, 100))), Seen(np.ones((5, 100, 100))))["jsd_extrapolated"])
-    assert any("one half of a set has no scan with a return" in said for said in metric.remarks())
 
 
 def test_disjoint_sets_have_the_largest_distance(scans_of):
