@@ -57,9 +57,7 @@ def test_sample_writes_the_same_scans_for_the_same_seed(r2flow, saved, tmp_path)
     )
     assert code == 0
     assert str(tmp_path / "a" / "samples.png") in out
-    r2flow(
-        "sample", "-c", path.parent.parent, "--num", 1, "--steps", 2, "--seed", 5, "-o", tmp_path / "b", "--pictures", 0
-    )
+    r2flow("sample", path.parent.parent, "--num", 1, "--steps", 2, "--seed", 5, "-o", tmp_path / "b", "--pictures", 0)
     r2flow("sample", "-c", path, "--num", 3, "--steps", 2, "--seed", 6, "-o", tmp_path / "c", "--format", "npy")
     images = {name: np.load(tmp_path / name / "000000.npy") for name in "abc"}
     assert images["a"].shape == (2, 8, 64)

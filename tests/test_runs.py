@@ -59,7 +59,7 @@ def test_a_finished_run_keeps_its_sampler(tmp_path: Path):
     assert open_run(tmp_path, other) == unfinished
     assert read_config(tmp_path) == other
     finished = checkpoint(tmp_path, 10)
-    with pytest.raises(InputError, match=r"sampler.steps=3 there, 4 here\..* r2flow sample -c .* --sampler NAME"):
+    with pytest.raises(InputError, match=r"sampler.steps=3 there, 4 here\..* r2flow sample .* --sampler NAME"):
         open_run(tmp_path, changed(sampler={"method": "euler", "steps": 4}))
     assert read_config(tmp_path) == other
     moved = changed(sampler={"method": "euler", "steps": 3, "precision": None}, data__root="b")  # a key of today

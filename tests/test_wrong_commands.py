@@ -261,11 +261,11 @@ evaluate image.npy # nothing to compare with
 evaluate simulated:x scans
 evaluate simulated:² scans # as simulated:0; found 'simulated:²'
 report curvature # Missing
-report curvature -c run # Missing
-report curvature -c nowhere -o out
-report curvature -c run -o file.txt
+report curvature run # Missing
+report curvature nowhere -o out
+report curvature run -o file.txt
 report solvers # Missing
-report solvers -c nowhere -o out
+report solvers nowhere -o out
 report solvers -o out --samplers nope
 report solvers -o out --budgets 0
 report solvers -o out --budgets a
@@ -293,7 +293,7 @@ BASES = {
     "complete": "complete scans/000000.bin -c run -o out", "view": "view run -o out.html", "show": "show scans -o out",
     "interpolate": "interpolate scans/000000.bin scans/000001.bin -c run -o out", "sensor": "sensor scans",
     "prepare": "prepare folder scans -o out", "evaluate": "evaluate scans run --metrics jsd", "compare": "compare run",
-    "curvature": "report curvature -c run -o out", "solvers": "report solvers -o out",
+    "curvature": "report curvature run -o out", "solvers": "report solvers -o out",
     "backbones": "report backbones", "paper": "report paper run -o out",
 }  # fmt: skip
 WORDS = ("device", "sensor", "sampler", "format", "projection", "convention", "precision", "metrics")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.groups import DrawOptions, SamplerOptions, grouped
+from r2flow.cli.groups import DrawOptions, ModelOptions, SamplerOptions, grouped
 from r2flow.cli.options import (
     OutOption,
     PrecisionOption,
@@ -67,22 +67,19 @@ def _pair(option: str, text: str, between: str, kind: type, meaning: str) -> tup
     return first, second
 
 
-@app.command(epilog="Example: r2flow sample --checkpoint runs/simulated-hdit_tiny --num 16 --steps 64 --out scans")
+@app.command(epilog="Example: r2flow sample street --num 16 --steps 64 --out scans")
 @grouped
 def sample(
+    which: ModelOptions,
     out: OutOption,
     draw: DrawOptions,
     how: SamplerOptions,
     part: RegionOptions,
-    checkpoint: Annotated[
-        Path | None,
-        typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model; street if left out."),
-    ] = None,
     precision: PrecisionOption = None,
     format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture.")] = 8,
 ) -> None:
-    """Draw scans from a trained generator: point clouds, range images and pictures.
+    """Draw scans from a trained generator, `street` if left out: point clouds, range images and pictures.
 
     The sampler is the generator's own if left out.
     """
@@ -90,9 +87,9 @@ def sample(
     from r2flow.models import DEFAULT, MODELS, find_model
     from r2flow.reports.outputs import formats_of, write_samples
 
-    if checkpoint is None:
+    if which.name is None:
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
-    loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(draw.device))
+    loaded = load_checkpoint(which.name or find_model(DEFAULT), device=choose_device(draw.device))
     sampler = loaded.generator.choose(**how.given)
     formats = [*dict.fromkeys(map(str.strip, format.split(",")))] if format else formats_of(loaded, part.channels)
     region = part.region(loaded)

@@ -17,6 +17,7 @@ from r2flow.cli.options import (
     SensorChoice,
     SizeOption,
 )
+from r2flow.errors import InputError
 
 
 def grouped(verb: Callable[..., None]) -> Callable[..., None]:
@@ -49,6 +50,29 @@ def grouped(verb: Callable[..., None]) -> Callable[..., None]:
     call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return call
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """The generator that a verb runs, by position or as --checkpoint."""
+
+    model: Annotated[
+        str | None, typer.Argument(help="A model, a run folder or a checkpoint file.", show_default=False)
+    ] = None
+    checkpoint: Annotated[
+        str | None, typer.Option("--checkpoint", "-c", help="MODEL as an option.", show_default=False)
+    ] = None
+
+    @property
+    def name(self) -> str | None:
+        """The model's name or path.
+
+        Raises:
+            InputError: both forms at once.
+        """
+        if self.model and self.checkpoint:
+            raise InputError(f"give MODEL or --checkpoint, not both; found {self.model} and {self.checkpoint}.")
+        return self.model or self.checkpoint
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from r2flow.cli.app import report
 from r2flow.cli.groups import grouped
 from r2flow.cli.options import (
     SETS,
-    CheckpointOption,
     DeviceOption,
     OutOption,
     ScaleChoice,
@@ -19,12 +18,13 @@ from r2flow.cli.options import (
 from r2flow.errors import InputError
 
 
-@report.command(epilog="Example: r2flow report completion kitti360/test -c street --num 15 --out reports")
+@report.command(epilog="Example: r2flow report completion kitti360/test street --num 15 --out reports")
 @grouped
 def completion(
     real: Annotated[str, typer.Argument(help=f"Scans, of which a part is hidden: {SETS}.")],
-    checkpoint: CheckpointOption = Path("street"),
-    also: Annotated[list[str] | None, typer.Option(help="More models, one each time.")] = None,
+    models: Annotated[
+        list[str] | None, typer.Argument(help="Models, run folders or checkpoint files; street if left out.")
+    ] = None,
     tasks: Annotated[
         str | None, typer.Option(help="Masks, as rows:4, a space between them; five masks if left out.")
     ] = None,
@@ -51,9 +51,7 @@ def completion(
     from r2flow.reports.completion import TASKS, Way, completion_page, completion_rows, measured_by, pictured
     from r2flow.reports.pages import prepare_folder
 
-    loaded = {
-        Path(name).stem: load_checkpoint(name, choose_device(device)) for name in [checkpoint, *map(Path, also or [])]
-    }
+    loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in models or ["street"]}
     ways = [
         Way(name, one, completing(one.generator, **SamplerOptions(sampler, steps).given))
         for name, one in loaded.items()

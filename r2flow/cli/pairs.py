@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.groups import SamplerOptions, grouped
-from r2flow.cli.options import CheckpointOption, DeviceOption, PrecisionOption, choose_device
+from r2flow.cli.groups import ModelOptions, SamplerOptions, grouped
+from r2flow.cli.options import DeviceOption, PrecisionOption, choose_device
 from r2flow.errors import InputError
 
 
@@ -48,10 +48,10 @@ class ShareOptions:
         return rank, ranks, where
 
 
-@app.command(epilog="Example: torchrun --nproc-per-node 8 -m r2flow.cli pairs -c runs/r2flow_1rf --num 1000000")
+@app.command(epilog="Example: torchrun --nproc-per-node 8 -m r2flow.cli pairs runs/r2flow_1rf --num 1000000")
 @grouped
 def pairs(
-    checkpoint: CheckpointOption,
+    which: ModelOptions,
     how: SamplerOptions,
     share: ShareOptions,
     num: Annotated[int, typer.Option(min=1, help="Pairs in all.")] = 1000,
@@ -80,9 +80,11 @@ def pairs(
     from r2flow.reports.pairs import make_and_tell
     from r2flow.runs.lineage import check_finished, pairs_of
 
+    if which.name is None:
+        raise InputError("Missing argument 'MODEL'.")
     rank, ranks, where = share.place()
-    flow = load_checkpoint(checkpoint)
-    check_finished(checkpoint, flow)
+    flow = load_checkpoint(which.name)
+    check_finished(Path(which.name), flow)
     options = {
         "sampler": {"name": "adams3", **how.given}, "precision": precision or "32-true",
         "num": num, "batch_size": batch_size, "shard_mib": shard_mib, "seed": seed, "first": first,

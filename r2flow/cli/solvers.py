@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from json import dumps as to_json
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -17,12 +16,10 @@ from r2flow.cli.output import command, finish, numbers
 from r2flow.errors import InputError
 
 
-@report.command(epilog="Example: r2flow report curvature -c runs/1rf -c runs/2rf --out reports")
+@report.command(epilog="Example: r2flow report curvature runs/1rf runs/2rf --out reports")
 @grouped
 def curvature(
-    checkpoints: Annotated[
-        list[Path], typer.Option("--checkpoint", "-c", help="A checkpoint, a run or a model; may be repeated.")
-    ],
+    models: Annotated[list[str], typer.Argument(help="Models, run folders or checkpoint files.")],
     out: OutOption,
     draw: DrawOptions,
     steps: Annotated[int, typer.Option(min=1, help="Euler steps of a path.")] = 256,
@@ -37,7 +34,7 @@ def curvature(
     from r2flow.reports.pages import prepare_folder
 
     where = choose_device(draw.device)
-    loaded = {str(path): load_checkpoint(path, where) for path in dict.fromkeys(checkpoints)}
+    loaded = {name: load_checkpoint(name, where) for name in dict.fromkeys(models)}
     for checkpoint in loaded.values():
         as_flow(checkpoint.generator, "curvature")
     prepare_folder(out)
@@ -61,15 +58,14 @@ class SolversOptions:
     repeats: Annotated[int, typer.Option(min=1, help="The most timed solutions of a scan.")] = 5
 
 
-@report.command(epilog="Example: r2flow report solvers -c runs/NAME --out reports")
+@report.command(epilog="Example: r2flow report solvers runs/NAME --out reports")
 @grouped
 def solvers(
     out: OutOption,
     draw: DrawOptions,
     options: SolversOptions,
-    checkpoint: Annotated[
-        Path | None,
-        typer.Option("--checkpoint", "-c", help="A checkpoint, a run or a model; exact problems alone if left out."),
+    model: Annotated[
+        str | None, typer.Argument(help="A model, a run or a checkpoint; exact problems alone if left out.")
     ] = None,
 ) -> None:
     """Error against run time of every solver: exact problems, stiff and extreme ones too, and a trained flow.
@@ -93,9 +89,9 @@ def solvers(
         PROBLEMS[problem]
     budgets, tolerances = numbers("budgets", options.budgets, int), numbers("tolerances", options.tolerances)
     chosen = measuring.configurations(methods, budgets, tolerances)
-    if not chosen or not (problems or checkpoint):
-        raise InputError("nothing to measure: give a checkpoint, more --budgets, or leave --problems none out.")
-    loaded = None if checkpoint is None else load_checkpoint(checkpoint, where)
+    if not chosen or not (problems or model):
+        raise InputError("nothing to measure: give a model, more --budgets, or leave --problems none out.")
+    loaded = None if model is None else load_checkpoint(model, where)
     if loaded is not None:
         as_flow(loaded.generator, "report solvers")
     prepare_folder(out)
@@ -103,9 +99,8 @@ def solvers(
     with only_errors():
         if loaded is not None:
             with Bar("measuring", draw.num * 512, "reference evaluations") as advance:
-                name = str(checkpoint)
                 flow = measuring.checkpoint_subject(
-                    loaded, name, draw.num, draw.seed, draw.batch_size, progress=advance
+                    loaded, str(model), draw.num, draw.seed, draw.batch_size, progress=advance
                 )
         everything = [*subjects, flow] if flow else subjects
         with Bar("measuring", len(everything) * len(chosen), "solutions") as advance:

@@ -46,7 +46,7 @@ def weights(
         for name, model in MODELS.items()
     ]
     print_table(models, ("model", "draws", "here", "file"))
-    print(f"\nLooked for in {models_folder()} (R2FLOW_MODELS) unless in the package. Draw: r2flow sample -c MODEL\n")
+    print(f"\nLooked for in {models_folder()} (R2FLOW_MODELS) unless in the package. Draw: r2flow sample MODEL\n")
     rows = []
     for name, source in SOURCES.items():
         there = kept(name)

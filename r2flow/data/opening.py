@@ -181,7 +181,7 @@ def samples_of(run: Path) -> Path | None:
     noted = {note.parent for note in run.glob(f"*/{SAMPLES}")}
     found = sorted(noted | {run / "samples"} if (run / "samples").is_dir() else noted)
     if not found:
-        raise InputError(f"{run} is a run without samples; draw some: r2flow sample -c {run} --out {run / 'samples'}.")
+        raise InputError(f"{run} is a run without samples; draw some: r2flow sample {run} --out {run / 'samples'}.")
     if len(found) == 1:
         return found[0]
     names = ", ".join(one.name for one in found)

@@ -1,4 +1,4 @@
-"""Trained generators by name: `r2flow.load("street")`, `r2flow sample -c street`, `stage.init=street`.
+"""Trained generators by name: `r2flow.load("street")`, `r2flow sample street`, `stage.init=street`.
 
 The file of a model is `NAME.safetensors`, in this folder where it comes with the package, else in the folder of models,
 where `r2flow weights --add NAME FILE` puts it. Nothing is downloaded.

@@ -271,7 +271,7 @@ def what_next(checkpoint: Path, out: Path, config: Mapping[str, Any] | None = No
     plugins = "".join(f" --plugin {shlex.quote(str(name))}" for name in (config or {}).get("plugins") or ())
     return f"""
 next
-  r2flow sample --checkpoint {checkpoint} --num 16{plugins} --seed 1 --out {out.parent / "more"}
+  r2flow sample {checkpoint} --num 16{plugins} --seed 1 --out {out.parent / "more"}
   r2flow show {out / "000000.ply"} --out {out.parent / "views"}
   {_what_to_train(checkpoint, config)}"""
 

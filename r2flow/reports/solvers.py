@@ -336,7 +336,7 @@ def flow_text(rows: Sequence[Row], subject: Subject, budgets: Sequence[int]) -> 
     for metres in WANTED:
         row = cheapest(rows, metres)
         how = ("none", None, None) if row is None else (
-            f"`r2flow sample -c {subject.name} {row['options']}`", row["evaluations"], row["seconds"]
+            f"`r2flow sample {subject.name} {row['options']}`", row["evaluations"], row["seconds"]
         )  # fmt: skip
         by_error.append((f"{metres:g} m", *how))
     return [

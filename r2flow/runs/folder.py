@@ -120,7 +120,7 @@ def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Ten
         if samplers and step_of(last) >= config["trainer"]["max_steps"]:
             raise InputError(
                 f"{run} is finished and keeps its sampler: {'; '.join(samplers)}. Leave it as it was, and draw by "
-                f"another with r2flow sample -c {run} --sampler NAME --steps N."
+                f"another with r2flow sample {run} --sampler NAME --steps N."
             )
     if old != dict(config) or not Path(run, CONFIG).is_file():  # free keys may have moved
         write_config(run, config)

@@ -141,7 +141,7 @@ class TestSamples:
 
     def test_a_run_stands_for_its_samples(self, tmp_path: Path, caplog):
         (tmp_path / "config.yaml").touch()
-        with pytest.raises(InputError, match="is a run without samples; draw some: r2flow sample -c"):
+        with pytest.raises(InputError, match="is a run without samples; draw some: r2flow sample"):
             open_scans(tmp_path)
         self.samples(tmp_path / "more")
         assert open_scans(tmp_path).source.places() == {str(tmp_path / "more" / "000000.npy")}

@@ -134,8 +134,8 @@ CANNOT = {
     "interpolate": (
         ["SCAN", "SCAN", "-c", "RUN", "-o", "OUT"], "interpolation needs the velocity of a flow, which a ToyGenerator"
     ),
-    "report curvature": (["-c", "RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
-    "report solvers": (["-c", "RUN", "-o", "OUT"], "report solvers needs the velocity of a flow"),
+    "report curvature": (["RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
+    "report solvers": (["RUN", "-o", "OUT"], "report solvers needs the velocity of a flow"),
     "export": (["RUN", "-o", "OUT.onnx"], "only flows can be exported"),
     "pairs": (["-c", "RUN"], "needs a generator with a velocity"),
     "sample": (["-c", "RUN", "--steps", "4", "-o", "OUT"], "has no option 'steps'"),

@@ -83,7 +83,7 @@ def test_the_verb_writes_a_page_with_its_picture(checkpoint, tmp_path: Path, mon
     checkpoint.save(tmp_path / "model.safetensors")
     out = tmp_path / "out"
     monkeypatch.setattr("sys.argv", [
-        "r2flow", "report", "completion", "simulated:3", "-c", str(tmp_path / "model.safetensors"), "--num", "2",
+        "r2flow", "report", "completion", "simulated:3", str(tmp_path / "model.safetensors"), "--num", "2",
         "--answers", "2", "--samplers", "euler,mmps", "--steps", "1", "--tasks", "rows:4 rows:2", "--out", str(out),
     ])  # fmt: skip
     with pytest.raises(SystemExit) as ended:

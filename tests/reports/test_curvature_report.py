@@ -125,7 +125,7 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
     copy = path.with_name("step-00000009.ckpt")
     copy.write_bytes(path.read_bytes())
     how = ("-o", out, "--steps", 4, "--num", 2, "--most-curved", 9)
-    code, said, _ = r2flow("report", "curvature", "-c", path, "-c", copy, *how)
+    code, said, _ = r2flow("report", "curvature", path, copy, *how)
     assert code == 0
     names = {"curvature.png", "trajectories.png", "curvature.csv", "curvature.json", "curvature.md"}
     assert {file.name for file in out.iterdir()} == names
@@ -133,7 +133,7 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
     content = json.loads((out / "curvature.json").read_text())
     assert len(content["rows"]) == 2 * 4
     assert {row["checkpoint"] for row in content["summary"]} == {str(path), str(copy)}
-    assert content["origin"]["command"].startswith(f"r2flow report curvature -c {path}")
+    assert content["origin"]["command"].startswith(f"r2flow report curvature {path}")
 
 
 def test_bad_input_is_one_line(r2flow, saved, tmp_path):  # noqa: F811
@@ -142,7 +142,7 @@ def test_bad_input_is_one_line(r2flow, saved, tmp_path):  # noqa: F811
         ((saved[0], "-o", tmp_path / "o", "--steps", 0), "--steps"),
         ((saved[0], "-o", saved[0] / "o"), "is a file, not a folder"),
     ):
-        code, _, err = r2flow("report", "curvature", "-c", *arguments)
+        code, _, err = r2flow("report", "curvature", *arguments)
         assert code == 2
         assert words in err
         assert len([line for line in err.splitlines() if not line.startswith("WARNING")]) == 1

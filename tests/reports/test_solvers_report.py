@@ -146,7 +146,7 @@ def test_the_exact_problems_are_reported_with_what_was_not_solved():
 def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
     out = tmp_path / "reports"
     code, said, _ = r2flow(
-        "report", "solvers", "-c", saved[0], "-o", out, "--num", 2, "--samplers", "euler,heun2,dopri5",
+        "report", "solvers", saved[0], "-o", out, "--num", 2, "--samplers", "euler,heun2,dopri5",
         "--budgets", "2,4", "--tolerances", "1e-2", "--problems", "gaussian,rotating", "--repeats", 1,
     )  # fmt: skip
     assert code == 0
@@ -171,7 +171,7 @@ def test_bad_input_is_one_line(r2flow, tmp_path):  # noqa: F811
         (("--budgets", "1", "--samplers", "rk4"), "--budgets"),
         (("--problems", "none"), "nothing to measure"),
         (("--problems", "gausian"), "'gaussian'"),
-        (("-c", tmp_path / "none"), "no checkpoint"),
+        ((tmp_path / "none",), "no checkpoint"),
     ):
         code, _, err = r2flow("report", "solvers", *arguments, "-o", out)
         assert code == 2
