@@ -73,7 +73,7 @@ def solvers(
     The page names the sampler that reaches a wanted error, as a command.
     """
     from r2flow.flow.problems import PROBLEMS
-    from r2flow.flow.solvers import check_method
+    from r2flow.flow.solvers import method_of
     from r2flow.generators import as_flow
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.progress import Bar
@@ -83,7 +83,7 @@ def solvers(
     where = choose_device(draw.device)
     methods = options.samplers.split(",") if options.samplers else list(measuring.METHODS)
     for method in methods:
-        check_method(method)
+        method_of(method)
     problems = [] if options.problems == "none" else options.problems.split(",") if options.problems else list(PROBLEMS)
     for problem in problems:
         PROBLEMS[problem]

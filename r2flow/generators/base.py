@@ -116,7 +116,7 @@ class Generator(nn.Module):
         known = condition and {name: value.to(self.device) for name, value in condition.items()}
         fresh = None if draws is None else lambda j: self.further_noise(draws, j).to(x)
         with autocast(self.device, precision):
-            return how(self, x, known, fresh, progress)
+            return how(self, x, known, fresh, progress or (lambda: None))
 
     def further_noise(self, draws: Draws, j: int) -> Tensor:
         """The noise of step j."""

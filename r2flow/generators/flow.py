@@ -14,7 +14,7 @@ from r2flow.generators.base import Condition, Generator
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
-from r2flow.samplers import MMPS, FixedSteps, ODESampler, Progress, Sampler
+from r2flow.samplers import MMPS, FixedSteps, Progress, Sampler
 
 USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  # of a new flow: docs/results.md
 
@@ -60,7 +60,7 @@ class Flow(Generator):
         """
         how = sampler or self.sampler
         how.check(self)
-        if not isinstance(how, ODESampler):
+        if not how.follows:
             raise InputError(f"sampler {how.name} does not follow the flow's paths: give a solver, such as adams3.")
         return how.solve(self, x.to(self.device), t_0, t_1, condition, progress, **options)
 
@@ -226,7 +226,7 @@ class Conditioned:
 
 def ode_sampler(flow: Flow) -> Sampler:
     """A flow's own sampler if it follows the flow's paths, else the usual one."""
-    return flow.sampler if isinstance(flow.sampler, ODESampler) else USUAL
+    return flow.sampler if flow.sampler.follows else USUAL
 
 
 def as_flow(generator: Generator, what: str) -> Flow:

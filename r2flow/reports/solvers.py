@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 
 from r2flow.flow.problems import PROBLEMS
-from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, Solution, Velocity, adapts, fixed_step, solve, usual_grid
+from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, Solution, Velocity, method_of, solve, usual_grid
 from r2flow.generators import as_flow
 from r2flow.generators.base import Progress
 from r2flow.inversion import metres_apart, rms
@@ -84,11 +84,11 @@ def configurations(methods: Sequence[str], budgets: Sequence[int], tolerances: S
     """Every fixed-step method at the numbers of steps that fit the budgets, every adaptive one at the tolerances."""
     chosen: list[Configuration] = []
     for method in methods:
-        if adapts(method):
+        how = method_of(method)
+        if how.adapts:
             chosen += [Configuration(method, tolerance=tolerance) for tolerance in tolerances]
             continue
-        own = fixed_step(method.removeprefix(TORCHDIFFEQ))
-        start, per_step = (own.start, own.evaluations) if own else (0, 1)
+        start, per_step = getattr(how, "start", 0), getattr(how, "evaluations", 1)
         steps = sorted({(budget - start) // per_step for budget in budgets if budget >= start + per_step})
         chosen += [Configuration(method, steps=count) for count in steps]
     return chosen
@@ -234,7 +234,7 @@ def judge(
         (None: none), `verdict` one of accurate, flagged, owned up and silent.
     """
     start, rows = Draws(0, range(scans)).start((elements,)), []
-    adaptive = [method for method in methods if method in SOLVERS and adapts(method)]
+    adaptive = [method for method in methods if method in SOLVERS and SOLVERS[method].adapts]
     for name, precision, method, tolerance in product(problems, PRECISIONS, adaptive, tolerances):
         problem, (state, network) = PROBLEMS[name](), PRECISIONS[precision]
         x_0 = start.to(state)

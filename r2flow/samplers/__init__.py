@@ -15,7 +15,7 @@ import yaml
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.solvers import SOLVERS, FixedStep, usual_grid
+from r2flow.flow.solvers import SOLVERS, usual_grid
 from r2flow.registry import Registry, lazy
 from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Sampler, _with_steps
 from r2flow.samplers.maps import Chord, Jump, Renoise
@@ -36,8 +36,7 @@ class _Samplers(Registry[Any]):
     def __getitem__(self, name: str) -> Any:
         if name not in SOLVERS or name in self._entries:
             return super().__getitem__(name)
-        solver = SOLVERS[name]
-        if not isinstance(solver, FixedStep):
+        if SOLVERS[name].adapts:
             return partial(Adaptive, method=name)
         return partial(FixedSteps, method=name, grid=usual_grid(name))
 
@@ -104,7 +103,4 @@ def knot_times(options: Mapping[str, Any], knots: int) -> Tensor:
     Raises:
         InputError: it keeps no such states.
     """
-    sampler = build_sampler(options)
-    if not isinstance(sampler, ODESampler):
-        raise InputError(f"sampler {sampler.name} keeps no inner states; give a solver of r2flow, such as adams3.")
-    return sampler.knot_times(knots)
+    return build_sampler(options).knot_times(knots)

@@ -16,8 +16,10 @@ from r2flow.registry import Bound, check_options, options_of
 Condition = Mapping[str, Tensor]
 """Conditions of each scan by name: tensors of shape (B, ...)."""
 
-Progress = Callable[[], None] | None
+Call = Callable[[], None]
+Progress = Call | None
 Noise = Callable[[int], Tensor]  # N(0, 1) of the j-th draw, j = 1, 2, ..., in the noise's shape
+Given, Fresh = Condition | None, Noise | None
 Steps = Annotated[int, Bound("from 1 to 1,000,000", lambda n: 1 <= n <= 10**6)]
 Grid = str | list[float] | tuple[float, ...]
 
@@ -56,23 +58,18 @@ class Sampler(ABC):
         draws: Whether noise is drawn on the way.
         paired: Whether x_1 still belongs to its noise x_0, so that both can be a reflow pair.
         completes: Whether a condition is needed.
+        follows: Whether it follows the flow's own paths, forward and backward in time (`ODESampler`).
         needs: Attribute of the generators that the sampler can run.
     """
 
     draws: ClassVar[bool] = False
     paired: ClassVar[bool] = True
     completes: ClassVar[bool] = False
+    follows: ClassVar[bool] = False
     needs: ClassVar[str] = "velocity"
 
     @abstractmethod
-    def __call__(
-        self,
-        generator: Any,
-        noise: Tensor,
-        condition: Condition | None = None,
-        draws: Noise | None = None,
-        progress: Progress = None,
-    ) -> Generated:
+    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         """x_1 in model space, (B, C, H, W).
 
         Args:
@@ -103,6 +100,14 @@ class Sampler(ABC):
         if getattr(generator, self.needs, None) is None:
             kind = type(generator).__name__
             raise InputError(f"sampler {self.name} needs a generator with a {self.needs}, which a {kind} is not.")
+
+    def knot_times(self, knots: int) -> Tensor:
+        """Times of both ends and of the inner states that a solution keeps, (knots + 2,) float64.
+
+        Raises:
+            InputError: this sampler keeps no such states.
+        """
+        raise InputError(f"sampler {self.name} keeps no inner states; give a solver of fixed steps, such as adams3.")
 
     def changed(self, **options: Any) -> Self:
         """The same sampler with the options that are not None.

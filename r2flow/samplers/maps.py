@@ -11,7 +11,7 @@ from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.flow.solvers import Solution
 from r2flow.flow.solvers.solution import finite, stepped
-from r2flow.samplers.base import Condition, Generated, Grid, Noise, OnGrid, Progress, Steps
+from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, OnGrid, Progress, Steps
 from r2flow.samplers.ode import ODESampler
 
 
@@ -33,7 +33,7 @@ class Jump(OnGrid, ODESampler):
         x: Tensor,
         t_0: float = 0.0,
         t_1: float = 1.0,
-        condition: Condition | None = None,
+        condition: Given = None,
         progress: Progress = None,
         **options: Any,
     ) -> Solution:
@@ -83,14 +83,7 @@ class Renoise(OnGrid):
 
     steps: Steps = 4
 
-    def __call__(
-        self,
-        generator: Any,
-        noise: Tensor,
-        condition: Condition | None = None,
-        draws: Noise | None = None,
-        progress: Progress = None,
-    ) -> Generated:
+    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         assert draws is not None
         u, x, alive, times = generator.map(condition), noise, finite(noise), self.times().to(noise)
         for j, (t, s) in enumerate(pairwise(times), start=1):
@@ -98,8 +91,7 @@ class Renoise(OnGrid):
             if s < 1:
                 following = s * following + (1 - s) * draws(j)
             x, alive = stepped(x, following, alive)
-            if progress is not None:
-                progress()
+            progress()
         return Generated.after(x, self.steps, alive)
 
 

@@ -1,52 +1,42 @@
 """The ODE dx/dt = v(t, x) of a flow, by a solver of `r2flow.flow.solvers`."""
 
-from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
-import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.solvers import TORCHDIFFEQ, FixedStep, Solution, check_method, fixed_step, named_grid, solve
+from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, Solution, method_of, named_grid, solve
 from r2flow.registry import Count, Portion, Positive
-from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Sampler
+from r2flow.samplers.base import Call, Fresh, Generated, Given, OnGrid, Progress, Sampler
 
 
 class ODESampler(Sampler):
     """A sampler that follows the flow's own paths, forward and backward in time."""
 
-    @abstractmethod
+    follows: ClassVar[bool] = True
+
+    def options(self) -> dict[str, Any]:
+        """Options of `r2flow.flow.solvers.solve`."""
+        raise NotImplementedError
+
     def solve(
         self,
         generator: Any,
         x: Tensor,
         t_0: float = 0.0,
         t_1: float = 1.0,
-        condition: Condition | None = None,
+        condition: Given = None,
         progress: Progress = None,
         **options: Any,
     ) -> Solution:
         """The state at t_1 from x at t_0, (B, ...); options are those of `r2flow.flow.solvers.solve`."""
+        how = {**self.options(), **options}
+        return solve(generator.field(condition), x, t_0, t_1, progress=progress, **how)
 
-    def __call__(
-        self,
-        generator: Any,
-        noise: Tensor,
-        condition: Condition | None = None,
-        draws: Noise | None = None,
-        progress: Progress = None,
-    ) -> Generated:
+    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         end = self.solve(generator, noise, condition=condition, progress=progress)
         return Generated(end.x, end.evaluations, end.converged)
-
-    def knot_times(self, knots: int) -> Tensor:
-        """Times from 0 to 1 of both ends and of the inner states that a solution keeps, (knots + 2,) float64.
-
-        Raises:
-            InputError: this sampler keeps no such states.
-        """
-        raise InputError(f"{self.name} keeps no inner states; give a solver of r2flow, such as adams3.")
 
 
 @dataclass(frozen=True)
@@ -65,41 +55,20 @@ class FixedSteps(OnGrid, ODESampler):
     def name(self) -> str:
         return self.method
 
-    @property
-    def solver(self) -> FixedStep:
-        """The method of steps."""
-        solver = fixed_step(self.method)
-        assert solver is not None
-        return solver
-
     def evaluations(self, generator: Any) -> int:
         last = int(bool(self.finish) and self.steps > 1)
-        return self.solver.cost(self.steps - last) + last
+        count: int = SOLVERS[self.method].cost(self.steps - last)  # type: ignore[union-attr]
+        return count + last
 
-    def solve(
-        self,
-        generator: Any,
-        x: Tensor,
-        t_0: float = 0.0,
-        t_1: float = 1.0,
-        condition: Condition | None = None,
-        progress: Progress = None,
-        **options: Any,
-    ) -> Solution:
-        how = {"method": self.method, "steps": self.steps, "grid": self.times_or_name, **options}
-        return solve(generator.field(condition), x, t_0, t_1, progress=progress, **how)
+    def options(self) -> dict[str, Any]:
+        return {"method": self.method, "steps": self.steps, "grid": self.times_or_name}
 
-    def __call__(
-        self,
-        generator: Any,
-        noise: Tensor,
-        condition: Condition | None = None,
-        draws: Noise | None = None,
-        progress: Progress = None,
-    ) -> Generated:
-        last = {"finish": self.finish, "steps": self.steps - 1} if self.finish and self.steps > 1 else {}
-        end = self.solve(generator, noise, condition=condition, progress=progress, **last)
-        return Generated(end.x, end.evaluations, end.converged)
+    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
+        if not self.finish or self.steps == 1:
+            return super().__call__(generator, noise, condition, draws, progress)
+        near = self.solve(generator, noise, 0.0, 1 - self.finish, condition, progress, steps=self.steps - 1)
+        last = solve(generator.field(condition), near.x, 1 - self.finish, steps=1, progress=progress)
+        return Generated(last.x, near.evaluations + last.evaluations, near.converged & last.converged)
 
     def knot_times(self, knots: int) -> Tensor:
         if self.steps % (knots + 1) or self.finish or not isinstance(self.grid, str):
@@ -125,21 +94,8 @@ class Adaptive(ODESampler):
     def name(self) -> str:
         return self.method
 
-    def solve(
-        self,
-        generator: Any,
-        x: Tensor,
-        t_0: float = 0.0,
-        t_1: float = 1.0,
-        condition: Condition | None = None,
-        progress: Progress = None,
-        **options: Any,
-    ) -> Solution:
-        how = {"method": self.method, "tolerance": self.tolerance, **options}
-        return solve(generator.field(condition), x, t_0, t_1, progress=progress, **how)
-
-    def knot_times(self, knots: int) -> Tensor:
-        return torch.linspace(0, 1, knots + 2, dtype=torch.float64)
+    def options(self) -> dict[str, Any]:
+        return {"method": self.method, "tolerance": self.tolerance}
 
 
 @dataclass(frozen=True)
@@ -157,20 +113,10 @@ class TorchDiffEq(ODESampler):
     steps: Count = 32
 
     def __post_init__(self) -> None:
-        check_method(TORCHDIFFEQ + self.method)
+        method_of(TORCHDIFFEQ + self.method)
 
     def evaluations(self, generator: Any) -> None:
         return None
 
-    def solve(
-        self,
-        generator: Any,
-        x: Tensor,
-        t_0: float = 0.0,
-        t_1: float = 1.0,
-        condition: Condition | None = None,
-        progress: Progress = None,
-        **options: Any,
-    ) -> Solution:
-        how = {"method": TORCHDIFFEQ + self.method, "steps": self.steps, "tolerance": self.tolerance, **options}
-        return solve(generator.field(condition), x, t_0, t_1, progress=progress, **how)
+    def options(self) -> dict[str, Any]:
+        return {"method": TORCHDIFFEQ + self.method, "steps": self.steps, "tolerance": self.tolerance}

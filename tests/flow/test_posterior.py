@@ -8,17 +8,12 @@ from torch import Tensor
 
 from benchmarks.completion import Case, bures, gaussian, map_of, moments, ring, velocity_of
 from r2flow.errors import InputError
-from r2flow.flow.posterior import (
-    GROWN,
-    _solved,
-    mmps,
-    repaint,
-)
 from r2flow.flow.problems import Correlated
 from r2flow.flow.solvers import named_grid
 from r2flow.generators import Field, build_generator
 from r2flow.noise import Draws
-from r2flow.samplers import build_sampler
+from r2flow.samplers import MMPS, Repaint, build_sampler
+from r2flow.samplers.posterior import GROWN, _solved
 
 WIDTH = 32
 ROWS = torch.arange(WIDTH) % 4 == 0
@@ -118,7 +113,7 @@ def bad_matrix(least: float) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("steps", [1, 2])
 def test_the_least_residual_of_the_same_directions(steps, monkeypatch):
-    monkeypatch.setattr("r2flow.flow.posterior.GROWN", -1.0)
+    monkeypatch.setattr("r2flow.samplers.posterior.GROWN", -1.0)
     matrix, r = bad_matrix(1e-3)[0], randn(3, WIDTH, seed=7)
     found = _solved(lambda p: (p, p @ matrix.T), r, steps)
     for row, x in zip(r, found, strict=True):
@@ -171,7 +166,7 @@ def test_mmps_has_the_posterior_s_own_velocity_on_any_gaussian(t):
     y = case.measure(prior.sample(1, draws(4)))
     x, end = randn(1, WIDTH), torch.tensor([t, 1.0], dtype=torch.float64)
     posterior = prior.posterior(case.matrix, y[0], 0.0)
-    found = mmps(velocity_of(prior), x, *case.measurement(y), end, numbered((1, WIDTH)), products=WIDTH)
+    found = MMPS(products=WIDTH).run(velocity_of(prior), x, *case.measurement(y), end, numbered((1, WIDTH)))
     torch.testing.assert_close(found, x + (1 - t) * posterior(end[0], x), rtol=1e-6, atol=1e-8)
 
 
@@ -229,7 +224,8 @@ def test_repaint_leaves_less_of_replacement_s_bias_the_more_often_it_repeats():
     off = []
     for repeats in (1, 4, 16):
         zeros = torch.zeros(4, WIDTH).double()
-        found = repaint(velocity_of(prior), zeros, *case.measurement(y), times(32), lambda j: zeros, repeats)  # noqa: B023
+        sampler, measured = Repaint(repeats=repeats), case.measurement(y)
+        found = sampler.run(velocity_of(prior), zeros, *measured, times(32), lambda j: zeros)  # noqa: B023
         off.append(float((found - exact).norm()))
     assert off[1] < 0.6 * off[0]
     assert off[2] < 0.6 * off[1]

@@ -6,7 +6,6 @@ scene come to the host and the times and sizes of the next step go back.
 """
 
 import logging
-import math
 
 import numpy as np
 import torch
@@ -16,8 +15,8 @@ from r2flow.flow.path import expand_time
 from r2flow.flow.solvers.batched import norms, powered, rows, unpowered, weighted
 from r2flow.flow.solvers.defect import Tried, inspect
 from r2flow.flow.solvers.embedded import EmbeddedMethod
-from r2flow.flow.solvers.solution import Evaluations, Solution, finite
-from r2flow.flow.solvers.step_size import Limits, StepController
+from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, finite
+from r2flow.flow.solvers.step_size import StepController
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +43,6 @@ def advance(
         The solution, and the time that each scene has reached, (B,).
     """
     control = StepController(v.scenes, t_0, t_1, method, limits, torch.finfo(x.dtype).eps)
-    device = x.device
     results = x.clone()
     k_1 = v(control.now(x), x)
     tolerance = attainable(limits, v.precision)
@@ -52,15 +50,10 @@ def advance(
         scale = x.abs().mul(tolerance).add_(tolerance)
         state, slope = norms(x / scale, k_1 / scale)
         control.start(state, slope, v.counts)
-    closing = math.copysign(limits.finish, t_1 - t_0)
     while True:
         if control.leaving.any():
-            gone, arrived = control.leaving.nonzero()[0], control.arrived[control.leaving]
-            last = rows(x, gone)
-            if closing:
-                ended = torch.from_numpy(arrived).to(device)
-                last = torch.where(expand_time(ended, x), last + closing * rows(k_1, gone), last)
-            results[torch.from_numpy(control.places[gone]).to(device)] = last
+            gone = control.leaving.nonzero()[0]
+            results[torch.from_numpy(control.places[gone]).to(x.device)] = rows(x, gone)
             rest = (~control.leaving).nonzero()[0]
             x, k_1 = rows(x, rest), rows(k_1, rest)
             control.keep(rest)

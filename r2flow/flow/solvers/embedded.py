@@ -4,6 +4,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from torch import Tensor
+
+from r2flow.flow.solvers.solution import Evaluations, Limits, Solution
 
 
 class EmbeddedMethod(NamedTuple):
@@ -21,7 +24,6 @@ class EmbeddedMethod(NamedTuple):
         bump: d_i, the weights of the quartic term of the interpolant.
         rough: Stages whose third divided difference shows how rough v is along a step.
         defect: Largest defect of a step in tolerances: several times that of accurate steps of the exact problems.
-        evaluations: None, since the evaluations of a solution depend on the scene.
     """
 
     order: int
@@ -34,7 +36,18 @@ class EmbeddedMethod(NamedTuple):
     bump: tuple[float, ...]
     rough: tuple[int, int, int, int]
     defect: float
-    evaluations: None = None
+
+    @property
+    def adapts(self) -> bool:
+        """Whether steps are chosen by a tolerance."""
+        return True
+
+    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits, knots: int = 0) -> Solution:
+        """Solve every scene of x, (B, ...), from the first time to the last by steps of its own."""
+        from r2flow.flow.solvers.adaptive import advance
+
+        assert not knots
+        return advance(v, x, float(times[0]), float(times[-1]), self, limits)[0]
 
     @property
     def stages(self) -> int:

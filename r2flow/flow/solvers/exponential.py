@@ -18,8 +18,7 @@ from torch import Tensor
 from r2flow.flow.solvers.adaptive import advance, attainable
 from r2flow.flow.solvers.batched import norms, powered, unpowered
 from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
-from r2flow.flow.solvers.solution import Evaluations, Solution
-from r2flow.flow.solvers.step_size import Limits
+from r2flow.flow.solvers.solution import Evaluations, Limits, Solution
 
 LARGEST = 40  # dimension of a Krylov space; where that is not enough the step is halved
 KRYLOV = 0.05  # error of a function of J, in tolerances
@@ -31,39 +30,41 @@ class ExponentialMethod(NamedTuple):
 
     Attributes:
         start: The explicit method that solves the scenes which are not stiff; None where all are taken for stiff.
-        evaluations: None, since the evaluations of a solution depend on the scene.
     """
 
     order: int = 4
     start: EmbeddedMethod | None = None
-    evaluations: None = None
+
+    @property
+    def adapts(self) -> bool:
+        """Whether steps are chosen by a tolerance."""
+        return True
+
+    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits, knots: int = 0) -> Solution:
+        """Solve every scene of x, (B, ...), from t_0 to t_1: the stiff ones, or all, one after another."""
+        assert not knots
+        t_0, t_1 = float(times[0]), float(times[-1])
+        if self.start is None:
+            at = np.full(len(x), t_0)
+            first = Solution.build(x, v.counts, 0, 0, False, False)
+        else:
+            first, at = advance(v, x, t_0, t_1, self.start, limits._replace(until_stiff=True))
+        ends, converged = first.x.clone(), first.converged.numpy().copy()
+        accepted, rejected = first.accepted.numpy().copy(), first.rejected.numpy().copy()
+        stiff = first.stiff.numpy() | (self.start is None)
+        for place in (stiff & ~converged).nonzero()[0]:
+            v.only(np.array([place]))
+            scene = _Scene(v, first.x[place].detach(), float(at[place]), t_0, t_1, limits)
+            converged[place] = scene.solve()
+            ends[place] = scene.u.view(x.shape[1:])
+            accepted[place] += scene.accepted
+            rejected[place] += scene.rejected
+        v.only(np.arange(len(x)))
+        return Solution.build(ends, v.counts, accepted, rejected, first.stiff.numpy(), converged)
 
 
 exprb43 = ExponentialMethod()
 automatic = ExponentialMethod(start=dopri5)
-
-
-def solve_exponential(
-    v: Evaluations, x: Tensor, t_0: float, t_1: float, method: ExponentialMethod, limits: Limits
-) -> Solution:
-    """Solve every scene of x, (B, ...), from t_0 to t_1: the stiff ones, or all, one after another."""
-    if method.start is None:
-        at = np.full(len(x), t_0)
-        first = Solution.build(x, v.counts, 0, 0, False, False)
-    else:
-        first, at = advance(v, x, t_0, t_1, method.start, limits._replace(until_stiff=True))
-    ends, converged = first.x.clone(), first.converged.numpy().copy()
-    accepted, rejected = first.accepted.numpy().copy(), first.rejected.numpy().copy()
-    stiff = first.stiff.numpy() | (method.start is None)
-    for place in (stiff & ~converged).nonzero()[0]:
-        v.only(np.array([place]))
-        scene = _Scene(v, first.x[place].detach(), float(at[place]), t_0, t_1, limits)
-        converged[place] = scene.solve()
-        ends[place] = scene.u.view(x.shape[1:])
-        accepted[place] += scene.accepted
-        rejected[place] += scene.rejected
-    v.only(np.arange(len(x)))
-    return Solution.build(ends, v.counts, accepted, rejected, first.stiff.numpy(), converged)
 
 
 class _Spent(Exception):
@@ -77,8 +78,7 @@ class _Scene:
         self.v, self.shape, self.limits = v, x.shape, limits
         self.u, self.t = x.flatten(), t
         self.direction = math.copysign(1.0, t_1 - t_0)
-        self.length = abs(t_1 - t_0) - limits.finish
-        self.t_0, self.t_end = t_0, t_0 + self.direction * self.length if limits.finish else t_1
+        self.length, self.t_0, self.t_end = abs(t_1 - t_0), t_0, t_1
         self.accepted = self.rejected = 0
         kind = x.device.type
         lower = torch.get_autocast_dtype(kind)
@@ -122,8 +122,6 @@ class _Scene:
                     return False
                 self.accepted += 1
                 self.u, self.t, f, h = end, t, following, h * factor
-            if self.t == self.t_end and self.limits.finish:
-                self.u = self.u + self.direction * self.limits.finish * f
         except _Spent:
             return False
         return self.t == self.t_end

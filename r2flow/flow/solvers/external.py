@@ -1,7 +1,7 @@
 """torchdiffeq's methods, scene by scene."""
 
 import logging
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,16 +10,13 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.solvers.adaptive import attainable
-from r2flow.flow.solvers.fixed import euler
-from r2flow.flow.solvers.solution import Evaluations, Solution
-from r2flow.flow.solvers.step_size import Limits
+from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, finite
 
 log = logging.getLogger(__name__)
 
 TORCHDIFFEQ = "torchdiffeq:"
 # Its Adams methods need equal steps, which it does not check: on others their order falls to 2. With its default order
-# of 12 the error of the explicit one grows with every halving of equal steps (measured: order -2). SciPy's count no
-# steps.
+# of 12 the error of the explicit one grows with every halving of equal steps. SciPy's count no steps.
 LEFT_OUT = ("explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver")
 
 
@@ -30,53 +27,61 @@ def torchdiffeq_methods() -> dict[str, Any]:
     return {name: method for name, method in SOLVERS.items() if name not in LEFT_OUT}
 
 
-def check_torchdiffeq(name: str) -> None:
-    """Check the name of a torchdiffeq method.
+@dataclass(frozen=True)
+class TorchDiffEqMethod:
+    """A method of torchdiffeq by its name there.
 
     Raises:
-        InputError: an unknown method, or one that is left out.
+        InputError: torchdiffeq has no such method, or it is left out.
     """
-    known = torchdiffeq_methods()
-    if name in LEFT_OUT:
-        raise InputError(
-            f"torchdiffeq's {name} is left out: its Adams methods lose their order on unequal steps, and its call of "
-            f"SciPy counts no steps. Take one of: {', '.join(sorted(known))}."
-        )
-    if name not in known:
-        raise InputError(f"torchdiffeq has no method {name!r}; it knows: {', '.join(sorted(known))}.")
 
+    name: str
 
-def is_fixed(name: str) -> bool:
-    """Whether a method of torchdiffeq takes the steps of a grid."""
-    from torchdiffeq._impl.solvers import FixedGridODESolver
+    def __post_init__(self) -> None:
+        names = torchdiffeq_methods()
+        if self.name not in names:
+            raise InputError(f"torchdiffeq has no method {self.name!r} here; it has: {', '.join(sorted(names))}.")
 
-    return issubclass(torchdiffeq_methods()[name], FixedGridODESolver)
+    @property
+    def adapts(self) -> bool:
+        """Whether steps are chosen by a tolerance."""
+        from torchdiffeq._impl.solvers import FixedGridODESolver
 
+        return not issubclass(torchdiffeq_methods()[self.name], FixedGridODESolver)
 
-def solve_torchdiffeq(
-    v: Evaluations, x: Tensor, times: Tensor, name: str, limits: Limits, finish: Tensor | None
-) -> Solution:
-    """Solve one scene after another, since torchdiffeq has one error norm for a batch, which hides a hard scene.
+    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits, knots: int = 0) -> Solution:
+        """Solve one scene after another, since torchdiffeq has one error norm for a batch, which hides a hard scene.
 
-    Args:
-        times: The time grid of a fixed-step method; an adaptive one goes from its first to its last time.
-    """
-    total = len(x)
-    # By the state's type: the velocity has not been called yet.
-    tolerance = limits.tolerance if is_fixed(name) else attainable(limits, v.coarsest(x))
-    ends, taken, lost, converged = [], [], [], []
-    for index in range(total):
-        v.only(np.array([index]))
-        field = _Scene(v, x[index : index + 1], limits.max_evaluations - int(v.counts[index]))
-        end, whole = _end(field, times, name, tolerance, finish)
-        if not whole:
-            log.warning("%s%s gave up on scene %d: %s.", TORCHDIFFEQ, name, index, field.trouble or "not finite")
-        ends.append(end)
-        taken.append(field.steps - field.rejected)
-        lost.append(field.rejected)
-        converged.append(whole)
-    v.only(np.arange(total))
-    return Solution.build(torch.cat(ends) if ends else x, v.counts, taken, lost, False, converged)
+        Args:
+            times: The time grid of a fixed-step method; an adaptive one goes from its first to its last time.
+        """
+        import torchdiffeq
+
+        assert not knots
+        grid = times.to(x)
+        # By the state's type: the velocity has not been called yet.
+        tolerance = attainable(limits, v.coarsest(x)) if self.adapts else limits.tolerance
+        options = {} if self.adapts else {"grid_constructor": lambda field, start, span: grid}
+        scenes = [_Scene(v, start, limits.max_evaluations, self.adapts) for start in x.split(1)]
+        converged = finite(x).cpu().numpy()
+        for i in converged.nonzero()[0]:
+            v.only(np.array([i]))
+            try:
+                end = torchdiffeq.odeint(
+                    scenes[i], scenes[i].last, grid[[0, -1]],
+                    rtol=tolerance, atol=tolerance, method=self.name, options=options,
+                )[-1]  # fmt: skip
+                converged[i] = bool(end.isfinite().all())
+                scenes[i].last = end if converged[i] else scenes[i].last
+            except (_Spent, AssertionError) as error:  # it asserts that steps do not underflow, values are finite
+                converged[i] = False
+                log.warning("%s%s gave up on scene %d: %s.", TORCHDIFFEQ, self.name, i, error)
+        v.only(np.arange(len(x)))
+        ends = torch.cat([scene.last for scene in scenes])
+        return Solution.build(
+            ends, v.counts, [scene.steps - scene.rejected for scene in scenes], [scene.rejected for scene in scenes],
+            False, converged,
+        )  # fmt: skip
 
 
 class _Spent(Exception):
@@ -86,9 +91,11 @@ class _Spent(Exception):
 class _Scene:
     """One scene's velocity, and what torchdiffeq reports on the way."""
 
-    def __init__(self, v: Evaluations, x: Tensor, max_evaluations: int) -> None:
+    def __init__(self, v: Evaluations, x: Tensor, max_evaluations: int, adapts: bool) -> None:
         self._v, self._left = v, max_evaluations
-        self.last, self.steps, self.rejected, self.trouble = x, 0, 0, ""
+        self.last, self.steps, self.rejected = x, 0, 0
+        if adapts:  # torchdiffeq warns about callbacks that a method does not call
+            self.callback_reject_step = self._reject
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
         if self._left <= 0:
@@ -96,43 +103,10 @@ class _Scene:
         self._left -= 1
         return self._v(t, x)
 
-    def step(self, t: Tensor, x: Tensor, h: Tensor) -> None:
+    def callback_step(self, t: Tensor, x: Tensor, h: Tensor) -> None:
+        """Called before each step."""
         self.steps += 1
         self.last = x if torch.isfinite(x).all() else self.last
 
-    def reject(self, t: Tensor, x: Tensor, h: Tensor) -> None:
+    def _reject(self, t: Tensor, x: Tensor, h: Tensor) -> None:
         self.rejected += 1
-
-    def callbacks(self, known: set[str]) -> Callable[[Tensor, Tensor], Tensor]:
-        """The velocity with the callbacks that the method knows; torchdiffeq warns about others."""
-
-        def field(t: Tensor, x: Tensor) -> Tensor:
-            return self(t, x)
-
-        for name, call in (("callback_step", self.step), ("callback_reject_step", self.reject)):
-            if name in known:
-                setattr(field, name, call)
-        return field
-
-
-def _end(field: _Scene, times: Tensor, name: str, tolerance: float, finish: Tensor | None) -> tuple[Tensor, bool]:
-    """The state at the end and True, or the last finite state and False."""
-    import torchdiffeq
-
-    method, x = torchdiffeq_methods()[name], field.last
-    grid = times.to(x)
-    options = {"grid_constructor": lambda v, x_0, span: grid} if is_fixed(name) else {}
-    if not torch.isfinite(x).all():
-        return x, False
-    try:
-        end = torchdiffeq.odeint(
-            field.callbacks(method.valid_callbacks()), x, grid[[0, -1]],
-            rtol=tolerance, atol=tolerance, method=name, options=options,
-        )[-1]  # fmt: skip
-        if finish is not None:
-            field.last = end if torch.isfinite(end).all() else field.last
-            end = euler(field, grid[-1], finish.to(x), end)
-    except (_Spent, AssertionError) as error:  # it asserts that steps do not underflow and that values are finite
-        field.trouble = str(error)
-        return field.last, False
-    return (end, True) if torch.isfinite(end).all() else (field.last, False)

@@ -1,14 +1,16 @@
-"""Solvers that take the steps of a time grid."""
+"""Solvers that take the steps of a time grid: Runge-Kutta and Adams methods."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite, stepped
+from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Velocity, finite, stepped
 
 Step = Callable[[Velocity, Tensor, Tensor, Tensor], Tensor]
 
@@ -17,8 +19,8 @@ class FixedStep(NamedTuple):
     """One step x(t) -> x(t + h).
 
     Attributes:
-        step: A function of v, t, h and x; in a multistep method, whose steps remember the earlier ones, what makes
-            that function from the times of a solution, (N + 1,) float64.
+        step: A function of v, t, h and x; of a multistep method, what makes that function from the times of a
+            solution, (N + 1,) float64.
         order: Of the global error.
         evaluations: Of the velocity, in a step.
         start: Further ones in the first step.
@@ -26,20 +28,40 @@ class FixedStep(NamedTuple):
         corrects: Whether that function has a corrector.
     """
 
-    step: Step | Callable[[Tensor], Step]
+    step: Callable[..., Any]
     order: int
     evaluations: int
     start: int = 0
     multistep: bool = False
     corrects: bool = False
 
-    def begin(self, times: Tensor) -> Step:
-        """The step function of a solution on these times."""
-        return cast(Callable[[Tensor], Step], self.step)(times) if self.multistep else cast(Step, self.step)
+    @property
+    def adapts(self) -> bool:
+        """Whether steps are chosen by a tolerance."""
+        return False
 
     def cost(self, steps: int) -> int:
         """Evaluations of a number of steps."""
         return self.start + steps * self.evaluations
+
+    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits | None = None, knots: int = 0) -> Solution:
+        """Take the steps of a time grid, (N + 1,) float64; keep `knots` inner states, equally many steps apart.
+
+        A scene whose state is no longer finite keeps its last finite one; the others are not affected.
+        """
+        step: Step = self.step(times) if self.multistep else self.step
+        low, high = sorted((float(times[0]), float(times[-1])))
+
+        def inside(t: Tensor, state: Tensor) -> Tensor:
+            return v(t.clamp(low, high), state)  # t + h can round to 1 + 1e-7
+
+        alive, kept, apart = finite(x), [], (len(times) - 1) // (knots + 1)
+        for n, (t, following) in enumerate(pairwise(times)):
+            if knots and n and n % apart == 0:
+                kept.append(x)
+            x, alive = stepped(x, step(inside, t.to(x), (following - t).to(x), x), alive)
+        solution = Solution.build(x, v.counts, len(times) - 1, 0, False, alive.cpu().numpy())
+        return replace(solution, knots=torch.stack(kept, 1)) if knots else solution
 
 
 def euler(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
@@ -73,29 +95,73 @@ def rk4(v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
     return x + h / 6 * (k_1 + 2 * k_2 + 2 * k_3 + k_4)
 
 
-def solve_fixed(
-    v: Evaluations, x: Tensor, times: Tensor, method: FixedStep, finish: Tensor | None, knots: int = 0
-) -> Solution:
-    """Take the steps of a time grid, (N + 1,) float64, then an Euler step of length `finish` if there is one.
+def adams(predictor: int, corrector: int = 0) -> FixedStep:
+    """An Adams method for steps of any lengths, with one evaluation a step.
 
-    `knots` inner states are kept, equally many steps apart.
+    The predictor x_n + integral of P dt, where the polynomial P passes through the last velocities, gives the point at
+    which v is evaluated next. The corrector takes the step again, with that velocity among those of P (PEC mode:
+    Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, III.1 and III.5). The last step is not
+    corrected, which would take v(1, x). The order is the greater of the two numbers.
 
-    A scene whose state is no longer finite keeps its last finite one; the others are not affected.
+    The first steps have fewer velocities. Up to order 3 the order survives that. A corrector of 4 takes Heun's step
+    first, with one evaluation more, and corrects the first two steps together.
+
+    Args:
+        predictor: Velocities in the predictor.
+        corrector: Velocities in the corrector, the new one included; 0 for no corrector (Adams-Bashforth).
     """
-    step = method.begin(times)
-    steps = [(t, following - t, step) for t, following in pairwise(times)]
-    if finish is not None:
-        steps.append((times[-1], finish, euler))
-    low, high = sorted((float(times[0]), float(times[-1])))
+    return FixedStep(
+        partial(_Adams, predictor, corrector), max(predictor, corrector), evaluations=1, start=int(corrector > 3),
+        multistep=True, corrects=corrector > 0,
+    )  # fmt: skip
 
-    def inside(t: Tensor, state: Tensor) -> Tensor:
-        return v(t.clamp(low, high), state)  # t + h can round to 1 + 1e-7
 
-    alive = finite(x)
-    kept = []
-    for n, (t, h, advance) in enumerate(steps):
-        if knots and n and n % (len(steps) // (knots + 1)) == 0:
-            kept.append(x)
-        x, alive = stepped(x, advance(inside, t.to(x), h.to(x), x), alive)
-    solution = Solution.build(x, v.counts, len(times) - 1, 0, False, alive.cpu().numpy())
-    return replace(solution, knots=torch.stack(kept, 1)) if knots else solution
+class _Adams:
+    """The steps of one solution.
+
+    The state between two steps is a predicted one: each call evaluates v there, corrects the step before and predicts.
+    """
+
+    def __init__(self, predictor: int, corrector: int, times: Tensor) -> None:
+        self.predictor, self.corrector, self.times = predictor, corrector, times.tolist()
+        self.heun_first = corrector > 3
+        self.taken = 0
+        self.velocities: list[Tensor] = []  # at the last times, the newest at the end
+        self.corrected: tuple[int, Tensor] | None = None  # a step and its state, from which the next correction starts
+
+    def __call__(self, v: Velocity, t: Tensor, h: Tensor, x: Tensor) -> Tensor:
+        n = self.taken
+        self.velocities = [*self.velocities, v(t, x)][-max(self.predictor, self.corrector) :]
+        self.taken += 1
+        if self.corrector and self.corrected is None:
+            self.corrected = 0, x
+        elif self.corrected is not None and not (self.heun_first and n == 1):
+            start, before = self.corrected
+            x = self._moved(before, start, n, self.corrector)
+            self.corrected = n, x
+        if self.heun_first and n == 0:
+            k = self.velocities[0]
+            return x + h / 2 * (k + v(t + h, x + h * k))
+        return self._moved(x, n, n + 1, self.predictor)
+
+    def _moved(self, x: Tensor, first: int, last: int, nodes: int) -> Tensor:
+        """x and the integral over the steps from `first` to `last` of the polynomial through the last velocities."""
+        known = self.velocities[-nodes:]
+        at = self.times[self.taken - len(known) : self.taken]
+        for weight, velocity in zip(weights(at, self.times[first], self.times[last]), known, strict=True):
+            x = x + weight * velocity
+        return x
+
+
+def weights(nodes: Sequence[float], start: float, end: float) -> list[float]:
+    """w such that sum w_i f_i is the integral from start to end of the polynomial through the (nodes_i, f_i).
+
+    For up to 4 nodes: Gauss-Legendre's rule of two points is exact for cubic polynomials.
+    """
+    middle, half = (start + end) / 2, (end - start) / 2
+    points = (middle - half / math.sqrt(3), middle + half / math.sqrt(3))
+
+    def basis(i: int, t: float) -> float:
+        return math.prod((t - other) / (nodes[i] - other) for j, other in enumerate(nodes) if j != i)
+
+    return [half * sum(basis(i, t) for t in points) for i in range(len(nodes))]

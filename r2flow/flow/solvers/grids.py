@@ -77,20 +77,3 @@ def build_grid(grid: str | Tensor, t_0: float, t_1: float, steps: int) -> Tensor
         raise InputError(f"this time grid runs from {times[0]:g} to {times[-1]:g}, the solution from {t_0} to {t_1}.")
     times[0], times[-1] = t_0, t_1  # what a grid kept in float32, or a power, has lost
     return times
-
-
-def halved(times: Tensor) -> Tensor:
-    """Every step divided into two; (N + 1,) -> (2 N + 1,)."""
-    finer = times.new_empty(2 * len(times) - 1)
-    finer[::2] = times
-    finer[1::2] = (times[1:] + times[:-1]) / 2
-    return finer
-
-
-def extended(times: Tensor, t_1: float, closing: float) -> Tensor:
-    """The times and further ones that halve the distance to t_1, until it is `closing` (which has a sign)."""
-    left = [t_1 - float(times[-1])]
-    while abs(left[-1]) > 2 * abs(closing):
-        left.append(left[-1] / 2)
-    further = [t_1 - way for way in left[1:]] + ([t_1 - closing] if abs(left[-1]) > 1.01 * abs(closing) else [])
-    return torch.cat([times, times.new_tensor(further)])

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -57,6 +58,24 @@ class Solution:
         counts = [torch.from_numpy(np.broadcast_to(n, of).astype(np.int64)) for n in (evaluations, accepted, rejected)]
         flags = [torch.from_numpy(np.broadcast_to(flag, of).astype(bool)) for flag in (stiff, converged)]
         return cls(x, *counts, *flags)
+
+
+class Limits(NamedTuple):
+    """The options of a solution.
+
+    Attributes:
+        tolerance: Absolute and relative tolerance of one step's error, as asked for.
+        max_evaluations: Budget of one scene.
+        tighter: The tolerance used is the attainable one divided by this.
+        max_step: Longest step as a share of the interval.
+        until_stiff: Whether a scene is left where it turns out to be stiff.
+    """
+
+    tolerance: float
+    max_evaluations: int
+    tighter: float = 1.0
+    max_step: float = 1.0
+    until_stiff: bool = False
 
 
 class Evaluations:

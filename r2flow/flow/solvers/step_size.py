@@ -1,14 +1,13 @@
 """Step size control for many scenes at once, on the host and in float64."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from r2flow.flow.solvers.embedded import EmbeddedMethod
-from r2flow.flow.solvers.solution import Solution
+from r2flow.flow.solvers.solution import Limits, Solution
 
 SHRINK = 0.2  # smallest factor between one step size and the next
 MEMORY = 0.04  # beta of the PI controller, the weight of the previous error: steadier steps at a stability limit
@@ -17,26 +16,6 @@ STIFF_AFTER, SMOOTH_AFTER = 15, 6  # Hairer: stiff after 15 such steps without 6
 # Eigenvalues near the imaginary axis limit steps at a smaller |h lambda|, where accuracy can limit them as well: a
 # scene is handed over after more such steps, but not called stiff otherwise.
 OSCILLATING, OSCILLATING_AFTER = 1.0, 200
-
-
-class Limits(NamedTuple):
-    """The options of a solution.
-
-    Attributes:
-        tolerance: Absolute and relative tolerance of one step's error, as asked for.
-        max_evaluations: Budget of one scene.
-        tighter: The tolerance used is the attainable one divided by this.
-        max_step: Longest step as a share of the interval.
-        finish: Length of the last part of the interval, which one Euler step takes.
-        until_stiff: Whether a scene is left where it turns out to be stiff.
-    """
-
-    tolerance: float
-    max_evaluations: int
-    tighter: float = 1.0
-    max_step: float = 1.0
-    finish: float = 0.0
-    until_stiff: bool = False
 
 
 class StepController:
@@ -51,8 +30,7 @@ class StepController:
     ) -> None:
         self.method, self.limits, self.nodes = method, limits, np.array(method.nodes)[:, None]
         self.t_0, self.direction = t_0, math.copysign(1.0, t_1 - t_0)
-        self.length = abs(t_1 - t_0) - limits.finish
-        self.t_end = t_0 + self.direction * self.length if limits.finish else t_1
+        self.length, self.t_end = abs(t_1 - t_0), t_1
         self.low, self.high = sorted((t_0, self.t_end))
         self.longest = limits.max_step * self.length
         self.eps = eps
