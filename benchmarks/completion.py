@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from r2flow.flow.maps import MeanVelocity
-from r2flow.flow.problems import Correlated
 from r2flow.flow.solvers import named_grid
 from r2flow.samplers import build_sampler
 
@@ -31,6 +30,70 @@ def ring(width: int = WIDTH, std: float = 0.5, length: float = 3.0) -> Tensor:
     apart = (apart[:, None] - apart).abs()
     near = torch.exp(-torch.minimum(apart, width - apart) / length)
     return std**2 * (0.95 * near + 0.05 * torch.eye(width, dtype=torch.float64))
+
+
+class Correlated:
+    """x_1 from a mixture of Gaussians with dense covariances S_i: what is measured of some elements says of others.
+
+    As in `GaussianMixture`, with matrices: in component i, x_t has mean t m_i and covariance
+    C_i = (1 - t)^2 + t^2 S_i, and x_1 - x_0 the mean m_i + (t S_i - (1 - t)) C_i^-1 (x - t m_i).
+
+    Args:
+        means: m_i, (K, D) float64.
+        covariances: S_i, (K, D, D) float64.
+        weights: (K,) float64, of sum 1.
+    """
+
+    def __init__(self, means: Tensor, covariances: Tensor, weights: Tensor | None = None) -> None:
+        self.means, self.covariances = means, covariances
+        self.weights = torch.full((len(means),), 1 / len(means)).to(means) if weights is None else weights
+        self.values, self.vectors = torch.linalg.eigh(covariances)
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        t, offset, (means, values, vectors) = self._offset(t, x)
+        variance = (1 - t) ** 2 + t**2 * values  # (K, B, D), as all that follows
+        slopes = means + torch.einsum("kbi,kji->kbj", (t * values - (1 - t)) / variance * offset, vectors)
+        scores = self.weights.to(x).log()[:, None] - 0.5 * (variance.log() + offset**2 / variance).sum(-1)
+        return (scores.softmax(0)[..., None] * slopes).sum(0).view(x.shape)
+
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        """x_t of a single Gaussian: along S's eigenvectors it is `Gaussian`'s."""
+        assert len(self.means) == 1
+        t, x = torch.as_tensor(t, dtype=torch.float64).reshape(-1, 1), x_0.double().flatten(1)
+        moved = x @ self.vectors[0] * ((1 - t) ** 2 + t**2 * self.values[0]).sqrt()
+        return (t * self.means[0] + moved @ self.vectors[0].T).view(x_0.shape)
+
+    def posterior(self, forward: Tensor, y: Tensor, sigma: float | Tensor) -> "Correlated":
+        """The law of x_1 given y = A x_1 + sigma n, a mixture of Gaussians again.
+
+        Args:
+            forward: A, (M, D), of full rank where sigma is 0.
+            y: (M,); with M = 0 nothing is measured.
+            sigma: Of each measured value, (M,) or one for all.
+        """
+        if not len(y):
+            return self
+        seen = self.covariances @ forward.T  # (K, D, M)
+        spread = forward @ seen + torch.diag_embed(torch.as_tensor(sigma).to(y).expand(len(y)) ** 2)
+        gain = torch.linalg.solve(spread, seen.mT).mT
+        off = y - self.means @ forward.T
+        likelihood = torch.distributions.MultivariateNormal(torch.zeros_like(y), spread).log_prob(off)
+        means = self.means + torch.einsum("kdm,km->kd", gain, off)
+        return Correlated(means, self.covariances - gain @ seen.mT, (self.weights.log() + likelihood).softmax(0))
+
+    def sample(self, count: int, draws: torch.Generator) -> Tensor:
+        """x_1, (count, D)."""
+        chosen = torch.multinomial(self.weights, count, replacement=True, generator=draws)
+        n = torch.randn(count, self.means.shape[1], generator=draws, dtype=self.means.dtype)
+        scaled = n * self.values.clamp(min=0).sqrt()[chosen]
+        return self.means[chosen] + torch.einsum("bi,bji->bj", scaled, self.vectors[chosen])
+
+    def _offset(self, t: Tensor, x: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
+        """t (1, B or 1, 1), x_t - t m_i along the eigenvectors, (K, B, D), and the components in x's type."""
+        means, values, vectors = (part.to(x) for part in (self.means, self.values, self.vectors))
+        t = t.to(x).reshape(1, -1, 1)
+        offset = torch.einsum("kbj,kji->kbi", x.flatten(1) - t * means[:, None], vectors)
+        return t, offset, (means[:, None], values[:, None], vectors)
 
 
 def gaussian() -> Correlated:

@@ -2,7 +2,7 @@
 
     X_{t->s}(x) = x + (s - t) u(x, t, s),    u(x, t, t) = v(t, x)
 
-An objective gives the point x_t at which u is learned and what it shall be there. None needs forward-mode derivatives.
+An objective gives the point x_t at which u is learned and its target there. None needs forward-mode derivatives.
 """
 
 import math
@@ -153,7 +153,7 @@ class JumpTimes:
 
 
 class Aim(NamedTuple):
-    """Where u is learned, and what it shall be there, (B, ...) each."""
+    """Where u is learned and its target, (B, ...) each."""
 
     x_t: Tensor
     target: Tensor
@@ -163,7 +163,7 @@ Objective = Callable[[MeanVelocity, Paths, Tensor, Tensor, Tensor], Aim]
 
 
 def along_knots(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
-    """u(x_t, t, s) = (x_s - x_t) / (s - t) on the path of an earlier flow itself, which its knots tell."""
+    """u(x_t, t, s) = (x_s - x_t) / (s - t) on the path of an earlier flow, by its knots."""
     return Aim(paths.at(t), paths.mean_velocity(t, s))
 
 
@@ -186,52 +186,6 @@ def consistency(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor
     return Aim(x_t, target)
 
 
-def solved(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor) -> Aim:
-    """u(x_t, t, s) = (x_s - x_t) / (s - t), x_s by an earlier flow from x_t, whose velocity is u(x, t, t) here.
-
-    x_t is on the straight line from x_0 to x_1, and so is the velocity where s = t. `knots` on scans: an earlier flow
-    is asked where it is needed, and none of its pairs is stored.
-    """
-    chord = paths.chord
-    x_t, target, rows = chord.at(t), chord.velocity(t), (t != s).nonzero()[:, 0]
-    if len(rows):
-        with torch.no_grad():
-            x, begin, end = x_t[rows], t[rows], s[rows]
-            mean = (_followed(_select(u, rows), x, begin, end) - x) / expand_time(end - begin, x)
-        target = target.index_copy(0, rows, mean.to(target))
-    return Aim(x_t, target)
-
-
-BENT, WHOLE = 1.5, 16  # a path's grid, t = 1 - (1 - q)^BENT, and its steps from q = 0 to 1
-
-
-def _followed(u: MeanVelocity, x: Tensor, t: Tensor, s: Tensor) -> Tensor:
-    """x_s of dx/dt = u(x, t, t) from x_t, in equal steps of q by the rule of Adams and Bashforth, of order 2.
-
-    The first step is one of the midpoint rule: most jumps have few steps, and some have one.
-    """
-    begin, end = (1 - (1 - time.double()).clamp(min=0) ** (1 / BENT) for time in (t, s))
-    counts = ((end - begin).abs() * WHOLE).ceil().clamp(min=1)
-    slope, length = torch.zeros_like(x), torch.ones_like(t)  # of the step before
-    x = x.clone()
-    for n in range(int(counts.max())):
-        rows = (counts > n).nonzero()[:, 0]
-        here, there = (
-            1 - (1 - torch.lerp(begin, end, m / counts)[rows]).clamp(min=0) ** BENT for m in (n, n + 1)
-        )  # fmt: skip
-        here, step = here.to(t), (there - here).to(t)
-        own = _select(u, rows)
-        v = own(here, x[rows], here).to(x)
-        if n == 0:
-            middle = here + step / 2
-            x += expand_time(step, x) * own(middle, x + expand_time(step / 2, x) * v, middle).to(x)
-        else:
-            before = step / length[rows] / 2
-            x[rows] += expand_time(step * (1 + before), x) * v - expand_time(step * before, x) * slope[rows]
-        slope[rows], length[rows] = v, step
-    return x
-
-
 def _select(u: MeanVelocity, rows: Tensor) -> MeanVelocity:
     """The map for some of the scans, where it has a condition for each (`r2flow.generators.flow.Conditioned`)."""
     select: Callable[[Tensor], MeanVelocity] | None = getattr(u, "select", None)
@@ -242,5 +196,4 @@ OBJECTIVES: Registry[Objective] = Registry(
     "objective of a flow map",
     knots=along_knots,
     consistency=consistency,
-    solved=solved,
 )

@@ -1,30 +1,29 @@
 """A flow map: jumps of any length, learned from the paths of an earlier flow, from its pairs or from scans."""
 
 from collections.abc import Mapping
-from copy import deepcopy
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots, solved
+from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, Paths, along_knots
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import FlowMap, Generator
 from r2flow.registry import Positive, check_options
-from r2flow.samplers import Chord, Jump, Renoise, build_sampler
+from r2flow.samplers import Jump, build_sampler
 from r2flow.stages.base import Batch
 from r2flow.stages.reflow import Reflow
 
 
 class LearnFlowMap(Reflow):
-    """Flow map: regress u(x_t, t, s) onto what an objective of `r2flow.flow.maps` says.
+    """Flow map: regress u(x_t, t, s) onto the target of an objective of `r2flow.flow.maps`.
 
-    From a 1-RF or a 2-RF on its pairs, with the inner states of their paths (`data.pairs.knots`) for the objective
-    `knots`; or on scans, where noise and scan are drawn independently, by `solved`. With scans next to the pairs
-    (`data.scans`) velocities, s = t, are learned from the scans, as by `Rectify`, and jumps from the pairs. Pairs of a
-    map by its own `chord` or `renoise` have no inner states; by `knots` their jumps are those of straight lines.
+    It learns from pairs of a 1-RF or a 2-RF, with the inner states of their paths (`data.pairs.knots`) for the
+    objective `knots`. With scans next to the pairs (`data.scans`) velocities, s = t, are learned from the scans, as by
+    `Rectify`, and jumps from the pairs. Pairs of a map by its own `chord` or `renoise` have no inner states; by `knots`
+    their jumps are those of straight lines.
 
     Args:
         objective: Name in `r2flow.flow.maps.OBJECTIVES`.
@@ -54,32 +53,22 @@ class LearnFlowMap(Reflow):
         check_options("stage.jumps", JumpTimes, jumps or {})
         self.jumps = JumpTimes(**(jumps or {}))
         self.on_pairs = True
-        self._parent = _Kept([deepcopy(generator).eval().requires_grad_(False)] if self.objective is solved else [])
         generator.run_by(Jump(grid=self.jumps.grid))
 
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
         self.on_pairs = data["name"] == "pairs"
         pairs = (data.get("pairs") or {}) if self.on_pairs else {}
-        refined = isinstance(build_sampler(pairs.get("sampler") or "adams3"), Chord | Renoise)
-        if self.objective is along_knots and not (pairs.get("knots") or refined):
+        by_map = build_sampler(pairs.get("sampler") or "adams3").needs == "map"
+        if self.objective is along_knots and not (pairs.get("knots") or by_map):
             raise InputError(
                 f"stage.objective={self.objective_name} learns from inner states of paths: give data=pairs "
                 "data.pairs.knots=7, or stage.objective=consistency."
-            )
-        if self._parent and (self.on_pairs or not self.config.get("stage", {}).get("init")):
-            what = "data=DATASET, not pairs" if self.on_pairs else "stage.init=RUN"
-            raise InputError(
-                f"stage.objective={self.objective_name} learns on scans, by the paths of an earlier flow: give {what}."
             )
         if data.get("scans") is not None and self.objective is not along_knots:
             raise InputError(
                 f"stage.objective={self.objective_name} learns from straight lines between pairs, whose velocities are "
                 "not those of scans: leave data.scans out, or give stage.objective=knots."
             )
-
-    def on_fit_start(self) -> None:
-        for parent in self._parent:
-            parent.to(self.device)
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         assert isinstance(self.generator, FlowMap)
@@ -91,8 +80,7 @@ class LearnFlowMap(Reflow):
         if self.training:
             known = of_scans | (self.on_pairs & (s - t == 1))  # the end of independent noise is no scan of the data
             rho = torch.where(known, 1.0, self.rho ** (self.global_step / max(int(self.trainer.max_steps), 1)))
-            asked = [parent.map(self.condition(batch)) for parent in self._parent] or [u_ts]
-            aim = self.objective(asked[0], paths, t, torch.where(of_scans, t, s), rho)
+            aim = self.objective(u_ts, paths, t, torch.where(of_scans, t, s), rho)
         else:  # one figure for all objectives
             aim = along_knots(u_ts, paths, t, s, torch.ones_like(t))
         if "scan" in batch:
@@ -100,13 +88,6 @@ class LearnFlowMap(Reflow):
             here = expand_time(of_scans, x_t)
             aim = Aim(torch.where(here, x_t, aim.x_t), torch.where(here, v, aim.target))
         return self.loss(u_ts(t, aim.x_t, s), aim.target).mean()
-
-
-class _Kept(list[FlowMap]):
-    """The parent as it was, for an objective that asks it: no part of what learns, and not copied for the average."""
-
-    def __deepcopy__(self, memo: Any) -> "_Kept":
-        return self
 
 
 def paths_of(batch: Batch) -> Paths:

@@ -6,9 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.completion import Case, bures, gaussian, map_of, moments, ring, velocity_of
+from benchmarks.completion import Case, Correlated, bures, gaussian, map_of, moments, ring, velocity_of
 from r2flow.errors import InputError
-from r2flow.flow.problems import Correlated
 from r2flow.flow.solvers import named_grid
 from r2flow.generators import Field, build_generator
 from r2flow.noise import Draws
