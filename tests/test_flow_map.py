@@ -453,7 +453,7 @@ def test_a_stage_of_jumps_says_what_it_lacks():
         stage(time={"name": "uniform"})
     with pytest.raises(InputError, match="'step'"):
         stage(jumps={"step": [1]})
-    with pytest.raises(InputError, match="which a RectifiedFlow does not have"):
+    with pytest.raises(InputError, match="learns a FlowMap"):
         stage(generator=parent())
     assert stage({"name": "simulated", "batch_size": 4}).objective is not None
 

@@ -44,11 +44,13 @@ class Stage(L.LightningModule):
         seed: Run seed.
 
     Attributes:
+        learns: Class of the generators that it can train.
         config: The run's, which goes into its checkpoints.
         gradient_clip_val: The run's, for a stage with manual optimisation, which clips for itself.
         further: What a batch holds beside, made of x_1, (C, H, W), and draws of each image by the loader's workers.
     """
 
+    learns: ClassVar[type[Generator]] = Generator
     generator_name: ClassVar[str | None] = None  # what it trains; None: the parent's, or a rectified flow
     needs_pairs: ClassVar[bool] = False  # whether a batch's x_0 and x_1 belong together
     needs_parent: ClassVar[bool] = False  # whether it starts from another run, also where it learns from scans
@@ -65,6 +67,9 @@ class Stage(L.LightningModule):
         batch_size: Count = 8,
         seed: int = 0,
     ) -> None:
+        if not isinstance(generator, self.learns):
+            wanted, found = self.learns.__name__, type(generator).__name__
+            raise InputError(f"{type(self).__name__} learns a {wanted}, found a {found}: give another stage.")
         super().__init__()
         self.generator = generator
         self.learning_rate, self.betas, self.weight_decay = learning_rate, betas, weight_decay

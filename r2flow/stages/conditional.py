@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
 from r2flow.generators import Condition, ConditionalFlow, Generator, condition_of
 from r2flow.generators.base import IMAGE, KNOWN
 from r2flow.lidar.known import every_row, random_points, random_rows, ray_states, without_sector
@@ -73,6 +72,7 @@ class Conditional(Rectify):
         tasks: Options of `Tasks`.
     """
 
+    learns = ConditionalFlow
     generator_name = "conditional_flow"
 
     def __init__(
@@ -84,8 +84,6 @@ class Conditional(Rectify):
         **options: Any,
     ) -> None:
         super().__init__(generator, loss, time, **options)
-        if not isinstance(generator, ConditionalFlow):
-            raise InputError(f"this stage learns from what is known, which a {type(generator).__name__} is not told.")
         check_options("stage.tasks", Tasks, tasks or {})
         self.further = partial(Tasks(**(tasks or {})), generator.space)
 

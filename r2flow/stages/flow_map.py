@@ -32,6 +32,8 @@ class LearnFlowMap(Reflow):
             factors, over the run. It is always 1 where s = t and, on pairs, for the jump from 0 to 1.
     """
 
+    learns = FlowMap
+    generator: FlowMap
     generator_name = "flow_map"
     needs_pairs = False
 
@@ -47,8 +49,6 @@ class LearnFlowMap(Reflow):
         if options.pop("time", None) is not None:
             raise InputError("a flow map learns jumps from time to time: give stage.jumps and leave stage.time out.")
         super().__init__(generator, loss, {"name": "uniform"}, **options)
-        if not isinstance(generator, FlowMap):
-            raise InputError(f"this stage learns jumps, which a {type(generator).__name__} does not have.")
         self.objective, self.objective_name, self.rho = OBJECTIVES[objective], objective, rho
         check_options("stage.jumps", JumpTimes, jumps or {})
         self.jumps = JumpTimes(**(jumps or {}))
@@ -71,7 +71,6 @@ class LearnFlowMap(Reflow):
             )
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
-        assert isinstance(self.generator, FlowMap)
         t, s = self.jumps(torch.cat([u[:, None], plastic_sequence(batch["k"])], 1))
         if not (self.training or self.on_pairs):
             t = s = self.jumps.velocities(u)  # of scans velocities alone are known

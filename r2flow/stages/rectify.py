@@ -23,15 +23,16 @@ class Rectify(SingleLoss):
         options: Those of `Stage`.
 
     Raises:
-        InputError: the generator has no velocity, or is told what this stage does not give; an unknown loss or density.
+        InputError: the generator is no flow, or takes a condition; an unknown loss or density.
     """
+
+    learns = Flow
+    generator: Flow
 
     def __init__(
         self, generator: Generator, loss: str = "mse", time: Mapping[str, Any] | None = None, **options: Any
     ) -> None:
         super().__init__(generator, **options)
-        if not isinstance(generator, Flow):
-            raise InputError(f"this stage learns a velocity, which a {type(generator).__name__} does not have.")
         if generator.told and type(self).condition is Rectify.condition:
             raise InputError(
                 f"a {type(generator).__name__} is told a part of each scan, and this stage tells it nothing: give "
@@ -49,5 +50,5 @@ class Rectify(SingleLoss):
         x_0, x_1 = batch["x_0"], batch["x_1"]
         t = self.time(u)
         x_t, u_t = interpolate(x_0, x_1, t)
-        v: Tensor = self.generator.velocity(t, x_t, self.condition(batch))  # type: ignore[operator]
+        v: Tensor = self.generator.velocity(t, x_t, self.condition(batch))
         return self.loss(v, u_t).mean()

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from r2flow.errors import InputError
-from r2flow.generators import Flow, Generator
+from r2flow.generators import Generator
 from r2flow.generators.flow import ode_sampler
 from r2flow.registry import Count
 from r2flow.samplers import FixedSteps
@@ -24,8 +24,7 @@ class Reflow(Rectify):
         self, generator: Generator, loss: str = "pseudo_huber", time: Mapping[str, Any] | None = None, **options: Any
     ) -> None:
         super().__init__(generator, loss, time or {"name": "u_shaped", "a": 4.0}, **options)
-        if isinstance(generator, Flow):  # of pairs that belong together, noise drawn on the way would part them
-            generator.run_by(ode_sampler(generator), generator.few)
+        generator.run_by(ode_sampler(self.generator), generator.few)  # fresh noise would part the pairs
 
 
 class Distill(Reflow):

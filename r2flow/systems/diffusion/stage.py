@@ -4,7 +4,6 @@ from typing import Any
 
 from torch import Tensor
 
-from r2flow.errors import InputError
 from r2flow.generators import Generator
 from r2flow.registry import Positive
 from r2flow.stages.base import Batch, SingleLoss
@@ -26,6 +25,8 @@ class LearnDiffusion(SingleLoss):
         options: Those of `Stage`.
     """
 
+    learns = Diffusion
+    generator: Diffusion
     generator_name = "diffusion"
 
     def __init__(
@@ -37,14 +38,11 @@ class LearnDiffusion(SingleLoss):
         **options: Any,
     ) -> None:
         super().__init__(generator, **options)
-        if not isinstance(generator, Diffusion):
-            raise InputError(f"this stage learns a diffusion, which a {type(generator).__name__} is not.")
         self.error, self.min_snr, self.paired = ERRORS[loss], min_snr, paired
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         """The weighted mean error at t = u, where t = 0 is data and t = 1 noise."""
         diffusion, x, eps = self.generator, batch["x_1"], batch["x_0"]
-        assert isinstance(diffusion, Diffusion)
         log_snr = diffusion.schedule(u)
         y = diffusion.predict(noised(x, log_snr, eps), log_snr)
         errors = mean_errors(self.error(y.float(), diffusion.prediction.target(x, eps, log_snr)))

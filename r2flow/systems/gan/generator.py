@@ -32,7 +32,10 @@ class Gan(Generator):
     Attributes:
         network: G.
         drops: Whether a mask of dropped rays is drawn: logistic noise of `draws.step(shape, 1)`.
+        turns: Whether the scan is turned by a random angle in training.
     """
+
+    turns: ClassVar[bool] = False
 
     def __init__(self, space: ModelSpace, build: Callable[[tuple[int, int], int], LatentGenerator]) -> None:
         channels, h, w = space.shape
@@ -162,6 +165,7 @@ class DustyV2(Gan):
     See `VanillaGan` for the others.
     """
 
+    turns = True
     angle: Tensor
 
     def __init__(

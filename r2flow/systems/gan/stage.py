@@ -7,14 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from r2flow.errors import InputError
 from r2flow.generators import Generator
 from r2flow.noise import generator as stream
 from r2flow.registry import Count, NonNegative, Portion, Registry, check_options
 from r2flow.stages.base import Batch, Stage
 from r2flow.systems.gan import dcgan, style_gan
 from r2flow.systems.gan.augment import AdaptiveAugment
-from r2flow.systems.gan.generator import DustyV2, Gan
+from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.losses import Warmup, discriminator_loss, generator_loss, lazy_adam, r1
 
 DISCRIMINATORS: Registry[type[nn.Module]] = Registry(
@@ -75,6 +74,9 @@ class LearnGan(Stage):
         seed: Run seed.
     """
 
+    learns = Gan
+    generator: Gan
+
     def __init__(
         self,
         generator: Generator,
@@ -88,11 +90,6 @@ class LearnGan(Stage):
         batch_size: Count = 32,
         seed: int = 0,
     ) -> None:
-        if not isinstance(generator, Gan):
-            raise InputError(
-                f"stage=gan learns a GAN, which a {type(generator).__name__} is not: give experiment=vanilla_gan, "
-                "dusty1 or dusty2, or generator=dusty2."
-            )
         super().__init__(generator, learning_rate, betas, warmup_images=0, batch_size=batch_size, seed=seed)
         self.automatic_optimization = False
         self.batch_size, self.r1, self.r1_every = batch_size, r1, r1_every
@@ -112,7 +109,6 @@ class LearnGan(Stage):
         ]
 
     def training_step(self, batch: Batch, batch_idx: int) -> None:
-        assert isinstance(self.generator, Gan)
         step = self.global_step + 1  # counted from 1, as published
         for_generator, for_discriminator = self.own_optimizers()
         images, real = step * self.batch_size, batch["x_1"]
@@ -146,10 +142,9 @@ class LearnGan(Stage):
 
     def make(self, z: Tensor, draws: BatchDraws) -> Tensor:
         """G(z), (B, C, H, W), with the mask and the turn that are drawn."""
-        assert isinstance(self.generator, Gan)
         rows, columns = self.generator.space.shape[1:]
         uniform = draws.uniform((1, rows, columns)) if self.generator.drops else None
-        shift = draws.uniform((1,))[:, 0] if isinstance(self.generator, DustyV2) else None
+        shift = draws.uniform((1,))[:, 0] if self.generator.turns else None
         return self.generator.made(z, uniform, shift)["image"]
 
     def shown(self, x: Tensor, images: int, draws: BatchDraws) -> Tensor:

@@ -50,6 +50,8 @@ class LearnAutoencoder(Stage):
         options: Those of `Stage`. The learning rate does not fall.
     """
 
+    learns = VQAutoencoder
+    generator: VQAutoencoder
     generator_name = "vq_autoencoder"
     anneals = False
 
@@ -65,8 +67,6 @@ class LearnAutoencoder(Stage):
         **options: Any,
     ) -> None:
         super().__init__(generator, **options)
-        if not isinstance(generator, VQAutoencoder):
-            raise InputError(f"this stage learns an autoencoder, which a {type(generator).__name__} is not.")
         self.automatic_optimization = False
         check_options("stage.discriminator", PatchDiscriminator, discriminator or {}, given=1)
         self.autoencoder = generator.first_stage_model
@@ -124,24 +124,22 @@ class LearnLatentDiffusion(SingleLoss):
         options: Those of `Stage`. The learning rate does not fall.
     """
 
+    learns = LatentDiffusion
+    generator: LatentDiffusion
     generator_name = "latent_diffusion"
     needs_parent = True
     anneals = False
 
     def __init__(self, generator: Generator, **options: Any) -> None:
         super().__init__(generator, **options)
-        if not isinstance(generator, LatentDiffusion):
-            raise InputError(f"this stage learns a diffusion of latents, which a {type(generator).__name__} has not.")
         generator.first_stage_model.requires_grad_(False)
 
     def configure_optimizers(self) -> Any:
-        assert isinstance(self.generator, LatentDiffusion)
         return self.optimizers_for(self.generator.unet.parameters())
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         """Mean over images at the steps that u in [0, 1) falls on, (B,)."""
         diffusion = self.generator
-        assert isinstance(diffusion, LatentDiffusion)
         with torch.no_grad():
             z = diffusion.first_stage_model.eval().encode(batch["x_1"]).float()  # for noise levels of all digits
         t = (u * len(diffusion.alpha_bar)).to(torch.int64)

@@ -5,7 +5,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
 from r2flow.generators import Generator
 from r2flow.registry import NonNegative
 from r2flow.stages.base import Batch, SingleLoss
@@ -22,18 +21,17 @@ class MatchScore(SingleLoss):
         options: Those of `Stage`. The learning rate does not fall.
     """
 
+    learns = ScoreModel
+    generator: ScoreModel
     generator_name = "score"
     anneals = False
 
     def __init__(self, generator: Generator, power: NonNegative = 2.0, **options: Any) -> None:
         super().__init__(generator, **options)
-        if not isinstance(generator, ScoreModel):
-            raise InputError(f"this stage learns a score, which a {type(generator).__name__} does not have.")
         self.power = power
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         """Mean over images at the noise levels that u in [0, 1) falls on, (B,)."""
-        assert isinstance(self.generator, ScoreModel)
         network = self.generator.network
         labels = (u * len(network.sigmas)).to(torch.int64)
         x = (batch["x_1"] + 1) / 2
