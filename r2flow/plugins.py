@@ -1,7 +1,7 @@
 """Modules of somebody else that enter their classes into our registries.
 
     r2flow train --plugin my.module stage=my_stage
-    r2flow sample --plugin ./my_stage.py --checkpoint runs/NAME
+    r2flow sample --plugin ./my_stage.py runs/NAME
 
 A package can say so itself, in the entry-point group `r2flow.plugins`: it is imported when a name is asked for that no
 registry knows. A config or a checkpoint names the plug-ins that it was made with, which is information: nothing that a

@@ -335,7 +335,7 @@ def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path
 
 def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):  # noqa: F811
     run = saved[0].parent.parent
-    assert r2flow("sample", "-c", run, "--num", 2, "--steps", 2, "-o", run / "samples", "--pictures", 0)[0] == 0
+    assert r2flow("sample", run, "--num", 2, "--steps", 2, "-o", run / "samples", "--pictures", 0)[0] == 0
     note = json.loads((run / "samples" / "scans.json").read_text())
     assert note["reading"]["projection"] == "spherical"
     sensor = note["reading"]["sensor"]

@@ -67,14 +67,14 @@ def test_interpolate_writes_every_frame(r2flow, run, files, tmp_path):  # noqa: 
 
 def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):  # noqa: F811
     code, said, _ = r2flow(
-        "sample", "-c", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "-o", tmp_path / "o"
+        "sample", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "-o", tmp_path / "o"
     )
     assert code == 0
     # 11.25 degrees are 2 columns, and the network's unit is 8.
     widened = "generating rows 0-3, columns 16-47, rounded outward from rows 0-2, columns 24-39 with its margin: 25% of"
     assert widened in said
     code, said, _ = r2flow(
-        "sample", "-c", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "--margin", 0,
+        "sample", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "--margin", 0,
         "-o", tmp_path / "o",
     )  # fmt: skip
     assert code == 0
@@ -97,7 +97,7 @@ def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):  # no
 def test_one_channel_is_written_alone(r2flow, run, tmp_path):  # noqa: F811
     for channels in ("both", "range", "reflectance"):
         out = tmp_path / channels
-        assert r2flow("sample", "-c", run, "--num", 1, "--steps", 2, "--channels", channels, "-o", out)[0] == 0
+        assert r2flow("sample", run, "--num", 1, "--steps", 2, "--channels", channels, "-o", out)[0] == 0
     both = np.load(tmp_path / "both" / "000000.npy")
     np.testing.assert_array_equal(np.load(tmp_path / "range" / "000000.npy"), both[:1])
     np.testing.assert_array_equal(np.load(tmp_path / "reflectance" / "000000.reflectance.npy"), both[1:])
@@ -110,7 +110,7 @@ def test_named_grids_are_sampled_on(r2flow, run, tmp_path):  # noqa: F811
     images = {}
     for grid in ("uniform", "power:2", "power-start:1.5"):
         out = tmp_path / grid.replace(":", "-")
-        assert r2flow("sample", "-c", run, "--num", 1, "--steps", 3, "--grid", grid, "-o", out)[0] == 0
+        assert r2flow("sample", run, "--num", 1, "--steps", 3, "--grid", grid, "-o", out)[0] == 0
         images[grid] = np.load(out / "000000.npy").tobytes()
     assert len(set(images.values())) == 3
 
@@ -145,18 +145,18 @@ class TestBadInput:
 
     def test_of_grids_and_errors(self, r2flow, run, tmp_path):  # noqa: F811
         out = tmp_path / "o"
-        options = ("sample", "-c", run, "-o", out)
+        options = ("sample", run, "-o", out)
         for grid in ("cubic", "power", "power:0", tmp_path / "no.json"):
             self.check(r2flow(*options, "--grid", grid), out, "power:P or power-start:P with P from 1 to 10", str(grid))
         self.check(r2flow(*options, "--grid", "power:2", "--sampler", "dopri5"), out, "grid")
 
     def test_of_seeds_and_tolerances(self, r2flow, run, files, tmp_path):  # noqa: F811
         out = tmp_path / "o"
-        self.check(r2flow("sample", "-c", run, "-o", out, "--seed", 2**64), out, "[0, 2^64)", str(2**64))
+        self.check(r2flow("sample", run, "-o", out, "--seed", 2**64), out, "[0, 2^64)", str(2**64))
 
     def test_of_regions_and_channels(self, r2flow, run, tmp_path):  # noqa: F811
         out = tmp_path / "o"
-        options = ("sample", "-c", run, "-o", out)
+        options = ("sample", run, "-o", out)
         self.check(r2flow(*options, "--sector", "north"), out, "--sector", "-45,45", "'north'")
         self.check(r2flow(*options, "--sector", "5,5"), out, "is empty")
         self.check(r2flow(*options, "--sector", "10,10.0000001"), out, "narrower than a column")
@@ -166,7 +166,7 @@ class TestBadInput:
         self.check(r2flow(*options, "--channels", "range", "--format", "bin"), out, "leaves it out", "ply,npy")
         self.check(r2flow(*options, "--channels", "reflectance", "--format", "ply"), out, "need a range")
         alone = write_checkpoint(tmp_path / "range", reflectance=False)
-        self.check(r2flow("sample", "-c", alone, "-o", out, "--channels", "reflectance"), out, "range alone")
+        self.check(r2flow("sample", alone, "-o", out, "--channels", "reflectance"), out, "range alone")
 
 
 def test_what_is_not_asked_for_is_not_imported():
@@ -181,7 +181,7 @@ def test_what_is_not_asked_for_is_not_imported():
 
 def test_a_model_of_range_alone_has_no_reflectance_to_compute(r2flow, tmp_path):  # noqa: F811
     alone = write_checkpoint(tmp_path / "range", reflectance=False)
-    assert r2flow("sample", "-c", alone, "--num", 1, "--steps", 2, "-o", tmp_path / "o")[0] == 0
+    assert r2flow("sample", alone, "--num", 1, "--steps", 2, "-o", tmp_path / "o")[0] == 0
     assert np.load(tmp_path / "o" / "000000.npy").shape == (1, 8, 64)
     assert read_points(tmp_path / "o" / "000000.ply").reflectance is None
 

@@ -22,7 +22,7 @@ QUICK = ("--sampler", "euler", "--steps", 2, "--batch-size", 4, "--num", 10)
 
 def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):  # noqa: F811
     path, _ = saved
-    code, said, _ = r2flow("pairs", "-c", path, *QUICK)
+    code, said, _ = r2flow("pairs", path, *QUICK)
     assert code == 0
     folder = path.parent.parent / "pairs"
     for words in ("12 pairs", "pairs/s", "2.0 evaluations a pair", f"{folder}: all 10 pairs, 1 shard"):
@@ -31,7 +31,7 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):  # noqa: F811
     options = {"sampler": {"name": "euler", "steps": 2}, "num": 10, "batch_size": 4}
     recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(flow.encoding.shape)
     assert len(PairSource(PairStore(folder, recipe), 10)) == 10
-    code, said, _ = r2flow("pairs", "-c", path, *QUICK)
+    code, said, _ = r2flow("pairs", path, *QUICK)
     assert code == 0
     assert "pairs/s" not in said  # nothing was left to make
 
@@ -44,10 +44,10 @@ def test_an_unfinished_run_draws_no_pairs(r2flow, saved):  # noqa: F811
     content = read_checkpoint(path)
     content["config"] = {**content["config"], "trainer": {"max_steps": content["global_step"] + 1}}
     AtomicCheckpointIO().save_checkpoint(content, path)
-    code, _, said = r2flow("pairs", "-c", path.parent.parent, *QUICK)
+    code, _, said = r2flow("pairs", path.parent.parent, *QUICK)
     assert code == 2
     assert "finish it, or name the checkpoint to start from" in said
-    assert r2flow("pairs", "-c", path, *QUICK)[0] == 0
+    assert r2flow("pairs", path, *QUICK)[0] == 0
 
 
 @pytest.mark.slow
@@ -55,7 +55,7 @@ def test_three_processes_of_torchrun_and_a_slurm_array_make_the_shards_of_one(sa
     path, _ = saved
 
     def make(out: Path, **environment: str) -> subprocess.Popen:
-        command = [sys.executable, "-m", "r2flow.cli", "pairs", "-c", path, *QUICK, "--out", out, "--shard-mib", "0.01"]
+        command = [sys.executable, "-m", "r2flow.cli", "pairs", path, *QUICK, "--out", out, "--shard-mib", "0.01"]
         full = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
         return subprocess.Popen([str(one) for one in command], env=full, stdout=subprocess.PIPE, text=True)
 
@@ -113,7 +113,7 @@ def test_where_a_process_stands(environment: dict[str, str], expected: tuple[int
 )
 def test_what_cannot_be_is_one_line(r2flow, saved, options, message):  # noqa: F811
     path, _ = saved
-    code, _, said = r2flow("pairs", "-c", path, *options)
+    code, _, said = r2flow("pairs", path, *options)
     assert code == 2
     assert message in said
     assert len(said.strip().splitlines()) == 1

@@ -51,7 +51,7 @@ def test_a_mistake_in_a_scan_of_any_name_is_one_line(r2flow, tmp_path, monkeypat
 def test_models_of_any_name_sample(r2flow, saved, tmp_path, monkeypatch, name):  # noqa: F811
     monkeypatch.chdir(tmp_path)
     shutil.copytree(saved[0].parents[1], f"./{name}")
-    code, _, err = r2flow("sample", "-c", f"./{name}", "-o", f"./{name}/s", "--num", 1, "--steps", 1)
+    code, _, err = r2flow("sample", f"./{name}", "-o", f"./{name}/s", "--num", 1, "--steps", 1)
     assert code == 0, err
     code, _, err = r2flow("report", "curvature", f"./{name}", "-o", "page", "--num", 1, "--steps", 2)
     assert code == 0, err

@@ -32,7 +32,7 @@ TRAIN = f"runpy.run_path({str(ROOT / 'train.py')!r}, run_name='__main__')"
     ("command", "argv", "module"),
     [
         (VERB, ["r2flow", "info", "x"], "typer"),
-        (VERB, ["r2flow", "sample", "-c", "x", "-o", "out"], "torch"),
+        (VERB, ["r2flow", "sample", "x", "-o", "out"], "torch"),
         (VERB, ["r2flow", "train", "name=x"], "hydra"),
         (TRAIN, ["train.py", "name=x"], "hydra"),
         (TRAIN, ["train.py", "name=x"], "torch"),

@@ -40,58 +40,58 @@ sampel -c run -o out # Did you mean 'sample'?
 report nope
 report --nope
 sample # Missing
-sample -c run # Missing
-sample -c nowhere -o out
-sample -c empty -o out
-sample -c bad.ckpt -o out
-sample -c file.txt -o out
-sample -c scans -o out # scans holds no checkpoint
-sample -c run -o file.txt
-sample -c run -o file.txt/a
-sample -c run -o out --sampler torchdiffeq:nope
-sample -c run -o out --sampler euler --tolerance 0.1 # tolerance
-sample -c run -o out --sampler nope --tolerance 0.1 # no sampler named
-sample -c run -o out --sampler sde:2 --tolerance 0.1 # no sampler named
-sample -c run -o out --sampler torchdiffeq:rk4 --tolerance 0.1 # no sampler named
-sample -c run -o out --sampler torchdiffeq:nope --tolerance 0.1 # no sampler named
-sample -c run -o out --sampler dopri5 --steps 50 # steps
-sample -c run -o out --sampler torchdiffeq:bosh3 --steps 50 # no sampler named
-sample -c run -o out --device meta
-sample -c run -o out --device cuda:99
-sample -c run -o out --device cpu:7
-sample -c run -o out --device '' # an argument is empty
-sample -c run -o out --format las
-sample -c run -o out --format ply,
-sample -c run -o out --sector 3
-sample -c run -o out --sector a,b
-sample -c run -o out --sector 10,10
-sample -c run -o out --sector nan,3
-sample -c run -o out --sector 0,inf
-sample -c run -o out --sector 1,2,3
-sample -c run -o out --rows 3
-sample -c run -o out --rows 5-3
-sample -c run -o out --rows 0-99
-sample -c run -o out --rows a-b
-sample -c run -o out --rows ' -1-3'
-sample -c run -o out --channels nope
-sample -c run -o out --channels reflectance --format ply
-sample -c run -o out --channels range --format bin
-sample -c run -o out --grid nope
-sample -c run -o out --grid nowhere.json
-sample -c run -o out --grid bad.json
-sample -c run -o out --grid file.txt
-sample -c run -o out --grid empty
-sample -c run -o out --sampler dopri5 --grid power:2
-sample -c run -o out --grid power:0
-sample -c run -o out --grid power:10 --steps 64 # 64 steps do not fit under power:10 in double precision
-sample -c run -o out --grid power:3 --steps 1000000 # fewer steps or a smaller power
-sample -c run -o out --margin 10 --sampler nope
-sample -c run -o out --plugin nope
-sample -c run -o out --plugin plugin.py
-sample -c run -o out --plugin empty
-sample -c run -o out extra
-sample -c run -c run -o out -o # '-o' requires an argument
-sample -c '' -o out # an argument is empty
+sample run # Missing
+sample nowhere -o out
+sample empty -o out
+sample bad.ckpt -o out
+sample file.txt -o out
+sample scans -o out # scans holds no checkpoint
+sample run -o file.txt
+sample run -o file.txt/a
+sample run -o out --sampler torchdiffeq:nope
+sample run -o out --sampler euler --tolerance 0.1 # tolerance
+sample run -o out --sampler nope --tolerance 0.1 # no sampler named
+sample run -o out --sampler sde:2 --tolerance 0.1 # no sampler named
+sample run -o out --sampler torchdiffeq:rk4 --tolerance 0.1 # no sampler named
+sample run -o out --sampler torchdiffeq:nope --tolerance 0.1 # no sampler named
+sample run -o out --sampler dopri5 --steps 50 # steps
+sample run -o out --sampler torchdiffeq:bosh3 --steps 50 # no sampler named
+sample run -o out --device meta
+sample run -o out --device cuda:99
+sample run -o out --device cpu:7
+sample run -o out --device '' # an argument is empty
+sample run -o out --format las
+sample run -o out --format ply,
+sample run -o out --sector 3
+sample run -o out --sector a,b
+sample run -o out --sector 10,10
+sample run -o out --sector nan,3
+sample run -o out --sector 0,inf
+sample run -o out --sector 1,2,3
+sample run -o out --rows 3
+sample run -o out --rows 5-3
+sample run -o out --rows 0-99
+sample run -o out --rows a-b
+sample run -o out --rows ' -1-3'
+sample run -o out --channels nope
+sample run -o out --channels reflectance --format ply
+sample run -o out --channels range --format bin
+sample run -o out --grid nope
+sample run -o out --grid nowhere.json
+sample run -o out --grid bad.json
+sample run -o out --grid file.txt
+sample run -o out --grid empty
+sample run -o out --sampler dopri5 --grid power:2
+sample run -o out --grid power:0
+sample run -o out --grid power:10 --steps 64 # 64 steps do not fit under power:10 in double precision
+sample run -o out --grid power:3 --steps 1000000 # fewer steps or a smaller power
+sample run -o out --margin 10 --sampler nope
+sample run -o out --plugin nope
+sample run -o out --plugin plugin.py
+sample run -o out --plugin empty
+sample run -o out extra
+sample run -o out -o # '-o' requires an argument
+sample '' -o out # an argument is empty
 info # Missing
 info nowhere
 info empty
@@ -100,8 +100,8 @@ info scans/000000.bin
 info run run # extra argument
 info run --jsn
 info run --json --card # --card and --json are two forms of one answer
-sample -c run -o out --steps 10000000 # 1,000,000
-sample -c run -o out --sampler jump:2 # no sampler named
+sample run -o out --steps 10000000 # 1,000,000
+sample run -o out --sampler jump:2 # no sampler named
 view scans --seed 3 -o v.html # --seed and --device are of a run
 view scans --device cpu -o v.html # --seed and --device are of a run
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
@@ -203,16 +203,16 @@ prepare --check empty
 prepare --check scans # no prepared scans
 prepare --check file.txt
 pairs # Missing
-pairs -c nowhere
-pairs -c empty
-pairs -c stopped
-pairs -c bad.ckpt
-pairs -c run --num 1 --seed 99999999999999999999
-pairs -c run --num 1 --first 99999999999999999999
-pairs -c run --num 1 --rank 1
-pairs -c run --num 1 --rank 2 --ranks 2
-pairs -c run --num 1 --ranks 2
-pairs -c run --num 1 -o file.txt
+pairs nowhere
+pairs empty
+pairs stopped
+pairs bad.ckpt
+pairs run --num 1 --seed 99999999999999999999
+pairs run --num 1 --first 99999999999999999999
+pairs run --num 1 --rank 1
+pairs run --num 1 --rank 2 --ranks 2
+pairs run --num 1 --ranks 2
+pairs run --num 1 -o file.txt
 weights --add
 weights --add nope file.txt
 weights --add rangenet53
@@ -281,15 +281,15 @@ report paper nowhere -o out
 report paper run -o out --results nowhere
 report paper run -o out --real nowhere
 report paper run -o file.txt
-sample -c run -o out --format '' # an argument is empty
-sample -c run -o '' # an argument is empty
+sample run -o out --format '' # an argument is empty
+sample run -o '' # an argument is empty
 evaluate scans scans --metrics '' # an argument is empty
 report backbones --only '' # an argument is empty
 """
 
 # What each verb's wrong values are tried on, and words that no option takes.
 BASES = {
-    "sample": "sample -c run -o out", "pairs": "pairs -c run --num 1", "simulate": "simulate -o out",
+    "sample": "sample run -o out", "pairs": "pairs run --num 1", "simulate": "simulate -o out",
     "complete": "complete scans/000000.bin -c run -o out", "view": "view run -o out.html", "show": "show scans -o out",
     "interpolate": "interpolate scans/000000.bin scans/000001.bin -c run -o out", "sensor": "sensor scans",
     "prepare": "prepare folder scans -o out", "evaluate": "evaluate scans run --metrics jsd", "compare": "compare run",

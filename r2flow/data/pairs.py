@@ -151,7 +151,7 @@ class PairSource:
     def __init__(self, store: PairStore, num: int) -> None:
         self.store = store
         if lacking := store.missing_pairs(num):
-            raise InputError(f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs -c RUN.")
+            raise InputError(f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
         usable = [flag for shard in store.shards(num) for flag in store.usable(shard)]
         self.indices = np.flatnonzero(usable[:num])
         self._opened: dict[tuple[int, str], Any] = {}

@@ -78,7 +78,7 @@ def test_scan_i_of_a_seed_is_the_same_in_any_batch(trained: tuple[Family, Path],
     family, run = trained
     for out, num, batch_size in (("three", 3, 3), ("two", 2, 1)):
         done = r2flow(
-            "sample", family.plugin, "-c", run, "-o", tmp_path / out, "--num", num, "--batch-size", batch_size,
+            "sample", family.plugin, run, "-o", tmp_path / out, "--num", num, "--batch-size", batch_size,
             "--format", "npy", "--pictures", 0,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
@@ -137,8 +137,8 @@ CANNOT = {
     "report curvature": (["RUN", "-o", "OUT"], "curvature needs the velocity of a flow, which a ToyGenerator"),
     "report solvers": (["RUN", "-o", "OUT"], "report solvers needs the velocity of a flow"),
     "export": (["RUN", "-o", "OUT.onnx"], "only flows can be exported"),
-    "pairs": (["-c", "RUN"], "needs a generator with a velocity"),
-    "sample": (["-c", "RUN", "--steps", "4", "-o", "OUT"], "has no option 'steps'"),
+    "pairs": (["RUN"], "needs a generator with a velocity"),
+    "sample": (["RUN", "--steps", "4", "-o", "OUT"], "has no option 'steps'"),
 }  # fmt: skip
 
 
@@ -167,7 +167,7 @@ def test_a_gan_s_optimizers_and_schedules_keep_step(gan: Path):
 def test_a_run_without_its_plugin_says_which_and_how(trained: tuple[Family, Path], tmp_path: Path):
     family, run = trained
     name, kind = ("toy_backbone", "backbone") if family is BACKBONE else (f"toy_{family.name}", "generator")
-    for arguments in (["info", run], ["sample", "-c", run, "-o", tmp_path / "out"]):
+    for arguments in (["info", run], ["sample", run, "-o", tmp_path / "out"]):
         done = r2flow(*arguments)
         assert done.returncode == 2
         assert len(done.stderr.splitlines()) == 1

@@ -40,13 +40,13 @@ def test_a_checkpoint_notes_it_and_needs_the_plugin(run: Path, tmp_path: Path):
         torch.testing.assert_close(found.states, torch.tensor([[1, 0, 0], [1, 0.25, 0], [1, 0.25, 0.25]]).double())
         with pytest.raises(InputError, match="share"):
             build_sampler("shrunken", share="x")
-    done = r2flow("sample", "-c", run, "-o", tmp_path / "out")
+    done = r2flow("sample", run, "-o", tmp_path / "out")
     assert done.returncode == 2
     assert "--plugin" in done.stderr
 
 
 def test_verbs_take_it(run: Path, tmp_path: Path):
-    given = (SHRUNKEN.plugin, "-c", run, "--sampler", "shrunken:share=0.75", "--steps", 2)
+    given = (SHRUNKEN.plugin, run, "--sampler", "shrunken:share=0.75", "--steps", 2)
     done = r2flow("sample", *given, "--num", 1, "--format", "npy", "--pictures", 0, "-o", tmp_path / "scans")
     assert done.returncode == 0, done.stderr
     assert np.isfinite(np.load(tmp_path / "scans" / "000000.npy")).all()

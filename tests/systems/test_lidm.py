@@ -399,7 +399,7 @@ def test_a_published_autoencoder_gives_its_codes(shared: Path):
 
 def test_an_autoencoder_where_scans_are_wanted_is_one_line(shared: Path, tmp_path: Path, monkeypatch, capsys):
     path = shared / "oracle_baselines" / "lidm_ae_published.ckpt"
-    monkeypatch.setattr("sys.argv", ["r2flow", "sample", "-c", str(path), "-o", str(tmp_path / "out")])
+    monkeypatch.setattr("sys.argv", ["r2flow", "sample", str(path), "-o", str(tmp_path / "out")])
     with pytest.raises(SystemExit) as end:
         main()
     said = capsys.readouterr().err.splitlines()

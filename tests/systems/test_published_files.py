@@ -26,9 +26,7 @@ def test_a_published_file_is_sampled_and_evaluated(r2flow, shared, tmp_path: Pat
         pytest.skip("the reference checkpoint is not here")
     options, evaluations = FILES[name]
     out = tmp_path / "scans"
-    code, said, error = r2flow(
-        "sample", "-c", path, *options, "--num", 2, "--pictures", 0, "--device", "cpu", "--out", out
-    )
+    code, said, error = r2flow("sample", path, *options, "--num", 2, "--pictures", 0, "--device", "cpu", "--out", out)
     assert code == 0, error
     assert (out / "000001.npy").is_file()
     rate = ["--metrics", "jsd", "--workers", 0, "--device", "cpu"]

@@ -314,7 +314,7 @@ def r2flow(*words: Any) -> None:
 
 def test_a_published_checkpoint_is_sampled_and_evaluated(shared, tmp_path):
     path = shared / "oracle_baselines" / "r2dm_published.pth"
-    r2flow("sample", "-c", path, "--num", 2, "--steps", 2, "--format", "npy", "--pictures", 0, "-o", tmp_path / "scans")
+    r2flow("sample", path, "--num", 2, "--steps", 2, "--format", "npy", "--pictures", 0, "-o", tmp_path / "scans")
     images = [np.load(one) for one in sorted((tmp_path / "scans").glob("*.npy"))]
     assert [image.shape for image in images] == [(2, 16, 64)] * 2
     with torch.no_grad():

@@ -97,7 +97,7 @@ def test_prepare(tmp_path: Path):
 
 
 def test_pairs(saved, tmp_path: Path):  # noqa: F811
-    command = [*VERB, "pairs", "-c", saved[0], "--num", 200, "--sampler", "midpoint", "--steps", 8, "--batch-size", 4,
+    command = [*VERB, "pairs", saved[0], "--num", 200, "--sampler", "midpoint", "--steps", 8, "--batch-size", 4,
                "--shard-mib", 0.05, "--device", "cpu", "--out"]  # fmt: skip
     seconds = finish(tmp_path, [*command, "one"])
     end_ten_times(tmp_path, [*command, "ended"], seconds, 2)

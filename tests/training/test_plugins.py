@@ -66,8 +66,8 @@ def eager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("line", "rest", "names"),
     [
         (["sample", "--num", "1"], ["sample", "--num", "1"], []),
-        (["--plugin", "a.b", "sample", "-c", "x"], ["sample", "-c", "x"], ["a.b"]),
-        (["sample", "-c", "x", "--plugin=a.b", "--plugin", "./c.py"], ["sample", "-c", "x"], ["a.b", "./c.py"]),
+        (["--plugin", "a.b", "sample", "x"], ["sample", "x"], ["a.b"]),
+        (["sample", "x", "--plugin=a.b", "--plugin", "./c.py"], ["sample", "x"], ["a.b", "./c.py"]),
     ],
 )
 def test_a_plugin_stands_anywhere_on_the_command_line(line: list[str], rest: list[str], names: list[str]):
