@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 CheckpointOption = Annotated[
     Path, typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model.", show_default=False)
 ]
-ModelArgument = Annotated[Path, typer.Argument(help="A checkpoint file, a run folder or a model.", show_default=False)]
 DeviceOption = Annotated[str, typer.Option(help="Where to compute: auto, cpu, cuda, cuda:1, ...")]
 PrecisionOption = Annotated[
     Literal["32-true", "bf16-mixed"] | None,
