@@ -11,6 +11,11 @@ from torch import Tensor
 MODES = list(itertools.product((True, False), (True, False)))  # gradients, autocast
 
 
+def quick(names):
+    """All of them, those but HDiT in the long run of the tests: tracing takes seconds."""
+    return [name if name == "hdit" else pytest.param(name, marks=pytest.mark.slow) for name in names]
+
+
 class Counter:
     """A compiler that runs each graph as it was traced, and counts them."""
 
@@ -22,7 +27,7 @@ class Counter:
         return graph.forward
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", quick(NAMES))
 def test_the_whole_model_is_one_graph(name):
     torch.compiler.reset()
     model, counter = tiny(name), Counter()
@@ -32,7 +37,7 @@ def test_the_whole_model_is_one_graph(name):
     assert counter.graphs == 1
 
 
-@pytest.mark.parametrize("name", TWO_TIMES)
+@pytest.mark.parametrize("name", quick(TWO_TIMES))
 def test_two_times_are_one_graph(name):
     torch.compiler.reset()
     model, counter = tiny(name, second_time=True), Counter()

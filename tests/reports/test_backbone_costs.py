@@ -45,10 +45,12 @@ def test_latency_is_measured():
     assert row["latency_ms"] > 0
 
 
+@pytest.mark.slow
 def test_every_configuration_takes_every_sensor_s_shape(sensor):
     assert [row for row in backbone_costs(sensor, list(PARAMETERS), repeats=0) if "error" in row] == []
 
 
+@pytest.mark.slow
 def test_the_verb_prints_every_configuration(r2flow):  # noqa: F811
     code, out, _ = r2flow("report", "backbones", "--repeats", 0, "--device", "cpu")
     assert code == 0
