@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Protocol, Self, TypedDict, runtime_checkable
+from typing import Any, ClassVar, Self, TypedDict
 
 import torch
 from torch import Tensor, nn
@@ -21,43 +21,32 @@ class CommonOptions(TypedDict, total=False):
     data_std: Positive | None
 
 
-@runtime_checkable
-class OnRing(Protocol):
-    """A layer that treats the columns as a ring and can be told that they are none."""
-
-    def open_ring(self) -> None:
-        """From now on the columns have two ends."""
-
-
 class Backbone(ExactBuffers):
     """A field v(t, x) on images, or the mean velocity u(x, t, s) of a flow from time t to time s.
 
     X_{t->s}(x) = x + (s - t) u(x, t, s), and u(x, t, t) = v(t, x) (Geng et al. 2025, "Mean flows for one-step
     generative modeling", with the sign of s - t).
 
-    A subclass implements `velocity`; layers that see times are `ExactLinear`, because times stay float32 whatever
-    the network computes in. That is enough. A class that can do more says so:
+    A subclass implements `velocity`; layers that see times are `ExactLinear`, since times stay float32. A class that
+    can do more declares it:
 
     - unit: What the rows and columns of the image, and of each part of it, are multiples of.
-    - follow_rays: What it derives from the rays goes into buffers here, of fixed size, outside the state_dict and
-      always float32; called by its constructor and whenever `coords` is loaded.
+    - follow_rays: Computes what derives from `coords` into buffers that are not saved; called by its constructor and
+      whenever `coords` is loaded.
     - takes_second_time: It can be built with `second_time=True`. It then has an `interval_embedding` of s - t, made
       after all else, whose last layer is zero, and `velocity` is given s (see `condition`).
-    - croppable: It can be evaluated on a part of its image. Layers that use the ring are `OnRing`.
+    - croppable: It can be evaluated on a part of its image. Layers that use the ring have a method `open_ring`.
     - learns_directions: It learns a vector for each direction, so that scans must not be turned in training.
     - tiny_options: Options that build it in milliseconds, for tests.
 
-    A module in it whose multiply-accumulates are not those of its torch layers has a method `macs`
-    (`r2flow.backbones.cost.Counted`).
-
-    `model.compile(dynamic=True)` makes it one graph without breaks: one for batches of two and more and one for a
-    single image, for each of gradients on or off and autocast on or off; then no further one.
+    A module in it may have a method `macs` (`r2flow.backbones.cost`). `model.compile(dynamic=True)` makes it one graph
+    without breaks for batches of two and more and one for a single image.
 
     Args:
         rays: Elevation and azimuth of every pixel in radians, (2, H, W).
         unit: See above.
         in_channels: Channels C of the image, and of the condition that is concatenated to it.
-        out_channels: Channels C' of the answer; None for C.
+        out_channels: Channels C' of the output; None for C.
         second_time: Whether the network takes s.
         data_std: Standard deviation of the data, for `precondition`; None for a network that gives v itself.
     """
@@ -125,8 +114,7 @@ class Backbone(ExactBuffers):
     def condition(self, time_embedding: nn.Module, t: Tensor, s: Tensor | None) -> Tensor:
         """time_embedding(t) + e(s - t) - e(0), e the `interval_embedding`: what steers the network, (B or 1, K).
 
-        The difference is zero when training begins, u(x, t, s) = v(t, x) for every s, bit by bit where t and s have one
-        shape; and always where s = t, so that without e the network is the one of u(x, t, t) = v(t, x).
+        The difference is zero when training begins, and always where s = t: u(x, t, t) = v(t, x).
         """
         c = time_embedding(t)
         if s is None:
@@ -135,11 +123,7 @@ class Backbone(ExactBuffers):
         return c + (e[:-1] - e[-1:])
 
     def second_time_names(self) -> frozenset[str]:
-        """Entries of the state_dict that a network of one time does not have.
-
-        The weights of one load with `load_state_dict({**new, **weights})`, `new` being this model's own values of
-        these names.
-        """
+        """Entries of the state_dict that a network of one time does not have."""
         return frozenset(name for name in self.state_dict() if name.startswith("interval_embedding."))
 
     def follow_rays(self) -> None:
@@ -158,9 +142,8 @@ class Backbone(ExactBuffers):
     def cropped(self, rows: Tensor, columns: Tensor) -> Self:
         """The backbone for a part of its image, (B, C, len(rows), len(columns)), its parameters shared.
 
-        The part has its own rays, and no wrap where the turn is cut. What a pixel sees beyond the cut is gone:
-        neighbourhoods are moved inside, convolutions find zeros, global attention and group norms know the part
-        alone. The field is therefore another one, near the cut most of all.
+        The part does not see the rest of the image, and does not wrap where the turn is cut: the field is another one,
+        near the cut most of all.
 
         Args:
             rows: Numbers of neighbouring rows, ascending.
@@ -176,9 +159,7 @@ class Backbone(ExactBuffers):
         rows, columns = rows.to(self.coords.device), columns.to(self.coords.device)
         part.coords = self.coords.index_select(-2, rows).index_select(-1, columns)
         if len(columns) < self.coords.shape[-1]:
-            for module in part.modules():
-                if isinstance(module, OnRing):
-                    module.open_ring()
+            open_rings(part)
         part.follow_rays()
         return part
 
@@ -199,6 +180,12 @@ class Backbone(ExactBuffers):
                     f"{dimension} {size} cannot be used by {name} with these options: it must be a multiple of {unit}; "
                     f"nearest: {nearest}."
                 )
+
+
+def open_rings(network: nn.Module) -> None:
+    """Let the columns of all layers of a network have two ends from now on."""
+    for module in network.modules():
+        getattr(module, "open_ring", lambda: None)()
 
 
 def precondition(t: Tensor, data_std: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, Self, Unpack, cast
 
 import torch
@@ -98,7 +97,12 @@ class HDiT(Backbone):
 
         self.timestep_pe = time_embedding(time_channels, dropout)
         self.tokenizer = nn.Sequential(nn.Conv2d(self.in_channels, base_channels, self.patch, self.patch, bias=False))
-        self.spatial_pe = _position(position, (rows, columns), base_channels, dropout)
+        name, tokens = position_name(position, "learnable", "none"), (rows, columns)
+        self.spatial_pe: LearnablePosition | FeaturePosition | None = None
+        if name == "learnable":
+            self.spatial_pe = LearnablePosition(tokens, base_channels)
+        elif name != "none":
+            self.spatial_pe = FeaturePosition(name, tokens, base_channels, dropout)
         self.down_levels, self.up_levels = nn.ModuleDict(), nn.ModuleDict()
         for level in range(levels - 1):
             for side in (self.down_levels, self.up_levels):
@@ -108,12 +112,10 @@ class HDiT(Backbone):
         self.mid_levels = blocks(levels - 1)
         pixels = zero_initialised(nn.Linear(base_channels, math.prod(self.patch) * self.out_channels, bias=False))
         self.detokenizer = nn.Sequential(RMSNorm(base_channels), pixels)
-        if detail is None:
-            self.detail = None
-        else:
-            count, channels = integers("detail", detail, 2)
-            ends = self.in_channels, self.out_channels
-            self.detail = Detail(count, channels, ends, base_channels, self.patch, time_channels, ring)
+        self.detail = None
+        if detail is not None:
+            (count, wide), ends = integers("detail", detail, 2), (self.in_channels, self.out_channels)
+            self.detail = Detail(count, wide, ends, base_channels, self.patch, time_channels, ring)
         if self.second_time:
             last = zero_initialised(ExactLinear(time_channels, time_channels, bias=False))
             self.interval_embedding = time_embedding(time_channels, dropout).append(last)
@@ -145,12 +147,12 @@ class HDiT(Backbone):
             rays = mean_rays(self.coords, (self.patch[0] << level, self.patch[1] << level))
             table = _shared_rotation(level, self._blocks(level)).table(rays)
             self.register_buffer(f"table_{level}", table, persistent=False)
-        if isinstance(self.spatial_pe, FeaturePosition):
+        if self.spatial_pe is not None:
             self.spatial_pe.follow(mean_rays(self.coords, self.patch))
 
     @property
     def learns_directions(self) -> bool:
-        return isinstance(self.spatial_pe, LearnablePosition)
+        return self.spatial_pe is not None and self.spatial_pe.learned
 
     @classmethod
     def tiny_options(cls) -> Mapping[str, Any]:
@@ -159,7 +161,7 @@ class HDiT(Backbone):
 
     def cropped(self, rows: Tensor, columns: Tensor) -> Self:
         part = super().cropped(rows, columns)
-        if isinstance(part.spatial_pe, LearnablePosition):
+        if part.spatial_pe is not None:
             part.spatial_pe.crop(*(n[::step] // step for n, step in zip((rows, columns), self.patch, strict=True)))
         return part
 
@@ -193,12 +195,17 @@ def _shared_rotation(level: int, blocks: Sequence["Block"]) -> Rotary:
 class LearnablePosition(nn.Module):
     """One learned vector for each token, added to it: the absolute position embedding of the paper."""
 
+    learned = True
+
     def __init__(self, tokens: tuple[int, int], channels: int) -> None:
         super().__init__()
         self.embedding = nn.Parameter(nn.init.trunc_normal_(torch.empty(1, *tokens, channels), std=0.02))
 
     def forward(self) -> Tensor:
         return self.embedding
+
+    def follow(self, rays: Tensor) -> None:
+        """Nothing of it derives from the rays."""
 
     def crop(self, rows: Tensor, columns: Tensor) -> None:
         """Keep the tokens of these rows and columns, as a constant."""
@@ -210,12 +217,19 @@ class LearnablePosition(nn.Module):
 class FeaturePosition(nn.Sequential):
     """Features of the mean ray of each token through a mapping network."""
 
+    learned = False
+
     def __init__(self, name: str, tokens: tuple[int, int], channels: int, dropout: float) -> None:
         features = RayFeatures(ENCODINGS[name](tokens), channels)
         super().__init__(features, mapping_network(channels, linear=nn.Linear, dropout=dropout))
 
     def follow(self, rays: Tensor) -> None:
-        cast(RayFeatures, self[0]).follow(rays)
+        """Compute the features again."""
+        features = cast(RayFeatures, self[0])
+        features.register_buffer("features", features.embedding(rays).permute(0, 2, 3, 1), persistent=False)
+
+    def crop(self, rows: Tensor, columns: Tensor) -> None:
+        """Its features follow the rays."""
 
     def forward(self) -> Tensor:  # type: ignore[override]  # its input are the rays, which it holds
         features, mapping = self
@@ -232,20 +246,8 @@ class RayFeatures(ExactBuffers):
         self.embedding = embedding
         self.linear = ExactLinear(embedding.channels, channels, bias=False)
 
-    def follow(self, rays: Tensor) -> None:
-        self.register_buffer("features", self.embedding(rays).permute(0, 2, 3, 1), persistent=False)
-
     def forward(self) -> Tensor:
         return self.linear(self.features).to(self.linear.weight.dtype)
-
-
-def _position(name: str | None, tokens: tuple[int, int], channels: int, dropout: float) -> nn.Module | None:
-    name = position_name(name, "learnable", "none")
-    if name == "none":
-        return None
-    if name == "learnable":
-        return LearnablePosition(tokens, channels)
-    return FeaturePosition(name, tokens, channels, dropout)
 
 
 class Neighbourhood(NamedTuple):
@@ -256,8 +258,7 @@ class Neighbourhood(NamedTuple):
     backend: str
 
 
-@dataclass(frozen=True)
-class BlockOptions:
+class BlockOptions(NamedTuple):
     """What all blocks of a level have in common.
 
     Attributes:
@@ -375,20 +376,14 @@ class Merge(nn.Sequential):
     """2 x 2 tokens of C channels become one of 2C."""
 
     def __init__(self, channels: int) -> None:
-        super().__init__(Shuffle((2, 2)), nn.Linear(4 * channels, 2 * channels, bias=False))
+        super().__init__(Shuffle(), nn.Linear(4 * channels, 2 * channels, bias=False))
 
 
 class Shuffle(nn.Module):
-    """(B, H p, W q, C) to (B, H, W, p q C)."""
-
-    def __init__(self, patch: tuple[int, int]) -> None:
-        super().__init__()
-        self.patch = patch
+    """(B, 2 H, 2 W, C) to (B, H, W, 4 C)."""
 
     def forward(self, x: Tensor) -> Tensor:
-        p, q = self.patch
-        x = x.unflatten(2, (-1, q)).unflatten(1, (-1, p))
-        return x.permute(0, 1, 3, 2, 4, 5).flatten(3)
+        return x.unflatten(2, (-1, 2)).unflatten(1, (-1, 2)).permute(0, 1, 3, 2, 4, 5).flatten(3)
 
 
 class Expand(nn.Module):

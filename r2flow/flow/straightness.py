@@ -3,15 +3,15 @@
     s(t) = |d - v_t|^2,  d = Phi(x_0, 1) - x_0,  v_t = v(t, Phi(x_0, t)),
 
 which is 0 on a straight path, where one Euler step is exact. Along n equal Euler steps d is the mean of v_t, so that
-the integral of s is the variance of v_t over the path, pixel by pixel: one pass. s(t) itself needs d, which is known
-only at the end: `straightness` makes a second pass instead of keeping n images; its memory does not grow with n.
+the integral of s is the variance of v_t over the path: one pass. s(t) itself needs d, which is known only at the end:
+`straightness` makes a second pass instead of keeping n images.
 
 An untrained flow with v = 0 is perfectly straight: read s together with s / |d|^2.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,8 +21,7 @@ from r2flow.flow.solvers import Velocity, solve
 Progress = Callable[[], None] | None
 
 
-@dataclass(frozen=True)
-class Curvature:
+class Curvature(NamedTuple):
     """The integral of s over the paths of a batch.
 
     Attributes:
@@ -50,14 +49,13 @@ class Curvature:
         return self.total / self.squared_length
 
 
-@dataclass(frozen=True)
-class Straightness:
+class Straightness(NamedTuple):
     """s(t) of every scene, and the paths of the elements that bend most.
 
     Attributes:
         t: The times 0, 1/n, ..., (n - 1)/n, (n,), float64.
         s: s(t), (B, n), float64.
-        curvature: The integral of s, from the first pass.
+        curvature: The integral of s.
         pixels: Elements of the flattened batch that bend most, the most bent first, (k,); those of a path that is not
             finite come last.
         trajectories: Their values at 0, 1/n, ..., 1, (k, n + 1).
@@ -77,23 +75,21 @@ class Straightness:
 
 @torch.no_grad()
 def curvature(velocity: Velocity, x_0: Tensor, steps: int = 256, progress: Progress = None) -> Curvature:
-    """The integral of s over the path, pixel by pixel, in one pass of Euler steps from x_0, (B, ...).
-
-    Raises:
-        InputError: fewer than one step.
-    """
+    """The integral of s over the path, pixel by pixel, in one pass of Euler steps from x_0, (B, ...)."""
     first: Tensor | None = None
     mean, mean_square = torch.zeros(2, *x_0.shape, dtype=torch.float64, device=x_0.device)
 
-    def accumulate(t: Tensor, x: Tensor, v: Tensor) -> None:
+    def watched(t: Tensor, x: Tensor) -> Tensor:
         nonlocal first
+        v = velocity(t, x).to(x.dtype)
         # Deviations from the first velocity: with v^2 itself, a small variance would be lost in the last digits.
-        first = v if first is None else first
+        first = v.clone() if first is None else first
         deviation = (v - first).double()
         mean.add_(deviation / steps)
         mean_square.add_(deviation.square() / steps)
+        return v
 
-    x_1 = _walk(velocity, x_0, steps, accumulate, progress)
+    x_1 = solve(watched, x_0, steps=steps, progress=progress).x
     return Curvature(x_0, x_1, (mean_square - mean.square()).clamp(min=0))
 
 
@@ -106,37 +102,23 @@ def straightness(
     Args:
         x_0: Noise, (B, ...).
         most_curved: How many elements, of all scans together, have their path kept.
-
-    Raises:
-        InputError: fewer than one step.
     """
-    found = curvature(velocity, x_0, steps, progress)
-    d = found.x_1 - found.x_0
-    bends = found.per_pixel.flatten().nan_to_num(-math.inf, -math.inf)
+    bent = curvature(velocity, x_0, steps, progress)
+    d = bent.x_1 - bent.x_0
+    bends = bent.per_pixel.flatten().nan_to_num(-math.inf, -math.inf)
     pixels = bends.topk(min(most_curved, len(bends))).indices
     s, trajectories = [], []
 
-    def watch(t: Tensor, x: Tensor, v: Tensor) -> None:
-        s.append(_squared_norm(d - v))
-        trajectories.append(x.flatten()[pixels])
-
-    x_1 = _walk(velocity, x_0, steps, watch, progress)
-    t = torch.arange(steps, dtype=torch.float64) / steps
-    paths = torch.stack([*trajectories, x_1.flatten()[pixels]], 1)
-    return Straightness(t, torch.stack(s, 1), found, pixels, paths)
-
-
-def _walk(
-    velocity: Velocity, x_0: Tensor, steps: int, watch: Callable[[Tensor, Tensor, Tensor], None], progress: Progress
-) -> Tensor:
-    """x_1 by Euler steps; `watch(t, x_t, v_t)` is called at each evaluation, which is at the start of a step."""
-
     def watched(t: Tensor, x: Tensor) -> Tensor:
         v = velocity(t, x).to(x.dtype)
-        watch(t, x, v)
+        s.append(_squared_norm(d - v))
+        trajectories.append(x.flatten()[pixels])
         return v
 
-    return solve(watched, x_0, method="euler", steps=steps, progress=progress).x
+    x_1 = solve(watched, x_0, steps=steps, progress=progress).x
+    t = torch.arange(steps, dtype=torch.float64) / steps
+    paths = torch.stack([*trajectories, x_1.flatten()[pixels]], 1)
+    return Straightness(t, torch.stack(s, 1), bent, pixels, paths)
 
 
 def _squared_norm(x: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones import Backbone
+from r2flow.backbones.base import open_rings
 from r2flow.backbones.convolutions import RingConv2d, zero_convolution
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
@@ -150,9 +151,8 @@ class ConditionalFlow(RectifiedFlow):
         part = super().part(region)
         if part is not self:
             part.trust = deepcopy(self.trust, {id(weight): weight for weight in self.trust.parameters()})
-            for layer in part.trust.modules():
-                if isinstance(layer, RingConv2d) and region.width < region.shape[1]:
-                    layer.open_ring()
+            if region.width < region.shape[1]:
+                open_rings(part.trust)
         return part
 
     def untold(self) -> RectifiedFlow:

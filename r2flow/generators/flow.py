@@ -60,8 +60,6 @@ class Flow(Generator):
         """
         how = sampler or self.sampler
         how.check(self)
-        if not how.follows:
-            raise InputError(f"sampler {how.name} does not follow the flow's paths: give a solver, such as adams3.")
         return how.solve(self, x.to(self.device), t_0, t_1, condition, progress, **options)
 
 
@@ -202,10 +200,6 @@ class Field(Flow):
     def field(self, condition: Condition | None = None) -> Velocity:
         assert condition is None
         return self.function
-
-    @property
-    def device(self) -> torch.device:
-        return next((p.device for p in self.parameters()), torch.device("cpu"))
 
 
 class Conditioned:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.solvers.grids import build_grid
-from r2flow.flow.solvers.solution import finite, wide
+from r2flow.flow.solvers.solution import Solution, finite, wide
 from r2flow.registry import Bound, check_options, options_of
 
 Condition = Mapping[str, Tensor]
@@ -19,7 +19,8 @@ Condition = Mapping[str, Tensor]
 Call = Callable[[], None]
 Progress = Call | None
 Noise = Callable[[int], Tensor]  # N(0, 1) of the j-th draw, j = 1, 2, ..., in the noise's shape
-Given, Fresh = Condition | None, Noise | None
+Given = Condition | None
+Fresh = Noise | None
 Steps = Annotated[int, Bound("from 1 to 1,000,000", lambda n: 1 <= n <= 10**6)]
 Grid = str | list[float] | tuple[float, ...]
 
@@ -100,6 +101,14 @@ class Sampler(ABC):
         if getattr(generator, self.needs, None) is None:
             kind = type(generator).__name__
             raise InputError(f"sampler {self.name} needs a generator with a {self.needs}, which a {kind} is not.")
+
+    def solve(self, *args: Any, **options: Any) -> Solution:
+        """The state at t_1 of the ODE, by an `ODESampler`.
+
+        Raises:
+            InputError: this sampler is none.
+        """
+        raise InputError(f"sampler {self.name} does not follow the flow's paths: give a solver, such as adams3.")
 
     def knot_times(self, knots: int) -> Tensor:
         """Times of both ends and of the inner states that a solution keeps, (knots + 2,) float64.

@@ -94,16 +94,6 @@ class Stage(L.LightningModule):
         if on_pairs and not self.needs_pairs:
             raise InputError(f"stage={name} learns from scans, and data=pairs has none; give stage=reflow.")
 
-    def check_parent(self, jumps: bool) -> None:
-        """Refuse a run that the stage cannot go on from.
-
-        Args:
-            jumps: Whether it is a flow map; False where there is none.
-
-        Raises:
-            InputError: it is not what the stage needs.
-        """
-
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         # Dropout draws from torch's own generator: seeded by position, a resumed run draws the same.
         position = batch_idx * self.trainer.world_size + self.global_rank

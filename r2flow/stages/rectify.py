@@ -1,7 +1,7 @@
 """1-RF: a velocity learned on straight lines from noise to data."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -26,7 +26,7 @@ class Rectify(SingleLoss):
         InputError: the generator is no flow, or takes a condition; an unknown loss or density.
     """
 
-    learns = Flow
+    learns: ClassVar[type[Generator]] = Flow
     generator: Flow
 
     def __init__(

@@ -25,26 +25,11 @@ def test_the_reference_pseudo_huber_is_per_element(shared):
 
 @pytest.mark.parametrize("name", list(LOSSES))
 class TestEveryLoss:
-    def test_is_zero_with_zero_gradient_where_the_estimate_is_right(self, name):
-        v = torch.randn(2, 2, 4, 8, requires_grad=True)
-        loss = LOSSES[name](v, v.detach())
-        loss.sum().backward()
-        assert loss.tolist() == [0, 0]
-        assert v.grad.abs().max() == 0
-
     def test_has_one_value_per_sample_and_they_are_independent(self, name):
         v, u = torch.randn(3, 2, 4, 8), torch.randn(3, 2, 4, 8)
         together = LOSSES[name](v, u)
         alone = torch.cat([LOSSES[name](v[i : i + 1], u[i : i + 1]) for i in range(3)])
         torch.testing.assert_close(together, alone, rtol=1e-6, atol=0)
-
-    @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-    def test_is_finite_at_large_residuals_of_half_precision(self, name, dtype):
-        v = torch.full((1, 2, 4, 8), 3e4, dtype=dtype, requires_grad=True)
-        loss = LOSSES[name](v, torch.zeros(1, 2, 4, 8))
-        loss.sum().backward()
-        assert loss.isfinite().all()
-        assert v.grad.isfinite().all()
 
     def test_gradient_is_that_of_finite_differences(self, name):
         # float32 inside: differences over 1e-2 of a smooth function, compared to a percent.

@@ -81,16 +81,9 @@ class Limits(NamedTuple):
 class Evaluations:
     """The velocity as solvers call it: evaluations are counted per scene, and v has the state's type.
 
-    A velocity that differs between scenes has a method `select(scenes)`, which returns the velocity of these scenes
-    alone, given as int64 indices into the batch that it was made for. It is called when scenes leave the batch.
-
-    The precision is the coarsest type among that of v, the surrounding autocast, the parameters of a module (whose
-    output may have the type of x) and, where it has one, the velocity's attribute `precision`.
-
-    Args:
-        velocity: v(t, x) with x of shape (B, ...) and t of shape () or (B,).
-        scenes: Size of the batch.
-        progress: Called after every evaluation.
+    A velocity that differs between scenes has a method `select(scenes)`, which returns the velocity of these scenes,
+    int64 indices into its batch. The precision is the coarsest type among that of v, the surrounding autocast, the
+    parameters of a module and, where it has one, the velocity's attribute `precision`.
 
     Attributes:
         counts: Evaluations of every scene of the batch, (B,).
@@ -110,10 +103,7 @@ class Evaluations:
         self.counts[self.scenes] += 1
         v = self._velocity(t, x)
         if v.shape != x.shape:
-            raise ValueError(
-                f"the velocity of a state {tuple(x.shape)} at times {tuple(t.shape)} must have the state's shape, "
-                f"found {tuple(v.shape)}. Does it expand t, one time for each scene?"
-            )
+            raise ValueError(f"a velocity must have the state's shape {tuple(x.shape)}, found {tuple(v.shape)}.")
         self.precision = self.coarsest(v, x)
         if self._progress is not None:
             self._progress()

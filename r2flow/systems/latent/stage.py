@@ -69,7 +69,7 @@ class LearnAutoencoder(Stage):
         super().__init__(generator, **options)
         self.automatic_optimization = False
         check_options("stage.discriminator", PatchDiscriminator, discriminator or {}, given=1)
-        self.autoencoder = generator.first_stage_model
+        self.autoencoder = self.generator.first_stage_model
         channels = generator.space.shape[0] + self.autoencoder.mask
         self.discriminator = PatchDiscriminator(channels, **(discriminator or {}))
         rows, columns = generator.space.shape[1:]
