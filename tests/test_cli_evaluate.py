@@ -292,8 +292,8 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
         (("{real}", "{generated}", *QUICK, "--split", "test"), "has no standard split"),
         (("{real}", *QUICK), "give GENERATED, --checkpoint RUN or --reference"),
         (("{real}", "-c", "run", *QUICK), "a curve needs --out"),
-        (("{real}", "{generated}", *QUICK, "--json", "{real}"), "is a folder; name a file"),
-        (("{real}", "{generated}", *QUICK, "--json", "{scan}"), "--json must be a file that ends in .json, found "),
+        (("{real}", "{generated}", *QUICK, "--json", "{real}"), "--json must be a file"),
+        (("{real}", "{generated}", *QUICK, "--json", "{scan}"), "--json must be a file"),
         (("{real}", "{bare}", "--metrics", "frechet_handcrafted", *QUICK[2:]), "has no reflectance"),
     ],
 )

@@ -102,8 +102,8 @@ info run --jsn
 info run --json --card # --card and --json are two forms of one answer
 sample run -o out --steps 10000000 # 1,000,000
 sample run -o out --sampler jump:2 # no sampler named
-view scans --seed 3 -o v.html # --seed and --device are of a run
-view scans --device cpu -o v.html # --seed and --device are of a run
+view scans --seed 3 -o v.html # are of a run
+view scans --device cpu -o v.html # are of a run
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
 export run --to onnx --half # --half
 report backbones --only nope
@@ -134,8 +134,8 @@ view run -o out.html --columns x,y,z # are of scans; found none
 view run -o out.html --steps 1,a
 view run -o out.html --times 1
 view run -o out.html --times 3 --steps 1,2 # one number of --steps
-view run scans -o out.html --times 3 --sequence # give one of them
-view run -o out.html --sequence # for samples of a model on a slider give --steps
+view run scans -o out.html --times 3 --sequence # --sequence
+view run -o out.html --sequence # --sequence
 view empty -o out.html
 simulate # Missing
 simulate -o out --num 0 # --num

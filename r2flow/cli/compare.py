@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.options import choose_device
 from r2flow.cli.output import command
 
 
@@ -19,20 +18,16 @@ def compare(
     group: Annotated[
         bool, typer.Option("--group", help="Several seeds of one configuration as mean ± spread.")
     ] = False,
-    repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each backbone; 0 leaves them out.")] = 0,
-    device: Annotated[str, typer.Option(help="Of these: auto, cpu, cuda, ...")] = "cpu",
 ) -> None:
     """Set runs side by side: loss, straightness, parameters, cost."""
     from r2flow.reports.compare import Group, compare_page, group_runs, print_comparison, read_runs
     from r2flow.reports.pages import prepare_folder, write_page
 
-    where = choose_device(device)
-    found = read_runs(runs, repeats, where)
+    compared = read_runs(runs)
+    groups = group_runs(compared) if group else [Group(run.label, (run,)) for run in compared]
     if out is not None:
         prepare_folder(out)
-    groups = group_runs(found) if group else [Group(run.label, (run,)) for run in found]
     print_comparison(groups)
     if out is not None:
-        page = compare_page(groups, command(), where)
-        for path in write_page(page, out):
+        for path in write_page(compare_page(groups, command()), out):
             print(path)

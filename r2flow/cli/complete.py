@@ -71,7 +71,7 @@ def complete(
         Path | None,
         typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model; street if left out."),
     ] = None,
-    precision: PrecisionOption = None,
+    precision: PrecisionOption = "32-true",
 ) -> None:
     """Complete scans: from fewer beams to more, from a part to the whole.
 
@@ -107,7 +107,7 @@ def complete(
     print(f"an answer has at most one point in each pixel of the model's image, {rows}x{columns}")
     job = Job(
         answers.num, answers.seed, mask, known.fill_gaps, answers.batch_size, known.surfaces, answers.pictures,
-        precision or "32-true",
+        precision,
     )  # fmt: skip
     about = {
         "mask": known.mask and mask_identity(known.mask), "from": known.source,

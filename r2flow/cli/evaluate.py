@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -13,29 +13,28 @@ import typer
 from r2flow.cli.app import app
 from r2flow.cli.groups import ReadingOptions, SamplerOptions, WorkOptions, grouped
 from r2flow.cli.options import SETS, PrecisionOption, choose_device, choose_reading
+from r2flow.cli.output import command, finish, numbers
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.data.reading import Reading
     from r2flow.data.sets import ScanSet
-    from r2flow.evaluation.measuring import Work
-    from r2flow.evaluation.processes import Process
-    from r2flow.evaluation.protocols import Rules
-    from r2flow.evaluation.statistics import Cache
+    from r2flow.evaluation.measuring import Gathered, Work
     from r2flow.metrics.base import ScanMetric
     from r2flow.model.checkpoint import Checkpoint
     from r2flow.reports.speed_quality import Drawing
 
 log = logging.getLogger(__name__)
 
-ALL = "all"
 SAMPLED = 1000  # scans of a flow
+STEPS = "1,2,4,8,16,32,64,128,256"  # of a curve
 REAL = "the real scans"
+SAMPLING = ("steps", "sampler", "tolerance", "precision", "seed")  # options of a sampled flow
 
 
 @dataclass(frozen=True)
-class MeasureOptions:
-    """What is measured."""
+class EvaluateOptions:
+    """What is measured, on which scans, and where the figures are written."""
 
     metrics: Annotated[
         str | None,
@@ -63,29 +62,15 @@ class MeasureOptions:
     train_split: Annotated[str | None, typer.Option(help="Part of TRAIN's standard split.")] = None
     bootstrap: Annotated[int, typer.Option(min=0, help="Resamples for 95 % intervals; 0 for none.")] = 0
     no_cache: Annotated[bool, typer.Option("--no-cache", help="Read the real scans again.")] = False
-
-
-@dataclass(frozen=True)
-class SetOptions:
-    """Which scans of the two sets are compared."""
-
     num: Annotated[
         int | None, typer.Option(min=1, help="Scans to sample or simulate (1000); the most to take of a folder (all).")
     ] = None
     real_num: Annotated[int | None, typer.Option(min=1, help="The most real scans to take, by a fixed shuffle.")] = None
-    split: Annotated[str | None, typer.Option("--split", "--real-split", help="Part of REAL's standard split.")] = None
-    generated_split: Annotated[str | None, typer.Option(help="Part of GENERATED's, where it is a LAYOUT:FOLDER.")] = (
-        None
-    )
+    split: Annotated[str | None, typer.Option(help="Part of REAL's standard split.")] = None
+    generated_split: Annotated[str | None, typer.Option(help="Part of GENERATED's, for a LAYOUT:FOLDER.")] = None
     generated_scale: Annotated[
         float | None, typer.Option(min=1e-6, max=1e9, help="--reflectance-scale of the files in GENERATED, if other.")
     ] = None
-
-
-@dataclass(frozen=True)
-class SamplingOptions:
-    """How scans are sampled from a flow."""
-
     steps: Annotated[
         str | None, typer.Option(help="Of the sampled flow, its own if left out; of a curve, 1,2,4,...,256.")
     ] = None
@@ -94,14 +79,8 @@ class SamplingOptions:
         typer.Option(help="Of the sampled flow: euler, heun2, dopri5, ...; of a curve, several as ddpm,adams3."),
     ] = None
     tolerance: Annotated[float | None, typer.Option(help="Of an adaptive sampler.")] = None
-    precision: PrecisionOption = None
+    precision: PrecisionOption = "32-true"
     seed: Annotated[int, typer.Option(min=0, help="Of sampled scans.")] = 0
-
-
-@dataclass(frozen=True)
-class OutputOptions:
-    """Where figures are written to."""
-
     json: Annotated[Path | None, typer.Option("--json", help="File for every figure with its protocol.")] = None
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for a page.", show_default=False)] = None
 
@@ -112,10 +91,7 @@ class OutputOptions:
 @grouped
 def evaluate(
     real: Annotated[str, typer.Argument(help=f"Real scans: {SETS}.", show_default=False)],
-    measured: MeasureOptions,
-    output: OutputOptions,
-    scans: SetOptions,
-    sampling: SamplingOptions,
+    options: EvaluateOptions,
     how: ReadingOptions,
     work: WorkOptions,
     generated: Annotated[
@@ -126,7 +102,7 @@ def evaluate(
         ),
     ] = None,
     checkpoint: Annotated[
-        list[Path] | None,
+        list[str] | None,
         typer.Option("--checkpoint", "-c", help="Flow for a speed-quality curve; may be given several times."),
     ] = None,
 ) -> None:
@@ -136,107 +112,81 @@ def evaluate(
     measures how the distance falls with the number of steps, against evaluations and seconds; points that are in --out
     already are not measured again. Under torchrun the processes share the scans.
     """
-    from r2flow.evaluation.measuring import Work, check_reflectance
+    from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
     from r2flow.evaluation.processes import joined
+    from r2flow.evaluation.protocols import PROTOCOLS
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.evaluation.statistics import Cache
     from r2flow.metrics import METRICS, default_metrics
     from r2flow.reports.pages import prepare_folder
 
-    named = list(dict.fromkeys(generated or []))
+    named, curve = list(dict.fromkeys(generated or [])), bool(checkpoint)
     sampled = [one for one in named if is_checkpoint(one)]
-    rules = _check_evaluation(named, checkpoint, measured, output)
-    _check_used(len(named) > len(sampled), bool(sampled or checkpoint), scans, sampling)
+    rules = PROTOCOLS[options.protocol]
+    _check_options(named, curve, options)
+    if not (sampled or curve) and any(getattr(options, key) != getattr(EvaluateOptions, key) for key in SAMPLING):
+        raise InputError(f"--{', --'.join(SAMPLING)} are of a run, a checkpoint or a model to sample; found none.")
+    if len(named) == len(sampled) and (options.generated_split or options.generated_scale):
+        raise InputError("--generated-split and --generated-scale are of files in GENERATED; found none.")
     with joined(choose_device(work.device)) as place:
-        wanted = (
-            None if measured.metrics in (None, ALL) else _build(measured.metrics.split(","), measured.bootstrap, place)
-        )
-        flows = _load_flows([*(checkpoint or []), *map(Path, sampled)], place.device)
-        if flows and scans.num is None and place.rank == 0:
-            each = "each point" if checkpoint else "each" if len(flows) > 1 else "it"
+        keep = options.bootstrap > 0
+        wanted = None
+        if options.metrics not in (None, "all"):
+            wanted = _build(options.metrics.split(","), keep, place.device)
+        flows = _load_flows([*(checkpoint or []), *sampled], place.device)
+        if flows and options.num is None and place.rank == 0:
+            each = "each point" if curve else "each" if len(flows) > 1 else "it"
             print(f"{', '.join(flows)}: {SAMPLED} scans of {each} are drawn (--num says how many)")
         files = [one for one in named if one not in sampled]
-        flow = next(iter(flows.values()), None)
-        reading = choose_reading([real, *files, measured.train], **vars(how), model=flow)
+        reading = choose_reading([real, *files, options.train], **vars(how), model=next(iter(flows.values()), None))
         if rules.convention is not None and how.convention is None:
             reading = replace(reading, convention=rules.convention)
-        if wanted is not None:  # where no metric reads reflectance, its scale does not matter
-            looks = any(m.needs_reflectance or m.uses_reflectance for m in wanted.values())
-            reading = replace(reading, reflectance=reading.reflectance if looks else False)
-        truth = _open(real, reading, scans.split, scans.real_num)
+        if wanted and not any(m.needs_reflectance or m.uses_reflectance for m in wanted.values()):
+            reading = replace(reading, reflectance=False)  # its scale does not matter
+        truth = _open(real, reading, options.split, options.real_num)
         rules.check(truth)
-        judged: dict[str, ScanSet] = {}
-        for text, name in zip(named, _names(named), strict=True):
-            if text in sampled:
-                judged[name] = _sampled(text, flows[text], scans.num or SAMPLED, sampling)
-            else:
-                scale = scans.generated_scale or reading.reflectance_scale
-                judged[name] = _open(text, replace(reading, reflectance_scale=scale), scans.generated_split, scans.num)
+        scaled = replace(reading, reflectance_scale=options.generated_scale or reading.reflectance_scale)
+        judged = {
+            name: _sampled(text, flows[text], options)
+            if text in sampled
+            else _open(text, scaled, options.generated_split, options.num)
+            for text, name in zip(named, _names(named), strict=True)
+        }
         sets = [truth, *judged.values()]
         reflectance = all(s.about["reflectance"] for s in sets)
         reflectance = reflectance and all(flow.encoding.reflectance for flow in flows.values())
-        names = METRICS if measured.metrics == ALL else default_metrics(reflectance)
-        built = wanted or _build_possible([*names], reflectance, measured.bootstrap, place)
-        check_reflectance(built, sets)
-        job = Job(
-            truth, built, Work(work.batch_size, work.workers, place.rank, place.ranks, watched=place.rank == 0),
-            None if measured.no_cache else Cache(), place.device, sampling, rules,
-        )  # fmt: skip
-        training = None if measured.train is None else _open(measured.train, reading, measured.train_split, None)
-        drawings, steps = _curve_of(flows, scans.num or SAMPLED, sampling) if checkpoint else ([], [])
-        for folder in (output.out, output.json.parent if output.json else None):
+        usual = [*METRICS] if options.metrics == "all" else default_metrics(reflectance)
+        metrics = wanted or _build_possible(usual, reflectance, keep, place.device)
+        check_reflectance(metrics, sets)
+        training = None if options.train is None else _open(options.train, reading, options.train_split, None)
+        drawings, steps = _curve_of(flows, options) if curve else ([], [])
+        for folder in (options.out, options.json.parent if options.json else None):
             if folder is not None:
                 prepare_folder(folder)
-        if drawings and output.out:
-            _measure_curve(job, flows, drawings, steps, measured.bootstrap, output.out)
+        share = Work(work.batch_size, work.workers, place.rank, place.ranks, watched=place.rank == 0)
+        cache = None if options.no_cache else Cache()
+
+        def gather(scans: "ScanSet") -> "Gathered":
+            return gather_real(metrics, scans, share, cache, rules)
+
+        if curve:
+            _measure_curve(truth, metrics, gather, share, place.device, flows, drawings, steps, options)
         else:
-            _compare(job, judged, training, measured, output)
+            _compare(truth, metrics, gather, share, place.device, judged, training, options)
 
 
-@dataclass(frozen=True)
-class Job:
-    """What a comparison and a curve both need: real scans, metrics, and how the work is done."""
-
-    truth: "ScanSet"
-    metrics: "dict[str, ScanMetric]"
-    work: "Work"
-    cache: "Cache | None"
-    device: str
-    sampling: SamplingOptions
-    rules: "Rules"
-
-
-def _check_evaluation(
-    generated: list[str], checkpoint: list[Path] | None, measured: MeasureOptions, output: OutputOptions
-) -> "Rules":
-    """The protocol; options that do not go together are refused before anything is read."""
-    from r2flow.evaluation.protocols import PROTOCOLS
-
-    rules = PROTOCOLS[measured.protocol]
-    if checkpoint and generated:
+def _check_options(generated: Sequence[str], curve: bool, options: EvaluateOptions) -> None:
+    """Refuse options that do not go together, before anything is read."""
+    if curve and generated:
         raise InputError("give GENERATED for one comparison or --checkpoint for a curve, not both.")
-    if checkpoint and output.out is None:
+    if curve and options.out is None:
         raise InputError("a curve needs --out FOLDER, where its points are kept.")
-    if not generated and not checkpoint and not (measured.reference or measured.baselines):
-        raise InputError("nothing to compare with: give GENERATED, --checkpoint RUN or --reference.")
-    if checkpoint and (measured.reference or measured.baselines or measured.train or output.json):
+    if curve and (options.reference or options.baselines or options.train or options.json):
         raise InputError("--reference, --baselines, --train and --json are of a comparison; a curve writes to --out.")
-    if output.json is not None and output.json.is_dir():
-        raise InputError(f"--json {output.json} is a folder; name a file to write to.")
-    if output.json is not None and output.json.suffix.lower() != ".json":
-        raise InputError(f"--json must be a file that ends in .json, found {output.json}.")
-    return rules
-
-
-def _check_used(files: bool, flows: bool, scans: SetOptions, sampling: SamplingOptions) -> None:
-    """Refuse options of generated files, or of flows, where there are none."""
-    if not flows and sampling != SamplingOptions():
-        raise InputError(
-            "--steps, --sampler, --tolerance, --precision and --seed are of a run, a checkpoint or a model to sample; "
-            "found none."
-        )
-    if not files and (scans.generated_split is not None or scans.generated_scale is not None):
-        raise InputError("--generated-split and --generated-scale are of files in GENERATED; found none.")
+    if not (curve or generated or options.reference or options.baselines):
+        raise InputError("nothing to compare with: give GENERATED, --checkpoint RUN or --reference.")
+    if options.json is not None and (options.json.is_dir() or options.json.suffix.lower() != ".json"):
+        raise InputError(f"--json must be a file that ends in .json, found {options.json}.")
 
 
 def _names(generated: Sequence[str]) -> list[str]:
@@ -249,40 +199,44 @@ def _names(generated: Sequence[str]) -> list[str]:
 
 
 def _compare(
-    job: Job, judged: "dict[str, ScanSet]", training: "ScanSet | None", measured: MeasureOptions, output: OutputOptions
+    truth: "ScanSet",
+    metrics: "Mapping[str, ScanMetric]",
+    gather: "Callable[[ScanSet], Gathered]",
+    work: "Work",
+    device: str,
+    judged: "dict[str, ScanSet]",
+    training: "ScanSet | None",
+    options: EvaluateOptions,
 ) -> None:
-    from r2flow.cli.output import command
     from r2flow.evaluation.copies import Nearest, copies_result, find_nearest
-    from r2flow.evaluation.measuring import Gathered, gather_real, measure
+    from r2flow.evaluation.measuring import measure
     from r2flow.evaluation.references import baseline_sets, reference_sets
     from r2flow.reports.evaluation import Comparison, Kind, evaluation_page, print_comparisons, write_json
     from r2flow.reports.pages import write_page
     from r2flow.reports.view.panels import write_sets
 
     kinds: dict[Kind, dict[str, tuple[ScanSet, ScanSet]]]
-    kinds = {"judged": {name: (job.truth, one) for name, one in judged.items()}}
+    kinds = {"judged": {name: (truth, one) for name, one in judged.items()}}
     usual = bool(judged)
-    if measured.reference or (usual and measured.reference is None and len(job.truth) > 1):
-        kinds["reference"] = reference_sets(job.truth, judged)
-    if measured.baselines or (usual and measured.baselines is None):
-        num = max((len(one) for one in judged.values()), default=len(job.truth))
-        baselines = baseline_sets(job.truth, min(num, SAMPLED))
-        kinds["baseline"] = {name: (job.truth, one) for name, one in baselines.items()}
+    if options.reference or (usual and options.reference is None and len(truth) > 1):
+        kinds["reference"] = reference_sets(truth, judged)
+    if options.baselines or (usual and options.baselines is None):
+        num = max((len(one) for one in judged.values()), default=len(truth))
+        kinds["baseline"] = {name: (truth, one) for name, one in baseline_sets(truth, min(num, SAMPLED)).items()}
     comparisons: list[Comparison] = []
     statistics: dict[int, Gathered] = {}
     for kind, (name, (real, other)) in ((kind, pair) for kind, pairs in kinds.items() for pair in pairs.items()):
         start = time.monotonic()
         if id(real) not in statistics:
-            statistics[id(real)] = gather_real(job.metrics, real, job.work, job.cache, job.rules)
-        draws = 0 if kind == "baseline" else measured.bootstrap
-        results = measure(job.metrics, statistics[id(real)], other, job.work, draws)
+            statistics[id(real)] = gather(real)
+        draws = 0 if kind == "baseline" else options.bootstrap
+        results = measure(metrics, statistics[id(real)], other, work, draws)
         comparisons.append(Comparison(name, real, other, results, time.monotonic() - start, kind))
-    if job.work.rank > 0:
+    if work.rank > 0:
         return
     nearest: dict[str, Nearest] = {}
     if training is not None:
-        alone = replace(job.work, ranks=1)
-        nearest = find_nearest({**judged, REAL: job.truth}, training, alone, job.device)
+        nearest = find_nearest({**judged, REAL: truth}, training, replace(work, ranks=1), device)
         of = {("judged", name): nearest[name] for name in judged} | {("reference", "real halves"): nearest[REAL]}
         for place, one in enumerate(comparisons):
             if (at := of.get((one.kind, one.name))) is not None:
@@ -290,75 +244,78 @@ def _compare(
                 comparisons[place] = replace(one, measured=[*one.measured, result])
     seeds: dict[str, int] = {}
     if any(one.about["kind"] == "sampled" for one in judged.values()):
-        seeds["sampled scans"] = job.sampling.seed
-    if measured.bootstrap:
+        seeds["sampled scans"] = options.seed
+    if options.bootstrap:
         seeds["bootstrap"] = 0
     drawn = {name: one for name, one in nearest.items() if name in judged}
-    page = evaluation_page(comparisons, command(), job.device, seeds, drawn, training)
+    page = evaluation_page(comparisons, command(), device, seeds, drawn, training)
     print_comparisons(comparisons)
-    if output.json is not None:
-        write_json(page, output.json)
-        print(output.json)
-    if output.out is not None:
-        for path in write_page(page, output.out):
+    if options.json is not None:
+        write_json(page, options.json)
+        print(options.json)
+    if options.out is not None:
+        for path in write_page(page, options.out):
             print(path)
-        sets = {"real": job.truth} | {"real, judged" if name == "real" else name: one for name, one in judged.items()}
-        print(write_sets(output.out / "evaluation.html", sets, title="Generated and real scans"))
+        sets = {"real": truth} | {"real, judged" if name == "real" else name: one for name, one in judged.items()}
+        print(write_sets(options.out / "evaluation.html", sets, title="Generated and real scans"))
 
 
-def _curve_of(flows: "dict[str, Checkpoint]", num: int, sampling: SamplingOptions) -> "tuple[list[Drawing], list[int]]":
-    """What is drawn for each line of a curve, and the numbers of steps; what they cannot be is refused before anything
-    is read.
-    """
+def _curve_of(flows: "Mapping[str, Checkpoint]", options: EvaluateOptions) -> "tuple[list[Drawing], list[int]]":
+    """The samplers of a curve and its numbers of steps, checked before anything is read."""
     from r2flow.registry import options_of
     from r2flow.reports.speed_quality import Drawing, steps_of
     from r2flow.samplers import SAMPLERS, parse_sampler
 
-    names = [*dict.fromkeys(sampling.sampler.split(","))] if sampling.sampler else []
+    names = [*dict.fromkeys(options.sampler.split(","))] if options.sampler else []
     ways = [parse_sampler(name) for name in names] or [{}]
     taken = [options_of(SAMPLERS[way["name"]]) for way in ways if way]
-    if taken and sampling.steps and not any("steps" in options for options in taken):
+    if taken and options.steps and not any("steps" in fields for fields in taken):
         raise InputError(f"{', '.join(names)}: no option 'steps'; leave --steps out.")
-    if sampling.tolerance is not None:  # of the samplers that have one
-        for way in [way for way, options in zip(ways, taken, strict=False) if "tolerance" in options] or ways:
-            way["tolerance"] = sampling.tolerance
-    drawings = [Drawing(num, sampling.seed, way, sampling.precision or "32-true") for way in ways]
-    steps = _many(sampling.steps)
+    if options.tolerance is not None:  # of the samplers that have one
+        for way in [way for way, fields in zip(ways, taken, strict=False) if "tolerance" in fields] or ways:
+            way["tolerance"] = options.tolerance
+    drawings = [Drawing(options.num or SAMPLED, options.seed, way, options.precision) for way in ways]
+    steps = numbers("steps", options.steps or STEPS, int)
     for (label, flow), drawing in product(flows.items(), drawings):
         steps_of(flow, label, steps, drawing)
     return drawings, steps
 
 
 def _measure_curve(
-    job: Job, flows: "dict[str, Checkpoint]", drawings: "list[Drawing]", steps: Sequence[int], bootstrap: int, out: Path
+    truth: "ScanSet",
+    metrics: "Mapping[str, ScanMetric]",
+    gather: "Callable[[ScanSet], Gathered]",
+    work: "Work",
+    device: str,
+    flows: "Mapping[str, Checkpoint]",
+    drawings: "Sequence[Drawing]",
+    steps: Sequence[int],
+    options: EvaluateOptions,
 ) -> None:
-    from r2flow.cli.output import command, finish
-    from r2flow.evaluation.measuring import gather_real
     from r2flow.reports.pages import write_page
     from r2flow.reports.speed_quality import Curve, measure_curve, read_rows, speed_quality_page
 
-    done = read_rows(out)
-    gathered = gather_real(job.metrics, job.truth, job.work, job.cache, job.rules)
-    curve = Curve(job.truth, job.metrics, gathered, drawings, job.device, bootstrap)
+    assert options.out is not None
+    out, done = options.out, read_rows(options.out)
+    curve = Curve(truth, metrics, gather(truth), drawings, device, options.bootstrap)
 
     def keep(rows: list[dict[str, Any]]) -> None:
-        if job.work.rank == 0:
+        if work.rank == 0:
             write_page(speed_quality_page(curve, rows, command(), done, figures=False), out)
 
-    rows = measure_curve(curve, flows, steps, job.work, done, keep)
-    if job.work.rank == 0:
+    rows = measure_curve(curve, flows, steps, work, done, keep)
+    if work.rank == 0:
         page = speed_quality_page(curve, rows, command(), done)
         finish(page, out, page.text)
 
 
-def _load_flows(paths: list[Path], device: str) -> "dict[str, Checkpoint]":
+def _load_flows(names: Sequence[str], device: str) -> "dict[str, Checkpoint]":
     from r2flow.model.checkpoint import load_checkpoint
 
-    flows = {str(path): load_checkpoint(path, device) for path in dict.fromkeys(paths)}
+    flows = {name: load_checkpoint(name, device) for name in dict.fromkeys(names)}
     sensors = {(flow.sensor.shape, flow.sensor.elevations) for flow in flows.values()}
     if len(sensors) > 1:
-        seen = (f"{name} {flow.sensor.name} {'x'.join(map(str, flow.sensor.shape))}" for name, flow in flows.items())
-        raise InputError(f"flows of different sensors or sizes, {', '.join(seen)}: measure each by itself.")
+        raise InputError(f"{', '.join(flows)} have different sensors or image sizes; measure each by itself.")
     return flows
 
 
@@ -372,34 +329,30 @@ def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> 
     return scans
 
 
-def _sampled(label: str, flow: "Checkpoint", num: int, sampling: SamplingOptions) -> "ScanSet":
-    """Scans of the one flow that is judged."""
+def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "ScanSet":
+    """Scans of a flow that is judged."""
     from r2flow.evaluation.sets import sampled_set
 
-    steps = _many(sampling.steps) if sampling.steps else [None]
+    steps = numbers("steps", options.steps, int) if options.steps else [None]
     if len(steps) != 1:
-        raise InputError(
-            f"one comparison takes one number of --steps, found {sampling.steps}; --checkpoint makes a curve."
-        )
-    how = flow.generator.choose(**SamplerOptions(sampling.sampler, steps[0], sampling.tolerance).given)
-    return sampled_set(flow, label, num, how, sampling.seed, sampling.precision or "32-true")
+        raise InputError(f"a comparison takes one number of --steps, found {options.steps}; -c makes a curve.")
+    sampler = flow.generator.choose(**SamplerOptions(options.sampler, steps[0], options.tolerance).given)
+    return sampled_set(flow, label, options.num or SAMPLED, sampler, options.seed, options.precision)
 
 
-def _build(names: Sequence[str], bootstrap: int, place: "Process") -> "dict[str, ScanMetric]":
+def _build(names: Sequence[str], keep: bool, device: str) -> "dict[str, ScanMetric]":
     from r2flow.metrics import METRICS
 
-    return {name: METRICS[name](keep=bootstrap > 0).to(place.device) for name in dict.fromkeys(names)}
+    return {name: METRICS[name](keep=keep).to(device) for name in dict.fromkeys(names)}
 
 
-def _build_possible(
-    names: Sequence[str], reflectance: bool, bootstrap: int, place: "Process"
-) -> "dict[str, ScanMetric]":
+def _build_possible(names: Sequence[str], reflectance: bool, keep: bool, device: str) -> "dict[str, ScanMetric]":
     """The metrics that can be computed here; a warning names the others."""
     built: dict[str, ScanMetric] = {}
     left_out: dict[str, list[str]] = {}
     for name in names:
         try:
-            (metric,) = _build([name], bootstrap, place).values()
+            metric = _build([name], keep, device)[name]
         except InputError:
             left_out.setdefault("their weights are not here (r2flow weights)", []).append(name)
             continue
@@ -410,9 +363,3 @@ def _build_possible(
     for why, those in left_out.items():
         log.warning("%s left out: %s", ", ".join(those), why)
     return built
-
-
-def _many(steps: str | None) -> list[int]:
-    from r2flow.cli.output import numbers
-
-    return numbers("steps", steps or "1,2,4,8,16,32,64,128,256", int)

@@ -75,7 +75,7 @@ def sample(
     draw: DrawOptions,
     how: SamplerOptions,
     part: RegionOptions,
-    precision: PrecisionOption = None,
+    precision: PrecisionOption = "32-true",
     format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture.")] = 8,
 ) -> None:
@@ -94,7 +94,7 @@ def sample(
     formats = [*dict.fromkeys(map(str.strip, format.split(",")))] if format else formats_of(loaded, part.channels)
     region = part.region(loaded)
     write_samples(loaded, out, draw.num, draw.seed, sampler, formats, pictures, draw.batch_size, region, part.channels,
-        precision=precision or "32-true",
+        precision=precision,
     )  # fmt: skip
     seen = f", pictures in {out / 'samples.png'}" if pictures else ""
     seen += f", in 3-D in {out / 'samples.html'}" if pictures and part.channels != "reflectance" else ""

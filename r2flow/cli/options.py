@@ -20,15 +20,12 @@ CheckpointOption = Annotated[
 ]
 DeviceOption = Annotated[str, typer.Option(help="Where to compute: auto, cpu, cuda, cuda:1, ...")]
 PrecisionOption = Annotated[
-    Literal["32-true", "bf16-mixed"] | None,
-    typer.Option(
-        help="Precision of the network; bf16-mixed is faster where there is bfloat16.",
-    ),
+    Literal["32-true", "bf16-mixed"],
+    typer.Option(help="Precision of the network; bf16-mixed is faster where there is bfloat16."),
 ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", show_default=False)]
 SensorOption = Annotated[str, typer.Option(help="Name of the sensor, or the YAML file of your own (r2flow sensor).")]
 SizeOption = Annotated[str | None, typer.Option(help="Rows x columns, as 64x1024; the sensor's own if left out.")]
-ProjectionOption = Annotated[str, typer.Option(help="spherical or unfolding.")]
 SurfacesOption = Annotated[
     bool,
     typer.Option("--surfaces/--no-surfaces", help="Move answers to the surfaces that measured returns lie on."),

@@ -64,7 +64,7 @@ def pairs(
     first: Annotated[
         int | None, typer.Option(min=0, help="Index of the first pair; behind the flow's own pairs if left out.")
     ] = None,
-    precision: PrecisionOption = None,
+    precision: PrecisionOption = "32-true",
     knots: Annotated[int | None, typer.Option(min=1, help="Inner states to keep of each path, for a flow map.")] = None,
 ) -> None:
     """Draw reflow pairs from a flow: what is missing or damaged, as one of any number of processes.
@@ -86,7 +86,7 @@ def pairs(
     flow = load_checkpoint(which.name)
     check_finished(Path(which.name), flow)
     options = {
-        "sampler": {"name": "adams3", **how.given}, "precision": precision or "32-true",
+        "sampler": {"name": "adams3", **how.given}, "precision": precision,
         "num": num, "batch_size": batch_size, "shard_mib": shard_mib, "seed": seed, "first": first,
         "knots": knots,
     }  # fmt: skip

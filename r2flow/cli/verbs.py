@@ -20,7 +20,6 @@ from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     pairs,
     paper,
     prepare,
-    scans,
     sensors,
     simulate,
     solvers,

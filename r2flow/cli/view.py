@@ -1,10 +1,11 @@
-"""`r2flow view`: scans in 3-D, in a browser."""
+"""`r2flow view` and `r2flow show`: scans in a browser, and as pictures."""
 
 import os
 import sys
 import webbrowser
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Annotated
@@ -17,33 +18,95 @@ from r2flow.cli.options import (
     SETS,
     ColumnsOption,
     DeviceOption,
-    ProjectionOption,
+    OutOption,
     SensorChoice,
     SizeOption,
+    build_sized,
+    check_words,
     choose_device,
+    named_columns,
 )
-from r2flow.cli.scans import PictureScale, views_to_draw
+from r2flow.cli.output import numbers
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.reports.view.panels import Panel
+    from r2flow.reports.views import View
 
 SCANS, SAMPLES = 16, 4  # of a folder, of a generator, where nobody says how many
 MOST = 256  # of each; a page holds no more
 
 
 @dataclass(frozen=True)
-class GeneratorOptions:
-    """What is drawn of a run, a checkpoint or a model."""
+class ViewOptions:
+    """How scan files are read."""
 
-    steps: Annotated[
-        str | None, typer.Option(help="As 1,2,4,32: the same noise at each number of steps, side by side.")
+    sensor: SensorChoice = None
+    size: SizeOption = None
+    projection: Annotated[str, typer.Option(help="spherical or unfolding.")] = "spherical"
+    reflectance_scale: Annotated[
+        float | None,
+        typer.Option(min=1e-6, max=1e9, help="Value in the file that means full reflectance; guessed if left out."),
     ] = None
-    times: Annotated[
-        int | None, typer.Option(min=2, max=MOST, help="Show x_t at so many times, from noise to scan.")
-    ] = None
-    seed: Annotated[int, typer.Option(min=0, help="Of the samples.")] = 0
-    device: DeviceOption = "auto"
+    columns: ColumnsOption = None
+
+    def views(self, scans: Sequence[str], most: int) -> "list[View]":
+        """The scans that are named, of each folder at most so many: `views_of`."""
+        from r2flow.reports.views import views_of
+
+        check_words(projection=self.projection)
+        sensor = self.sensor
+        if self.projection == "unfolding" and sensor in (None, "hdl64e"):
+            sensor = "hdl64e_rings"  # rows are rings then, and these are not evenly spaced
+        chosen = build_sized(sensor or "hdl64e", self.size) if sensor or self.size else None
+        columns = named_columns(self.columns)
+        return [
+            view
+            for spec in scans
+            for view in views_of(spec, chosen, self.projection, self.reflectance_scale, most, columns)
+        ]
+
+
+@app.command(epilog="Example: r2flow show scans/000000.ply velodyne/0000000100.bin --out views")
+@grouped
+def show(
+    scans: Annotated[list[str], typer.Argument(help=f"Scan files, range images (.npy), or {SETS}.")],
+    out: OutOption,
+    how: ViewOptions,
+    most: Annotated[int, typer.Option("--num", min=1, help="The most scans to draw of a folder.")] = SCANS,
+    labels: Annotated[bool, typer.Option("--labels", help="Draw the classes of .label files, too.")] = False,
+    format: Annotated[str, typer.Option(help="png, or npy for range images, (2, H, W).")] = "png",
+) -> None:
+    """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each; or write range images."""
+    import numpy as np
+
+    from r2flow.files import atomic_write
+    from r2flow.reports.pictures import save_figure, scan_figure
+    from r2flow.reports.views import label_view
+
+    if format not in ("png", "npy"):
+        raise InputError(f"--format must be png or npy, found {format!r}.")
+    views = how.views(scans, most)
+    for view, name in zip(views, unique_stems([view.path for view in views]), strict=True):
+        image = view.image
+        if format == "npy":
+            with atomic_write(out / f"{name}.npy") as file:
+                np.save(file, image)
+            print(f"{out / name}.npy: {' x '.join(map(str, image.shape))}, {(image[0] > 0).mean():.1%} returns")
+        else:
+            figure = scan_figure(image, view.rays, view.path.name, label_view(view) if labels else None)
+            print(save_figure(figure, out / f"{name}.png"))
+
+
+def unique_stems(paths: Sequence[Path]) -> list[str]:
+    """The files' stems, with their folder's name where two share one, and with a number where they share that too."""
+    stems = [path.stem for path in paths]
+    names: list[str] = []
+    for path in paths:
+        name = path.stem if stems.count(path.stem) == 1 else f"{path.parent.name}_{path.name.replace('.', '_')}"
+        choices = chain([name], (f"{name}_{number}" for number in count(2)))
+        names.append(next(one for one in choices if one not in names))
+    return names
 
 
 @app.command(epilog="Example: r2flow view street velodyne/0000000100.bin --steps 1,2,4,32 --out page.html")
@@ -53,7 +116,7 @@ def view(
         list[str],
         typer.Argument(help=f"Scan files, range images, {SETS}; or a run, checkpoint or model to draw from."),
     ],
-    drawn: GeneratorOptions,
+    how: ViewOptions,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="The .html to write; a temporary one, opened, if left out.")
     ] = None,
@@ -66,67 +129,57 @@ def view(
         ),
     ] = None,
     sequence: Annotated[bool, typer.Option("--sequence", help="Scans one after another, on a slider.")] = False,
-    sensor: SensorChoice = None,
-    size: SizeOption = None,
-    projection: ProjectionOption = "spherical",
-    reflectance_scale: PictureScale = None,
-    columns: ColumnsOption = None,
+    steps: Annotated[
+        str | None, typer.Option(help="As 1,2,4,32: the same noise at each number of steps, side by side.")
+    ] = None,
+    times: Annotated[
+        int | None, typer.Option(min=2, max=MOST, help="Show x_t at so many times, from noise to scan.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the samples of a model.")] = 0,
+    device: DeviceOption = "auto",
 ) -> None:
     """Look at scans in 3-D: one page that works offline, to turn, colour and compare them.
 
     Points and range image find each other under the cursor; labels beside the scans are shown.
     """
     from r2flow.evaluation.sets import is_checkpoint
-    from r2flow.reports.view.panels import in_turn, scan_panels, write_panels
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.reports.view.panels import in_turn, sample_panels, scan_panels, way_panels, write_panels
 
     if out is not None and out.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--out must be a file that ends in .html, found {out}.")
-    flows = [one for one in what if is_checkpoint(one)]
-    if not flows and (drawn.steps or drawn.times):
-        raise InputError("--steps and --times are of a run, a checkpoint or a model; found none.")
-    if not flows and (drawn.seed or drawn.device != "auto"):
-        raise InputError("--seed and --device are of a run, a checkpoint or a model that is drawn from; found none.")
-    of_files = (sensor, size, reflectance_scale, columns)
-    if len(flows) == len(what) and (projection != "spherical" or any(one is not None for one in of_files)):
+    models = [one for one in what if is_checkpoint(one)]
+    if not models and (steps or times or seed or device != "auto"):
+        raise InputError("--steps, --times, --seed and --device are of a run, a checkpoint or a model; found none.")
+    if len(models) == len(what) and (sequence or how != ViewOptions()):
         raise InputError(
-            "--sensor, --size, --projection, --reflectance-scale and --columns are of scans; found none beside a model."
+            "--sequence, --sensor, --size, --projection, --reflectance-scale and --columns are of scans; found none."
         )
-    if sequence and drawn.times:
+    if sequence and times:
         raise InputError("--sequence and --times both use the slider; give one of them.")
-    if sequence and len(flows) == len(what):
-        raise InputError("--sequence is of scans; for samples of a model on a slider give --steps.")
+    counts = numbers("steps", steps, int) if steps else []
+    if times and len(counts) > 1:
+        raise InputError(f"--times takes one number of --steps, found {steps}.")
     panels: list[Panel] = []
     frames: list[str] = []
     for one in what:
-        if one in flows:
-            found, frames = _drawn(one, num or SAMPLES, drawn)
+        if one not in models:
+            new = scan_panels(how.views([one], num or SCANS))
+            if sequence and len(new) > 1:
+                together, frames = in_turn(new, one)
+                new = [together]
+        elif times:
+            model = load_checkpoint(one, choose_device(device))
+            new, frames = way_panels(model, one, num or SAMPLES, seed, counts[0] if counts else None, times)
         else:
-            views = views_to_draw([one], sensor, size, projection, reflectance_scale, columns, num or SCANS)
-            found = scan_panels(views)
-            if sequence and len(found) > 1:
-                together, frames = in_turn(found, one)
-                found = [together]
-        panels += found
+            new = sample_panels(load_checkpoint(one, choose_device(device)), one, num or SAMPLES, seed, counts)
+            frames = [f"sample {number}" for number in range(num or SAMPLES)] if counts else []
+        panels += new
     title = ", ".join(Path(one).name or one for one in what)
     path = write_panels(out or Path(mkdtemp(prefix="r2flow-"), "view.html"), panels, frames, title)
     print(path)
     if out is None:
         open_browser(path)
-
-
-def _drawn(name: str, num: int, how: GeneratorOptions) -> "tuple[Sequence[Panel], list[str]]":
-    from r2flow.cli.output import numbers
-    from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.reports.view.panels import sample_panels, way_panels
-
-    steps = numbers("steps", how.steps, int) if how.steps else []
-    loaded = load_checkpoint(name, choose_device(how.device))
-    if how.times is None:
-        frames = [f"sample {number}" for number in range(num)] if steps else []
-        return sample_panels(loaded, name, num, how.seed, steps), frames
-    if len(steps) > 1:
-        raise InputError(f"--times takes one number of --steps, found {how.steps}.")
-    return way_panels(loaded, name, num, how.seed, steps[0] if steps else None, how.times)
 
 
 def open_browser(path: Path) -> bool:

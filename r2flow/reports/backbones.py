@@ -1,6 +1,6 @@
 """What each backbone costs: the paper's table II, measured here."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from statistics import median
 from typing import Any
@@ -11,6 +11,7 @@ from torch import nn
 from r2flow.backbones import build_backbone, configurations
 from r2flow.backbones.cost import RULE, count_macs, count_parameters
 from r2flow.errors import InputError
+from r2flow.generators import RectifiedFlow, build_generator
 from r2flow.lidar.sensors import Sensor
 from r2flow.reports.tables import print_table
 from r2flow.reports.timing import timed
@@ -46,6 +47,17 @@ def backbone_costs(
         if repeats > 0:
             row["latency_ms"] = latency(model.to(device), (1, channels, *sensor.shape), repeats, device)
         yield row
+
+
+def cost(config: Mapping[str, Any], repeats: int = 0, device: str = "cpu") -> dict[str, Any]:
+    """Parameters, GMAC and, if `repeats`, milliseconds of one evaluation for one image of a config's backbone."""
+    generator = build_generator(config)
+    if not isinstance(generator, RectifiedFlow):
+        return {"parameters": count_parameters(generator), "gmac": None, "latency_ms": None}
+    model = generator.untold().backbone.eval()
+    parameters, gmac, shape = count_parameters(model), count_macs(model) / 1e9, (1, *generator.space.shape)
+    time = latency(model.to(device), shape, repeats, device) if repeats else None
+    return {"parameters": parameters, "gmac": gmac, "latency_ms": time}
 
 
 def latency(model: nn.Module, shape: tuple[int, ...], repeats: int, device: str) -> float:

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,12 +14,10 @@ import numpy as np
 import yaml
 from matplotlib.figure import Figure
 
-from r2flow.backbones.cost import count_macs, count_parameters
 from r2flow.config import flatten
 from r2flow.errors import InputError, naming
-from r2flow.generators import RectifiedFlow, build_generator
 from r2flow.model.checkpoint import checkpoints_of, step_of
-from r2flow.reports.backbones import latency
+from r2flow.reports.backbones import cost
 from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.tables import print_table, shown, table
 from r2flow.reports.training import Curve, read_curves
@@ -40,7 +37,7 @@ FIXED = {
 }  # fmt: skip
 MEASURED = {
     "train_loss": "train loss, last tenth", "val_best": "val loss, best", "val_last": "val loss, last",
-    "straightness": "s / length^2", "seconds": "seconds", "latency_ms": "latency, ms",
+    "straightness": "s / length^2",
 }  # fmt: skip
 
 
@@ -110,12 +107,8 @@ def labels(folders: Sequence[Path]) -> list[str]:
     return ["/".join(p[-depth:]) for p in parts]
 
 
-def read_runs(paths: Sequence[Path], repeats: int = 0, device: str = "cpu") -> list[ComparedRun]:
-    """Every run, each backbone built once.
-
-    Args:
-        repeats: Timed evaluations of each backbone; 0 leaves the latency out.
-    """
+def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
+    """Every run, each backbone built once."""
     folders = find_runs(paths)
     costs: dict[str, dict[str, Any]] = {}
     runs = []
@@ -124,7 +117,7 @@ def read_runs(paths: Sequence[Path], repeats: int = 0, device: str = "cpu") -> l
         architecture = json.dumps([config.get(key) for key in ("sensor", "encoding", "backbone")], sort_keys=True)
         if architecture not in costs:
             with naming(path):
-                costs[architecture] = cost(config, repeats, device)
+                costs[architecture] = cost(config)
         curves = read_curves(path, tuple(CURVES))
         runs.append(ComparedRun(label, config, {**costs[architecture], **_read_values(path, config, curves)}, curves))
     return runs
@@ -157,30 +150,7 @@ def _read_values(path: Path, config: Mapping[str, Any], curves: Mapping[str, Cur
         "val_best": float(validation.min()) if len(validation) else None,
         "val_last": float(validation[-1]) if len(validation) else None,
         "straightness": float(straightness[-1]) if len(straightness) else None,
-        "seconds": training_seconds(path),
     }
-
-
-def cost(config: Mapping[str, Any], repeats: int, device: str) -> dict[str, Any]:
-    """Parameters, GMAC and, if `repeats`, milliseconds of one evaluation for one image of a config's backbone."""
-    generator = build_generator(config)
-    if not isinstance(generator, RectifiedFlow):
-        return {"parameters": count_parameters(generator), "gmac": None, "latency_ms": None}
-    model = generator.untold().backbone.eval()
-    parameters, gmac, shape = count_parameters(model), count_macs(model) / 1e9, (1, *generator.space.shape)
-    time = latency(model.to(device), shape, repeats, device) if repeats else None
-    return {"parameters": parameters, "gmac": gmac, "latency_ms": time}
-
-
-def training_seconds(path: Path) -> float | None:
-    """Time between the first and the last entry of TensorBoard's logs, all starts of the run added; None without."""
-    from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
-
-    total = 0.0
-    for file in sorted(path.glob("tensorboard/**/events.out.tfevents.*")):
-        times = [event.wall_time for event in EventFileLoader(os.fspath(file)).Load() if event.HasField("summary")]
-        total += max(times, default=0.0) - min(times, default=0.0)
-    return total or None
 
 
 def group_runs(runs: Sequence[ComparedRun]) -> list[Group]:
@@ -268,11 +238,11 @@ def print_comparison(groups: Sequence[Group]) -> None:
 NOTES = (
     "Losses are those that were logged: of validation, with the averaged weights; compare them only between runs with "
     "the same loss and the same data. s / length^2 is the last `curvature/s_normalised`; an untrained flow is straight "
-    "too. Seconds are between the first and last entry of TensorBoard's logs. Several seeds: mean ± standard deviation."
+    "too. Several seeds: mean ± standard deviation."
 )
 
 
-def compare_page(groups: Sequence[Group], command: str, device: str = "cpu") -> Page:
+def compare_page(groups: Sequence[Group], command: str) -> Page:
     """`compare.md .csv .json .png`."""
     runs = [(group.label, run) for group in groups for run in group.runs]
     seeds = {run.label: int(run.config["seed"]) for _, run in runs if "seed" in run.config}
@@ -281,7 +251,7 @@ def compare_page(groups: Sequence[Group], command: str, device: str = "cpu") -> 
     drawn = any(run.curves for _, run in runs)
     return Page(
         "compare", "Runs compared", [*written, NOTES], rows_of(groups),
-        {"compare": compare_figure(groups)} if drawn else {}, command, seeds, device, {"runs": members},
+        {"compare": compare_figure(groups)} if drawn else {}, command, seeds, more={"runs": members},
     )  # fmt: skip
 
 

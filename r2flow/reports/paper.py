@@ -18,7 +18,7 @@ from r2flow.metrics.birds_eye import EXTENT, birds_eye_histogram, js_distance
 from r2flow.model.checkpoint import Checkpoint, weights_hash
 from r2flow.model.sampling import sample
 from r2flow.progress import track
-from r2flow.reports.compare import cost
+from r2flow.reports.backbones import cost
 from r2flow.reports.curvature import curvature_figure, curvature_text, measure_paths, trajectories_figure
 from r2flow.reports.interpolation import interpolation_figure
 from r2flow.reports.pages import Page, blank_figure

@@ -11,9 +11,6 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image
-from tensorboard.compat.proto.event_pb2 import Event
-from tensorboard.compat.proto.summary_pb2 import Summary
-from tensorboard.summary.writer.record_writer import RecordWriter
 
 from r2flow.cli import main
 from r2flow.errors import InputError
@@ -54,7 +51,6 @@ def make_run(
     train: list[float] | None = None,
     val: list[float] | None = None,
     curvature: list[float] | None = None,
-    seconds: tuple[tuple[float, float], ...] = (),
     checkpoint: int | None = None,
 ) -> Path:
     """A folder as train.py leaves it: Lightning logs step s under the number s - 1."""
@@ -75,14 +71,6 @@ def make_run(
             writer = csv.DictWriter(file, ["step", "train/loss", "val/loss", "curvature/s", "curvature/s_normalised"])
             writer.writeheader()
             writer.writerows(rows)
-    for number, times in enumerate(seconds):
-        (folder / "tensorboard").mkdir(exist_ok=True)
-        with (folder / "tensorboard" / f"events.out.tfevents.{number}").open("wb") as file:
-            records = RecordWriter(file)
-            records.write(Event(wall_time=0.0, file_version="brain.Event:2").SerializeToString())
-            for when in times:
-                summary = Summary(value=[Summary.Value(tag="train/loss", simple_value=1.0)])
-                records.write(Event(wall_time=when, step=1, summary=summary).SerializeToString())
     if checkpoint is not None:
         (folder / "checkpoints").mkdir()
         (folder / "checkpoints" / f"step-{checkpoint:08d}.ckpt").touch()
@@ -97,7 +85,7 @@ def single(folder: Path) -> dict[str, Any]:
 def test_every_number_is_the_folder_s(tmp_path):
     found = single(make_run(
         tmp_path / "run", train=[1.0] * 36 + [0.5, 0.3, 0.2, 0.2], val=[0.9, 0.4, 0.6], curvature=[0.2, 0.05],
-        seconds=((100.0, 130.0, 160.0), (1000.0, 1005.0)), checkpoint=38,
+        checkpoint=38,
     ))  # fmt: skip
     assert found["stage"] == "rectify"
     assert found["backbone"] == "hdit"
@@ -107,14 +95,13 @@ def test_every_number_is_the_folder_s(tmp_path):
     assert found["val_best"] == 0.4
     assert found["val_last"] == 0.6
     assert found["straightness"] == 0.05
-    assert found["seconds"] == 65.0  # 60 in the first start and 5 in the second
     assert found["label"] == "run"
 
 
 def test_what_a_folder_does_not_say_is_not_made_up(tmp_path):
     run = read_runs([make_run(tmp_path / "bare")])
     row = rows_of([Group("bare", tuple(run))])[0]
-    for column in ("steps", "images", "train_loss", "val_best", "val_last", "straightness", "seconds", "latency_ms"):
+    for column in ("steps", "images", "train_loss", "val_best", "val_last", "straightness"):
         assert row[column] is None
         assert cell(row, column) == "-"
     assert row["parameters"] > 0  # which the config says
@@ -127,8 +114,6 @@ def test_cost_is_a_constant_and_a_share_of_the_columns(tmp_path):
         first, second = (found[i + 1][key] - found[i][key] for i in (0, 1))
         assert second == pytest.approx(2 * first, rel=1e-9)
         assert exactly is None or second == exactly
-    assert found[0]["latency_ms"] is None
-    assert read_runs([tmp_path / "64"], repeats=1)[0].values["latency_ms"] > 0
 
 
 def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
