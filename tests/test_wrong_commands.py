@@ -99,7 +99,6 @@ info bad.ckpt
 info scans/000000.bin
 info run run # extra argument
 info run --jsn
-info run --json --card # --card and --json are two forms of one answer
 sample run -o out --steps 10000000 # 1,000,000
 sample run -o out --sampler jump:2 # no sampler named
 view scans --seed 3 -o v.html # are of a run

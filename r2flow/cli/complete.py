@@ -1,6 +1,5 @@
 """`r2flow complete`: a scan from a part of a scan."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -21,57 +20,43 @@ from r2flow.cli.options import (
 )
 
 
-@dataclass(frozen=True)
-class KnownOptions:
-    """What is known of the scans."""
-
-    source: Annotated[
-        str | None,
-        typer.Option("--from", help="Sensor of the scans, by name or YAML; found in the scans if left out."),
-    ] = None
-    mask: Annotated[
-        str | None,
-        typer.Option(help="Keep a part of what was measured: rows:4, random:0.5, points:0.1, sector:-30,30, FILE.npy."),
-    ] = None
-    fill_gaps: Annotated[
-        bool,
-        typer.Option("--fill-gaps", help="Take rays without a return as not measured, as in a thinned scan."),
-    ] = False
-    surfaces: SurfacesOption = True
-    reflectance_scale: Annotated[
-        float | None,
-        typer.Option(min=1e-6, max=1e9, help="Value in the files that means full reflectance; found if left out."),
-    ] = None
-    columns: ColumnsOption = None
-
-
-@dataclass(frozen=True)
-class AnswerOptions:
-    """How many answers, and where they are computed."""
-
-    num: Annotated[int, typer.Option(min=1, help="Answers to each scan.")] = 1
-    seed: Annotated[int, typer.Option(min=0, help="An answer depends on seed, scan and its number alone.")] = 0
-    scans: Annotated[
-        int | None, typer.Option("--scans", min=1, help="The most scans of each folder, evenly spread; all.")
-    ] = None
-    batch_size: Annotated[int, typer.Option(min=1, help="Answers at once.")] = 1
-    pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture and a page in 3-D.")] = 8
-    device: DeviceOption = "auto"
-
-
 @app.command(epilog="Example: r2flow complete scan.pcd --from vlp16 --num 8 --out dense")
 @grouped
 def complete(
     what: Annotated[list[str], typer.Argument(metavar="SCANS...", help=f"Scan files, range images (.npy), or {SETS}.")],
     out: OutOption,
-    known: KnownOptions,
-    answers: AnswerOptions,
     how: SamplerOptions,
     checkpoint: Annotated[
         Path | None,
         typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model; street if left out."),
     ] = None,
     precision: PrecisionOption = "32-true",
+    source: Annotated[
+        str | None,
+        typer.Option("--from", help="Sensor of the scans, by name or YAML; found in the scans if left out."),
+    ] = None,
+    mask: Annotated[
+        str | None,
+        typer.Option(help="Keep a part of what was measured: rows:4, random:0.5, points:0.1, sector:-30,30, FILE.npy."),
+    ] = None,
+    fill_gaps: Annotated[
+        bool,
+        typer.Option("--fill-gaps", help="Take rays without a return as not measured, as in a thinned scan."),
+    ] = False,
+    surfaces: SurfacesOption = True,
+    reflectance_scale: Annotated[
+        float | None,
+        typer.Option(min=1e-6, max=1e9, help="Value in the files that means full reflectance; found if left out."),
+    ] = None,
+    columns: ColumnsOption = None,
+    num: Annotated[int, typer.Option(min=1, help="Answers to each scan.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="An answer depends on seed, scan and its number alone.")] = 0,
+    scans: Annotated[
+        int | None, typer.Option("--scans", min=1, help="The most scans of each folder, evenly spread; all.")
+    ] = None,
+    batch_size: Annotated[int, typer.Option(min=1, help="Answers at once.")] = 1,
+    pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture and a page in 3-D.")] = 8,
+    device: DeviceOption = "auto",
 ) -> None:
     """Complete scans: from fewer beams to more, from a part to the whole.
 
@@ -91,30 +76,27 @@ def complete(
 
     if checkpoint is None:
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
-    mask = None if known.mask is None else parse_mask(known.mask)
-    source = None if known.source is None else build_sized(known.source, None)
-    loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(answers.device))
-    reading = replace(reading_for([], loaded), columns=named_columns(known.columns))
-    scans, said = open_partial(what, reading, source, known.reflectance_scale, answers.scans)
+    keep = None if mask is None else parse_mask(mask)
+    sensor = None if source is None else build_sized(source, None)
+    loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(device))
+    reading = replace(reading_for([], loaded), columns=named_columns(columns))
+    partial, said = open_partial(what, reading, sensor, reflectance_scale, scans)
     sampler = completing(loaded.generator, **how.given)
     for line in said:
         print(line)
-    for ending in sorted({scan.ending for scan in scans if answer_ending(loaded, scan) != scan.ending}):
+    for ending in sorted({scan.ending for scan in partial if answer_ending(loaded, scan) != scan.ending}):
         print(f"answers to {ending} are written as .ply")
     if not loaded.encoding.reflectance:
         print("the model is of range alone: answers have no reflectance")
-    rows, columns = loaded.sensor.shape
-    print(f"an answer has at most one point in each pixel of the model's image, {rows}x{columns}")
-    job = Job(
-        answers.num, answers.seed, mask, known.fill_gaps, answers.batch_size, known.surfaces, answers.pictures,
-        precision,
-    )  # fmt: skip
+    size = "x".join(map(str, loaded.sensor.shape))
+    print(f"an answer has at most one point in each pixel of the model's image, {size}")
+    job = Job(num, seed, keep, fill_gaps, batch_size, surfaces, pictures, precision)
     about = {
-        "mask": known.mask and mask_identity(known.mask), "from": known.source,
-        "reflectance_scale": known.reflectance_scale, "columns": known.columns,
+        "mask": mask and mask_identity(mask), "from": source, "reflectance_scale": reflectance_scale,
+        "columns": columns,
     }  # fmt: skip
-    done = write_completed(loaded, scans, out, job, sampler, about)
-    skipped = len(scans) - len(done)
+    done = write_completed(loaded, partial, out, job, sampler, about)
+    skipped = len(partial) - len(done)
     print(f"{len(done)} scans completed in {out}" + (f", {skipped} were there already" if skipped else ""))
     errors = [error for error in done.values() if error is not None]
     if errors:

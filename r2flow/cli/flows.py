@@ -1,4 +1,4 @@
-"""Verbs for trained generators and their backbones."""
+"""`r2flow sample`, `interpolate` and `info`."""
 
 from dataclasses import dataclass
 from json import dumps as to_json
@@ -9,11 +9,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import DrawOptions, ModelOptions, SamplerOptions, grouped
-from r2flow.cli.options import (
-    OutOption,
-    PrecisionOption,
-    choose_device,
-)
+from r2flow.cli.options import CheckpointOption, DeviceOption, OutOption, PrecisionOption, choose_device
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -101,22 +97,52 @@ def sample(
     print(f"{draw.num} scan{'s' * (draw.num != 1)} ({', '.join(formats)}) in {out}{seen}")
 
 
+@app.command(epilog="Example: r2flow interpolate 0000000100.bin 0000000250.bin -c runs/NAME --frames 6 --out between")
+@grouped
+def interpolate(
+    first: Annotated[str, typer.Argument(help="A scan file or a range image (.npy).")],
+    last: Annotated[str, typer.Argument(help="Another.")],
+    checkpoint: CheckpointOption,
+    out: OutOption,
+    sampling: SamplerOptions,
+    frames: Annotated[int, typer.Option(min=2, help="Scans in all, the two ends included.")] = 6,
+    reflectance_scale: Annotated[
+        float | None,
+        typer.Option(min=1e-6, max=1e9, help="Value in the files that means full reflectance; else the training's."),
+    ] = None,
+    batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1,
+    device: DeviceOption = "auto",
+) -> None:
+    """Go from one real scan to another through their noises: a figure and a point cloud for every frame.
+
+    The solver is dopri5 at a tolerance of 1e-4 if left out.
+    """
+    from r2flow.cli.output import command
+    from r2flow.inversion import real_scans
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.reports.interpolation import interpolation
+    from r2flow.reports.pages import write_page
+    from r2flow.samplers import build_sampler
+
+    loaded = load_checkpoint(checkpoint, choose_device(device))
+    ends = real_scans(loaded, [first, last], reflectance_scale)
+    given = sampling.given
+    sampler = build_sampler(given if "name" in given else {"name": "dopri5", "tolerance": 1e-4, **given})
+    written = write_page(interpolation(loaded, ends, frames, out, sampler, batch_size, command()), out)
+    pages = ", ".join(map(str, [*written, out / "interpolation.html"]))
+    print(f"{frames} scans in {out / 'frames'}; {pages}")
+
+
 @app.command(epilog="Example: r2flow info runs/simulated-hdit_tiny")
 def info(
     checkpoint: Annotated[Path, typer.Argument(help="A checkpoint file, a run folder or a model.")],
     json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
-    card: Annotated[bool, typer.Option("--card", help="The table of its model card, as docs/models has it.")] = False,
 ) -> None:
     """Print what is in a checkpoint."""
-    from r2flow.reports.contents import card as card_of
     from r2flow.reports.contents import describe, print_contents
 
-    if card and json:
-        raise InputError("--card and --json are two forms of one answer; give one of them.")
     contents = describe(checkpoint)
-    if card:
-        print(card_of(contents))
-    elif json:
+    if json:
         print(to_json(contents, indent=2))
     else:
         print_contents(contents)

@@ -1,6 +1,5 @@
 """What is in a checkpoint, for a reader and as JSON."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,7 @@ from r2flow.backbones import Backbone
 from r2flow.config import flatten
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.models import MODELS, name_of
-from r2flow.reports.tables import print_table, table
+from r2flow.reports.tables import print_table
 
 
 def describe(path: str | Path) -> dict[str, Any]:
@@ -37,44 +36,6 @@ def describe(path: str | Path) -> dict[str, Any]:
         **loaded.generator.drawing(),
         "config": loaded.config,
     }
-
-
-def card(contents: dict[str, Any]) -> str:
-    """What the file of a model says of itself: the table of its model card."""
-    config, sampler = contents["config"], contents["sampler"]
-    data, stage, parent = config.get("data") or {}, config.get("stage") or {}, config.get("parent")
-    learned_from = [data.get("name"), config.get("scans"), *_said(data.get("augment") or {})]
-    steps, batch_size = contents["step"], data.get("batch_size")
-    seen = f" of {batch_size} images, {steps * batch_size:,} images" if batch_size else ""
-    facts = {
-        "draws": contents.get("draws"),
-        "image": f"{' x '.join(map(str, contents['image']))}, {' to '.join(map(str, contents['range_m']))} m",
-        "sensor": contents["sensor"],
-        "network": f"{contents['backbone'] or contents['generator']}, {contents['parameters']:,} parameters",
-        "file": f"{contents['bytes'] / 1e6:.1f} MB",
-        "drawn with": f"{sampler['name']}, {sampler.get('steps', 'adaptive')} steps"
-        + (f"; {contents['few']['name']} in fewer" if contents.get("few") else ""),
-        "learned from": ", ".join(filter(None, learned_from)) or None,
-        "stage": ", ".join([contents["stage"], *_said({key: stage.get(key) for key in ("loss", "time")})]),
-        "starts from": parent and _lineage(parent),
-        "budget": f"{steps:,} steps{seen}",
-        "seed": config.get("seed"),
-        "licence": contents.get("licence"),
-    }
-    return table([(key, value) for key, value in facts.items() if value is not None], ("", ""))
-
-
-def _lineage(parent: Mapping[str, Any]) -> str:
-    if "grown_from" in parent:
-        return f"a network of weights {parent['weights']}, grown from {_lineage(parent['grown_from'])}"
-    kind = f"a {parent['stage']} flow" if "stage" in parent else "a flow"
-    return f"{kind} of {parent['step']:,} steps, weights {parent['weights']}"
-
-
-def _said(options: Mapping[str, Any]) -> list[str]:
-    """Options that are given, in words."""
-    return [f"{key} {' '.join(map(str, value.values())) if isinstance(value, Mapping) else value}"
-            for key, value in options.items() if value]  # fmt: skip
 
 
 def print_contents(contents: dict[str, Any]) -> None:

@@ -1,0 +1,242 @@
+"""`r2flow report`: solvers, curvature, backbones, completion and the paper's tables."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from json import dumps as to_json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from r2flow.cli.app import report
+from r2flow.cli.groups import DrawOptions, SamplerOptions, grouped
+from r2flow.cli.options import (
+    SETS,
+    DeviceOption,
+    OutOption,
+    ScaleChoice,
+    SensorOption,
+    SizeOption,
+    SurfacesOption,
+    build_sized,
+    choose_device,
+)
+from r2flow.cli.output import command, finish, numbers
+from r2flow.errors import InputError
+
+
+@report.command(epilog="Example: r2flow report curvature runs/1rf runs/2rf --out reports")
+@grouped
+def curvature(
+    models: Annotated[list[str], typer.Argument(help="Models, run folders or checkpoint files.")],
+    out: OutOption,
+    draw: DrawOptions,
+    steps: Annotated[int, typer.Option(min=1, help="Euler steps of a path.")] = 256,
+    most_curved: Annotated[int, typer.Option(min=1, help="Pixels whose paths are drawn.")] = 200,
+) -> None:
+    """How straight trained flows are: s(t), and the paths of the most curved pixels (the paper's figure 8)."""
+    from r2flow.generators import as_flow
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.model.sampling import batches
+    from r2flow.progress import Bar
+    from r2flow.reports.curvature import curvature_page, measure_paths
+    from r2flow.reports.pages import prepare_folder
+
+    where = choose_device(draw.device)
+    loaded = {name: load_checkpoint(name, where) for name in dict.fromkeys(models)}
+    for checkpoint in loaded.values():
+        as_flow(checkpoint.generator, "curvature")
+    prepare_folder(out)
+    with Bar("measuring", len(loaded) * batches(draw.num, draw.batch_size) * 2 * steps, "evaluations") as advance:
+        flows = [
+            measure_paths(checkpoint, label, draw.num, steps, draw.seed, draw.batch_size, most_curved, advance)
+            for label, checkpoint in loaded.items()
+        ]
+    page = curvature_page(flows, draw.seed, command(), where)
+    finish(page, out, page.text)
+
+
+@report.command(epilog="Example: r2flow report solvers runs/NAME --out reports")
+@grouped
+def solvers(
+    out: OutOption,
+    draw: DrawOptions,
+    model: Annotated[
+        str | None, typer.Argument(help="A model, a run or a checkpoint; exact problems alone if left out.")
+    ] = None,
+    samplers: Annotated[str | None, typer.Option(help="Solvers, separated by commas; all of ours if left out.")] = None,
+    budgets: Annotated[str, typer.Option(help="Evaluations of the fixed-step solvers.")] = "4,8,16,32,64",
+    tolerances: Annotated[str, typer.Option(help="Of the adaptive solvers.")] = "1e-2,1e-3,1e-4,1e-5",
+    problems: Annotated[str | None, typer.Option(help="Exact problems by name; all if left out, or none.")] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="The most timed solutions of a scan.")] = 5,
+) -> None:
+    """Error against run time of every solver: exact problems, stiff and extreme ones too, and a trained flow.
+
+    The page names the sampler that reaches a wanted error, as a command.
+    """
+    from r2flow.flow.problems import PROBLEMS
+    from r2flow.flow.solvers import method_of
+    from r2flow.generators import as_flow
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.progress import Bar
+    from r2flow.reports import solvers as measuring
+    from r2flow.reports.pages import prepare_folder
+
+    where = choose_device(draw.device)
+    methods = samplers.split(",") if samplers else list(measuring.METHODS)
+    for method in methods:
+        method_of(method)
+    problems = [] if problems == "none" else problems.split(",") if problems else list(PROBLEMS)
+    for problem in problems:
+        PROBLEMS[problem]
+    budgets, tolerances = numbers("budgets", budgets, int), numbers("tolerances", tolerances)
+    chosen = measuring.configurations(methods, budgets, tolerances)
+    if not chosen or not (problems or model):
+        raise InputError("nothing to measure: give a model, more --budgets, or leave --problems none out.")
+    loaded = None if model is None else load_checkpoint(model, where)
+    if loaded is not None:
+        as_flow(loaded.generator, "report solvers")
+    prepare_folder(out)
+    subjects, flow = measuring.problem_subjects(problems), None
+    with only_errors():
+        if loaded is not None:
+            with Bar("measuring", draw.num * 512, "reference evaluations") as advance:
+                flow = measuring.checkpoint_subject(
+                    loaded, str(model), draw.num, draw.seed, draw.batch_size, progress=advance
+                )
+        everything = [*subjects, flow] if flow else subjects
+        with Bar("measuring", len(everything) * len(chosen), "solutions") as advance:
+            rows = measuring.measure(everything, chosen, repeats, advance)
+        with Bar("judging", 0, "solutions") as advance:
+            verdicts = measuring.judge(problems, methods, progress=advance)
+    page = measuring.solvers_page(rows, verdicts, flow, budgets, {"scans": draw.seed}, command(), where)
+    finish(page, out, page.text[: -(2 + 3 * bool(verdicts))])  # without the long tables
+
+
+@report.command(epilog="Example: r2flow report backbones --size 64x1024")
+def backbones(
+    only: Annotated[str | None, typer.Option(help="Names, separated by commas; all if left out.")] = None,
+    sensor: SensorOption = "hdl64e",
+    size: SizeOption = None,
+    channels: Annotated[int, typer.Option(min=1, help="Channels of the image.")] = 2,
+    repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each; 0 leaves the latency out.")] = 3,
+    device: DeviceOption = "auto",
+    json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """Parameters, multiply-accumulates and measured latency of every configuration: the paper's table II."""
+    from r2flow.backbones import configurations
+    from r2flow.progress import track
+    from r2flow.reports.backbones import backbone_costs, print_costs
+
+    chosen, where = build_sized(sensor, size), choose_device(device)
+    names = only.split(",") if only else list(configurations())
+    rows = backbone_costs(chosen, names, channels, repeats, where)
+    measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
+    print(to_json(measured, indent=2)) if json else print_costs(measured, chosen, where)
+
+
+@contextmanager
+def only_errors() -> Iterator[None]:
+    """No warnings about scans that a solver gave up on: the report counts them."""
+    log = logging.getLogger("r2flow.flow")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+
+
+@report.command(epilog="Example: r2flow report completion kitti360/test street --num 15 --out reports")
+def completion(
+    real: Annotated[str, typer.Argument(help=f"Scans, of which a part is hidden: {SETS}.")],
+    models: Annotated[
+        list[str] | None, typer.Argument(help="Models, run folders or checkpoint files; street if left out.")
+    ] = None,
+    tasks: Annotated[
+        str | None, typer.Option(help="Masks, as rows:4, a space between them; five masks if left out.")
+    ] = None,
+    samplers: Annotated[str | None, typer.Option(help="Samplers for the models, as mmps,replace.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps of each sampler.")] = None,
+    num: Annotated[int, typer.Option(min=1, help="The most scans of a set, evenly spread over it.")] = 16,
+    answers: Annotated[int, typer.Option(min=1, help="Answers to each scan; 19 give intervals of 90 %.")] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Of the noise. What is hidden of a scan does not depend on it.")] = 0,
+    batch_size: Annotated[int, typer.Option(min=1, help="Answers at once.")] = 4,
+    surfaces: SurfacesOption = True,
+    reflectance_scale: ScaleChoice = None,
+    device: DeviceOption = "auto",
+    out: OutOption = Path("reports"),
+) -> None:
+    """Hide a part of scans and complete them, by models and by plain interpolation: errors against evaluations."""
+    import numpy as np
+
+    from r2flow.inversion import real_scans
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.model.completion import completing
+    from r2flow.progress import Bar
+    from r2flow.reports.completion import TASKS, Way, completion_page, completion_rows, measured_by, pictured
+    from r2flow.reports.pages import prepare_folder
+
+    loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in models or ["street"]}
+    ways = [
+        Way(name, one, completing(one.generator, **SamplerOptions(sampler, steps).given))
+        for name, one in loaded.items()
+        for sampler in (samplers.split(",") if samplers else [None])
+    ]
+    first = ways[0].checkpoint
+    masks = tasks.split() if tasks else list(TASKS)
+    for task in masks:
+        measured_by(task, first.sensor, 0)
+    scans = real_scans(first, [real], reflectance_scale, num)
+    truths = [np.asarray(scan.image) for scan in scans if scan.image[0].any()]
+    if not truths:
+        raise InputError(f"{real}: no scan has a return, so there is nothing to hide.")
+    prepare_folder(out)
+    cost = sum(way.sampler.evaluations(way.checkpoint.generator) or 0 for way in ways) * len(masks)
+    with Bar("completing", len(truths) * -(-answers // batch_size) * cost, "evaluations") as advance:
+        shown = list(
+            completion_rows(truths, first.sensor, ways, masks, answers, seed, batch_size, surfaces, progress=advance)
+        )
+    figure = pictured(truths[0], shown, first.sensor)
+    about = f"{len(truths)} scans of {real}, {answers} answers to each."
+    page = completion_page([row for row, _ in shown], figure, about, seed, command(), str(choose_device(device)))
+    finish(page, out, page.text[1:])
+
+
+@report.command(epilog="Example: r2flow report paper runs/1rf runs/2rf --results speed --real kitti360/test -o paper")
+def paper(
+    models: Annotated[list[str], typer.Argument(help="Runs, checkpoint files or models; ROLE=MODEL sets the row.")],
+    out: OutOption,
+    results: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of `r2flow evaluate REAL -c MODEL --out FOLDER`; may be repeated."),
+    ] = None,
+    real: Annotated[str | None, typer.Option(help=f"Real scans for figures 3, 5 and 7: {SETS}.")] = None,
+    num: Annotated[int, typer.Option(min=1, help="Scans of each model in figures 5 and 7.")] = 16,
+    paths: Annotated[int, typer.Option(min=0, help="Scans whose paths figure 8 follows; 0 leaves it out.")] = 4,
+    steps: Annotated[int, typer.Option(min=1, help="Euler steps of these paths.")] = 256,
+    repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each network for table II.")] = 3,
+    device: DeviceOption = "auto",
+) -> None:
+    """The paper's tables I and II and figures 3 and 5 to 8: its printed numbers next to those of `evaluate`."""
+    from r2flow.data.opening import open_scans, reading_for
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.reports.pages import prepare_folder
+    from r2flow.reports.paper import PaperRun, paper_page, read_results, role_of
+
+    where = choose_device(device)
+    files = [folder / "speed_quality.json" for folder in results or []]
+    if missing := [file for file in files if not file.is_file()]:
+        raise InputError(f"--results: {missing[0]} does not exist; r2flow evaluate REAL -c MODEL --out writes it.")
+    runs = []
+    for text in models:
+        role, _, model = text.rpartition("=")
+        checkpoint = load_checkpoint(model, where)
+        if not checkpoint.generator.draws:
+            raise InputError(f"{model} is an autoencoder and draws no scans.")
+        runs.append(PaperRun(role or role_of(checkpoint, Path(model).stem), model, checkpoint))
+    scans = None if real is None else open_scans(real, reading_for([], runs[0].checkpoint))
+    prepare_folder(out)
+    page = paper_page(runs, read_results(files), scans, num, paths, steps, repeats, command(), where)
+    finish(page, out, page.text[:1])
