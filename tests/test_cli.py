@@ -175,27 +175,6 @@ class TestBadInput:
         (tmp_path / "bad.bin").write_bytes(content)
         self.check(r2flow("show", tmp_path / "bad.bin", "--out", tmp_path / "views"), tmp_path / "views", *words)
 
-    def test_missing_and_empty_places(self, r2flow, tmp_path):
-        self.check(r2flow("show", tmp_path / "no.bin", "-o", tmp_path / "v"), tmp_path / "v", "no.bin")
-        (tmp_path / "empty").mkdir()
-        self.check(r2flow("show", tmp_path / "empty", "-o", tmp_path / "v"), tmp_path / "v", "holds no scan")
-        self.check(r2flow("sample", "-c", tmp_path / "empty", "-o", tmp_path / "s"), tmp_path / "s", "no checkpoint")
-
-    def test_options(self, r2flow, saved, scan, tmp_path):  # noqa: F811
-        out = tmp_path / "out"
-        self.check(r2flow("show", scan, "--size", "64", "-o", out), out, "ROWSxCOLUMNS", "'64'")
-        self.check(r2flow("show", scan, "--sensor", "hdl64", "-o", out), out, "Did you mean 'hdl64e'?")
-        self.check(r2flow("show", scan, "--projection", "flat", "-o", out), out, "unfolding")
-        self.check(r2flow("sample", "-c", saved[0], "--sampler", "eulr", "-o", out), out, "Did you mean 'euler'?")
-        self.check(r2flow("sample", "-c", saved[0], "--format", "las", "-o", out), out, "ply, bin, npy")
-        self.check(r2flow("sample", "-c", saved[0], "--num", 0, "-o", out), out, "--num")
-        self.check(r2flow("sample", "-c", saved[0], "--seed", -1, "-o", out), out, "--seed")
-        self.check(r2flow("sample", "-c", saved[0], "--batch-size", 0, "-o", out), out, "--batch-size")
-        self.check(r2flow("sample", "-c", saved[0], "--device", "foo", "-o", out), out, "--device", "'foo'")
-        self.check(r2flow("sample", "-c", saved[0], "-o", out, "--stepps", 3), out, "--stepps")
-        if not torch.cuda.is_available():
-            self.check(r2flow("sample", "-c", saved[0], "--device", "cuda", "-o", out), out, "--device cpu")
-
     def test_a_place_that_cannot_be_written(self, r2flow, scan, tmp_path):
         (tmp_path / "file").write_text("in the way")
         out = tmp_path / "file" / "views"

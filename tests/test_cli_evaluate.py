@@ -308,12 +308,6 @@ def test_a_mistake_is_one_line(r2flow, real, generated, tmp_path, arguments, mes
     assert places["scan"].read_bytes() == before
 
 
-def test_help_has_an_example(r2flow):  # noqa: F811
-    code, said, _ = r2flow("evaluate", "--help")
-    assert code == 0
-    assert "Example: r2flow evaluate" in " ".join(said.split())
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("ranks", [2, 3])
 def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path, ranks):  # noqa: F811

@@ -115,13 +115,6 @@ def test_named_grids_are_sampled_on(r2flow, run, tmp_path):  # noqa: F811
     assert len(set(images.values())) == 3
 
 
-@pytest.mark.parametrize("verb", ["interpolate"])
-def test_every_verb_has_help_with_an_example(r2flow, verb):  # noqa: F811
-    code, said, _ = r2flow(*verb.split(), "--help")
-    assert code == 0
-    assert f"Example: r2flow {verb}" in " ".join(said.split())
-
-
 class TestBadInput:
     """One clear line, exit code 2, nothing written."""
 
@@ -133,26 +126,6 @@ class TestBadInput:
         for word in words:
             assert word in lines[0]
         assert not out.exists()
-
-    def test_of_inversion(self, r2flow, run, files, tmp_path):  # noqa: F811
-        out = tmp_path / "o"
-        with_run = ("-c", run, "-o", out)
-        np.save(tmp_path / "wide.npy", np.ones((2, 8, 128), np.float32))
-        np.save(tmp_path / "range.npy", np.full((1, 8, 64), 9, np.float32))
-        (tmp_path / "bad.bin").write_bytes(b"\0" * 30)
-        self.check(r2flow("interpolate", *files, *with_run, "--frames", 1), out, "--frames")
-        self.check(r2flow("interpolate", files[0], tmp_path / "no.ply", *with_run), out, "no.ply")
-
-    def test_of_grids_and_errors(self, r2flow, run, tmp_path):  # noqa: F811
-        out = tmp_path / "o"
-        options = ("sample", run, "-o", out)
-        for grid in ("cubic", "power", "power:0", tmp_path / "no.json"):
-            self.check(r2flow(*options, "--grid", grid), out, "power:P or power-start:P with P from 1 to 10", str(grid))
-        self.check(r2flow(*options, "--grid", "power:2", "--sampler", "dopri5"), out, "grid")
-
-    def test_of_seeds_and_tolerances(self, r2flow, run, files, tmp_path):  # noqa: F811
-        out = tmp_path / "o"
-        self.check(r2flow("sample", run, "-o", out, "--seed", 2**64), out, "[0, 2^64)", str(2**64))
 
     def test_of_regions_and_channels(self, r2flow, run, tmp_path):  # noqa: F811
         out = tmp_path / "o"

@@ -101,25 +101,6 @@ def test_where_a_process_stands(environment: dict[str, str], expected: tuple[int
     assert place(environment) == expected
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--rank", 1], "--rank and --ranks belong together"),
-        (["--rank", 2, "--ranks", 2], "process 2 of 2: they count from 0"),
-        (["--sampler", "eulr"], "Did you mean 'euler'"),
-        (["--tolerance", -1], "tolerance"),
-        (["--out", "/proc/nowhere"], "/proc/nowhere"),
-    ],
-)
-def test_what_cannot_be_is_one_line(r2flow, saved, options, message):  # noqa: F811
-    path, _ = saved
-    code, _, said = r2flow("pairs", path, *options)
-    assert code == 2
-    assert message in said
-    assert len(said.strip().splitlines()) == 1
-    assert not (path.parent.parent / "pairs").exists()
-
-
 def test_the_defaults_are_those_of_the_config():
     import inspect
 

@@ -85,33 +85,6 @@ def test_simulated_scans_are_prepared_by_number_and_seed(r2flow, tmp_path):  # n
     assert open_prepared(tmp_path, Reading(SMALL, reflectance=True)).names == ["scene 0", "scene 1"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["kitti_360"], "r2flow prepare needs LAYOUT ROOT --out FOLDER, or --check FOLDER."),
-        (["kitti_360", "--out", "OUT"], "r2flow prepare kitti_360 needs the folder of its scans"),
-        (["simulated", "ROOT", "--out", "OUT"], "simulated scans are no files: leave out ROOT."),
-        (["simulated", "--out", "OUT", "--split", "test"], "simulated scans are no files: leave out --split."),
-        (["folder", "ROOT", "--out", "OUT", "--num", "3"], "--num is for simulated scans"),
-        (["folders", "ROOT", "--out", "OUT"], "no data set named 'folders'"),
-        (["folder", "ROOT", "--out", "OUT", "--reflectance-levels", "300"], "must lie in [1, 256]"),
-        (["folder", "ROOT", "--out", "OUT", "--on-bad-scan", "ignore"], "must be one of error, skip; found 'ignore'"),
-        (["folder", "ROOT", "--out", "FILE/below"], "is a file, not a folder; give another name."),
-        (["--check", "ROOT"], "holds no prepared scans (no manifest.json); make them: r2flow prepare."),
-    ],
-)
-def test_a_mistake_is_one_line(r2flow, tmp_path, arguments: list[str], said: str):  # noqa: F811
-    write_scan(tmp_path / "scans" / "1.bin", 1)
-    (tmp_path / "file").touch()
-    places = {"ROOT": tmp_path / "scans", "OUT": tmp_path / "out", "FILE/below": tmp_path / "file" / "below"}
-    code, _, error = r2flow("prepare", *(places.get(one, one) for one in arguments), *(["--workers", 1]))
-    assert code == 2
-    error = error.strip()
-    assert error.startswith("error: ")
-    assert said in error
-    assert "\n" not in error
-
-
 @pytest.mark.slow
 def test_the_command_killed_and_started_twice_ends_with_the_same_bytes(tmp_path: Path):
     for number in range(60):

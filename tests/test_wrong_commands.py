@@ -61,6 +61,9 @@ sample run -o out --device cuda:99
 sample run -o out --device cpu:7
 sample run -o out --device '' # an argument is empty
 sample run -o out --format las
+sample run -o out --seed 18446744073709551616 # 2^64
+sample run -o out --sector 10,10.0000001 # narrower than a column
+sample run -c run -o out # not both
 sample run -o out --format ply,
 sample run -o out --sector 3
 sample run -o out --sector a,b
@@ -272,6 +275,7 @@ report solvers -o out --budgets '' # an argument is empty
 report solvers -o out --tolerances -1
 report solvers -o out --tolerances nan
 report solvers -o out --problems nope
+report solvers -o out --budgets 1 --samplers rk4 # --budgets
 report solvers -o out --problems none # nothing to measure
 report solvers -o file.txt
 report paper # Missing

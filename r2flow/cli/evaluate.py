@@ -12,7 +12,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import ReadingOptions, SamplerOptions, WorkOptions, grouped
-from r2flow.cli.options import SETS, PrecisionOption, choose_device, choose_reading
+from r2flow.cli.options import SETS, PrecisionOption, choose_device
 from r2flow.cli.output import command, finish, numbers
 from r2flow.errors import InputError
 
@@ -138,7 +138,7 @@ def evaluate(
             each = "each point" if curve else "each" if len(flows) > 1 else "it"
             print(f"{', '.join(flows)}: {SAMPLED} scans of {each} are drawn (--num says how many)")
         files = [one for one in named if one not in sampled]
-        reading = choose_reading([real, *files, options.train], **vars(how), model=next(iter(flows.values()), None))
+        reading = how.reading([real, *files, options.train], next(iter(flows.values()), None))
         if rules.convention is not None and how.convention is None:
             reading = replace(reading, convention=rules.convention)
         if wanted and not any(m.needs_reflectance or m.uses_reflectance for m in wanted.values()):

@@ -1,23 +1,28 @@
 """Options that belong together: a dataclass with an option a field, which a verb takes as one parameter."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
-from typing import Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
 from r2flow.cli.options import (
     ColumnsOption,
-    ConventionChoice,
     DeviceOption,
-    ProjectionChoice,
     ScaleChoice,
     SensorChoice,
     SizeOption,
+    check_words,
+    named_columns,
+    rows_and_columns,
 )
 from r2flow.errors import InputError
+
+if TYPE_CHECKING:
+    from r2flow.data.reading import Reading
+    from r2flow.model.checkpoint import Checkpoint
 
 
 def grouped(verb: Callable[..., None]) -> Callable[..., None]:
@@ -81,10 +86,22 @@ class ReadingOptions:
 
     sensor: SensorChoice = None
     size: SizeOption = None
-    projection: ProjectionChoice = None
-    convention: ConventionChoice = None
+    projection: Annotated[str | None, typer.Option(help="spherical (usual) or unfolding.")] = None
+    convention: Annotated[str | None, typer.Option(help="centre (usual), or reference for the published models'.")] = (
+        None
+    )
     reflectance_scale: ScaleChoice = None
     columns: ColumnsOption = None
+
+    def reading(self, specs: Sequence[str | None], model: "Checkpoint | None" = None) -> "Reading":
+        """`reading_for` these scans and this model with the options that are given."""
+        from r2flow.data.opening import reading_for
+
+        check_words(projection=self.projection, convention=self.convention)
+        return reading_for(
+            specs, model, self.sensor, rows_and_columns(self.size), self.projection, self.convention,
+            self.reflectance_scale, named_columns(self.columns),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Options that several verbs share, and what becomes of them."""
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,9 +10,7 @@ from r2flow.devices import choose_device as choose_device  # for every verb
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
-    from r2flow.data.reading import Reading
     from r2flow.lidar.sensors import Sensor
-    from r2flow.model.checkpoint import Checkpoint
 
 CheckpointOption = Annotated[
     Path, typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model.", show_default=False)
@@ -33,15 +30,6 @@ SurfacesOption = Annotated[
 SETS = "a folder of scans, samples, a run, prepared shards, NAME:FOLDER, simulated:SEED"
 SensorChoice = Annotated[
     str | None, typer.Option(help="Name of the sensor; that of the flow or the scans, or hdl64e, if left out.")
-]
-ProjectionChoice = Annotated[
-    str | None, typer.Option(help="spherical or unfolding; that of the flow or the scans, or spherical, if left out.")
-]
-ConventionChoice = Annotated[
-    str | None,
-    typer.Option(
-        help="centre, or reference for the published models'; that of the flow or the scans, or centre, if left out."
-    ),
 ]
 ScaleChoice = Annotated[
     float | None,
@@ -72,25 +60,6 @@ def build_sized(sensor: str, size: str | None) -> "Sensor":
     from r2flow.data.opening import named_sensor
 
     return named_sensor(sensor, rows_and_columns(size))
-
-
-def choose_reading(
-    specs: Sequence[str | Path | None],
-    sensor: str | None = None,
-    size: str | None = None,
-    projection: str | None = None,
-    convention: str | None = None,
-    reflectance_scale: float | None = None,
-    columns: str | None = None,
-    model: "Checkpoint | None" = None,
-) -> "Reading":
-    """`reading_for` with the values of `ReadingOptions`."""
-    from r2flow.data.opening import reading_for
-
-    check_words(projection=projection, convention=convention)
-    return reading_for(
-        specs, model, sensor, rows_and_columns(size), projection, convention, reflectance_scale, named_columns(columns)
-    )
 
 
 def check_words(**options: str | None) -> None:

@@ -17,6 +17,7 @@ from r2flow.generators import as_flow
 from r2flow.generators.base import Progress
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import Draws
+from r2flow.reports.compare import labels
 from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.tables import table
 
@@ -173,7 +174,7 @@ def trajectories_figure(flows: Sequence[Paths]) -> Figure:
     """The most curved paths, a panel for each checkpoint: the paper's figure 8 (b)."""
     figure = blank_figure(1 + 4.2 * len(flows), 4.2)
     panels = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
-    for axes, flow, title in zip(panels, flows, short_labels([flow.label for flow in flows]), strict=True):
+    for axes, flow, title in zip(panels, flows, labels([Path(flow.label) for flow in flows]), strict=True):
         for dropped, style in ((False, {"color": "0.55", "ls": "-"}), (True, {"color": "#b5301c", "ls": "--"})):
             chosen = flow.trajectories[flow.dropped == dropped]
             label = f"ray ends {'dropped' if dropped else 'as a return'}: {len(chosen)}"
@@ -188,15 +189,6 @@ def trajectories_figure(flows: Sequence[Paths]) -> Figure:
         axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False)
     panels[0].set_ylabel("value in model space (dotted: -1, ray-drop)")
     return figure
-
-
-def short_labels(labels: Sequence[str]) -> list[str]:
-    """The last two parts of each path, or as many as tell them apart."""
-    parts = [Path(label).parts for label in labels]
-    depth = 2
-    while depth < max(map(len, parts)) and len({p[-depth:] for p in parts}) < len(set(parts)):
-        depth += 1
-    return [str(Path(*p[-depth:])) for p in parts]
 
 
 def curvature_page(flows: Sequence[Paths], seed: int, command: str, device: str = "cpu") -> Page:

@@ -207,14 +207,13 @@ class ScanBar(Bar):
     """A bar of scans that moves with the network evaluations between two scans.
 
     Args:
-        evaluations: Network evaluations in all, batches counted as one; 0 where nobody knows: then a batch is taken
-            to need as many as the one before it.
+        evaluations: Network evaluations in all, batches counted as one; 0 where an adaptive solver decides.
     """
 
     def __init__(self, doing: str, num: int, evaluations: int = 0) -> None:
         super().__init__(doing, num, "scans")
         self._share = num / evaluations if evaluations else 0.0
-        self._spent = self._done = self._spent_before = 0
+        self._spent = 0
 
     def evaluated(self) -> None:
         self._spent += 1
@@ -223,9 +222,6 @@ class ScanBar(Bar):
 
     def finished(self, done: int) -> None:
         """So many scans are done by now."""
-        if self._spent > self._spent_before:
-            self._share = (done - self._done) / (self._spent - self._spent_before)
-        self._done, self._spent_before = done, self._spent
         self.set(done)
 
 

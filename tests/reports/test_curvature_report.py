@@ -16,7 +16,6 @@ from r2flow.reports.curvature import (
     curvature_page,
     curvature_rows,
     measure_paths,
-    short_labels,
     summary,
     trajectories_figure,
 )
@@ -113,9 +112,6 @@ def test_a_flow_that_goes_nowhere_has_no_normalised_integral():
 
 def test_panels_are_named_by_the_end_of_their_path():
     labels = ["/a/b/runs/x/rf1", "/a/b/runs/x/rf2", "/a/b/runs/y/rf1"]
-    assert short_labels(labels) == ["x/rf1", "x/rf2", "y/rf1"]
-    assert short_labels(["one/x/rf", "two/x/rf"]) == ["one/x/rf", "two/x/rf"]
-    assert short_labels(["rf.ckpt"]) == ["rf.ckpt"]
     figure = trajectories_figure([measure_paths(checkpoint(Falling()), label, 1, STEPS, 0) for label in labels])
     assert [axes.get_title() for axes in figure.axes] == ["x/rf1", "x/rf2", "y/rf1"]
 
@@ -134,16 +130,3 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
     assert len(content["rows"]) == 2 * 4
     assert {row["checkpoint"] for row in content["summary"]} == {str(path), str(copy)}
     assert content["origin"]["command"].startswith(f"r2flow report curvature {path}")
-
-
-def test_bad_input_is_one_line(r2flow, saved, tmp_path):  # noqa: F811
-    for arguments, words in (
-        ((tmp_path / "none", "-o", tmp_path / "o"), "no checkpoint"),
-        ((saved[0], "-o", tmp_path / "o", "--steps", 0), "--steps"),
-        ((saved[0], "-o", saved[0] / "o"), "is a file, not a folder"),
-    ):
-        code, _, err = r2flow("report", "curvature", *arguments)
-        assert code == 2
-        assert words in err
-        assert len([line for line in err.splitlines() if not line.startswith("WARNING")]) == 1
-        assert not (tmp_path / "o").exists()

@@ -162,24 +162,6 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
     assert len(verdicts) == 2 * len(PRECISIONS) * 2  # two problems, dopri5 at two tolerances
 
 
-def test_bad_input_is_one_line(r2flow, tmp_path):  # noqa: F811
-    out = tmp_path / "o"
-    for arguments, words in (
-        (("--samplers", "eulr"), "'euler'"),
-        (("--budgets", "4,x"), "--budgets"),
-        (("--tolerances", "-1"), "--tolerances"),
-        (("--budgets", "1", "--samplers", "rk4"), "--budgets"),
-        (("--problems", "none"), "nothing to measure"),
-        (("--problems", "gausian"), "'gaussian'"),
-        ((tmp_path / "none",), "no checkpoint"),
-    ):
-        code, _, err = r2flow("report", "solvers", *arguments, "-o", out)
-        assert code == 2
-        assert words in err
-        assert len(err.splitlines()) == 1
-        assert not out.exists()
-
-
 def test_unknown_problems_are_refused():
     with pytest.raises(InputError, match="gaussian"):
         problem_subjects(["gausian"])
