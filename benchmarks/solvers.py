@@ -97,7 +97,6 @@ def by_diffrax(solver: str) -> Solve:
 
 
 SOLVERS: dict[str, Solve] = {
-    "bosh3": ours("bosh3"),
     "dopri5": ours("dopri5"),
     "scipy RK23": by_scipy("RK23"),
     "scipy RK45": by_scipy("RK45"),
@@ -116,7 +115,7 @@ def mixed_batch(last: list[Problem], seeds: int) -> list[list[str]]:
     """Share of torchdiffeq's evaluations, and the error of the hardest scene, medians over the seeds."""
     batch = Mixed([Straight()] * 8 + [Gaussian()] * 4 + [TwoModes()] * (4 - len(last)) + last)
     rows = []
-    for method in ("bosh3", "dopri5"):
+    for method in ("dopri5", "auto"):
         for tolerance in (1e-3, 1e-5):
             shares, pairs = [], []
             for seed in range(seeds):

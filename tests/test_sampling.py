@@ -65,12 +65,12 @@ def scans(count: int = 2) -> torch.Tensor:
     return torch.cat([r, torch.rand(r.shape, generator=draw) * (r > 0)], 1)
 
 
-@pytest.mark.parametrize(("method", "apart"), [("dopri5", 1e-4), ("bosh3", 1e-3), ("rk4", 1e-4), ("euler", 0.2)])
+@pytest.mark.parametrize(("method", "apart"), [("dopri5", 1e-4), ("rk4", 1e-4), ("euler", 0.2)])
 def test_inversion_finds_the_noise(method, apart):
     found = invert(
         flow(),
         scans(),
-        build_sampler(method, **({"tolerance": 1e-6} if method in ("dopri5", "bosh3") else {"steps": 64})),
+        build_sampler(method, **({"tolerance": 1e-6} if method == "dopri5" else {"steps": 64})),
     )
     expected = (flow().encoding.encode(scans()) - M) / S
     assert (found.x_0 - expected).abs().max() < apart

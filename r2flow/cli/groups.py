@@ -120,7 +120,7 @@ class SamplerOptions:
     sampler: Annotated[
         str | None,
         typer.Option(
-            help="NAME or NAME:FIELD=VALUE:...: adams2-4, euler, midpoint, heun2-3, rk4, ab2; adaptive: dopri5, bosh3, "
+            help="NAME or NAME:FIELD=VALUE:...: adams2-4, euler, midpoint, heun2-3, rk4, ab2; adaptive: dopri5, "
             "auto, torchdiffeq; with fresh noise: sde; of flow maps: jump, chord, renoise; to complete: mmps, replace, "
             "repaint. Other systems have their own (docs/systems.md)."
         ),

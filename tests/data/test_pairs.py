@@ -180,7 +180,7 @@ def test_a_damaged_shard_is_found_and_made_again_and_no_other(tmp_path: Path, ha
 @pytest.mark.parametrize(
     ("option", "value"),
     [
-        ("parent", "abd"), ("seed", 1), ("sampler", {"name": "bosh3", "tolerance": 1e-3}), ("batch_size", 8),
+        ("parent", "abd"), ("seed", 1), ("sampler", {"name": "auto", "tolerance": 1e-3}), ("batch_size", 8),
         ("precision", "bf16-mixed"),
     ],
 )  # fmt: skip

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.solvers.adaptive import LEAST_TOLERANCE
-from r2flow.flow.solvers.embedded import EmbeddedMethod, bosh3, dopri5
+from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
 from r2flow.flow.solvers.exponential import ExponentialMethod, automatic, exprb43
 from r2flow.flow.solvers.external import TORCHDIFFEQ, TorchDiffEqMethod
 from r2flow.flow.solvers.fixed import FixedStep, adams, euler, heun2, heun3, midpoint, rk4
@@ -36,7 +36,6 @@ SOLVERS: Registry[FixedStep | EmbeddedMethod | ExponentialMethod] = Registry(
     adams2=adams(2, 2),
     adams3=adams(2, 3),
     adams4=adams(3, 4),
-    bosh3=bosh3,
     dopri5=dopri5,
     exprb43=exprb43,
     auto=automatic,

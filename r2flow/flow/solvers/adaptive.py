@@ -82,26 +82,12 @@ def _step(
     good = control.within(size, dk, dy, whole / tolerance)
     good = inspect(v, control, Tried(method, x, y, k, h, scale), good)
     accepted = control.judge(good, size, dk, dy, v.counts[control.scenes])
-    if control.doubtful.any():
-        _confirm_stiffness(v, control, stages[-1], y, k[-1], error)
     if accepted.all():
         x, k_1 = y, k[-1]
     elif accepted.any():
         chosen = expand_time(torch.from_numpy(accepted).to(x.device), x)
         x, k_1 = torch.where(chosen, y, x), torch.where(chosen, k[-1], k_1)
     return _cross(v, control, x, k_1) if control.crossing.any() else (x, k_1)
-
-
-@torch.no_grad()
-def _confirm_stiffness(v: Evaluations, control: StepController, t: Tensor, y: Tensor, k: Tensor, error: Tensor) -> None:
-    """Measure |h lambda| at one time, in the direction of the error, which the stiff components dominate."""
-    places = control.doubtful.nonzero()[0]
-    t, y, k, way = (rows(part, places) for part in (t, y, k, error))
-    sizes, ways = norms(y, way)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        length = np.where(ways > 0, torch.finfo(v.precision).eps ** 0.5 * (1 + sizes) / ways, 0.0)
-    moved = torch.addcmul(y, way, expand_time(torch.from_numpy(length).to(y), y))
-    control.confirm(*norms(v.some(places, t, moved) - k, moved - y))
 
 
 def _cross(v: Evaluations, control: StepController, x: Tensor, k_1: Tensor) -> tuple[Tensor, Tensor]:

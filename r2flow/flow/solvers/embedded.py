@@ -12,6 +12,8 @@ from r2flow.flow.solvers.solution import Evaluations, Limits, Solution
 class EmbeddedMethod(NamedTuple):
     """The Butcher tableau of an explicit embedded method whose last stage is the next step's first (FSAL).
 
+    Its last two stages are at the same t, by which stiffness is seen.
+
     Attributes:
         order: Order of the solution that is carried on.
         nodes: c_i of stages 2 to s.
@@ -55,11 +57,6 @@ class EmbeddedMethod(NamedTuple):
         return len(self.rows)
 
     @property
-    def same_time(self) -> bool:
-        """Whether the last two stages are at the same t."""
-        return self.nodes[-2] == self.nodes[-1]
-
-    @property
     def distinct(self) -> dict[float, int]:
         """The stage at each time of the step, the last one where there are several, in the order of time."""
         return dict(sorted({c: i for i, c in enumerate((0.0, *self.nodes))}.items()))
@@ -90,20 +87,6 @@ class EmbeddedMethod(NamedTuple):
         slope += first * (rest * (1 - 3 * theta)) - end * (theta * (2 - 3 * theta))
         return state, slope
 
-
-# Bogacki, Shampine, A 3(2) pair of Runge-Kutta formulas, 1989.
-bosh3 = EmbeddedMethod(
-    order=3,
-    nodes=(1 / 2, 3 / 4, 1),
-    rows=((1 / 2,), (0, 3 / 4), (2 / 9, 1 / 3, 4 / 9)),
-    error=(2 / 9 - 7 / 24, 1 / 3 - 1 / 4, 4 / 9 - 1 / 3, -1 / 8),
-    safety=0.7,
-    grow=3.0,  # measured: longer steps double the error on the mixed batch of benchmarks/solvers.py
-    stability=1.75,  # 2.51, reduced because its last two stages are at different times
-    bump=(0, 0, 0, 0),
-    rough=(0, 1, 2, 3),
-    defect=6.0,
-)
 
 # Dormand, Prince, A family of embedded Runge-Kutta formulae, 1980.
 dopri5 = EmbeddedMethod(

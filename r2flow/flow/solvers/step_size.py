@@ -49,7 +49,6 @@ class StepController:
         self.roughness, self.rough = np.zeros(of), np.full(of, np.nan)  # third difference; of the last step, over h^4
         self.troubled = np.zeros(of, int)  # steps for which a rejection is remembered
         self.factor = np.full(of, np.inf)  # between a step that does not hold and the next one
-        self.doubtful = np.zeros(of, bool)  # seems stiff, by stages at different times
 
     def time(self, reached: np.ndarray) -> np.ndarray:
         """t at a length from t_0, never beyond the end."""
@@ -143,7 +142,7 @@ class StepController:
         self.accepted[self.places] += good
         self.rejected[self.places] += ~good
         self._look_for_stiffness(good, dk, dy)
-        tried = self.tried = self.h
+        tried = self.h
         self.reached = np.where(good, self.following, self.reached)
         self.h = tried * self._factors(good, finite, error)
         self.rough = np.where(good, self.roughness / tried**4, self.rough)
@@ -197,24 +196,11 @@ class StepController:
         self.stiff_run += touching
         self.smooth_run = np.where(touching, 0, self.smooth_run + (good & ~touching))
         self.stiff_run = np.where(self.smooth_run >= SMOOTH_AFTER, 0, self.stiff_run)
-        seeming = self.stiff_run >= STIFF_AFTER
         if self.limits.until_stiff:
             self.calm_run = np.where(oscillating, 0, self.calm_run + (good & ~oscillating))
             self.oscillating_run = np.where(self.calm_run >= SMOOTH_AFTER, 0, self.oscillating_run + oscillating)
             self.stiff[self.places] |= self.oscillating_run >= OSCILLATING_AFTER
-        if self.method.same_time:
-            self.stiff[self.places] |= seeming
-        else:
-            self.doubtful = seeming & ~self.stiff[self.places]
-
-    def confirm(self, change: np.ndarray, distance: np.ndarray) -> None:
-        """Whether the doubtful scenes are stiff, from norms of a change of v and of x at one time, (N,) each."""
-        with np.errstate(invalid="ignore"):
-            stiff = self.tried[self.doubtful] * change > self.method.stability * distance
-        self.stiff[self.places[self.doubtful]] = stiff
-        self.stiff_run[self.doubtful] = 0
-        self.leaving |= self._handed_over()
-        self.doubtful[:] = False
+        self.stiff[self.places] |= self.stiff_run >= STIFF_AFTER
 
     def _handed_over(self) -> np.ndarray:
         return self.stiff[self.places] & self.limits.until_stiff & ~self.crossing
@@ -226,7 +212,7 @@ class StepController:
         for name in (
             "scenes", "places", "reached", "h", "grow", "last_error", "stiff_run", "smooth_run", "oscillating_run",
             "calm_run", "arrived", "leaving", "begin", "end", "resume", "crossing", "rough", "troubled",
-            "factor", "doubtful",
+            "factor",
         ):  # fmt: skip
             setattr(self, name, getattr(self, name)[rest])
 
