@@ -86,8 +86,8 @@ sample run -o out --grid file.txt
 sample run -o out --grid empty
 sample run -o out --sampler dopri5 --grid power:2
 sample run -o out --grid power:0
-sample run -o out --grid power:10 --steps 64 # 64 steps do not fit under power:10 in double precision
-sample run -o out --grid power:3 --steps 1000000 # fewer steps or a smaller power
+sample run -o out --grid power:10 --steps 64 # 64 steps on power:10
+sample run -o out --grid power:3 --steps 1000000 # too short for float64
 sample run -o out --margin 10 --sampler nope
 sample run -o out --plugin nope
 sample run -o out --plugin plugin.py

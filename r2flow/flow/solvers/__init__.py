@@ -63,10 +63,9 @@ def solve(
 ) -> Solution:
     """Solve dx/dt = v(t, x) from x at t_0 to t_1, forward or backward in time.
 
-    The state and t stay in float32 (float64 when x is) whatever the network computes in; the memory does not grow with
-    the number of steps. Our own methods evaluate v only between t_0 and t_1. A scene has its own steps, so that its
-    result depends on the others only as far as v's rounding does. A scene that cannot be solved is flagged; no
-    exception is raised.
+    The state and t stay in float32 (float64 when x is) whatever the network computes in. Our own methods evaluate v
+    only between t_0 and t_1. A scene has its own steps. A scene that cannot be solved is flagged; no exception is
+    raised.
 
     Args:
         velocity: v(t, x) with t of shape () in a fixed-step method, (B,) in an adaptive one, where B shrinks as scenes
