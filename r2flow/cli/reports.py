@@ -87,18 +87,18 @@ def solvers(
     methods = samplers.split(",") if samplers else list(measuring.METHODS)
     for method in methods:
         method_of(method)
-    problems = [] if problems == "none" else problems.split(",") if problems else list(PROBLEMS)
-    for problem in problems:
-        PROBLEMS[problem]
-    budgets, tolerances = numbers("budgets", budgets, int), numbers("tolerances", tolerances)
-    chosen = measuring.configurations(methods, budgets, tolerances)
-    if not chosen or not (problems or model):
+    names = [] if problems == "none" else problems.split(",") if problems else list(PROBLEMS)
+    for name in names:
+        PROBLEMS[name]
+    most = numbers("budgets", budgets, int)
+    chosen = measuring.configurations(methods, most, numbers("tolerances", tolerances))
+    if not chosen or not (names or model):
         raise InputError("nothing to measure: give a model, more --budgets, or leave --problems none out.")
     loaded = None if model is None else load_checkpoint(model, where)
     if loaded is not None:
         as_flow(loaded.generator, "report solvers")
     prepare_folder(out)
-    subjects, flow = measuring.problem_subjects(problems), None
+    subjects, flow = measuring.problem_subjects(names), None
     with only_errors():
         if loaded is not None:
             with Bar("measuring", draw.num * 512, "reference evaluations") as advance:
@@ -109,8 +109,8 @@ def solvers(
         with Bar("measuring", len(everything) * len(chosen), "solutions") as advance:
             rows = measuring.measure(everything, chosen, repeats, advance)
         with Bar("judging", 0, "solutions") as advance:
-            verdicts = measuring.judge(problems, methods, progress=advance)
-    page = measuring.solvers_page(rows, verdicts, flow, budgets, {"scans": draw.seed}, command(), where)
+            verdicts = measuring.judge(names, methods, progress=advance)
+    page = measuring.solvers_page(rows, verdicts, flow, most, {"scans": draw.seed}, command(), where)
     finish(page, out, page.text[: -(2 + 3 * bool(verdicts))])  # without the long tables
 
 
