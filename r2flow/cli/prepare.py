@@ -32,7 +32,9 @@ def prepare(
     split: Annotated[str | None, typer.Option(help="A part of the layout's split; all of it if left out.")] = None,
     drives: Annotated[str | None, typer.Option(help="Names or numbers, separated by commas; all if left out.")] = None,
     on_bad_scan: Annotated[str, typer.Option(help="error, or skip: leave out by name what cannot be used.")] = "error",
-    num: Annotated[int | None, typer.Option(min=1, help="Scenes, of simulated scans.", show_default=False)] = None,
+    num: Annotated[
+        int | None, typer.Option(min=1, max=10**7, help="Scenes, of simulated scans.", show_default=False)
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of simulated scans.")] = 0,
     reflectance_levels: Annotated[
         int | None, typer.Option(help="Reflectance is kept as n / LEVELS; found from the scans if left out.")

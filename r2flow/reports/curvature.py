@@ -1,5 +1,6 @@
 """How straight the paths of trained flows are: the paper's figure 8."""
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from r2flow.noise import Draws
 from r2flow.reports.compare import labels
 from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.tables import table
+
+log = logging.getLogger(__name__)
 
 MOST_CURVED = 200  # paths drawn, as in the paper's figure 8 (b)
 
@@ -88,6 +91,8 @@ def measure_paths(
         sums += bends.numel(), dropped.sum().item(), bends.sum().item(), bends[dropped].sum().item()
     s, squared_length = (torch.cat(batches).cpu().numpy() for batches in zip(*scans, strict=True))
     worst, trajectories, ends = (torch.cat(batches).cpu().numpy() for batches in zip(*most, strict=True))
+    if not np.isfinite(s).all():
+        log.warning("%s: s(t) is not finite for %d of %d scans.", label, (~np.isfinite(s).all(1)).sum(), len(s))
     order = np.argsort(-worst, kind="stable")[:most_curved]
     elements, ends_dropped, bend, bend_of_dropped = map(float, sums)
     return Paths(

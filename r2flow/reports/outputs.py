@@ -144,7 +144,11 @@ def warn_unsolved(converged: Tensor, first: int = 0) -> list[int]:
 
 
 def _warn_lost(numbers: Sequence[int]) -> None:
-    log.warning("not solved, so no scans of this flow: %s; try another solver.", ", ".join(map(str, numbers)))
+    log.warning(
+        "not solved, so no scans of this flow: %s; try another solver, or for a velocity that is singular at t = 1 a "
+        "last step before it: --sampler adams3:finish=0.001.",
+        ", ".join(map(str, numbers)),
+    )
 
 
 def _former(out: Path, about: Mapping[str, Any], num: int, replace: bool) -> dict[str, Any] | None:

@@ -55,7 +55,8 @@ class Chord(Jump):
     """x_s = x_t + (s - t) u(x_t, t, 1), on the straight line to the end of a jump.
 
     The next jump sees that end under less of the same noise and corrects it. This is DDIM's step (Song et al. 2021)
-    with X_{t->1}(x_t) for the estimate of the scan; exact where paths are straight.
+    with X_{t->1}(x_t) for the estimate of the scan; exact where paths are straight. Elsewhere x_s does not have the
+    density of the flow at s even for the exact map, and each jump adds grain to the reflectance.
 
     Attributes:
         grid: None for `late`.

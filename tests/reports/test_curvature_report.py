@@ -110,6 +110,11 @@ def test_a_flow_that_goes_nowhere_has_no_normalised_integral():
     assert "| still | 0 | - |" in page.text[1]
 
 
+def test_a_flow_of_nan_is_said(caplog):
+    measure_paths(checkpoint(Falling(math.nan)), "broken", 2, 4, 5)
+    assert "broken: s(t) is not finite for 2 of 2 scans" in caplog.text
+
+
 def test_panels_are_named_by_the_end_of_their_path():
     labels = ["/a/b/runs/x/rf1", "/a/b/runs/x/rf2", "/a/b/runs/y/rf1"]
     figure = trajectories_figure([measure_paths(checkpoint(Falling()), label, 1, STEPS, 0) for label in labels])
