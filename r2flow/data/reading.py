@@ -85,53 +85,45 @@ class Projected(NamedTuple):
         return found.reshape(*shape, *values.shape[1:])
 
 
-def read_scan(
-    path: str | Path,
-    sensor: Sensor,
-    projection: Projection = "spherical",
-    convention: Convention = "centre",
-    reflectance: bool = True,
-    reflectance_scale: float | None = 1.0,
-    columns: Sequence[str] | None = None,
-) -> np.ndarray:
-    """One scan file as a range image, (2, H, W); without `reflectance`, (1, H, W). The options are those of `Reading`.
+def read_scan(path: str | Path, sensor: Sensor, **options: Any) -> np.ndarray:
+    """One scan file as a range image, (2, H, W), or (1, H, W) without `reflectance`; the options are `Reading`'s.
 
     Raises:
-        InputError: the file cannot be read, no point of it lies in the sensor's view and range (`NoPointsError`), or it
-            has no reflectance, or one beyond the scale, where it is needed.
+        InputError: as `read_projected`.
     """
-    return read_projected(path, sensor, projection, convention, reflectance, reflectance_scale, columns).image
+    reading = Reading(sensor, **{"reflectance": True, "on_bad_scan": "error", **options})
+    return read_projected(path, reading).image
 
 
-def read_projected(
-    path: str | Path,
-    sensor: Sensor,
-    projection: Projection = "spherical",
-    convention: Convention = "centre",
-    reflectance: bool = True,
-    reflectance_scale: float | None = 1.0,
-    columns: Sequence[str] | None = None,
-) -> Projected:
-    """`read_scan` with the points behind its image.
+def read_projected(path: str | Path, reading: Reading) -> Projected:
+    """A file of points as an image, and the points behind it.
 
     Raises:
-        InputError: as `read_scan`.
+        InputError: the file cannot be read, no point of it lies in the sensor's view and range (`NoPointsError`, unless
+            that is an empty image), or it has no reflectance, or one beyond the scale, where it is needed.
     """
-    points = read_points(path, columns)
+    try:
+        return _projected(path, reading)
+    except NoPointsError:
+        if reading.on_bad_scan != "empty":
+            raise
+    image = np.zeros((1 + bool(reading.reflectance), *reading.sensor.shape), np.float32)
+    return Projected(image, Points(np.zeros((0, 3), np.float32)), *np.zeros((2, 0), np.int64))
+
+
+def _projected(path: str | Path, reading: Reading) -> Projected:
+    points, sensor = read_points(path, reading.columns), reading.sensor
     if points.dropped:
-        log.warning(
-            "%s: dropped %d points with NaN or infinite coordinates, or %g m and more away",
-            path, points.dropped, FARTHEST,
-        )  # fmt: skip
-    if projection == "unfolding":
+        log.warning("%s: dropped %d points, NaN, infinite or beyond %g m", path, points.dropped, FARTHEST)
+    if reading.projection == "unfolding":
         points = points.with_lost_rays()
-    scaled = _scaled_reflectance(path, points, reflectance_scale) if reflectance else None
+    scaled = _scaled_reflectance(path, points, reading.reflectance_scale) if reading.reflectance else None
     with naming(path):
-        pixels, chosen, kept = project_indices(points.xyz, sensor, projection, convention, points.ring)
-    image = image_of(sensor, pixels, kept, None if scaled is None else scaled[chosen])
+        pixels, chosen, r = project_indices(points.xyz, sensor, reading.projection, reading.convention, points.ring)
+    image = image_of(sensor, pixels, r, None if scaled is None else scaled[chosen])
     if not image[0].any():
         raise nothing_in_view(path, points, sensor)
-    return Projected(image if reflectance else image[:1], points, pixels, chosen)
+    return Projected(image[: 1 + bool(reading.reflectance)], points, pixels, chosen)
 
 
 def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPointsError:
@@ -144,7 +136,7 @@ def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPoint
     )
 
 
-def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tuple[np.ndarray, np.ndarray | None]:
+def read_labelled_scan(path: str | Path, reading: Reading) -> tuple[np.ndarray, np.ndarray | None]:
     """The image of `read_scan`, and the semantic id of each pixel's return, (H, W) uint16, 0 where none was kept.
 
     The ids are None where no labels lie beside the scan.
@@ -152,7 +144,7 @@ def read_labelled_scan(path: str | Path, sensor: Sensor, **options: Any) -> tupl
     Raises:
         InputError: what `read_scan` refuses, or labels that are damaged or of another scan.
     """
-    found = read_projected(path, sensor, **options)
+    found = read_projected(path, reading)
     file = labels_beside(path)
     if file is None:
         return found.image, None
@@ -208,11 +200,10 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
         InputError: it cannot be read, has another size, or no reflectance where that is needed; it has no return in the
             sensor's view and `reading.on_bad_scan` is not `empty`.
     """
-    sensor, channels = reading.sensor, 1 + bool(reading.reflectance)
-    image = range_image(path, sensor.shape)
+    channels = 1 + bool(reading.reflectance)
+    image = range_image(path, reading.sensor.shape)
     if image is None:
-        found = _projected(path, reading)
-        return _empty(reading) if found is None else found.image
+        return read_projected(path, reading).image
     if len(image) < channels:
         raise _no_reflectance(path)
     image = image[:channels]
@@ -243,26 +234,9 @@ def read_points_image(path: Path, reading: Reading) -> tuple[np.ndarray, np.ndar
     Raises:
         InputError: as `read_image`.
     """
-    found = _projected(path, reading)
-    if found is None:
-        return _empty(reading), np.zeros((3, *reading.sensor.shape), np.float32)
+    found = read_projected(path, reading)
     xyz = found.spread(found.points.xyz[found.chosen].astype(np.float32))
     return found.image, np.ascontiguousarray(np.moveaxis(xyz, -1, 0))
-
-
-def _projected(path: Path, reading: Reading) -> Projected | None:
-    """A file of points; None for one without a return where that may be."""
-    how = reading.projection, reading.convention, bool(reading.reflectance), reading.reflectance_scale, reading.columns
-    try:
-        return read_projected(path, reading.sensor, *how)
-    except NoPointsError:
-        if reading.on_bad_scan != "empty":
-            raise
-        return None
-
-
-def _empty(reading: Reading) -> np.ndarray:
-    return np.zeros((1 + bool(reading.reflectance), *reading.sensor.shape), np.float32)
 
 
 def lacks_reflectance(

