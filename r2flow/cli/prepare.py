@@ -101,17 +101,15 @@ def _plan_files(
     levels: int | None,
     shard_scans: int,
 ) -> "Plan":
-    from r2flow.data.opening import SOURCES, find_drives, scale_of_folder
-    from r2flow.data.options import FOLDER
+    from r2flow.data.opening import SOURCES, find_drives, usual_scale
     from r2flow.data.prepared import plan_files
     from r2flow.data.reading import Reading
 
-    usual = SOURCES[layout]
-    sensor = build_sized(reading.sensor or usual.sensor, reading.size)
-    scale = scale_of_folder(root, sensor.reflectance_scale) if layout == FOLDER else usual.reflectance_scale
+    sensor = build_sized(reading.sensor or SOURCES[layout].sensor, reading.size)
+    scale = reading.reflectance_scale or usual_scale(f"{layout}:{root}", sensor)
     how = Reading(
         sensor, reading.projection or "spherical", reading.convention or "centre",  # type: ignore[arg-type]
-        reading.reflectance_scale or scale, columns=named_columns(reading.columns),
+        scale, columns=named_columns(reading.columns),
     )  # fmt: skip
     chosen = find_drives(layout, root, split, drives.split(",") if drives else None)
     return plan_files(layout, root, chosen, how, levels, shard_scans)

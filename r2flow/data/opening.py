@@ -285,13 +285,8 @@ def usual_scale(spec: str | Path, sensor: Sensor) -> float:
     """The value in the files of a set of scans that usually means full reflectance: 1 in what r2flow wrote."""
     options = parse(str(spec))[0]
     if options.name == FOLDER:
-        return scale_of_folder(options.folder, sensor.reflectance_scale)
+        return 1.0 if made_here(options.folder) else sensor.reflectance_scale or 1.0
     return SOURCES[options.name].reflectance_scale
-
-
-def scale_of_folder(root: str | Path, of_sensor: float | None) -> float:
-    """The same of a folder of scan files, else the sensor's."""
-    return 1.0 if made_here(root) else of_sensor or 1.0
 
 
 def written_by(folder: Path) -> str | None:

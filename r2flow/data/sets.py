@@ -1,8 +1,8 @@
 """A set of scans as a verb or a report sees it: numbered range images, and what is known of them."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -75,43 +75,41 @@ class ScanSet:
 
     def batches(self, numbers: Sequence[int], batch_size: int, workers: int = 0) -> Iterator[Tensor]:
         """The scans of these numbers in order, each batch (B, 2 or 1, H, W), read by `workers` further processes."""
-        return self._read(_Batches(self.source), numbers, batch_size, workers)
+        return self._read(self.source.batch, numbers, batch_size, workers)
 
     def batches_with_points(
         self, numbers: Sequence[int], batch_size: int, workers: int = 0
     ) -> Iterator[tuple[Tensor, Tensor]]:
         """The same, and with each batch the measured points of its pixels, (B, 3, H, W): `ScanSource.with_points`."""
-        return self._read(_BatchesWithPoints(self.source), numbers, batch_size, workers)
+        return self._read(partial(_with_points, self.source), numbers, batch_size, workers)
 
-    def _read(self, batches: Dataset[Any], numbers: Sequence[int], batch_size: int, workers: int) -> Iterator[Any]:
+    def _read(
+        self, read: Callable[[list[int]], Any], numbers: Sequence[int], batch_size: int, workers: int
+    ) -> Iterator[Any]:
         chunks = [list(numbers[i : i + batch_size]) for i in range(0, len(numbers), batch_size)]
         # Processes cost seconds to start; and what is drawn is drawn where the network is.
         alone = self.source.drawn or len(chunks) < 8
         workers = 0 if alone else workers
         return iter(
-            DataLoader(batches, batch_size=None, sampler=chunks, num_workers=workers, worker_init_fn=end_with_parent)
+            DataLoader(
+                _Batches(read), batch_size=None, sampler=chunks, num_workers=workers, worker_init_fn=end_with_parent
+            )
         )
 
 
-class _Batches(Dataset[Tensor]):
+class _Batches(Dataset[Any]):
     """Batches by the numbers of their scans."""
 
-    def __init__(self, source: ScanSource) -> None:
-        self.source = source
+    def __init__(self, read: Callable[[list[int]], Any]) -> None:
+        self.read = read
 
-    def __getitem__(self, numbers: list[int]) -> Tensor:
-        return self.source.batch(numbers)
+    def __getitem__(self, numbers: list[int]) -> Any:
+        return self.read(numbers)
 
 
-class _BatchesWithPoints(Dataset[tuple[Tensor, Tensor]]):
-    """Batches of images and of their pixels' points."""
-
-    def __init__(self, source: ScanSource) -> None:
-        self.source = source
-
-    def __getitem__(self, numbers: list[int]) -> tuple[Tensor, Tensor]:
-        images, points = zip(*(self.source.with_points(number) for number in numbers), strict=True)
-        return torch.from_numpy(np.stack(images)), torch.from_numpy(np.stack(points))
+def _with_points(source: ScanSource, numbers: list[int]) -> tuple[Tensor, Tensor]:
+    images, points = zip(*(source.with_points(number) for number in numbers), strict=True)
+    return torch.from_numpy(np.stack(images)), torch.from_numpy(np.stack(points))
 
 
 def fixed_choice(count: int, most: int) -> list[int]:
