@@ -93,6 +93,7 @@ def read_text(path: Path, columns: object = None) -> Table:
     def words(line: str) -> list[str]:
         return [re.sub(r"\s*[\[(].*", "", word.strip(' "')) for word in line.lstrip("#/ ").split(apart)]
 
+    names: list[str] | None
     if not any(map(_is_number, words(rows[0]))):
         names, rows = words(rows[0]), rows[1:]
         check(bool(rows), "it holds no line of numbers.")
