@@ -29,12 +29,14 @@ PAIRS = {"cpu": 1024, "cuda": 131072}  # compared together: on a CPU what is mad
 
 def described(scans: ScanSet, work: Work, device: str, doing: str) -> Iterator[Tensor]:
     """Log-range averaged over cells, (B, h, w), batch by batch; NaN for a scan without a return."""
-    size = [min(most, size) for most, size in zip(CELLS, scans.sensor.shape, strict=True)]
+    rows, columns = scans.sensor.shape
     encoding = Encoding(scans.sensor, reflectance=False)
     with torch.no_grad(), work.bar(doing, len(scans)) as advance:
         for images in scans.batches(range(len(scans)), work.batch_size, work.workers):
             seen = Scans(images.to(device), scans.sensor)
-            mean = adaptive_avg_pool2d(encoding.encode(seen.images[:, :1]), size)[:, 0]
+            mean = adaptive_avg_pool2d(
+                encoding.encode(seen.images[:, :1]), (min(CELLS[0], rows), min(CELLS[1], columns))
+            )[:, 0]
             yield torch.where(seen.returned.flatten(1).any(1)[:, None, None], mean, torch.nan)
             advance(len(images))
 
