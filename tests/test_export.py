@@ -97,7 +97,7 @@ def test_a_sampler_that_draws_noise_on_the_way_is_refused():
 
 
 def snippets() -> list[str]:
-    return re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "export.md").read_text(), flags=re.DOTALL)
+    return re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "sample.md").read_text(), flags=re.DOTALL)
 
 
 def test_the_noise_of_the_page_is_that_of_a_scan():
