@@ -24,7 +24,6 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from r2flow.callbacks import build_callbacks, build_loggers, log_config, log_figures
 from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override, key_of
-from r2flow.data.contents import check_contents, record_contents
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import SOURCES, Layout, Prepared, resolve_reflectance, whole
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, SourceOptions
@@ -337,8 +336,6 @@ def _fit_in_folder(run: Run) -> int:
             further = as_override("stage.init", run.folder)
             print(f"finished before, at step {step_of(last)}; to learn more: {further} name=OTHER")
         return step_of(last)  # nothing is left to do, nor pairs to make
-    if run.trainer.is_global_zero and run.data.files:
-        (record_contents if last is None else check_contents)(run.folder, run.data.files)
     if last is not None:
         log.info("going on from %s", last)
     if run.trainer.is_global_zero:

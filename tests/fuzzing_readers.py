@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from r2flow.data.contents import check_contents
 from r2flow.data.opening import open_prepared, own_reading
+from r2flow.data.pairs import PairRecipe, PairStore
 from r2flow.data.prepared import check_prepared
 from r2flow.data.reading import Reading, read_image
-from r2flow.data.shards import PairRecipe, PairStore
 from r2flow.errors import InputError
 from r2flow.lidar.labels import read_labels
 from r2flow.lidar.scan_files import read_points
@@ -80,17 +79,12 @@ def config(path: Path) -> None:
     read_config(in_folder("run")(path))
 
 
-def contents(path: Path) -> None:
-    folder = in_folder("run")(path)
-    check_contents(folder, {"scan.bin": folder.parent / "scan.bin"})
-
-
 def weights(path: Path) -> None:
     read_published(path)
 
 
 READERS: dict[str, Callable[[Path], object]] = {
     "points": points, "image": image, "labels": labels, "prepared": prepared, "pairs": pairs, "checkpoint": checkpoint,
-    "samples": samples, "config": config, "contents": contents, "weights": weights,
+    "samples": samples, "config": config, "weights": weights,
     "sensor": read_sensor,
 }  # fmt: skip

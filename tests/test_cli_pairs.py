@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from r2flow.data.options import PairOptions
-from r2flow.data.pairs import PairSource
-from r2flow.data.shards import PairStore
+from r2flow.data.pairs import PairSource, PairStore
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
 from r2flow.reports.pairs import place
 from r2flow.runs.lineage import pairs_of

@@ -15,10 +15,9 @@ import pytest
 import torch
 import yaml
 
-from r2flow.data.contents import RECORD, record_contents
 from r2flow.data.opening import samples_note, write_samples_note
+from r2flow.data.pairs import Block, PairRecipe, PairStore
 from r2flow.data.reading import Reading
-from r2flow.data.shards import Block, PairRecipe, PairStore
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensor_files import write_sensor
 from r2flow.lidar.sensors import SENSORS
@@ -99,9 +98,7 @@ def write_stores(folder: Path, beside: Path) -> None:
     keep(folder, "samples", beside / "samples" / "scans.json")
     (beside / "run").mkdir()
     (beside / "run" / "config.yaml").write_text(yaml.safe_dump(CONFIG))
-    record_contents(beside / "run", {"scan.bin": beside / "scan.bin"})
     keep(folder, "config", beside / "run" / "config.yaml")
-    keep(folder, "contents", beside / "run" / RECORD)
     write_sensor(replace(SENSORS["vlp16"], name="mine"), beside / "mine.yaml", "of a test")
     keep(folder, "sensor", beside / "mine.yaml")
 

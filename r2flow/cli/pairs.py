@@ -74,8 +74,7 @@ def pairs(
     --sampler dopri5 is the paper's; chord or renoise gives a flow map's first jump as its later ones correct it.
     """
     from r2flow.data.options import PairOptions
-    from r2flow.data.pairs import default_folder
-    from r2flow.data.shards import PairStore
+    from r2flow.data.pairs import PairStore, default_folder
     from r2flow.model.checkpoint import load_checkpoint, weights_hash
     from r2flow.reports.pairs import make_and_tell
     from r2flow.runs.lineage import check_finished, pairs_of

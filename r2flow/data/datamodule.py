@@ -5,7 +5,6 @@ import logging
 import math
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -19,9 +18,8 @@ from r2flow.data.loader import FlowDataset, Further, Item, Order, Permutations, 
 from r2flow.data.mixture import MixedOrder, Mixture
 from r2flow.data.opening import held_out_options, open_source, split_parts, whole
 from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
-from r2flow.data.pairs import PairDataset, PairSource
+from r2flow.data.pairs import PairDataset, PairSource, PairStore
 from r2flow.data.reading import Reading
-from r2flow.data.shards import PairStore
 from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
@@ -65,7 +63,6 @@ class ScanDataModule(L.LightningDataModule):
         self.validation = self.options.held
         self.further: Further | None = None
         self.names: list[str] = []
-        self.files: dict[str, str | Path] = {}  # that scans are read from; see `r2flow.data.contents`
         self.training_source: ScanSource | PairSource | None = None
         self.validation_source: ScanSource | PairSource | None = None
         self.pairs = self._pair_options() if self.options.name == PAIRS else None
@@ -95,7 +92,7 @@ class ScanDataModule(L.LightningDataModule):
             _ = self.pair_store  # other pairs in its folder are refused now; missing ones are made later
             if self.options.beside is not None:
                 source = self._open(whole(self.options.beside, self.sensor.reflectance_scale))
-                self.names, self.files = list(source.names), dict(source.files())
+                self.names = list(source.names)
                 self.scans = self._kept(source, "scans beside the pairs")
             return
         training, held = self.sources()
@@ -111,10 +108,7 @@ class ScanDataModule(L.LightningDataModule):
         whole = [self._open(options) for options in self.parts]
         # What goes before the names of each part's scans tells them apart.
         labels = [f"{number}: " if len(whole) > 1 else "" for number in range(len(whole))]
-        self.names, self.files = [], {}
-        for label, source in zip(labels, whole, strict=True):
-            self.names += [f"{label}{name}" for name in source.names]
-            self.files |= {f"{label}{name}": file for name, file in source.files().items()}
+        self.names = [f"{label}{name}" for label, source in zip(labels, whole, strict=True) for name in source.names]
         other = held_out_options(self.options, self.sensor.reflectance_scale)
         if not other:
             training, held = [], []
@@ -135,7 +129,6 @@ class ScanDataModule(L.LightningDataModule):
                     "data.validation.data holds %d scans that are trained on, as %s: give it its own split or drives",
                     len(shared), min(shared),
                 )  # fmt: skip
-            self.files |= {f"held out: {name}": file for name, file in held[0].files().items()}
         validation = _joined(held)
         return _joined(training), validation.subset(spread(len(validation), self.validation.scans))
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, Self
 
-from r2flow.data.shards import PairRecipe
+from r2flow.data.pairs import PairRecipe
 from r2flow.errors import InputError
 from r2flow.generators.base import Precision
 from r2flow.lidar.projection import Convention, Projection

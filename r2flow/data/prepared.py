@@ -331,9 +331,6 @@ class PreparedScans(ScanSource):
                 digest.update(file.read(int.from_bytes(file.read(8), "little")))
         return digest.hexdigest()
 
-    def files(self) -> dict[str, str | Path]:
-        return {path.name: path for shard in np.unique(self.rows[:, 1]) for path in self.store.files(int(shard))}
-
     def places(self) -> set[str]:
         real = os.path.realpath(self.folder)
         return {os.path.join(real, name) for name in self.names} | super().places()

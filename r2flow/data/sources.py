@@ -107,10 +107,6 @@ class ScanSource(ABC):
             for number in some
         }
 
-    def files(self) -> dict[str, str | Path]:
-        """The files that decide what the images are, by names that do not depend on where they lie."""
-        return {}
-
 
 def made_here(root: str | Path) -> bool:
     """Whether a folder, or one in it, holds samples or simulated scans of r2flow, or the folder of a file does."""
@@ -190,9 +186,6 @@ class ScanFiles(ScanSource):
 
     def subset(self, indices: Sequence[int]) -> "ScanFiles":
         return ScanFiles([self.paths[i] for i in indices], self.reading, self.root, about=self.described)
-
-    def files(self) -> dict[str, str | Path]:
-        return dict(zip(self.names, self.paths, strict=True))
 
     def about(self) -> dict[str, Any]:
         return {**self.described, "files": self._digest[:12], "reflectance": bool(self.reading.reflectance)}

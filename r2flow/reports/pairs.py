@@ -5,8 +5,7 @@ from collections.abc import Mapping
 
 import torch
 
-from r2flow.data.pairs import Made, make_pairs
-from r2flow.data.shards import PairStore
+from r2flow.data.pairs import Made, PairStore, make_pairs
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.progress import Bar
 

@@ -23,10 +23,9 @@ from r2flow.data.opening import (
     write_samples_note,
 )
 from r2flow.data.options import PairOptions, SourceOptions
-from r2flow.data.pairs import PairSource, make_pairs, pair_noise
+from r2flow.data.pairs import PairSource, PairStore, make_pairs, pair_noise
 from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet
-from r2flow.data.shards import PairStore
 from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
 from r2flow.generators import Field

@@ -17,11 +17,11 @@ from r2flow.data.options import PairOptions
 from r2flow.data.pairs import (
     PairDataset,
     PairSource,
+    PairStore,
     default_folder,
     make_pairs,
     pair_noise,
 )
-from r2flow.data.shards import PairStore
 from r2flow.errors import InputError
 from r2flow.generators import Field
 from r2flow.noise import standard_normal
