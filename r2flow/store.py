@@ -16,7 +16,7 @@ import logging
 import multiprocessing
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
@@ -78,11 +78,10 @@ class Store:
                     f"{self.option}."
                 )
             return True
-        scan = next((path for path in self.folder.rglob("*") if path.name.endswith(FIRM_ENDINGS)), None)
+        scan = next((path for path in self.folder.glob("*") if path.name.endswith(FIRM_ENDINGS)), None)
         if scan is not None:
             raise InputError(
-                f"{self.folder} holds scans ({scan.relative_to(self.folder)}) and no {MANIFEST}: give another folder "
-                f"by {self.option}."
+                f"{self.folder} holds scans ({scan.name}) and no {MANIFEST}: give another folder by {self.option}."
             )
         return False
 
@@ -94,9 +93,7 @@ class Store:
         """
         try:
             if not self.check():
-                content = {"format": f"r2flow {self.kind}", "recipe": self.described, **notes}
-                with atomic_write(self.folder / MANIFEST, "w") as file:
-                    json.dump({**content, "checksum": checksum(content)}, file, indent=1)
+                self.write_manifest(**notes)
                 self.check()  # another process may have taken the folder in between
             for left in (*self.folder.glob(".*.part"), *self.folder.glob(".*.lock")):  # of killed writers
                 with suppress(FileNotFoundError):
@@ -104,6 +101,11 @@ class Store:
                         left.unlink()
         except PermissionError:
             raise InputError(f"{self.folder} cannot be written to; give another by {self.option}.") from None
+
+    def write_manifest(self, **notes: Any) -> None:
+        content = {"format": f"r2flow {self.kind}", "recipe": self.described, **notes}
+        with atomic_write(self.folder / MANIFEST, "w") as file:
+            json.dump({**content, "checksum": checksum(content)}, file, indent=1)
 
     def has(self, item: int) -> bool:
         """Whether an item is there; of its file only the head is read."""
@@ -255,6 +257,20 @@ class Store:
             if mine and not self.has(item):
                 work(item)
             return mine
+
+
+class FileStore(Store):
+    """A store whose items are files of other formats, `000003.ENDING`: an item is there when all its files are."""
+
+    def __init__(self, folder: str | Path, kind: str, recipe: Mapping[str, Any], endings: Sequence[str]) -> None:
+        super().__init__(folder, kind, recipe)
+        self.endings = endings
+
+    def files(self, item: int) -> list[Path]:
+        return [self.folder / f"{item:06d}.{ending}" for ending in self.endings]
+
+    def has(self, item: int) -> bool:
+        return all(file.is_file() for file in self.files(item))
 
 
 _job: tuple[Store, Callable[[int], None]]  # of a worker process

@@ -250,7 +250,7 @@ def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_b
     code, _, error = r2flow("sample", "-c", published, *drawn, "--format", "npy,ply")
     assert code == 0
     assert error.count("points are written along rays through their middles") == 1
-    assert json.loads((out / "scans.json").read_text())["rays"] == "centre"
+    assert json.loads((out / "manifest.json").read_text())["recipe"]["rays"] == "centre"
     h, w, image = 16, 192, np.load(out / "000000.npy")
     xyz = read_points(out / "000000.ply").xyz
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])

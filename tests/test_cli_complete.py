@@ -17,6 +17,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.transfer import image_through
 from r2flow.noise import generator
 from r2flow.stages.checkpointing import AtomicCheckpointIO
+from r2flow.store import Store
 from tests.data.conftest import prepare_folder
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_completion import network, scans
@@ -130,7 +131,7 @@ def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(r2flow,
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.npy")} == first
     code, _, error = r2flow(*asked[:-1], tmp_path / "out", "--num", 3)
     assert code == 2
-    assert "num 1, not 3" in error
+    assert "num is 1 there, 3 here" in error
     kept = parse_mask("points:0.3")((8, 64), generator(3, "condition", 1))
     image, answer = np.load(tmp_path / "in" / "two.npy"), np.load(tmp_path / "out" / "two.npy")
     assert np.array_equal(image[:, kept], answer[:, kept])
@@ -185,7 +186,7 @@ def test_a_diffusion_completes_by_its_own_repaint(r2flow, tmp_path):  # noqa: F8
     code, _, error = r2flow(*asked, "--sampler", "repaint", "--steps", 2)
     assert (code, error) == (0, "")
     assert np.array_equal(np.load(tmp_path / "out" / "one.npy")[:, ::2], image[:, ::2])
-    note = json.loads((tmp_path / "out" / "scans.json").read_text())["completion"]["sampler"]
+    note = json.loads((tmp_path / "out" / "manifest.json").read_text())["recipe"]["sampler"]
     assert (note["name"], note["steps"], note["repeats"]) == ("repaint", 2, 16)
 
 
@@ -278,7 +279,7 @@ def test_a_file_of_an_answer_s_name_is_no_answer(r2flow, run, tmp_path):  # noqa
     (tmp_path / "out" / "one.npy").write_text("mine")
     code, _, error = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out")
     assert code == 2
-    assert "one.npy is no answer" in error
+    assert "one.npy" in error
     assert (tmp_path / "out" / "one.npy").read_text() == "mine"
 
 
@@ -286,7 +287,7 @@ def test_answers_of_another_sampler_are_told_apart_by_its_setting(r2flow, run, t
     full_scan(tmp_path / "one.npy")
     asked = [*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out", "--steps"]
     assert r2flow(*asked, 1)[0] == 0
-    assert "answers with sampler" in r2flow(*asked, 2)[2]
+    assert "answers: sampler" in r2flow(*asked, 2)[2]
 
 
 @pytest.mark.parametrize("ending", [".npy", ".bin"])
@@ -358,20 +359,19 @@ def test_answers_by_another_mask_file_or_scale_are_none(r2flow, run, tmp_path): 
     asked = *COMPLETE, tmp_path / "one.bin", "-c", run, "--mask", tmp_path / "mask.npy", "--out", tmp_path / "out"
     assert r2flow(*asked)[0] == 0
     assert "1 were there already" in r2flow(*asked)[1]
-    assert "reflectance_scale None, not 2.0" in r2flow(*asked, "--reflectance-scale", 2)[2]
+    assert "reflectance_scale is None there, 2.0 here" in r2flow(*asked, "--reflectance-scale", 2)[2]
     np.save(tmp_path / "mask.npy", ~mask)
     code, _, error = r2flow(*asked)
     assert code == 2
-    assert "answers with mask" in error
+    assert "mask is" in error
 
 
 def test_a_folder_of_other_samples_is_not_written_into(r2flow, run, tmp_path):  # noqa: F811
     full_scan(tmp_path / "one.npy")
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "scans.json").write_text(json.dumps({"seed": 0}))
+    Store(tmp_path / "out", "samples", {"seed": 0}).begin()
     code, _, error = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out")
     assert code == 2
-    assert "holds other scans than completed ones" in error
+    assert "holds samples, not answers" in error
 
 
 @pytest.mark.slow

@@ -330,7 +330,7 @@ def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path
 def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):  # noqa: F811
     run = saved[0].parent.parent
     assert r2flow("sample", run, "--num", 2, "--steps", 2, "-o", run / "samples", "--pictures", 0)[0] == 0
-    note = json.loads((run / "samples" / "scans.json").read_text())
+    note = json.loads((run / "samples" / "manifest.json").read_text())["recipe"]
     assert note["reading"]["projection"] == "spherical"
     sensor = note["reading"]["sensor"]
     assert (len(sensor["elevations"]), sensor["columns"]) == (8, 64)
@@ -341,7 +341,7 @@ def test_a_run_s_samples_need_no_size(r2flow, saved, real, tmp_path):  # noqa: F
     for wrong in (("--size", "16x64"), ("--sensor", "vlp16", "--size", "8x64")):
         code, _, said = r2flow("evaluate", real, run / "samples", *quick, *wrong)
         assert code == 2
-        assert "holds images of hdl64e 8x64 (its scans.json says so)" in said
+        assert "holds images of hdl64e 8x64 (its manifest.json says so)" in said
         assert len(said.splitlines()) == 1
     assert r2flow("show", run, "--out", tmp_path / "views")[0] == 0
     assert sorted(path.name for path in (tmp_path / "views").iterdir()) == ["000000.png", "000001.png"]

@@ -15,13 +15,13 @@ import pytest
 import torch
 import yaml
 
-from r2flow.data.opening import samples_note, write_samples_note
 from r2flow.data.pairs import Block, PairRecipe, PairStore
 from r2flow.data.reading import Reading
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensor_files import write_sensor
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
+from r2flow.store import Store
 from tests.data.conftest import prepare_folder
 from tests.lidar.test_scan_files_damage import PCD_OF_4, TEXT, compressed, ply_ascii
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
@@ -94,8 +94,8 @@ def write_stores(folder: Path, beside: Path) -> None:
     DRAW.integers(0, 100, 64).astype("<u4").tofile(folder / "labels" / "scan.label")
     (folder / "image").mkdir()
     np.save(folder / "image" / "image.npy", DRAW.uniform(2, 70, (2, 8, 64)).astype(np.float32))
-    write_samples_note(beside / "samples", samples_note(Reading(SENSOR), seed=0))
-    keep(folder, "samples", beside / "samples" / "scans.json")
+    Store(beside / "samples", "samples", {"reading": Reading(SENSOR).described()}).begin()
+    keep(folder, "samples", beside / "samples" / "manifest.json")
     (beside / "run").mkdir()
     (beside / "run" / "config.yaml").write_text(yaml.safe_dump(CONFIG))
     keep(folder, "config", beside / "run" / "config.yaml")

@@ -174,7 +174,7 @@ def reading_in(data, root: str | None = None, of_sensor: float | None = 0.012):
 def test_full_reflectance_is_what_was_given_else_the_sensors_and_one_in_what_r2flow_wrote(
     tmp_path: Path, name, root, given, expected
 ):
-    for folder, note in (("drawn", "scans.json"), ("simulated", "manifest.json"), ("scans", "other.json")):
+    for folder, note in (("drawn", "manifest.json"), ("simulated", "manifest.json"), ("scans", "other.json")):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / note).touch()
     data = {"name": name, "reading": {"reflectance_scale": given}}

@@ -7,7 +7,6 @@
 `SOURCES.add("mine", Layout(find_mine))` for scan files that `find_mine(root)` finds, or a `SourceKind` of your own.
 """
 
-import json
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -32,13 +31,12 @@ from r2flow.data.options import (
 from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_images
 from r2flow.data.reading import AUTO, Reading, lacks_reflectance, range_image
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import SAMPLES, ScanFiles, ScanSource, SimulatedScans, made_here, warn_of_other_sensor
+from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, made_here, warn_of_other_sensor
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, read_json
 from r2flow.lidar.sensor_files import ENDINGS, read_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.registry import Registry, check_options, did_you_mean
-from r2flow.store import read_manifest
+from r2flow.store import MANIFEST, read_manifest
 
 log = logging.getLogger(__name__)
 
@@ -148,7 +146,7 @@ def parse(text: str) -> tuple[SourceOptions, Path | None]:
         raise InputError(
             f"{path} does not exist. Give a scan file, a folder of scans, NAME:FOLDER, simulated:SEED or a run."
         )
-    if written_by(path) == "r2flow scans":
+    if _manifest(path).get("format") == "r2flow scans":
         return SourceOptions(PREPARED, str(path)), None
     return SourceOptions(FOLDER, str(samples_of(path) or path)), None
 
@@ -163,22 +161,11 @@ def find_drives(
 # What scans say of themselves
 
 
-def samples_note(reading: Reading, **about: Any) -> dict[str, Any]:
-    """What a folder of samples says of their images, as plain values: `open_scans` then needs no sensor and no size."""
-    note: dict[str, Any] = json.loads(json.dumps({"format": "r2flow samples", "reading": reading.described(), **about}))
-    return note
-
-
-def write_samples_note(folder: Path, note: Mapping[str, Any]) -> None:
-    with atomic_write(folder / SAMPLES, "w") as file:
-        json.dump(note, file, indent=1)
-
-
 def samples_of(run: Path) -> Path | None:
     """The samples of a run folder: its `samples`, else its only folder of samples; None where it is no run folder."""
     if not (run / "config.yaml").is_file() and not (run / "checkpoints").is_dir():
         return None
-    noted = {note.parent for note in run.glob(f"*/{SAMPLES}")}
+    noted = {note.parent for note in run.glob(f"*/{MANIFEST}") if drawn_recipe(note.parent) is not None}
     found = sorted(noted | {run / "samples"} if (run / "samples").is_dir() else noted)
     if not found:
         raise InputError(f"{run} is a run without samples; draw some: r2flow sample {run} --out {run / 'samples'}.")
@@ -275,10 +262,8 @@ def own_reading(spec: str | Path) -> Reading | None:
         return replace(there, reflectance=AUTO, within_limits=False)
     if options.name != FOLDER:
         return None
-    folder = Path(options.folder)
-    if written_by(folder) == "r2flow simulated":
-        return Reading.of(read_manifest(folder)["recipe"]["reading"])
-    return _noted(folder)
+    reading = _manifest(Path(options.folder)).get("recipe", {}).get("reading")
+    return None if reading is None else Reading.of(reading)
 
 
 def usual_scale(spec: str | Path, sensor: Sensor) -> float:
@@ -289,33 +274,31 @@ def usual_scale(spec: str | Path, sensor: Sensor) -> float:
     return SOURCES[options.name].reflectance_scale
 
 
-def written_by(folder: Path) -> str | None:
-    """The format of a folder that r2flow wrote, by its manifest; None where there is no manifest."""
+def _manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a folder that r2flow wrote, empty where there is none."""
     try:
-        found: str = read_manifest(folder)["format"]
+        return read_manifest(folder)
     except (FileNotFoundError, NotADirectoryError):
-        return None
-    return found
+        return {}
 
 
-def _noted(folder: Path) -> Reading | None:
-    path = folder / SAMPLES
-    if not path.is_file():
-        return None
-    try:
-        return Reading.of(read_json(path)["reading"])
-    except (ValueError, KeyError, TypeError, AttributeError):
-        raise InputError(f"{path} is damaged; delete it and give --sensor and --size.") from None
+def drawn_recipe(folder: Path) -> dict[str, Any] | None:
+    """The recipe of a folder of samples or of completed scans; None of another folder."""
+    manifest = _manifest(folder)
+    return manifest["recipe"] if manifest.get("format") in ("r2flow samples", "r2flow answers") else None
 
 
 def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
     """Refuse a folder whose note says that its images are of another sensor or size."""
-    own = _noted(folder)
-    if own is None or (own.sensor.shape == sensor.shape and np.allclose(own.sensor.elevations, sensor.elevations)):
+    recipe = drawn_recipe(folder)
+    if recipe is None:
+        return
+    own = Reading.of(recipe["reading"])
+    if own.sensor.shape == sensor.shape and np.allclose(own.sensor.elevations, sensor.elevations):
         return
     there, here = (f"{one.name} {one.shape[0]}x{one.shape[1]}" for one in (own.sensor, sensor))
     raise InputError(
-        f"{folder} holds images of {there} (its {SAMPLES} says so), not of {here}: give no other --sensor or --size, "
+        f"{folder} holds images of {there} (its {MANIFEST} says so), not of {here}: give no other --sensor or --size, "
         "no scans of another one beside them, and for a model of another one point clouds (.ply, .bin)."
     )
 
@@ -329,10 +312,9 @@ def refuse_parts(spec: str | Path) -> None:
     options, _ = parse(str(spec))
     if options.name != FOLDER:
         return
-    folder = Path(options.folder)
-    if _noted(folder) is not None and read_json(folder / SAMPLES).get("region"):
+    if (drawn_recipe(Path(options.folder)) or {}).get("region"):
         raise InputError(
-            f"{spec} holds a part of each scan alone (its {SAMPLES} says so) and cannot be judged beside whole scans: "
+            f"{spec} holds a part of each scan alone (its {MANIFEST} says so) and cannot be judged beside whole scans: "
             "sample without --sector and --rows."
         )
 

@@ -33,7 +33,6 @@ log = logging.getLogger(__name__)
 
 Read = TypeVar("Read")
 
-SAMPLES = "scans.json"  # what a folder of samples says of itself
 LOOKED_AT = 3  # scans of a set, whose beams are compared with the sensor's
 
 
@@ -117,7 +116,7 @@ def made_here(root: str | Path) -> bool:
         return False
     with os.scandir(folder) as entries:  # which knows a folder without asking the disk about each file
         places = [folder, *(Path(entry.path) for entry in entries if entry.is_dir())]
-    return any((place / note).is_file() for place in places for note in (SAMPLES, MANIFEST))
+    return any((place / MANIFEST).is_file() for place in places)
 
 
 def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: str | Path) -> None:

@@ -1,6 +1,5 @@
 """Completed scans as files and pictures."""
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,10 +10,9 @@ import numpy as np
 import torch
 
 from r2flow import noise
-from r2flow.data.opening import SAMPLES, write_samples_note
 from r2flow.data.partial import PartialScan
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, read_json
+from r2flow.files import atomic_write
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.known import Mask, Ray
@@ -23,11 +21,12 @@ from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.transfer import Partial
 from r2flow.metrics.completion import errors
-from r2flow.model.checkpoint import Checkpoint, weights_hash
+from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import Completed, complete
-from r2flow.reports.outputs import ScanBar, note_of, warn_unsolved
+from r2flow.reports.outputs import ScanBar, recipe_of, warn_unsolved
 from r2flow.reports.pictures import completed_figure, save_figure
 from r2flow.reports.view import write_page
+from r2flow.store import Store, read_manifest
 
 WRITTEN = (".bin", ".pcd", ".ply", ".npy")  # formats that answers are written in; others become .ply
 SHOWN = 4  # answers on a page
@@ -82,11 +81,11 @@ def write_completed(
         if scan.path and (out / scan.name).resolve().parent == scan.path.resolve().parent:
             raise InputError(f"{out} is the folder of the scans; give another --out.")
     settings = {
-        "num": job.num, "seed": job.seed, "surfaces": job.on_surfaces, "fill_gaps": job.fill_gaps,
-        "weights": weights_hash(checkpoint), **about, "sampler": sampler.asdict(), "precision": job.precision,
+        "num": job.num, "surfaces": job.on_surfaces, "fill_gaps": job.fill_gaps,
+        **about, "precision": job.precision,
     }  # fmt: skip
-    inputs = {scan.name: scan.identity() for scan in scans}
-    settings["inputs"] = _check_folder(out, settings, inputs, files) | inputs
+    store = Store(out, "answers", recipe_of(checkpoint, job.seed, {"completion": settings}, **sampler.asdict()))
+    inputs = _inputs(store, {scan.name: scan.identity() for scan in scans}, files)
     left = [number for number, scan in enumerate(scans) if not all(path.is_file() for path in files[scan.name])]
     done: dict[str, dict[str, float] | None] = {}
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
@@ -104,7 +103,7 @@ def write_completed(
                 on_surfaces=job.on_surfaces, precision=job.precision, progress=bar.evaluated,
             )  # fmt: skip
             if not done:  # the first answer shows that the settings can be used
-                write_samples_note(out, note_of(checkpoint, job.seed, {"completion": settings}, **sampler.asdict()))
+                store.write_manifest(inputs=inputs)
             warn_unsolved(completed.converged)
             if number < job.pictures:
                 _draw(checkpoint, scan, out, given, completed, whole if job.mask else None)
@@ -156,30 +155,17 @@ def answer_files(checkpoint: Checkpoint, scan: PartialScan, out: Path, num: int)
     return [out / f"{scan.name}{number}{ending}" for number in numbers]
 
 
-def _check_folder(
-    out: Path, settings: Mapping[str, Any], inputs: Mapping[str, str], files: Mapping[str, Sequence[Path]]
-) -> dict[str, str]:
-    """Refuse a folder with other files, or with answers by other settings or to other scans.
+def _inputs(store: Store, inputs: Mapping[str, str], files: Mapping[str, Sequence[Path]]) -> dict[str, str]:
+    """Identities of the scans that a folder's answers belong to, by name, with those of `inputs`.
 
-    Returns:
-        Identities of the scans that were completed in the folder, by name.
+    Raises:
+        InputError: the folder holds answers by other settings, or to another scan of the same name.
     """
-    present = {name: path for name, paths in files.items() for path in paths if path.exists()}
-    if not (out / SAMPLES).exists():  # it is written before the first answer
-        if present:
-            raise InputError(f"{next(iter(present.values()))} is no answer of this command; give another --out.")
-        return {}
-    note = read_json(out / SAMPLES).get("completion")
-    if note is None:
-        raise InputError(f"{out} holds other scans than completed ones; give another --out.")
-    for key, value in json.loads(json.dumps(settings)).items():
-        if note.get(key) != value:
-            raise InputError(f"{out} holds answers with {key} {note.get(key)}, not {value}; give another --out.")
-    before: dict[str, str] = note["inputs"]
-    for name in present:
-        if before.get(name, inputs[name]) != inputs[name]:
-            raise InputError(f"{out} holds answers to another scan of the name {name}; give another --out.")
-    return before
+    before: dict[str, str] = read_manifest(store.folder, store.kind)["inputs"] if store.check() else {}
+    for name, paths in files.items():
+        if before.get(name, inputs[name]) != inputs[name] and any(path.exists() for path in paths):
+            raise InputError(f"{store.folder} holds answers to another scan of the name {name}; give another --out.")
+    return {**before, **inputs}
 
 
 def _write(

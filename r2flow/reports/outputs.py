@@ -13,24 +13,24 @@ import torch
 from torch import Tensor
 
 from r2flow.config import as_override
-from r2flow.data.opening import SAMPLES, reading_for, samples_note, write_samples_note
+from r2flow.data.opening import reading_for
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, read_json
+from r2flow.files import atomic_write
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.region import Region
-from r2flow.lidar.scan_files import FIRM_ENDINGS, write_points
+from r2flow.lidar.scan_files import write_points
 from r2flow.model.checkpoint import Checkpoint, weights_hash
 from r2flow.model.sampling import batches, draw
 from r2flow.progress import Bar, track
 from r2flow.reports.view import most_images, write_page
+from r2flow.store import MANIFEST, FileStore, read_manifest
 
 log = logging.getLogger(__name__)
 
 FORMATS = ("ply", "bin", "npy")
 OWN = re.compile(r"\d{6}(\.reflectance)?\.(ply|bin|npy|png)|samples\.(png|html)")  # what samples are written to
-UNSOLVED = "unsolved"  # in the note: numbers of the samples that are none
 
 
 def formats_of(checkpoint: Checkpoint, channels: str = "both") -> list[str]:
@@ -64,14 +64,14 @@ def write_samples(
             float32 (2 or 1, H, W) in metres and reflectance; reflectance alone is `NNNNNN.reflectance.npy`.
         pictures: How many scans get a page of their own; the contact sheet shows at most 8 of them.
         region, channels: See `r2flow.model.sampling.sample`. Files are of the sensor's shape, 0 outside the region.
-        replace: Whether more samples of other settings than `num` are replaced.
+        replace: Whether samples of other settings in the folder are removed first.
 
     Returns:
         The images drawn as pictures.
 
     Raises:
-        InputError: an unknown format, one that cannot hold what is asked for, nothing to draw, or a folder with scans
-            that are none of these samples.
+        InputError: an unknown format, one that cannot hold what is asked for, nothing to draw, or a folder that holds
+            other scans.
     """
     if num < 1 or batch_size < 1:
         raise InputError(f"needs at least one scan and a batch of at least one; found {num} and {batch_size}.")
@@ -85,11 +85,9 @@ def write_samples(
     part: dict[str, Any] = {} if region is None else {"region": asdict(region)}
     part |= {} if channels == "both" else {"channels": channels}
     part |= {} if precision == "32-true" else {"precision": precision}
-    about = note_of(checkpoint, seed, part, **sampler.asdict())
-    former = _former(out, about, num, replace)
-    ending = "reflectance.npy" if channels == "reflectance" else ""
-    if former and former.get(UNSOLVED):
-        _warn_lost(former[UNSOLVED])
+    endings = ["reflectance.npy"] if channels == "reflectance" else formats
+    store = FileStore(out, "samples", recipe_of(checkpoint, seed, part, **sampler.asdict()), endings)
+    _check_folder(store, replace)
     if {"ply", "bin"} & set(formats) and not torch.equal(generator.space.rays, rays):
         log.warning(
             "the model was told rays through the corners of the bins (rays=reference); points are written along rays "
@@ -99,22 +97,15 @@ def write_samples(
     with ScanBar("sampling", num, batches(num, batch_size) * (sampler.evaluations(generator) or 0)) as bar:
         for first in range(0, num, batch_size):
             numbers = range(first, min(first + batch_size, num))
-            files = [out / f"{number:06d}.{ending or one}" for number in numbers for one in formats]
-            if former and first >= pictures and all(file.is_file() for file in files):
+            if first >= pictures and not store.missing(numbers):
                 bar.finished(numbers.stop)
                 continue
             drawn = draw(
                 generator, numbers, seed, sampler, region=region, channels=channels, precision=precision,
                 progress=bar.evaluated,
             )  # fmt: skip
-            lost = warn_unsolved(drawn.converged, drawn.first)
-            if former is None and (out / SAMPLES).is_file():
-                for file in out.glob("*"):
-                    if OWN.fullmatch(file.name):
-                        file.unlink()
-            if former is None or lost:
-                former = {**about, UNSOLVED: sorted({*(former or {}).get(UNSOLVED, []), *lost})}
-                write_samples_note(out, former)
+            warn_unsolved(drawn.converged, drawn.first)
+            store.begin()  # the first scan shows that the settings can be used
             for number, image in enumerate(drawn.images.numpy(), drawn.first):
                 if channels == "reflectance":
                     _save(image, out / f"{number:06d}.reflectance.npy")
@@ -135,60 +126,40 @@ def write_samples(
     return shown
 
 
-def warn_unsolved(converged: Tensor, first: int = 0) -> list[int]:
-    """Warn of the scans that are none of the flow, and return their numbers."""
-    lost = [first + offset for offset, solved in enumerate(converged.tolist()) if not solved]
+def warn_unsolved(converged: Tensor, first: int = 0) -> None:
+    """Warn of the scans that the sampler has not solved; `first` is the number of the first one."""
+    lost = [str(first + offset) for offset, solved in enumerate(converged.tolist()) if not solved]
     if lost:
-        _warn_lost(lost)
-    return lost
-
-
-def _warn_lost(numbers: Sequence[int]) -> None:
-    log.warning(
-        "not solved, so no scans of this flow: %s; try another solver, or for a velocity that is singular at t = 1 a "
-        "last step before it: --sampler adams3:finish=0.001.",
-        ", ".join(map(str, numbers)),
-    )
-
-
-def _former(out: Path, about: Mapping[str, Any], num: int, replace: bool) -> dict[str, Any] | None:
-    """The note of a folder that holds samples of these settings.
-
-    Raises:
-        InputError: it holds scans that are no samples, or more samples of other settings than are drawn now.
-    """
-    names, note = sorted(file.name for file in out.glob("*")), out / SAMPLES
-    try:
-        found = read_json(note) if note.is_file() else {}
-    except ValueError:
-        found = {}
-    there: dict[str, Any] = found if isinstance(found, dict) else {}
-    scans = [name for name in names if name.endswith(FIRM_ENDINGS)]
-    ours = there and "completion" not in there
-    foreign = [name for name in scans if not OWN.fullmatch(name)] if ours else [*scans, *filter(OWN.fullmatch, names)]
-    if {key: value for key, value in there.items() if key != UNSOLVED} == about:
-        return there
-    if replace:
-        return None
-    if foreign:
-        raise InputError(f"{out} holds files that are no samples of r2flow ({foreign[0]}); give another --out.")
-    others = [name for name in scans if int(name[:6]) >= num]
-    if others:
-        raise InputError(
-            f"{out} holds samples of other settings, more than the {num} that would replace them ({others[0]}): give "
-            "another --out, or empty it."
+        log.warning(
+            "not solved, so no scans of this flow: %s; try another solver, or for a velocity that is singular at t = 1 "
+            "a last step before it: --sampler adams3:finish=0.001.",
+            ", ".join(lost),
         )
-    return None
 
 
-def note_of(checkpoint: Checkpoint, seed: int, more: Mapping[str, Any] | None = None, **sampler: Any) -> dict[str, Any]:
-    """What is written beside samples: what they are and `more`, so that readers know their size and sensor."""
+def _check_folder(store: FileStore, replace: bool) -> None:
+    """Refuse a folder that holds other scans; with `replace`, samples of other settings are removed."""
+    files = [file for file in store.folder.glob("*") if OWN.fullmatch(file.name)]
+    note = store.folder / MANIFEST
+    if replace and note.is_file() and read_manifest(store.folder, store.kind)["recipe"] != store.described:
+        for file in (*files, note):
+            file.unlink()
+    elif not store.check() and files:
+        raise InputError(f"{store.folder} holds {files[0].name} and no {MANIFEST}; give another folder by --out.")
+
+
+def recipe_of(
+    checkpoint: Checkpoint, seed: int, more: Mapping[str, Any] | None = None, **sampler: Any
+) -> dict[str, Any]:
+    """What decides samples, and how they are read: the recipe of their store."""
     about = {**checkpoint.config.get("encoding", {}), "reflectance": checkpoint.encoding.reflectance}
     about |= {"min_range": checkpoint.sensor.min_range, "max_range": checkpoint.sensor.max_range}
     reading, step = reading_for([], checkpoint), checkpoint.step
     # Points lie on rays through the middles of the bins, whatever rays the model was told.
-    return samples_note(reading, encoding=about, seed=seed, sampler=sampler, step=step,
-                        weights=weights_hash(checkpoint), rays="centre", **(more or {}))  # fmt: skip
+    return {
+        "reading": reading.described(), "encoding": about, "seed": seed, "sampler": sampler, "step": step,
+        "weights": weights_hash(checkpoint), "rays": "centre", **(more or {}),
+    }  # fmt: skip
 
 
 def check_formats(checkpoint: Checkpoint, formats: Sequence[str], channels: str) -> None:

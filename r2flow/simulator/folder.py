@@ -12,13 +12,13 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.simulator import REVISION, simulate
-from r2flow.store import Store, read_manifest
+from r2flow.store import FileStore, read_manifest
 
 KIND = "simulated"
 FORMATS = ("bin", "pcd", "ply", "npy")  # npy is the range image itself
 
 
-class SimulatedFolder(Store):
+class SimulatedFolder(FileStore):
     """The scans of one folder: scan i is a function of the sensor, the seed and i alone.
 
     Args:
@@ -30,9 +30,9 @@ class SimulatedFolder(Store):
         self, folder: str | Path, sensor: Sensor, seed: int, formats: Sequence[str] = ("bin",), labels: bool = False
     ) -> None:
         reading = {"sensor": sensor.described(), "reflectance_scale": 1.0}
-        super().__init__(folder, KIND, {"simulator": REVISION, "seed": seed, "reading": reading})
+        endings = [*formats, *(["label"] if labels else [])]
+        super().__init__(folder, KIND, {"simulator": REVISION, "seed": seed, "reading": reading}, endings)
         self.sensor, self.seed = sensor, seed
-        self.endings = [*formats, *(["label"] if labels else [])]
         for name in formats:
             if name not in FORMATS:
                 raise InputError(f"no format named {name!r} for simulated scans; known: {', '.join(FORMATS)}.")
@@ -40,12 +40,6 @@ class SimulatedFolder(Store):
             raise InputError(
                 "labels are those of points, and .npy is a range image without any; add another format, such as bin."
             )
-
-    def files(self, item: int) -> list[Path]:
-        return [self.folder / f"{item:06d}.{ending}" for ending in self.endings]
-
-    def has(self, item: int) -> bool:
-        return all(file.is_file() for file in self.files(item))
 
     def simulate(self, item: int) -> None:
         """Make one scan and write its files."""

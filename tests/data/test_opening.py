@@ -1,6 +1,5 @@
 """One opener: what a name may be, whether scans have reflectance, and kinds of scans that a user adds."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,15 +11,12 @@ import r2flow
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive, Layout, SourceKind
 from r2flow.data.opening import (
-    SAMPLES,
     SOURCES,
     open_scans,
     open_source,
     own_reading,
     reading_for,
     resolve_reflectance,
-    samples_note,
-    write_samples_note,
 )
 from r2flow.data.options import PairOptions, SourceOptions
 from r2flow.data.pairs import PairSource, PairStore, make_pairs, pair_noise
@@ -35,6 +31,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.noise import standard_normal
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
+from r2flow.store import Store
 from tests.data.conftest import prepare_folder, write_scan
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
@@ -111,8 +108,8 @@ class TestSamples:
     """Samples say their own size and sensor."""
 
     def samples(self, folder: Path, size: tuple[int, int] = (8, 32)) -> Path:
+        Store(folder, "samples", {"reading": Reading(SENSORS["hdl64e"].resized(*size)).described()}).begin()
         write_image(folder / "000000.npy", 2, size=size)
-        write_samples_note(folder, samples_note(Reading(SENSORS["hdl64e"].resized(*size)), seed=3))
         return folder
 
     def test_nobody_types_their_size(self, tmp_path: Path):
@@ -120,11 +117,10 @@ class TestSamples:
         assert scans.sensor == SENSOR
         assert numbers(scans) == [2]
         assert own_reading(tmp_path / "000000.npy") == READING  # one of them, too
-        assert json.loads((tmp_path / SAMPLES).read_text())["seed"] == 3
 
     def test_another_size_is_one_line(self, tmp_path: Path):
         self.samples(tmp_path)
-        said = r"holds images of hdl64e 8x32 \(its scans.json says so\), not of hdl64e 16x64: give no other"
+        said = r"holds images of hdl64e 8x32 \(its manifest.json says so\), not of hdl64e 16x64: give no other"
         for name in (tmp_path, tmp_path / "000000.npy"):
             with pytest.raises(InputError, match=said):
                 open_scans(name, Reading(SENSORS["hdl64e"].resized(16, 64)))
@@ -160,9 +156,9 @@ class TestSamples:
 
     def test_a_damaged_note_is_one_line(self, tmp_path: Path):
         self.samples(tmp_path)
-        for content in ("{", "[]", '{"reading": {}}', '{"reading": {"sensor": {"name": "a", "elevation": 3}}}'):
-            (tmp_path / SAMPLES).write_text(content)
-            with pytest.raises(InputError, match=r"scans.json is damaged; delete it") as error:
+        for content in ("{", "[]", '{"reading": {}}', '{"recipe": {"reading": {"sensor": {"name": "a"}}}}'):
+            (tmp_path / "manifest.json").write_text(content)
+            with pytest.raises(InputError, match=r"manifest.json is damaged") as error:
                 open_scans(tmp_path)
             assert "\n" not in str(error.value)
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.data.opening import SAMPLES
 from r2flow.errors import InputError
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.export import tableau
@@ -50,7 +49,7 @@ def test_verbs_take_it(run: Path, tmp_path: Path):
     done = r2flow("sample", *given, "--num", 1, "--format", "npy", "--pictures", 0, "-o", tmp_path / "scans")
     assert done.returncode == 0, done.stderr
     assert np.isfinite(np.load(tmp_path / "scans" / "000000.npy")).all()
-    note = json.loads((tmp_path / "scans" / SAMPLES).read_text())["sampler"]
+    note = json.loads((tmp_path / "scans" / "manifest.json").read_text())["recipe"]["sampler"]
     assert note == {"name": "shrunken", "steps": 2, "grid": "uniform", "share": 0.75}
     done = r2flow("pairs", *given, "--num", 2, "--batch-size", 2, "-o", tmp_path / "pairs")
     assert done.returncode == 0, done.stderr
