@@ -52,13 +52,11 @@ def scan(tmp_path: Path) -> Path:
 
 def test_sample_writes_the_same_scans_for_the_same_seed(r2flow, saved, tmp_path):  # noqa: F811
     path, _ = saved
-    code, out, _ = r2flow(
-        "sample", "--checkpoint", path, "--num", 3, "--steps", 2, "--seed", 5, "--out", tmp_path / "a"
-    )
+    code, out, _ = r2flow("sample", path, "--num", 3, "--steps", 2, "--seed", 5, "--out", tmp_path / "a")
     assert code == 0
     assert str(tmp_path / "a" / "samples.png") in out
     r2flow("sample", path.parent.parent, "--num", 1, "--steps", 2, "--seed", 5, "-o", tmp_path / "b", "--pictures", 0)
-    r2flow("sample", "-c", path, "--num", 3, "--steps", 2, "--seed", 6, "-o", tmp_path / "c", "--format", "npy")
+    r2flow("sample", path, "--num", 3, "--steps", 2, "--seed", 6, "-o", tmp_path / "c", "--format", "npy")
     images = {name: np.load(tmp_path / name / "000000.npy") for name in "abc"}
     assert images["a"].shape == (2, 8, 64)
     assert images["a"].dtype == np.float32
@@ -69,7 +67,7 @@ def test_sample_writes_the_same_scans_for_the_same_seed(r2flow, saved, tmp_path)
 
 
 def test_the_formats_hold_the_same_scan(r2flow, saved, tmp_path):  # noqa: F811
-    r2flow("sample", "-c", saved[0], "--num", 1, "--steps", 2, "-o", tmp_path, "--pictures", 0)
+    r2flow("sample", saved[0], "--num", 1, "--steps", 2, "-o", tmp_path, "--pictures", 0)
     image = np.load(tmp_path / "000000.npy")
     ply, kitti = read_points(tmp_path / "000000.ply"), read_points(tmp_path / "000000.bin")
     assert len(ply.xyz) == (image[0] > 0).sum() > 0
@@ -247,7 +245,7 @@ def test_importing_r2flow_loads_neither_lightning_nor_matplotlib():
 def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_bins(r2flow, saved, shared, tmp_path):  # noqa: F811
     published, out = shared / "oracle" / "published_format.pth", tmp_path / "out"
     drawn = ("--num", 1, "--steps", 1, "--pictures", 0, "--out", out)
-    code, _, error = r2flow("sample", "-c", published, *drawn, "--format", "npy,ply")
+    code, _, error = r2flow("sample", published, *drawn, "--format", "npy,ply")
     assert code == 0
     assert error.count("points are written along rays through their middles") == 1
     assert json.loads((out / "manifest.json").read_text())["recipe"]["rays"] == "centre"
@@ -260,5 +258,5 @@ def test_points_of_a_model_with_rays_through_corners_lie_in_the_middles_of_the_b
         np.testing.assert_allclose(place, place.round(), atol=1e-3)
     found = image[0][row.round().astype(int), column.round().astype(int)]
     np.testing.assert_allclose(np.linalg.norm(xyz, axis=1), found, rtol=1e-5)
-    assert "middles" not in r2flow("sample", "-c", published, *drawn, "--format", "npy")[2]
-    assert "middles" not in r2flow("sample", "-c", saved[0], *drawn, "--format", "ply")[2]
+    assert "middles" not in r2flow("sample", published, *drawn, "--format", "npy")[2]
+    assert "middles" not in r2flow("sample", saved[0], *drawn, "--format", "ply")[2]

@@ -146,7 +146,7 @@ def test_how_many_scans_are_drawn_is_said_where_nobody_asked(r2flow, saved, real
     run, quick = saved[0].parent.parent, ("--metrics", "jsd", "--steps", 1, "--workers", 0)
     code, said, _ = r2flow("evaluate", real, run, *quick)
     assert (code, said.splitlines()[0]) == (0, f"{run}: 3 scans of it are drawn (--num says how many)")
-    code, said, _ = r2flow("evaluate", real, "-c", run, *quick, "-o", tmp_path / "curve")
+    code, said, _ = r2flow("evaluate", real, run, "--curve", *quick, "-o", tmp_path / "curve")
     assert (code, said.splitlines()[0]) == (0, f"{run}: 3 scans of each point are drawn (--num says how many)")
     code, said, _ = r2flow("evaluate", real, run, *quick, "--num", 2)
     assert (code, "drawn (" in said) == (0, False)
@@ -154,8 +154,8 @@ def test_how_many_scans_are_drawn_is_said_where_nobody_asked(r2flow, saved, real
 
 def test_a_curve_of_several_solvers_has_a_line_for_each_with_intervals(r2flow, saved, real, tmp_path):  # noqa: F811
     code, _, err = r2flow(
-        "evaluate", real, "-c", saved[0], "--sampler", "euler,heun2", "--steps", "1,2", "--metrics", "jsd", "--num", 4,
-        "--bootstrap", 8, "--workers", 0, "--out", tmp_path,
+        "evaluate", real, saved[0], "--curve", "--sampler", "euler,heun2", "--steps", "1,2", "--metrics", "jsd",
+        "--num", 4, "--bootstrap", 8, "--workers", 0, "--out", tmp_path,
     )  # fmt: skip
     assert code == 0, err
     rows = json.loads((tmp_path / "speed_quality.json").read_text())["rows"]
@@ -173,7 +173,7 @@ def test_a_curve_names_the_solver_where_a_model_has_another_in_fewer_steps(r2flo
     generator.run_by(build_sampler("adams3", steps=2, grid="power:1.75"), few=build_sampler("chord", steps=1))
     save_checkpoint(Checkpoint(generator, config), tmp_path / "map.safetensors")
     code, _, err = r2flow(
-        "evaluate", real, "-c", tmp_path / "map.safetensors", "--steps", "1,2", "--metrics", "jsd", "--num", 4,
+        "evaluate", real, tmp_path / "map.safetensors", "--curve", "--steps", "1,2", "--metrics", "jsd", "--num", 4,
         "--workers", 0, "--out", tmp_path,
     )  # fmt: skip
     assert code == 0, err
@@ -184,7 +184,20 @@ def test_a_curve_names_the_solver_where_a_model_has_another_in_fewer_steps(r2flo
 
 
 def test_of_an_adaptive_solver_a_curve_has_one_point(r2flow, saved, real, tmp_path):  # noqa: F811
-    measured = ("evaluate", real, "-c", saved[0], "--metrics", "jsd", "--num", 2, "--workers", 0, "--out", tmp_path)
+    measured = (
+        "evaluate",
+        real,
+        saved[0],
+        "--curve",
+        "--metrics",
+        "jsd",
+        "--num",
+        2,
+        "--workers",
+        0,
+        "--out",
+        tmp_path,
+    )
     code, _, err = r2flow(*measured, "--sampler", "dopri5,euler", "--steps", "1,2", "--tolerance", 1e-2)
     assert code == 0, err
     rows = json.loads((tmp_path / "speed_quality.json").read_text())["rows"]
@@ -198,7 +211,7 @@ def test_a_curve_goes_on_where_it_stopped(r2flow, saved, real, tmp_path, monkeyp
 
     def points(steps: str) -> list[dict[str, str]]:
         code, said, err = r2flow(
-            "evaluate", real, "-c", saved[0], "--steps", steps, "--metrics", "jsd", "--num", 4, "--workers", 0,
+            "evaluate", real, saved[0], "--curve", "--steps", steps, "--metrics", "jsd", "--num", 4, "--workers", 0,
             "--batch-size", 2, "--out", tmp_path / "curve",
         )  # fmt: skip
         assert code == 0, err
@@ -290,8 +303,8 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
         (("{real}", "nowhere", *QUICK), "nowhere does not exist"),
         (("{real}", "{generated}", *QUICK[:2]), "give --size 8x64"),
         (("{real}", "{generated}", *QUICK, "--split", "test"), "has no standard split"),
-        (("{real}", *QUICK), "give GENERATED, --checkpoint RUN or --reference"),
-        (("{real}", "-c", "run", *QUICK), "a curve needs --out"),
+        (("{real}", *QUICK), "give GENERATED or --reference"),
+        (("{real}", "street", "--curve", *QUICK), "a curve needs --out"),
         (("{real}", "{generated}", *QUICK, "--json", "{real}"), "--json must be a file"),
         (("{real}", "{generated}", *QUICK, "--json", "{scan}"), "--json must be a file"),
         (("{real}", "{bare}", "--metrics", "frechet_handcrafted", *QUICK[2:]), "has no reflectance"),

@@ -75,13 +75,13 @@ def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):  # no
     assert widened in said
     code, said, _ = r2flow(
         "sample", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "--margin", 0,
-        "-o", tmp_path / "o",
+        "-o", tmp_path / "part",
     )  # fmt: skip
     assert code == 0
     assert "generating rows 0-3, columns 24-39, rounded outward from rows 0-2, columns 24-39: 12% of the image" in said
-    image = np.load(tmp_path / "o" / "000000.npy")
+    part = tmp_path / "part"
+    image = np.load(part / "000000.npy")
     assert image.shape == (2, 8, 64)
-    part = tmp_path / "o"
     for judged in (("evaluate", part, "simulated:0"), ("evaluate", "simulated:0", part)):
         code, _, complaint = r2flow(*judged)
         assert code == 2
@@ -90,7 +90,7 @@ def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):  # no
     inside[:3, 24:40] = True
     assert (image[0][inside] > 0).any()
     assert (image[:, ~inside] == 0).all()
-    xyz = read_points(tmp_path / "o" / "000000.ply").xyz
+    xyz = read_points(part / "000000.ply").xyz
     assert (np.abs(np.arctan2(xyz[:, 1], xyz[:, 0])) < np.pi / 4).all()
 
 
@@ -103,7 +103,7 @@ def test_one_channel_is_written_alone(r2flow, run, tmp_path):  # noqa: F811
     np.testing.assert_array_equal(np.load(tmp_path / "reflectance" / "000000.reflectance.npy"), both[1:])
     assert read_points(tmp_path / "range" / "000000.ply").reflectance is None
     assert not list((tmp_path / "range").glob("*.bin"))
-    assert [path.suffix for path in sorted((tmp_path / "reflectance").iterdir())] == [".npy", ".png", ".json"]
+    assert {path.suffix for path in (tmp_path / "reflectance").iterdir()} == {".npy", ".png", ".json"}
 
 
 def test_named_grids_are_sampled_on(r2flow, run, tmp_path):  # noqa: F811

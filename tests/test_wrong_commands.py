@@ -63,7 +63,6 @@ sample run -o out --device '' # an argument is empty
 sample run -o out --format las
 sample run -o out --seed 18446744073709551616 # 2^64
 sample run -o out --sector 10,10.0000001 # narrower than a column
-sample run -c run -o out # not both
 sample run -o out --format ply,
 sample run -o out --sector 3
 sample run -o out --sector a,b
@@ -243,17 +242,17 @@ evaluate scans scans --seed 3 # found none
 evaluate scans --reference --steps 4 # found none
 evaluate scans run --generated-scale 255 # are of files in GENERATED; found none
 evaluate scans run --generated-split foo # are of files in GENERATED; found none
-evaluate scans -c run -o out --generated-split foo # are of files in GENERATED; found none
+evaluate scans run --curve -o out --generated-split foo # are of files in GENERATED; found none
 evaluate scans scans --json empty
 evaluate scans scans --json file.txt/a.json
 evaluate scans scans --json file.txt
 evaluate scans scans -o file.txt
-evaluate scans -c run # a curve needs --out
-evaluate scans -c nowhere -o out
-evaluate scans scans -c run -o out # not both
-evaluate scans -c run -o out --reference
-evaluate scans -c run -o out --steps 1,,2
-evaluate scans -c run -o out --sampler euler,heun2 --tolerance 0.1 # tolerance
+evaluate scans run --curve # a curve needs --out
+evaluate scans nowhere --curve -o out
+evaluate scans scans run --curve -o out # --curve is of
+evaluate scans run --curve -o out --reference
+evaluate scans run --curve -o out --steps 1,,2
+evaluate scans run --curve -o out --sampler euler,heun2 --tolerance 0.1 # tolerance
 evaluate scans run --steps 1,2
 evaluate scans run --steps 2 --sampler dopri5 # steps
 evaluate scans run --tolerance 0.1 # tolerance

@@ -62,6 +62,9 @@ class EvaluateOptions:
     train_split: Annotated[str | None, typer.Option(help="Part of TRAIN's standard split.")] = None
     bootstrap: Annotated[int, typer.Option(min=0, help="Resamples for 95 % intervals; 0 for none.")] = 0
     no_cache: Annotated[bool, typer.Option("--no-cache", help="Read the real scans again.")] = False
+    curve: Annotated[
+        bool, typer.Option("--curve", help="Distance of models against evaluations and seconds, into --out.")
+    ] = False
     num: Annotated[
         int | None, typer.Option(min=1, help="Scans to sample or simulate (1000); the most to take of a folder (all).")
     ] = None
@@ -101,16 +104,12 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
-    checkpoint: Annotated[
-        list[str] | None,
-        typer.Option("--checkpoint", "-c", help="Flow for a speed-quality curve; may be given several times."),
-    ] = None,
 ) -> None:
     """Measure generated scans against real ones: distances, each with its protocol and the sensor.
 
-    Several sets make one table, next to reference distances between real scans and to baselines. With --checkpoint it
-    measures how the distance falls with the number of steps, against evaluations and seconds; points that are in --out
-    already are not measured again. Under torchrun the processes share the scans.
+    Several sets make one table, next to reference distances between real scans and to baselines. With --curve it
+    measures how the distance of models falls with the number of steps, against evaluations and seconds; points that are
+    in --out already are not measured again. Under torchrun the processes share the scans.
     """
     from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
     from r2flow.evaluation.processes import joined
@@ -120,11 +119,11 @@ def evaluate(
     from r2flow.metrics import METRICS, default_metrics
     from r2flow.reports.pages import prepare_folder
 
-    named, curve = list(dict.fromkeys(generated or [])), bool(checkpoint)
+    named, curve = list(dict.fromkeys(generated or [])), options.curve
     sampled = [one for one in named if is_checkpoint(one)]
     rules = PROTOCOLS[options.protocol]
-    _check_options(named, curve, options)
-    if not (sampled or curve) and any(getattr(options, key) != getattr(EvaluateOptions, key) for key in SAMPLING):
+    _check_options(named, sampled, options)
+    if not sampled and any(getattr(options, key) != getattr(EvaluateOptions, key) for key in SAMPLING):
         raise InputError(f"--{', --'.join(SAMPLING)} are of a run, a checkpoint or a model to sample; found none.")
     if len(named) == len(sampled) and (options.generated_split or options.generated_scale):
         raise InputError("--generated-split and --generated-scale are of files in GENERATED; found none.")
@@ -133,7 +132,7 @@ def evaluate(
         wanted = None
         if options.metrics not in (None, "all"):
             wanted = _build(options.metrics.split(","), keep, place.device)
-        flows = _load_flows([*(checkpoint or []), *sampled], place.device)
+        flows = _load_flows(sampled, place.device)
         if flows and options.num is None and place.rank == 0:
             each = "each point" if curve else "each" if len(flows) > 1 else "it"
             print(f"{', '.join(flows)}: {SAMPLED} scans of {each} are drawn (--num says how many)")
@@ -146,12 +145,16 @@ def evaluate(
         truth = _open(real, reading, options.split, options.real_num)
         rules.check(truth)
         scaled = replace(reading, reflectance_scale=options.generated_scale or reading.reflectance_scale)
-        judged = {
-            name: _sampled(text, flows[text], options)
-            if text in sampled
-            else _open(text, scaled, options.generated_split, options.num)
-            for text, name in zip(named, _names(named), strict=True)
-        }
+        judged = (
+            {}
+            if curve
+            else {
+                name: _sampled(text, flows[text], options)
+                if text in sampled
+                else _open(text, scaled, options.generated_split, options.num)
+                for text, name in zip(named, _names(named), strict=True)
+            }
+        )
         sets = [truth, *judged.values()]
         reflectance = all(s.about["reflectance"] for s in sets)
         reflectance = reflectance and all(flow.encoding.reflectance for flow in flows.values())
@@ -175,16 +178,17 @@ def evaluate(
             _compare(truth, metrics, gather, share, place.device, judged, training, options)
 
 
-def _check_options(generated: Sequence[str], curve: bool, options: EvaluateOptions) -> None:
+def _check_options(generated: Sequence[str], sampled: Sequence[str], options: EvaluateOptions) -> None:
     """Refuse options that do not go together, before anything is read."""
-    if curve and generated:
-        raise InputError("give GENERATED for one comparison or --checkpoint for a curve, not both.")
+    curve, scans = options.curve, [one for one in generated if one not in sampled]
+    if curve and (scans or not sampled):
+        raise InputError(f"--curve is of runs, checkpoints or models to sample, found {scans[0] if scans else 'none'}.")
     if curve and options.out is None:
         raise InputError("a curve needs --out FOLDER, where its points are kept.")
     if curve and (options.reference or options.baselines or options.train or options.json):
         raise InputError("--reference, --baselines, --train and --json are of a comparison; a curve writes to --out.")
-    if not (curve or generated or options.reference or options.baselines):
-        raise InputError("nothing to compare with: give GENERATED, --checkpoint RUN or --reference.")
+    if not (generated or options.reference or options.baselines):
+        raise InputError("nothing to compare with: give GENERATED or --reference.")
     if options.json is not None and (options.json.is_dir() or options.json.suffix.lower() != ".json"):
         raise InputError(f"--json must be a file that ends in .json, found {options.json}.")
 
@@ -335,7 +339,7 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "ScanS
 
     steps = numbers("steps", options.steps, int) if options.steps else [None]
     if len(steps) != 1:
-        raise InputError(f"a comparison takes one number of --steps, found {options.steps}; -c makes a curve.")
+        raise InputError(f"a comparison takes one number of --steps, found {options.steps}; --curve takes several.")
     sampler = flow.generator.choose(**SamplerOptions(options.sampler, steps[0], options.tolerance).given)
     return sampled_set(flow, label, options.num or SAMPLED, sampler, options.seed, options.precision)
 

@@ -8,8 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.groups import DrawOptions, ModelOptions, SamplerOptions, grouped
-from r2flow.cli.options import CheckpointOption, DeviceOption, OutOption, PrecisionOption, choose_device
+from r2flow.cli.groups import DrawOptions, SamplerOptions, grouped
+from r2flow.cli.options import (
+    CheckpointOption,
+    DeviceOption,
+    OutOption,
+    PrecisionOption,
+    choose_device,
+)
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
@@ -66,11 +72,13 @@ def _pair(option: str, text: str, between: str, kind: type, meaning: str) -> tup
 @app.command(epilog="Example: r2flow sample street --num 16 --steps 64 --out scans")
 @grouped
 def sample(
-    which: ModelOptions,
     out: OutOption,
     draw: DrawOptions,
     how: SamplerOptions,
     part: RegionOptions,
+    model: Annotated[
+        str | None, typer.Argument(help="A model, a run folder or a checkpoint file.", show_default=False)
+    ] = None,
     precision: PrecisionOption = "32-true",
     format: Annotated[str | None, typer.Option(help="Any of ply,bin,npy; all that fit if left out.")] = None,
     pictures: Annotated[int, typer.Option(min=0, help="Scans that get a picture.")] = 8,
@@ -83,9 +91,9 @@ def sample(
     from r2flow.models import DEFAULT, MODELS, find_model
     from r2flow.reports.outputs import formats_of, write_samples
 
-    if which.name is None:
+    if model is None:
         print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
-    loaded = load_checkpoint(which.name or find_model(DEFAULT), device=choose_device(draw.device))
+    loaded = load_checkpoint(model or find_model(DEFAULT), device=choose_device(draw.device))
     sampler = loaded.generator.choose(**how.given)
     formats = [*dict.fromkeys(map(str.strip, format.split(",")))] if format else formats_of(loaded, part.channels)
     region = part.region(loaded)

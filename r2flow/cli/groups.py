@@ -18,7 +18,6 @@ from r2flow.cli.options import (
     named_columns,
     rows_and_columns,
 )
-from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.data.reading import Reading
@@ -55,29 +54,6 @@ def grouped(verb: Callable[..., None]) -> Callable[..., None]:
     call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return call
-
-
-@dataclass(frozen=True)
-class ModelOptions:
-    """The generator that a verb runs, by position or as --checkpoint."""
-
-    model: Annotated[
-        str | None, typer.Argument(help="A model, a run folder or a checkpoint file.", show_default=False)
-    ] = None
-    checkpoint: Annotated[
-        str | None, typer.Option("--checkpoint", "-c", help="MODEL as an option.", show_default=False)
-    ] = None
-
-    @property
-    def name(self) -> str | None:
-        """The model's name or path.
-
-        Raises:
-            InputError: both forms at once.
-        """
-        if self.model and self.checkpoint:
-            raise InputError(f"give MODEL or --checkpoint, not both; found {self.model} and {self.checkpoint}.")
-        return self.model or self.checkpoint
 
 
 @dataclass(frozen=True)

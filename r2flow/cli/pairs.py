@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.groups import ModelOptions, SamplerOptions, grouped
+from r2flow.cli.groups import SamplerOptions, grouped
 from r2flow.cli.options import DeviceOption, PrecisionOption, choose_device
 from r2flow.errors import InputError
 
@@ -51,7 +51,7 @@ class ShareOptions:
 @app.command(epilog="Example: torchrun --nproc-per-node 8 -m r2flow.cli pairs runs/r2flow_1rf --num 1000000")
 @grouped
 def pairs(
-    which: ModelOptions,
+    model: Annotated[str, typer.Argument(help="A model, a run folder or a checkpoint file.", show_default=False)],
     how: SamplerOptions,
     share: ShareOptions,
     num: Annotated[int, typer.Option(min=1, help="Pairs in all.")] = 1000,
@@ -79,11 +79,9 @@ def pairs(
     from r2flow.reports.pairs import make_and_tell
     from r2flow.runs.lineage import check_finished, pairs_of
 
-    if which.name is None:
-        raise InputError("Missing argument 'MODEL'.")
     rank, ranks, where = share.place()
-    flow = load_checkpoint(which.name)
-    check_finished(Path(which.name), flow)
+    flow = load_checkpoint(model)
+    check_finished(Path(model), flow)
     options = {
         "sampler": {"name": "adams3", **how.given}, "precision": precision,
         "num": num, "batch_size": batch_size, "shard_mib": shard_mib, "seed": seed, "first": first,

@@ -210,7 +210,7 @@ def paper(
     out: OutOption,
     results: Annotated[
         list[Path] | None,
-        typer.Option(help="Folder of `r2flow evaluate REAL -c MODEL --out FOLDER`; may be repeated."),
+        typer.Option(help="Folder of `r2flow evaluate REAL MODEL --curve --out FOLDER`; may be repeated."),
     ] = None,
     real: Annotated[str | None, typer.Option(help=f"Real scans for figures 3, 5 and 7: {SETS}.")] = None,
     num: Annotated[int, typer.Option(min=1, help="Scans of each model in figures 5 and 7.")] = 16,
@@ -228,7 +228,7 @@ def paper(
     where = choose_device(device)
     files = [folder / "speed_quality.json" for folder in results or []]
     if missing := [file for file in files if not file.is_file()]:
-        raise InputError(f"--results: {missing[0]} does not exist; r2flow evaluate REAL -c MODEL --out writes it.")
+        raise InputError(f"--results: {missing[0]} does not exist; r2flow evaluate REAL MODEL --curve --out writes it.")
     runs = []
     for text in models:
         role, _, model = text.rpartition("=")

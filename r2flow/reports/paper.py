@@ -73,7 +73,7 @@ def paper_page(
     """The page, still to be written.
 
     Args:
-        rows: Of `speed_quality.json` files (`r2flow evaluate REAL -c RUN ... --out FOLDER`).
+        rows: Of `speed_quality.json` files (`r2flow evaluate REAL RUN ... --curve --out FOLDER`).
         real: Scans for figures 3, 5 and 7; None leaves figure 3 out.
         num: Scans of each generator in figures 5 and 7.
         paths: Scans whose paths figure 8 follows, in `steps` Euler steps; 0 leaves it out.

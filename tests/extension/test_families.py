@@ -93,7 +93,7 @@ def test_samples_are_measured(trained: tuple[Family, Path], tmp_path: Path):
     done = r2flow("evaluate", family.plugin, "simulated:7", run, *EVALUATE, "--json", tmp_path / "e.json")
     assert done.returncode == 0, done.stderr
     assert "JSD" in done.stdout
-    done = r2flow("evaluate", family.plugin, "simulated:7", "-c", run, *EVALUATE, "--steps", "1,2", "-o", tmp_path)
+    done = r2flow("evaluate", family.plugin, "simulated:7", run, "--curve", *EVALUATE, "--steps", "1,2", "-o", tmp_path)
     assert done.returncode == 0, done.stderr
     steps = [row["steps"] for row in json.loads((tmp_path / "speed_quality.json").read_text())["rows"]]
     assert steps == ([1] if family is GAN else [1, 2])
