@@ -3,7 +3,8 @@
 R2Flow's files are a dict of cfg, weights, optimizer, lr_scheduler and num_images.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -64,6 +65,17 @@ class Format(NamedTuple):
     read: Read
 
 
+@contextmanager
+def garbled(path: Path) -> Iterator[None]:
+    """Raises `InputError` where the content of a published file lacks a part or has one of another form."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise InputError(f"{path}: the published checkpoint lacks or garbles {error}.") from None
+
+
 def holds(content: Any) -> bool:
     return isinstance(content, Mapping) and {"cfg", "weights"} <= content.keys() and "ema_weights" not in content
 
@@ -76,7 +88,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
 
 def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """Our config of a published checkpoint's `cfg`, which holds data, model, flow, training and finetuning."""
-    try:
+    with garbled(path):
         data, model = cfg["data"], cfg["model"]
         rows, columns = (int(n) for n in data["resolution"])
         return {
@@ -96,10 +108,6 @@ def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
             },
             "published": dict(cfg),
         }
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: the published config lacks or garbles {error}.") from None
 
 
 def backbone_of(model: Mapping[str, Any], path: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.generators import Generator
-from r2flow.model.published import Format, Published
+from r2flow.model.published import Format, Published, garbled
 from r2flow.systems.gan.generator import DROPPED
 
 GENERATORS = {"vanilla": "vanilla_gan", "dusty_v1": "dusty1", "dusty_v2": "dusty2"}
@@ -24,7 +24,7 @@ def holds(content: Any) -> bool:
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
     """A published GAN: its generator, by the averaged weights or the raw ones."""
     cfg, angle = content["cfg"], content["angle"]
-    try:
+    with garbled(path):
         name, own = _generator(cfg["model"]["generator"])
         dataset, out = cfg["dataset"], cfg["model"]["generator"]["synthesis_kwargs"]
         rows, columns = (int(n) for n in out["resolution"])
@@ -47,10 +47,6 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
         if tuple(angle.shape) != (1, 2, rows, columns):
             raise InputError(f"{path}: the angles are {tuple(angle.shape)}, not (1, 2, {rows}, {columns}).")
         weights = {NETWORK + key: value for key, value in content["G_ema" if averaged else "G"].items()}
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: the published config lacks or garbles {error}.") from None
     if name == "dusty2":
         weights["angle"] = angle
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import ShiftedLog
 from r2flow.lidar.sensors import build_sensor
-from r2flow.model.published import Format, Published
+from r2flow.model.published import Format, Published, garbled
 from r2flow.systems.latent.autoencoder import UP
 
 log = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
     """A published latent diffusion, with its averaged weights, whose names have lost their dots."""
     state = _state(content)
     params = _params(path)
-    try:
+    with garbled(path):
         raw = {name: value for name, value in state.items() if name.startswith((UNET, AUTOENCODER))}
         average = {name: state.get(_undotted(name), value) for name, value in raw.items()}
         head = int(params.get("unet_config", {}).get("params", {}).get("num_head_channels", HEAD))
@@ -58,8 +58,6 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
             "diffusion_steps": len(state["betas"]),
         }
         config = _config(generator, path)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise _garbled(error, path) from None
     weights = average if averaged else raw
     return Published(config, dict(weights), _step(content), {"name": "latent_ddim"})
 
@@ -67,17 +65,9 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
 def read_autoencoder(content: Any, path: Path, averaged: bool = True) -> Published:
     """A published autoencoder; its discriminator is left out."""
     raw = {name: value for name, value in _state(content).items() if not name.startswith("loss.")}
-    try:
+    with garbled(path):
         config = _config({"name": "vq_autoencoder", "autoencoder": _autoencoder(raw)}, path)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise _garbled(error, path) from None
     return Published(config, {AUTOENCODER + name: value for name, value in raw.items()}, _step(content))
-
-
-def _garbled(error: Exception, path: Path) -> InputError:
-    if isinstance(error, InputError):
-        return error
-    return InputError(f"{path}: the published LiDM checkpoint lacks or garbles {error}.")
 
 
 def _undotted(name: str) -> str:

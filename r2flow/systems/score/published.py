@@ -9,8 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from r2flow.errors import InputError
-from r2flow.model.published import Format, Published
+from r2flow.model.published import Format, Published, garbled
 
 NETWORK = "network."  # in the generator
 WRAPPED = "module."  # by torch's DataParallel
@@ -29,7 +28,7 @@ def holds(content: Any) -> bool:
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
     """A published score model; its averaged weights lack the buffers, and files without them have the raw ones."""
-    try:
+    with garbled(path):
         raw: dict[str, Tensor] = {name.removeprefix(WRAPPED): value for name, value in content[0].items()}
         average = {name.removeprefix(WRAPPED): value for name, value in dict(*content[4:]).items()}
         sigmas, step = raw["sigmas"], int(content[3])
@@ -47,8 +46,6 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
             "data": {"name": "kitti_360", "reading": {"projection": "spherical", "convention": "reference"}},
             "published": {"system": "LiDARGen"},
         }
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InputError(f"{path}: the published LiDARGen checkpoint lacks or garbles {error}.") from None
     weights = {**raw, **average} if averaged else raw
     return Published(
         config,
