@@ -1,6 +1,5 @@
 """r2flow evaluate as a user types it."""
 
-import csv
 import json
 import math
 import os
@@ -8,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.sums import SumMetric
 from r2flow.model.checkpoint import Checkpoint, save_checkpoint
+from r2flow.reports.paper import read_results
 from r2flow.samplers import build_sampler
 from tests.test_checkpoints import CONFIG, saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
@@ -145,92 +146,76 @@ def test_how_many_scans_are_drawn_is_said_where_nobody_asked(r2flow, saved, real
     monkeypatch.setattr("r2flow.cli.evaluate.SAMPLED", 3)
     run, quick = saved[0].parent.parent, ("--metrics", "jsd", "--steps", 1, "--workers", 0)
     code, said, _ = r2flow("evaluate", real, run, *quick)
-    assert (code, said.splitlines()[0]) == (0, f"{run}: 3 scans of it are drawn (--num says how many)")
-    code, said, _ = r2flow("evaluate", real, run, "--curve", *quick, "-o", tmp_path / "curve")
-    assert (code, said.splitlines()[0]) == (0, f"{run}: 3 scans of each point are drawn (--num says how many)")
+    assert (code, said.splitlines()[0]) == (0, f"{run}: 3 scans of each set are drawn (--num says how many)")
     code, said, _ = r2flow("evaluate", real, run, *quick, "--num", 2)
     assert (code, "drawn (" in said) == (0, False)
 
 
-def test_a_curve_of_several_solvers_has_a_line_for_each_with_intervals(r2flow, saved, real, tmp_path):  # noqa: F811
-    code, _, err = r2flow(
-        "evaluate", real, saved[0], "--curve", "--sampler", "euler,heun2", "--steps", "1,2", "--metrics", "jsd",
-        "--num", 4, "--bootstrap", 8, "--workers", 0, "--out", tmp_path,
-    )  # fmt: skip
-    assert code == 0, err
-    rows = json.loads((tmp_path / "speed_quality.json").read_text())["rows"]
-    assert [(row["solver"], row["evaluations"]) for row in rows] == [
+@pytest.fixture
+def points(r2flow, real, tmp_path):  # noqa: F811
+    """The sampled sets of an evaluation, as `report paper` reads them, and its Markdown page."""
+
+    def measure(*arguments: object) -> tuple[list[dict[str, Any]], str]:
+        options = (
+            "--metrics",
+            "jsd",
+            "--num",
+            4,
+            "--workers",
+            0,
+            "--no-reference",
+            "--no-baselines",
+            "--out",
+            tmp_path,
+        )
+        code, _, err = r2flow("evaluate", real, *arguments, *options)
+        assert code == 0, err
+        return read_results([tmp_path / "evaluation.json"]), (tmp_path / "evaluation.md").read_text()
+
+    return measure
+
+
+def test_several_samplers_and_steps_make_a_set_each(points, saved, tmp_path):  # noqa: F811
+    rows, page = points(saved[0], "--sampler", "euler,heun2", "--steps", "1,2", "--bootstrap", 8)
+    assert [(row["flow"].partition(", ")[2], row["evaluations"]) for row in rows] == [
         ("euler", 1), ("euler", 2), ("heun2", 2), ("heun2", 4),
     ]  # fmt: skip
-    assert [row["flow"].partition(", ")[2] for row in rows] == ["euler", "euler", "heun2", "heun2"]
-    assert all(row["jsd/jsd low"] < row["jsd/jsd high"] for row in rows)
-    assert (tmp_path / "speed_quality.md").read_text().count(" to ") >= 4
+    assert all(row["jsd/jsd low"] < row["jsd/jsd high"] and row["seconds"] > 0 for row in rows)
+    assert f"{saved[0].name}, heun2, 2 steps" in page
+    assert (tmp_path / "evaluation_speed.png").stat().st_size > 10_000
 
 
-def test_a_curve_names_the_solver_where_a_model_has_another_in_fewer_steps(r2flow, real, tmp_path):  # noqa: F811
+def test_each_number_of_steps_takes_the_sampler_that_the_generator_has_for_it(points, tmp_path):
     config = {**CONFIG, "generator": {"name": "flow_map"}}
     generator = build_generator(config).eval()
     generator.run_by(build_sampler("adams3", steps=2, grid="power:1.75"), few=build_sampler("chord", steps=1))
     save_checkpoint(Checkpoint(generator, config), tmp_path / "map.safetensors")
-    code, _, err = r2flow(
-        "evaluate", real, tmp_path / "map.safetensors", "--curve", "--steps", "1,2", "--metrics", "jsd", "--num", 4,
-        "--workers", 0, "--out", tmp_path,
-    )  # fmt: skip
-    assert code == 0, err
-    page = (tmp_path / "speed_quality.md").read_text()
-    assert [line.split(" | ")[1:3] for line in page.splitlines() if "map.safetensors | " in line] == [
-        ["1", "chord"], ["2", "adams3"],
+    points(tmp_path / "map.safetensors", "--steps", "1,2")
+    one, two = json.loads((tmp_path / "evaluation.json").read_text())["comparisons"]
+    assert [(c["generated"]["sampler"]["name"], c["comparison"]) for c in (one, two)] == [
+        ("chord", "map.safetensors, 1 step"), ("adams3", "map.safetensors, 2 steps"),
     ]  # fmt: skip
 
 
-def test_of_an_adaptive_solver_a_curve_has_one_point(r2flow, saved, real, tmp_path):  # noqa: F811
-    measured = (
-        "evaluate",
-        real,
-        saved[0],
-        "--curve",
-        "--metrics",
-        "jsd",
-        "--num",
-        2,
-        "--workers",
-        0,
-        "--out",
-        tmp_path,
-    )
-    code, _, err = r2flow(*measured, "--sampler", "dopri5,euler", "--steps", "1,2", "--tolerance", 1e-2)
-    assert code == 0, err
-    rows = json.loads((tmp_path / "speed_quality.json").read_text())["rows"]
-    assert [row["solver"] for row in rows] == ["dopri5", "euler", "euler"]
-    code, _, said = r2flow(*measured, "--sampler", "dopri5", "--steps", "1,2")
+def test_an_adaptive_solver_is_one_set(r2flow, points, saved, real):  # noqa: F811
+    rows, _ = points(saved[0], "--sampler", "dopri5,euler", "--steps", "1,2", "--tolerance", 1e-2)
+    assert [row["flow"].partition(", ")[2] for row in rows] == ["dopri5", "euler", "euler"]
+    code, _, said = r2flow("evaluate", real, saved[0], "--sampler", "dopri5", "--steps", "1,2")
     assert (code, "no option 'steps'" in said) == (2, True)
 
 
-def test_a_curve_goes_on_where_it_stopped(r2flow, saved, real, tmp_path, monkeypatch):  # noqa: F811
-    import r2flow.reports.speed_quality as speed_quality
+def test_an_evaluation_resumes(points, saved, monkeypatch):  # noqa: F811
+    import r2flow.evaluation.measuring as measuring
 
-    def points(steps: str) -> list[dict[str, str]]:
-        code, said, err = r2flow(
-            "evaluate", real, saved[0], "--curve", "--steps", steps, "--metrics", "jsd", "--num", 4, "--workers", 0,
-            "--batch-size", 2, "--out", tmp_path / "curve",
-        )  # fmt: skip
-        assert code == 0, err
-        lines = (tmp_path / "curve" / "speed_quality.csv").read_text().splitlines()
-        return list(csv.DictReader(line for line in lines if not line.startswith("#")))
-
-    first = points("1,2")
+    first, _ = points(saved[0], "--steps", "1,2", "--batch-size", 2)
     measured: list[int] = []
-    measure = speed_quality.measure
-    monkeypatch.setattr(speed_quality, "measure", lambda *a: (measured.append(1), measure(*a))[1])
-    third = points("4")
-    second = points("4,2,1")
+    measure = measuring.measure
+    monkeypatch.setattr(measuring, "measure", lambda *a: (measured.append(1), measure(*a))[1])
+    second, _ = points(saved[0], "--steps", "4,2,1", "--batch-size", 2)
     assert len(measured) == 1
-    assert third[0] == second[0]
-    assert second[2] == first[0]
-    assert second[1] == first[1]
-    assert [float(row["evaluations"]) for row in second] == [4, 2, 1]
-    assert all(float(row["seconds"]) > 0 and 0 <= float(row["jsd/jsd"]) <= math.sqrt(math.log(2)) for row in second)
-    assert {path.suffix for path in (tmp_path / "curve").iterdir()} == {".png", ".csv", ".json", ".md"}
+    assert second[1:] == first[::-1]
+    assert [row["evaluations"] for row in second] == [4, 2, 1]
+    assert all(0 <= row["jsd/jsd"] <= math.sqrt(math.log(2)) for row in second)
 
 
 def test_weights_that_are_missing_are_left_out_or_named(r2flow, real, generated, tmp_path):  # noqa: F811
@@ -304,7 +289,6 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(r2flow, real, g
         (("{real}", "{generated}", *QUICK[:2]), "give --size 8x64"),
         (("{real}", "{generated}", *QUICK, "--split", "test"), "has no standard split"),
         (("{real}", *QUICK), "give GENERATED or --reference"),
-        (("{real}", "street", "--curve", *QUICK), "a curve needs --out"),
         (("{real}", "{generated}", *QUICK, "--json", "{real}"), "--json must be a file"),
         (("{real}", "{generated}", *QUICK, "--json", "{scan}"), "--json must be a file"),
         (("{real}", "{bare}", "--metrics", "frechet_handcrafted", *QUICK[2:]), "has no reflectance"),

@@ -242,19 +242,13 @@ evaluate scans scans --seed 3 # found none
 evaluate scans --reference --steps 4 # found none
 evaluate scans run --generated-scale 255 # are of files in GENERATED; found none
 evaluate scans run --generated-split foo # are of files in GENERATED; found none
-evaluate scans run --curve -o out --generated-split foo # are of files in GENERATED; found none
 evaluate scans scans --json empty
 evaluate scans scans --json file.txt/a.json
 evaluate scans scans --json file.txt
 evaluate scans scans -o file.txt
-evaluate scans run --curve # a curve needs --out
-evaluate scans nowhere --curve -o out
-evaluate scans scans run --curve -o out # --curve is of
-evaluate scans run --curve -o out --reference
-evaluate scans run --curve -o out --steps 1,,2
-evaluate scans run --curve -o out --sampler euler,heun2 --tolerance 0.1 # tolerance
-evaluate scans run --steps 1,2
 evaluate scans run --steps 2 --sampler dopri5 # steps
+evaluate scans run --steps 1,,2
+evaluate scans run --sampler euler,heun2 --tolerance 0.1 # tolerance
 evaluate scans run --tolerance 0.1 # tolerance
 evaluate scans run --sensor vlp16
 evaluate scans run --size 16x64

@@ -4,30 +4,28 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import ReadingOptions, SamplerOptions, WorkOptions, grouped
 from r2flow.cli.options import SETS, PrecisionOption, choose_device
-from r2flow.cli.output import command, finish, numbers
+from r2flow.cli.output import command, numbers
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.data.reading import Reading
     from r2flow.data.sets import ScanSet
     from r2flow.evaluation.measuring import Gathered, Work
+    from r2flow.generators import Generator, Sampler
     from r2flow.metrics.base import ScanMetric
     from r2flow.model.checkpoint import Checkpoint
-    from r2flow.reports.speed_quality import Drawing
 
 log = logging.getLogger(__name__)
 
 SAMPLED = 1000  # scans of a flow
-STEPS = "1,2,4,8,16,32,64,128,256"  # of a curve
 REAL = "the real scans"
 SAMPLING = ("steps", "sampler", "tolerance", "precision", "seed")  # options of a sampled flow
 
@@ -62,9 +60,6 @@ class EvaluateOptions:
     train_split: Annotated[str | None, typer.Option(help="Part of TRAIN's standard split.")] = None
     bootstrap: Annotated[int, typer.Option(min=0, help="Resamples for 95 % intervals; 0 for none.")] = 0
     no_cache: Annotated[bool, typer.Option("--no-cache", help="Read the real scans again.")] = False
-    curve: Annotated[
-        bool, typer.Option("--curve", help="Distance of models against evaluations and seconds, into --out.")
-    ] = False
     num: Annotated[
         int | None, typer.Option(min=1, help="Scans to sample or simulate (1000); the most to take of a folder (all).")
     ] = None
@@ -75,11 +70,11 @@ class EvaluateOptions:
         float | None, typer.Option(min=1e-6, max=1e9, help="--reflectance-scale of the files in GENERATED, if other.")
     ] = None
     steps: Annotated[
-        str | None, typer.Option(help="Of the sampled flow, its own if left out; of a curve, 1,2,4,...,256.")
+        str | None, typer.Option(help="Of the models, their own if left out; 1,2,4 makes a set of each number.")
     ] = None
     sampler: Annotated[
         str | None,
-        typer.Option(help="Of the sampled flow: euler, heun2, dopri5, ...; of a curve, several as ddpm,adams3."),
+        typer.Option(help="Of the models, their own if left out; adams3,heun2 makes a set of each sampler."),
     ] = None
     tolerance: Annotated[float | None, typer.Option(help="Of an adaptive sampler.")] = None
     precision: PrecisionOption = "32-true"
@@ -107,9 +102,9 @@ def evaluate(
 ) -> None:
     """Measure generated scans against real ones: distances, each with its protocol and the sensor.
 
-    Several sets make one table, next to reference distances between real scans and to baselines. With --curve it
-    measures how the distance of models falls with the number of steps, against evaluations and seconds; points that are
-    in --out already are not measured again. Under torchrun the processes share the scans.
+    Several sets make one table, next to reference distances between real scans and to baselines. Models are sampled;
+    several --steps or --sampler show distance against evaluations and seconds. The same command with --out resumes.
+    Under torchrun the processes share the scans.
     """
     from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
     from r2flow.evaluation.processes import joined
@@ -117,12 +112,13 @@ def evaluate(
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.evaluation.statistics import Cache
     from r2flow.metrics import METRICS, default_metrics
+    from r2flow.reports.compare import labels
     from r2flow.reports.pages import prepare_folder
 
-    named, curve = list(dict.fromkeys(generated or [])), options.curve
+    named = list(dict.fromkeys(generated or []))
     sampled = [one for one in named if is_checkpoint(one)]
     rules = PROTOCOLS[options.protocol]
-    _check_options(named, sampled, options)
+    _check_options(named, options)
     if not sampled and any(getattr(options, key) != getattr(EvaluateOptions, key) for key in SAMPLING):
         raise InputError(f"--{', --'.join(SAMPLING)} are of a run, a checkpoint or a model to sample; found none.")
     if len(named) == len(sampled) and (options.generated_split or options.generated_scale):
@@ -134,8 +130,7 @@ def evaluate(
             wanted = _build(options.metrics.split(","), keep, place.device)
         flows = _load_flows(sampled, place.device)
         if flows and options.num is None and place.rank == 0:
-            each = "each point" if curve else "each" if len(flows) > 1 else "it"
-            print(f"{', '.join(flows)}: {SAMPLED} scans of {each} are drawn (--num says how many)")
+            print(f"{', '.join(flows)}: {SAMPLED} scans of each set are drawn (--num says how many)")
         files = [one for one in named if one not in sampled]
         reading = how.reading([real, *files, options.train], next(iter(flows.values()), None))
         if rules.convention is not None and how.convention is None:
@@ -145,16 +140,14 @@ def evaluate(
         truth = _open(real, reading, options.split, options.real_num)
         rules.check(truth)
         scaled = replace(reading, reflectance_scale=options.generated_scale or reading.reflectance_scale)
-        judged = (
-            {}
-            if curve
-            else {
-                name: _sampled(text, flows[text], options)
-                if text in sampled
-                else _open(text, scaled, options.generated_split, options.num)
-                for text, name in zip(named, _names(named), strict=True)
-            }
-        )
+        judged: dict[str, ScanSet] = {}
+        for text, name in zip(named, labels([Path(text) for text in named]), strict=True):
+            if text in sampled:
+                judged |= _sampled(name, flows[text], options)
+            else:
+                judged[name] = _open(text, scaled, options.generated_split, options.num)
+        if len(judged) == 1:
+            judged = {"generated": next(iter(judged.values()))}
         sets = [truth, *judged.values()]
         reflectance = all(s.about["reflectance"] for s in sets)
         reflectance = reflectance and all(flow.encoding.reflectance for flow in flows.values())
@@ -162,7 +155,6 @@ def evaluate(
         metrics = wanted or _build_possible(usual, reflectance, keep, place.device)
         check_reflectance(metrics, sets)
         training = None if options.train is None else _open(options.train, reading, options.train_split, None)
-        drawings, steps = _curve_of(flows, options) if curve else ([], [])
         for folder in (options.out, options.json.parent if options.json else None):
             if folder is not None:
                 prepare_folder(folder)
@@ -172,34 +164,15 @@ def evaluate(
         def gather(scans: "ScanSet") -> "Gathered":
             return gather_real(metrics, scans, share, cache, rules)
 
-        if curve:
-            _measure_curve(truth, metrics, gather, share, place.device, flows, drawings, steps, options)
-        else:
-            _compare(truth, metrics, gather, share, place.device, judged, training, options)
+        _compare(truth, metrics, gather, share, place.device, judged, training, options)
 
 
-def _check_options(generated: Sequence[str], sampled: Sequence[str], options: EvaluateOptions) -> None:
+def _check_options(generated: Sequence[str], options: EvaluateOptions) -> None:
     """Refuse options that do not go together, before anything is read."""
-    curve, scans = options.curve, [one for one in generated if one not in sampled]
-    if curve and (scans or not sampled):
-        raise InputError(f"--curve is of runs, checkpoints or models to sample, found {scans[0] if scans else 'none'}.")
-    if curve and options.out is None:
-        raise InputError("a curve needs --out FOLDER, where its points are kept.")
-    if curve and (options.reference or options.baselines or options.train or options.json):
-        raise InputError("--reference, --baselines, --train and --json are of a comparison; a curve writes to --out.")
     if not (generated or options.reference or options.baselines):
         raise InputError("nothing to compare with: give GENERATED or --reference.")
     if options.json is not None and (options.json.is_dir() or options.json.suffix.lower() != ".json"):
         raise InputError(f"--json must be a file that ends in .json, found {options.json}.")
-
-
-def _names(generated: Sequence[str]) -> list[str]:
-    """What each judged set is called: `generated` where it is the only one, else the shortest end of its name."""
-    if len(generated) < 2:
-        return ["generated"] * len(generated)
-    from r2flow.reports.compare import labels
-
-    return labels([Path(text) for text in generated])
 
 
 def _compare(
@@ -213,8 +186,9 @@ def _compare(
     options: EvaluateOptions,
 ) -> None:
     from r2flow.evaluation.copies import Nearest, copies_result, find_nearest
-    from r2flow.evaluation.measuring import measure
+    from r2flow.evaluation.measuring import measure, speed_result
     from r2flow.evaluation.references import baseline_sets, reference_sets
+    from r2flow.evaluation.results import Results
     from r2flow.reports.evaluation import Comparison, Kind, evaluation_page, print_comparisons, write_json
     from r2flow.reports.pages import write_page
     from r2flow.reports.view.panels import write_sets
@@ -229,12 +203,21 @@ def _compare(
         kinds["baseline"] = {name: (truth, one) for name, one in baseline_sets(truth, min(num, SAMPLED)).items()}
     comparisons: list[Comparison] = []
     statistics: dict[int, Gathered] = {}
+    folder = options.out and options.out / "results"
+    kept = Results(folder, metrics, bootstrap=options.bootstrap, protocol=options.protocol, device=device)
     for kind, (name, (real, other)) in ((kind, pair) for kind, pairs in kinds.items() for pair in pairs.items()):
         start = time.monotonic()
-        if id(real) not in statistics:
-            statistics[id(real)] = gather(real)
-        draws = 0 if kind == "baseline" else options.bootstrap
-        results = measure(metrics, statistics[id(real)], other, work, draws)
+        sampled = other.about.get("kind") == "sampled"
+        results = kept.read(real, other) if sampled else None
+        if results is None:
+            if id(real) not in statistics:
+                statistics[id(real)] = gather(real)
+            draws = 0 if kind == "baseline" else options.bootstrap
+            results = measure(metrics, statistics[id(real)], other, work, draws)
+            if sampled:
+                results.append(speed_result(real, other))
+                if work.rank == 0:
+                    kept.write(real, other, results)
         comparisons.append(Comparison(name, real, other, results, time.monotonic() - start, kind))
     if work.rank > 0:
         return
@@ -264,55 +247,6 @@ def _compare(
         print(write_sets(options.out / "evaluation.html", sets, title="Generated and real scans"))
 
 
-def _curve_of(flows: "Mapping[str, Checkpoint]", options: EvaluateOptions) -> "tuple[list[Drawing], list[int]]":
-    """The samplers of a curve and its numbers of steps, checked before anything is read."""
-    from r2flow.registry import options_of
-    from r2flow.reports.speed_quality import Drawing, steps_of
-    from r2flow.samplers import SAMPLERS, parse_sampler
-
-    names = [*dict.fromkeys(options.sampler.split(","))] if options.sampler else []
-    ways = [parse_sampler(name) for name in names] or [{}]
-    taken = [options_of(SAMPLERS[way["name"]]) for way in ways if way]
-    if taken and options.steps and not any("steps" in fields for fields in taken):
-        raise InputError(f"{', '.join(names)}: no option 'steps'; leave --steps out.")
-    if options.tolerance is not None:  # of the samplers that have one
-        for way in [way for way, fields in zip(ways, taken, strict=False) if "tolerance" in fields] or ways:
-            way["tolerance"] = options.tolerance
-    drawings = [Drawing(options.num or SAMPLED, options.seed, way, options.precision) for way in ways]
-    steps = numbers("steps", options.steps or STEPS, int)
-    for (label, flow), drawing in product(flows.items(), drawings):
-        steps_of(flow, label, steps, drawing)
-    return drawings, steps
-
-
-def _measure_curve(
-    truth: "ScanSet",
-    metrics: "Mapping[str, ScanMetric]",
-    gather: "Callable[[ScanSet], Gathered]",
-    work: "Work",
-    device: str,
-    flows: "Mapping[str, Checkpoint]",
-    drawings: "Sequence[Drawing]",
-    steps: Sequence[int],
-    options: EvaluateOptions,
-) -> None:
-    from r2flow.reports.pages import write_page
-    from r2flow.reports.speed_quality import Curve, measure_curve, read_rows, speed_quality_page
-
-    assert options.out is not None
-    out, done = options.out, read_rows(options.out)
-    curve = Curve(truth, metrics, gather(truth), drawings, device, options.bootstrap)
-
-    def keep(rows: list[dict[str, Any]]) -> None:
-        if work.rank == 0:
-            write_page(speed_quality_page(curve, rows, command(), done, figures=False), out)
-
-    rows = measure_curve(curve, flows, steps, work, done, keep)
-    if work.rank == 0:
-        page = speed_quality_page(curve, rows, command(), done)
-        finish(page, out, page.text)
-
-
 def _load_flows(names: Sequence[str], device: str) -> "dict[str, Checkpoint]":
     from r2flow.model.checkpoint import load_checkpoint
 
@@ -333,15 +267,49 @@ def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> 
     return scans
 
 
-def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "ScanSet":
-    """Scans of a flow that is judged."""
+def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[str, ScanSet]":
+    """A set for each of the samplers and numbers of steps that the generator can be run with, by its name."""
     from r2flow.evaluation.sets import sampled_set
 
+    names = options.sampler.split(",") if options.sampler else [None]
     steps = numbers("steps", options.steps, int) if options.steps else [None]
-    if len(steps) != 1:
-        raise InputError(f"a comparison takes one number of --steps, found {options.steps}; --curve takes several.")
-    sampler = flow.generator.choose(**SamplerOptions(options.sampler, steps[0], options.tolerance).given)
-    return sampled_set(flow, label, options.num or SAMPLED, sampler, options.seed, options.precision)
+    samplers = _samplers(flow.generator, names, steps, options.tolerance)
+    sets = {}
+    for sampler in samplers:
+        line = f"{label}, {sampler.name}" if len(names) > 1 else label
+        count = getattr(sampler, "steps", None)
+        name = f"{line}, {count} step{'s' * (count > 1)}" if count and len(steps) > 1 else line
+        sets[name] = sampled_set(flow, line, options.num or SAMPLED, sampler, options.seed, options.precision)
+    return sets
+
+
+def _samplers(
+    generator: "Generator", names: Sequence[str | None], steps: Sequence[int | None], tolerance: float | None
+) -> "list[Sampler]":
+    """The samplers that a generator can be run with; of several each takes the options that it has."""
+    from r2flow.registry import options_of
+    from r2flow.samplers import SAMPLERS, parse_sampler
+
+    fields = [options_of(SAMPLERS[parse_sampler(name)["name"]]) if name else vars(generator.sampler) for name in names]
+    curve = names == [None] and len(steps) > 1  # a generator without steps, a GAN, is one point of it
+    chosen: list[Sampler] = []
+    refused = None
+    for place, name in enumerate(names):
+        for count in steps:
+            given = SamplerOptions(name, count, tolerance).given
+            for option in ("steps", "tolerance"):
+                if option not in fields[place] and (curve or any(option in other for other in fields)):
+                    given.pop(option, None)
+            try:
+                sampler = generator.choose(**given)
+            except InputError as error:
+                refused = error
+                continue
+            if sampler not in chosen:
+                chosen.append(sampler)
+    if refused and not chosen:
+        raise refused
+    return chosen
 
 
 def _build(names: Sequence[str], keep: bool, device: str) -> "dict[str, ScanMetric]":

@@ -9,13 +9,7 @@ import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import DrawOptions, SamplerOptions, grouped
-from r2flow.cli.options import (
-    CheckpointOption,
-    DeviceOption,
-    OutOption,
-    PrecisionOption,
-    choose_device,
-)
+from r2flow.cli.options import CheckpointOption, DeviceOption, OutOption, PrecisionOption, choose_device
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:

@@ -204,13 +204,13 @@ def completion(
     finish(page, out, page.text[1:])
 
 
-@report.command(epilog="Example: r2flow report paper runs/1rf runs/2rf --results speed --real kitti360/test -o paper")
+@report.command(epilog="Example: r2flow report paper runs/1rf runs/2rf --results e.json --real kitti360/test -o paper")
 def paper(
     models: Annotated[list[str], typer.Argument(help="Runs, checkpoint files or models; ROLE=MODEL sets the row.")],
     out: OutOption,
     results: Annotated[
         list[Path] | None,
-        typer.Option(help="Folder of `r2flow evaluate REAL MODEL --curve --out FOLDER`; may be repeated."),
+        typer.Option(help="JSON file of `r2flow evaluate REAL MODEL... --json FILE`; may be repeated."),
     ] = None,
     real: Annotated[str | None, typer.Option(help=f"Real scans for figures 3, 5 and 7: {SETS}.")] = None,
     num: Annotated[int, typer.Option(min=1, help="Scans of each model in figures 5 and 7.")] = 16,
@@ -226,10 +226,7 @@ def paper(
     from r2flow.reports.paper import PaperRun, paper_page, read_results, role_of
 
     where = choose_device(device)
-    files = [folder / "speed_quality.json" for folder in results or []]
-    if missing := [file for file in files if not file.is_file()]:
-        raise InputError(f"--results: {missing[0]} does not exist; r2flow evaluate REAL MODEL --curve --out writes it.")
-    runs = []
+    rows, runs = read_results(results or []), []
     for text in models:
         role, _, model = text.rpartition("=")
         checkpoint = load_checkpoint(model, where)
@@ -238,5 +235,5 @@ def paper(
         runs.append(PaperRun(role or role_of(checkpoint, Path(model).stem), model, checkpoint))
     scans = None if real is None else open_scans(real, reading_for([], runs[0].checkpoint))
     prepare_folder(out)
-    page = paper_page(runs, read_results(files), scans, num, paths, steps, repeats, command(), where)
+    page = paper_page(runs, rows, scans, num, paths, steps, repeats, command(), where)
     finish(page, out, page.text[:1])

@@ -1,8 +1,7 @@
 """The metrics' figures of generated scans against real ones, each with its protocol."""
 
-import hashlib
-import json
 import math
+import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,7 +12,7 @@ from r2flow.errors import InputError
 from r2flow.evaluation.protocols import R2FLOW, WORDS, Rules
 from r2flow.evaluation.sets import SampledScans, ScanSet
 from r2flow.evaluation.statistics import Cache, Statistics, key_of
-from r2flow.metrics.base import ScanMetric
+from r2flow.metrics.base import Protocol, ScanMetric
 from r2flow.metrics.bootstrap import bootstrap
 from r2flow.metrics.scans import Scans
 from r2flow.progress import Bar
@@ -161,11 +160,17 @@ def measure(
     return results
 
 
-def point_key(real: ScanSet, metrics: Mapping[str, ScanMetric], **sampling: Any) -> str:
-    """16 hex digits of everything that the figures of a sampled flow depend on; `sampling` is how it is sampled."""
-    protocols = {name: metric.protocol.asdict() for name, metric in metrics.items()}
-    parts = {"real": real.identity or real.label, "metrics": protocols, **sampling}
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+def speed_result(real: ScanSet, generated: ScanSet) -> MetricResult:
+    """Mean network evaluations a scan, and seconds a scan: the median over batches, without the metrics' time."""
+    source = generated.source
+    assert isinstance(source, SampledScans)
+    # A process without a batch has drawn nothing; the first process always has.
+    figures = {
+        "evaluations": statistics.fmean(source.evaluations or [math.nan]),
+        "seconds": statistics.median(source.seconds or [math.nan]),
+    }
+    sizes = {"real": len(real), "real_chosen": "none", "generated": len(generated)}
+    return MetricResult("speed", figures, {**Protocol("speed", "network and solver").asdict(), "sizes": sizes})
 
 
 def _update(

@@ -102,7 +102,7 @@ def labels(folders: Sequence[Path]) -> list[str]:
     """Each folder's name, with as many parents as it takes to tell them apart."""
     parts = [folder.resolve().parts for folder in folders]
     depth = 1
-    while depth < max(map(len, parts)) and len({p[-depth:] for p in parts}) < len(set(parts)):
+    while depth < max(map(len, parts), default=1) and len({p[-depth:] for p in parts}) < len(set(parts)):
         depth += 1
     return ["/".join(p[-depth:]) for p in parts]
 

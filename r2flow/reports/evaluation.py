@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle, product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,17 +15,19 @@ from r2flow.evaluation.copies import Nearest
 from r2flow.evaluation.measuring import MetricResult
 from r2flow.evaluation.sets import ScanSet
 from r2flow.files import atomic_write
-from r2flow.reports.pages import STYLES, Page, blank_figure, plain, provenance
+from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks, plain, provenance
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
 from r2flow.reports.tables import print_table, shown, table
 
 FORMAT = "r2flow evaluation 1"
 Kind = Literal["judged", "reference", "baseline"]
+ENDS = (" low", " high")  # of the names of an interval's ends
+AXES = (("evaluations", "network evaluations a scan"), ("seconds", "seconds a scan"))
 
 # Figures that the field's tables print scaled: heading and factor. The figure itself stays what it is.
 PRINTED = {
     "jsd": ("JSD x 10^2", 1e2),
-    "mmd": ("MMD x 10^4", 1e4), "mmd_unbiased": ("MMD x 10^4, unbiased", 1e4),
+    "seconds": ("s a scan", 1.0), "mmd": ("MMD x 10^4", 1e4), "mmd_unbiased": ("MMD x 10^4, unbiased", 1e4),
 }  # fmt: skip
 
 
@@ -46,7 +49,7 @@ class Comparison:
 
 def heading(metric: str, figure: str) -> tuple[str, float]:
     """The heading of a figure in a table, and the factor that it is printed with."""
-    return PRINTED[metric] if metric in PRINTED and figure == metric else (figure, 1.0)
+    return PRINTED[figure] if figure in PRINTED and metric in (figure, "speed") else (figure, 1.0)
 
 
 def rows_of(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
@@ -121,6 +124,10 @@ def evaluation_page(
     ]  # fmt: skip
     more = {"comparisons": [_plain_comparison(one) for one in comparisons]}
     figures = {"evaluation": _figure(comparisons)}
+    sampled = points(more["comparisons"])
+    if len(sampled) > len({row["flow"] for row in sampled}):
+        names = [name for name in dict.fromkeys(key for row in sampled for key in row) if "/" in name]
+        figures["evaluation_speed"] = speed_figure(sampled, [name for name in names if not name.endswith(ENDS)])
     if nearest and training is not None:
         figures["evaluation_copies"] = copies_figure(nearest, training)
     title = "Generated scans against real ones"
@@ -212,7 +219,8 @@ def _plain_comparison(one: Comparison) -> dict[str, Any]:
 
 def _figure(comparisons: Sequence[Comparison]) -> Figure:
     """A plot for each metric's first figure, with a mark for each comparison."""
-    first = {m.metric: next(iter(m.figures)) for one in comparisons for m in one.measured if m.figures}
+    measured = [m for one in comparisons for m in one.measured if m.figures and m.metric != "speed"]
+    first = {m.metric: next(iter(m.figures)) for m in measured}
     columns = max(min(len(first), 4), 1)
     lines = max(math.ceil(len(first) / columns), 1)
     title = "Each metric's first figure, generated scans and real ones"
@@ -236,6 +244,49 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
         axes.locator_params(axis="x", nbins=4)
         axes.grid(True, axis="x", color="0.88", lw=0.6)
         axes.tick_params(labelsize=8)
+    return figure
+
+
+def points(comparisons: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each sampled set of a JSON's `comparisons`: flow, weights, speed, METRIC/FIGURE and interval."""
+    rows = []
+    for one in comparisons:
+        if one["kind"] != "judged" or one["generated"].get("kind") != "sampled":
+            continue
+        row = {"flow": one["generated"]["set"], "weights": one["generated"]["weights"]}
+        for metric in one["metrics"]:
+            short = "" if metric["metric"] == "speed" else f"{metric['metric']}/"
+            row |= {f"{short}{name}": math.nan if value is None else value for name, value in metric["figures"].items()}
+            for name, ends in metric["intervals"].items():
+                row |= {f"{short}{name}{end}": value for end, value in zip(ENDS, ends, strict=True)}
+        rows.append(row)
+    return rows
+
+
+def speed_figure(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Figure:
+    """Each metric's first figure against evaluations (above) and seconds (below), a line for each flow."""
+    first: dict[str, str] = {}
+    for name in names:
+        first.setdefault(name.split("/", 1)[0], name)
+    flows = list(dict.fromkeys(row["flow"] for row in rows))
+    figure = blank_figure(3.4 * len(first) + 0.6, 6.2, "quality against speed: lower left is better")
+    panels = figure.subplots(2, len(first), squeeze=False)
+    for (line, (x, label)), (column, name) in product(enumerate(AXES), enumerate(first.values())):
+        axes = panels[line, column]
+        title, factor = heading(*name.split("/", 1))
+        for flow, style in zip(flows, cycle(STYLES), strict=False):
+            line_rows = sorted((row for row in rows if row["flow"] == flow), key=lambda row: row[x])
+            at = [row[x] for row in line_rows]
+            axes.plot(at, [row.get(name, math.nan) * factor for row in line_rows], **style, ms=5, lw=1.2, label=flow)
+            ends = [[row.get(f"{name}{end}", math.nan) * factor for row in line_rows] for end in ENDS]
+            axes.vlines(at, *ends, color=style["color"], lw=0.8)
+        positive = all(row[name] > 0 for row in rows if name in row)
+        axes.set(xscale="log", yscale="log" if positive else "linear", xlabel=label, ylabel=title)
+        few_log_ticks(axes.xaxis)
+        axes.grid(True, which="major", color="0.88", lw=0.6)
+        axes.tick_params(labelsize=8)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(flows), 4), fontsize=8, frameon=False)
     return figure
 
 

@@ -1,6 +1,5 @@
 """The paper's tables I and II and figures 3 and 5 to 8 from runs: the printed numbers next to evaluated ones."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,8 @@ import torch
 from matplotlib.figure import Figure
 
 from r2flow.data.sets import ScanSet
+from r2flow.errors import InputError
+from r2flow.files import read_json
 from r2flow.generators import Flow
 from r2flow.inversion import interpolate_scans
 from r2flow.lidar.projection import image_to_points
@@ -20,11 +21,11 @@ from r2flow.model.sampling import sample
 from r2flow.progress import track
 from r2flow.reports.backbones import cost
 from r2flow.reports.curvature import curvature_figure, curvature_text, measure_paths, trajectories_figure
+from r2flow.reports.evaluation import points, speed_figure
 from r2flow.reports.interpolation import interpolation_figure
 from r2flow.reports.pages import Page, blank_figure
 from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.printed import COLUMNS, TABLE_I, TABLE_II, Architecture
-from r2flow.reports.speed_quality import speed_quality_figure
 from r2flow.reports.tables import Row, table
 
 FRAMES = 6  # of figure 3, as in the paper: both ends' round trips and four between
@@ -73,7 +74,7 @@ def paper_page(
     """The page, still to be written.
 
     Args:
-        rows: Of `speed_quality.json` files (`r2flow evaluate REAL RUN ... --curve --out FOLDER`).
+        rows: From `read_results`.
         real: Scans for figures 3, 5 and 7; None leaves figure 3 out.
         num: Scans of each generator in figures 5 and 7.
         paths: Scans whose paths figure 8 follows, in `steps` Euler steps; 0 leaves it out.
@@ -97,7 +98,7 @@ def paper_page(
     )
     names = [name for name in dict.fromkeys(key for row in evaluated for key in row) if name in _figures(evaluated)]
     if names:
-        figures["figure_6"] = speed_quality_figure([{**row, "flow": row["role"]} for row in evaluated], names)
+        figures["figure_6"] = speed_figure([{**row, "flow": row["role"]} for row in evaluated], names)
     figures["figure_7"] = scans_figure(runs, drawn, truth)
     if paths and flows:
         straight = [
@@ -115,8 +116,18 @@ def paper_page(
 
 
 def read_results(files: Sequence[Path]) -> list[dict[str, Any]]:
-    """The rows of `speed_quality.json` files."""
-    return [row for file in files for row in json.loads(file.read_text(encoding="utf-8"))["rows"]]
+    """A row for each sampled set of the JSON files of `r2flow evaluate`; see `r2flow.reports.evaluation.points`.
+
+    Raises:
+        InputError: a file that cannot be read or holds something else.
+    """
+    rows = []
+    for file in files:
+        try:
+            rows += points(read_json(file)["comparisons"])
+        except (OSError, ValueError, LookupError, TypeError, AttributeError):
+            raise InputError(f"{file} is not a JSON file of `r2flow evaluate`.") from None
+    return rows
 
 
 def _figures(rows: Sequence[Row]) -> list[str]:

@@ -90,13 +90,14 @@ def test_scan_i_of_a_seed_is_the_same_in_any_batch(trained: tuple[Family, Path],
 
 def test_samples_are_measured(trained: tuple[Family, Path], tmp_path: Path):
     family, run = trained
-    done = r2flow("evaluate", family.plugin, "simulated:7", run, *EVALUATE, "--json", tmp_path / "e.json")
+    done = r2flow(
+        "evaluate", family.plugin, "simulated:7", run, *EVALUATE, "--steps", "1,2", "--json", tmp_path / "e.json"
+    )
     assert done.returncode == 0, done.stderr
     assert "JSD" in done.stdout
-    done = r2flow("evaluate", family.plugin, "simulated:7", run, "--curve", *EVALUATE, "--steps", "1,2", "-o", tmp_path)
-    assert done.returncode == 0, done.stderr
-    steps = [row["steps"] for row in json.loads((tmp_path / "speed_quality.json").read_text())["rows"]]
-    assert steps == ([1] if family is GAN else [1, 2])
+    sets = [one["generated"] for one in json.loads((tmp_path / "e.json").read_text())["comparisons"]]
+    steps = [one["sampler"].get("steps") for one in sets if one.get("kind") == "sampled"]
+    assert steps == ([None] if family is GAN else [1, 2])
 
 
 def test_weights_travel_as_safetensors(trained: tuple[Family, Path], tmp_path: Path):

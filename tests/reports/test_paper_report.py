@@ -69,13 +69,15 @@ def test_marginals_are_sums_over_the_other_axis():
 
 
 def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):  # noqa: F811
-    row = {"flow": "a", "weights": weights_hash(load_checkpoint(runs["1-RF"])), "steps": 1, "evaluations": 1.0,
-           "seconds": 0.1, "solver": "euler", "jsd/jsd": 0.25, "mmd/mmd": 1e-4}  # fmt: skip
-    folder = tmp_path / "speed"
-    folder.mkdir()
-    (folder / "speed_quality.json").write_text(json.dumps({"rows": [row, {**row, "weights": "another model"}]}))
+    figures = {"speed": {"evaluations": 1.0, "seconds": 0.1}, "jsd": {"jsd": 0.25}, "mmd": {"mmd": 1e-4}}
+    metrics = [{"metric": name, "figures": values, "intervals": {}} for name, values in figures.items()]
+    hashes = weights_hash(load_checkpoint(runs["1-RF"])), "another model"
+    sets = [{"kind": "sampled", "set": "a", "weights": weights} for weights in hashes]
+    comparisons = [{"kind": "judged", "generated": one, "metrics": metrics} for one in sets]
+    results = tmp_path / "e.json"
+    results.write_text(json.dumps({"comparisons": comparisons}))
     options = ("--num", 2, "--paths", 1, "--steps", 4, "--repeats", 0, "--device", "cpu", "--real", "simulated:0")
-    code, said, _ = r2flow("report", "paper", *runs.values(), "--results", folder, *options, "-o", tmp_path / "out")
+    code, said, _ = r2flow("report", "paper", *runs.values(), "--results", results, *options, "-o", tmp_path / "out")
     assert code == 0
     assert "3 generators" in said
     content = json.loads((tmp_path / "out" / "paper.json").read_text())

@@ -323,9 +323,9 @@ def test_a_published_checkpoint_is_sampled_and_evaluated(shared, tmp_path):
         made = diffusion(noise, sampler=build_sampler("ddpm", steps=2), draws=Draws(0, [1]))
     np.testing.assert_allclose(images[1], diffusion.space.decode(made.x)[0], rtol=0, atol=1e-3)
     few = ["--num", 2, "--real-num", 2, "--workers", 0, "--no-cache", "--metrics", "jsd"]
-    r2flow("evaluate", "simulated:7", path, "--curve", *few, "--steps", "1,2", "-o", tmp_path)
-    rows = json.loads((tmp_path / "speed_quality.json").read_text())["rows"]
-    assert [row["steps"] for row in rows] == [1, 2]
+    r2flow("evaluate", "simulated:7", path, *few, "--steps", "1,2", "--json", tmp_path / "e.json")
+    judged = json.loads((tmp_path / "e.json").read_text())["comparisons"][:2]
+    assert [one["generated"]["sampler"]["steps"] for one in judged] == [1, 2]
 
 
 def test_a_sampler_is_refused_before_anything_is_said(shared, tmp_path, caplog):
