@@ -86,7 +86,7 @@ class Store:
         return False
 
     def begin(self, **notes: Any) -> None:
-        """Write the manifest where there is none, with `notes` beside the recipe.
+        """Write the manifest if it is missing: the recipe and `notes`.
 
         Raises:
             InputError: as `check`, or the folder cannot be written to.
@@ -103,6 +103,7 @@ class Store:
             raise InputError(f"{self.folder} cannot be written to; give another by {self.option}.") from None
 
     def write_manifest(self, **notes: Any) -> None:
+        """Write the manifest, over an earlier one: the recipe, and `notes`."""
         content = {"format": f"r2flow {self.kind}", "recipe": self.described, **notes}
         with atomic_write(self.folder / MANIFEST, "w") as file:
             json.dump({**content, "checksum": checksum(content)}, file, indent=1)

@@ -295,6 +295,9 @@ def test_answers_to_another_scan_of_the_same_name_are_none(r2flow, run, tmp_path
     for number, drive in enumerate("ab"):
         full_scan(tmp_path / drive / f"one{ending}", number)
     asked = "-c", run, "--mask", "rows:2", "--out", tmp_path / "out"
+    full_scan(tmp_path / "out" / f"one{ending}", 1)
+    assert r2flow(*COMPLETE, tmp_path / "a", *asked)[0] == 2
+    (tmp_path / "out" / f"one{ending}").unlink()
     assert r2flow(*COMPLETE, tmp_path / "a", *asked)[0] == 0
     before = (tmp_path / "out" / f"one{ending}").read_bytes()
     code, _, error = r2flow(*COMPLETE, tmp_path / "b", *asked)
@@ -349,7 +352,7 @@ def test_a_bad_scan_may_be_mended_and_the_command_given_again(r2flow, run, tmp_p
     assert code == 0
     assert "1 scans completed" in said
     full_scan(tmp_path / "in" / "b.npy", 0)
-    assert "answers to another scan of the name b" in r2flow(*asked)[2]
+    assert "another scan of the name b" in r2flow(*asked)[2]
 
 
 def test_answers_by_another_mask_file_or_scale_are_none(r2flow, run, tmp_path):  # noqa: F811

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -259,6 +260,10 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
     assert {name: (tmp_path / name).read_bytes() for name in names()[:4]} == whole
     with pytest.raises(InputError, match="holds other samples: seed is 0 there, 1 here"):
         write(2, seed=1)
+    assert names() == [f"{number:06d}.npy" for number in range(5)]
+    monkeypatch.setattr("r2flow.reports.outputs.draw", mock.Mock(side_effect=MemoryError))
+    with pytest.raises(MemoryError):
+        write_samples(checkpoint, tmp_path, 2, 1, build_sampler("euler", steps=2), ["npy"], replace=True)
     assert names() == [f"{number:06d}.npy" for number in range(5)]
     assert write(2, seed=1, replace=True) == [0, 1]
     assert names() == ["000000.npy", "000001.npy"]

@@ -28,7 +28,7 @@ ELSEWHERE = "data.root=FOLDER (r2flow pairs --out FOLDER)"  # how another folder
 
 @dataclass(frozen=True)
 class PairRecipe:
-    """What a pair is a function of, beside its index: two folders of one recipe hold the same bytes."""
+    """What a pair depends on, apart from its index: two folders of one recipe hold the same bytes."""
 
     parent: str  # hash of the flow's weights and of what they mean
     shape: tuple[int, int, int]  # (C, H, W) of a scan in model space
@@ -52,7 +52,7 @@ class Block(NamedTuple):
         x_1: (n, C, H, W) float16.
         evaluations: (n,) int32.
         usable: (n,) bool.
-        knots: Inner states of each path, (n, K, C, H, W) float16, at `r2flow.flow.solvers.knot_times`; or none.
+        knots: Inner states of each path, (n, K, C, H, W) float16, at `r2flow.flow.solvers.knot_times`, or None.
     """
 
     x_1: np.ndarray
@@ -321,7 +321,7 @@ class PairDataset(Dataset[Item]):
 
 
 def default_folder(checkpoint: Path) -> Path:
-    """Where the pairs of a flow lie unless told otherwise: `pairs` in its run's folder, or beside its file.
+    """The usual folder of a flow's pairs: `pairs` in its run's folder, or next to its file.
 
     Those of a model lie in `runs`, for its own folder is that of the package or of the models.
     """

@@ -159,12 +159,12 @@ def _inputs(store: Store, inputs: Mapping[str, str], files: Mapping[str, Sequenc
     """Identities of the scans that a folder's answers belong to, by name, with those of `inputs`.
 
     Raises:
-        InputError: the folder holds answers by other settings, or to another scan of the same name.
+        InputError: the folder holds answers by other settings, or files of an answer's name that are not its.
     """
     before: dict[str, str] = read_manifest(store.folder, store.kind)["inputs"] if store.check() else {}
     for name, paths in files.items():
-        if before.get(name, inputs[name]) != inputs[name] and any(path.exists() for path in paths):
-            raise InputError(f"{store.folder} holds answers to another scan of the name {name}; give another --out.")
+        if before.get(name) != inputs[name] and any(path.exists() for path in paths):
+            raise InputError(f"{store.folder} holds files of another scan of the name {name}; give another --out.")
     return {**before, **inputs}
 
 

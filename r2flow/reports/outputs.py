@@ -87,7 +87,7 @@ def write_samples(
     part |= {} if precision == "32-true" else {"precision": precision}
     endings = ["reflectance.npy"] if channels == "reflectance" else formats
     store = FileStore(out, "samples", recipe_of(checkpoint, seed, part, **sampler.asdict()), endings)
-    _check_folder(store, replace)
+    stale = _stale(store, replace)
     if {"ply", "bin"} & set(formats) and not torch.equal(generator.space.rays, rays):
         log.warning(
             "the model was told rays through the corners of the bins (rays=reference); points are written along rays "
@@ -97,7 +97,7 @@ def write_samples(
     with ScanBar("sampling", num, batches(num, batch_size) * (sampler.evaluations(generator) or 0)) as bar:
         for first in range(0, num, batch_size):
             numbers = range(first, min(first + batch_size, num))
-            if first >= pictures and not store.missing(numbers):
+            if first >= pictures and not stale and not store.missing(numbers):
                 bar.finished(numbers.stop)
                 continue
             drawn = draw(
@@ -105,7 +105,9 @@ def write_samples(
                 progress=bar.evaluated,
             )  # fmt: skip
             warn_unsolved(drawn.converged, drawn.first)
-            store.begin()  # the first scan shows that the settings can be used
+            while stale:  # the first scan shows that the settings can be used
+                stale.pop().unlink()
+            store.begin()
             for number, image in enumerate(drawn.images.numpy(), drawn.first):
                 if channels == "reflectance":
                     _save(image, out / f"{number:06d}.reflectance.npy")
@@ -137,15 +139,19 @@ def warn_unsolved(converged: Tensor, first: int = 0) -> None:
         )
 
 
-def _check_folder(store: FileStore, replace: bool) -> None:
-    """Refuse a folder that holds other scans; with `replace`, samples of other settings are removed."""
+def _stale(store: FileStore, replace: bool) -> list[Path]:
+    """The files of samples of other settings, if they are to be replaced.
+
+    Raises:
+        InputError: the folder holds other scans.
+    """
     files = [file for file in store.folder.glob("*") if OWN.fullmatch(file.name)]
     note = store.folder / MANIFEST
     if replace and note.is_file() and read_manifest(store.folder, store.kind)["recipe"] != store.described:
-        for file in (*files, note):
-            file.unlink()
-    elif not store.check() and files:
+        return [note, *files]
+    if not store.check() and files:
         raise InputError(f"{store.folder} holds {files[0].name} and no {MANIFEST}; give another folder by --out.")
+    return []
 
 
 def recipe_of(
