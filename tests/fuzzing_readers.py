@@ -7,7 +7,6 @@ import numpy as np
 
 from r2flow.data.opening import open_prepared, own_reading
 from r2flow.data.pairs import PairRecipe, PairStore
-from r2flow.data.prepared import check_prepared
 from r2flow.data.reading import Reading, read_image
 from r2flow.errors import InputError
 from r2flow.lidar.labels import read_labels
@@ -50,8 +49,9 @@ def in_folder(name: str) -> Callable[[Path], Path]:
 def prepared(path: Path) -> bytes:
     folder = in_folder("prepared")(path)
     source = open_prepared(folder, Reading(SENSOR, reflectance=True))
-    if check_prepared(folder):
-        raise InputError("damage was found")
+    for shard in source.rows[:, 1]:
+        if damage := source.store.damage(int(shard)):
+            raise InputError(damage)
     return b"".join(source[number].tobytes() for number in range(len(source)))
 
 

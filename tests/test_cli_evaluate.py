@@ -65,7 +65,7 @@ def test_the_json_holds_everything_about_a_figure(r2flow, real, generated, tmp_p
 def test_prepared_shards_are_the_scans_that_they_were_made_of(r2flow, generated, tmp_path):  # noqa: F811
     for number, image in enumerate(images(6, 1)):
         write_points(tmp_path / "drives" / str(number // 3) / f"{number}.bin", *image_to_points(image, SENSOR.rays()))
-    assert r2flow("prepare", "folder", tmp_path / "drives", "--size", "8x64", "--out", tmp_path / "shards")[0] == 0
+    assert r2flow("prepare", tmp_path / "drives", "--size", "8x64", "--out", tmp_path / "shards")[0] == 0
     found = open_scans(tmp_path / "shards")
     assert {name: list(numbers) for name, numbers in found.drives.items()} == {"0": [0, 1, 2], "1": [3, 4, 5]}
     np.testing.assert_allclose(found.source[4], images(6, 1)[4], atol=5e-3)

@@ -117,7 +117,7 @@ def test_the_wrong_sensor_is_said_in_one_line_with_the_right_one(r2flow, tmp_pat
     one, out = tmp_path / "scans" / "0.bin", tmp_path / "out"
     for verb in (
         ("show", tmp_path / "scans"),
-        ("prepare", "folder", tmp_path / "scans", "--workers", 1),
+        ("prepare", tmp_path / "scans", "--workers", 1),
         ("evaluate", tmp_path / "scans", one, "--metrics", "jsd", "--workers", 0),
     ):
         given = verb if "-o" in verb else (*verb, "--out", out / verb[0])
@@ -143,7 +143,7 @@ def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, 
     expected = np.unique(raw / np.float32(255))
     assert set(np.unique(np.load(image)[1])) <= {0, *expected}
     assert np.load(image)[1].max() > 0.95
-    code, _, error = r2flow("prepare", "folder", scans, "--sensor", out, "--out", tmp_path / "prepared", "--workers", 1)
+    code, _, error = r2flow("prepare", scans, "--sensor", out, "--out", tmp_path / "prepared", "--workers", 1)
     assert (code, error) == (0, "")
     assert read_manifest(tmp_path / "prepared")["recipe"]["reading"]["reflectance_scale"] == 255
     given = (scans, scans / "000000.bin", "--sensor", out, "--metrics", "jsd,sensor", "--workers", 0)
@@ -192,7 +192,7 @@ def test_the_three_commands_of_the_docs_run_as_they_are_written(r2flow, shared: 
     code, _, error = r2flow("sensor", data, "--out", mine)
     assert (code, error) == (0, "")
     assert read_sensor(mine).reflectance_scale == SCALES[folder]
-    code, _, error = r2flow("prepare", "folder", data, "--sensor", mine, "--out", prepared, "--workers", 1)
+    code, _, error = r2flow("prepare", data, "--sensor", mine, "--out", prepared, "--workers", 1)
     assert (code, error) == (0, "")
     small = [part for part in TINY if not part.startswith(("data", "sensor."))]
     for given in (["data=prepared", f"data.root={prepared}"], ["data=folder", f"data.root={data}"]):

@@ -29,7 +29,7 @@ def test_scans_of_any_name_are_drawn_measured_and_prepared(r2flow, tmp_path, mon
         write_scan(folder / f"{name}{number}.bin", number)
     for arguments in (
         ("show", folder, "-o", "views"),
-        ("prepare", "folder", folder, "-o", "prepared", "--size", "16x64", "--workers", 1),
+        ("prepare", folder, "-o", "prepared", "--size", "16x64", "--workers", 1),
         ("evaluate", folder, folder, "--metrics", "jsd", "--out", "page", "--size", "16x64", "--workers", 0),
     ):
         code, _, err = r2flow(*[f"./{one}" if one is folder else one for one in arguments])

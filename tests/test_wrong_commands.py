@@ -181,28 +181,19 @@ sensor scans -o out # a .yaml file
 sensor scans -o out.yaml --name 'a b'
 sensor scans -o out.yaml --name hdl64e
 sensor scans -o file.txt/out.yaml
-prepare # needs LAYOUT
-prepare folder # needs LAYOUT
-prepare folder scans # needs LAYOUT
-prepare nope scans -o out
-prepare folder nowhere -o out
-prepare folder empty -o out
-prepare folder -o out
-prepare folder scans -o file.txt
-prepare folder scans -o out --split train # no split named 'train'
-prepare folder scans -o out --drives 77
-prepare folder scans -o out --num 3
-prepare folder scans -o out --on-bad-scan ignore
-prepare folder scans -o out --reflectance-levels 999999
-prepare kitti_360 scans -o out
-prepare kitti_360 scans -o out --split nope
-prepare simulated scans -o out
-prepare simulated -o out --split train
-prepare prepared scans -o out
-prepare --check nowhere
-prepare --check empty
-prepare --check scans # no prepared scans
-prepare --check file.txt
+prepare nope:scans -o out
+prepare nowhere -o out
+prepare empty -o out
+prepare -o out # Missing
+prepare simulated:3 -o out
+prepare scans/000000.bin -o out
+prepare scans -o file.txt
+prepare scans -o out --split train # no split named 'train'
+prepare scans -o out --drives 77
+prepare scans -o out --on-bad-scan ignore
+prepare kitti_360:scans -o out
+prepare kitti_360:scans -o out --split nope
+prepare prepared:scans -o out
 pairs # Missing
 pairs nowhere
 pairs empty
@@ -288,7 +279,7 @@ BASES = {
     "sample": "sample run -o out", "pairs": "pairs run --num 1", "simulate": "simulate -o out",
     "complete": "complete scans/000000.bin -c run -o out", "view": "view run -o out.html", "show": "show scans -o out",
     "interpolate": "interpolate scans/000000.bin scans/000001.bin -c run -o out", "sensor": "sensor scans",
-    "prepare": "prepare folder scans -o out", "evaluate": "evaluate scans run --metrics jsd", "compare": "compare run",
+    "prepare": "prepare scans -o out", "evaluate": "evaluate scans run --metrics jsd", "compare": "compare run",
     "curvature": "report curvature run -o out", "solvers": "report solvers -o out",
     "backbones": "report backbones", "paper": "report paper run -o out",
 }  # fmt: skip

@@ -118,10 +118,8 @@ class ScanDataModule(L.LightningDataModule):
                 training.append(source.subset(first))
                 held.append(source.subset(last))
         else:
-            # Scenes that are held out come after those that are trained on, in whatever form these lie.
-            first_scene = 1 + max(
-                (max(source.simulated_scenes().get(self.seed, ()), default=-1) for source in whole), default=-1
-            )
+            # Scenes that are held out come after those that are trained on.
+            first_scene = max((part.scenes for part in self.parts if part.name == SIMULATED), default=0)
             training, held = whole, [self._open(options, first_scene) for options in other]
             shared = held[0].places() & set().union(*(source.places() for source in whole))
             if shared:

@@ -47,9 +47,10 @@ class Simulated(SourceKind):
     """Scenes of the simulator."""
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
+        if options.root is not None:
+            raise InputError("data=simulated takes no data.root; for scans of `r2flow simulate` give data=folder.")
         scenes = range(first_scene, first_scene + options.scenes)
-        folder = None if options.root is None else options.folder
-        return SimulatedScans(reading.sensor, seed, scenes, bool(reading.reflectance), folder)
+        return SimulatedScans(reading.sensor, seed, scenes, bool(reading.reflectance))
 
 
 class Prepared(SourceKind):
@@ -103,8 +104,8 @@ def open_scans(
         columns = None if reading.columns is None else list(reading.columns)
         options = replace(options, split=split, scenes=num or SCENES, reading={"columns": columns})
         if options.name == SIMULATED:
-            seed = int(options.folder)
-            return ScanSet(label, open_source(replace(options, root=None), reading, seed), reading.sensor)
+            seed, options = int(options.folder), replace(options, root=None)
+            return ScanSet(label, open_source(options, reading, seed), reading.sensor)
         return ScanSet(label, open_source(options, reading), reading.sensor).limited(num)
     image = range_image(file)
     if image is not None:  # points can be seen through any sensor
@@ -402,8 +403,8 @@ def held_out_options(options: DataOptions, scale: float | None = None) -> list[S
     kinds = {options.name, other.get("name", options.name)}
     if len(kinds) == 2:  # other files, with columns and a scale of their own
         theirs = {key: value for key, value in theirs.items() if key not in ("columns", "reflectance_scale")}
-        if SIMULATED in kinds:
-            common["root"] = None  # where simulated scans are kept, no others lie
+    if other.get("name") == SIMULATED:
+        common["root"] = None
     held = SourceOptions(**{**common, **other})
     if held.name in (MIXED, PAIRS):
         raise InputError(f"data.validation.data must name one data set, found {held.name}; hold out a part of it.")

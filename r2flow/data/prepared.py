@@ -11,7 +11,7 @@ A shard is an item of `r2flow.store`: `range` uint16 (n, H, W) and, where the sc
 import hashlib
 import logging
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,15 +23,12 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from r2flow import simulator
 from r2flow.data.layouts import Drive
-from r2flow.data.options import SIMULATED
 from r2flow.data.quantise import OTHER_LEVELS, RangeCodes, ReflectanceCodes, find_levels
 from r2flow.data.reading import Reading, lacks_reflectance, range_image, stored_reflectance
-from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, spread, warn_of_other_sensor
+from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
-from r2flow.lidar.sensors import Sensor
 from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, difference, read_manifest
 
 log = logging.getLogger(__name__)
@@ -66,51 +63,26 @@ def plan_files(
     root: str | Path,
     drives: Sequence[Drive],
     reading: Reading,
-    levels: int | None = None,
     shard_scans: int = SHARD_SCANS,
 ) -> Plan:
-    """Scan files in drives below a root. Without `levels`, some of the scans decide those of reflectance.
-
-    Raises:
-        InputError: levels out of their range.
-    """
+    """Scan files in drives below a root; some of them decide the levels of reflectance."""
     root = Path(root).expanduser()
     paths = [path for drive in drives for path in drive.scans]
     named = tuple(Drive(d.name, tuple(Path(os.path.relpath(p, root)).as_posix() for p in d.scans)) for d in drives)
     reading = replace(reading, on_bad_scan="error", within_limits=True)
     warn_of_other_sensor(paths, reading, root)
-    levels = _reflectance_levels(paths, reading, levels)
+    levels = _reflectance_levels(paths, reading)
     reading = replace(reading, reflectance=levels is not None)
-    return _plan(layout, named, ScanFiles(paths, reading), reading, levels, shard_scans, PROJECTION)
-
-
-def plan_simulated(
-    num: int, seed: int, sensor: Sensor, levels: int | None = None, shard_scans: int = SHARD_SCANS
-) -> Plan:
-    """The first `num` scenes of the simulator under a seed."""
-    drives = (Drive(SIMULATED, tuple(f"scene {scene}" for scene in range(num))),)
-    source = SimulatedScans(sensor, seed, range(num))
-    levels = find_levels(source[0][1]) if levels is None else levels
-    reading = Reading(sensor, reflectance=True, within_limits=True)
-    return _plan(SIMULATED, drives, source, reading, levels, shard_scans, simulator.REVISION, seed)
-
-
-def _plan(
-    layout: str, drives: tuple[Drive, ...], source: ScanSource, reading: Reading, levels: int | None,
-    shard_scans: int, revision: int, seed: int | None = None,
-) -> Plan:  # fmt: skip
-    names = [name for drive in drives for name in drive.scans]
-    if levels is not None:
-        ReflectanceCodes(levels)  # refuses what is no number of levels
+    names = [name for drive in named for name in drive.scans]
     recipe = {
-        "revision": revision, "layout": layout, "scans": len(names), "names": checksum(names),
-        "reading": reading.described(), "levels": levels, "shard_scans": shard_scans, "seed": seed,
+        "revision": PROJECTION, "layout": layout, "scans": len(names), "names": checksum(names),
+        "reading": reading.described(), "levels": levels, "shard_scans": shard_scans,
     }  # fmt: skip
-    return Plan(recipe, drives, source)
+    return Plan(recipe, named, ScanFiles(paths, reading))
 
 
-def _reflectance_levels(paths: Sequence[str], reading: Reading, levels: int | None) -> int | None:
-    """Levels of reflectance, `levels` where given; None where the scans have no reflectance."""
+def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
+    """Levels of reflectance; None if the scans lack reflectance."""
     if lacks_reflectance(paths, "skip", reading.columns) is not None:
         return None
     found, scale, images = [], reading.reflectance_scale or 1.0, False
@@ -123,9 +95,7 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading, levels: int | No
                 images |= is_image
     values = np.concatenate(found) if found else np.zeros(0)
     if not values.any():
-        return OTHER_LEVELS if levels is None else levels
-    if levels is not None:
-        return levels
+        return OTHER_LEVELS
     levels, highest = find_levels(values), float(values.max())
     if not images and highest < 0.25 and not ReflectanceCodes(levels).fits(values):
         log.warning(
@@ -220,19 +190,6 @@ def read_prepared(folder: Path) -> tuple[dict[str, Any], list[Drive]]:
     except FileNotFoundError:
         raise InputError(f"{folder} holds no prepared scans (no {MANIFEST}); make them: r2flow prepare.") from None
     return content["recipe"], [Drive(name, tuple(scans)) for name, scans in content["drives"]]
-
-
-def check_prepared(folder: Path, advance: Callable[[int], None] = lambda shard: None) -> dict[Path, str]:
-    """Read every byte of every shard: the damaged or missing ones and what is wrong with them."""
-    recipe, drives = read_prepared(folder)
-    plan = Plan(recipe, tuple(drives), ScanFiles([], Reading.of(recipe["reading"])))
-    store, damaged = plan.store(folder), {}
-    for shard in plan.shards:
-        damage = store.damage(shard) or ("" if store.has(shard) else "it is missing")
-        if damage:
-            damaged[store.files(shard)[0]] = damage
-        advance(shard)
-    return damaged
 
 
 def refuse_other_images(folder: Path, recipe: Mapping[str, Any], reading: Reading) -> None:
@@ -333,11 +290,7 @@ class PreparedScans(ScanSource):
 
     def places(self) -> set[str]:
         real = os.path.realpath(self.folder)
-        return {os.path.join(real, name) for name in self.names} | super().places()
-
-    def simulated_scenes(self) -> dict[int, Sequence[int]]:
-        seed = self.recipe["seed"]
-        return {} if seed is None else {seed: self.rows[:, 0].tolist()}
+        return {os.path.join(real, name) for name in self.names}
 
     def __getitem__(self, index: int) -> np.ndarray:
         return self._looked_up(index, self._values)

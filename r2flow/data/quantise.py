@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 
-from r2flow.errors import InputError
-
 CODES = 2**16  # code 0 is no return; the others climb from min_range to max_range
 STEP = 1.9e-3  # metres: half of it, and float32's rounding, stay below a millimetre
 KNEE = 65.0  # metres up to which the step is held, where the sensor reaches too far for one step
@@ -65,14 +63,13 @@ class RangeCodes:
 class ReflectanceCodes:
     """uint8 codes of reflectance, n / levels; a value between two levels becomes the nearer one.
 
-    `values` is what each code means, (256,), float32 in [0, 1]. Levels outside [1, 256] are refused (`InputError`).
+    `values` is what each code means, (256,), float32 in [0, 1].
     """
 
     dtype = np.uint8
 
     def __init__(self, levels: int) -> None:
-        if not 1 <= levels <= 256:
-            raise InputError(f"--reflectance-levels must lie in [1, 256], for codes of one byte; found {levels}.")
+        assert 1 <= levels <= 256
         self.levels = levels
         self.values = np.minimum(np.arange(256, dtype=np.float32) / np.float32(levels), np.float32(1))
 

@@ -10,9 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import cached_property
-from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -25,9 +24,6 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.store import MANIFEST
-
-if TYPE_CHECKING:
-    from r2flow.simulator.folder import SimulatedFolder
 
 log = logging.getLogger(__name__)
 
@@ -94,17 +90,9 @@ class ScanSource(ABC):
         """All that decides what the images are; None where nobody knows, and nothing of them is worth keeping."""
         return None
 
-    def simulated_scenes(self) -> dict[int, Sequence[int]]:
-        """The numbers of the simulated scenes among them, by the seed."""
-        return {}
-
     def places(self) -> set[str]:
-        """Where the scans lie, and which scenes they are, by which two sources are known to share some."""
-        return {
-            f"scene {number} of simulator seed {seed}"
-            for seed, some in self.simulated_scenes().items()
-            for number in some
-        }
+        """Where the files of the scans lie: two sources with a common place share scans."""
+        return set()
 
 
 def made_here(root: str | Path) -> bool:
@@ -204,19 +192,9 @@ class ScanFiles(ScanSource):
                     some.append(hashlib.file_digest(file, "sha256").hexdigest())
         return hashlib.sha256(json.dumps([stats, some]).encode()).hexdigest()
 
-    def simulated_scenes(self) -> dict[int, Sequence[int]]:
-        from r2flow.simulator.folder import simulated_seed
-
-        found: dict[int, list[int]] = {}
-        for folder, paths in groupby(map(Path, self.paths), lambda path: path.parent):
-            seed = simulated_seed(folder)
-            if seed is not None:
-                found.setdefault(seed, []).extend(int(path.stem) for path in paths if path.stem.isdecimal())
-        return dict(found)
-
     def places(self) -> set[str]:
         real = os.path.realpath(self.root)  # once for all of them: on a network disk it takes its time
-        return {os.path.join(real, name) for name in self.names} | super().places()
+        return {os.path.join(real, name) for name in self.names}
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -243,47 +221,19 @@ class ScanFiles(ScanSource):
 
 
 class SimulatedScans(ScanSource):
-    """Scenes of the simulator under one seed, by their numbers.
+    """Scenes of the simulator under one seed, by their numbers."""
 
-    Args:
-        folder: Where they are kept, as `r2flow simulate --format npy` does: each is made when it is asked for first.
+    slow = True
 
-    Raises:
-        InputError: the folder holds scans of another sensor, seed or revision of the simulator.
-    """
-
-    def __init__(
-        self,
-        sensor: Sensor,
-        seed: int,
-        scenes: Sequence[int],
-        reflectance: bool = True,
-        folder: str | Path | None = None,
-    ) -> None:
-        self.sensor, self.seed, self.scenes, self.reflectance, self.folder = sensor, seed, scenes, reflectance, folder
-        if self._kept is not None:
-            self._kept.check()
-
-    @property
-    def slow(self) -> bool:  # type: ignore[override]
-        return self.folder is None
-
-    @cached_property
-    def _kept(self) -> "SimulatedFolder | None":
-        from r2flow.simulator.folder import SimulatedFolder
-
-        return None if self.folder is None else SimulatedFolder(Path(self.folder), self.sensor, self.seed, ("npy",))
+    def __init__(self, sensor: Sensor, seed: int, scenes: Sequence[int], reflectance: bool = True) -> None:
+        self.sensor, self.seed, self.scenes, self.reflectance = sensor, seed, scenes, reflectance
 
     @property
     def names(self) -> list[str]:
         return [f"scene {scene}" for scene in self.scenes]
 
     def subset(self, indices: Sequence[int]) -> "SimulatedScans":
-        scenes = [self.scenes[i] for i in indices]
-        return SimulatedScans(self.sensor, self.seed, scenes, self.reflectance, self.folder)
-
-    def simulated_scenes(self) -> dict[int, Sequence[int]]:
-        return {self.seed: self.scenes}
+        return SimulatedScans(self.sensor, self.seed, [self.scenes[i] for i in indices], self.reflectance)
 
     def about(self) -> dict[str, Any]:
         return {"kind": "simulated", "seed": self.seed, "scenes": len(self), "reflectance": self.reflectance}
@@ -300,17 +250,7 @@ class SimulatedScans(ScanSource):
     def __getitem__(self, index: int) -> np.ndarray:
         from r2flow.simulator import simulate
 
-        scene, channels = self.scenes[index], 1 + self.reflectance
-        if self._kept is None:
-            return simulate(self.sensor, self.seed, scene).image[:channels]
-        if not self._kept.has(scene):
-            self._kept.begin()
-            self._kept.simulate(scene)
-        (path,) = self._kept.files(scene)
-        image = range_image(path, self.sensor.shape)
-        if image is None:
-            raise InputError(f"{path} is damaged; remove it, and it is made again.")
-        return image[:channels]
+        return simulate(self.sensor, self.seed, self.scenes[index]).image[: 1 + self.reflectance]
 
 
 class InMemory(ScanSource):

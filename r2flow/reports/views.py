@@ -38,7 +38,7 @@ class View(NamedTuple):
     def labelled(self) -> tuple[np.ndarray, np.ndarray | None]:
         """The image, and the semantic id of each pixel, (H, W), where a .label file or the simulator knows it."""
         source = self.scans.source
-        if isinstance(source, SimulatedScans) and source.folder is None:
+        if isinstance(source, SimulatedScans):
             from r2flow.simulator import simulate
 
             made = simulate(source.sensor, source.seed, source.scenes[self.number])

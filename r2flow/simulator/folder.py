@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.simulator import REVISION, simulate
-from r2flow.store import FileStore, read_manifest
+from r2flow.store import FileStore
 
 KIND = "simulated"
 FORMATS = ("bin", "pcd", "ply", "npy")  # npy is the range image itself
@@ -57,12 +56,3 @@ class SimulatedFolder(FileStore):
                     file.write(labels.astype("<u4").tobytes())
             else:
                 write_points(path, xyz, reflectance)
-
-
-def simulated_seed(folder: Path) -> int | None:
-    """The seed of the simulated scans in a folder; None where it holds none."""
-    try:
-        seed: Any = read_manifest(folder, KIND)["recipe"]["seed"]
-    except (FileNotFoundError, InputError):
-        return None
-    return seed if isinstance(seed, int) else None

@@ -19,10 +19,10 @@ from r2flow import store
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive
 from r2flow.data.opening import find_drives, open_prepared
-from r2flow.data.prepared import Plan, check_prepared, plan_files, plan_simulated, prepare
+from r2flow.data.prepared import Plan, plan_files, prepare, read_prepared
 from r2flow.data.quantise import RangeCodes, ReflectanceCodes, find_levels
 from r2flow.data.reading import Reading
-from r2flow.data.sources import ScanFiles, SimulatedScans
+from r2flow.data.sources import ScanFiles
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import FORMATS, Encoding
 from r2flow.lidar.scan_files import write_points
@@ -235,12 +235,12 @@ def test_encoded_is_the_encoding_of_the_decoded_bit_for_bit_in_every_code(
     tmp_path: Path, format: str, reflectance: bool
 ):
     sensor = SENSORS["hdl64e"]
-    plan = plan_simulated(1, 0, sensor.resized(2, 4), levels=100)
     metres = RangeCodes(sensor.min_range, sensor.max_range).values.reshape(64, 1024)
     values = np.random.default_rng(0).permutation(np.arange(65536) % 101).reshape(64, 1024) / np.float32(100)
     image = np.stack([metres, np.where(metres > 0, values, 0).astype(np.float32)])
-    recipe = {**plan.recipe, "reading": Reading(sensor, reflectance=True).described()}
-    make(tmp_path, Plan(recipe, plan.drives, Images(image[None])))
+    recipe = {"layout": "folder", "scans": 1, "levels": 100, "shard_scans": 1}
+    recipe["reading"] = Reading(sensor, reflectance=True).described()
+    make(tmp_path, Plan(recipe, (Drive("", ("a",)),), Images(image[None])))
     source = prepared_in(tmp_path, sensor, reflectance=reflectance)
     assert np.array_equal(source[0], image[: 1 + reflectance])
     encoding = Encoding(sensor, format, reflectance)
@@ -249,16 +249,6 @@ def test_encoded_is_the_encoding_of_the_decoded_bit_for_bit_in_every_code(
         assert torch.equal(source.encoded(0, encoding), expected)
     other = Encoding(sensor, "metric", reflectance)  # another encoding after the first has its own table
     assert torch.equal(source.encoded(0, other), other.encode(torch.from_numpy(image[: 1 + reflectance])))
-
-
-def test_simulated_scans_too(tmp_path: Path):
-    sensor = SMALL.resized(8, 32)
-    make(tmp_path, plan_simulated(5, 3, sensor, shard_scans=2))
-    prepared, raw = prepared_in(tmp_path, sensor), SimulatedScans(sensor, 3, range(5))
-    assert prepared.names == raw.names
-    for index in range(5):
-        assert np.abs(prepared[index][0] - raw[index][0]).max() <= MILLIMETRE
-        assert np.array_equal(prepared[index][1], raw[index][1])  # the simulator reports n / 100
 
 
 # What is stored
@@ -579,13 +569,18 @@ DAMAGES = [
 GONE = (_missing, _dangling, _folder)
 
 
+def damaged(folder: Path) -> list[Path]:
+    store = Plan(read_prepared(folder)[0], (), ScanFiles([], Reading(SMALL))).store(folder)
+    return [path for i in range(4) for path in store.files(i) if store.damage(i) or not store.has(i)]
+
+
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_shard_is_refused_by_name_and_made_again(clouds: Path, tmp_path: Path, damage):
     plan = plan_of(clouds)
     make(tmp_path, plan)
     whole, path = files(tmp_path), tmp_path / "scans-000001.safetensors"
     damage(path)
-    assert path in check_prepared(tmp_path)
+    assert path in damaged(tmp_path)
     if damage is not _wrong_type and damage is not _wrong_order_of_bytes:  # of which the head says nothing
         with pytest.raises(InputError, match="is not finished" if damage in GONE else "scans-000001.safetensors is da"):
             prepared_in(tmp_path)
@@ -595,7 +590,7 @@ def test_a_damaged_shard_is_refused_by_name_and_made_again(clouds: Path, tmp_pat
     prepare(tmp_path, plan, made=made.append)
     assert made == ([1, 2] if damage is _swapped else [1])  # these alone
     assert files(tmp_path) == whole
-    assert check_prepared(tmp_path) == {}
+    assert damaged(tmp_path) == []
 
 
 def test_no_flipped_bit_of_a_shard_goes_unnoticed(clouds: Path, tmp_path: Path):
@@ -607,7 +602,7 @@ def test_no_flipped_bit_of_a_shard_goes_unnoticed(clouds: Path, tmp_path: Path):
         data[position] ^= 1 << draw.randrange(8)
         path.write_bytes(data)
         try:
-            assert list(check_prepared(tmp_path)) == [path]
+            assert damaged(tmp_path) == [path]
         except InputError:  # the flip is in the digest of the recipe
             continue
 

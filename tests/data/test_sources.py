@@ -4,14 +4,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.data.opening import held_out_options, split_parts
-from r2flow.data.options import DataOptions
 from r2flow.data.reading import Reading, read_scan
-from r2flow.data.sources import InMemory, ScanFiles, SimulatedScans, holdout_block, spread
+from r2flow.data.sources import InMemory, ScanFiles, holdout_block, spread
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.simulator.folder import SimulatedFolder
 from tests.data.conftest import write_scan
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
@@ -149,58 +146,3 @@ def test_every_real_sensor_is_read_and_projected(shared: Path):
         for path in sorted((others / folder).glob("*[bd]")):
             image = read_scan(path, SENSORS[sensor], reflectance=reflectance, reflectance_scale=scale)
             assert (image[0] > 0).mean() > 0.1, path
-
-
-class TestKeptSimulatedScans:
-    SENSOR = SENSORS["hdl64e"].resized(8, 32)
-
-    def test_each_is_made_once_and_is_that_of_the_simulator(self, tmp_path: Path):
-        fresh, kept = (SimulatedScans(self.SENSOR, 3, range(4), folder=folder) for folder in (None, tmp_path / "kept"))
-        assert not list(tmp_path.iterdir())  # nothing was asked for yet
-        np.testing.assert_array_equal(kept.subset([2])[0], fresh[2])
-        assert [path.name for path in (tmp_path / "kept").glob("*.npy")] == ["000002.npy"]
-        made = (tmp_path / "kept" / "000002.npy").stat().st_mtime_ns
-        np.testing.assert_array_equal(kept[2], fresh[2])
-        assert (tmp_path / "kept" / "000002.npy").stat().st_mtime_ns == made
-        assert kept.names == fresh.names
-        range_alone = SimulatedScans(self.SENSOR, 3, range(4), reflectance=False, folder=tmp_path / "kept")
-        np.testing.assert_array_equal(range_alone[1], fresh[1][:1])
-
-    def test_the_folder_is_that_of_the_simulate_verb(self, tmp_path: Path):
-        folder = SimulatedFolder(tmp_path / "kept", self.SENSOR, 3, ("npy",))
-        folder.begin()
-        folder.make(range(2), folder.simulate)
-        before = sorted((path.name, path.stat().st_mtime_ns) for path in (tmp_path / "kept").iterdir())
-        kept = SimulatedScans(self.SENSOR, 3, range(2), folder=tmp_path / "kept")
-        np.testing.assert_array_equal(kept[1], SimulatedScans(self.SENSOR, 3, range(2))[1])
-        assert sorted((path.name, path.stat().st_mtime_ns) for path in (tmp_path / "kept").iterdir()) == before
-
-    def test_scans_of_another_seed_or_of_others_are_refused(self, tmp_path: Path):
-        _ = SimulatedScans(self.SENSOR, 3, range(2), folder=tmp_path / "kept")[0]
-        with pytest.raises(InputError, match="seed is 3 there, 4 here"):
-            SimulatedScans(self.SENSOR, 4, range(2), folder=tmp_path / "kept")
-        (tmp_path / "mine").mkdir()
-        (tmp_path / "mine" / "scan.bin").write_bytes(b"")
-        with pytest.raises(InputError, match=r"holds scans \(scan.bin\)"):
-            SimulatedScans(self.SENSOR, 3, range(2), folder=tmp_path / "mine")
-
-    def test_held_out_simulated_scans_do_not_lie_among_files(self):
-        held = held_out_options(DataOptions("folder", "mine", validation={"data": {"name": "simulated"}}))
-        assert [one.root for one in held] == [None]
-        held = held_out_options(DataOptions("simulated", "kept", validation={"data": {"name": "simulated"}}))
-        assert [one.root for one in held] == ["kept"]
-
-    def test_held_out_scans_of_another_kind_have_a_scale_and_columns_of_their_own(self):
-        run = {"reading": {"reflectance_scale": 255.0, "columns": ["x", "y", "z", "intensity"]}}
-        for name, scale in (("kitti_360", 1.0), ("nuscenes", 255.0), ("folder", 255.0)):
-            held = held_out_options(DataOptions("folder", "mine", **run, validation={"data": {"name": name}}))[0]
-            assert (held.chosen["reflectance_scale"], held.columns is None) == (scale, name != "folder")
-        other = {"name": "kitti_360", "reading": {"reflectance_scale": 2.0}}
-        held = held_out_options(DataOptions("folder", "mine", **run, validation={"data": other}))[0]
-        assert held.chosen["reflectance_scale"] == 2
-
-    def test_so_has_a_part_unless_the_run_says_one_for_all(self):
-        parts = [{"name": "kitti_360", "root": "A", "split": "train"}, {"name": "nuscenes", "root": "B"}]
-        assert [p.chosen["reflectance_scale"] for p in split_parts(DataOptions("mixed", parts=parts))] == [1, 255]
-        both = split_parts(DataOptions("mixed", parts=parts, reading={"reflectance_scale": 100.0}))
-        assert [p.chosen["reflectance_scale"] for p in both] == [100, 100]

@@ -90,7 +90,7 @@ def test_simulate(tmp_path: Path):
 def test_prepare(tmp_path: Path):
     for number in range(60):
         write_scan(tmp_path / "scans" / f"{number}.bin", number)
-    command = [*VERB, "prepare", "folder", "scans", "--shard-scans", 2, "--workers", 2, "--out"]
+    command = [*VERB, "prepare", "scans", "--shard-scans", 2, "--workers", 2, "--out"]
     seconds = finish(tmp_path, [*command, "one"])
     end_ten_times(tmp_path, [*command, "ended"], seconds, 1)
     assert files(tmp_path / "ended") == files(tmp_path / "one")
