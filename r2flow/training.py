@@ -13,7 +13,7 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,8 +25,8 @@ from r2flow.callbacks import build_callbacks, build_loggers, log_config, log_fig
 from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override, key_of
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.opening import SOURCES, Layout, Prepared, resolve_reflectance, whole
-from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, SourceOptions
+from r2flow.data.opening import SOURCES, Layout, Prepared, resolve, resolve_reflectance
+from r2flow.data.options import MIXED, PAIRS, SIMULATED, SourceOptions
 from r2flow.data.reading import AUTO
 from r2flow.errors import InputError
 from r2flow.generators import Generator, build_generator
@@ -41,7 +41,6 @@ from r2flow.runs.lineage import Parent, find_parent, inherit
 from r2flow.stages import build_stage, check_roll
 from r2flow.stages.base import Stage
 from r2flow.stages.checkpointing import AtomicCheckpointIO
-from r2flow.store import MANIFEST
 
 __all__ = ["Result", "Run", "build", "check", "compose", "fit"]
 
@@ -193,8 +192,6 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
     check_options("samples", SampleOptions, config["samples"])
     with made_with(parent.config if parent else {}, "the run that it starts from"):
         config = inherit(config, asked, parent)
-    check_options("data", DataOptions, config["data"])
-    _refuse_cache(config["data"], asked)
     drawn = sorted(key for key in map(key_of, asked) if f"{key}.".startswith("data.pairs."))
     if drawn and config["data"]["name"] != PAIRS:
         raise InputError(f"{', '.join(drawn)} are of data=pairs, found data={config['data']['name']}: leave them out.")
@@ -204,33 +201,16 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
     return config
 
 
-def _refuse_cache(data: Mapping[str, Any], asked: Sequence[str]) -> None:
-    """Refuse a `data.root` that holds nothing, where nobody said that simulated scans are to be kept in it.
-
-    Raises:
-        InputError: rather a folder of scans that was mistyped.
-    """
-    said = {key_of(one) for one in asked}
-    if data["name"] != SIMULATED or "data.root" not in said or "data" in said or data["root"] is None:
-        return
-    root = Path(str(data["root"])).expanduser()
-    if not (root / MANIFEST).is_file():
-        raise InputError(
-            f"data.root={root} holds no simulated scans. For scans of yours add data=folder (or data=kitti_raw, ...); "
-            "to keep simulated scans there add data=simulated."
-        )
-
-
 def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
     """Refuse what the set of scans under this key would pass over in silence.
 
     Raises:
         InputError: the options of files with simulated scans, those of scans with pairs, and the like.
     """
-    name, usual = data.get("name"), whole(SourceOptions())
-    every = {f.name for f in fields(usual)} - {"name"}
+    name, usual = data.get("name"), {**asdict(SourceOptions()), **resolve({})}
+    every = usual.keys() - {"name"}
     if name == SIMULATED:
-        what, unread = "simulated scans are no files", every - {"root", "scenes"}
+        what, unread = "simulated scans are not files (data=folder for yours)", every - {"scenes"}
     elif name == PAIRS:
         what, unread = "pairs are drawn, not read", every - {"root", "reading"}
     elif name == MIXED:
@@ -239,7 +219,7 @@ def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
         what, unread = "scans in files are no simulated scenes", {"scenes"}
     else:
         return
-    wrong = sorted(f"{key}.{one}" for one in unread if data.get(one, getattr(usual, one)) != getattr(usual, one))
+    wrong = sorted(f"{key}.{one}" for one in unread if data.get(one, usual[one]) != usual[one])
     if wrong:
         raise InputError(f"{what}: leave {', '.join(wrong)} out.")
 

@@ -8,6 +8,7 @@ import yaml
 
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.loader import FlowDataset
+from r2flow.data.opening import resolve
 from r2flow.data.options import DataOptions, PairOptions
 from r2flow.data.pairs import PairDataset, PairSource, PairStore, make_pairs
 from r2flow.errors import InputError
@@ -416,7 +417,7 @@ def test_scans_beside_pairs_are_for_objectives_on_the_parents_own_paths():
     with pytest.raises(InputError, match=r"data\.scans stand beside pairs, found data=simulated"):
         DataOptions(scans=scans)
     with pytest.raises(InputError, match=r"data\.scans needs the name of a data set"):
-        assert DataOptions(name="pairs", scans={"scenes": 4}).beside
+        resolve({"name": "pairs", "scans": {"scenes": 4}})
 
 
 def test_a_batch_of_pairs_with_scans_beside_is_a_function_of_its_number(tmp_path: Path):

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from r2flow.data.opening import with_readings
+from r2flow.data.opening import resolve
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
@@ -156,7 +156,7 @@ OWN = {"name": "own", "reflectance_scale": 0.012}
 
 
 def reading_in(data, root: str | None = None, of_sensor: float | None = 0.012):
-    return with_readings({"sensor": {**OWN, "reflectance_scale": of_sensor}, "data": {**data, "root": root}})["data"]
+    return resolve({**data, "root": root}, of_sensor)
 
 
 @pytest.mark.parametrize(

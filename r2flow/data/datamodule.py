@@ -16,7 +16,7 @@ from r2flow import simulator
 from r2flow.data.augment import Augmentation
 from r2flow.data.loader import FlowDataset, Further, Item, Order, Permutations, RunLoader, RunSampler, fixed_batches
 from r2flow.data.mixture import MixedOrder, Mixture
-from r2flow.data.opening import held_out_options, open_source, split_parts, whole
+from r2flow.data.opening import open_source, resolve
 from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, SourceOptions
 from r2flow.data.pairs import PairDataset, PairSource, PairStore
 from r2flow.data.reading import Reading
@@ -51,12 +51,11 @@ class ScanDataModule(L.LightningDataModule):
         self, sensor: Sensor, encoding: Encoding, seed: int, noise_shape: Sequence[int] | None = None, **keys: Any
     ) -> None:
         super().__init__()
-        check_options("data", DataOptions, keys)
         self.sensor, self.encoding, self.seed = sensor, encoding, seed
         self.noise_shape = tuple(noise_shape or encoding.shape)
-        self.options = DataOptions(**keys)
+        self.options = DataOptions(**resolve(keys, sensor.reflectance_scale))
         self.batch_size = self.options.batch_size
-        self.parts = split_parts(self.options, sensor.reflectance_scale)
+        self.parts = self.options.sets
         augment = self.options.augment or {}
         check_options("data.augment", Augmentation, augment)
         self.augment = Augmentation(**augment)
@@ -90,8 +89,8 @@ class ScanDataModule(L.LightningDataModule):
             return
         if self.pairs is not None:
             _ = self.pair_store  # other pairs in its folder are refused now; missing ones are made later
-            if self.options.beside is not None:
-                source = self._open(whole(self.options.beside, self.sensor.reflectance_scale))
+            if self.options.next_to_pairs is not None:
+                source = self._open(self.options.next_to_pairs)
                 self.names = list(source.names)
                 self.scans = self._kept(source, "scans beside the pairs")
             return
@@ -109,8 +108,8 @@ class ScanDataModule(L.LightningDataModule):
         # What goes before the names of each part's scans tells them apart.
         labels = [f"{number}: " if len(whole) > 1 else "" for number in range(len(whole))]
         self.names = [f"{label}{name}" for label, source in zip(labels, whole, strict=True) for name in source.names]
-        other = held_out_options(self.options, self.sensor.reflectance_scale)
-        if not other:
+        other = self.options.held_out
+        if other is None:
             training, held = [], []
             for source in whole:
                 starts = sorted(numbers[0] for numbers in source.drives.values() if len(numbers))
@@ -120,7 +119,7 @@ class ScanDataModule(L.LightningDataModule):
         else:
             # Scenes that are held out come after those that are trained on.
             first_scene = max((part.scenes for part in self.parts if part.name == SIMULATED), default=0)
-            training, held = whole, [self._open(options, first_scene) for options in other]
+            training, held = whole, [self._open(other, first_scene)]
             shared = held[0].places() & set().union(*(source.places() for source in whole))
             if shared:
                 log.warning(
@@ -147,8 +146,8 @@ class ScanDataModule(L.LightningDataModule):
         """What is trained on, wherever it lies: a run goes on only with the same scans in the same order."""
         if self.pairs is not None:
             pairs = f"{self.pairs.num} pairs, {self.pair_store.digest[:16]}"
-            beside = self.options.beside
-            return f"{pairs}; {self._named(self.scans, [beside])}" if self.scans is not None and beside else pairs
+            other = self.options.next_to_pairs
+            return f"{pairs}; {self._named(self.scans, [other])}" if self.scans is not None and other else pairs
         assert isinstance(self.training_source, ScanSource)
         return self._named(self.training_source, self.parts)
 

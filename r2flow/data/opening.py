@@ -19,15 +19,7 @@ from torch import Tensor
 
 from r2flow.data import layouts
 from r2flow.data.layouts import Drive, Layout, SourceKind, spans_of
-from r2flow.data.options import (
-    FOLDER,
-    MIXED,
-    PAIRS,
-    PREPARED,
-    SIMULATED,
-    DataOptions,
-    SourceOptions,
-)
+from r2flow.data.options import FOLDER, MIXED, PAIRS, PREPARED, SIMULATED, Data, DataOptions, SourceOptions
 from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_images
 from r2flow.data.reading import AUTO, Reading, lacks_reflectance, range_image
 from r2flow.data.sets import ScanSet
@@ -47,8 +39,6 @@ class Simulated(SourceKind):
     """Scenes of the simulator."""
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
-        if options.root is not None:
-            raise InputError("data=simulated takes no data.root; for scans of `r2flow simulate` give data=folder.")
         scenes = range(first_scene, first_scene + options.scenes)
         return SimulatedScans(reading.sensor, seed, scenes, bool(reading.reflectance))
 
@@ -350,108 +340,78 @@ def open_prepared(
 # The sets of scans that a run's `data` names
 
 
-def _check_split(what: str, given: Mapping[str, Any]) -> None:
-    known = ", ".join(SOURCES[given["name"]].splits)
-    if known and "split" not in given:
-        raise InputError(f"{what}: {given['name']} has a standard split: give split, one of {known}, or null for all.")
-
-
-def split_parts(options: DataOptions, scale: float | None = None) -> list[SourceOptions]:
-    """The sets of scans to train on; none of pairs. What a part does not say is the run's, but for root, split, drives.
+def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping[str, Any] | None = None) -> Data:
+    """A run's `data` in which each set of scans says everything: parts and held-out scans take from the run what they
+    leave out, but for split and drives, and every `reading` has all fields of `ReadingOptions`.
 
     Args:
         scale: The value that means full reflectance in files of the sensor.
+        parent: The reading of the run that this run starts from, or of the flow that draws its pairs.
 
     Raises:
-        InputError: a mixture without parts, an option that a part does not know, weights on some alone, or a part of
-            which nobody said whether its test drives are meant too.
+        InputError: an unknown key, or sets of scans that cannot be.
     """
-    if options.name == PAIRS:
-        if options.beside is not None:
-            _check_split("data.scans", options.scans or {})
-        return []
-    if options.name != MIXED:
-        return [whole(SourceOptions(**options.common), scale)]
-    if not options.parts:
+    check_options("data", DataOptions, data)
+    run = DataOptions(**data)
+    inherited = () if run.name == SIMULATED else parent or () if run.name == PAIRS else ("projection", "convention")
+    reading = {**{key: parent[key] for key in inherited if parent and parent.get(key) is not None}, **run.chosen}
+
+    def whole(options: Mapping[str, Any], usual: Mapping[str, Any]) -> Data:
+        return {**options, "reading": _whole_reading(SourceOptions(**options), usual, scale)}
+
+    data = {**data, "reading": _whole_reading(run, reading, scale)}
+    if run.name == MIXED:
+        data["parts"] = [whole(part, reading) for part in _checked_parts(run)]
+    if run.scans is not None:
+        _check_set("data.scans", run.scans)
+        data["scans"] = whole(run.scans, {})
+    other = run.held.data
+    if other is not None and run.name != PAIRS:
+        held = {"name": run.name, "root": run.root, "scenes": run.scenes, **other}
+        _check_set("data.validation.data", held, split=False)
+        if held["name"] != run.name:  # other files, with columns and a scale of their own
+            reading = {key: value for key, value in reading.items() if key not in ("columns", "reflectance_scale")}
+            held["root"] = other.get("root")
+        data["validation"] = {**data["validation"], "data": whole(held, reading)}
+    return data
+
+
+def _whole_reading(options: SourceOptions, usual: Mapping[str, Any], scale: float | None) -> Data:
+    """Every field of `ReadingOptions`: what a set of scans says, else `usual`, else what its kind usually has."""
+    name, of_kind = options.name, 1.0
+    if name == FOLDER:
+        of_kind = scale or 1.0
+    elif name in SOURCES:
+        of_kind = SOURCES[name].reflectance_scale
+    reading: Data = {"projection": "spherical", "convention": "centre", "columns": None, "on_bad_scan": "error"}
+    reading |= {"reflectance_scale": of_kind, **usual, **options.chosen}
+    written = name == FOLDER and options.root is not None and made_here(str(options.root))
+    return {**reading, "reflectance_scale": 1.0} if written else reading
+
+
+def _checked_parts(run: DataOptions) -> list[Data]:
+    """The parts of a mixture."""
+    if not run.parts:
         example = "[{name: kitti_360, root: FOLDER, split: train, weight: 3}, {name: folder, root: FOLDER, weight: 1}]"
         raise InputError(f"data=mixed needs its parts: data.parts='{example}'.")
-    made = []
-    for number, part in enumerate(options.parts):
-        what = f"data.parts[{number}]"
-        if not isinstance(part, Mapping):
-            raise InputError(f"{what} must be a group of keys, as {{name: folder, root: FOLDER}}; found {part!r}.")
-        check_options(what, SourceOptions, part)
-        if "name" not in part or part["name"] in (MIXED, PAIRS):
-            raise InputError(f"{what} needs the name of a data set, found {part.get('name')!r}.")
-        _check_split(what, part)
-        made.append(whole(SourceOptions(**{"scenes": options.scenes, **part}), scale, options.chosen))
-    if len({part.weight is None for part in made}) > 1:
+    for number, part in enumerate(run.parts):
+        _check_set(f"data.parts[{number}]", part)
+    if len({part.get("weight") is None for part in run.parts}) > 1:
         raise InputError("data.parts: give every part a weight, or none, for shares by size.")
-    if sum(part.name == SIMULATED for part in made) > 1:
+    if sum(part["name"] == SIMULATED for part in run.parts) > 1:
         raise InputError("data.parts: simulated scenes are numbered; give one simulated part, with all its scenes.")
-    return made
+    return [{"scenes": run.scenes, **part} for part in run.parts]
 
 
-def held_out_options(options: DataOptions, scale: float | None = None) -> list[SourceOptions]:
-    """`data.validation.data`, where there is one: what it does not say is the run's, but for split and drives."""
-    other = options.held.data
-    if other is None or options.name == PAIRS:
-        return []
-    check_options("data.validation.data", SourceOptions, other)
-    common = {**options.common, "split": None, "drives": None, "reading": None, "weight": None}
-    theirs = options.chosen
-    kinds = {options.name, other.get("name", options.name)}
-    if len(kinds) == 2:  # other files, with columns and a scale of their own
-        theirs = {key: value for key, value in theirs.items() if key not in ("columns", "reflectance_scale")}
-    if other.get("name") == SIMULATED:
-        common["root"] = None
-    held = SourceOptions(**{**common, **other})
-    if held.name in (MIXED, PAIRS):
-        raise InputError(f"data.validation.data must name one data set, found {held.name}; hold out a part of it.")
-    return [whole(held, scale, theirs)]
-
-
-def whole(options: SourceOptions, scale: float | None = None, theirs: Mapping[str, Any] | None = None) -> SourceOptions:
-    """A set of scans with every field of its reading.
-
-    Args:
-        scale: The value that means full reflectance in files of the sensor.
-        theirs: What is the case where the options do not say.
-    """
-    of_kind = SOURCES[options.name].reflectance_scale if options.name in SOURCES else 1.0
-    usual = {
-        "projection": "spherical", "convention": "centre", "columns": None, "on_bad_scan": "error",
-        "reflectance_scale": (scale or 1.0) if options.name == FOLDER else of_kind,
-    }  # fmt: skip
-    written = options.name == FOLDER and options.root is not None and made_here(str(options.root))
-    believed = {"reflectance_scale": 1.0} if written else {}
-    return replace(options, reading={**usual, **(theirs or {}), **options.chosen, **believed})
-
-
-def with_readings(config: Mapping[str, Any], parent: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """A config in which each set of scans says every field of its reading.
-
-    Args:
-        parent: The reading of the run that this one starts from, or of the flow that draws its pairs.
-    """
-    data, scale = dict(config["data"]), config["sensor"].get("reflectance_scale")
-    check_options("data", DataOptions, data)
-    options = DataOptions.of(data)
-    theirs = {key: value for key, value in (parent or {}).items() if value is not None}
-    if options.name != PAIRS:
-        theirs = {key: value for key, value in theirs.items() if key in ("projection", "convention")}
-    if options.name == SIMULATED:
-        theirs = {}
-    said = replace(options, reading={**theirs, **options.chosen})
-    if options.name == MIXED and options.parts:
-        parts = zip(options.parts, split_parts(said, scale), strict=True)
-        data["parts"] = [{**part, "reading": of_part.reading} for part, of_part in parts]
-    for held in held_out_options(said, scale):
-        data["validation"] = {**data["validation"], "data": {**data["validation"]["data"], "reading": held.reading}}
-    if options.beside is not None:
-        data["scans"] = {**data["scans"], "reading": whole(options.beside, scale).reading}
-    data["reading"] = whole(said, scale).reading
-    return {**config, "data": data}
+def _check_set(what: str, options: Mapping[str, Any], split: bool = True) -> None:
+    """Refuse what names no single set of scans, or, with `split`, does not say whether test drives are meant too."""
+    check_options(what, SourceOptions, options)
+    name = options.get("name")
+    if name in (None, MIXED, PAIRS):
+        raise InputError(f"{what} needs the name of a data set, found {name!r}.")
+    known = ", ".join(SOURCES[name].splits)
+    if split and known and "split" not in options:
+        raise InputError(f"{what}: {name} has a standard split: give split, one of {known}, or null for all.")
 
 
 def resolve_reflectance(wanted: Any, data: Mapping[str, Any]) -> bool:
@@ -460,8 +420,8 @@ def resolve_reflectance(wanted: Any, data: Mapping[str, Any]) -> bool:
         return wanted
     if wanted != AUTO:
         raise InputError(f"encoding.reflectance must be true, false or auto, found {wanted!r}.")
-    named = DataOptions.of(data)
-    for options in [*split_parts(named), *held_out_options(named)]:
+    named = DataOptions(**resolve(data))
+    for options in (*named.sets, *([named.held_out] if named.held_out else [])):
         lacking = SOURCES[options.name].lacks_reflectance(options, options.on_bad_scan)
         if lacking:
             log.info("encoding.reflectance=auto is false here, a flow of range alone: %s", lacking)

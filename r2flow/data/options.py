@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from r2flow.data.pairs import PairRecipe
 from r2flow.errors import InputError
@@ -14,6 +14,7 @@ from r2flow.registry import NonNegative, Positive, check_options
 from r2flow.samplers import build_sampler, knot_times
 
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # in the table `r2flow.data.opening.SOURCES`
+Data = dict[str, Any]  # of a config
 MIXED, PAIRS = "mixed", "pairs"  # what `data.name` may be besides: several sets of scans, and pairs drawn by a flow
 
 
@@ -59,16 +60,6 @@ class SourceOptions:
     def on_bad_scan(self) -> str:
         found: str = self.chosen.get("on_bad_scan", "error")
         return found
-
-    @classmethod
-    def of(cls, data: Mapping[str, Any]) -> Self:
-        """The keys of a config's `data` that are known here."""
-        return cls(**{f.name: data[f.name] for f in fields(cls) if f.name in data})
-
-    @property
-    def common(self) -> dict[str, Any]:
-        """The options of a set of scans among these."""
-        return {f.name: getattr(self, f.name) for f in fields(SourceOptions)}
 
     @property
     def folder(self) -> str:
@@ -169,12 +160,22 @@ class DataOptions(SourceOptions):
         check_options("data.validation", ValidationOptions, self.validation or {})
         return ValidationOptions(**(self.validation or {}))
 
+    # What follows needs the `data` of `r2flow.data.opening.resolve`.
+
     @property
-    def beside(self) -> SourceOptions | None:
-        """`scans`, checked."""
-        if self.scans is None:
-            return None
-        check_options("data.scans", SourceOptions, self.scans)
-        if self.scans.get("name") in (None, MIXED, PAIRS):
-            raise InputError(f"data.scans needs the name of a data set, found {self.scans.get('name')!r}.")
-        return SourceOptions(**self.scans)
+    def sets(self) -> list[SourceOptions]:
+        """The sets of scans to train on; empty for pairs."""
+        if self.name == MIXED:
+            return [SourceOptions(**part) for part in self.parts or ()]
+        alone = SourceOptions(**{f.name: getattr(self, f.name) for f in fields(SourceOptions)})
+        return [] if self.name == PAIRS else [alone]
+
+    @property
+    def held_out(self) -> SourceOptions | None:
+        """The set of `validation.data`."""
+        return None if self.held.data is None or self.name == PAIRS else SourceOptions(**self.held.data)
+
+    @property
+    def next_to_pairs(self) -> SourceOptions | None:
+        """The set of `scans`."""
+        return None if self.scans is None else SourceOptions(**self.scans)

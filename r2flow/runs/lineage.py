@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.config import groups_of, key_of, rule
-from r2flow.data.opening import with_readings
+from r2flow.data.opening import resolve
 from r2flow.data.options import MIXED, PairOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
@@ -75,7 +75,7 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
         if STAGES[config["stage"]["name"]].needs_parent:
             raise InputError(f"stage={config['stage']['name']} starts from another run: give stage.init=RUN.")
         config["generator"] = generator_of(config, parent)
-        return with_readings(config)
+        return _with_data(config)
     keys = [key_of(one) for one in asked]
     for group in (*groups_of(inherited="always"), *groups_of(inherited="with_pairs")):
         config[group] = _chosen(group, parent.config.get(group), config.get(group), keys, config, parent)
@@ -92,8 +92,13 @@ def inherit(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | No
                 raise InputError(f"data.reading.{key} is that of the flow that draws the pairs: leave it out.")
         data["reading"] = theirs
     elif data["name"] != MIXED:
-        return with_readings(config, parent.config.get("data", {}).get("reading"))
-    return with_readings(config)
+        return _with_data(config, parent.config.get("data", {}).get("reading"))
+    return _with_data(config)
+
+
+def _with_data(config: Mapping[str, Any], reading: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The config with `data` resolved; `reading` is the parent's."""
+    return {**config, "data": resolve(config["data"], config["sensor"].get("reflectance_scale"), reading)}
 
 
 ABSENT = object()
