@@ -23,7 +23,7 @@ def test_a_velocity_may_write_each_output_into_the_same_buffer(method: str):
 
 
 @pytest.mark.parametrize("place", [0.31, 0.4567, 0.5, 0.6180339, 0.777])
-@pytest.mark.parametrize(("power", "tolerance"), [(1, 1e-3), (1, 1e-4), (2, 1e-2), (2, 1e-4)])
+@pytest.mark.parametrize(("power", "tolerance"), [(1, 1e-2), (1, 1e-3), (1, 1e-4), (2, 1e-2), (2, 1e-4)])
 def test_no_solution_crosses_a_pole(place: float, power: int, tolerance: float):
     solution = solve(
         lambda t, x: ((t - place) ** -power).reshape(-1, 1) + 0 * x, X, method="dopri5", tolerance=tolerance

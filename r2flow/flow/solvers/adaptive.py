@@ -25,6 +25,9 @@ log = logging.getLogger(__name__)
 LEAST_TOLERANCE = {torch.float64: 1e-14, torch.float32: 1e-7, torch.float16: 1e-5, torch.bfloat16: 1e-4}
 
 
+SHORT = 1e-3  # of the interval: steps whose length of path is looked at, for poles
+
+
 def attainable(limits: Limits, dtype: torch.dtype) -> float:
     """The tolerance to use, no lower than a type can hold; warns where that is not the one asked for."""
     least = LEAST_TOLERANCE[dtype]
@@ -81,7 +84,13 @@ def _step(
     size = unpowered(powers)
     good = control.within(size, dk, dy, whole / tolerance)
     good = inspect(v, control, Tried(method, x, y, k, h, scale), good)
+    short = (good & (control.h < SHORT * control.length)).nonzero()[0]
     accepted = control.judge(good, size, dk, dy, v.counts[control.scenes])
+    if len(short):
+        way, length = rows(k[-1] * expand_time(h, x), short), 1 + rows(y, short).abs()
+        share = way.flatten(1).norm(dim=1) / length.flatten(1).norm(dim=1)
+        back = (rows(k[0], short) * way * expand_time(rows(h, short), way)).flatten(1).sum(1) < 0
+        control.note_pole(short, rows(h, short).abs().cpu().numpy(), share.cpu().numpy(), back.cpu().numpy())
     if accepted.all():
         x, k_1 = y, k[-1]
     elif accepted.any():

@@ -16,6 +16,7 @@ STIFF_AFTER, SMOOTH_AFTER = 15, 6  # Hairer: stiff after 15 such steps without 6
 # Eigenvalues near the imaginary axis limit steps at a smaller |h lambda|, where accuracy can limit them as well: a
 # scene is handed over after more such steps, but not called stiff otherwise.
 OSCILLATING, OSCILLATING_AFTER = 1.0, 200
+FAR, DECADES = 0.02, 3  # share of its size that x moves in a step; powers of ten of the step size that tell a pole
 
 
 class StepController:
@@ -48,6 +49,7 @@ class StepController:
         self.crossing = np.zeros(of, bool)
         self.roughness, self.rough = np.zeros(of), np.full(of, np.nan)  # third difference; of the last step, over h^4
         self.troubled = np.zeros(of, int)  # steps for which a rejection is remembered
+        self.decades = np.zeros(of, int)  # of short steps that have moved x far: a bit for each power of ten
         self.factor = np.full(of, np.inf)  # between a step that does not hold and the next one
 
     def time(self, reached: np.ndarray) -> np.ndarray:
@@ -157,6 +159,21 @@ class StepController:
         self.leaving = self.arrived | stuck | spent | self._handed_over()
         return good
 
+    def note_pole(self, places: np.ndarray, h: np.ndarray, share: np.ndarray, back: np.ndarray) -> None:
+        """A scene leaves without having arrived once the path does not shorten with the step.
+
+        About a pole without an integral, as 1 / (t - a), steps of 1e-4, 1e-5 and 1e-6 of the interval all move x by the
+        same share of its size, and a step that happens to straddle the pole can meet a loose tolerance.
+
+        Args:
+            h: Lengths of accepted steps of these scenes, (N,).
+            share: |h v| / |1 + |x||, (N,).
+            back: Whether v points back at the end of the step, which tells a pole one power of ten earlier.
+        """
+        decade = 2 ** np.floor(-np.log10(h / self.length)).astype(int)
+        self.decades[places] |= np.where(share > FAR, decade, 0)
+        self.give_up(places[np.bitwise_count(self.decades[places]) >= DECADES - (back & (share > FAR))])
+
     def cross(self) -> np.ndarray:
         """Time after and signed length of the crossing of a jump, (2, N); these scenes stand behind it then."""
         here, end = self.reached[self.crossing], np.minimum(self.end[self.crossing], self.length)
@@ -212,7 +229,7 @@ class StepController:
         for name in (
             "scenes", "places", "reached", "h", "grow", "last_error", "stiff_run", "smooth_run", "oscillating_run",
             "calm_run", "arrived", "leaving", "begin", "end", "resume", "crossing", "rough", "troubled",
-            "factor",
+            "factor", "decades",
         ):  # fmt: skip
             setattr(self, name, getattr(self, name)[rest])
 
