@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -143,7 +144,9 @@ def test_the_exact_problems_are_reported_with_what_was_not_solved():
     assert set(page.figures) == {"solvers_problems"}
 
 
-def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
+def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch):  # noqa: F811
+    quick = partial(checkpoint_subject, steps=16, tolerance=1e-3)
+    monkeypatch.setattr("r2flow.reports.solvers.checkpoint_subject", quick)
     out = tmp_path / "reports"
     code, said, _ = r2flow(
         "report", "solvers", saved[0], "-o", out, "--num", 2, "--samplers", "euler,heun2,dopri5",

@@ -46,7 +46,7 @@ from tests.training.conftest import Run
         (["data.flip=true"], ["no key 'data.flip'"]),
         (["data=mixed"], ["data=mixed needs its parts", "data.parts="]),
         (["data=mixed", "data.parts=[{name: folder, rot: x}]"], ["data.parts[0] has no option 'rot'", "'root'"]),
-        (["data.validation.data={name: mixed}"], ["must name one data set"]),
+        (["data.validation.data={name: mixed}"], ["needs the name of a data set"]),
     ],
 )
 def test_wrong_config(train: Run, tmp_path: Path, overrides: list[str], words: list[str]):
