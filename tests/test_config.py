@@ -18,7 +18,10 @@ from r2flow.registry import options_of
 from r2flow.runs.composing import CONF, choices, compose
 from r2flow.stages import STAGES
 
-CONFIG = compose()
+
+@pytest.fixture(scope="module")
+def config() -> dict[str, Any]:
+    return compose()
 
 
 def test_a_key_follows_the_group_that_it_is_in():
@@ -48,17 +51,21 @@ def test_the_key_of_an_override(override: str, key: str):
     assert key_of(override) == key
 
 
-def test_every_rule_is_of_a_key_that_exists():
-    keys = {key for key, _ in flatten(CONFIG)} | {"experiment", "size", "hydra", "parent.path", "data.parts.*.root"}
+def test_every_rule_is_of_a_key_that_exists(config):
+    keys = {key for key, _ in flatten(config)} | {"experiment", "size", "hydra", "parent.path", "data.parts.*.root"}
     keys |= {"data.validation.data.root", "data.scans.root", *(f"callbacks.{name}" for name in CALLBACKS)}
     keys |= {key for key, _ in flatten(compose(["backbone=pyramid"]))}
     for key in RULES:
         assert any(known == key or known.startswith(f"{key}.") for known in keys), key
 
 
-def entries() -> list[tuple[str, Callable[..., Any], dict[str, Any], set[str]]]:
+Entry = tuple[str, Callable[..., Any], dict[str, Any], set[str]]
+
+
+@pytest.fixture(scope="module")
+def entries(config) -> list[Entry]:
     """(group, constructor, what the composed config says, what the run adds)."""
-    found: list[tuple[str, Callable[..., Any], dict[str, Any], set[str]]] = []
+    found: list[Entry] = []
     for name in choices("stage"):
         stage = dict(compose([f"stage={name}"])["stage"])
         found.append((f"stage={name}", STAGES[stage.pop("name")], stage, {"generator", "batch_size", "seed", "init"}))
@@ -66,38 +73,35 @@ def entries() -> list[tuple[str, Callable[..., Any], dict[str, Any], set[str]]]:
         backbone = dict(compose([f"backbone={name}"])["backbone"])
         added = {"rays", "in_channels", "out_channels", "second_time"}
         found.append((f"backbone={name}", BACKBONES[backbone.pop("name")], backbone, added))
-    for name, options in CONFIG["callbacks"].items():
+    for name, options in config["callbacks"].items():
         entry = CALLBACKS[name]
-        given = len(entry.given(CONFIG))
+        given = len(entry.given(config))
         added = set(list(inspect.signature(entry.constructor).parameters)[:given])
         found.append((f"callbacks.{name}", entry.constructor, options, added))
-    data = CONFIG["data"]
+    data = config["data"]
     found.append(("data", DataOptions, data, set()))
     found.append(("data.augment", Augmentation, data["augment"], set()))
     found.append(("data.pairs", PairOptions, data["pairs"], {"parent"}))
-    found.append(("trainer", L.Trainer, CONFIG["trainer"], {"callbacks", "logger", "plugins"}))
+    found.append(("trainer", L.Trainer, config["trainer"], {"callbacks", "logger", "plugins"}))
     return found
 
 
-ENTRIES = entries()  # before a plug-in of another test adds its own
-
-
-@pytest.mark.parametrize(("group", "constructor", "options", "added"), ENTRIES, ids=[one[0] for one in ENTRIES])
-def test_conf_says_every_option_of_a_constructor(group: str, constructor, options: dict[str, Any], added: set[str]):
-    known = set(options_of(constructor)) - added
-    if group.startswith("stage=distill"):
-        known -= {"time"} - set(options)
-    assert set(options) - added == known
+def test_conf_says_every_option_of_a_constructor(entries: list[Entry]):
+    for group, constructor, options, added in entries:
+        known = set(options_of(constructor)) - added
+        if group.startswith("stage=distill"):
+            known -= {"time"} - set(options)
+        assert set(options) - added == known, group
 
 
 @pytest.mark.parametrize("group", ["callbacks", "data", "data.augment", "data.pairs", *BACKBONES])
-def test_where_conf_and_a_constructor_say_a_default_it_is_the_same(group: str):
+def test_where_conf_and_a_constructor_say_a_default_it_is_the_same(group: str, entries: list[Entry]):
     own = {
         "callbacks.ema": {"every"},
         "data": {"batch_size", "name", "validation", "augment", "pairs", "reading"},
         "data.pairs": {"sampler"},
     }  # of the budget
-    for name, constructor, options, added in ENTRIES:
+    for name, constructor, options, added in entries:
         if name == group or name == f"backbone={group}" or (name.startswith(f"{group}.") and group == "callbacks"):
             defaults = options_of(constructor)
             for key in set(options) - added - own.get(name, set()):
@@ -105,9 +109,8 @@ def test_where_conf_and_a_constructor_say_a_default_it_is_the_same(group: str):
                 assert default in (options[key], "???") or (key, default) == ("time_channels", None), f"{name}.{key}"
 
 
-def test_the_groups_of_conf_are_groups_of_the_default_config():
+def test_the_groups_of_conf_are_groups_of_the_default_config(config):
     folders = {path.name for path in CONF.iterdir() if path.is_dir()} - {"hydra", "experiment", "size"}
-    config = compose([])
     assert folders == {key for key in config if choices(key)}
     assert all(isinstance(config[group], dict) for group in folders)
 
