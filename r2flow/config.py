@@ -52,6 +52,7 @@ RULES: dict[str, Key] = {
     "parent.path": FREE,
     "sensor": replace(OF_THE_MODEL, inherited="with_pairs"),
     "encoding": OF_THE_MODEL,
+    "encoding.levels": replace(OF_THE_MODEL, inherited="unless_given"),
     "generator": Key(inherited="unless_given", links="scans"),  # see `lineage.generator_of`
     "backbone": OF_THE_MODEL,
     "backbone.attention": replace(OF_THE_MODEL, inherited="unless_given"),  # the weights fit all the same

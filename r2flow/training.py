@@ -25,7 +25,7 @@ from r2flow.callbacks import build_callbacks, build_loggers, log_config, log_fig
 from r2flow.callbacks.stopping import Stopping
 from r2flow.config import as_override, key_of
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.opening import SOURCES, Layout, Prepared, resolve, resolve_reflectance
+from r2flow.data.opening import SOURCES, Layout, Prepared, reflectance_levels, resolve, resolve_reflectance
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, SourceOptions
 from r2flow.data.reading import AUTO
 from r2flow.errors import InputError
@@ -153,6 +153,9 @@ def _build(config: Mapping[str, Any], asked: Sequence[str]) -> Run:
     parent, checkpoint = find_parent(config) or (None, None)
     config = _checked(config, asked, parent)
     config["encoding"]["reflectance"] = resolve_reflectance(config["encoding"].get("reflectance", AUTO), config["data"])
+    levels = reflectance_levels(config["data"])
+    if levels is not None and "encoding.levels" not in map(key_of, asked):
+        config["encoding"]["levels"] = levels
     seed_torch(config["seed"], "weights")
     generator = build_generator(config)
     if checkpoint is not None:

@@ -35,6 +35,7 @@ class SourceKind:
     splits: Mapping[str, Sequence[int | str]] = {}  # names or numbers of the drives of each part of a standard split
     sensor = "hdl64e"  # name of the usual sensor
     reflectance_scale = 1.0  # the usual value that means full reflectance
+    levels: int | None = None  # reflectance is n / levels
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
         """The scans in their order, none of them read yet; `seed` and `first_scene` are for simulated ones.
@@ -46,6 +47,10 @@ class SourceKind:
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
         """Why the scans count as scans without reflectance; None where they have it."""
         return None
+
+    def levels_of(self, options: SourceOptions) -> int | None:
+        """The levels of these scans' reflectance, n / levels; None if they are not known."""
+        return self.levels
 
     def find_drives(self, options: SourceOptions) -> list[Drive]:
         """The drives of scan files, in order."""
@@ -87,6 +92,7 @@ class Layout(SourceKind):
     splits: Mapping[str, Sequence[int | str]] = field(default_factory=dict)
     sensor: str = "hdl64e"
     reflectance_scale: float = 1.0
+    levels: int | None = None
 
     def find_drives(self, options: SourceOptions) -> list[Drive]:
         """Those of the split and the drives that `options` names; a drive without a scan is none.

@@ -38,6 +38,8 @@ SCENES = 1000  # of simulated scans, where nobody says how many
 class Simulated(SourceKind):
     """Scenes of the simulator."""
 
+    levels = 100
+
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
         scenes = range(first_scene, first_scene + options.scenes)
         return SimulatedScans(reading.sensor, seed, scenes, bool(reading.reflectance))
@@ -50,19 +52,22 @@ class Prepared(SourceKind):
         return open_prepared(options.folder, reading, options.split, options.drives)
 
     def lacks_reflectance(self, options: SourceOptions, on_bad_scan: str = "error") -> str | None:
-        lacks = read_prepared(Path(options.folder).expanduser())[0]["levels"] is None
-        return f"the scans in {options.folder} have no reflectance" if lacks else None
+        return f"the scans in {options.folder} have no reflectance" if self.levels_of(options) is None else None
+
+    def levels_of(self, options: SourceOptions) -> int | None:
+        levels: int | None = read_prepared(Path(options.folder).expanduser())[0]["levels"]
+        return levels
 
 
 SOURCES: Registry[SourceKind] = Registry(
     "data set",
     simulated=Simulated(),
     prepared=Prepared(),
-    kitti_360=Layout(layouts.kitti_360, layouts.KITTI_360_SPLIT),
-    kitti_raw=Layout(layouts.kitti_raw),
-    odometry=Layout(layouts.odometry, layouts.ODOMETRY_SPLIT),
-    object=Layout(layouts.kitti_object, layouts.OBJECT_SPLIT),
-    nuscenes=Layout(layouts.nuscenes, sensor="hdl32e", reflectance_scale=255.0),
+    kitti_360=Layout(layouts.kitti_360, layouts.KITTI_360_SPLIT, levels=256),
+    kitti_raw=Layout(layouts.kitti_raw, levels=100),
+    odometry=Layout(layouts.odometry, layouts.ODOMETRY_SPLIT, levels=100),
+    object=Layout(layouts.kitti_object, layouts.OBJECT_SPLIT, levels=100),
+    nuscenes=Layout(layouts.nuscenes, sensor="hdl32e", reflectance_scale=255.0, levels=255),
     folder=Layout(layouts.folder),
 )
 
@@ -428,3 +433,9 @@ def resolve_reflectance(wanted: Any, data: Mapping[str, Any]) -> bool:
             return False
     log.info("encoding.reflectance=auto is true here: the scans have it")
     return True
+
+
+def reflectance_levels(data: Mapping[str, Any]) -> int | None:
+    """The levels of reflectance that all sets of a config's `data` share; None if they differ or are not known."""
+    levels = {SOURCES[options.name].levels_of(options) for options in DataOptions(**resolve(data)).sets}
+    return levels.pop() if len(levels) == 1 else None

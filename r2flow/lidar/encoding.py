@@ -10,7 +10,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Sensor
-from r2flow.registry import Registry, check_options
+from r2flow.registry import Positive, Registry, check_options
 
 # Decoding may miss a range limit by float32's rounding: within this relative distance a range is the limit.
 LIMIT_TOLERANCE = 1e-5
@@ -130,6 +130,7 @@ class Encoding:
         reflectance: Whether reflectance is a channel; without it a model is of range alone.
         limits: `closed`: ranges of exactly the sensor's limits are returns. `open`, as R2DM has it: they are not, and
             none is encoded that does not lie between them.
+        levels: Decoded reflectance is rounded to n / levels, as the sensor reports it; None leaves it continuous.
     """
 
     def __init__(
@@ -138,10 +139,11 @@ class Encoding:
         format: str = "logscale",
         reflectance: bool = True,
         limits: Literal["closed", "open"] = "closed",
+        levels: Positive | None = None,
     ) -> None:
         self.sensor = sensor
         self.reflectance = reflectance
-        self.limits = limits
+        self.limits, self.levels = limits, levels
         self.format = FORMATS[format](sensor)
 
     @property
@@ -176,7 +178,7 @@ class Encoding:
     def decode(self, x: Tensor) -> Tensor:
         """(..., channels, H, W) -> range in metres and reflectance, (..., 2 or 1, H, W).
 
-        A range outside the limits is a dropped ray, 0 in both; reflectance is clamped to [0, 1].
+        A range outside the limits is a dropped ray, 0 in both; reflectance is clamped to [0, 1], rounded to `levels`.
         """
         y = (x + 1) / 2
         ranges = self.format.channels
@@ -190,6 +192,8 @@ class Encoding:
         image = torch.where(returned, r.clamp(near, far), zero)
         if self.reflectance:
             reflectance = y[..., ranges:, :, :].clamp(0, 1)
+            if self.levels is not None:
+                reflectance = (reflectance * self.levels).round() / self.levels
             image = torch.cat([image, torch.where(returned, reflectance, zero)], dim=-3)
         return image
 
@@ -198,6 +202,6 @@ class Encoding:
 
 
 def build_encoding(options: Mapping[str, Any], sensor: Sensor) -> Encoding:
-    """The encoding a config describes: `format`, `reflectance` and `limits`."""
+    """The encoding a config describes: `format`, `reflectance`, `limits` and `levels`."""
     check_options("encoding", Encoding, options, given=1)
     return Encoding(sensor, **options)

@@ -136,7 +136,7 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
     old = read_config(run)
     if old is None or not checkpoints_of(run):
         return
-    later = ("scans", "parent", "encoding.reflectance", "data.pairs.parent")
+    later = ("scans", "parent", "encoding.reflectance", "encoding.levels", "data.pairs.parent")
     known = [{k: v for k, v in flatten(one) if not f"{k}.".startswith(tuple(f"{group}." for group in later))}
              for one in (old, config)]  # fmt: skip
     differing = contradictions(*known)

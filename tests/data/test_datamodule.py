@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.opening import resolve_reflectance
+from r2flow.data.opening import reflectance_levels, resolve_reflectance
 from r2flow.data.prepared import PreparedScans
 from r2flow.data.sources import InMemory
 from r2flow.errors import InputError
@@ -299,6 +299,13 @@ class TestPrepared:
         assert numbers(prepared.validation_source) == numbers(raw.validation_source) == [30, 31, 32]  # a whole drive
         assert prepared.fingerprint() == raw.fingerprint()
         assert isinstance(prepared.training_source, PreparedScans)  # mapped, not copied
+
+    def test_samples_get_the_levels_that_sets_share(self, prepared_360: Path, numbered: Path):
+        prepared, simulated = {"name": "prepared", "root": str(prepared_360), "split": None}, {"name": "simulated"}
+        assert reflectance_levels(prepared) == 256  # as prepare found them
+        assert reflectance_levels(simulated) == 100
+        assert reflectance_levels({"name": "mixed", "parts": [prepared, simulated]}) is None
+        assert reflectance_levels({"name": "folder", "root": str(numbered)}) is None
 
     def test_they_mix_with_others(self, prepared_360: Path, numbered: Path):
         parts = [{"name": "prepared", "root": str(prepared_360), "split": "train"},

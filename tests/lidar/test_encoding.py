@@ -67,6 +67,15 @@ def test_reflectance_is_clamped():
     assert Encoding(HDL64E).decode(x)[1, 0, :2].tolist() == [0, 1]
 
 
+def test_decoded_reflectance_has_the_sensors_levels():
+    sensor = SENSORS["hdl64e"].resized(8, 64)
+    image = torch.rand(2, 8, 64, generator=torch.Generator().manual_seed(0))
+    image[0] = 10 * image[0] + 2
+    decoded = Encoding(sensor, levels=100).decode(Encoding(sensor).encode(image))[1]
+    torch.testing.assert_close(decoded, (100 * image[1]).round() / 100, rtol=0, atol=1e-6)
+    assert set((100 * decoded).round().int().ravel().tolist()) <= set(range(101))
+
+
 def test_a_nan_is_a_dropped_ray_and_changes_no_other():
     x = torch.zeros(2, *HDL64E.shape)
     x[0, 0, 0] = math.nan

@@ -10,7 +10,7 @@ from r2flow.errors import InputError
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import CONFIG, RESUMED, open_run, read_config
 from r2flow.stages.checkpointing import AtomicCheckpointIO
-from r2flow.training import check
+from r2flow.training import build, check
 from tests.training.conftest import in_process
 
 REFUSED = {
@@ -106,6 +106,14 @@ def test_a_wrong_value_is_refused(tmp_path: Path, argument: str, words: str):
     assert line.startswith("error: ")
     assert words in line
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):
+    asked = ["data.scenes=2", "backbone=hdit_tiny", f"run_dir={tmp_path}"]
+    assert build(compose(asked), asked).config["encoding"]["levels"] == 100
+    asked.append("encoding.levels=50")
+    run = build(compose(asked), asked)
+    assert run.config["encoding"]["levels"] == run.stage.generator.space.encoding.levels == 50
 
 
 def test_files_have_no_scenes(tmp_path: Path):
