@@ -229,6 +229,8 @@ def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
 
 def _assembled(config: dict[str, Any], generator: Generator) -> Run:
     space = generator.space
+    if not hasattr(generator, "backbone"):  # its network is of its own kind
+        config["backbone"] = None
     data = ScanDataModule(space.sensor, space.encoding, config["seed"], generator.noise_shape, **config["data"])
     if data.pairs is not None:
         data.pairs.recipe(data.encoding.shape, data.noise_shape)  # refuses what is out of its range

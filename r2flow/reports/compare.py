@@ -143,7 +143,7 @@ def _read_values(path: Path, config: Mapping[str, Any], curves: Mapping[str, Cur
     stage = config["stage"]
     return {
         "stage": f"{stage['name']} {stage['steps']}" if "steps" in stage else str(stage["name"]),
-        "backbone": config["backbone"]["name"],
+        "backbone": (config["backbone"] or {}).get("name"),
         "steps": step,
         "images": None if step is None else step * int(config["data"]["batch_size"]),
         "train_loss": float(train[-max(len(train) // 10, 1) :].mean()) if len(train) else None,

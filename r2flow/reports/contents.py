@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-from r2flow.backbones import Backbone
 from r2flow.config import flatten
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.models import MODELS, name_of
@@ -17,7 +16,6 @@ def describe(path: str | Path) -> dict[str, Any]:
     model = name_of(loaded.path)
     known = {"model": model, "draws": MODELS[model].about, "licence": MODELS[model].licence} if model else {}
     broken = [name for name, value in loaded.generator.state_dict().items() if not value.isfinite().all()]
-    with_backbone = any(isinstance(module, Backbone) for module in loaded.generator.modules())
     return {
         **known,
         "path": str(loaded.path),
@@ -26,7 +24,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "step": loaded.step,
         "stage": loaded.config.get("stage", {}).get("name", "unknown"),
         "generator": (loaded.config.get("generator") or {}).get("name", "rectified_flow"),
-        "backbone": loaded.config["backbone"]["name"] if with_backbone else None,
+        "backbone": (loaded.config["backbone"] or {}).get("name"),
         "parameters": sum(p.numel() for p in loaded.generator.parameters()),
         **({"not finite": ", ".join(broken)} if broken else {}),
         "image": [loaded.encoding.channels, rows, columns],

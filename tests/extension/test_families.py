@@ -72,6 +72,7 @@ def test_info_names_the_family(trained: tuple[Family, Path]):
         BACKBONE: ("rectified_flow", "toy_backbone"),
     }  # fmt: skip
     assert (about["generator"], about["backbone"]) == expected[family]
+    assert (about["config"]["backbone"] is None) == (family is GAN)  # which has a network of its own kind
 
 
 def test_scan_i_of_a_seed_is_the_same_in_any_batch(trained: tuple[Family, Path], tmp_path: Path):
