@@ -8,7 +8,7 @@
     python train.py -m backbone=hdit_tiny,hdit_small seed=1,2,3
     python train.py --plugin my.module stage=my_stage
 
-The same command again goes on from the run's last checkpoint. `--cfg job` shows every key, `--help` the choices.
+The same command again resumes from the run's last checkpoint. `--cfg job` shows every key, `--help` the choices.
 """
 
 import sys

@@ -122,8 +122,8 @@ class Guard(L.Callback):
     def _last_good(self) -> str:
         newest = next(iter(checkpoints_of(self.run_dir)), None)
         if newest is None:
-            return "There is no checkpoint to go on from yet."
-        return f"The last good checkpoint is {newest}, from which the same command goes on."
+            return "There is no checkpoint to resume from yet."
+        return f"The last good checkpoint is {newest}, from which the same command resumes."
 
     def state_dict(self) -> dict[str, Any]:
         return {"in_a_row": self.in_a_row, "total": self.total}

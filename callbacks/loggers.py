@@ -28,7 +28,7 @@ def _tensorboard(run_dir: Path) -> Logger:
 
 
 def _wandb(run_dir: Path) -> Logger:
-    """W&B, which names a folder of a run `run-DATE-ID`: the same run goes on where there is one."""
+    """W&B, which names a folder of a run `run-DATE-ID`: the same run resumes where there is one."""
     require("loggers=[wandb]", "wandb", "wandb")
     before = sorted((run_dir / "wandb").glob("*run-*-*"), key=lambda folder: folder.stat().st_mtime)
     run_id = before[-1].name.rsplit("-", 1)[1] if before else None
@@ -86,7 +86,7 @@ def log_config(loggers: Iterable[Logger], config: Mapping[str, Any]) -> None:
     """A run's config, to the loggers that are not in its folder."""
     for logger in loggers:
         if isinstance(logger, MLFlowLogger) and logger.experiment.get_run(logger.run_id).data.params:
-            continue  # they cannot be changed when a run goes on
+            continue  # they cannot be changed when a run resumes
         if isinstance(logger, ELSEWHERE):
             logger.log_hyperparams(dict(config))
 

@@ -128,7 +128,7 @@ class Stopping(L.Callback):
             if first:
                 self._requeue(where)
         begun = bool(checkpoints_of(self.run_dir))
-        kept = "goes on from the last checkpoint" if begun else "starts it again: no checkpoint yet"
+        kept = "resumes from the last checkpoint" if begun else "starts it again: no checkpoint yet"
         raise Stopped(code, f"{where}; the same command {kept}" if first else "") from None
 
     def _requeue(self, where: str) -> None:

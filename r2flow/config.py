@@ -19,7 +19,7 @@ class Key:
     """A config key's rule.
 
     Attributes:
-        resume: `free`: it may differ when a run goes on, for it says where and how is computed, not what.
+        resume: `free`: it may differ when a run resumes, for it says where and how is computed, not what.
         inherited: A run with `stage.init` has its parent's value: `always`, or `unless_given` on the command line;
             `with_pairs`, which are images of the parent, always, and else unless given.
         links: Which links of a chain take it from the chain's command line: all, those that read `scans` (the others

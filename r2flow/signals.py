@@ -14,7 +14,7 @@ Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 
 STOPPING = (signal.SIGTERM, signal.SIGINT)
 
-LATER = 75  # exit code, "try again later" among the system's: the run is not at its end, the same command goes on
+LATER = 75  # exit code, "try again later" among the system's: the run is not at its end, the same command resumes
 
 
 class Stopped(BaseException):

@@ -5,7 +5,7 @@
     result = fit(build(compose(["data=kitti_raw", "data.root=FOLDER", "trainer.max_steps=1000"])))
     result.metrics["val/loss"], result.checkpoint
 
-The same command again, and the same config, go on from the last checkpoint.
+The same command again, and the same config, resume from the last checkpoint.
 """
 
 import logging
@@ -322,7 +322,7 @@ def _fit_in_folder(run: Run) -> int:
             print(f"finished before, at step {step_of(last)}; to learn more: {further} name=OTHER")
         return step_of(last)  # nothing is left to do, nor pairs to make
     if last is not None:
-        log.info("going on from %s", last)
+        log.info("resuming from %s", last)
     if run.trainer.is_global_zero:
         log_config(run.trainer.loggers, run.config)
     try:

@@ -143,7 +143,7 @@ class ScanDataModule(L.LightningDataModule):
         return Permutations(len(source), self.seed)
 
     def fingerprint(self) -> str:
-        """What is trained on, wherever it lies: a run goes on only with the same scans in the same order."""
+        """What is trained on, wherever it lies: a run resumes only with the same scans in the same order."""
         if self.pairs is not None:
             pairs = f"{self.pairs.num} pairs, {self.pair_store.digest[:16]}"
             other = self.options.next_to_pairs

@@ -56,7 +56,7 @@ def write_samples(
 ) -> list[np.ndarray]:
     """Draw scans and write each as `out/NNNNNN.FORMAT`, the first ones also as pictures and in 3-D (`samples.html`).
 
-    Scan i of a seed is the same whatever `num` and `batch_size` are. A call that was stopped goes on where it was.
+    Scan i of a seed is the same whatever `num` and `batch_size` are. A call that was stopped resumes.
 
     Args:
         sampler: How the generator is run; its own if left out.

@@ -66,7 +66,7 @@ def finish(
     path = find_checkpoint(run)
     checkpoint = load_checkpoint(path, device)
     if checkpoint.step < max_steps:
-        print(f"stopped at step {checkpoint.step} of {max_steps}: the same command goes on from here")
+        print(f"stopped at step {checkpoint.step} of {max_steps}: the same command resumes from here")
     out = run / "samples"
     if samples["num"] == 0 or not checkpoint.generator.draws:
         print(f"checkpoint    {path}")

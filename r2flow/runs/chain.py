@@ -100,7 +100,7 @@ def run_chain(links: Sequence[Link], command: Sequence[str]) -> tuple[int, bool]
         code = run_process([*command, *link.overrides]) or (0 if has_ended(link.run_dir) else LATER)
         if code:
             if code != 2:  # which is the user's to mend, and has been said
-                print(f"the chain stopped in {link.name}; the same command goes on there", file=sys.stderr, flush=True)
+                print(f"the chain stopped in {link.name}; the same command resumes there", file=sys.stderr, flush=True)
             return code, True
         _note(link.run_dir, _record(link))
     return 0, not skipping

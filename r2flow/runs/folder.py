@@ -1,4 +1,4 @@
-"""A run's folder: what it holds, and whether a command may go on in it."""
+"""A run's folder: what it holds, and whether a command may resume in it."""
 
 import logging
 import os
@@ -94,7 +94,7 @@ def write_config(run: str | Path, config: Mapping[str, Any]) -> None:
 
 
 def open_run(run: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor] | None = None) -> Path | None:
-    """Enter a run folder: the newest checkpoint to go on from, or None where a run begins.
+    """Enter a run folder: the newest checkpoint to resume from, or None where a run begins.
 
     Args:
         state: The state_dict of what is trained; a checkpoint with other names or shapes is passed over.
@@ -150,7 +150,7 @@ def _another_config(run: str | Path, differing: list[str]) -> str:
     changed = f", change it in {Path(run, CONFIG)} too" if length else ""
     return (
         f"{run} holds a run of another config: {'; '.join(differing[:3])}{more}. "
-        f"Give the same command to go on with it{changed}, or name=OTHER for a new one."
+        f"Give the same command to resume it{changed}, or name=OTHER for a new one."
     )
 
 

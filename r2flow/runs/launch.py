@@ -1,6 +1,6 @@
 """What `train.py` and `r2flow train` do: Hydra, sweeps, chains, exit codes, and mistakes in one line.
 
-Exit codes: 0 at the run's end, 2 for what the user can mend, 75 where the same command goes on (`trainer.max_time`,
+Exit codes: 0 at the run's end, 2 for what the user can mend, 75 where the same command resumes (`trainer.max_time`,
 SLURM's time limit), 130 after Ctrl-C, 143 after SIGTERM.
 """
 
@@ -94,7 +94,7 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
         if failed:
             print(f"error: {number} of the sweep's jobs failed: {names}", file=sys.stderr)
             return 2
-        print(f"{number} of the sweep's jobs go on with the same command: {names}")
+        print(f"{number} of the sweep's jobs resume with the same command: {names}")
         return LATER
     except (HydraException, OmegaConfBaseException) as error:
         print(f"error: {one_line(explain(error))}{_forgotten_plugins(arguments)}", file=sys.stderr)
@@ -236,7 +236,7 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], ended: list[tuple[i
     log.info("job %s: %s", HydraConfig.get().job.num, " ".join(given))
     code = run_process([*_restart(command), *given, override("run_dir", str(run_dir))])
     if code in (130, 143):
-        raise Stopped(code, "the sweep stopped; the same command goes on there")
+        raise Stopped(code, "the sweep stopped; the same command resumes there")
     if code:
         ended.append((code, str(run_dir)))
 

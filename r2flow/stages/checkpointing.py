@@ -37,7 +37,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             ) from None
 
     def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: bool | None = None) -> dict[str, Any]:
-        # On the CPU, as Lightning's own: a run goes on without the GPU that it began on.
+        # On the CPU, as Lightning's own: a run resumes without the GPU that it began on.
         found = read_checkpoint(path, map_location or "cpu")
         # Lightning's timer would go on where it stopped, with its time spent; trainer.max_time is of each command.
         found["callbacks"] = {k: v for k, v in (found.get("callbacks") or {}).items() if not k.startswith("Timer")}

@@ -196,7 +196,7 @@ def test_broken_weights_are_never_written(tmp_path, averaged: bool):
         fit(Line(), batches(*[1.0] * 9), tmp_path, *callbacks, Guard(tmp_path), Spoil(at=3))
     said = str(caught.value)
     assert "stopped at step 3: the weights are no longer finite (inner.bias first, 1 of 4)" in said
-    assert "step-00000002.ckpt, from which the same command goes on" in said
+    assert "step-00000002.ckpt, from which the same command resumes" in said
     assert [p.name for p in checkpoints_of(tmp_path)] == ["step-00000002.ckpt", "step-00000001.ckpt"]
 
 

@@ -45,7 +45,7 @@ def test_a_run_goes_on_from_its_checkpoint_bit_by_bit(trained: tuple[Family, Pat
     family, run = trained
     stopped = Path(shutil.copytree(run, tmp_path / "stopped"))
     checkpoints_of(stopped)[0].unlink()  # as if killed between steps 4 and 6
-    assert "going on from" in train(stopped, family).stdout
+    assert "resuming from" in train(stopped, family).stdout
     assert_bit_equal(run, stopped)
 
 

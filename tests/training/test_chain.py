@@ -146,8 +146,8 @@ def test_a_chain_told_to_stop_passes_it_on_and_its_last_link_is_not_finished(
     process.send_signal(signal.SIGTERM)  # to the chain alone
     said, _ = process.communicate(timeout=100)
     assert process.returncode == 143, said
-    assert "stopped at step 6; the same command goes on from the last checkpoint" in said
-    assert "the chain stopped in td2; the same command goes on there" in said
+    assert "stopped at step 6; the same command resumes from the last checkpoint" in said
+    assert "the chain stopped in td2; the same command resumes there" in said
     assert not (run / "td2" / "link.json").exists()
     assert not (run / "report").exists()
     let_go(tmp_path / HELD)

@@ -35,7 +35,7 @@ def test_a_mixture_goes_on_where_it_stopped_and_may_move(train: Run, scans: Path
     checkpoints_of(tmp_path / "runs/stopped")[0].unlink()  # its end: it is left at step 10 of 12
     (tmp_path / "a").rename(tmp_path / "moved")
     done = train(*options(tmp_path / "moved", "stopped"), "data.workers=2")
-    assert "going on from" in done.stdout
+    assert "resuming from" in done.stdout
     whole, stopped = weights(tmp_path / "runs/whole"), weights(tmp_path / "runs/stopped")
     assert all(torch.equal(whole[name], stopped[name]) for name in whole)
     # The scans have no reflectance: nobody asked for a flow of range alone, and it is one.

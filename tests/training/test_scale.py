@@ -178,11 +178,11 @@ def test_a_job_told_to_leave_is_queued_again_and_ends_as_the_one_left_alone(
     left = [read_checkpoint(path)["global_step"] for path in checkpoints_of(run)]
     assert 2 <= left[0] < 12
     assert len(left) == 2
-    assert f"stopped at step {left[0]}; the same command goes on" in said
+    assert f"stopped at step {left[0]}; the same command resumes" in said
     assert not list(run.rglob("hpc_ckpt*"))  # Lightning's own, which nothing would remove or read
     [(code, said)] = srun(tmp_path, scans, *command)
     assert code == 0, said
-    assert f"step-{left[0]:08d}.ckpt" in said[said.index("going on from") :].splitlines()[0]
+    assert f"step-{left[0]:08d}.ckpt" in said[said.index("resuming from") :].splitlines()[0]
     assert_bit_equal(alone[0], run)
     assert [p.name for p in checkpoints_of(run)] == ["step-00000012.ckpt", "step-00000010.ckpt"]
 
@@ -213,7 +213,7 @@ def test_two_processes_of_which_one_is_told_to_stop_leave_together(scans: Path, 
     process.send_signal(signal.SIGTERM)  # to the launching process alone
     said, _ = process.communicate(timeout=100)
     assert process.returncode == 143, said
-    assert said.count("stopped at step 6; the same command goes on from the last checkpoint") == 1
+    assert said.count("stopped at step 6; the same command resumes from the last checkpoint") == 1
     assert "Traceback" not in said
     assert read_checkpoint(checkpoints_of(tmp_path / "runs" / "stopped")[0])["global_step"] == 6
 

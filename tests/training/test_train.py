@@ -84,7 +84,7 @@ def test_a_killed_run_ends_as_the_one_left_alone(
     options = ["name=killed", f"data.workers={workers}", *hold_at(step, tmp_path / "held")]
     stop_held(tmp_path / "held", signal.SIGKILL, tiny(scans, *options))
     done = train(*options)
-    assert "going on from" in done.stdout
+    assert "resuming from" in done.stdout
     assert_bit_equal(alone[0], tmp_path / "runs" / "killed")
 
 
@@ -99,7 +99,7 @@ def test_a_run_told_to_stop_leaves_a_checkpoint_and_one_line(
     options += hold_at(5, tmp_path / "held")
     found, said = stop_held(tmp_path / "held", by, tiny(scans, *options))
     assert found == code, said
-    assert lines_of(said) == ["stopped at step 6; the same command goes on from the last checkpoint"]
+    assert lines_of(said) == ["stopped at step 6; the same command resumes from the last checkpoint"]
     run = tmp_path / "runs" / "stopped"
     assert [step_of(path) for path in checkpoints_of(run)] == [6, 4]
     train(*options)
@@ -167,7 +167,7 @@ def test_an_odd_last_checkpoint_is_passed_over(train: Run, alone: tuple[Path, st
             content["state_dict"]["foo"] = content["state_dict"].pop(name)
         torch.save(content, newest)
     done = train("name=copied")
-    assert f"going on from {older.relative_to(copied.parents[1])}" in done.stdout
+    assert f"resuming from {older.relative_to(copied.parents[1])}" in done.stdout
     assert_bit_equal(alone[0], copied)
 
 
@@ -197,7 +197,7 @@ def test_another_config_in_the_same_folder_is_refused(train: Run, copied: Path):
 def test_another_length_of_a_begun_run_has_a_place(train: Run, copied: Path):
     done = train("name=copied", "trainer.max_steps=5000", check=False)
     assert done.returncode == 2
-    assert "go on with it, change it in runs/copied/config.yaml too, or name=OTHER for a new one." in done.stderr
+    assert "resume it, change it in runs/copied/config.yaml too, or name=OTHER for a new one." in done.stderr
 
 
 def test_a_folder_that_now_holds_other_scans_is_refused(train: Run, copied: Path, scans: Path, tmp_path: Path):
@@ -205,7 +205,7 @@ def test_a_folder_that_now_holds_other_scans_is_refused(train: Run, copied: Path
     shutil.copytree(scans, other)
     checkpoints_of(copied)[0].unlink()
     moved = train("name=copied", f"data.root={other}")  # the same scans elsewhere
-    assert "going on from" in moved.stdout + moved.stderr
+    assert "resuming from" in moved.stdout + moved.stderr
     (other / "000000.bin").rename(other / "another.bin")
     done = train("name=copied", f"data.root={other}", check=False)
     assert done.returncode == 2
@@ -228,7 +228,7 @@ def test_a_sweep_whose_jobs_reach_their_time_goes_on_with_the_same_command(train
     job = "seed=1,2", "trainer.max_time=00:00:00:00", "trainer.max_steps=3", "samples.num=0"
     done = train(*job, check=False, flags=("-m",))
     assert done.returncode == LATER
-    assert "2 of the sweep's jobs go on with the same command: " in done.stdout
+    assert "2 of the sweep's jobs resume with the same command: " in done.stdout
     assert "failed" not in done.stdout + done.stderr
     assert "stopped before a checkpoint was kept: the same command starts it again" in done.stdout
     mixed = train(*job, "stage.loss=mse,nonsense", check=False, flags=("-m",))
