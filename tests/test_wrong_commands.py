@@ -256,8 +256,6 @@ report solvers -o out --samplers nope
 report solvers -o out --budgets 0
 report solvers -o out --budgets a
 report solvers -o out --budgets '' # an argument is empty
-report solvers -o out --tolerances -1
-report solvers -o out --tolerances nan
 report solvers -o out --problems nope
 report solvers -o out --budgets 1 --samplers rk4 # --budgets
 report solvers -o out --problems none # nothing to measure

@@ -1,8 +1,6 @@
 """`r2flow report`: solvers, curvature, backbones, completion and the paper's tables."""
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from json import dumps as to_json
 from pathlib import Path
 from typing import Annotated
@@ -67,16 +65,13 @@ def solvers(
     ] = None,
     samplers: Annotated[str | None, typer.Option(help="Solvers, separated by commas; all of ours if left out.")] = None,
     budgets: Annotated[str, typer.Option(help="Evaluations of the fixed-step solvers.")] = "4,8,16,32,64",
-    tolerances: Annotated[str, typer.Option(help="Of the adaptive solvers.")] = "1e-2,1e-3,1e-4,1e-5",
     problems: Annotated[str | None, typer.Option(help="Exact problems by name; all if left out, or none.")] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="The most timed solutions of a scan.")] = 5,
 ) -> None:
     """Error against run time of every solver: exact problems, stiff and extreme ones too, and a trained flow.
 
     The page names the sampler that reaches a wanted error, as a command.
     """
     from r2flow.flow.problems import PROBLEMS
-    from r2flow.flow.solvers import method_of
     from r2flow.generators import as_flow
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.progress import Bar
@@ -84,34 +79,28 @@ def solvers(
     from r2flow.reports.pages import prepare_folder
 
     where = choose_device(draw.device)
-    methods = samplers.split(",") if samplers else list(measuring.METHODS)
-    for method in methods:
-        method_of(method)
+    methods = samplers.split(",") if samplers else measuring.METHODS
     names = [] if problems == "none" else problems.split(",") if problems else list(PROBLEMS)
-    for name in names:
-        PROBLEMS[name]
     most = numbers("budgets", budgets, int)
-    chosen = measuring.configurations(methods, most, numbers("tolerances", tolerances))
+    chosen, everything, flow = measuring.configurations(methods, most), measuring.problem_subjects(names), None
     if not chosen or not (names or model):
         raise InputError("nothing to measure: give a model, more --budgets, or leave --problems none out.")
     loaded = None if model is None else load_checkpoint(model, where)
     if loaded is not None:
         as_flow(loaded.generator, "report solvers")
     prepare_folder(out)
-    subjects, flow = measuring.problem_subjects(names), None
-    with only_errors():
-        if loaded is not None:
-            with Bar("measuring", draw.num * 512, "reference evaluations") as advance:
-                flow = measuring.checkpoint_subject(
-                    loaded, str(model), draw.num, draw.seed, draw.batch_size, progress=advance
-                )
-        everything = [*subjects, flow] if flow else subjects
-        with Bar("measuring", len(everything) * len(chosen), "solutions") as advance:
-            rows = measuring.measure(everything, chosen, repeats, advance)
-        with Bar("judging", 0, "solutions") as advance:
-            verdicts = measuring.judge(names, methods, progress=advance)
-    page = measuring.solvers_page(rows, verdicts, flow, most, {"scans": draw.seed}, command(), where)
-    finish(page, out, page.text[: -(2 + 3 * bool(verdicts))])  # without the long tables
+    log = logging.getLogger("r2flow.flow")
+    log.setLevel(logging.ERROR)  # the report counts the scans that a solver gave up on
+    if loaded is not None:
+        with Bar("measuring", draw.num * 512, "reference evaluations") as advance:
+            flow = measuring.checkpoint_subject(
+                loaded, str(model), draw.num, draw.seed, draw.batch_size, progress=advance
+            )
+        everything.append(flow)
+    with Bar("measuring", len(everything) * len(chosen), "solutions") as advance:
+        rows = measuring.measure(everything, chosen, advance)
+    page = measuring.solvers_page(rows, flow, most, {"scans": draw.seed}, command(), where)
+    finish(page, out, page.text[:-2])  # without the long table
 
 
 @report.command(epilog="Example: r2flow report backbones --size 64x1024")
@@ -134,18 +123,6 @@ def backbones(
     rows = backbone_costs(chosen, names, channels, repeats, where)
     measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
     print(to_json(measured, indent=2)) if json else print_costs(measured, chosen, where)
-
-
-@contextmanager
-def only_errors() -> Iterator[None]:
-    """No warnings about scans that a solver gave up on: the report counts them."""
-    log = logging.getLogger("r2flow.flow")
-    level = log.level
-    log.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        log.setLevel(level)
 
 
 @report.command(epilog="Example: r2flow report completion kitti360/test street --num 15 --out reports")

@@ -1,9 +1,4 @@
-"""Error against run time of every solver, on exact problems (smooth, stiff, extreme) and on a trained flow.
-
-A second table judges adaptive solvers where they fail. A failure is an error of more than ten times the tolerance. It
-is not silent where the solution is flagged (stiff, not converged, no estimate) or where its global estimate is within a
-factor of five of the true error.
-"""
+"""Error against run time of every solver, on exact problems (smooth, stiff, extreme) and on a trained flow."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -27,27 +22,16 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import Draws
 from r2flow.reports.pages import STYLES, Page, blank_figure
-from r2flow.reports.tables import shown, table
+from r2flow.reports.tables import Row, shown, table
 from r2flow.reports.timing import timed
 
-Row = Mapping[str, Any]
-
 METHODS = (*SOLVERS, f"{TORCHDIFFEQ}dopri5")
+TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5)  # of the adaptive methods
 MOST_EVALUATIONS = 1000  # of an adaptive method for a scan; one that needs more is of no use here
-PATIENCE = 0.5  # seconds after which a configuration is not timed again
+REPEATS, PATIENCE = 5, 0.5  # timed solutions of a scan; seconds after which a configuration is not timed again
 TRUST = 3.0  # an error can be measured when it is this many times the reference's own
 ROUNDING = 1e-9  # the least error that is told apart from rounding in float64
 WANTED = (0.2, 0.05, 0.01)  # RMS errors of the range, m
-
-PRECISIONS: dict[str, tuple[torch.dtype, torch.dtype | None]] = {  # of the state, of the network where it differs
-    "float64": (torch.float64, None),
-    "float32": (torch.float32, None),
-    "bfloat16 network": (torch.float32, torch.bfloat16),
-    "float16 network": (torch.float32, torch.float16),
-}
-FAILS_AT = 10.0  # times the tolerance
-HONEST_WITHIN = 5.0  # of the true error
-JET = "narrow_jet"  # the known exception: nothing evaluated on either side of it shows it
 
 
 @dataclass(frozen=True)
@@ -66,21 +50,16 @@ class Configuration:
         return f"{self.method}, {self.steps} step{'s' * (self.steps > 1)}"
 
     @property
-    def options(self) -> str:
-        """As options of `r2flow sample`."""
+    def fields(self) -> dict[str, Any]:
+        """Of `solve`, and as options of `r2flow sample`."""
         if self.steps is None:
-            return f"--sampler {self.method} --tolerance {self.tolerance:g}"
-        return f"--sampler {self.method} --steps {self.steps} --grid {usual_grid(self.method)}"
-
-    def solve(self, velocity: Velocity, x_0: Tensor, **options: Any) -> Solution:
-        """x_1 from x_0."""
-        if self.steps is None:
-            assert self.tolerance is not None
-            return solve(velocity, x_0, method=self.method, tolerance=self.tolerance, **options)
-        return solve(velocity, x_0, method=self.method, steps=self.steps, grid=usual_grid(self.method), **options)
+            return {"tolerance": self.tolerance}
+        return {"steps": self.steps, "grid": usual_grid(self.method)}
 
 
-def configurations(methods: Sequence[str], budgets: Sequence[int], tolerances: Sequence[float]) -> list[Configuration]:
+def configurations(
+    methods: Sequence[str], budgets: Sequence[int], tolerances: Sequence[float] = TOLERANCES
+) -> list[Configuration]:
     """Every fixed-step method at the numbers of steps that fit the budgets, every adaptive one at the tolerances."""
     chosen: list[Configuration] = []
     for method in methods:
@@ -149,46 +128,46 @@ def checkpoint_subject(
 
 
 def measure(
-    subjects: Sequence[Subject], chosen: Sequence[Configuration], repeats: int = 5, progress: Progress = None
+    subjects: Sequence[Subject], chosen: Sequence[Configuration], progress: Progress = None
 ) -> list[dict[str, Any]]:
     """Error, evaluations and seconds of every configuration on every subject, a row each.
 
-    The configurations take turns, so that whatever else the machine does slows all of them alike.
-
-    Args:
-        repeats: The most timed solutions of a scan; the error is that of the first.
-        progress: Called for every subject and configuration.
+    The configurations take turns, so that whatever else the machine does slows all of them alike; the error is that of
+    the first turn.
     """
     rows = []
     for subject in subjects:
         seconds: list[list[float]] = [[] for _ in chosen]
-        found: list[list[Solution]] = [[] for _ in chosen]
+        solutions: list[list[Solution]] = [[] for _ in chosen]
         with torch.inference_mode():
             subject.velocity(torch.zeros((), device=subject.x_0.device), subject.x_0[:1])  # warm up
-            for repeat, (i, one) in product(range(repeats), enumerate(chosen)):
+            for repeat, (i, one) in product(range(REPEATS), enumerate(chosen)):
                 for x_0 in subject.x_0.split(subject.batch_size) if repeat == 0 or sum(seconds[i]) < PATIENCE else ():
-                    call = partial(one.solve, subject.velocity, x_0, max_evaluations=MOST_EVALUATIONS)
+                    call = partial(
+                        solve, subject.velocity, x_0, method=one.method, max_evaluations=MOST_EVALUATIONS, **one.fields
+                    )
                     solution, taken = timed(call, x_0.device)
                     seconds[i].append(taken / len(x_0))
                     if repeat == 0:
-                        found[i].append(solution)
+                        solutions[i].append(solution)
                 if progress is not None and repeat == 0:
                     progress()
-        rows += [_row(subject, *one) for one in zip(chosen, seconds, found, strict=True)]
+        rows += [_row(subject, *one) for one in zip(chosen, seconds, solutions, strict=True)]
     return rows
 
 
-def _row(subject: Subject, one: Configuration, seconds: list[float], found: Sequence[Solution]) -> dict[str, Any]:
-    x_1 = torch.cat([solution.x for solution in found])
+def _row(subject: Subject, one: Configuration, seconds: list[float], solutions: Sequence[Solution]) -> dict[str, Any]:
+    x_1 = torch.cat([solution.x for solution in solutions])
     errors = rms(x_1 - subject.x_1)
+    fields = [f"--{key} {value:g}" if key == "tolerance" else f"--{key} {value}" for key, value in one.fields.items()]
     row = {
-        "problem": subject.name, "method": one.method, "steps": one.steps, "tolerance": one.tolerance,
-        "label": one.label, "options": one.options, "scans": len(errors),
-        "evaluations": float(torch.cat([solution.evaluations for solution in found]).double().mean()),
+        "problem": subject.name, "method": one.method, "label": one.label,
+        "options": " ".join([f"--sampler {one.method}", *fields]), "scans": len(errors),
+        "evaluations": float(torch.cat([solution.evaluations for solution in solutions]).double().mean()),
         "seconds": float(np.median(seconds)), "error": float(errors.median()), "error_worst": float(errors.max()),
         "floor": subject.floor, "length": float(rms(subject.x_1 - subject.x_0).median()),
-        "converged": int(sum(solution.converged.sum() for solution in found)),
-        "stiff": int(sum(solution.stiff.sum() for solution in found)),
+        "converged": int(sum(solution.converged.sum() for solution in solutions)),
+        "stiff": int(sum(solution.stiff.sum() for solution in solutions)),
     }  # fmt: skip
     if subject.encoding is not None:
         _, metres, dropped = metres_apart(*(subject.encoding.decode(x.float()) for x in (x_1, subject.x_1)))
@@ -206,10 +185,10 @@ def reached(row: Row) -> float:
     return float(max(row["error"], row["floor"]))
 
 
-def best_within(rows: Sequence[Row], budget: float, work: str = "evaluations") -> Row | None:
-    """The row of least error whose work is within a budget; of equals, the one of least work."""
-    within = [row for row in rows if row[work] <= budget and math.isfinite(reached(row))]
-    return min(within, key=lambda row: (reached(row), row[work]), default=None)
+def best_within(rows: Sequence[Row], budget: float) -> Row | None:
+    """The row of least error within a number of evaluations; of equals, the one of fewest."""
+    within = [row for row in rows if row["evaluations"] <= budget and math.isfinite(reached(row))]
+    return min(within, key=lambda row: (reached(row), row["evaluations"]), default=None)
 
 
 def cheapest(rows: Sequence[Row], metres: float) -> Row | None:
@@ -218,70 +197,15 @@ def cheapest(rows: Sequence[Row], metres: float) -> Row | None:
     return min(near, key=lambda row: (row["evaluations"], reached(row)), default=None)
 
 
-def judge(
-    problems: Sequence[str],
-    methods: Sequence[str],
-    tolerances: Sequence[float] = (1e-3, 1e-5),
-    scans: int = 8,
-    elements: int = 64,
-    max_evaluations: int = 5000,
-    progress: Progress = None,
-) -> list[dict[str, Any]]:
-    """Whether adaptive solvers admit their failures: every problem, precision, solver and tolerance, a row each.
-
-    Returns:
-        `error` is the root mean square over the elements of the worst scan, `estimate` that scan's global estimate
-        (None: none), `verdict` one of accurate, flagged, owned up and silent.
-    """
-    start, rows = Draws(0, range(scans)).start((elements,)), []
-    adaptive = [method for method in methods if method in SOLVERS and SOLVERS[method].adapts]
-    for name, precision, method, tolerance in product(problems, PRECISIONS, adaptive, tolerances):
-        problem, (state, network) = PROBLEMS[name](), PRECISIONS[precision]
-        x_0 = start.to(state)
-        solver = Configuration(method, tolerance=tolerance)
-        solution = solver.solve(_rounded(problem, network), x_0, global_error=True, max_evaluations=max_evaluations)
-        assert solution.global_error is not None
-        assert solution.estimate_evaluations is not None
-        difference = (solution.x.double() - problem.solution(x_0, 1.0).double()).flatten(1)
-        largest = difference.abs().amax(1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
-        errors = largest[:, 0] * rms(difference / largest)  # squares of stiff problems' errors overflow
-        worst = int(errors.argmax())
-        estimate = solution.global_error[worst].item()
-        rows.append({
-            "problem": name, "precision": precision, "solver": method, "tolerance": tolerance,
-            "error": errors[worst].item(), "estimate": estimate if math.isfinite(estimate) else None,
-            "evaluations": (solution.evaluations - solution.estimate_evaluations).double().mean().item(),
-            "stiff": solution.stiff.double().mean().item(), "converged": solution.converged.double().mean().item(),
-            "verdict": _verdict(solution, errors, tolerance),
-        })  # fmt: skip
-        if progress is not None:
-            progress()
-    return rows
-
-
-def _rounded(velocity: Velocity, dtype: torch.dtype | None) -> Velocity:
-    """A velocity as a network in half precision gives it: x rounded before it, v after it; t stays in float32."""
-    if dtype is None:
-        return velocity
-    return lambda t, x: velocity(t, x.to(dtype).to(x.dtype)).to(dtype)
-
-
-def _verdict(solution: Solution, errors: Tensor, tolerance: float) -> str:
-    estimate = solution.global_error
-    assert estimate is not None
-    failed = errors > FAILS_AT * tolerance
-    flagged = solution.stiff | ~solution.converged | ~estimate.isfinite()
-    honest = (estimate >= errors / HONEST_WITHIN) & (estimate <= errors * HONEST_WITHIN)
-    if not failed.any():
-        return "accurate"
-    if (failed & ~flagged & ~honest).any():
-        return "silent"
-    return "flagged" if (failed & flagged).any() else "owned up"
+COLUMNS = {
+    "problem": "problem", "label": "solver", "evaluations": "evaluations", "seconds": "s a scan", "error": "RMS error",
+    "error_worst": "worst scan", "range_rms_m": "range, RMS m", "drop_differs": "ray-drop differs",
+    "converged": "solved", "stiff": "stiff",
+}  # fmt: skip
 
 
 def solvers_page(
     rows: Sequence[Row],
-    verdicts: Sequence[Row],
     subject: Subject | None,
     budgets: Sequence[int],
     seeds: Mapping[str, int],
@@ -292,58 +216,43 @@ def solvers_page(
 
     Args:
         rows: From `measure`.
-        verdicts: From `judge`.
         subject: The trained flow among the subjects.
         budgets: Evaluations within which the most accurate solver is named.
     """
     text: list[str] = []
     figures: dict[str, Figure] = {}
-    exact = [row for row in rows if subject is None or row["problem"] != subject.name]
-    if subject is not None:
-        own = [row for row in rows if row["problem"] == subject.name]
-        text += flow_text(own, subject, budgets)
-        figures["solvers"] = error_figure(own, PANELS)
-    if exact:
-        scans = exact[0]["scans"]
+    groups = _by(rows, "problem")
+    flow = None if subject is None else groups.pop(subject.name)
+    if subject is not None and flow is not None:
+        text += flow_text(flow, subject, budgets)
+        axes = product(("evaluations", "seconds"), ("error", "range_rms_m"))
+        figures["solvers"] = _figure([(subject.name, flow, x, y) for x, y in axes], 2)
+    if groups:
         text += [
             "## Exact problems",
-            f"{scans} scans each, in float64: the most accurate solver within a number of evaluations and its median "
-            "RMS error; none where x_0 is as near.",
-            problems_table(exact, budgets),
+            f"{rows[0]['scans']} scans each, in float64: the most accurate solver within a number of evaluations and "
+            "its median RMS error; none where x_0 is as near.",
+            problems_table(groups, budgets),
         ]
-        figures["solvers_problems"] = problems_figure(exact)
-    if verdicts:
-        text += ["## Failures of adaptive solvers", verdicts_text(verdicts), table(verdicts, VERDICTS)]
-        figures["solvers_estimates"] = estimates_figure(verdicts)
+        panels = [(name, own, "evaluations", "error") for name, own in groups.items()]
+        figures["solvers_problems"] = _figure(panels, 4)
     text += ["## All configurations", table(rows, COLUMNS)]
-    more = {"verdicts": verdicts}
-    return Page("solvers", "Solvers: error against run time", text, rows, figures, command, seeds, device, more)
-
-
-COLUMNS = {
-    "problem": "problem", "label": "solver", "evaluations": "evaluations", "seconds": "s a scan", "error": "RMS error",
-    "error_worst": "worst scan", "range_rms_m": "range, RMS m", "drop_differs": "ray-drop differs",
-    "converged": "solved", "stiff": "stiff",
-}  # fmt: skip
-VERDICTS = {key: key for key in ("problem", "precision", "solver", "tolerance", "error", "estimate", "verdict")}
+    return Page("solvers", "Solvers: error against run time", text, rows, figures, command, seeds, device)
 
 
 def flow_text(rows: Sequence[Row], subject: Subject, budgets: Sequence[int]) -> list[str]:
     """Which solver for which budget and which error on a trained flow."""
-    best = [best_within(rows, budget) or {"label": "none"} for budget in sorted(budgets)]
-    by_budget = [{"budget": budget, **row} for budget, row in zip(sorted(budgets), best, strict=True)]
-    by_error: list[tuple[Any, ...]] = []
+    by_budget = [{"budget": budget, **(best_within(rows, budget) or {"label": "none"})} for budget in sorted(budgets)]
+    by_error: list[dict[str, Any]] = []
     for metres in WANTED:
         row = cheapest(rows, metres)
-        how = ("none", None, None) if row is None else (
-            f"`r2flow sample {subject.name} {row['options']}`", row["evaluations"], row["seconds"]
-        )  # fmt: skip
-        by_error.append((f"{metres:g} m", *how))
+        how = {"how": "none"} if row is None else {**row, "how": f"`r2flow sample {subject.name} {row['options']}`"}
+        by_error.append({**how, "wanted": f"{metres:g} m"})
     return [
         f"**{subject.name}**, {len(subject.x_0)} scans, against its own tight solution. Errors above "
         f"{shown(subject.floor)} can be measured.",
         "The sampler of fewest evaluations that reaches an RMS error of the range:",
-        table(by_error, ("error", "sampler", "evaluations", "s a scan")),
+        table(by_error, {"wanted": "error", "how": "sampler", "evaluations": "evaluations", "seconds": "s a scan"}),
         "The most accurate solver within a number of evaluations:",
         table(
             by_budget, {"budget": "evaluations", "label": "solver", "error": "RMS error", "range_rms_m": "range, RMS m"}
@@ -351,99 +260,41 @@ def flow_text(rows: Sequence[Row], subject: Subject, budgets: Sequence[int]) -> 
     ]
 
 
-def problems_table(rows: Sequence[Row], budgets: Sequence[int]) -> str:
+def problems_table(groups: Mapping[str, Sequence[Row]], budgets: Sequence[int]) -> str:
     """The most accurate solver of every exact problem within every budget."""
     lines = []
-    for name, own in _by(rows, "problem").items():
+    for name, own in groups.items():
         best = [best_within(own, budget) for budget in sorted(budgets)]
         lines.append([name, *("none" if one is None else f"{one['method']} {shown(reached(one))}" for one in best)])
     return table(lines, ["problem", *(f"within {budget}" for budget in sorted(budgets))])
 
 
-def verdicts_text(rows: Sequence[Row]) -> str:
-    """How many cells fail, and how many of these do so silently, the jet apart."""
-    failed = [row for row in rows if row["verdict"] != "accurate"]
-    silent = [row for row in failed if row["verdict"] == "silent"]
-    jets = sum(row["problem"] == JET for row in silent)
-    names = "; ".join(
-        f"{row['problem']} / {row['precision']} / {row['solver']}" for row in silent if row["problem"] != JET
-    )
-    return (
-        f"{len(failed)} of {len(rows)} cells have an error of more than {FAILS_AT:g} times the tolerance in the worst "
-        f"scan; {len(silent) - jets} of these are silent: neither flagged, nor with a global estimate within a factor "
-        f"of {HONEST_WITHIN:g} of the error{f' ({names})' if names else ''}. The narrow jet is the known exception: "
-        f"{jets} of its cells are silent."
-    )
+LABELS = {
+    "evaluations": "evaluations a scan", "seconds": "seconds a scan", "error": "RMS error, model space",
+    "range_rms_m": "RMS range error, m",
+}  # fmt: skip
 
 
-PANELS = (
-    ("evaluations", "evaluations a scan", "error", "RMS error, model space"),
-    ("seconds", "seconds a scan", "error", "RMS error, model space"),
-    ("evaluations", "evaluations a scan", "range_rms_m", "RMS range error, m"),
-    ("evaluations", "evaluations a scan", "drop_differs", "share of rays that differ in ray-drop"),
-)
-
-
-def error_figure(rows: Sequence[Row], panels: Sequence[tuple[str, str, str, str]]) -> Figure:
-    """Error of a flow's solutions against evaluations and time."""
-    figure = blank_figure(10.5, 8.2)
-    for place, (x, x_label, y, y_label) in enumerate(panels):
-        axes = figure.add_subplot(2, 2, place + 1)
-        _draw(axes, rows, x, y)
-        axes.set(xlabel=x_label, ylabel=y_label)
-        if y == "error" and math.isfinite(rows[0]["floor"]):
-            axes.axhline(rows[0]["floor"], color="0.6", ls=":", lw=1)
-    _legend(figure, rows)
-    return figure
-
-
-def problems_figure(rows: Sequence[Row]) -> Figure:
-    """Error on every exact problem against evaluations."""
-    problems = _by(rows, "problem")
-    columns = min(4, len(problems))
-    lines = math.ceil(len(problems) / columns)
-    figure = blank_figure(3.2 * columns + 0.4, 2.7 * lines + 0.9)
-    for place, (name, own) in enumerate(problems.items()):
-        axes = figure.add_subplot(lines, columns, place + 1)
-        _draw(axes, own, "evaluations", "error")
-        axes.set_title(name.replace("_", " "), fontsize=9)
-        axes.set(ylabel="RMS error" if place % columns == 0 else "")
-    _legend(figure, rows)
-    return figure
-
-
-def _draw(axes: Any, rows: Sequence[Row], x: str, y: str) -> None:
-    """A line for each method through the rows that solve the problem."""
-    for method, own in _by([row for row in rows if math.isfinite(reached(row))], "method").items():
-        points = sorted((row[x], max(row[y], ROUNDING / 10)) for row in own if math.isfinite(row[y]))
-        if points:
-            axes.plot(*np.array(points).T, **_style(method), ms=4.5, lw=1.1)
-    axes.set(xscale="log", yscale="log")
-    axes.grid(True, which="major", color="0.88", lw=0.6)
-    axes.tick_params(labelsize=8)
-
-
-def _legend(figure: Figure, rows: Sequence[Row]) -> None:
-    handles = [Line2D([], [], **_style(method), ms=5, lw=1.1, label=method) for method in _by(rows, "method")]
+def _figure(panels: Sequence[tuple[str, Sequence[Row], str, str]], columns: int) -> Figure:
+    """A panel for each (title, rows, x, y), a line for each method through the rows that solve the problem."""
+    columns = min(columns, len(panels))
+    lines = math.ceil(len(panels) / columns)
+    figure = blank_figure(3.6 * columns + 0.4, 3.0 * lines + 0.9)
+    methods: dict[str, dict[str, Any]] = {}
+    for place, (title, rows, x, y) in enumerate(panels, 1):
+        axes = figure.add_subplot(lines, columns, place)
+        for method, own in _by(rows, "method").items():
+            methods[method] = STYLES[METHODS.index(method) % len(STYLES)] if method in METHODS else STYLES[-1]
+            solved = [row for row in own if math.isfinite(reached(row)) and math.isfinite(row[y])]
+            points = sorted((row[x], max(row[y], ROUNDING / 10)) for row in solved)
+            if points:
+                axes.plot(*np.array(points).T, **methods[method], ms=4.5, lw=1.1)
+        axes.set(xscale="log", yscale="log", xlabel=LABELS[x], ylabel=LABELS[y])
+        axes.set_title(title.replace("_", " "), fontsize=9)
+        axes.grid(True, which="major", color="0.88", lw=0.6)
+        axes.tick_params(labelsize=8)
+    handles = [Line2D([], [], **style, ms=5, lw=1.1, label=method) for method, style in methods.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
-
-
-def _style(method: str) -> dict[str, Any]:
-    return STYLES[METHODS.index(method) % len(STYLES)] if method in METHODS else STYLES[-1]
-
-
-def estimates_figure(rows: Sequence[Row]) -> Figure:
-    """Global estimate against true error, a marker for each verdict; grey within a factor of five."""
-    figure = blank_figure(6, 5)
-    axes, ends = figure.subplots(), np.array([1e-9, 1e2])
-    axes.plot(ends, ends, color="black", lw=0.8)
-    axes.fill_between(ends, ends / HONEST_WITHIN, ends * HONEST_WITHIN, color="0.9")
-    for style, (verdict, own) in zip(STYLES, _by(rows, "verdict").items(), strict=False):
-        known = [row for row in own if row["estimate"] is not None]
-        x, y = ([max(row[key], ends[0]) for row in known] for key in ("error", "estimate"))
-        axes.scatter(x, y, s=24, marker=style["marker"], color=style["color"], label=f"{verdict} ({len(own)})")
-    axes.set(xscale="log", yscale="log", xlabel="true error", ylabel="global estimate")
-    axes.legend(fontsize=8)
     return figure
 
 
