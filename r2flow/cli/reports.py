@@ -31,7 +31,6 @@ def curvature(
     out: OutOption,
     draw: DrawOptions,
     steps: Annotated[int, typer.Option(min=1, help="Euler steps of a path.")] = 256,
-    most_curved: Annotated[int, typer.Option(min=1, help="Pixels whose paths are drawn.")] = 200,
 ) -> None:
     """How straight trained flows are: s(t), and the paths of the most curved pixels (the paper's figure 8)."""
     from r2flow.generators import as_flow
@@ -48,7 +47,7 @@ def curvature(
     prepare_folder(out)
     with Bar("measuring", len(loaded) * batches(draw.num, draw.batch_size) * 2 * steps, "evaluations") as advance:
         flows = [
-            measure_paths(checkpoint, label, draw.num, steps, draw.seed, draw.batch_size, most_curved, advance)
+            measure_paths(checkpoint, label, draw.num, steps, draw.seed, draw.batch_size, progress=advance)
             for label, checkpoint in loaded.items()
         ]
     page = curvature_page(flows, draw.seed, command(), where)

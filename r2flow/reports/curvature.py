@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from torch import Tensor
 
 from r2flow.flow.straightness import straightness
 from r2flow.generators import as_flow
@@ -32,28 +31,17 @@ class Paths:
     """The paths of one checkpoint; an element is a pixel of range or of reflectance.
 
     Attributes:
-        label: Its name on the page.
         t: Times of the Euler steps, (n,).
         s: s(t) of every scan, (N, n).
         squared_length: |x_1 - x_0|^2 of every scan, (N,).
-        elements: Of all scans together.
-        bends: int (d - v_t)^2 dt of the most curved elements, the most curved first, (k,).
-        trajectories: Their values in model space at 0, 1/n, ..., 1, (k, n + 1).
-        dropped: Whether their rays end as dropped, (k,).
-        dropped_share: Share of all elements whose rays end as dropped.
-        dropped_bend: Share of int s(t) dt on them; NaN where every path is straight.
+        trajectories: The most curved elements, the most curved first, in model space at 0, 1/n, ..., 1, (k, n + 1).
     """
 
     label: str
     t: np.ndarray
     s: np.ndarray
     squared_length: np.ndarray
-    elements: int
-    bends: np.ndarray
     trajectories: np.ndarray
-    dropped: np.ndarray
-    dropped_share: float
-    dropped_bend: float
 
     @property
     def s_normalised(self) -> np.ndarray:
@@ -77,41 +65,26 @@ def measure_paths(
     Takes 2 x steps evaluations a batch, `progress` after each; the memory does not grow with `num`.
     """
     flow = as_flow(checkpoint.generator, "curvature")
-    scans: list[tuple[Tensor, ...]] = []  # s and squared length of each
-    most: list[tuple[Tensor, ...]] = []  # bend, path and end of the most curved of each batch
-    sums = np.zeros(4)  # elements, those that end as dropped, the bend of all, the bend of those
+    batches = []
     for first in range(0, num, batch_size):
         x_0 = Draws(seed, range(first, min(first + batch_size, num))).start(flow.noise_shape).to(flow.device)
         with torch.inference_mode():
             found = straightness(flow.velocity, x_0, steps, most_curved, progress)
-        bends, pixels = found.curvature.per_pixel, found.pixels
-        dropped = (checkpoint.encoding.decode(found.curvature.x_1)[:, :1] == 0).expand_as(bends)
-        scans.append((found.s, found.curvature.squared_length))
-        most.append((bends.flatten()[pixels], found.trajectories, dropped.flatten()[pixels]))
-        sums += bends.numel(), dropped.sum().item(), bends.sum().item(), bends[dropped].sum().item()
-    s, squared_length = (torch.cat(batches).cpu().numpy() for batches in zip(*scans, strict=True))
-    worst, trajectories, ends = (torch.cat(batches).cpu().numpy() for batches in zip(*most, strict=True))
+        most = found.curvature.per_pixel.flatten()[found.pixels]
+        batches.append((found.s, found.curvature.squared_length, most, found.trajectories))
+    s, squared_length, bends, trajectories = (torch.cat(one).cpu().numpy() for one in zip(*batches, strict=True))
     if not np.isfinite(s).all():
         log.warning("%s: s(t) is not finite for %d of %d scans.", label, (~np.isfinite(s).all(1)).sum(), len(s))
-    order = np.argsort(-worst, kind="stable")[:most_curved]
-    elements, ends_dropped, bend, bend_of_dropped = map(float, sums)
-    return Paths(
-        label, found.t.numpy(), s, squared_length, int(elements), worst[order], trajectories[order], ends[order],
-        dropped_share=ends_dropped / elements, dropped_bend=bend_of_dropped / bend if bend else math.nan,
-    )  # fmt: skip
+    order = np.argsort(-bends, kind="stable")[:most_curved]
+    return Paths(label, found.t.numpy(), s, squared_length, trajectories[order])
 
 
 def curvature_rows(flows: Sequence[Paths]) -> list[dict[str, Any]]:
-    """s(t) of every checkpoint and time: mean, least and most over the scans, as it is and over |d|^2."""
+    """s(t) of every checkpoint and time, the mean over the scans, as it is and over |d|^2."""
     return [
-        {"checkpoint": flow.label, "t": float(t)}
-        | {
-            f"{name}{end}": float(reduce(getattr(flow, name)[:, index]))
-            for name in ("s", "s_normalised")
-            for end, reduce in (("", np.mean), ("_least", np.min), ("_most", np.max))
-        }
+        {"checkpoint": flow.label, "t": float(t), "s": float(s), "s_normalised": float(normalised)}
         for flow in flows
-        for index, t in enumerate(flow.t)
+        for t, s, normalised in zip(flow.t, flow.s.mean(0), flow.s_normalised.mean(0), strict=True)
     ]
 
 
@@ -127,33 +100,24 @@ def summary(flow: Paths) -> dict[str, Any]:
         "t_of_most": float(flow.t[mean.argmax()]),
         "first_tenth": float(mean[flow.t < 0.1].sum() / whole),
         "last_tenth": float(mean[flow.t >= 0.9].sum() / whole),
-        "paths": len(flow.bends),
-        "paths_share": len(flow.bends) / flow.elements,
-        "paths_dropped": float(flow.dropped.mean()) if len(flow.dropped) else math.nan,
-        "dropped_share": flow.dropped_share,
-        "dropped_bend": flow.dropped_bend,
     }
 
 
 COLUMNS = {
     "checkpoint": "checkpoint", "integral": "int s dt", "integral_normalised": "int s dt / length^2",
     "t_of_most": "t of the most", "first_tenth": "share in t < 0.1", "last_tenth": "share in t >= 0.9",
-    "paths_dropped": "most curved: ending at ray-drop", "dropped_share": "rays dropped",
-    "dropped_bend": "share of curvature on dropped rays",
 }  # fmt: skip
 
 
 def curvature_text(flows: Sequence[Paths]) -> list[str]:
     """What s(t) is, and the flows in a table."""
-    summaries = [summary(flow) for flow in flows]
     about = (
         "s(t) = |(x_1 - x_0) - v(t, x_t)|^2 along the flow's own path (the paper's eq. 5), the mean over "
-        f"{summaries[0]['scans']} scans from the same noise and {len(flows[0].t)} Euler steps. It is 0 on a straight "
+        f"{len(flows[0].s)} scans from the same noise and {len(flows[0].t)} Euler steps. It is 0 on a straight "
         "path, which one step follows exactly. A flow that goes nowhere is straight too: compare int s dt over the "
-        f"squared length |x_1 - x_0|^2. The most curved paths are {summaries[0]['paths_share']:.2%} of all pixels of "
-        "range and reflectance."
+        "squared length |x_1 - x_0|^2."
     )
-    return [about, table(summaries, COLUMNS)]
+    return [about, table([summary(flow) for flow in flows], COLUMNS)]
 
 
 def curvature_figure(flows: Sequence[Paths]) -> Figure:
@@ -162,10 +126,8 @@ def curvature_figure(flows: Sequence[Paths]) -> Figure:
     panels = {"s": "s(t) = |(x_1 - x_0) - v_t|²", "s_normalised": "s(t) / |x_1 - x_0|²"}
     for axes, (name, label) in zip(figure.subplots(1, 2), panels.items(), strict=True):
         for flow, style in zip(flows, cycle(STYLES), strict=False):
-            values = getattr(flow, name)
-            axes.plot(
-                flow.t, values.mean(0), **style, ms=5, lw=1.4, markevery=max(len(flow.t) // 8, 1), label=flow.label
-            )
+            values, every = getattr(flow, name), max(len(flow.t) // 8, 1)
+            axes.plot(flow.t, values.mean(0), **style, ms=5, lw=1.4, markevery=every, label=flow.label)
             axes.fill_between(flow.t, values.min(0), values.max(0), color=style["color"], alpha=0.12, lw=0)
         axes.set(xlabel="t  (0 noise, 1 data)", ylabel=label, xlim=(0, 1))
         if any((getattr(flow, name) > 0).any() for flow in flows):
@@ -180,18 +142,10 @@ def trajectories_figure(flows: Sequence[Paths]) -> Figure:
     figure = blank_figure(1 + 4.2 * len(flows), 4.2)
     panels = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
     for axes, flow, title in zip(panels, flows, labels([Path(flow.label) for flow in flows]), strict=True):
-        for dropped, style in ((False, {"color": "0.55", "ls": "-"}), (True, {"color": "#b5301c", "ls": "--"})):
-            chosen = flow.trajectories[flow.dropped == dropped]
-            label = f"ray ends {'dropped' if dropped else 'as a return'}: {len(chosen)}"
-            for number, values in enumerate(chosen):
-                axes.plot(
-                    np.append(flow.t, 1.0), values, lw=0.7, alpha=0.8, label=label if number == 0 else None, **style
-                )
+        axes.plot(np.append(flow.t, 1.0), flow.trajectories.T, lw=0.7, alpha=0.8, color="0.55")
         axes.set(xlabel="t  (0 noise, 1 data)", xlim=(0, 1))
         axes.set_title(title, fontsize=9)
         axes.axhline(-1, color="black", lw=0.9, ls=":", zorder=4)
-        # below the panel: paths are everywhere in it
-        axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False)
     panels[0].set_ylabel("value in model space (dotted: -1, ray-drop)")
     return figure
 

@@ -61,16 +61,8 @@ def test_the_figures_are_those_of_paths_kept_whole(batch_size):
     np.testing.assert_allclose(found.squared_length, (d**2).sum(-1), rtol=1e-5)
     bends = ((d[:, None] - v) ** 2).mean(1)
     most = np.argsort(-bends.ravel())[:7]
-    np.testing.assert_allclose(found.bends, bends.ravel()[most], rtol=1e-4)
     paths = x.transpose(0, 2, 1).reshape(-1, STEPS + 1)[most]
     np.testing.assert_allclose(found.trajectories, paths, atol=1e-5)
-    # A ray has ended as dropped where its range decodes to less than the sensor's least, 1.45 m, or above its most.
-    range_image = x[:, -1].reshape(3, 2, -1)[:, :1]
-    least = 2 * math.log2(1.45 + 1) / math.log2(80 + 1) - 1
-    dropped = np.broadcast_to((range_image < least) | (range_image > 1), (3, 2, 64)).reshape(3, -1)
-    assert found.dropped.tolist() == dropped.ravel()[most].tolist()
-    assert found.dropped_share == pytest.approx(dropped.mean())
-    assert found.dropped_bend == pytest.approx(bends[dropped].sum() / bends.sum(), rel=1e-4)
 
 
 def test_the_summary_and_the_rows_are_of_the_mean_over_scenes():
@@ -81,11 +73,9 @@ def test_the_summary_and_the_rows_are_of_the_mean_over_scenes():
     assert row["integral"] == pytest.approx(s.mean(), rel=1e-4)
     assert row["t_of_most"] == s.mean(0).argmax() / STEPS
     assert row["last_tenth"] == pytest.approx(s[:, 15].sum() / s.sum(), rel=1e-4)  # of 16 steps, one begins after .9
-    assert row["paths_share"] == 200 / 256  # of the elements of two scenes
     rows = curvature_rows([found])
     assert [r["t"] for r in rows] == [k / STEPS for k in range(STEPS)]
     assert rows[3]["s"] == pytest.approx(s[:, 3].mean(), rel=1e-4)
-    assert rows[3]["s_most"] == pytest.approx(s[:, 3].max(), rel=1e-4)
 
 
 def test_the_page_compares_the_flows():
@@ -125,7 +115,7 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811
     path, out = saved[0], tmp_path / "reports"
     copy = path.with_name("step-00000009.ckpt")
     copy.write_bytes(path.read_bytes())
-    how = ("-o", out, "--steps", 4, "--num", 2, "--most-curved", 9)
+    how = ("-o", out, "--steps", 4, "--num", 2)
     code, said, _ = r2flow("report", "curvature", path, copy, *how)
     assert code == 0
     names = {"curvature.png", "trajectories.png", "curvature.csv", "curvature.json", "curvature.md"}
