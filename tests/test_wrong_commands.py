@@ -216,7 +216,7 @@ compare # Missing
 compare nowhere
 compare empty
 compare file.txt
-compare scans # is no run
+compare scans # is not a run
 compare run -o file.txt
 evaluate # Missing
 evaluate scans # nothing to compare with

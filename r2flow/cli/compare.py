@@ -20,14 +20,17 @@ def compare(
     ] = False,
 ) -> None:
     """Set runs side by side: loss, straightness, parameters, cost."""
-    from r2flow.reports.compare import Group, compare_page, group_runs, print_comparison, read_runs
+    from r2flow.reports.compare import compare_page, group_runs, read_runs, tables
     from r2flow.reports.pages import prepare_folder, write_page
+    from r2flow.reports.tables import print_table
 
     compared = read_runs(runs)
-    groups = group_runs(compared) if group else [Group(run.label, (run,)) for run in compared]
+    groups = group_runs(compared) if group else {run.label: [run] for run in compared}
     if out is not None:
         prepare_folder(out)
-    print_comparison(groups)
+    for title, (cells, headings) in tables(groups).items():
+        print_table(cells, headings, title)
+        print()
     if out is not None:
         for path in write_page(compare_page(groups, command()), out):
             print(path)

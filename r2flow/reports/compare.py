@@ -4,31 +4,21 @@ import json
 import logging
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-import yaml
-from matplotlib.figure import Figure
-
-from r2flow.config import flatten
+from r2flow.config import flatten, rule
 from r2flow.errors import InputError, naming
 from r2flow.model.checkpoint import checkpoints_of, step_of
 from r2flow.reports.backbones import cost
-from r2flow.reports.pages import STYLES, Page, blank_figure
-from r2flow.reports.tables import print_table, shown, table
-from r2flow.reports.training import Curve, read_curves
-from r2flow.runs.folder import CONFIG, contradictions, read_config
+from r2flow.reports.pages import Page
+from r2flow.reports.tables import shown, table
+from r2flow.reports.training import CURVES, Curve, curves_figure, read_curves
+from r2flow.runs.folder import CONFIG, read_config
 
 log = logging.getLogger(__name__)
-
-# As logged, and the titles of the panels.
-CURVES = {
-    "train/loss": "training loss", "val/loss": "validation loss", "curvature/s_normalised": "straightness, s / length²",
-}  # fmt: skip
 
 # Column -> heading: what is equal for all seeds, and what is averaged over them.
 FIXED = {
@@ -41,8 +31,7 @@ MEASURED = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class ComparedRun:
+class ComparedRun(NamedTuple):
     """A run, read from its folder.
 
     Attributes:
@@ -56,12 +45,7 @@ class ComparedRun:
     curves: dict[str, Curve]
 
 
-@dataclass(frozen=True)
-class Group:
-    """Runs that differ in their seed alone, or a single run."""
-
-    label: str
-    runs: tuple[ComparedRun, ...]
+Groups = Mapping[str, Sequence[ComparedRun]]  # by label: runs that differ in their seed alone, or a single run
 
 
 def find_runs(paths: Sequence[Path]) -> list[Path]:
@@ -77,25 +61,16 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         if not path.exists():
             raise InputError(f"{path} does not exist.")
-        inside = _runs_in(path, levels=2)
-        found += inside
+        inside = [run.parent for level in ("", "*/", "*/*/") for run in sorted(path.glob(f"{level}{CONFIG}"))]
+        inside = [run for run in inside if not run.name.startswith(".")]
+        found += inside[:1] if path in inside else inside
         others += [] if inside else [path]
     if others and not found:
-        raise InputError(f"{others[0]} is no run: it has no {CONFIG}. Give folders that train.py has written.")
+        raise InputError(f"{others[0]} is not a run: it has no {CONFIG}. Give folders that train.py has written.")
     for path in others:
         if path.suffix not in (".yaml", ".log"):  # which lie in a sweep's folder
             log.warning("%s holds no run and is skipped.", path)
     return list(dict.fromkeys(found))
-
-
-def _runs_in(path: Path, levels: int) -> list[Path]:
-    """The folder itself where it is a run; else the runs in it, down to so many levels, without hidden folders."""
-    if (path / CONFIG).is_file():
-        return [path]
-    if not levels or not path.is_dir():
-        return []
-    folders = sorted(folder for folder in path.iterdir() if folder.is_dir() and not folder.name.startswith("."))
-    return [run for folder in folders for run in _runs_in(folder, levels - 1)]
 
 
 def labels(folders: Sequence[Path]) -> list[str]:
@@ -113,7 +88,9 @@ def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
     costs: dict[str, dict[str, Any]] = {}
     runs = []
     for path, label in zip(folders, labels(folders), strict=True):
-        config = _config_of(path)
+        config = read_config(path) or {}
+        if not {"stage", "backbone", "data"} <= config.keys():
+            raise InputError(f"{path / CONFIG} is not the config of a run.")
         architecture = json.dumps([config.get(key) for key in ("sensor", "encoding", "backbone")], sort_keys=True)
         if architecture not in costs:
             with naming(path):
@@ -123,20 +100,9 @@ def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
     return runs
 
 
-def _config_of(path: Path) -> dict[str, Any]:
-    try:
-        config = read_config(path)
-    except yaml.YAMLError:
-        raise InputError(f"{path / CONFIG} cannot be read as YAML; is it whole?") from None
-    if not isinstance(config, dict) or not {"stage", "backbone", "data"} <= config.keys():
-        raise InputError(f"{path / CONFIG} is no config of a run.")
-    return config
-
-
 def _read_values(path: Path, config: Mapping[str, Any], curves: Mapping[str, Curve]) -> dict[str, Any]:
     """The columns of a run that its network does not decide."""
-    nothing = (np.empty(0), np.empty(0))
-    train, validation, straightness = (curves.get(name, nothing)[1] for name in CURVES)
+    train, validation, straightness = (curves[name][1].tolist() if name in curves else [] for name in CURVES)
     checkpoints = checkpoints_of(path)
     logged = [int(steps[-1]) for name, (steps, _) in curves.items() if name.endswith("loss")]
     step = step_of(checkpoints[0]) if checkpoints else max(logged, default=None)
@@ -146,62 +112,57 @@ def _read_values(path: Path, config: Mapping[str, Any], curves: Mapping[str, Cur
         "backbone": (config["backbone"] or {}).get("name"),
         "steps": step,
         "images": None if step is None else step * int(config["data"]["batch_size"]),
-        "train_loss": float(train[-max(len(train) // 10, 1) :].mean()) if len(train) else None,
-        "val_best": float(validation.min()) if len(validation) else None,
-        "val_last": float(validation[-1]) if len(validation) else None,
-        "straightness": float(straightness[-1]) if len(straightness) else None,
+        "train_loss": fmean(train[-max(len(train) // 10, 1) :]) if train else None,
+        "val_best": min(validation, default=None),
+        "val_last": validation[-1] if validation else None,
+        "straightness": straightness[-1] if straightness else None,
     }
 
 
-def group_runs(runs: Sequence[ComparedRun]) -> list[Group]:
+def group_runs(runs: Sequence[ComparedRun]) -> Groups:
     """Runs of one configuration and several seeds together, in the order given."""
-    groups: list[list[ComparedRun]] = []
+    groups: dict[str, list[ComparedRun]] = {}
     for run in runs:
-        same = next((group for group in groups if same_but_seed(group[0].config, run.config)), None)
-        if same is None:
-            groups.append([run])
-        else:
-            same.append(run)
-    return [Group(_common_label(group), tuple(group)) for group in groups]
+        groups.setdefault(configuration(run.config), []).append(run)
+    return {_common_label(group): group for group in groups.values()}
 
 
-def same_but_seed(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
-    """Whether two configs train the same thing, from another seed or from parents that do so."""
+def configuration(config: Mapping[str, Any]) -> str:
+    """What a run trains, whatever its seed, and what the runs did that it starts from."""
+    pairs = config["data"]["name"] == "pairs"
     # Pairs carry their parent's hash, which differs between seeds.
-    ignored = {"seed", "data.pairs.parent", "scans"} if first["data"]["name"] == "pairs" else {"seed"}
-    trimmed = [
-        {key: value for key, value in flatten(config) if key not in ignored and not key.startswith("parent.")}
-        for config in (first, second)
+    ignored = {"seed", "data.pairs.parent", "scans"} if pairs else {"seed"}
+    keys = [
+        f"{key}={value}"
+        for key, value in sorted(flatten(config))
+        if value is not None and key not in ignored and rule(key).resume != "free" and not key.startswith("parent.")
+        if pairs or not key.startswith("data.pairs.")
     ]
-    if contradictions(*trimmed):
-        return False
-    one, other = first.get("parent"), second.get("parent")
-    if not one or not other or one["weights"] == other["weights"]:
-        return bool(one) == bool(other)
-    parents = [read_config(Path(parent["path"]).parent.parent) for parent in (one, other)]
-    return bool(parents[0] and parents[1] and same_but_seed(parents[0], parents[1]))
+    if parent := config.get("parent"):
+        before = read_config(Path(parent["path"]).parent.parent)
+        keys.append(configuration(before) if before else parent["weights"])
+    return "\n".join(keys)
 
 
 def _common_label(runs: Sequence[ComparedRun]) -> str:
     """The common part of several runs' names, without the word seed."""
-    if len(runs) == 1:
-        return runs[0].label
-    words = zip(*(re.split(r"([-_.,/= ]+)", run.label) for run in runs), strict=False)
-    common = "".join(word[0] for word in takewhile(lambda word: len(set(word)) == 1, words))
-    common = re.sub(r"[-_.,/= ]*(seed)?[-_.,/= ]*$", "", common)
+    signs = takewhile(lambda signs: len(set(signs)) == 1, zip(*(run.label for run in runs), strict=False))
+    common = "".join(sign for sign, *_ in signs)
+    if len(runs) > 1:
+        common = re.sub(r"[-_.,/= ]*(seed[-_.= ]*\d*)?[-_.,/= ]*$", "", common)
     return common or f"{runs[0].values['stage']}, {runs[0].values['backbone']}"
 
 
-def rows_of(groups: Sequence[Group]) -> list[dict[str, Any]]:
+def rows_of(groups: Groups) -> list[dict[str, Any]]:
     """A row for each group: means, with the spread and n where there are several runs."""
     rows = []
-    for group in groups:
-        row: dict[str, Any] = {"name": group.label, "n": len(group.runs)}
+    for label, runs in groups.items():
+        row: dict[str, Any] = {"name": label, "n": len(runs)}
         for column in FIXED:
-            found = {run.values[column] for run in group.runs}
-            row[column] = found.pop() if len(found) == 1 else None
+            equal = {run.values[column] for run in runs}
+            row[column] = equal.pop() if len(equal) == 1 else None
         for column in MEASURED:
-            values = [run.values[column] for run in group.runs if run.values[column] is not None]
+            values = [run.values[column] for run in runs if run.values[column] is not None]
             row[column] = fmean(values) if values else None
             row[f"{column}_spread"] = stdev(values) if len(values) > 1 else None
         rows.append(row)
@@ -217,7 +178,7 @@ def cell(row: Mapping[str, Any], column: str) -> str:
     return text if deviation is None else f"{text} ± {shown(deviation)}"
 
 
-def tables(groups: Sequence[Group]) -> dict[str, tuple[list[list[str]], list[str]]]:
+def tables(groups: Groups) -> dict[str, tuple[list[list[str]], list[str]]]:
     """(cells, headings) by title: what the runs are, and their results."""
     rows = rows_of(groups)
     measured = {key: heading for key, heading in MEASURED.items() if any(row[key] is not None for row in rows)}
@@ -228,13 +189,6 @@ def tables(groups: Sequence[Group]) -> dict[str, tuple[list[list[str]], list[str
     }
 
 
-def print_comparison(groups: Sequence[Group]) -> None:
-    """The tables in the terminal."""
-    for title, (cells, headings) in tables(groups).items():
-        print_table(cells, headings, title)
-        print()
-
-
 NOTES = (
     "Losses are those that were logged: of validation, with the averaged weights; compare them only between runs with "
     "the same loss and the same data. s / length^2 is the last `curvature/s_normalised`; an untrained flow is straight "
@@ -242,42 +196,13 @@ NOTES = (
 )
 
 
-def compare_page(groups: Sequence[Group], command: str) -> Page:
+def compare_page(groups: Groups, command: str) -> Page:
     """`compare.md .csv .json .png`."""
-    runs = [(group.label, run) for group in groups for run in group.runs]
-    seeds = {run.label: int(run.config["seed"]) for _, run in runs if "seed" in run.config}
+    members = [(label, run) for label, runs in groups.items() for run in runs]
+    seeds = {run.label: int(run.config["seed"]) for _, run in members if "seed" in run.config}
     written = [text for title, parts in tables(groups).items() for text in (f"## {title}", table(*parts))]
-    members = [{"group": label, "run": run.label, **run.values} for label, run in runs]
-    drawn = any(run.curves for _, run in runs)
-    return Page(
-        "compare", "Runs compared", [*written, NOTES], rows_of(groups),
-        {"compare": compare_figure(groups)} if drawn else {}, command, seeds, more={"runs": members},
-    )  # fmt: skip
-
-
-def compare_figure(groups: Sequence[Group]) -> Figure:
-    """A panel for each curve that a run has logged, every run in its group's style."""
-    names = [name for name in CURVES if any(name in run.curves for group in groups for run in group.runs)]
-    figure = blank_figure(5.5 * len(names), 3.8)
-    for place, name in enumerate(names):
-        axes = figure.add_subplot(1, len(names), place + 1)
-        for index, group in enumerate(groups):
-            for number, run in enumerate([run for run in group.runs if name in run.curves]):
-                steps, values = smooth(*run.curves[name])
-                axes.plot(
-                    steps, values, **STYLES[index % len(STYLES)], ms=4, lw=1.1, markevery=max(len(steps) // 8, 1),
-                    label=group.label if number == 0 else None,
-                )  # fmt: skip
-        axes.set(title=CURVES[name], xlabel="optimiser step")
-        if all((line.get_ydata() > 0).all() for line in axes.lines):  # type: ignore[operator, union-attr]
-            axes.set_yscale("log")
-        axes.grid(alpha=0.25)
-        axes.legend(fontsize=8)
-    return figure
-
-
-def smooth(steps: np.ndarray, values: np.ndarray) -> Curve:
-    """The running mean over a twentieth of the points, each at the middle of its steps."""
-    width = max(len(values) // 20, 1)
-    kernel = np.full(width, 1 / width)
-    return np.convolve(steps, kernel, "valid"), np.convolve(values, kernel, "valid")
+    curves = [(label, run.curves) for label, run in members]
+    figures = {"compare": curves_figure(curves)} if any(one for _, one in curves) else {}
+    rows = [{"group": label, "run": run.label, **run.values} for label, run in members]
+    return Page("compare", "Runs compared", [*written, NOTES], rows_of(groups), figures, command, seeds,
+                more={"runs": rows})  # fmt: skip

@@ -121,24 +121,6 @@ def _draw_row(figure: Figure, grid: Any, row: int, image: np.ndarray, rays: Tens
     return strips
 
 
-def loss_figure(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
-    """Loss against optimiser step; each curve is (steps, values), a long noisy one also smoothed."""
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
-    axes = FigureCanvasAgg(figure).figure.add_subplot()
-    for colour, (name, (steps, values)) in zip(("C0", "C1", "C2"), curves.items(), strict=False):
-        long = len(values) > 100
-        axes.plot(steps, values, color=colour, alpha=0.25 if long else 1, lw=1, marker="" if long else "o", ms=3,
-                  label=None if long else name)  # fmt: skip
-        if long:
-            width = max(len(values) // 50, 5)
-            smooth = np.convolve(values, np.ones(width) / width, mode="valid")
-            axes.plot(steps[width - 1 :], smooth, color=colour, lw=1.8, label=f"{name} (mean of {width})")
-    axes.set(xlabel="optimiser step", ylabel="loss", yscale="log")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend()
-    return figure
-
-
 def draw_range(axes: Any, image: np.ndarray, label: bool = True) -> None:
     """Range on a logarithmic colour scale, dropped rays black."""
     r = image[0]

@@ -2,18 +2,26 @@
 
 import csv
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from r2flow.model.checkpoint import checkpoints_of, find_checkpoint, load_checkpoint
 from r2flow.reports.outputs import what_next, write_samples
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 log = logging.getLogger(__name__)
 
 Curve = tuple[np.ndarray, np.ndarray]
+
+# As logged, and the titles of the panels.
+CURVES = {
+    "train/loss": "training loss", "val/loss": "validation loss", "curvature/s_normalised": "straightness, s / length²",
+}  # fmt: skip
 
 
 def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/loss")) -> dict[str, Curve]:
@@ -43,6 +51,34 @@ def read_curves(run: str | Path, names: tuple[str, ...] = ("train/loss", "val/lo
     }
 
 
+def curves_figure(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> "Figure":
+    """A panel for each of `CURVES` that was logged, a line for each run; runs of one label have one style."""
+    from r2flow.reports.pages import STYLES, blank_figure
+
+    names = [name for name in CURVES if any(name in curves for _, curves in runs)]
+    styles = {label: STYLES[i % len(STYLES)] for i, label in enumerate(dict.fromkeys(label for label, _ in runs))}
+    figure = blank_figure(5.5 * len(names), 3.8)
+    for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+        for label, curves in runs:
+            if name in curves:
+                steps, values = smooth(*curves[name])
+                axes.plot(steps, values, **styles[label], ms=4, lw=1.1, markevery=max(len(steps) // 8, 1), label=label)
+        axes.set(title=CURVES[name], xlabel="optimiser step")
+        if all((line.get_ydata() > 0).all() for line in axes.lines):
+            axes.set_yscale("log")
+        axes.grid(alpha=0.25)
+        handles = {line.get_label(): line for line in axes.lines}
+        axes.legend(handles.values(), handles, fontsize=8)
+    return figure
+
+
+def smooth(steps: np.ndarray, values: np.ndarray) -> Curve:
+    """The running mean over a twentieth of the points, each at the middle of its steps."""
+    width = max(len(values) // 20, 1)
+    kernel = np.full(width, 1 / width)
+    return np.convolve(steps, kernel, "valid"), np.convolve(values, kernel, "valid")
+
+
 def finish(
     run: str | Path, samples: Mapping[str, Any], seed: int, device: str, max_steps: int, kept: bool = True
 ) -> None:
@@ -51,12 +87,12 @@ def finish(
     Args:
         kept: Whether the run keeps checkpoints.
     """
-    from r2flow.reports.pictures import loss_figure, save_figure
+    from r2flow.reports.pictures import save_figure
 
     run = Path(run)
     curves = read_curves(run)
     if curves:
-        save_figure(loss_figure(curves), run / "loss.png")
+        save_figure(curves_figure([(run.name, curves)]), run / "loss.png")
     if not checkpoints_of(run):
         if kept:
             print("stopped before a checkpoint was kept: the same command starts it again")

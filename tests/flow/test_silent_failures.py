@@ -42,7 +42,7 @@ def test_only_failures_on_the_jet_are_silent():
     cells = list(product(PROBLEMS, methods, (1e-3, 1e-5), PRECISIONS))
     found = {cell: verdict(*cell[:3], *cell[3]) for cell in cells}
     assert {name for (name, *_), seen in found.items() if seen == "silent"} == {JET}
-    assert sum(seen in ("failed", "silent") for seen in found.values()) > 40
+    assert sum(seen in ("failed", "silent") for seen in found.values()) > 30  # so that there is something to judge
     smooth = [seen for (name, *_), seen in found.items() if name in ("straight", "gaussian", "two_modes", "rotating")]
     assert "flagged" not in smooth
     assert verdict("stiff_1e4", "auto", 1e-3) == verdict("gaussian", "auto", 1e-3) == "solved"

@@ -15,20 +15,17 @@ from PIL import Image
 from r2flow.cli import main
 from r2flow.errors import InputError
 from r2flow.reports.compare import (
-    Group,
     cell,
-    compare_figure,
     compare_page,
+    configuration,
     find_runs,
     group_runs,
     labels,
     read_runs,
     rows_of,
-    same_but_seed,
-    smooth,
 )
 from r2flow.reports.pages import write_page
-from r2flow.reports.training import read_curves
+from r2flow.reports.training import curves_figure, read_curves, smooth
 
 CONFIG: dict[str, Any] = {
     "name": "small",
@@ -100,7 +97,7 @@ def test_every_number_is_the_folder_s(tmp_path):
 
 def test_what_a_folder_does_not_say_is_not_made_up(tmp_path):
     run = read_runs([make_run(tmp_path / "bare")])
-    row = rows_of([Group("bare", tuple(run))])[0]
+    row = rows_of({"bare": run})[0]
     for column in ("steps", "images", "train_loss", "val_best", "val_last", "straightness"):
         assert row[column] is None
         assert cell(row, column) == "-"
@@ -122,7 +119,7 @@ def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
         make_run(tmp_path / f"net-seed={seed}", {"seed": seed}, val=[value], checkpoint=40)
     make_run(tmp_path / "other", {"stage.learning_rate": 2e-3}, val=[0.1], checkpoint=40)
     groups = group_runs(read_runs([tmp_path]))
-    assert [(g.label, len(g.runs)) for g in groups] == [("net", 3), ("other", 1)]
+    assert {label: len(runs) for label, runs in groups.items()} == {"net": 3, "other": 1}
     rows = rows_of(groups)
     assert rows[0]["val_last"] == pytest.approx(0.5)
     assert rows[0]["val_last_spread"] == pytest.approx(math.sqrt((0.09 + 0.01 + 0.16) / 2))
@@ -142,11 +139,9 @@ def test_children_of_several_seeds_are_one_configuration_and_of_other_parents_an
     same = child(make_run(tmp_path / "b", {"seed": 1}), "bbb", seed=1)
     other = child(make_run(tmp_path / "c", {"stage.learning_rate": 2e-3}), "ccc", seed=2)
     gone = child(tmp_path / "nowhere", "ddd", seed=3)
-    assert same_but_seed(first, same)
-    assert not same_but_seed(first, other)
-    assert not same_but_seed(first, gone)
-    assert not same_but_seed(first, CONFIG)
-    assert not same_but_seed(CONFIG, {**CONFIG, "scans": "8 of 8 scans, another data set"})
+    assert configuration(first) == configuration(same)
+    others = (other, gone, CONFIG, {**CONFIG, "scans": "8 of 8 scans, another data set"})
+    assert len({configuration(one) for one in (first, *others)}) == 5
 
 
 def test_a_folder_of_runs_stands_for_its_runs(tmp_path):
@@ -165,7 +160,7 @@ def test_a_sweep_s_files_and_folders_without_a_run_are_passed_over(tmp_path, cap
     assert "multirun" not in caplog.text
     with pytest.raises(InputError, match="none does not exist"):
         find_runs([tmp_path / "a", tmp_path / "none"])
-    with pytest.raises(InputError, match="logs is no run"):
+    with pytest.raises(InputError, match="logs is not a run"):
         find_runs([tmp_path / "logs", tmp_path / "multirun.yaml"])
 
 
@@ -213,14 +208,10 @@ def test_the_page_is_written_with_its_picture(tmp_path):
     assert Image.open(written["compare.png"]).size[0] > 900
 
 
-def titles_of(folder: Path) -> list[str]:
-    return [axes.get_title() for axes in compare_figure(group_runs(read_runs([folder]))).axes]
-
-
 def test_the_picture_has_a_panel_for_each_logged_curve(tmp_path):
     make_run(tmp_path / "runs" / "a", curvature=[0.1])
     make_run(tmp_path / "runs" / "c", train=[2.0, 1.0], curvature=[0.2])
-    figure = compare_figure(group_runs(read_runs([tmp_path / "runs"])))
+    figure = curves_figure([(run.label, run.curves) for run in read_runs([tmp_path / "runs"])])
     assert [len(axes.lines) for axes in figure.axes] == [1, 2]
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from r2flow.lidar.sensors import SENSORS
-from r2flow.reports.pictures import contact_sheet, figure_pixels, loss_figure, save_figure, scan_figure
+from r2flow.reports.pictures import contact_sheet, figure_pixels, save_figure, scan_figure
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 E, A = SENSOR.rays().numpy()
@@ -45,13 +45,6 @@ def test_a_wall_on_the_left_is_drawn_on_the_left():
     birds_eye = pixels[int(height * 0.42) :, : int(width * 0.4)]
     middle = birds_eye.shape[1] // 2
     assert lit(birds_eye[:, : middle - 20]) > 10 * max(lit(birds_eye[:, middle + 20 :]), 1)
-
-
-def test_loss_curves_are_drawn_short_and_long():
-    steps = np.arange(1, 500)
-    figure = loss_figure({"train/loss": (steps, 1 / steps), "val/loss": (steps[::100], 1 / steps[::100])})
-    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert labels == ["train/loss (mean of 9)", "val/loss"]
 
 
 def test_labels_are_a_row_of_their_classes_colours():
