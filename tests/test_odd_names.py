@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from r2flow.errors import InputError, explain_mistake
 from r2flow.files import atomic_write
@@ -68,8 +69,9 @@ def test_a_dollar_in_a_text_is_drawn_as_one():
     axes.set(xscale="log", xlim=(1, 1e4))
     as_usual = blank_figure(4, 3)
     as_usual.subplots().set(xscale="log", xlim=(1, 1e4))
-    as_usual.canvas.draw()
-    before = np.asarray(as_usual.canvas.buffer_rgba())[..., :3]
+    canvas = FigureCanvasAgg(as_usual)
+    canvas.draw()
+    before = np.asarray(canvas.buffer_rgba())[..., :3]
     np.testing.assert_array_equal(figure_pixels(axes.figure, int(axes.figure.dpi)), before)
 
 

@@ -190,9 +190,7 @@ def paper(
     ] = None,
     real: Annotated[str | None, typer.Option(help=f"Real scans for figures 3, 5 and 7: {SETS}.")] = None,
     num: Annotated[int, typer.Option(min=1, help="Scans of each model in figures 5 and 7.")] = 16,
-    paths: Annotated[int, typer.Option(min=0, help="Scans whose paths figure 8 follows; 0 leaves it out.")] = 4,
-    steps: Annotated[int, typer.Option(min=1, help="Euler steps of these paths.")] = 256,
-    repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each network for table II.")] = 3,
+    steps: Annotated[int, typer.Option(min=1, help="Euler steps of the paths in figure 8.")] = 256,
     device: DeviceOption = "auto",
 ) -> None:
     """The paper's tables I and II and figures 3 and 5 to 8: its printed numbers next to those of `evaluate`."""
@@ -211,5 +209,5 @@ def paper(
         runs.append(PaperRun(role or role_of(checkpoint, Path(model).stem), model, checkpoint))
     scans = None if real is None else open_scans(real, reading_for([], runs[0].checkpoint))
     prepare_folder(out)
-    page = paper_page(runs, rows, scans, num, paths, steps, repeats, command(), where)
+    page = paper_page(runs, rows, scans, num, steps, command(), where)
     finish(page, out, page.text[:1])

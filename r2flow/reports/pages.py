@@ -6,6 +6,7 @@ import json
 import math
 import os
 import platform
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -14,17 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 import r2flow
 from r2flow.errors import InputError, explain_mistake, printable
 from r2flow.files import atomic_write
-from r2flow.reports.pictures import take_names_as_they_are
+from r2flow.reports.pictures import save_figure
 from r2flow.reports.tables import Row
 
-# Told apart without colour: every line of a figure has a marker and a dash of its own.
+# Without colour, too, lines differ by marker and dash.
 _DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (7, 2)), (0, (1, 1)), "-", "--", "-.", ":", "-")
 _COLOURS = (
     "#000000", "#1f6fb4", "#b5301c", "#3d7d3a", "#8c4fb0", "#c77c11",
@@ -41,8 +41,8 @@ class Page:
     """What a report has to say, before it is written.
 
     Attributes:
-        name: Of its files, as `work_precision`.
-        title, text: Of its page: paragraphs and tables of Markdown.
+        name: Of its files, as `solvers`.
+        text: Paragraphs and tables of Markdown.
         rows: One for each measurement: the CSV, and the `rows` of the JSON.
         figures: By name; the PNG is `NAME.png`.
         command: What makes the page again.
@@ -68,12 +68,16 @@ def write_page(page: Page, out: str | Path) -> list[Path]:
     Returns:
         The files, the page last.
     """
-    out = Path(out)
-    origin = provenance(page)
-    written = [_write_figure(figure, out / f"{name}.png", origin) for name, figure in page.figures.items()]
+    out, origin = Path(out), provenance(page)
+    # Figures travel without their page. Latin-1 is all that the notes of a PNG hold.
+    note = printable(json.dumps(origin)).encode("latin-1", "backslashreplace").decode("latin-1")
+    written = [
+        save_figure(figure, out / f"{name}.png", 100, Title=page.title, Description=note)
+        for name, figure in page.figures.items()
+    ]
     contents = {
         "csv": _csv(page.rows, origin),
-        "json": _json({"origin": origin, "rows": page.rows, **page.more}),
+        "json": json.dumps(plain({"origin": origin, "rows": page.rows, **page.more}), indent=1, allow_nan=False) + "\n",
         "md": _markdown(page, origin),
     }
     for ending, content in contents.items():
@@ -84,11 +88,7 @@ def write_page(page: Page, out: str | Path) -> list[Path]:
 
 
 def prepare_folder(out: str | Path) -> Path:
-    """Make the folder now: whether it can be written is better known before the measuring than after it.
-
-    Raises:
-        InputError: something that is no folder is in the way, or it cannot be written to.
-    """
+    """Make the folder now: whether it can be written is better known before the measuring than after it."""
     out = Path(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -101,12 +101,12 @@ def prepare_folder(out: str | Path) -> Path:
 
 def provenance(page: Page) -> dict[str, Any]:
     """The machine, the versions, the seeds, the date and the command of a page. No paths but the command's."""
-    cuda = page.device.startswith("cuda")
     machine = {
         "cpu": _cpu_name(), "cores": os.cpu_count() or 1, "threads": torch.get_num_threads(),
         "system": platform.platform(terse=True),
-        **({"gpu": torch.cuda.get_device_name(page.device)} if cuda else {}),
     }  # fmt: skip
+    if page.device.startswith("cuda"):
+        machine["gpu"] = torch.cuda.get_device_name(page.device)
     return {
         "report": page.title,
         "command": page.command,
@@ -121,7 +121,6 @@ def provenance(page: Page) -> dict[str, Any]:
 def blank_figure(width: float, height: float, title: str = "") -> Figure:
     """A white page of inches, its parts laid out so that nothing overlaps."""
     figure = Figure(figsize=(width, height), facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
     if title:
         figure.suptitle(title, fontsize=11)
     return figure
@@ -134,16 +133,6 @@ def few_log_ticks(axis: Any) -> None:
     axis.set_minor_formatter(lambda value, _: f"{value:g}")
 
 
-def _write_figure(figure: Figure, path: Path, origin: Mapping[str, Any]) -> Path:
-    """Write a PNG that carries its origin: figures travel without their page."""
-    take_names_as_they_are(figure)
-    # Latin-1 is all that the notes of a PNG hold.
-    note = printable(json.dumps(origin)).encode("latin-1", "backslashreplace").decode("latin-1")
-    with atomic_write(path) as file:
-        figure.savefig(file, format="png", dpi=100, metadata={"Title": origin["report"], "Description": note})
-    return path
-
-
 def _csv(rows: Sequence[Row], origin: Mapping[str, Any]) -> str:
     columns = list(dict.fromkeys(key for row in rows for key in row))
     text = io.StringIO()
@@ -153,16 +142,6 @@ def _csv(rows: Sequence[Row], origin: Mapping[str, Any]) -> str:
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
-
-
-def _json(contents: Mapping[str, Any]) -> str:
-    """Strict JSON with a line for each row."""
-    parts = []
-    for name, value in contents.items():
-        rows = [json.dumps(plain(item), allow_nan=False) for item in ([value] if isinstance(value, Mapping) else value)]
-        joined = rows[0] if isinstance(value, Mapping) else "[\n" + ",\n".join(rows) + "\n]"
-        parts.append(f"{json.dumps(name)}: {joined}")
-    return "{\n" + ",\n".join(parts) + "\n}\n"
 
 
 def _markdown(page: Page, origin: Mapping[str, Any]) -> str:
@@ -188,8 +167,6 @@ def plain(value: Any) -> Any:
 
 
 def _cpu_name() -> str:
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
+    with suppress(OSError, IndexError):
+        return re.findall(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text(encoding="utf-8"))[0]
     return platform.processor() or "unknown"

@@ -65,9 +65,7 @@ def paper_page(
     rows: Sequence[Row],
     real: ScanSet | None = None,
     num: int = 16,
-    paths: int = 4,
     steps: int = 256,
-    repeats: int = 3,
     command: str = "",
     device: str = "cpu",
 ) -> Page:
@@ -77,12 +75,11 @@ def paper_page(
         rows: From `read_results`.
         real: Scans for figures 3, 5 and 7; None leaves figure 3 out.
         num: Scans of each generator in figures 5 and 7.
-        paths: Scans whose paths figure 8 follows, in `steps` Euler steps; 0 leaves it out.
-        repeats: Timed evaluations of each network for table II.
+        steps: Euler steps of the paths of four scans in figure 8.
     """
     roles = {weights_hash(run.checkpoint): run.role for run in runs}
     evaluated = [{**row, "role": roles[row["weights"]]} for row in rows if row["weights"] in roles]
-    architectures = architecture_rows(runs, evaluated, repeats, device)
+    architectures = architecture_rows(runs, evaluated, device)
     text = ["## Table I: methods and metrics", table_i(evaluated)]
     if architectures:
         text += ["## Table II: velocity estimators", table(architectures, ARCHITECTURES)]
@@ -90,24 +87,26 @@ def paper_page(
     flows = [run for run in runs if isinstance(run.checkpoint.generator, Flow)]
     if real is not None and len(real) > 1 and flows and flows[0].role not in SYSTEMS.values():
         figures["figure_3"] = between_figure(flows[0].checkpoint, real)
-    drawn = {run.label: _drawn(run.checkpoint, num) for run in track(runs, "sampling", "generators")}
+    drawn = {
+        run.label: np.concatenate([one.images.nan_to_num(0.0).numpy() for one in sample(run.checkpoint, num)])
+        for run in track(runs, "sampling", "generators")
+    }
     truth = None if real is None else np.stack([real.spread(num).source[i] for i in range(min(num, len(real)))])
     figures["figure_5"] = birds_eye_figure(
         {run.label: _from_above(drawn[run.label], run.checkpoint) for run in runs},
         None if truth is None else _from_above(truth, runs[0].checkpoint),
     )
-    names = [name for name in dict.fromkeys(key for row in evaluated for key in row) if name in _figures(evaluated)]
+    names = [f"{name}/{name}" for name in COLUMNS if any(f"{name}/{name}" in row for row in evaluated)]
     if names:
         figures["figure_6"] = speed_figure([{**row, "flow": row["role"]} for row in evaluated], names)
     figures["figure_7"] = scans_figure(runs, drawn, truth)
-    if paths and flows:
-        straight = [
-            measure_paths(run.checkpoint, run.label, paths, steps, batch_size=paths)
-            for run in track([run for run in flows if not run.checkpoint.generator.fixed], "following paths")
-        ]
-        if straight:
-            figures |= {"figure_8a": curvature_figure(straight), "figure_8b": trajectories_figure(straight)}
-            text += ["## Figure 8: straightness", *curvature_text(straight)]
+    straight = [
+        measure_paths(run.checkpoint, run.label, steps=steps, batch_size=4)
+        for run in track([run for run in flows if not run.checkpoint.generator.fixed], "following paths")
+    ]
+    if straight:
+        figures |= {"figure_8a": curvature_figure(straight), "figure_8b": trajectories_figure(straight)}
+        text += ["## Figure 8: straightness", *curvature_text(straight)]
     text.insert(0, f"{len(runs)} generators: {', '.join(f'{run.label} ({run.role})' for run in runs)}.")
     return Page(
         "paper", "The paper's tables and figures", text, evaluated, figures, command, {"sampled scans": 0}, device,
@@ -128,11 +127,6 @@ def read_results(files: Sequence[Path]) -> list[dict[str, Any]]:
         except (OSError, ValueError, LookupError, TypeError, AttributeError):
             raise InputError(f"{file} is not a JSON file of `r2flow evaluate`.") from None
     return rows
-
-
-def _figures(rows: Sequence[Row]) -> list[str]:
-    """The columns METRIC/METRIC of the metrics that table I has."""
-    return [f"{name}/{name}" for name in COLUMNS if any(f"{name}/{name}" in row for row in rows)]
 
 
 def table_i(rows: Sequence[Row]) -> str:
@@ -169,19 +163,17 @@ ARCHITECTURES = {
 }  # fmt: skip
 
 
-def architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], repeats: int, device: str) -> list[dict[str, Any]]:
+def architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str) -> list[dict[str, Any]]:
     """Table II: a row for each 1-RF, with the printed row of the network of as many parameters."""
     found = []
-    for run in runs:
-        if run.role != "1-RF":
-            continue
+    for run in (run for run in runs if run.role == "1-RF"):
         config = run.checkpoint.config
-        row = {"backbone": config["backbone"]["name"], **cost(config, repeats, device)}
-        printed = same_architecture(row["parameters"])
-        row |= {"gmac_printed": printed and printed.gmac, "latency_printed": printed and printed.latency_ms}
+        row = {"backbone": config["backbone"]["name"], **cost(config, 3, device)}
+        if printed := same_architecture(row["parameters"]):
+            row |= {"gmac_printed": printed.gmac, "latency_printed": printed.latency_ms, "frd_printed": printed.frd}
         own = [one for one in rows if one["weights"] == weights_hash(run.checkpoint) and "frd/frd" in one]
         best = max(own, key=lambda one: one["evaluations"], default={})
-        found.append(row | {"frd": best.get("frd/frd"), "frd_printed": printed and printed.frd})
+        found.append(row | {"frd": best.get("frd/frd")})
     return found
 
 
@@ -196,10 +188,6 @@ def between_figure(checkpoint: Checkpoint, real: ScanSet) -> Figure:
     found = interpolate_scans(checkpoint, torch.from_numpy(ends), FRAMES)
     frames = found.images.nan_to_num(0.0).numpy()
     return interpolation_figure(ends, frames, found.weights.tolist(), checkpoint.sensor.rays(), ("first", "last"))
-
-
-def _drawn(checkpoint: Checkpoint, num: int) -> np.ndarray:
-    return np.concatenate([one.images.nan_to_num(0.0).numpy() for one in sample(checkpoint, num)])
 
 
 def _from_above(images: np.ndarray, checkpoint: Checkpoint) -> np.ndarray:
@@ -222,27 +210,24 @@ def birds_eye_figure(made: Mapping[str, np.ndarray], real: np.ndarray | None) ->
     """Figure 5: where points lie from above, (100, 100) each, and their marginals with the real scans' dotted."""
     shown = {**made, **({} if real is None else {"real scans": real})}
     figure = blank_figure(2.75 * len(shown) + 0.5, 3.6)
-    figure.set_layout_engine("none")
-    outer = figure.add_gridspec(1, len(shown), left=0.5 / figure.get_figwidth(), right=0.99, bottom=0.13, top=0.86)
+    panels = figure.subplots(2, 2 * len(shown), squeeze=False, width_ratios=(3.2, 1) * len(shown),
+                             height_ratios=(1, 3.2))  # fmt: skip
     centres = (np.arange(100) + 0.5) / 100 * 2 * EXTENT - EXTENT
     for place, (name, counts) in enumerate(shown.items()):
-        grid = outer[place].subgridspec(2, 2, height_ratios=(1, 3.2), width_ratios=(3.2, 1), hspace=0.03, wspace=0.03)
-        axes = figure.add_subplot(grid[1, 0])
+        (above, corner), (axes, beside) = panels[:, 2 * place : 2 * place + 2]
         share = counts / max(counts.sum(), 1)
         # Ahead is up and left is left, as in every other picture from above.
         axes.imshow(np.log10(share[::-1, ::-1] + 1e-7), extent=(EXTENT, -EXTENT, -EXTENT, EXTENT), cmap="magma",
                     vmin=-6, vmax=-2, aspect="auto")  # fmt: skip
-        axes.set(xlabel="y, m", ylabel="x, m" if place == 0 else "", xticks=(60, 0, -60), yticks=(-60, 0, 60))
-        axes.tick_params(labelsize=7, labelleft=place == 0)
-        above, beside = figure.add_subplot(grid[0, 0], sharex=axes), figure.add_subplot(grid[1, 1], sharey=axes)
-        for histogram, colour, dash in ((counts, "#1f6fb4", "-"), (real, "0.2", ":")):
+        axes.set(xlabel="y, m", ylabel="x, m" if place == 0 else "")
+        for histogram, style in ((counts, {"color": "#1f6fb4"}), (real, {"color": "0.2", "ls": ":"})):
             if histogram is not None:
                 along_x, along_y = (m / max(m.sum(), 1) for m in marginals(histogram))
-                above.plot(centres, along_y, lw=0.9, color=colour, ls=dash)
-                beside.plot(along_x, centres, lw=0.9, color=colour, ls=dash)
-        for panel in (above, beside):
-            panel.tick_params(labelbottom=False, labelleft=False, bottom=False, left=False)
-            panel.spines[:].set_visible(False)
+                above.plot(centres, along_y, lw=0.9, **style)
+                beside.plot(along_x, centres, lw=0.9, **style)
+        above.set(xlim=(EXTENT, -EXTENT))
+        for panel in (above, beside, corner):
+            panel.set_axis_off()
         apart = "" if real is None or counts is real else f"marginals apart {marginals_apart(counts, real):.3f}"
         above.set_title(f"{name}\n{apart}", fontsize=8)
     return figure
@@ -250,13 +235,11 @@ def birds_eye_figure(made: Mapping[str, np.ndarray], real: np.ndarray | None) ->
 
 def scans_figure(runs: Sequence[PaperRun], drawn: Mapping[str, np.ndarray], real: np.ndarray | None) -> Figure:
     """Figure 7: a real scan and the first scan of each generator."""
-    images = ([] if real is None else [real[0]]) + [drawn[run.label][0] for run in runs]
-    titles = ([] if real is None else ["real"]) + [f"{run.role}, {_nfe(run.checkpoint)}" for run in runs]
-    channels = min(map(len, images))
-    return contact_sheet([image[:channels] for image in images], runs[0].checkpoint.sensor.rays(), titles)
-
-
-def _nfe(checkpoint: Checkpoint) -> str:
-    generator = checkpoint.generator
-    count = generator.sampler.evaluations(generator)
-    return f"NFE {count}" if count else "adaptive steps"
+    images = {} if real is None else {"real": real[0]}
+    for run in runs:
+        generator = run.checkpoint.generator
+        count = generator.sampler.evaluations(generator)
+        images[f"{run.role}, {f'NFE {count}' if count else 'adaptive steps'}"] = drawn[run.label][0]
+    channels = min(map(len, images.values()))
+    shown = [image[:channels] for image in images.values()]
+    return contact_sheet(shown, runs[0].checkpoint.sensor.rays(), list(images))

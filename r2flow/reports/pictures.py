@@ -123,18 +123,19 @@ def _draw_row(figure: Figure, grid: Any, row: int, image: np.ndarray, rays: Tens
 
 def draw_range(axes: Any, image: np.ndarray, label: bool = True) -> None:
     """Range on a logarithmic colour scale, dropped rays black."""
-    r = image[0]
-    shown = np.ma.masked_where(r <= 0, np.log(np.maximum(r, 1e-3)))
-    low, high = np.log(RANGES)
-    axes.imshow(shown, cmap=_ranges(), vmin=low, vmax=high, aspect="auto", interpolation="nearest")
-    _strip(axes, "range" if label else "")
+    _draw_channel(axes, image, np.log(np.maximum(image[0], 1e-3)), _ranges(), np.log(RANGES), "range" if label else "")
 
 
 def draw_reflectance(axes: Any, image: np.ndarray, label: bool = True) -> None:
     """Reflectance of [0, 1] from blue to yellow, its square root shown, dropped rays black."""
-    shown = np.ma.masked_where(image[0] <= 0, np.sqrt(np.clip(image[1], 0, 1)))
-    axes.imshow(shown, cmap=_colours("cividis"), vmin=0, vmax=0.9, aspect="auto", interpolation="nearest")
-    _strip(axes, "reflectance" if label else "")
+    shown = np.sqrt(np.clip(image[1], 0, 1))
+    _draw_channel(axes, image, shown, _colours("cividis"), (0, 0.9), "reflectance" if label else "")
+
+
+def _draw_channel(axes: Any, image: np.ndarray, shown: np.ndarray, colours: Any, limits: Any, title: str) -> None:
+    shown = np.ma.masked_where(image[0] <= 0, shown)
+    axes.imshow(shown, cmap=colours, vmin=limits[0], vmax=limits[1], aspect="auto", interpolation="nearest")
+    _strip(axes, title)
 
 
 def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
@@ -207,12 +208,12 @@ def take_names_as_they_are(figure: Figure) -> None:
             text.set_parse_math(False)
 
 
-def save_figure(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
-    """Write a PNG, whole or not at all."""
+def save_figure(figure: Figure, path: str | Path, dpi: int = 110, **notes: str) -> Path:
+    """Write a PNG with notes in it, whole or not at all."""
     path = Path(path)
     take_names_as_they_are(figure)
     with atomic_write(path) as file:
-        figure.savefig(file, format="png", dpi=dpi, facecolor=figure.get_facecolor())
+        figure.savefig(file, format="png", dpi=dpi, facecolor=figure.get_facecolor(), metadata=notes)
     return path
 
 
@@ -220,17 +221,14 @@ def figure_pixels(figure: Figure, dpi: int = 80) -> np.ndarray:
     """The figure as (height, width, 3) uint8."""
     take_names_as_they_are(figure)
     figure.set_dpi(dpi)
-    canvas = figure.canvas
-    assert isinstance(canvas, FigureCanvasAgg)
+    canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def dark_figure(width: float, height: float) -> Figure:
     """An empty figure of inches for scans."""
-    figure = Figure(figsize=(width, height), facecolor=BACKGROUND)
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=(width, height), facecolor=BACKGROUND)
 
 
 def colour_table(what: str) -> np.ndarray:

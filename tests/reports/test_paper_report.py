@@ -10,7 +10,7 @@ import pytest
 from r2flow.metrics import METRICS
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
-from r2flow.reports.paper import PaperRun, marginals, marginals_apart, role_of, same_architecture, table_i
+from r2flow.reports.paper import marginals, marginals_apart, role_of, same_architecture, table_i
 from r2flow.reports.printed import COLUMNS, TABLE_I, TABLE_II
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.test_cli import r2flow  # noqa: F401  a fixture
@@ -76,21 +76,25 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):  # noqa: F811
     comparisons = [{"kind": "judged", "generated": one, "metrics": metrics} for one in sets]
     results = tmp_path / "e.json"
     results.write_text(json.dumps({"comparisons": comparisons}))
-    options = ("--num", 2, "--paths", 1, "--steps", 4, "--repeats", 0, "--device", "cpu", "--real", "simulated:0")
-    code, said, _ = r2flow("report", "paper", *runs.values(), "--results", results, *options, "-o", tmp_path / "out")
+    options = ("--num", 2, "--steps", 2, "--device", "cpu", "--real", "simulated:0")
+    code, said, _ = r2flow(
+        "report",
+        "paper",
+        f"9-RF={runs['2-RF']}",
+        runs["1-RF"],
+        runs["4-TD"],
+        "--results",
+        results,
+        *options,
+        "-o",
+        tmp_path / "out",
+    )
     assert code == 0
     assert "3 generators" in said
+    assert "(9-RF)" in said
     content = json.loads((tmp_path / "out" / "paper.json").read_text())
     assert [(row["role"], row["jsd/jsd"]) for row in content["rows"]] == [("1-RF", 0.25)]
     (architecture,) = content["architectures"]
     assert architecture["parameters"] == sum(p.numel() for p in network().model.parameters())
     written = {path.stem for path in (tmp_path / "out").glob("*.png")}
     assert written == {"figure_3", "figure_5", "figure_6", "figure_7", "figure_8a", "figure_8b"}
-
-
-def test_a_role_can_be_given(r2flow, runs, tmp_path):  # noqa: F811
-    options = ("--num", 1, "--paths", 0, "--repeats", 0, "--device", "cpu")
-    code, said, _ = r2flow("report", "paper", f"9-RF={runs['1-RF']}", *options, "-o", tmp_path / "out")
-    assert code == 0
-    assert "(9-RF)" in said
-    assert PaperRun("9-RF", "run", load_checkpoint(runs["1-RF"])).role == "9-RF"
