@@ -103,7 +103,7 @@ def test_pictures_of_files_of_one_name_have_names_of_their_own(r2flow, tmp_path)
         write_scan(file, 3)
     code, said, _ = r2flow("show", *files, "--size", "32x256", "--out", tmp_path / "views")
     assert code == 0
-    names = ["data_000000_bin.png", "data_000000_bin_2.png", "data_000000_bin_3.png"]
+    names = ["000000.png", "000000_2.png", "000000_3.png"]
     assert said.splitlines() == [str(tmp_path / "views" / name) for name in names]
 
 

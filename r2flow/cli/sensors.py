@@ -24,6 +24,7 @@ def sensor(
 
     The YAML is a sensor for the verbs (--sensor mine.yaml) and, in conf/sensor/, for train.py (sensor=mine).
     """
+    from r2flow.data.sources import spread
     from r2flow.lidar.beams import estimate_sensor, nearest_sensor
     from r2flow.lidar.scan_files import read_points
     from r2flow.lidar.sensor_files import ENDINGS, write_sensor
@@ -41,7 +42,8 @@ def sensor(
         name = f"my_{name}" if name in SENSORS or not name[:1].isalpha() else name
     if name in SENSORS or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise InputError(f"--name must be letters, digits and _, and not that of a built-in sensor; found {name!r}.")
-    paths = [path for scan in scans for path in scans_of(scan, most)]
+    folders = [scans_of(path) for path in scans]
+    paths = [folder[index] for folder in folders for index in spread(len(folder), most)]
     points = [read_points(path, named_columns(columns)) for path in track(paths, "reading", "scans", least=16)]
     mine, beams, steps = estimate_sensor(points, name)
     e, middle = mine.elevations, len(mine.elevations) // 2

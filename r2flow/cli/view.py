@@ -1,11 +1,13 @@
 """`r2flow view` and `r2flow show`: scans in a browser, and as pictures."""
 
+import logging
 import os
 import sys
 import webbrowser
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import chain, count
+from contextlib import suppress
+from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Annotated
@@ -13,19 +15,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.groups import grouped
-from r2flow.cli.options import (
-    SETS,
-    ColumnsOption,
-    DeviceOption,
-    OutOption,
-    SensorChoice,
-    SizeOption,
-    build_sized,
-    check_words,
-    choose_device,
-    named_columns,
-)
+from r2flow.cli.groups import ReadingOptions, grouped
+from r2flow.cli.options import SETS, DeviceOption, OutOption, choose_device
 from r2flow.cli.output import numbers
 from r2flow.errors import InputError
 
@@ -33,38 +24,24 @@ if TYPE_CHECKING:
     from r2flow.reports.view.panels import Panel
     from r2flow.reports.views import View
 
+log = logging.getLogger(__name__)
+
 SCANS, SAMPLES = 16, 4  # of a folder, of a generator, where nobody says how many
 MOST = 256  # of each; a page holds no more
 
 
-@dataclass(frozen=True)
-class ViewOptions:
-    """How scan files are read."""
+def views(scans: Sequence[str], how: ReadingOptions, most: int) -> "list[View]":
+    """The scans that are named, of each folder at most so many."""
+    from r2flow.data.opening import own_reading
+    from r2flow.reports.views import views_of
 
-    sensor: SensorChoice = None
-    size: SizeOption = None
-    projection: Annotated[str, typer.Option(help="spherical or unfolding.")] = "spherical"
-    reflectance_scale: Annotated[
-        float | None,
-        typer.Option(min=1e-6, max=1e9, help="Value in the file that means full reflectance; guessed if left out."),
-    ] = None
-    columns: ColumnsOption = None
-
-    def views(self, scans: Sequence[str], most: int) -> "list[View]":
-        """The scans that are named, of each folder at most so many: `views_of`."""
-        from r2flow.reports.views import views_of
-
-        check_words(projection=self.projection)
-        sensor = self.sensor
-        if self.projection == "unfolding" and sensor in (None, "hdl64e"):
-            sensor = "hdl64e_rings"  # rows are rings then, and these are not evenly spaced
-        chosen = build_sized(sensor or "hdl64e", self.size) if sensor or self.size else None
-        columns = named_columns(self.columns)
-        return [
-            view
-            for spec in scans
-            for view in views_of(spec, chosen, self.projection, self.reflectance_scale, most, columns)
-        ]
+    found: list[View] = []
+    for spec in scans:
+        reading = how.reading([spec])
+        if how.reflectance_scale is None and own_reading(spec) is None:  # else guessed from the values
+            reading = replace(reading, reflectance_scale=reading.sensor.reflectance_scale)
+        found += views_of(spec, reading, most)
+    return found
 
 
 @app.command(epilog="Example: r2flow show scans/000000.ply velodyne/0000000100.bin --out views")
@@ -72,7 +49,7 @@ class ViewOptions:
 def show(
     scans: Annotated[list[str], typer.Argument(help=f"Scan files, range images (.npy), or {SETS}.")],
     out: OutOption,
-    how: ViewOptions,
+    how: ReadingOptions,
     most: Annotated[int, typer.Option("--num", min=1, help="The most scans to draw of a folder.")] = SCANS,
     labels: Annotated[bool, typer.Option("--labels", help="Draw the classes of .label files, too.")] = False,
     format: Annotated[str, typer.Option(help="png, or npy for range images, (2, H, W).")] = "png",
@@ -82,31 +59,24 @@ def show(
 
     from r2flow.files import atomic_write
     from r2flow.reports.pictures import save_figure, scan_figure
-    from r2flow.reports.views import label_view
 
     if format not in ("png", "npy"):
         raise InputError(f"--format must be png or npy, found {format!r}.")
-    views = how.views(scans, most)
-    for view, name in zip(views, unique_stems([view.path for view in views]), strict=True):
-        image = view.image
-        if format == "npy":
-            with atomic_write(out / f"{name}.npy") as file:
-                np.save(file, image)
-            print(f"{out / name}.npy: {' x '.join(map(str, image.shape))}, {(image[0] > 0).mean():.1%} returns")
-        else:
-            figure = scan_figure(image, view.rays, view.path.name, label_view(view) if labels else None)
-            print(save_figure(figure, out / f"{name}.png"))
-
-
-def unique_stems(paths: Sequence[Path]) -> list[str]:
-    """The files' stems, with their folder's name where two share one, and with a number where they share that too."""
-    stems = [path.stem for path in paths]
     names: list[str] = []
-    for path in paths:
-        name = path.stem if stems.count(path.stem) == 1 else f"{path.parent.name}_{path.name.replace('.', '_')}"
-        choices = chain([name], (f"{name}_{number}" for number in count(2)))
-        names.append(next(one for one in choices if one not in names))
-    return names
+    for view in views(scans, how, most):
+        stem = view.path.stem
+        names.append(next(one for n in count(1) if (one := stem if n == 1 else f"{stem}_{n}") not in names))
+        path = out / f"{names[-1]}.{format}"
+        if format == "npy":
+            with atomic_write(path) as file:
+                np.save(file, view.image)
+            size, returns = " x ".join(map(str, view.image.shape)), (view.image[0] > 0).mean()
+            print(f"{path}: {size}, {returns:.1%} returns")
+            continue
+        image, classes = view.labelled() if labels else (view.image, None)
+        if labels and classes is None:
+            log.warning("%s: no .label file lies beside it", view.path)
+        print(save_figure(scan_figure(image, view.rays, view.path.name, classes), path))
 
 
 @app.command(epilog="Example: r2flow view street velodyne/0000000100.bin --steps 1,2,4,32 --out page.html")
@@ -116,7 +86,7 @@ def view(
         list[str],
         typer.Argument(help=f"Scan files, range images, {SETS}; or a run, checkpoint or model to draw from."),
     ],
-    how: ViewOptions,
+    how: ReadingOptions,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="The .html to write; a temporary one, opened, if left out.")
     ] = None,
@@ -151,10 +121,9 @@ def view(
     models = [one for one in what if is_checkpoint(one)]
     if not models and (steps or times or seed or device != "auto"):
         raise InputError("--steps, --times, --seed and --device are of a run, a checkpoint or a model; found none.")
-    if len(models) == len(what) and (sequence or how != ViewOptions()):
-        raise InputError(
-            "--sequence, --sensor, --size, --projection, --reflectance-scale and --columns are of scans; found none."
-        )
+    if len(models) == len(what) and (sequence or how != ReadingOptions()):
+        words = "--sensor, --size, --projection, --convention, --reflectance-scale and --columns"
+        raise InputError(f"--sequence, {words} are of scans; found none.")
     if sequence and times:
         raise InputError("--sequence and --times both use the slider; give one of them.")
     counts = numbers("steps", steps, int) if steps else []
@@ -164,7 +133,7 @@ def view(
     frames: list[str] = []
     for one in what:
         if one not in models:
-            new = scan_panels(how.views([one], num or SCANS))
+            new = scan_panels(views([one], how, num or SCANS))
             if sequence and len(new) > 1:
                 together, frames = in_turn(new, one)
                 new = [together]
@@ -182,11 +151,9 @@ def view(
         open_browser(path)
 
 
-def open_browser(path: Path) -> bool:
-    """Open a page where there is a screen; whether it was tried with success."""
+def open_browser(path: Path) -> None:
+    """Open a page where there is a screen: a browser of text would take the terminal."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        return False  # a browser of text would take the terminal
-    try:
-        return webbrowser.open(path.resolve().as_uri())
-    except webbrowser.Error:
-        return False
+        return
+    with suppress(webbrowser.Error):
+        webbrowser.open(path.resolve().as_uri())

@@ -226,6 +226,7 @@ def birds_eye_figure(made: Mapping[str, np.ndarray], real: np.ndarray | None) ->
                 above.plot(centres, along_y, lw=0.9, **style)
                 beside.plot(along_x, centres, lw=0.9, **style)
         above.set(xlim=(EXTENT, -EXTENT))
+        beside.set(ylim=(-EXTENT, EXTENT))
         for panel in (above, beside, corner):
             panel.set_axis_off()
         apart = "" if real is None or counts is real else f"marginals apart {marginals_apart(counts, real):.3f}"

@@ -8,14 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
-from r2flow.data.opening import find_drives, open_scans, own_reading, parse, reading_for
+from r2flow.data.opening import find_drives, open_scans, own_reading, parse
 from r2flow.data.options import FOLDER, SIMULATED
-from r2flow.data.reading import range_image, read_labelled_scan
+from r2flow.data.reading import Reading, range_image, read_labelled_scan
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanFiles, SimulatedScans, spread, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.labels import labels_beside
-from r2flow.lidar.sensors import Sensor
 
 log = logging.getLogger(__name__)
 
@@ -51,8 +50,8 @@ class View(NamedTuple):
         return read_labelled_scan(path, replace(how, on_bad_scan="error"))
 
 
-def scans_of(path: Path, most: int, say: bool = False) -> list[Path]:
-    """The file itself, or at most `most` scans of a folder, evenly spread over it; `say` so where there are more.
+def scans_of(path: Path) -> list[Path]:
+    """The file itself, or the scans of a folder.
 
     Raises:
         InputError: nothing is there, or a folder without scans.
@@ -61,10 +60,7 @@ def scans_of(path: Path, most: int, say: bool = False) -> list[Path]:
         raise InputError(f"{path} does not exist.")
     if not path.is_dir():
         return [path]
-    found = [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans]
-    if say:
-        _say_how_many(path, len(found), most)
-    return [found[index] for index in spread(len(found), most)]
+    return [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans]
 
 
 def _say_how_many(what: str | Path, count: int, most: int) -> None:
@@ -72,35 +68,18 @@ def _say_how_many(what: str | Path, count: int, most: int) -> None:
         log.warning("%s: %d of its %s scans are taken, evenly spread; --num takes more", what, most, f"{count:,}")
 
 
-def views_of(
-    spec: str | Path,
-    sensor: Sensor | None = None,
-    projection: str = "spherical",
-    reflectance_scale: float | None = None,
-    most: int = 16,
-    columns: tuple[str, ...] | None = None,
-) -> list[View]:
+def views_of(spec: str, reading: Reading, most: int) -> list[View]:
     """At most `most` of the scans that a name stands for (`open_scans`), evenly spread.
 
-    Files that say nothing of themselves are opened one by one: each has its own reflectance or none, and a range image
-    its own size.
-
-    Args:
-        sensor: Of scans that do not say theirs; None takes the usual one.
-        columns, reflectance_scale: As in `Reading`; None takes the sensor's, else guesses it.
-
-    Raises:
-        InputError: nothing is there, or it is not of this sensor.
+    Files that r2flow did not write are opened one by one: each has its own reflectance or none, and a range image its
+    own size.
     """
-    options, file = parse(str(spec))
-    own = own_reading(spec)
-    reading = own or reading_for([spec], projection=projection)
-    sensor = sensor or reading.sensor
-    if own is None and reflectance_scale is None:
-        reflectance_scale = sensor.reflectance_scale
-    reading = replace(reading, sensor=sensor, reflectance_scale=reflectance_scale, on_bad_scan="error", columns=columns)
-    if own is None and options.name == FOLDER:
-        loose = scans_of(file or Path(options.folder), most, say=True)
+    reading = replace(reading, on_bad_scan="error")
+    options, file = parse(spec)
+    if own_reading(spec) is None and options.name == FOLDER:
+        every = scans_of(file or Path(options.folder))
+        _say_how_many(spec, len(every), most)
+        loose = [every[index] for index in spread(len(every), most)]
         warn_of_other_sensor(loose, reading, spec)
         return [View(path, open_scans(path, reading, own_size=True), 0) for path in loose]
     opened = open_scans(spec, reading)
@@ -108,11 +87,3 @@ def views_of(
         _say_how_many(spec, len(opened), most)
     scans = opened.spread(most)
     return [View(Path(options.folder, name), scans, number) for number, name in enumerate(scans.source.names)]
-
-
-def label_view(view: View) -> np.ndarray | None:
-    """The class of each pixel, (H, W); None, with a warning, where the scan has no labels."""
-    _, labels = view.labelled()
-    if labels is None:
-        log.warning("%s: no .label file lies beside it", view.path)
-    return labels
