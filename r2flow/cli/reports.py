@@ -1,7 +1,6 @@
 """`r2flow report`: solvers, curvature, backbones, completion and the paper's tables."""
 
 import logging
-from json import dumps as to_json
 from pathlib import Path
 from typing import Annotated
 
@@ -107,10 +106,8 @@ def backbones(
     only: Annotated[str | None, typer.Option(help="Names, separated by commas; all if left out.")] = None,
     sensor: SensorOption = "hdl64e",
     size: SizeOption = None,
-    channels: Annotated[int, typer.Option(min=1, help="Channels of the image.")] = 2,
     repeats: Annotated[int, typer.Option(min=0, help="Timed evaluations of each; 0 leaves the latency out.")] = 3,
     device: DeviceOption = "auto",
-    json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
     """Parameters, multiply-accumulates and measured latency of every configuration: the paper's table II."""
     from r2flow.backbones import configurations
@@ -119,9 +116,9 @@ def backbones(
 
     chosen, where = build_sized(sensor, size), choose_device(device)
     names = only.split(",") if only else list(configurations())
-    rows = backbone_costs(chosen, names, channels, repeats, where)
+    rows = backbone_costs(chosen, names, repeats, where)
     measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
-    print(to_json(measured, indent=2)) if json else print_costs(measured, chosen, where)
+    print_costs(measured, chosen, where)
 
 
 @report.command(epilog="Example: r2flow report completion kitti360/test street --num 15 --out reports")

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from r2flow.backbones import build_backbone, configurations
+from r2flow.backbones import Backbone, build_backbone, configurations
 from r2flow.backbones.cost import RULE, count_macs, count_parameters
 from r2flow.errors import InputError
 from r2flow.generators import RectifiedFlow, build_generator
@@ -18,9 +18,9 @@ from r2flow.reports.timing import timed
 
 
 def backbone_costs(
-    sensor: Sensor, names: Sequence[str] | None = None, channels: int = 2, repeats: int = 3, device: str = "cpu"
+    sensor: Sensor, names: Sequence[str] | None = None, repeats: int = 3, device: str = "cpu"
 ) -> Iterator[dict[str, Any]]:
-    """Parameters, GMAC and median latency of every configuration for one image, one at a time.
+    """Parameters, GMAC and median latency of every configuration for one image of two channels, one at a time.
 
     Args:
         names: Of `configurations`; None for all.
@@ -29,9 +29,6 @@ def backbone_costs(
     Returns:
         `{name, parameters, gmac, latency_ms}`; a configuration that cannot take the size has None for all three and
         says why under `error`.
-
-    Raises:
-        InputError: an unknown name.
     """
     known = configurations()
     for name in names or known:
@@ -39,14 +36,11 @@ def backbone_costs(
         row: dict[str, Any] = {"name": name, "parameters": None, "gmac": None, "latency_ms": None}
         try:
             with torch.device("cpu" if repeats > 0 else "meta"):  # counting needs no weights
-                model = build_backbone(options, sensor.rays(), channels).eval()
+                model = build_backbone(options, sensor.rays(), 2).eval()
         except InputError as error:
             yield {**row, "error": str(error)}
             continue
-        row["parameters"], row["gmac"] = count_parameters(model), count_macs(model) / 1e9
-        if repeats > 0:
-            row["latency_ms"] = latency(model.to(device), (1, channels, *sensor.shape), repeats, device)
-        yield row
+        yield {**row, **_cost_of(model, (1, 2, *sensor.shape), repeats, device)}
 
 
 def cost(config: Mapping[str, Any], repeats: int = 0, device: str = "cpu") -> dict[str, Any]:
@@ -54,10 +48,12 @@ def cost(config: Mapping[str, Any], repeats: int = 0, device: str = "cpu") -> di
     generator = build_generator(config)
     if not isinstance(generator, RectifiedFlow):
         return {"parameters": count_parameters(generator), "gmac": None, "latency_ms": None}
-    model = generator.untold().backbone.eval()
-    parameters, gmac, shape = count_parameters(model), count_macs(model) / 1e9, (1, *generator.space.shape)
-    time = latency(model.to(device), shape, repeats, device) if repeats else None
-    return {"parameters": parameters, "gmac": gmac, "latency_ms": time}
+    return _cost_of(generator.untold().backbone.eval(), (1, *generator.space.shape), repeats, device)
+
+
+def _cost_of(model: Backbone, shape: tuple[int, ...], repeats: int, device: str) -> dict[str, Any]:
+    row = {"parameters": count_parameters(model), "gmac": count_macs(model) / 1e9, "latency_ms": None}
+    return row | {"latency_ms": latency(model.to(device), shape, repeats, device)} if repeats else row
 
 
 def latency(model: nn.Module, shape: tuple[int, ...], repeats: int, device: str) -> float:
@@ -70,13 +66,10 @@ def latency(model: nn.Module, shape: tuple[int, ...], repeats: int, device: str)
 
 def print_costs(rows: Sequence[dict[str, Any]], sensor: Sensor, device: str) -> None:
     """The rows as a table, with the counting rule."""
-    height, width = sensor.shape
-    formats = {"parameters": "{:,}", "gmac": "{:.2f}", "latency_ms": "{:,.0f}"}
-    cells = [
-        row | {key: form.format(row[key]) for key, form in formats.items() if row[key] is not None} for row in rows
-    ]
+    forms = {"parameters": "{:,}", "gmac": "{:.2f}", "latency_ms": "{:,.0f}"}
+    cells = [row | {key: form.format(row[key]) for key, form in forms.items() if row[key] is not None} for row in rows]
     columns = {"name": "backbone", "parameters": "parameters", "gmac": "GMAC", "latency_ms": "latency, ms"}
     if any("error" in row for row in rows):
         columns["error"] = ""
-    print_table(cells, columns, f"{height} x {width}, batch 1, float32, {device}")
+    print_table(cells, columns, f"{' x '.join(map(str, sensor.shape))}, batch 1, float32, {device}")
     print(f"GMAC: {RULE}.")

@@ -44,8 +44,8 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     """
     out = Path(out)
     flows = {name: load_checkpoint(run, device) for name, run in runs.items()}
-    first = next(iter(flows.values()))
-    real = held_out(first, next(iter(runs.values())))
+    (first, *_), (last, folder) = flows.values(), list(runs.items())[-1]
+    real, rays = held_out(first, next(iter(runs.values()))), first.sensor.rays()
     truth = panel(real, first.sensor)
     rows, drawn = [], {}
     bends = {name: bend(flow, num) for name, flow in flows.items()}
@@ -58,7 +58,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
         mean = mean_distance(lines)
         rows.append({"flow": name, "steps": steps, "seconds": seconds, "bend": bends[name], "mean": mean, **lines})
         drawn[name, steps] = images
-    shown, rays = list(drawn[cells[-1]][:4]), first.sensor.rays()
+    shown = list(drawn[cells[-1]][:4])
     for index, image in enumerate(shown):
         write_scan(image, rays, out, f"{index:06d}", ("ply", "npy"))
     draw_pages(shown, rays, out)
@@ -67,38 +67,30 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
         "scans. *Bend* is the integral of the paper's s(t) over the squared length of the path (median over scans, 0 "
         "is straight); an untrained flow is straight too, so read it beside the *distance*: the mean of the "
         "panel's lines, 0 is equal.",
-        table(rows, COLUMNS),
-        "The lines of the panel:",
-        table(rows, {"flow": "flow", "steps": "steps", **{line: line for line in PANEL}}),
+        table(rows, COLUMNS | {line: line for line in PANEL}),
     ]
     titles = [f"{name}, {steps} step{'s' * (steps > 1)}" for name, steps in cells]
     figures = {"chain": contact_sheet([drawn[cell][0] for cell in cells], rays, titles)}
     page = Page("chain", "From many steps to few", text, rows, figures, command, {"evaluation": 0}, device)
     written = write_page(page, out)[-1]
     print_table(rows, COLUMNS)
-    last, folder = list(runs.items())[-1]
     learned = {**flows[last].config, "data": first.config.get("data", {})}  # the chain's scans are its first link's
     print(
         f"""
 pictures      {out / "chain.png"} (every generator, few and many steps), {out / "samples.png"} ({last})
 point clouds  {out / "000000.ply"} ...
 table         {written}
-flows         {", ".join(str(run) for run in runs.values())}
+flows         {", ".join(map(str, runs.values()))}
 {what_next(folder, out, config=learned)}""",
         flush=True,
     )
     return written
 
 
-def _steps(flow: Checkpoint) -> int:
-    return int(flow.generator.sampler.steps)  # type: ignore[attr-defined]
-
-
 def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:
     """A generator for fixed steps at these; the others at all of these and at many."""
-    if flow.generator.fixed:
-        return [_steps(flow)]
-    return sorted({1, *(_steps(other) for other in flows if other.generator.fixed), MANY})
+    fixed = {one.generator.sampler.steps for one in flows if one.generator.fixed}  # type: ignore[attr-defined]
+    return [flow.generator.sampler.steps] if flow.generator.fixed else sorted({1, *fixed, MANY})  # type: ignore[attr-defined]
 
 
 def held_out(flow: Checkpoint, run: Path) -> np.ndarray:

@@ -40,10 +40,9 @@ def print_contents(contents: dict[str, Any]) -> None:
     """Print them as two short tables."""
     summary = {key: value for key, value in contents.items() if key != "config"}
     summary["image"] = " x ".join(map(str, contents["image"]))
-    for name, options in contents.items():
-        if name not in ("encoding", "sampler", "few") or not options:
-            continue
-        summary[name] = ", ".join(f"{key} {value}" for key, value in options.items())
+    for name in ("encoding", "sampler", "few"):
+        if options := contents.get(name):
+            summary[name] = ", ".join(f"{key} {value}" for key, value in options.items())
     summary |= {key: f"{value:,}" for key, value in summary.items() if isinstance(value, int)}
     print_table([(key, str(value)) for key, value in summary.items()], ("", ""))
     print()

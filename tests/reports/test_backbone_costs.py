@@ -1,5 +1,3 @@
-import json
-
 import pytest
 
 from r2flow.backbones import configurations
@@ -61,15 +59,10 @@ def test_the_verb_prints_every_configuration(r2flow):  # noqa: F811
 
 
 def test_the_verb_measures_what_it_is_asked_for(r2flow):  # noqa: F811
-    options = ("--only", "hdit_tiny,adm_unet_large", "--size", "16x64", "--channels", 1, "--repeats", 0, "--json")
+    options = ("--only", "hdit_tiny,adm_unet_large", "--size", "16x64", "--repeats", 0, "--device", "cpu")
     code, out, _ = r2flow("report", "backbones", *options)
     assert code == 0
-    assert [row["name"] for row in json.loads(out)] == ["hdit_tiny", "adm_unet_large"]
-    code, out, _ = r2flow(
-        "report", "backbones", "--only", "hdit_tiny", "--size", "16x64", "--repeats", 1, "--device", "cpu"
-    )
-    assert code == 0
-    assert "hdit_tiny" in out
+    assert [line.split()[0] for line in out.splitlines()[2:4]] == ["hdit_tiny", "adm_unet_large"]
     code, _, err = r2flow("report", "backbones", "--only", "hditt", "--repeats", 0)
     assert code != 0
-    assert "Did you mean 'hdit'?" in err
+    assert "'hdit'" in err
