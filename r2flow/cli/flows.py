@@ -112,7 +112,6 @@ def interpolate(
         float | None,
         typer.Option(min=1e-6, max=1e9, help="Value in the files that means full reflectance; else the training's."),
     ] = None,
-    batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1,
     device: DeviceOption = "auto",
 ) -> None:
     """Go from one real scan to another through their noises: a figure and a point cloud for every frame.
@@ -120,17 +119,22 @@ def interpolate(
     The solver is dopri5 at a tolerance of 1e-4 if left out.
     """
     from r2flow.cli.output import command
+    from r2flow.generators import as_flow
     from r2flow.inversion import real_scans
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.interpolation import interpolation
-    from r2flow.reports.pages import write_page
+    from r2flow.reports.pages import prepare_folder, write_page
     from r2flow.samplers import build_sampler
 
     loaded = load_checkpoint(checkpoint, choose_device(device))
-    ends = real_scans(loaded, [first, last], reflectance_scale)
     given = sampling.given
     sampler = build_sampler(given if "name" in given else {"name": "dopri5", "tolerance": 1e-4, **given})
-    written = write_page(interpolation(loaded, ends, frames, out, sampler, batch_size, command()), out)
+    sampler.check(as_flow(loaded.generator, "interpolation"))
+    ends = real_scans(loaded, [first, last], reflectance_scale)
+    if len(ends) != 2:
+        raise InputError(f"give two scans, found {len(ends)}.")
+    prepare_folder(out)
+    written = write_page(interpolation(loaded, ends, frames, out, sampler, command()), out)
     pages = ", ".join(map(str, [*written, out / "interpolation.html"]))
     print(f"{frames} scans in {out / 'frames'}; {pages}")
 

@@ -9,13 +9,12 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from r2flow.data.sources import spread
-from r2flow.errors import InputError
-from r2flow.generators import Sampler, as_flow
+from r2flow.generators import Sampler
 from r2flow.inversion import TIGHT, Real, interpolate_scans, round_trip
 from r2flow.lidar.projection import image_to_points
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.reports.outputs import ScanBar, warn_unsolved, write_scan
-from r2flow.reports.pages import Page, prepare_folder
+from r2flow.reports.pages import Page
 from r2flow.reports.pictures import (
     FOREGROUND,
     dark_figure,
@@ -48,27 +47,17 @@ def interpolation(
     frames: int,
     out: str | Path,
     sampler: Sampler = TIGHT,
-    batch_size: int = 1,
     command: str = "",
 ) -> Page:
     """Write `frames` scans on the way from one scan to another as `out/frames/NNN.ply` and `.npy`.
 
     Returns:
         The page with the figure, still to be written.
-
-    Raises:
-        InputError: a scan or a solver that cannot be used, before anything is written; a scan without its noise.
     """
-    sampler.check(as_flow(checkpoint.generator, "interpolation"))
-    if len(scans) != 2:
-        raise InputError(f"give two scans, found {len(scans)}.")
-    pair = torch.stack([scan.image for scan in scans])
-    prepare_folder(out)
-    names = [scan.name for scan in scans]
-    rays = checkpoint.sensor.rays()
+    pair, names, rays = torch.stack([scan.image for scan in scans]), [s.name for s in scans], checkpoint.sensor.rays()
     # both ends go there and back
     with ScanBar("interpolating", frames, (frames + 2) * (sampler.evaluations(checkpoint.generator) or 0)) as bar:
-        found = interpolate_scans(checkpoint, pair, frames, sampler, batch_size, bar.evaluated, bar.finished)
+        found = interpolate_scans(checkpoint, pair, frames, sampler, progress=bar.evaluated, arrived=bar.finished)
     warn_unsolved(found.converged)
     images = found.images.nan_to_num(0.0).numpy()
     rows = []
@@ -107,26 +96,21 @@ def interpolation_figure(
         weights: Of the frames, (N,).
     """
     last = len(frames) - 1
-    chosen = sorted({round(i * last / (MOST - 1)) for i in range(MOST)}) if last >= MOST else range(last + 1)
+    chosen = sorted({round(i) for i in np.linspace(0, last, MOST)})
     between = [("there and back" if i in (0, last) else f"w = {weights[i]:.2f}", frames[i]) for i in chosen]
     columns = [(f"real: {names[0]}", real[0]), *between, (f"real: {names[1]}", real[1])]
     heights = [1.15, 1.6, *[0.5] * real.shape[1]]
-    width, height = 2.45 * len(columns), 1.55 * sum(heights) + 0.45
-    figure = dark_figure(width, height)
-    grid = figure.add_gridspec(
-        len(heights), len(columns), height_ratios=heights, hspace=0.05, wspace=0.04,
-        left=0.35 / width, right=1 - 0.08 / width, top=1 - 0.32 / height, bottom=0.08 / height,
-    )  # fmt: skip
+    figure = dark_figure(2.45 * len(columns), 1.55 * sum(heights) + 0.45)
+    figure.set_layout_engine("constrained", hspace=0.02, wspace=0.02)
+    panels = figure.subplots(len(heights), len(columns), squeeze=False, height_ratios=heights)
     for place, (title, image) in enumerate(columns):
         xyz, _ = image_to_points(image, rays)
         colour = REAL if place in (0, len(columns) - 1) else FOREGROUND
-        for row, (name, draw) in enumerate(list(PANELS.items())[: len(heights)]):
-            axes = figure.add_subplot(grid[row, place])
-            draw(axes, xyz if row < 2 else image, label=False)
-            if row == 0:
-                axes.set_title(title, color=colour, fontsize=9, pad=4)
+        for axes, (name, draw) in zip(panels[:, place], PANELS.items(), strict=False):
+            draw(axes, xyz if "view" in name or name == "perspective" else image, label=False)
             if place == 0:
                 axes.set_ylabel(name, color=FOREGROUND, fontsize=8)
             if colour == REAL:
                 axes.spines[:].set(visible=True, color=REAL, linewidth=1.2)
+        panels[0, place].set_title(title, color=colour, fontsize=9, pad=4)
     return figure
