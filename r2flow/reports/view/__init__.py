@@ -65,12 +65,13 @@ def page(
             f"a page holds 1 to 256 images of 64 x 1024 (33 MB), or {MOST:,} pixels; found {count} images with "
             f"{pixels:,}. Take fewer scans or frames (--num)."
         )
-    shared = isinstance(rays, np.ndarray | Tensor) and rays.ndim == 3
+    shared = isinstance(rays, np.ndarray | Tensor)
     each_rays = [np.asarray(one, dtype=np.float64) for one in ([rays] * len(stacks) if shared else rays)]
     each_labels = [None if one is None else np.asarray(one) for one in labels or [None] * len(stacks)]
-    each_caption = list(captions) or [f"{number}" for number in range(len(stacks))]
+    each_caption = captions or range(len(stacks))
     sensors: dict[bytes, tuple[int, dict[str, Any]]] = {}
-    classes = _classes(each_labels)
+    given = [ids[ids > 0] for ids in each_labels if ids is not None]
+    classes = class_colours(np.concatenate(given), most=255) if given else {}
     step = max(STEP, max(float(stack[:, 0].max(initial=0)) for stack in stacks) / (CODES - 1))
     scans = []
     for stack, seen, ids, caption in zip(stacks, each_rays, each_labels, each_caption, strict=True):
@@ -82,7 +83,6 @@ def page(
             "caption": printable(str(caption)), "rays": number, "frames": packed,
             "reflectance": stack.shape[1] > 1, "labels": ids is not None,
         })  # fmt: skip
-    entries = [("no class", "#808080"), *classes.values()]
     contents = {
         "scans": scans,
         "rays": [described for _, described in sensors.values()],
@@ -91,8 +91,8 @@ def page(
         "ranges": RANGES,
         "heights": HEIGHTS,
         "colours": _text(np.concatenate([colour_table(name) for name in ("range", "height", "reflectance")]).tobytes()),
-        "classes": entries,
-        "legend": list(dict(entries[1:]).items()),
+        "classes": [("no class", "#808080"), *classes.values()],
+        "legend": list(dict(classes.values()).items()),
         "shown": {"reflectance": any(s["reflectance"] for s in scans), "label": any(s["labels"] for s in scans)},
     }
     return _filled(contents, title)
@@ -135,10 +135,8 @@ def packed_image(image: np.ndarray, step: float, numbers: np.ndarray | None = No
 def _frames_of(images: Images) -> np.ndarray:
     """(T, 2 or 1, H, W) of one scan."""
     stack = np.asarray(images, dtype=np.float32)
-    stack = stack[None] if stack.ndim == 3 else stack
-    assert stack.ndim == 4, np.shape(images)
-    assert stack.shape[1] in (1, 2), np.shape(images)
-    return stack
+    assert stack.shape[-3] in (1, 2), stack.shape
+    return stack.reshape(-1, *stack.shape[-3:])
 
 
 def _described(rays: np.ndarray) -> dict[str, Any]:
@@ -157,12 +155,6 @@ def _spacing(rays: np.ndarray) -> float:
     return float(np.prod(gaps) ** (1 / len(gaps))) if gaps else 0.01
 
 
-def _classes(labels: Sequence[np.ndarray | None]) -> dict[int, tuple[str, str]]:
-    """Name and colour of the commonest 255 ids."""
-    given = [ids.ravel() for ids in labels if ids is not None]
-    return class_colours(np.concatenate(given)[np.concatenate(given) > 0], most=255) if given else {}
-
-
 def _numbered(ids: np.ndarray, stack: np.ndarray, classes: dict[int, tuple[str, str]]) -> np.ndarray:
     """The place of each id among the classes, from 1 on, (T, H, W); 0 for none."""
     table = np.zeros(int(max(ids.max(initial=0), *classes, 0)) + 1, np.uint8)
@@ -171,6 +163,7 @@ def _numbered(ids: np.ndarray, stack: np.ndarray, classes: dict[int, tuple[str, 
 
 
 def _filled(contents: dict[str, Any], title: str) -> str:
+    # The policy lets the one script and the one style run, by their hashes.
     part = {name: files(__package__).joinpath(f"view.{name}").read_text("utf-8") for name in ("html", "css", "js")}
     # Within a script element only "<" could end it, or begin another one.
     data = json.dumps(contents, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
@@ -181,7 +174,6 @@ def _filled(contents: dict[str, Any], title: str) -> str:
 
 
 def _hash(text: str) -> str:
-    """Of the one script and the one style that the page lets run."""
     return "sha256-" + _text(hashlib.sha256(text.encode()).digest())
 
 

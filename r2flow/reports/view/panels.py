@@ -3,9 +3,9 @@
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,8 +24,7 @@ from r2flow.reports.views import View
 from r2flow.samplers import OnGrid
 
 
-@dataclass(frozen=True)
-class Panel:
+class Panel(NamedTuple):
     """One scan of a page, or several in the slider's turn.
 
     Attributes:
@@ -42,8 +41,7 @@ class Panel:
 
 def write_panels(path: str | Path, panels: Sequence[Panel], frames: Sequence[str] = (), title: str = "r2flow") -> Path:
     """Write the page of some panels."""
-    images, rays = [panel.images for panel in panels], [panel.rays for panel in panels]
-    captions, labels = [panel.caption for panel in panels], [panel.labels for panel in panels]
+    captions, images, rays, labels = zip(*panels, strict=True) if panels else ((), (), (), ())
     return write_page(path, images, rays, captions, frames=frames, labels=labels, title=title)
 
 
@@ -64,38 +62,32 @@ def in_turn(panels: Sequence[Panel], caption: str) -> tuple[Panel, list[str]]:
     Raises:
         InputError: they differ in size or rays, or some have reflectance or labels and some not.
     """
-    first = panels[0]
-    for panel in panels:
-        alike = panel.images.shape == first.images.shape and (panel.labels is None) == (first.labels is None)
-        if not alike or not torch.equal(panel.rays, first.rays):
-            raise InputError(f"{panel.caption} and {first.caption} differ in size, sensor, reflectance or labels: "
+    captions, images, rays, labels = zip(*panels, strict=True)
+    for name, image, ray, label in panels[1:]:
+        alike = image.shape == images[0].shape and (label is None) == (labels[0] is None)
+        if not alike or not torch.equal(ray, rays[0]):
+            raise InputError(f"{name} and {captions[0]} differ in size, sensor, reflectance or labels: "
                              "they cannot be frames of one sequence; leave --sequence out.")  # fmt: skip
-    labels = None if first.labels is None else np.concatenate([p.labels for p in panels if p.labels is not None])
-    images = np.concatenate([panel.images for panel in panels])
-    return Panel(caption, images, first.rays, labels), [panel.caption for panel in panels]
+    numbers = None if labels[0] is None else np.concatenate(labels)
+    return Panel(caption, np.concatenate(images), rays[0], numbers), list(captions)
 
 
 def sample_panels(flow: Checkpoint, label: str, num: int, seed: int = 0, steps: Sequence[int] = ()) -> list[Panel]:
-    """Scans 0 to num - 1 of a seed, a panel each; with `steps`, a panel for each number of steps, a scan each frame.
-
-    Raises:
-        InputError: numbers of steps that the generator cannot take.
-    """
+    """Scans 0 to num - 1 of a seed, a panel each; with `steps`, a panel for each number of steps, a scan each frame."""
     samplers = [flow.generator.choose(steps=count) for count in steps] or [flow.generator.sampler]
     drawn = []
     evaluations = num * sum(one.evaluations(flow.generator) or 0 for one in samplers)
     with ScanBar("sampling", num * len(samplers), evaluations) as bar:
         for one in samplers:
-            images = []
-            for made in sample(flow, num, seed, sampler=one, progress=bar.evaluated):
-                warn_unsolved(made.converged, made.first)
-                images.append(made.images.nan_to_num(0.0).numpy())
-            drawn.append(np.concatenate(images))
+            made = list(sample(flow, num, seed, sampler=one, progress=bar.evaluated))
+            for batch in made:
+                warn_unsolved(batch.converged, batch.first)
+            drawn.append(torch.cat([batch.images for batch in made]).nan_to_num(0.0).numpy())
             bar.finished(num * len(drawn))
     rays = flow.sensor.rays()
     if steps:
-        said = [f"{label}, {count} step{'s' * (count > 1)}" for count in steps]
-        return [Panel(caption, images, rays) for caption, images in zip(said, drawn, strict=True)]
+        captions = [f"{label}, {count} step{'s' * (count > 1)}" for count in steps]
+        return [Panel(caption, images, rays) for caption, images in zip(captions, drawn, strict=True)]
     return [Panel(f"{label}, sample {number}", image[None], rays) for number, image in enumerate(drawn[0])]
 
 
@@ -106,12 +98,7 @@ def way_panels(
 
     Between two times the flow's own solver takes its share of the steps, at least one, or the usual one where its own
     draws noise.
-
-    Raises:
-        InputError: a generator without an ODE, or fewer than two times.
     """
-    if times < 2:
-        raise InputError(f"a way has two ends: --times must be at least 2, found {times}.")
     solved = as_flow(flow.generator, "x_t")
     share = ode_sampler(solved).changed(steps=steps)
     if isinstance(share, OnGrid):
@@ -125,8 +112,7 @@ def way_panels(
             decoded.append(flow.encoding.decode(x.cpu()))
             bar.finished(len(decoded) - 1)
     images = torch.stack(decoded, 1).nan_to_num(0.0).numpy()
-    rays = flow.sensor.rays()
-    panels = [Panel(f"{label}, sample {number}", image, rays) for number, image in enumerate(images)]
+    panels = [Panel(f"{label}, sample {number}", image, flow.sensor.rays()) for number, image in enumerate(images)]
     return panels, [f"t = {t:.3g}" for t in at]
 
 
@@ -135,8 +121,7 @@ def write_sets(path: str | Path, sets: Mapping[str, ScanSet], num: int = 4, titl
     panels = []
     for name, scans in sets.items():
         some = scans.spread(num)
-        if not len(some):
-            continue
-        images = some.source.batch(range(len(some))).nan_to_num(0.0).numpy()
-        panels.append(Panel(f"{name}: {scans.label}", images, scans.sensor.rays()))
+        if len(some):
+            images = some.source.batch(range(len(some))).nan_to_num(0.0).numpy()
+            panels.append(Panel(f"{name}: {scans.label}", images, scans.sensor.rays()))
     return write_panels(path, panels, title=title)
