@@ -117,8 +117,8 @@ def test_a_sampler_without_a_fixed_number_of_steps_is_refused(sampler, tmp_path)
     ("options", "answer"),
     [
         (["--to", "onx"], "no export format named 'onx'"),
-        (["--what", "all"], "--what must be sampler or network"),
-        (["--what", "network", "--steps", "4"], "has no sampler: leave sampler, steps"),
+        (["--what", "all"], "--what"),
+        (["--what", "network", "--steps", "4"], "takes no sampler: leave sampler, steps"),
         (["--to", "pt2", "--out", "a.onnx"], "--to pt2 writes a .pt2, found --out a.onnx"),
         (["--sampler", "dopri5"], "give --sampler adams3 --steps 16"),
     ],

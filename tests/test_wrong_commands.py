@@ -87,7 +87,6 @@ sample run -o out --sampler dopri5 --grid power:2
 sample run -o out --grid power:0
 sample run -o out --grid power:10 --steps 64 # 64 steps on power:10
 sample run -o out --grid power:3 --steps 1000000 # too short for float64
-sample run -o out --margin 10 --sampler nope
 sample run -o out --plugin nope
 sample run -o out --plugin plugin.py
 sample run -o out --plugin empty
@@ -155,7 +154,7 @@ interpolate scans/000000.bin nowhere.bin -c run -o out
 interpolate scans/000000.bin bad.bin -c run -o out
 interpolate scans/000000.bin scans/000001.bin -c run -o file.txt
 interpolate scans scans -c run -o out # scan
-show scans/000000.bin -o out --format nope # png or npy
+show scans/000000.bin -o out --format nope
 show # Missing
 show scans # Missing
 show nowhere -o out
@@ -178,8 +177,6 @@ sensor bad.bin
 sensor file.txt
 sensor image.npy
 sensor scans -o out # a .yaml file
-sensor scans -o out.yaml --name 'a b'
-sensor scans -o out.yaml --name hdl64e
 sensor scans -o file.txt/out.yaml
 prepare nope:scans -o out
 prepare nowhere -o out
@@ -200,10 +197,6 @@ pairs empty
 pairs stopped
 pairs bad.ckpt
 pairs run --num 1 --seed 99999999999999999999
-pairs run --num 1 --first 99999999999999999999
-pairs run --num 1 --rank 1
-pairs run --num 1 --rank 2 --ranks 2
-pairs run --num 1 --ranks 2
 pairs run --num 1 -o file.txt
 weights --add
 weights --add nope file.txt

@@ -2,7 +2,7 @@
 
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -19,7 +19,9 @@ def export(
     to: Annotated[
         str, typer.Option(help="onnx for onnxruntime and its like, pt2 for torch, or safetensors for r2flow.")
     ] = "onnx",
-    what: Annotated[str, typer.Option(help="sampler: noise in, scan out; or network: v(t, x) alone.")] = "sampler",
+    what: Annotated[
+        Literal["sampler", "network"], typer.Option(help="sampler: noise in, scan out; or network: v(t, x) alone.")
+    ] = "sampler",
     half: Annotated[
         bool, typer.Option("--half", help="Large weights of a .safetensors in float16: half the size.")
     ] = False,
@@ -31,32 +33,32 @@ def export(
     averaged weights, config and sampler of any generator, to share; the same bytes each time.
     """
     from r2flow.model import export as writing
-    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
 
     if out is None:
         out = Path(f"{checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name}.{to}")
     elif out.suffix != f".{to}":
         raise InputError(f"--to {to} writes a .{to}, found --out {out}.")
+    if half and to != "safetensors":
+        raise InputError("--half is for --to safetensors.")
+    if (to == "safetensors" or what == "network") and how != SamplerOptions():
+        raise InputError(f"--to {to} --what {what} takes no sampler: leave sampler, steps, tolerance and grid out.")
+    loaded = load_checkpoint(checkpoint)
     if to == "safetensors":
-        _write_weights(checkpoint, out, half, how == SamplerOptions())
+        if out.exists() and out.samefile(loaded.path):
+            raise InputError(f"{out} would be replaced by what is made of it; give another name.")
+        save_checkpoint(loaded, out, half)
+        print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, SHA-256 {sha256(out.read_bytes()).hexdigest()}")
         return
     writing.FORMATS[to]
-    if half:
-        raise InputError("--half is for --to safetensors.")
-    if what not in ("sampler", "network"):
-        raise InputError(f"--what must be sampler or network, found {what!r}.")
-    network = what == "network"
-    if network and how != SamplerOptions():
-        raise InputError("--what network has no sampler: leave sampler, steps, tolerance and grid out.")
-    loaded = load_checkpoint(checkpoint)
     sampler = writing.flow_of(loaded).choose(**how.given)
-    written = writing.export(loaded, out, sampler, network)
-    size = f"{out.stat().st_size / 1e6:.1f} MB"
+    written = writing.export(loaded, out, sampler, what == "network")
     batch = "any batch" if written.any_batch else "one scan at a time, torch could not free its batch"
-    if network:
-        print(f"{out}: {size}, the network v(t, x), {batch}")
+    print(
+        f"{out}: {out.stat().st_size / 1e6:.1f} MB, {sampler if what == 'sampler' else 'the network v(t, x)'}, {batch}"
+    )
+    if what == "network":
         return
-    print(f"{out}: {size}, {sampler}, {batch}")
     try:
         apart = writing.compare(loaded, written, sampler)
     except InputError as missing:
@@ -66,15 +68,3 @@ def export(
         f"compared with the flow: range within {1000 * apart.metres:.2g} mm, reflectance within "
         f"{apart.reflectance:.2g}, {apart.rays} rays dropped by one alone"
     )
-
-
-def _write_weights(checkpoint: Path, out: Path, half: bool, as_is: bool) -> None:
-    from r2flow.model.checkpoint import load_checkpoint, save_checkpoint
-
-    if not as_is:
-        raise InputError("--to safetensors keeps the generator's own sampler: leave the sampler's options out.")
-    loaded = load_checkpoint(checkpoint)
-    if out.exists() and out.samefile(loaded.path):
-        raise InputError(f"{out} would be replaced by what is made of it; give another name.")
-    save_checkpoint(loaded, out, half)
-    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, SHA-256 {sha256(out.read_bytes()).hexdigest()}")

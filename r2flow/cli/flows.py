@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from json import dumps as to_json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -24,34 +24,23 @@ class RegionOptions:
     sector: Annotated[
         str | None, typer.Option(help="Azimuths in degrees, as -45,45 for the quarter ahead: generate no more.")
     ] = None
-    margin: Annotated[
-        float | None,
-        typer.Option(
-            min=0,
-            max=180,
-            help="Degrees on either side of --sector that are generated and cut off; 11.25 if left out.",
-        ),
-    ] = None
     rows: Annotated[str | None, typer.Option(help="Rows of the image, as 0-31 for the upper half of 64.")] = None
-    channels: Annotated[str, typer.Option(help="both, range, or reflectance: what is decoded and written.")] = "both"
+    channels: Annotated[Literal["both", "range", "reflectance"], typer.Option(help="What is decoded and written.")] = (
+        "both"
+    )
 
     def region(self, checkpoint: "Checkpoint") -> "Region | None":
         """The region of --sector and --rows; prints what is generated for it."""
         from r2flow.lidar.region import MARGIN, region
         from r2flow.model.sampling import evaluated_region
 
-        if self.sector is None and self.margin is not None:
-            raise InputError("--margin is for a --sector; found none.")
         if self.sector is None and self.rows is None:
             return None
         angles = self.sector and _pair("--sector", self.sector, ",", float, "two azimuths in degrees, as -45,45")
-        margin = (MARGIN if self.margin is None else self.margin) if self.sector else 0.0
         limits = self.rows and _pair("--rows", self.rows, "-", int, "the first and the last row, as 0-31")
-        wanted = region(checkpoint.sensor.shape, angles or None, limits or None, margin)
+        wanted = region(checkpoint.sensor.shape, angles or None, limits or None, MARGIN if angles else 0.0)
         seen = evaluated_region(checkpoint.generator, wanted)
-        with_margin = " with its margin" if wanted.margin else ""
-        rounded = "" if seen == wanted.widened() else f", rounded outward from {wanted}{with_margin}"
-        print(f"generating {seen}{rounded}: {seen.share:.0%} of the image")
+        print(f"generating {seen}, for {wanted}: {seen.share:.0%} of the image")
         return wanted
 
 

@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
@@ -14,7 +14,6 @@ from r2flow.cli.options import (
     ScaleChoice,
     SensorChoice,
     SizeOption,
-    check_words,
     named_columns,
     rows_and_columns,
 )
@@ -62,10 +61,11 @@ class ReadingOptions:
 
     sensor: SensorChoice = None
     size: SizeOption = None
-    projection: Annotated[str | None, typer.Option(help="spherical (usual) or unfolding.")] = None
-    convention: Annotated[str | None, typer.Option(help="centre (usual), or reference for the published models'.")] = (
-        None
-    )
+    projection: Annotated[Literal["spherical", "unfolding"] | None, typer.Option(help="Usual: spherical.")] = None
+    convention: Annotated[
+        Literal["centre", "reference"] | None,
+        typer.Option(help="Usual: centre; reference is that of the published models."),
+    ] = None
     reflectance_scale: ScaleChoice = None
     columns: ColumnsOption = None
 
@@ -73,7 +73,6 @@ class ReadingOptions:
         """`reading_for` these scans and this model with the options that are given."""
         from r2flow.data.opening import reading_for
 
-        check_words(projection=self.projection, convention=self.convention)
         return reading_for(
             specs, model, self.sensor, rows_and_columns(self.size), self.projection, self.convention,
             self.reflectance_scale, named_columns(self.columns),

@@ -62,21 +62,6 @@ def build_sized(sensor: str, size: str | None) -> "Sensor":
     return named_sensor(sensor, rows_and_columns(size))
 
 
-def check_words(**options: str | None) -> None:
-    """Check options that are one of a few words each, where they are given.
-
-    Raises:
-        InputError: another word.
-    """
-    from r2flow.lidar.projection import CONVENTIONS, PROJECTIONS
-
-    known = {"projection": PROJECTIONS, "convention": CONVENTIONS, "on_bad_scan": ("error", "skip")}
-    for option, value in options.items():
-        if value is not None and value not in known[option]:
-            words = ", ".join(known[option])
-            raise InputError(f"--{option.replace('_', '-')} must be one of {words}; found {value!r}.")
-
-
 def rows_and_columns(size: str | None) -> tuple[int, int] | None:
     """The numbers of an image size written as 64x1024."""
     if size is None:

@@ -33,13 +33,10 @@ def command() -> str:
     return shlex.join(["r2flow", *sys.argv[1:]])
 
 
-def finish(page: "Page", out: Path, said: Sequence[str] | None = None) -> None:
-    """Write a page; print its sentences, or `said`, and the files."""
+def finish(page: "Page", out: Path, said: Sequence[str]) -> None:
+    """Write a page; print these parts of it, and the files."""
     from r2flow.reports.pages import write_page
 
     written = write_page(page, out)
-    sentences = [part for part in page.text if not part.startswith("|")] if said is None else said
-    print("\n\n".join(sentences))
-    print()
-    for path in written:
-        print(path)
+    print("\n\n".join(said), end="\n\n")
+    print(*written, sep="\n")

@@ -1,13 +1,13 @@
 """The verb that turns a data set into prepared scans."""
 
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from r2flow.cli.app import app
 from r2flow.cli.groups import ReadingOptions, grouped
-from r2flow.cli.options import OutOption, check_words, cores
+from r2flow.cli.options import OutOption, cores
 from r2flow.errors import InputError
 
 
@@ -19,7 +19,9 @@ def prepare(
     out: OutOption,
     split: Annotated[str | None, typer.Option(help="A part of the layout's split; all of it if left out.")] = None,
     drives: Annotated[str | None, typer.Option(help="Names or numbers, separated by commas; all if left out.")] = None,
-    on_bad_scan: Annotated[str, typer.Option(help="error, or skip: leave out by name what cannot be used.")] = "error",
+    on_bad_scan: Annotated[
+        Literal["error", "skip"], typer.Option(help="skip: leave out by name what cannot be used.")
+    ] = "error",
     shard_scans: Annotated[int, typer.Option(min=1, help="Scans a file.")] = 64,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one a core if left out.")] = None,
 ) -> None:
@@ -33,7 +35,6 @@ def prepare(
     from r2flow.data.prepared import prepare as make
     from r2flow.progress import Bar
 
-    check_words(on_bad_scan=on_bad_scan)
     options, file = parse(scans)
     if file is not None:
         raise InputError(f"{scans} is one scan; give the folder of a data set.")

@@ -15,7 +15,6 @@ from r2flow.errors import InputError
 def sensor(
     scans: Annotated[list[Path], typer.Argument(help="Scan files, or folders of them, of one sensor.")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="The .yaml to write; none if left out.")] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the sensor; by default from that of the file.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
     columns: ColumnsOption = None,
     most: Annotated[int, typer.Option("--num", min=1, help="The most scans to read of a folder.")] = 8,
@@ -37,11 +36,8 @@ def sensor(
         raise InputError(f"--out must be a .yaml file, as --sensor expects; found {out}.")
     if out is not None and out.exists() and not overwrite:
         raise InputError(f"{out} exists; give another --out, or --overwrite to replace it.")
-    if name is None:
-        name = re.sub(r"\W", "_", out.stem, flags=re.ASCII) if out is not None else "mine"
-        name = f"my_{name}" if name in SENSORS or not name[:1].isalpha() else name
-    if name in SENSORS or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
-        raise InputError(f"--name must be letters, digits and _, and not that of a built-in sensor; found {name!r}.")
+    name = re.sub(r"\W", "_", out.stem, flags=re.ASCII) if out is not None else "mine"
+    name = f"my_{name}" if name in SENSORS or not name[:1].isalpha() else name
     folders = [scans_of(path) for path in scans]
     paths = [folder[index] for folder in folders for index in spread(len(folder), most)]
     points = [read_points(path, named_columns(columns)) for path in track(paths, "reading", "scans", least=16)]
@@ -49,9 +45,7 @@ def sensor(
     e, middle = mine.elevations, len(mine.elevations) // 2
     shown = " ... ".join(f"{a:+.2f} {b:+.2f}" for a, b in (e[:2], e[middle - 1 : middle + 1], e[-2:]))
     nearest, distance = nearest_sensor(beams.elevations)
-    scale = "none: encoding.reflectance=false"
-    if mine.reflectance_scale is not None:
-        scale = f"reflectance_scale={mine.reflectance_scale:g}"
+    scale = mine.reflectance_scale
     rows = [
         ("beams", f"{len(e)}: {beams.order}"),
         ("elevations", f"{shown} degrees"),
@@ -59,7 +53,7 @@ def sensor(
         ("resolution", f"{steps:,.0f} steps a turn; images of {mine.columns} columns"),
         ("range", f"{mine.min_range:g} to {mine.max_range:g} m; raise min_range if the vehicle itself is seen"),
         ("height", f"{mine.height:.2f} m above the ground"),
-        ("reflectance", scale),
+        ("reflectance", "none: encoding.reflectance=false" if scale is None else f"reflectance_scale={scale:g}"),
     ]
     print_table(rows, ("", ""))
     if out is not None:

@@ -15,7 +15,6 @@ def simulate(
     sensor: SensorOption = "hdl64e",
     size: SizeOption = None,
     seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Scan i depends on the seed and on i alone.")] = 0,
-    first: Annotated[int, typer.Option(min=0, max=2**63, help="Number of the first scan.")] = 0,
     format: Annotated[
         str, typer.Option(help="Any of bin,ply,pcd, or npy: the range image, (2, H, W) float32.")
     ] = "bin",
@@ -31,7 +30,7 @@ def simulate(
     formats = tuple(dict.fromkeys(format.split(",")))
     folder = SimulatedFolder(out, build_sized(sensor, size), seed, formats, labels)
     folder.begin()
-    missing = folder.missing(range(first, first + num))
+    missing = folder.missing(range(num))
     with Bar("simulating", len(missing), "scans") as advance:
         folder.make(missing, folder.simulate, workers or cores(), lambda scan: advance())
     kept = f", {num - len(missing)} were there already" if len(missing) < num else ""

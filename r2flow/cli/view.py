@@ -10,7 +10,7 @@ from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -52,7 +52,7 @@ def show(
     how: ReadingOptions,
     most: Annotated[int, typer.Option("--num", min=1, help="The most scans to draw of a folder.")] = SCANS,
     labels: Annotated[bool, typer.Option("--labels", help="Draw the classes of .label files, too.")] = False,
-    format: Annotated[str, typer.Option(help="png, or npy for range images, (2, H, W).")] = "png",
+    format: Annotated[Literal["png", "npy"], typer.Option(help="npy: range images, (2, H, W).")] = "png",
 ) -> None:
     """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each; or write range images."""
     import numpy as np
@@ -60,8 +60,6 @@ def show(
     from r2flow.files import atomic_write
     from r2flow.reports.pictures import save_figure, scan_figure
 
-    if format not in ("png", "npy"):
-        raise InputError(f"--format must be png or npy, found {format!r}.")
     names: list[str] = []
     for view in views(scans, how, most):
         stem = view.path.stem

@@ -23,17 +23,16 @@ def weights(
     ~/.cache/r2flow/models. A network is read as tensors alone, checked and kept in R2FLOW_WEIGHTS, or
     ~/.cache/r2flow/weights.
     """
+    from r2flow.metrics.extractors.weights import SOURCES, kept, kept_file, weights_folder
+    from r2flow.metrics.extractors.weights import add as take
     from r2flow.models import MODELS, add_model, model_file, models_folder
     from r2flow.reports.tables import print_table
 
-    if add is not None and add[0] in MODELS:
-        print(f"{add_model(*add)}: the model {add[0]}")
-        return
-    from r2flow.metrics.extractors.weights import SOURCES, kept, kept_file, weights_folder
-    from r2flow.metrics.extractors.weights import add as take
-
     if add is not None:
         name, path = add
+        if name in MODELS:
+            print(f"{add_model(name, path)}: the model {name}")
+            return
         if name not in SOURCES:
             known = [*MODELS, *SOURCES]
             raise InputError(f"no weights named {name!r}; known: {', '.join(known)}.{did_you_mean(name, known)}")

@@ -105,14 +105,14 @@ def test_formats_that_cannot_be_written_are_named(tmp_path, formats, labels, wor
 
 
 def test_the_verb_writes_the_scans_of_any_sensor(tmp_path, monkeypatch, capsys, sensor):
-    command = ["r2flow", "simulate", "--num", "1", "--first", "2", "--sensor", sensor.name, "--seed", "4"]
+    command = ["r2flow", "simulate", "--num", "1", "--sensor", sensor.name, "--seed", "4"]
     monkeypatch.setattr(sys, "argv", [*command, "--format", "npy,ply", "--size", "16x64", "--out", str(tmp_path)])
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == 0
     assert "1 scans (npy, ply)" in capsys.readouterr().out
-    image = np.load(tmp_path / "000002.npy")
-    np.testing.assert_array_equal(image, simulate(sensor.resized(16, 64), 4, 2).image)
+    image = np.load(tmp_path / "000000.npy")
+    np.testing.assert_array_equal(image, simulate(sensor.resized(16, 64), 4, 0).image)
     assert (
         json.loads((tmp_path / "manifest.json").read_text("utf-8"))["recipe"]["reading"]["sensor"]["name"]
         == sensor.name
