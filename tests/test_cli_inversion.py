@@ -126,7 +126,7 @@ class TestBadInput:
         self.check(r2flow(*options, "--sector", "10,10.0000001"), out, "narrower than a column")
         self.check(r2flow(*options, "--rows", "0-8"), out, "0-7", "found 0-8")
         self.check(r2flow(*options, "--rows", "1,2"), out, "--rows", "as 0-31")
-        self.check(r2flow(*options, "--channels", "depth"), out, "both, range or reflectance", "'depth'")
+        self.check(r2flow(*options, "--channels", "depth"), out, "'both', 'range', 'reflectance'", "'depth'")
         self.check(r2flow(*options, "--channels", "range", "--format", "bin"), out, "leaves it out", "ply,npy")
         self.check(r2flow(*options, "--channels", "reflectance", "--format", "ply"), out, "need a range")
         alone = write_checkpoint(tmp_path / "range", reflectance=False)
