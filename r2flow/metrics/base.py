@@ -73,6 +73,7 @@ class ScanMetric(Metric):
         fewest: Scans of each set that an interval takes.
         of_equal_sets: The value of its figures for two equal sets; None where it depends on the sets.
         better: Which way its figures are better; a distance's smaller ones are.
+        ordered: Whether figures depend on the order of the scans, whose neighbours are then kept together.
 
     Args:
         keep: Whether the rows are kept, for bootstrap intervals.
@@ -95,6 +96,7 @@ class ScanMetric(Metric):
     fewest: ClassVar[int] = 2
     of_equal_sets: ClassVar[float | None] = 0.0
     better: ClassVar[Better] = "smaller"
+    ordered: ClassVar[bool] = False
 
     def __init__(
         self, keep: bool = False, *, sensor: Sensor | None = None, name: str | None = None, **options: Any

@@ -75,7 +75,8 @@ def test_figures_do_not_depend_on_processes_or_the_order_of_scans(build, sets, p
         for k, first in enumerate(range(0, len(scans), 2)):
             ranks[k % processes].update(part(scans, slice(first, first + 2)), side == "real", first)
     shuffled = {s: part(scans, torch.randperm(len(scans))) for s, scans in sets.items()}
-    for values in (backwards, shared_by(ranks).compute(), give(build(), shuffled).compute()):
+    orders = [] if build().ordered else [give(build(), shuffled).compute()]
+    for values in (backwards, shared_by(ranks).compute(), *orders):
         assert values == pytest.approx(expected, rel=1e-10, abs=1e-13)
 
 
@@ -228,6 +229,8 @@ def test_images_are_given_as_tensors_in_batches_without_numbers(build, sets):
 
 def test_merged_states_are_those_of_all_scans(build, sets):
     expected = give(build(), sets).compute()
+    if build().ordered:
+        pytest.skip("the scans of a merged state are numbered from 0 again")
     halves = [{s: part(x, numbers) for s, x in sets.items()} for numbers in (slice(0, 5), slice(5, None))]
     parts = [told(build(sensor=SMALL, keep=True), half) for half in halves]
     parts[1].persistent(True)
