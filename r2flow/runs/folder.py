@@ -147,10 +147,10 @@ def check_run(run: str | Path, config: Mapping[str, Any]) -> None:
 def _another_config(run: str | Path, differing: list[str]) -> str:
     more = f" (and {len(differing) - 3} more)" if len(differing) > 3 else ""
     length = all(one.startswith("trainer.max_steps=") for one in differing)
-    changed = f", change it in {Path(run, CONFIG)} too" if length else ""
+    more_steps = f", stage.init={run} name=OTHER to learn on from its weights" if length else ""
     return (
         f"{run} holds a run of another config: {'; '.join(differing[:3])}{more}. "
-        f"Give the same command to resume it{changed}, or name=OTHER for a new one."
+        f"Give the same command to resume it{more_steps}, or name=OTHER for a new one."
     )
 
 

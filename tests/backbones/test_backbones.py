@@ -12,6 +12,7 @@ from reference_cases import relative
 from tiny_backbones import COLUMNS, NAMES, PUBLISHED, ROWS, image, tiny, untrained
 
 from r2flow.backbones import BACKBONES, build_backbone, configurations
+from r2flow.backbones.cost import count_macs
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS, build_sensor
 
@@ -165,9 +166,15 @@ def test_a_shape_that_is_not_whole_units_names_the_nearest_that_are(name, dimens
 
 @pytest.mark.parametrize("name", NAMES)
 def test_an_image_of_another_shape_is_refused(name):
-    for other in ((2, ROWS, 2 * COLUMNS), (3, ROWS, COLUMNS)):
-        with pytest.raises(InputError, match=r"built for images of \(2, 16, 64\), found \((2, 16, 128|3, 16, 64)\)"):
-            tiny(name)(0.5, torch.randn(1, *other))
+    model = tiny(name)
+    with pytest.raises(InputError, match=r"built for images of \(2, 16, 64\), found \(3, 16, 64\)"):
+        model(0.5, torch.randn(1, 3, ROWS, COLUMNS))
+    wide = torch.randn(1, 2, ROWS, 2 * COLUMNS)
+    if model.any_size:
+        assert model(0.5, wide).shape == wide.shape
+    else:
+        with pytest.raises(InputError, match=r"built for images of \(2, 16, 64\), found \(2, 16, 128\)"):
+            model(0.5, wide)
 
 
 @pytest.mark.parametrize("position", ["fourier_features", "polar", "spherical_harmonics", "none", None])
@@ -223,6 +230,20 @@ def test_every_configuration_builds_for_every_sensor(config):
     with torch.device("meta"):
         for sensor in SENSORS:
             build_backbone(configurations()[config], build_sensor(sensor).rays(), 2)
+
+
+@pytest.mark.parametrize(
+    ("names", "count"),
+    [
+        (("hdit_18m", "adm_unet_18m", "efficient_unet_18m"), lambda model: sum(p.numel() for p in model.parameters())),
+        (("hdit_18m", "adm_unet_15g", "efficient_unet_15g"), count_macs),
+    ],
+)
+def test_backbones_of_an_ablation_are_of_one_size_or_one_cost(names, count):
+    with torch.device("meta"):
+        rays = build_sensor("hdl64e").rays()
+        counts = [count(build_backbone(configurations()[name], rays, 2)) for name in names]
+    assert max(counts) <= 1.1 * min(counts)
 
 
 @pytest.mark.parametrize("config", MODELS)

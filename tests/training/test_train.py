@@ -197,7 +197,7 @@ def test_another_config_in_the_same_folder_is_refused(train: Run, copied: Path):
 def test_another_length_of_a_begun_run_has_a_place(train: Run, copied: Path):
     done = train("name=copied", "trainer.max_steps=5000", check=False)
     assert done.returncode == 2
-    assert "resume it, change it in runs/copied/config.yaml too, or name=OTHER for a new one." in done.stderr
+    assert "stage.init=runs/copied name=OTHER to learn on from its weights" in done.stderr
 
 
 def test_a_folder_that_now_holds_other_scans_is_refused(train: Run, copied: Path, scans: Path, tmp_path: Path):
