@@ -29,7 +29,7 @@ class Curvature(Periodic):
 
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         flow = pl_module.generator
-        if not isinstance(flow, Flow):
+        if not isinstance(flow, Flow) or not flow.draws:
             return
         x_0 = Draws(self.seed, range(self.num)).start(flow.noise_shape).to(pl_module.device)
         found = curvature(flow.velocity, x_0, self.steps)

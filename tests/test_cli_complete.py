@@ -16,6 +16,7 @@ from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.transfer import image_through
 from r2flow.noise import generator
+from r2flow.simulator import simulate
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from r2flow.store import Store
 from tests.data.conftest import prepare_folder
@@ -28,11 +29,11 @@ COMPLETE = "complete", "--pictures", "0"
 
 
 def write_run(path: Path, **options) -> Path:
-    """A run folder with a conditional flow of random weights, 8 x 64."""
+    """A run folder with a transfer flow of random weights, 8 x 64."""
     made = network(**options)
     content = {
         "state_dict": {f"generator.{name}": value for name, value in made.generator.state_dict().items()},
-        "config": {**made.config, "stage": {"name": "conditional"}}, "global_step": 7,
+        "config": {**made.config, "stage": {"name": "transfer"}}, "global_step": 7,
         "sampler": made.generator.sampler.asdict(),
     }  # fmt: skip
     AtomicCheckpointIO().save_checkpoint(content, path / "checkpoints" / "step-00000007.ckpt")
@@ -103,7 +104,7 @@ def test_a_sparser_sensor_is_found_and_its_points_come_back(r2flow, run, tmp_pat
         same = {tuple(p) for p in answer.xyz} & {tuple(p) for p in xyz.astype(np.float32)}
         assert len(same) == 6 * 64  # of each measured pixel one of the points
         assert answer.reflectance.std() > 0  # the model's
-    assert not np.array_equal(answers[0].xyz, answers[1].xyz)
+    assert not np.array_equal(answers[0].reflectance, answers[1].reflectance)
     with np.load(tmp_path / "out" / "room.spread.npz") as spread:
         assert spread["deviation"].shape == spread["returned"].shape == (8, 64)
         assert ((spread["deviation"] == 0) & (spread["returned"] == 1)).sum() >= 6 * 64
@@ -411,3 +412,31 @@ def test_points_of_a_coarser_sensor_leave_as_much_open_as_its_image(
     for ray in Ray:
         assert abs(int((found.state == ray).sum()) - int((expected.state == ray).sum())) <= rows * columns // 50
     assert ("32 rays a turn" in said) == (columns == 32)
+
+
+@pytest.mark.parametrize(
+    ("mask", "more", "model", "size"),
+    [
+        ("rows:4", (), "densify", "64x1024"),
+        ("rows:2", ("--size", "32x256"), "densify", "32x256"),
+        ("rows:2", ("--to", "vlp16", "--size", "16x128"), "densify", "16x128"),
+        ("sector:-60,60", ("--steps", 1), "street", "32x256"),
+        ("rows:4", ("--sampler", "replace", "--steps", 1), "street", "32x256"),
+    ],
+)
+def test_the_model_is_chosen_by_what_is_missing(r2flow, tmp_path, mask, more, model, size):  # noqa: F811
+    image = simulate(SENSORS["hdl64e"].resized(64, 512), 5, 0).image
+    write_points(tmp_path / "one.ply", *image_to_points(image, SENSORS["hdl64e"].resized(64, 512).rays()))
+    asked = (tmp_path / "one.ply", "--from", "hdl64e", "--mask", mask, *more, "--out", tmp_path / "out")
+    code, said, _ = r2flow(*COMPLETE, *asked)
+    assert code == 0
+    assert f"the model {model}: " in said
+    assert f"of the image, {size}" in said
+    assert len(read_points(tmp_path / "out" / "one.ply").xyz) > 1000
+
+
+def test_a_model_of_one_image_takes_no_other(r2flow, tmp_path):  # noqa: F811
+    full_scan(tmp_path / "one.npy")
+    code, _, said = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", "street", "--to", "vlp16", "--out", tmp_path / "out")
+    assert (code, "--to and --size" in said) == (2, True)
+    assert not (tmp_path / "out").exists()

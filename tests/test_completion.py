@@ -9,7 +9,7 @@ from r2flow.errors import InputError
 from r2flow.generators import Generator, build_generator
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.model.completion import ANSWER, ROUGH, SURE, TAILS, complete, completing, settled, spread_of
+from r2flow.model.completion import ANSWER, complete, completing, spread_of
 from r2flow.noise import Draws, generator
 from r2flow.samplers import build_sampler
 from tests.test_checkpoints import CONFIG
@@ -17,12 +17,14 @@ from tests.test_checkpoints import CONFIG
 SHAPE = 8, 64
 
 
-def network(name: str = "conditional_flow", reflectance: bool = True, **backbone) -> Checkpoint:
+def network(name: str = "transfer_flow", reflectance: bool = True, **backbone) -> Checkpoint:
     config = {
         **CONFIG,
         "generator": {"name": name},
         "encoding": {"format": "logscale", "reflectance": reflectance},
-        "backbone": {**CONFIG["backbone"], "position": "none", "ring": True, **backbone},
+        "backbone": {**CONFIG["backbone"], "position": "none", "ring": True, **backbone}
+        if name != "transfer_flow"
+        else {"name": "local", "channels": 8, "dilations": [1, 2]},
     }
     torch.manual_seed(4)
     made = build_generator(config).eval().requires_grad_(False)
@@ -77,7 +79,7 @@ def test_a_scan_of_which_everything_is_known_comes_back_without_an_evaluation():
 
 
 def test_a_scan_of_which_nothing_is_known_is_the_sample_of_its_number():
-    checkpoint = network()
+    checkpoint = network("rectified_flow")
     nothing = torch.zeros(3, 2, *SHAPE)
     state = torch.zeros(3, *SHAPE, dtype=torch.uint8)
     found = checkpoint.complete(nothing, state, num=2, seed=5)
@@ -115,12 +117,14 @@ def test_scans_that_are_known_in_part_wholly_and_not_at_all_go_together():
     state = halved(images)
     state[1] = ray_states(images)[1]
     state[2] = Ray.UNKNOWN
-    checkpoint = network()
-    found = list(complete(checkpoint, images, state, num=2, batch_size=4))
-    assert [one.evaluations.tolist() for one in found] == [[3, 3], [0, 0], [3, 3]]
+    checkpoint = network("rectified_flow")
+    found = list(complete(checkpoint, images, state, num=2, batch_size=4, sampler=build_sampler("replace", steps=2)))
+    assert [one.evaluations.tolist() for one in found] == [[2, 2], [0, 0], [3, 3]]
     assert torch.equal(found[1].images[0], images[1])
     for i, one in enumerate(found):
-        (alone,) = complete(checkpoint, images[i : i + 1], state[i : i + 1], num=2, first=i)
+        (alone,) = complete(
+            checkpoint, images[i : i + 1], state[i : i + 1], num=2, first=i, sampler=build_sampler("replace", steps=2)
+        )
         torch.testing.assert_close(one.images, alone.images, rtol=1e-4, atol=1e-4)
 
 
@@ -206,41 +210,3 @@ def test_what_fits_nothing_is_refused(changed, message):
     given = {"images": images, "state": torch.zeros(1, *SHAPE, dtype=torch.uint8), **changed}
     with pytest.raises(InputError, match=message):
         list(complete(network(), **given))
-
-
-def test_settled_answers_scatter_as_the_surface_leaves_it():
-    draws = torch.Generator().manual_seed(2)
-    surface, error = torch.tensor(20.0), torch.tensor(0.03)
-    left = TAILS * 0.03
-    around = surface * ((ROUGH**2 + left**2) ** 0.5 * torch.randn(200_000, generator=draws).clamp(-3, 3)).exp()
-    logs = (settled(around, surface, error) / surface).log()
-    assert float(logs.std()) == pytest.approx(left, rel=0.02)  # three deviations of 200,000 draws are 0.5 %
-    assert float(logs.mean()) == pytest.approx(0, abs=3 * left / 200_000**0.5)
-
-
-def test_settled_answers_far_off_stay_unless_the_surface_is_sure():
-    r = torch.tensor([40.0, 40.0, 0.0, 21.0])
-    surface = torch.full((4,), 20.0)
-    error = torch.tensor([2 * SURE, SURE / 2, 0.001, torch.inf])
-    assert settled(r, surface, error).tolist() == [40, 20, 0, 21]
-
-
-@pytest.mark.parametrize(("kind", "method"), [("rectified_flow", "mmps"), ("conditional_flow", "euler")])
-def test_answers_of_a_flow_are_moved_to_surfaces(kind, method):
-    images = scans()
-    images[:, 0] = torch.where(images[:, 0] > 0, 7.0, 0)  # walls around the sensor
-    state = halved(images)
-    plain = network(kind)
-    how = {"num": 2, "sampler": build_sampler(method, steps=2)}
-    by_default, without = plain.complete(images, state, **how), plain.complete(images, state, on_surfaces=False, **how)
-    known = (state != Ray.UNKNOWN)[:, None, None].expand_as(without)
-    assert torch.equal(by_default[known], without[known])
-    assert torch.equal(by_default[:, :, 0] > 0, without[:, :, 0] > 0)
-    assert torch.equal(by_default[:, :, 1], without[:, :, 1])
-    surrounded = torch.zeros(SHAPE, dtype=torch.bool)
-    surrounded[3] = True
-    inside = surrounded & (images[:, 0].roll(1, 1) > 0) & (images[:, 0].roll(-1, 1) > 0)
-    returned = inside[:, None] & (without[:, :, 0] > 0)
-    off, left = (one[:, :, 0][returned] - 7 for one in (without, by_default))
-    assert returned.any()
-    assert float(left.abs().mean()) < 0.5 * float(off.abs().mean())

@@ -99,8 +99,8 @@ def test_a_size_that_is_no_multiple(shape):
 
 
 def test_other_generators_do_not_grow():
-    with pytest.raises(InputError, match="holds a ConditionalFlow; only a flow of whole scans can grow"):
-        grown(flow(generator={"name": "conditional_flow"}), (16, 128))
+    with pytest.raises(InputError, match="holds a TransferFlow; only a flow of whole scans can grow"):
+        grown(flow(generator={"name": "transfer_flow"}, backbone={"name": "local"}), (16, 128))
 
 
 def test_a_diffusion_has_no_time_for_a_pyramid():

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
@@ -13,8 +14,13 @@ from r2flow.config import learned
 from r2flow.data.pairs import default_folder
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import is_checkpoint
+from r2flow.lidar.interpolation import interpolated
+from r2flow.lidar.known import parse_mask, ray_states
+from r2flow.lidar.sensors import build_sensor
+from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import find_checkpoint, load_checkpoint, save_checkpoint
 from r2flow.models import MODELS, SHIPPED, Model, add_model, find_model, model_file, name_of
+from r2flow.simulator import simulate
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 
@@ -26,10 +32,31 @@ def test_a_model_of_the_package_draws(name):
     found = load_checkpoint(name)
     assert found.path == find_model(name) == SHIPPED / f"{name}.safetensors"
     assert all(value.isfinite().all() for value in found.generator.state_dict().values())
+    if not found.generator.draws:
+        with pytest.raises(InputError, match="r2flow complete"):
+            found.sample(1)
+        return
     images = found.sample(1, steps=1)
     assert images.shape == (1, *found.generator.space.shape)
     assert images.isfinite().all()
     assert torch.equal(images, found.sample(2, steps=1)[:1])
+
+
+@pytest.mark.parametrize("size", [(64, 1024), (32, 256)])
+@pytest.mark.parametrize("task", ["rows:4", "points:0.1"])
+def test_densify_is_ahead_of_interpolation(size, task):
+    sensor = build_sensor("hdl64e", *size)
+    image = simulate(sensor, 77, 0).image
+    measured = parse_mask(task)(size, np.random.default_rng(0))
+    state = ray_states(torch.from_numpy(image)[None], torch.from_numpy(measured))
+    found = load_checkpoint("densify").through(sensor)
+    answer = found.complete(torch.from_numpy(image * measured)[None], state)[0, 0].numpy()
+    line = interpolated(image * measured, measured)
+    ours, lines = (errors(image, one, ~measured, sensor) for one in (answer, line))
+    assert ours["drop_wrong"] < 0.6 * lines["drop_wrong"]
+    assert ours["iou"] > 1.15 * lines["iou"]
+    assert ours["chamfer_m"] < lines["chamfer_m"]
+    assert ours["mae_all_m"] < lines["mae_all_m"]
 
 
 def test_the_wheel_can_bear_the_models():

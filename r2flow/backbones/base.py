@@ -36,6 +36,7 @@ class Backbone(ExactBuffers):
     - takes_second_time: It can be built with `second_time=True`. It then has an `interval_embedding` of s - t, made
       after all else, whose last layer is zero, and `velocity` is given s (see `condition`).
     - croppable: It can be evaluated on a part of its image. Layers that use the ring have a method `open_ring`.
+    - any_size: It takes images of any number of rows and columns.
     - learns_directions: It learns a vector for each direction, so that scans must not be turned in training.
     - tiny_options: Options that build it in milliseconds, for tests.
 
@@ -53,6 +54,7 @@ class Backbone(ExactBuffers):
 
     takes_second_time: ClassVar[bool] = False
     croppable: ClassVar[bool] = False
+    any_size: ClassVar[bool] = False
     coords: Tensor
     interval_embedding: nn.Module
 
@@ -86,7 +88,7 @@ class Backbone(ExactBuffers):
         Returns:
             (B, C', H, W), in x's type.
         """
-        expected = self.in_channels, *self.coords.shape[2:]
+        expected = self.in_channels, *(x.shape[2:] if self.any_size else self.coords.shape[2:])
         if x.shape[1:] != expected:
             raise InputError(f"this backbone was built for images of {expected}, found {tuple(x.shape[1:])}.")
         assert s is None or self.second_time, "this backbone was built for one time and takes no s"

@@ -13,10 +13,11 @@ from r2flow.cli.options import (
     DeviceOption,
     OutOption,
     PrecisionOption,
-    SurfacesOption,
+    SizeOption,
     build_sized,
     choose_device,
     named_columns,
+    rows_and_columns,
 )
 
 
@@ -28,13 +29,22 @@ def complete(
     how: SamplerOptions,
     checkpoint: Annotated[
         Path | None,
-        typer.Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model; street if left out."),
+        typer.Option(
+            "--checkpoint",
+            "-c",
+            help="A checkpoint file, a run folder or a model; if left out densify, and street for what lies in sectors "
+            "without any ray or with --sampler.",
+        ),
     ] = None,
     precision: PrecisionOption = "32-true",
     source: Annotated[
         str | None,
         typer.Option("--from", help="Sensor of the scans, by name or YAML; found in the scans if left out."),
     ] = None,
+    to: Annotated[
+        str | None, typer.Option(help="Sensor of the answers, by name or YAML, of a model for any; the model's own.")
+    ] = None,
+    size: SizeOption = None,
     mask: Annotated[
         str | None,
         typer.Option(help="Keep a part of what was measured: rows:4, random:0.5, points:0.1, sector:-30,30, FILE.npy."),
@@ -43,7 +53,6 @@ def complete(
         bool,
         typer.Option("--fill-gaps", help="Take rays without a return as not measured, as in a thinned scan."),
     ] = False,
-    surfaces: SurfacesOption = True,
     reflectance_scale: Annotated[
         float | None,
         typer.Option(min=1e-6, max=1e9, help="Value in the files that means full reflectance; found if left out."),
@@ -66,21 +75,31 @@ def complete(
 
     import numpy as np
 
-    from r2flow.data.opening import reading_for
+    from r2flow.data.opening import named_sensor, reading_for
     from r2flow.data.partial import open_partial
-    from r2flow.lidar.known import mask_identity, parse_mask
+    from r2flow.generators import TransferFlow
+    from r2flow.lidar.known import mask_identity, parse_mask, share_in_sectors
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.model.completion import completing
-    from r2flow.models import DEFAULT, MODELS, find_model
-    from r2flow.reports.completed import Job, answer_ending, write_completed
+    from r2flow.models import DEFAULT, DENSIFY, MODELS
+    from r2flow.reports.completed import Job, answer_ending, hiding, write_completed
 
-    if checkpoint is None:
-        print(f"the model {DEFAULT}: {MODELS[DEFAULT].about} (r2flow info {DEFAULT})")
-    keep = None if mask is None else parse_mask(mask)
+    job = Job(num, seed, None if mask is None else parse_mask(mask), fill_gaps, batch_size, pictures, precision)
     sensor = None if source is None else build_sized(source, None)
-    loaded = load_checkpoint(checkpoint or find_model(DEFAULT), device=choose_device(device))
-    reading = replace(reading_for([], loaded), columns=named_columns(columns))
-    partial, said = open_partial(what, reading, sensor, reflectance_scale, scans)
+    name = str(checkpoint or (DEFAULT if how.sampler else DENSIFY))
+    while True:
+        loaded = load_checkpoint(name, device=choose_device(device))
+        if to or size:
+            loaded = loaded.through(named_sensor(to or loaded.sensor, rows_and_columns(size)))
+        reading = replace(reading_for([], loaded), columns=named_columns(columns))
+        partial, said = open_partial(what, reading, sensor, reflectance_scale, scans)
+        if checkpoint or name == DEFAULT or to or size or share_in_sectors(hiding(partial[0], job, 0)[1].state) < 0.5:
+            break
+        name = DEFAULT
+    if said and isinstance(loaded.generator, TransferFlow):  # of another sensor, which fills other rows
+        loaded = loaded.through(loaded.sensor, numbered=False)
+    if checkpoint is None:
+        print(f"the model {name}: {MODELS[name].about} (r2flow info {name})")
     sampler = completing(loaded.generator, **how.given)
     for line in said:
         print(line)
@@ -88,12 +107,10 @@ def complete(
         print(f"answers to {ending} are written as .ply")
     if not loaded.encoding.reflectance:
         print("the model is of range alone: answers have no reflectance")
-    size = "x".join(map(str, loaded.sensor.shape))
-    print(f"an answer has at most one point in each pixel of the model's image, {size}")
-    job = Job(num, seed, keep, fill_gaps, batch_size, surfaces, pictures, precision)
+    print(f"an answer has at most one point in each pixel of the image, {'x'.join(map(str, loaded.sensor.shape))}")
     about = {
         "mask": mask and mask_identity(mask), "from": source, "reflectance_scale": reflectance_scale,
-        "columns": columns,
+        "columns": columns, "to": to, "size": size,
     }  # fmt: skip
     done = write_completed(loaded, partial, out, job, sampler, about)
     skipped = len(partial) - len(done)

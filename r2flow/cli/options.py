@@ -23,10 +23,6 @@ PrecisionOption = Annotated[
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", show_default=False)]
 SensorOption = Annotated[str, typer.Option(help="Name of the sensor, or the YAML file of your own (r2flow sensor).")]
 SizeOption = Annotated[str | None, typer.Option(help="Rows x columns, as 64x1024; the sensor's own if left out.")]
-SurfacesOption = Annotated[
-    bool,
-    typer.Option("--surfaces/--no-surfaces", help="Move answers to the surfaces that measured returns lie on."),
-]
 SETS = "a folder of scans, samples, a run, prepared shards, NAME:FOLDER, simulated:SEED"
 SensorChoice = Annotated[
     str | None, typer.Option(help="Name of the sensor; that of the flow or the scans, or hdl64e, if left out.")

@@ -15,7 +15,6 @@ from r2flow.cli.options import (
     ScaleChoice,
     SensorOption,
     SizeOption,
-    SurfacesOption,
     build_sized,
     choose_device,
 )
@@ -125,7 +124,7 @@ def backbones(
 def completion(
     real: Annotated[str, typer.Argument(help=f"Scans, of which a part is hidden: {SETS}.")],
     models: Annotated[
-        list[str] | None, typer.Argument(help="Models, run folders or checkpoint files; street if left out.")
+        list[str] | None, typer.Argument(help="Models, run folders or checkpoint files; densify if left out.")
     ] = None,
     tasks: Annotated[
         str | None, typer.Option(help="Masks, as rows:4, a space between them; five masks if left out.")
@@ -136,7 +135,6 @@ def completion(
     answers: Annotated[int, typer.Option(min=1, help="Answers to each scan; 19 give intervals of 90 %.")] = 8,
     seed: Annotated[int, typer.Option(min=0, help="Of the noise. What is hidden of a scan does not depend on it.")] = 0,
     batch_size: Annotated[int, typer.Option(min=1, help="Answers at once.")] = 4,
-    surfaces: SurfacesOption = True,
     reflectance_scale: ScaleChoice = None,
     device: DeviceOption = "auto",
     out: OutOption = Path("reports"),
@@ -147,11 +145,12 @@ def completion(
     from r2flow.inversion import real_scans
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.model.completion import completing
+    from r2flow.models import DENSIFY
     from r2flow.progress import Bar
     from r2flow.reports.completion import TASKS, Way, completion_page, completion_rows, measured_by, pictured
     from r2flow.reports.pages import prepare_folder
 
-    loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in models or ["street"]}
+    loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in models or [DENSIFY]}
     ways = [
         Way(name, one, completing(one.generator, **SamplerOptions(sampler, steps).given))
         for name, one in loaded.items()
@@ -168,9 +167,7 @@ def completion(
     prepare_folder(out)
     cost = sum(way.sampler.evaluations(way.checkpoint.generator) or 0 for way in ways) * len(masks)
     with Bar("completing", len(truths) * -(-answers // batch_size) * cost, "evaluations") as advance:
-        shown = list(
-            completion_rows(truths, first.sensor, ways, masks, answers, seed, batch_size, surfaces, progress=advance)
-        )
+        shown = list(completion_rows(truths, first.sensor, ways, masks, answers, seed, batch_size, progress=advance))
     figure = pictured(truths[0], shown, first.sensor)
     about = f"{len(truths)} scans of {real}, {answers} answers to each."
     page = completion_page([row for row, _ in shown], figure, about, seed, command(), str(choose_device(device)))
@@ -202,7 +199,7 @@ def paper(
         role, _, model = text.rpartition("=")
         checkpoint = load_checkpoint(model, where)
         if not checkpoint.generator.draws:
-            raise InputError(f"{model} is an autoencoder and draws no scans.")
+            raise InputError(f"{model} draws no scans from noise.")
         runs.append(PaperRun(role or role_of(checkpoint, Path(model).stem), model, checkpoint))
     scans = None if real is None else open_scans(real, reading_for([], runs[0].checkpoint))
     prepare_folder(out)

@@ -21,6 +21,7 @@ from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     sensors,
     simulate,
     train,
+    translate,
     unpack,
     view,
     weights,
@@ -36,7 +37,7 @@ USAGE_ERROR: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "
 # The verbs of --help in their order.
 GROUPS = {
     "Make": ("train", "pairs"),
-    "Draw": ("sample", "complete", "interpolate"),
+    "Draw": ("sample", "complete", "translate", "interpolate"),
     "Look": ("view", "show"),
     "Measure": ("evaluate", "compare"),
     "Data": ("simulate", "prepare", "sensor"),

@@ -19,7 +19,6 @@ from r2flow.samplers.base import Condition, Generated, Progress, Sampler
 Precision = Literal["32-true", "bf16-mixed"]  # words of Lightning's trainer
 
 IMAGE, KNOWN = "image", "known"  # the names of what is known of a part of a scan
-LOGIT, SIGMA = "logit", "sigma"  # and of what a conditional flow finds of these once (`r2flow.generators.conditional`)
 
 WHOLE_ONLY = "a {} makes whole images and no part of one; leave the region out."
 
@@ -32,7 +31,7 @@ def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor]:
     """
     if condition is None:
         return torch.zeros_like(x), torch.zeros_like(x)
-    if condition.keys() - {LOGIT, SIGMA} != {IMAGE, KNOWN}:
+    if not condition.keys() >= {IMAGE, KNOWN}:
         raise InputError(f"the condition must have the keys '{IMAGE}' and '{KNOWN}', got {', '.join(condition)}.")
     image, known = (condition[name].to(x) for name in (IMAGE, KNOWN))
     if image.shape != x.shape or known.shape != x.shape:

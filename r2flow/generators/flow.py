@@ -93,10 +93,10 @@ class NetworkFlow(Flow):
         return noise if self.region is None else self.region.crop(noise)
 
     def start_from(self, parent: Generator) -> None:
-        """Take over a flow's weights; what a second time or a condition adds changes nothing at first.
+        """Take over a flow's weights; what a second time adds changes nothing at first.
 
-        A condition of the other flow is forgotten, and of a flow map all but its velocity u(x, t, t). A flow that looks
-        elsewhere, as through another sensor, keeps its own rays.
+        Of a flow map all but its velocity u(x, t, t) is forgotten. A flow that looks elsewhere, as through another
+        sensor, keeps its own rays.
 
         Raises:
             InputError: other weights; a network that tells something else; one with weights for each place of the
@@ -106,10 +106,9 @@ class NetworkFlow(Flow):
         if theirs_tell != self.answer:
             raise InputError(f"the network to start from tells {theirs_tell}, and this one learns {self.answer}.")
         own = self.state_dict()
-        more = self.condition_channels - getattr(parent, "condition_channels", 0)
         apart = parent.backbone.second_time_names() if isinstance(parent, NetworkFlow) else frozenset[str]()
         theirs = {
-            name: _with_inputs(value, own[name].shape, self.space.shape[0], more) if name in own else value
+            name: value
             for name, value in parent.state_dict().items()
             if name in own or (name.startswith("backbone.") and name.removeprefix("backbone.") not in apart)
         }
@@ -161,21 +160,6 @@ class RectifiedFlow(NetworkFlow):
         assert condition is None
         v: Tensor = self.backbone(t, x)
         return v
-
-    def untold(self) -> "RectifiedFlow":
-        """The flow of scans of which nothing is known: itself, where it takes no condition."""
-        return self
-
-
-def _with_inputs(weights: Tensor, wanted: tuple[int, ...], channels: int, more: int) -> Tensor:
-    """Weights on an image's channels, and features behind them, with `more` zeros between these, or as many taken out.
-
-    Other weights, which the wanted shape tells, stay as they are.
-    """
-    if not more or weights.shape == wanted or len(wanted) < 2 or weights.shape[1] + more != wanted[1]:
-        return weights
-    own, rest = weights[:, :channels], weights[:, channels + max(-more, 0) :]
-    return torch.cat([own, weights.new_zeros(len(weights), max(more, 0), *weights.shape[2:]), rest], dim=1)
 
 
 class Field(Flow):

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
+from copy import copy
 from typing import Any, Literal
 
 import torch
@@ -145,6 +146,12 @@ class Encoding:
         self.reflectance = reflectance
         self.limits, self.levels = limits, levels
         self.format = FORMATS[format](sensor)
+
+    def through(self, sensor: Sensor) -> "Encoding":
+        """The same encoding of another sensor's ranges."""
+        other = copy(self)
+        other.sensor, other.format = sensor, type(self.format)(sensor)
+        return other
 
     @property
     def channels(self) -> int:

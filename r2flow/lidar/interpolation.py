@@ -34,68 +34,11 @@ def interpolated(image: np.ndarray, measured: np.ndarray, rule: Rule = "inverse"
     return filled.astype(np.float32)
 
 
-def interpolated_both_ways(image: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Linear in 1 / range, along the column or the row, by which fits the measured rays better (`surfaces`)."""
-    filled = interpolated(image, measured)
-    r, error = surfaces(image[0] * measured, measured)
-    filled[0] = np.where(np.isfinite(error) & (filled[0] > 0), r, filled[0])
-    return filled
-
-
 INTERPOLATIONS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
     "nearest": partial(interpolated, rule="nearest"),
     "linear": partial(interpolated, rule="linear"),
     "linear, 1/r": interpolated,
-    "linear, 1/r, both ways": interpolated_both_ways,
 }
-
-
-def surfaces(r: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ranges where measured returns lie on a surface, and how well they do.
-
-    Along columns and along rows, whose ring is closed, 1 / range of an unknown ray is taken on the straight line
-    between the two measured rays next to it, which a plane nearly follows. How well that holds is seen at these two:
-    each is predicted by the same rule from its own two neighbours, over a wider gap. The lesser error counts, and of
-    the two directions the one with the lesser.
-
-    Args:
-        r: Range in metres, (H, W); 0 without a return.
-        known: Which rays are measured, (H, W) bool.
-
-    Returns:
-        Range in metres and its error, |log(predicted / measured)|, (H, W) each; an infinite error where the neighbours
-        did not return, or are not enough.
-    """
-    columns = r.shape[1]
-    upright = [found.T for found in _lines(r.T, known.T)]
-    ring = _lines(np.concatenate([r] * 3, axis=1), np.concatenate([known] * 3, axis=1))
-    level = [found[:, columns : 2 * columns] for found in ring]
-    nearer = level[1] < upright[1]
-    return np.where(nearer, level[0], upright[0]), np.where(nearer, level[1], upright[1])
-
-
-def _lines(r: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`surfaces` along lines, (lines, places)."""
-    count = r.shape[1]
-    at, lines = np.arange(count), np.arange(len(r))[:, None]
-    inverse = np.where(r > 0, 1 / np.where(r > 0, r.astype(np.float64), 1), np.nan)
-    left, right = _neighbours(known, at)
-    before, after = np.pad(left, ((0, 0), (1, 0)))[:, :-1], np.pad(right, ((0, 0), (0, 1)))[:, 1:]
-    before[:, 0], after[:, -1] = -1, count
-
-    def there(values: np.ndarray, places: np.ndarray) -> np.ndarray:
-        inside = (places >= 0) & (places < count)
-        return np.where(inside, values[lines, places.clip(0, count - 1)], np.nan)
-
-    def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return there(inverse, a) + (there(inverse, b) - there(inverse, a)) * (at - a) / np.maximum(b - a, 1)
-
-    with np.errstate(invalid="ignore"):
-        missed = np.where(known, np.abs(np.log(between(before, after) / inverse)), np.nan)
-    error = np.fmin(there(missed, left), there(missed, right))
-    found = between(left, right)
-    said = ~known & np.isfinite(error) & np.isfinite(found)
-    return np.where(said, 1 / np.where(said, found, 1), 0.0), np.where(said, error, np.inf)
 
 
 def _rows_beyond(image: np.ndarray, done: np.ndarray) -> np.ndarray:

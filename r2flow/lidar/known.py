@@ -42,6 +42,23 @@ def ray_states(images: Tensor, measured: Tensor | None = None) -> Tensor:
     return state
 
 
+def share_in_sectors(state: np.ndarray, least: float = 5.0) -> float:
+    """Of the unknown rays the share that lies in sectors of `least` degrees and more of which nothing is known.
+
+    Args:
+        state: `Ray` of each ray, (H, W).
+    """
+    unknown = state == Ray.UNKNOWN
+    empty = unknown.all(0)
+    width = math.ceil(least / 360 * len(empty))
+    if empty.all():
+        return 1.0
+    begins = np.roll(empty, -int(np.flatnonzero(~empty)[0]))  # from a column of which something is known
+    runs = np.split(begins, np.flatnonzero(np.diff(begins)) + 1)
+    wide = sum(len(run) for run in runs if run[0] and len(run) >= width)
+    return float(wide * len(state) / max(unknown.sum(), 1))
+
+
 Mask = Callable[[tuple[int, int], np.random.Generator], np.ndarray]  # (H, W) and draws to measured rays, (H, W) bool
 
 

@@ -32,6 +32,10 @@ class ModelSpace:
     encoding: Encoding
     rays: Tensor
 
+    def through(self, sensor: Sensor) -> "ModelSpace":
+        """The images of another sensor in the same encoding."""
+        return ModelSpace(sensor, self.encoding.through(sensor), sensor.rays())
+
     @property
     def shape(self) -> tuple[int, int, int]:
         """C, H and W of one image."""

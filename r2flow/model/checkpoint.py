@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from r2flow.config import check_tree, learned
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, parse_json
-from r2flow.generators import Generator, RectifiedFlow, build_generator
+from r2flow.generators import Generator, RectifiedFlow, TransferFlow, build_generator
 from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
@@ -63,7 +63,7 @@ class Checkpoint:
         """
         if not isinstance(self.generator, RectifiedFlow):
             raise InputError(f"{self.path} holds a {type(self.generator).__name__}, which has no network v(t, x).")
-        return self.generator.untold().backbone
+        return self.generator.backbone
 
     @property
     def sensor(self) -> Sensor:
@@ -92,6 +92,16 @@ class Checkpoint:
             how: Options of `r2flow.model.completion.complete`: keep, steps, batch_size, ...
         """
         return torch.stack([found.images for found in complete(self, images, state, num, seed, **how)])
+
+    def through(self, sensor: Sensor, numbered: bool = True) -> "Checkpoint":
+        """The same model for another sensor's images; see `TransferFlow.at`.
+
+        Raises:
+            InputError: a model of its own sensor's alone.
+        """
+        if not isinstance(self.generator, TransferFlow):
+            raise InputError(f"{self.path} is a model of its own sensor alone: leave --to and --size out.")
+        return replace(self, generator=self.generator.at(self.generator.space.through(sensor), numbered))
 
     def points(self, images: Tensor) -> list[np.ndarray]:
         """The returns of each range image, (N, 4): x, y, z in metres and reflectance; see `ModelSpace.points`."""

@@ -15,16 +15,11 @@ from r2flow.errors import InputError
 from r2flow.generators import Flow, Generator, Sampler, condition_of
 from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
-from r2flow.lidar.interpolation import surfaces
 from r2flow.lidar.known import Ray
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.sampling import HasGenerator, draw
 from r2flow.samplers import build_sampler
 
-ROUGH = 0.015  # of its range: how far the answers of a flow lie about a surface
-EXACT = 0.004  # of its range: no surface is known better
-TAILS = 2  # so many times the error at the measured rays is that between them taken for; docs/completion.md
-SURE = 0.05  # of its range: a surface known better than that holds wherever an answer has the return
 ANSWER = 2**32  # noise numbers from one answer to the next: answer 0 of scan i has the noise of sample i
 
 
@@ -101,7 +96,6 @@ def complete(
     sampler: Sampler | None = None,
     batch_size: int = 1,
     first: int = 0,
-    on_surfaces: bool = True,
     precision: Precision = "32-true",
     progress: Progress = None,
     **changes: Any,
@@ -112,7 +106,7 @@ def complete(
     `r2flow.model.sampling.sample` draws it: answer 0 of scan i is sample i of the seed.
 
     Args:
-        source: A checkpoint or its generator.
+        source: A checkpoint or its generator; one that draws no scans needs a known ray in each.
         images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W), 0 without a return. A model with
             reflectance completes that of a scan without; a model of range alone leaves reflectance out.
         state: `r2flow.lidar.known.Ray` of each ray, (B, H, W). If left out, a ray without a return counts as not
@@ -121,7 +115,6 @@ def complete(
         sampler: How the generator is run; if left out, that of `completing`.
         batch_size: Answers to a scan at once. It does not change a fixed-step result beyond rounding.
         first: Number of the first scan.
-        on_surfaces: Whether returns of an answer are moved towards the surfaces of the known ones (`settled`).
         progress: Called after every network evaluation of a batch.
         changes: `name` and fields of the sampler: steps, grid, ...
 
@@ -164,9 +157,6 @@ def complete(
                 )
             )
         answers = torch.cat([part.images for part in parts])
-        if on_surfaces:
-            surface, error = map(torch.from_numpy, surfaces(image[0].numpy(), measured.numpy()))
-            answers[:, 0] = settled(answers[:, 0], surface.float(), error.float())
         shared = min(answers.shape[1], image.shape[0])
         answers[:, :shared] = torch.where(measured, image[:shared], answers[:, :shared])
         yield Completed(
@@ -175,27 +165,6 @@ def complete(
             torch.cat([part.converged for part in parts]),
             sum(part.seconds for part in parts),
         )
-
-
-def settled(r: Tensor, surface: Tensor, error: Tensor) -> Tensor:
-    """Ranges of an answer, moved towards the surfaces that the measured returns lie on.
-
-    Where the answer's log-range is log(surface) + d with |d| <= 3 s, s^2 = `ROUGH`^2 + e^2, e = `TAILS` error, it is
-    taken for one of N(log surface, s^2) and becomes log(surface) + d e / s, which has the variance that the surface
-    leaves. Further off it stays, unless the surface is known better than `SURE`: then the range is the surface's. No
-    published method: docs/completion.md has what it is worth.
-
-    Args:
-        r: (..., H, W) in metres; 0, without a return, stays 0.
-        surface: Range in metres, (..., H, W), of `r2flow.lidar.interpolation.surfaces`.
-        error: Its error; infinite where there is none.
-    """
-    said = error.isfinite() & (r > 0)
-    e = torch.where(said, TAILS * error, 1).clamp(min=EXACT)
-    d = torch.where(said, r / torch.where(said, surface, 1), 1).log()
-    s = (ROUGH**2 + e.square()).sqrt()
-    share = torch.where(d.abs() <= 3 * s, e / s, torch.where(error < SURE, 0, 1))
-    return torch.where(said, surface * (share * d).exp(), r).to(r)
 
 
 def _check_values(sensor: Sensor, images: Tensor) -> None:

@@ -172,7 +172,7 @@ def export(checkpoint: Checkpoint, path: str | Path, sampler: Sampler | None = N
     """
     path, flow = Path(path), flow_of(checkpoint)
     write = FORMATS[path.suffix.removeprefix(".")]
-    flow, how = flow.untold(), sampler or flow.sampler
+    how = sampler or flow.sampler
     steps = None if network else tableau(flow, how)
     notes = _notes(checkpoint, how, steps)
     with _quiet():

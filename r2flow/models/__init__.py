@@ -44,8 +44,13 @@ MODELS: Registry[Model] = Registry(
         "c4641b71eecd2086f1851cbb9816ae063bf27c1325a2ea45dfa06b378c766776",
         page="release/street_full.safetensors in the source of r2flow",
     ),
+    densify=Model(
+        "scans of few beams or points completed to all, in one evaluation, learned from simulated scans",
+        "caa513b8a9cbafb673576354048230ceeacdfd9ca89de856c109eebce124e075",
+    ),
 )
 DEFAULT = "street"
+DENSIFY = "densify"
 
 
 def models_folder() -> Path:

@@ -48,7 +48,7 @@ def cost(config: Mapping[str, Any], repeats: int = 0, device: str = "cpu") -> di
     generator = build_generator(config)
     if not isinstance(generator, RectifiedFlow):
         return {"parameters": count_parameters(generator), "gmac": None, "latency_ms": None}
-    return _cost_of(generator.untold().backbone.eval(), (1, *generator.space.shape), repeats, device)
+    return _cost_of(generator.backbone.eval(), (1, *generator.space.shape), repeats, device)
 
 
 def _cost_of(model: Backbone, shape: tuple[int, ...], repeats: int, device: str) -> dict[str, Any]:

@@ -40,7 +40,6 @@ class Job:
         num: Answers to each scan.
         mask: Of the measured rays of each scan those that are kept; None for all.
         fill_gaps: Whether rays without a return count as not measured.
-        on_surfaces: As in `r2flow.model.completion.complete`.
         pictures: How many scans get a picture and a page in 3-D.
     """
 
@@ -49,7 +48,6 @@ class Job:
     mask: Mask | None = None
     fill_gaps: bool = False
     batch_size: int = 1
-    on_surfaces: bool = True
     pictures: int = 8
     precision: Precision = "32-true"
 
@@ -81,7 +79,7 @@ def write_completed(
         if scan.path and (out / scan.name).resolve().parent == scan.path.resolve().parent:
             raise InputError(f"{out} is the folder of the scans; give another --out.")
     settings = {
-        "num": job.num, "surfaces": job.on_surfaces, "fill_gaps": job.fill_gaps,
+        "num": job.num, "fill_gaps": job.fill_gaps,
         **about, "precision": job.precision,
     }  # fmt: skip
     store = Store(out, "answers", recipe_of(checkpoint, job.seed, {"completion": settings}, **sampler.asdict()))
@@ -92,15 +90,11 @@ def write_completed(
     with ScanBar("completing", len(left), len(left) * batches) as bar:
         for number in left:
             scan = scans[number]
-            whole = scan.read()
-            if job.fill_gaps:
-                gaps = np.where(whole.state == Ray.EMPTY, int(Ray.UNKNOWN), whole.state)
-                whole = replace(whole, state=gaps.astype(np.uint8))
-            given = masked(whole, job.mask, number, job.seed, scan.name)
+            whole, given = hiding(scan, job, number)
             images, state = torch.from_numpy(given.image)[None], torch.from_numpy(given.state)[None]
             (completed,) = complete(
                 checkpoint, images, state, job.num, job.seed, sampler=sampler, batch_size=job.batch_size, first=number,
-                on_surfaces=job.on_surfaces, precision=job.precision, progress=bar.evaluated,
+                precision=job.precision, progress=bar.evaluated,
             )  # fmt: skip
             if not done:  # the first answer shows that the settings can be used
                 store.write_manifest(inputs=inputs)
@@ -113,6 +107,15 @@ def write_completed(
                 print(f"{scan.name}: everything is known; see --fill-gaps and --mask")
             bar.finished(len(done))
     return done
+
+
+def hiding(scan: PartialScan, job: Job, number: int) -> tuple[Partial, Partial]:
+    """What is known of scan `number`, and what the job leaves of it."""
+    whole = scan.read()
+    if job.fill_gaps:
+        gaps = np.where(whole.state == Ray.EMPTY, int(Ray.UNKNOWN), whole.state)
+        whole = replace(whole, state=gaps.astype(np.uint8))
+    return whole, masked(whole, job.mask, number, job.seed, scan.name)
 
 
 def masked(scan: Partial, mask: Mask | None, number: int, seed: int, name: str) -> Partial:

@@ -63,7 +63,6 @@ def completion_rows(
     num: int = 8,
     seed: int = 0,
     batch_size: int = 4,
-    on_surfaces: bool = True,
     progress: Progress = None,
 ) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     """A row for each task and method, means over scans and answers, and the first answer to the first scan.
@@ -72,7 +71,6 @@ def completion_rows(
         truths: Range images, (2 or 1, H, W).
         num: Answers to each scan; interpolations have one.
         batch_size: Answers at once.
-        on_surfaces: As in `r2flow.model.completion.complete`.
     """
     reference = panel(np.stack(truths), sensor)
     for task in tasks:
@@ -88,7 +86,7 @@ def completion_rows(
             made = list(
                 complete(
                     way.checkpoint, images, state, num, seed, sampler=way.sampler, batch_size=batch_size,
-                    on_surfaces=on_surfaces, progress=progress,
+                    progress=progress,
                 )
             )  # fmt: skip
             answers[way.name] = [one.images.numpy() for one in made]

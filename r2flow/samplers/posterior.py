@@ -42,6 +42,12 @@ class Posterior(OnGrid):
     def run(self, u: MeanVelocity, x: Tensor, y: Tensor, known: Tensor, times: Tensor, noise: Any) -> Tensor:
         """x_1 from noise x, (B, ...), given y where `known`, (B, ...) bool."""
 
+    def check(self, generator: Any) -> None:
+        super().check(generator)
+        if generator.told:
+            kind = type(generator).__name__
+            raise InputError(f"sampler {self.name} asks a flow of whole scans; a {kind} completes by jump.")
+
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         if condition is None:
             raise InputError(f"{self.name} completes scans: it needs a condition.")
@@ -118,6 +124,12 @@ class Repaint(Posterior):
                     j += 1
                     x = torch.where(known, s * y + (1 - s) * noise(j), jump(u, t, x, s))
         return x
+
+    def check(self, generator: Any) -> None:
+        super().check(generator)
+        if generator.told:
+            kind = type(generator).__name__
+            raise InputError(f"sampler {self.name} asks a flow of whole scans; a {kind} completes by jump.")
 
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         if condition is None or not hasattr(generator, "repaint"):

@@ -9,10 +9,10 @@ from r2flow.generators import Generator
 from r2flow.registry import Registry, lazy
 from r2flow.samplers import build_sampler
 from r2flow.stages.base import Stage
-from r2flow.stages.conditional import Conditional
 from r2flow.stages.flow_map import LearnFlowMap
 from r2flow.stages.rectify import Rectify
 from r2flow.stages.reflow import Distill, Reflow
+from r2flow.stages.transfer import LearnSensor, Transfer
 
 STAGES: Registry[type[Stage]] = Registry(
     "stage",
@@ -20,7 +20,8 @@ STAGES: Registry[type[Stage]] = Registry(
     reflow=Reflow,
     distill=Distill,
     flow_map=LearnFlowMap,
-    conditional=Conditional,
+    transfer=Transfer,
+    sensor=LearnSensor,
     diffusion=lazy("r2flow.systems.diffusion.stage:LearnDiffusion"),
     gan=lazy("r2flow.systems.gan.stage:LearnGan"),
     score_matching=lazy("r2flow.systems.score.stage:MatchScore"),

@@ -36,7 +36,7 @@ class Rectify(SingleLoss):
         if generator.told and type(self).condition is Rectify.condition:
             raise InputError(
                 f"a {type(generator).__name__} is told a part of each scan, and this stage tells it nothing: give "
-                "stage=conditional, as it was trained."
+                "stage=transfer, or the stage by which it was trained."
             )
         self.loss = LOSSES[loss]
         self.time = TIMES.build(time or {"name": "uniform"})

@@ -311,7 +311,7 @@ TINY = {
 }
 
 
-@pytest.mark.parametrize("family", ["rectified_flow", "flow_map", "conditional_flow"])
+@pytest.mark.parametrize("family", ["rectified_flow", "flow_map"])
 @pytest.mark.parametrize("method", ["repaint", "mmps"])
 def test_every_flow_completes_a_scan(family, method):
     flow, seen = build_generator({**TINY, "generator": {"name": family}}).eval(), []
@@ -330,10 +330,9 @@ def test_every_flow_completes_a_scan(family, method):
     assert len(seen) == how.evaluations()
     with pytest.raises(InputError, match="condition"):
         flow(x_0, sampler=how, draws=who)
-    if family != "conditional_flow":
-        for plain in ("euler", "jump")[: 2 if family == "flow_map" else 1]:
-            with pytest.raises(InputError, match="mmps"):
-                flow(x_0, condition, sampler=build_sampler(plain, steps=2))
+    for plain in ("euler", "jump")[: 2 if family == "flow_map" else 1]:
+        with pytest.raises(InputError, match="mmps"):
+            flow(x_0, condition, sampler=build_sampler(plain, steps=2))
 
 
 @pytest.mark.parametrize("text", ["repaint:repeats=0", "repaint:length=1", "mmps:products=x", "mmps:finish=0.1"])

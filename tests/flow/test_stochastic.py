@@ -179,7 +179,8 @@ def test_a_method_asks_for_draws_where_it_needs_them():
 
 def test_what_is_known_arrives_as_it_was_given():
     torch.manual_seed(0)
-    flow = build_generator({**CONFIG, "generator": {"name": "conditional_flow"}}).eval()
+    backbone = {"name": "local", "channels": 8}
+    flow = build_generator({**CONFIG, "backbone": backbone, "generator": {"name": "transfer_flow"}}).eval()
     who = Draws(5, range(2))
     x_0 = who.start(flow.noise_shape)
     known = torch.zeros_like(x_0)

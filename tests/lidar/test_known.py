@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from r2flow.errors import InputError
-from r2flow.lidar.interpolation import INTERPOLATIONS, interpolated, interpolated_both_ways, surfaces
+from r2flow.lidar.interpolation import INTERPOLATIONS, interpolated
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.lidar.sensors import SENSORS
 
@@ -159,60 +159,3 @@ def test_interpolation_follows_columns_and_then_the_ring(rule):
 
 def test_nothing_is_guessed_from_nothing():
     assert not interpolated(ground(), np.zeros(SHAPE, dtype=bool)).any()
-
-
-def test_between_the_rings_of_a_plane_surfaces_are_as_far_as_the_curve_bends():
-    image = ground()
-    measured = parse_mask("rows:2")(SHAPE, draws())
-    r, error = surfaces(image[0], measured)
-    # 1 / r = sin(-e) / h: by two neighbours at a distance d it comes out as cos(d) of itself. A hidden row has d of one
-    # row, its neighbours, which are judged by theirs, two. Seen along rows, a ring is a line exactly.
-    step = np.deg2rad(28 / 16)
-    inner = np.flatnonzero(~measured.any(1) & (image[0] > 0).all(1))
-    inner = inner[(inner >= np.flatnonzero((image[0] > 0).all(1))[0] + 3) & (inner < 13)]
-    assert len(inner) >= 2
-    assert r[inner] == pytest.approx(image[0][inner] / np.cos(step), rel=1e-5)
-    assert error[inner] == pytest.approx(-np.log(np.cos(2 * step)), rel=1e-3)
-    assert np.isinf(error[measured]).all()
-    assert np.isinf(error[:3]).all()  # the sky
-    points = parse_mask("points:0.5")(SHAPE, draws())
-    r, error = surfaces(image[0], points)
-    said = np.isfinite(error)
-    assert said[~points & (image[0] > 0)].mean() > 0.9
-    assert r[said] == pytest.approx(image[0][said], rel=2e-6)
-
-
-def test_surfaces_know_a_wall_in_azimuth_and_an_edge_between_two():
-    # A wall at y = 5 from azimuth 60 to 120 degrees, another at y = 20 beside it: 1 / r = sin(azimuth) / y.
-    azimuth = np.deg2rad((np.arange(64) + 0.5) * 360 / 64)
-    sight = (azimuth > np.deg2rad(30)) & (azimuth < np.deg2rad(150))
-    near = np.abs(azimuth - np.pi / 2) < np.deg2rad(30)
-    r = np.where(sight, np.where(near, 5.0, 20.0) / np.sin(azimuth).clip(0.1), 0.0)
-    measured = np.arange(64) % 2 == 0
-    found, error = surfaces(np.tile(r, (2, 1)), np.tile(measured, (2, 1)))
-    inside = np.flatnonzero(near & ~measured)[1:-1]
-    assert found[0, inside] == pytest.approx(r[inside] / np.cos(2 * np.pi / 64), rel=1e-9)
-    assert (error[0, inside] < 0.03).all()
-    steps = np.flatnonzero(np.diff(near.astype(int)))
-    across = [i for i in range(1, 63) if not measured[i] and near[i - 1] != near[i + 1]]
-    assert len(across) == len(steps) == 2
-    assert (error[0, across] > 0.3).all()  # each neighbour is off the line through its own
-
-
-def test_surfaces_turn_with_the_scan():
-    random = draws(5)
-    r = np.where(random.random(SHAPE) < 0.8, random.uniform(2, 70, SHAPE), 0)
-    measured = parse_mask("points:0.4")(SHAPE, draws(6))
-    turned = [np.roll(part, 11, axis=1) for part in surfaces(r, measured)]
-    for part, expected in zip(surfaces(np.roll(r, 11, 1), np.roll(measured, 11, 1)), turned, strict=True):
-        assert np.allclose(part, expected)
-
-
-def test_both_ways_the_ring_of_the_ground_is_exact():
-    image = ground()
-    measured = parse_mask("points:0.3")(SHAPE, draws())
-    hidden = ~measured & (image[0] > 0)
-    one, both = interpolated(image, measured), interpolated_both_ways(image, measured)
-    said = np.isfinite(surfaces(image[0], measured)[1]) & hidden & (one[0] > 0)
-    assert said.sum() > 0.8 * hidden.sum()
-    assert np.abs(both[0] - image[0])[said].max() < 1e-4 < np.abs(one[0] - image[0])[said].max()

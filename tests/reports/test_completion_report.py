@@ -15,13 +15,13 @@ from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.reports.completion import Way, completion_rows, measured_by
 from r2flow.samplers import build_sampler
-from tests.stages.test_conditional import CONFIG
+from tests.stages.test_transfer_flow import CONFIG
 
 
 @pytest.fixture(scope="module")
 def checkpoint() -> Checkpoint:
     torch.manual_seed(0)
-    config = {**CONFIG, "generator": {"name": "conditional_flow"}}
+    config = {**CONFIG, "generator": {"name": "transfer_flow"}}
     return Checkpoint(build_generator(config).eval(), config)
 
 
@@ -43,7 +43,7 @@ def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(
 
     monkeypatch.setattr(checkpoint.generator, "forward", answer)
     ways = [Way("truth", checkpoint, build_sampler("euler", steps=7))]
-    options = {"tasks": ["rows:4"], "num": 1, "on_surfaces": False}
+    options = {"tasks": ["rows:4"], "num": 1}
     *plain, (row, _) = completion_rows(truths, sensor, ways, **options)
     assert [one["method"] for one, _ in plain] == list(INTERPOLATIONS)
     assert row["evaluations"] == 7
@@ -84,13 +84,13 @@ def test_the_verb_writes_a_page_with_its_picture(checkpoint, tmp_path: Path, mon
     out = tmp_path / "out"
     monkeypatch.setattr("sys.argv", [
         "r2flow", "report", "completion", "simulated:3", str(tmp_path / "model.safetensors"), "--num", "2",
-        "--answers", "2", "--samplers", "euler,mmps", "--steps", "1", "--tasks", "rows:4 rows:2", "--out", str(out),
+        "--answers", "2", "--samplers", "euler,jump", "--steps", "1", "--tasks", "rows:4 rows:2", "--out", str(out),
     ])  # fmt: skip
     with pytest.raises(SystemExit) as ended:
         main()
     assert not ended.value.code
     assert (out / "completion.png").stat().st_size > 10_000
     rows = json.loads((out / "completion.json").read_text())["rows"]
-    ways = "model, euler, 1 step", "model, mmps, 1 step"
+    ways = "model, euler, 1 step", "model, jump, 1 step"
     assert [row["method"] for row in rows] == [*INTERPOLATIONS, *ways, *INTERPOLATIONS, *ways]
     assert "coverage" in (out / "completion.md").read_text()

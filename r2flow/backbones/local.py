@@ -1,0 +1,76 @@
+"""A small convolutional network at full resolution, for work that needs no more than a ray's surroundings."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Unpack
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from r2flow.backbones.base import Backbone, CommonOptions, integers
+from r2flow.backbones.convolutions import time_embedding, zero_convolution
+from r2flow.backbones.layers import uncast, wrapped
+from r2flow.registry import Count
+
+
+class Local(Backbone):
+    """Residual 3 x 3 convolutions, dilated along the rows, on images of any number of rows and columns.
+
+    Columns are circular where the image is a full turn; elsewhere zeros lie beyond its edges.
+
+    Args:
+        rays: Elevation and azimuth of every pixel in radians, (2, H, W).
+        channels: Width of the hidden layers.
+        dilations: Columns between the taps of each block's two convolutions.
+        ring: Whether the columns are a full turn.
+        common: Options of `Backbone`.
+    """
+
+    croppable = any_size = True
+
+    def __init__(
+        self,
+        rays: Tensor,
+        channels: Count = 48,
+        dilations: Sequence[int] = (1, 2, 4, 8, 1),
+        ring: bool = True,
+        **common: Unpack[CommonOptions],
+    ) -> None:
+        super().__init__(rays, (1, 1), **common)
+        widths = integers("backbone.dilations", dilations, len(dilations))
+        self.ring, self.margin = ring, 2 + 2 * sum(widths)  # how far a pixel is seen
+        self.time = time_embedding(channels, channels)
+        self.image = nn.Conv2d(self.in_channels, channels, 3, padding=1)
+        self.blocks = nn.ModuleList([_Block(channels, width) for width in widths])
+        self.answer = zero_convolution(nn.Conv2d(channels, self.out_channels, 3, padding=1))
+
+    @classmethod
+    def tiny_options(cls) -> Mapping[str, Any]:
+        return {"channels": 8, "dilations": (1, 2)}
+
+    def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
+        columns = x.shape[3]
+        margin = min(self.margin, columns) if self.ring else 0
+        x = x.contiguous(memory_format=torch.channels_last)  # in which a CPU convolves up to twice as fast
+        h = uncast(self.image, wrapped(x, margin, margin) if margin else x)
+        h = h + self.time(t)[:, :, None, None].to(h.dtype)
+        for block in self.blocks:
+            h = block(h)
+        return uncast(self.answer, F.silu(h))[..., margin : margin + columns].contiguous()
+
+    def open_ring(self) -> None:
+        """Zeros beyond the left and right edges from now on."""
+        self.ring = False
+
+
+class _Block(nn.Module):
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.first, self.second = (
+            nn.Conv2d(channels, channels, 3, padding=(1, width), dilation=(1, width)) for _ in range(2)
+        )
+        zero_convolution(self.second)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h: Tensor = self.second(F.silu(self.first(F.silu(x))))
+        return x + h

@@ -1,0 +1,161 @@
+"""Flows from scan to scan: learned on scans of which a part is hidden."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from r2flow.flow.path import interpolate
+from r2flow.generators import Condition, Generator, TransferFlow
+from r2flow.generators.base import IMAGE, KNOWN
+from r2flow.generators.sensor import SensorFlow, hidden_returns, target_of
+from r2flow.generators.transfer import WEIGHTS, steps_of
+from r2flow.lidar.known import every_row, random_points, random_rows
+from r2flow.lidar.space import ModelSpace
+from r2flow.registry import Count, Portion, check_options
+from r2flow.stages.base import Batch, SingleLoss
+from r2flow.stages.rectify import Rectify
+
+AROUND = 32  # columns beside a part of a scan
+
+
+@dataclass(frozen=True)
+class Tasks:
+    """A part of each training scan, and what is known of it, drawn for each image of a run.
+
+    Known are the rows of a sparser sensor (every 2nd to 8th, half of them every 4th or 2nd), a random share of the
+    rows, or a random share of the rays (3 to 80 %).
+
+    Args:
+        rows: Of a part.
+        columns: Of a part.
+        halved: Share of the parts at half the rows and a quarter of the columns, as a coarser image shows them.
+        silent: Share whose reflectance is not known.
+        unnumbered: Share for which what was learned of single rows is not told, as of another sensor.
+    """
+
+    rows: Count = 32
+    columns: Count = 256
+    halved: Portion = 0.3
+    silent: Portion = 0.05
+    unnumbered: Portion = 0.1
+
+    def __call__(self, space: ModelSpace, x_1: Tensor, draws: np.random.Generator) -> Batch:
+        """`target`, `image` and `known` of the part in model space, (C, h, w); `elevations` (h,), `steps` (2,)."""
+        halve, silent, unnumbered, top, left = draws.random(5)
+        elevations = space.rays[0, :, 0]
+        if halve < self.halved and x_1.shape[1] >= 2 * self.rows and x_1.shape[2] >= 4 * self.columns:
+            x_1, elevations = coarser(space, x_1), elevations.unflatten(0, (-1, 2)).mean(1)
+        rows, columns = min(self.rows, x_1.shape[1]), min(self.columns, x_1.shape[2])
+        first = int(top * (x_1.shape[1] - rows + 1))
+        chosen = (torch.arange(columns) + int(left * x_1.shape[2])) % x_1.shape[2]
+        part = x_1[:, first : first + rows].index_select(2, chosen)
+        elevations = elevations[first : first + rows].clone()
+        steps = steps_of(elevations[None], 2 * math.pi / x_1.shape[2])[0]
+        known = torch.from_numpy(_measured((rows, columns), draws)).expand_as(part).float()
+        if silent < self.silent and space.encoding.reflectance:
+            known = known.clone()
+            known[-1] = 0
+        return {
+            "target": part, IMAGE: part * known, KNOWN: known, "elevations": elevations,
+            "steps": steps, "numbered": torch.tensor(unnumbered >= self.unnumbered),
+        }  # fmt: skip
+
+
+def coarser(space: ModelSpace, x: Tensor) -> Tensor:
+    """A scan in model space, (C, H, W), at half the rows and a quarter of the columns: the nearest return of each."""
+    image = space.decode(x[None])[0]
+    blocks = image.unflatten(1, (-1, 2)).unflatten(3, (-1, 4)).movedim(2, 3).flatten(3)
+    r = torch.where(blocks[:1] > 0, blocks[:1], torch.inf)
+    return space.encoding.encode(blocks.gather(3, r.argmin(3, keepdim=True).expand(len(blocks), -1, -1, 1))[..., 0])
+
+
+def _measured(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
+    kind, a, b = draws.random(3)
+    if kind < 0.6:
+        step = (2 if a < 0.25 else 4) if kind < 0.35 else 2 + int(a * 7)
+        mask = every_row(step, int(b * step))
+    elif kind < 0.7:
+        mask = random_rows(0.15 + 0.6 * a)
+    else:
+        mask = random_points(0.03 * 27**a)
+    return mask(shape, draws)
+
+
+class Transfer(SingleLoss):
+    """Learn the density of the hidden rays of scans, of which a flow's velocity is the mean (`TransferFlow`).
+
+    Half of the images are learned at t = 0, where one evaluation answers, the others at uniform t.
+
+    Args:
+        tasks: Options of `Tasks`.
+    """
+
+    learns: ClassVar[type[Generator]] = TransferFlow
+    generator_name = "transfer_flow"
+    generator: TransferFlow
+
+    def __init__(self, generator: Generator, tasks: Mapping[str, Any] | None = None, **options: Any) -> None:
+        super().__init__(generator, **options)
+        check_options("stage.tasks", Tasks, tasks or {})
+        self.further = partial(Tasks(**(tasks or {})), generator.space)
+
+    def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
+        target = batch["target"]
+        noise = batch["x_0"][:, :, : target.shape[2], : target.shape[3]]
+        rows = self.generator.rows(batch["elevations"], batch["steps"], batch["numbered"])
+        parts = self.generator.loss(
+            target, {IMAGE: batch[IMAGE], KNOWN: batch[KNOWN]}, (2 * u - 1).clamp(min=0), noise,
+            batch["steps"], rows,
+        )  # fmt: skip
+        where = "train" if self.training else "val"
+        for name, value in parts.items():
+            self.log(f"{where}/{name}", value, batch_size=len(target), sync_dist=True)
+        return torch.stack([WEIGHTS[name] * value for name, value in parts.items()]).sum()
+
+
+class LearnSensor(Rectify):
+    """1-RF of ray-drop and reflectance under the geometry of real scans (`SensorFlow`).
+
+    Args:
+        columns: Of the part of each scan that a step learns from.
+        hidden: The largest share of the returns that is filled as holes are.
+    """
+
+    learns: ClassVar[type[Generator]] = SensorFlow
+    generator_name = "sensor_flow"
+    generator: SensorFlow
+
+    def __init__(self, generator: Generator, columns: Count = 256, hidden: Portion = 0.5, **options: Any) -> None:
+        super().__init__(generator, **options)
+        self.columns, self.hidden = columns, hidden
+        self.further = self._part
+
+    def _part(self, x_1: Tensor, draws: np.random.Generator) -> Batch:
+        turn, first = x_1.shape[2], int(draws.integers(x_1.shape[2]))
+        columns = min(self.columns, turn)
+        margin = min(AROUND, (turn - columns) // 2)  # what a ray's neighbours are needs no more of the turn
+        seen = (torch.arange(columns + 2 * margin) + first) % turn
+        images = self.generator.space.decode(x_1[None].index_select(3, seen))
+        noise = torch.from_numpy(draws.standard_normal((1, 3, *images.shape[2:]), dtype=np.float32))
+        with torch.no_grad():
+            hidden = hidden_returns(noise[:, :2], self.hidden * float(draws.random()))
+            features, surface, _ = self.generator.geometry(images, hidden, noise[:, 2:], ring=columns == turn)
+        parts = {"features": features, "surface": surface, "target": target_of(images)}
+        return {name: value[0, ..., margin : margin + columns].contiguous() for name, value in parts.items()}
+
+    def condition(self, batch: Batch) -> Condition:
+        return self.generator.condition(batch["features"])
+
+    def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
+        x_1, surface = batch["target"], batch["surface"]
+        t = self.time(u)
+        x_t, u_t = interpolate(batch["x_0"][..., : x_1.shape[3]], x_1, t)
+        v = self.generator.velocity(t, x_t, self.condition(batch))
+        seen = torch.cat([surface, surface & (x_1[:, :1] > 0)], 1).to(v)
+        return self.loss(v * seen, u_t * seen).mean()

@@ -1,0 +1,223 @@
+"""Flows from a scan with hidden rays to the whole scan."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import quad
+
+from r2flow import noise
+from r2flow.backbones import BACKBONES
+from r2flow.errors import InputError
+from r2flow.generators import TransferFlow, build_generator, condition_of
+from r2flow.generators.transfer import Answers
+from r2flow.lidar.known import Ray, parse_mask, ray_states
+from r2flow.lidar.sensors import build_sensor
+from r2flow.noise import Draws
+from r2flow.samplers import build_sampler
+from r2flow.stages import build_stage
+from r2flow.stages.transfer import Tasks, Transfer, coarser
+
+CONFIG = {
+    "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
+    "encoding": {"format": "logscale", "reflectance": True},
+    "backbone": {"name": "local", "channels": 16, "dilations": [1, 2]},
+}
+
+
+def built(nought: bool = False, **changed) -> TransferFlow:
+    torch.manual_seed(1)
+    flow = build_generator({**CONFIG, **changed, "generator": {"name": "transfer_flow"}})
+    with torch.no_grad():
+        for weight in flow.parameters():
+            if not (weight.any() or nought):
+                weight.normal_(std=0.05)
+    return flow.eval()
+
+
+@pytest.fixture(scope="module")
+def flow() -> TransferFlow:
+    return built()
+
+
+@pytest.fixture(scope="module")
+def scans() -> torch.Tensor:
+    draw = torch.Generator().manual_seed(3)
+    images = torch.stack([2 + 70 * torch.rand(3, 8, 32, generator=draw), torch.rand(3, 8, 32, generator=draw)], 1)
+    return images * (torch.rand(3, 1, 8, 32, generator=draw) > 0.2)
+
+
+def measured(images: torch.Tensor, text: str = "rows:4") -> torch.Tensor:
+    mask = torch.from_numpy(parse_mask(text)(images.shape[-2:], noise.generator(0, "condition", 0)))
+    return ray_states(images, mask)
+
+
+def answered(flow: TransferFlow, images: torch.Tensor, state: torch.Tensor, sampler: str = "jump:steps=1", **how):
+    condition = condition_of(flow.space, images, state)
+    draws = Draws(0, range(len(images)))
+    return flow(draws.start(flow.noise_shape), condition, sampler=build_sampler(sampler), draws=draws, **how)
+
+
+@pytest.mark.parametrize("sampler", ["jump:steps=1", "jump:steps=4", "euler:steps=3", "sde:steps=3"])
+@pytest.mark.parametrize("mask", ["rows:4", "points:0.3"])
+def test_known_rays_come_back_to_the_bit_and_the_others_within_the_sensor(flow, scans, sampler, mask):
+    state = measured(scans, mask)
+    made = answered(flow, scans, state, sampler)
+    known = condition_of(flow.space, scans, state)
+    assert torch.equal(made.x[known["known"] > 0], known["image"][known["known"] > 0])
+    r = flow.space.decode(made.x)[:, 0]
+    assert made.converged.all()
+    assert ((r == 0) | ((r >= 1.45) & (r <= 80))).all()
+
+
+def test_before_it_has_learned_a_plane_comes_back_whole():
+    """1 / r is linear in the tangent of elevation on the ground, and so in the rows of a narrow view."""
+    flow = built(nought=True, sensor={"name": "hdl64e", "rows": 64, "columns": 32})
+    elevation = flow.space.rays[0]
+    r = torch.where(elevation < math.radians(-5), 1.73 / (-elevation).sin().clamp(min=1e-3), 0)
+    images = torch.stack([r, torch.full_like(r, 0.4)])[None] * (r > 0)
+    state = measured(images, "rows:2")
+    answer = flow.space.decode(answered(flow, images, state).x)[0]
+    inner = (r > 0) & (r.roll(1, 0) > 0) & (r.roll(-1, 0) > 0) & (state[0] == Ray.UNKNOWN)
+    assert inner.sum() > 500
+    assert ((answer[0] - r).abs() / r)[inner].max() < 1e-3  # a chord's sagitta: step^2 / 2 = 3e-5, and float32
+    assert answer[1][inner].allclose(torch.tensor(0.4), atol=1e-5)
+
+
+def test_the_answer_does_not_depend_on_what_is_hidden(flow, scans):
+    state = measured(scans)
+    other = torch.where((state == Ray.UNKNOWN)[:, None], scans.roll(5, 3), scans)
+    assert torch.equal(answered(flow, scans, state).x, answered(flow, other, state).x)
+
+
+def test_a_turned_scan_has_a_turned_answer(flow, scans):
+    state = measured(scans)
+    one, turned = (flow.eval() for _ in range(2))
+    noise_free = TransferFlow(flow.space, CONFIG["backbone"], sigma=0.0)
+    noise_free.load_state_dict(flow.state_dict())
+    noise_free.eval()
+    one = answered(noise_free, scans, state).x
+    turned = answered(noise_free, scans.roll(7, 3), state.roll(7, 2)).x
+    torch.testing.assert_close(turned, one.roll(7, 3), rtol=0, atol=2e-5)
+
+
+def test_the_density_is_one_and_its_expected_error_that_of_an_integral():
+    draw = torch.Generator().manual_seed(5)
+    one = {name: torch.randn(1, 7, 1, 1, generator=draw) for name in ("logits", "ranges", "scales")}
+    answers = Answers(
+        one["logits"].log_softmax(1), one["ranges"], one["scales"].abs() / 4 + 0.1, torch.zeros(1, 1, 1, 1),
+        torch.zeros(1, 7, 1, 1),
+    )  # fmt: skip
+
+    def density(x: float) -> float:
+        return float(answers.log_density(torch.tensor(x).reshape(1, 1, 1, 1)).exp())
+
+    knots = sorted(answers.ranges.flatten().tolist())
+    assert quad(density, -12, 12, points=knots, limit=200)[0] == pytest.approx(1, abs=1e-4)
+    off = [
+        quad(lambda x, m=m: abs(x - m) * density(x), -12, 12, points=knots, limit=200)[0]
+        for m in answers.ranges.flatten().tolist()
+    ]
+    assert int(answers.least_error()) == int(np.argmin(off))
+
+
+def test_the_velocity_leads_to_the_mean(flow, scans):
+    """Two Laplace densities of one weight: of the encoded ranges the velocity takes the mean, the last step one."""
+    state = measured(scans)
+    x = answered(flow, scans, state, "euler:steps=1").x
+    mean = flow.space.decode(x)
+    last = flow.space.decode(answered(flow, scans, state).x)
+    hidden = state == Ray.UNKNOWN
+    assert not torch.equal(mean[:, 0][hidden], last[:, 0][hidden])
+
+
+@pytest.mark.parametrize("sensor", [("hdl64e", 16, 64), ("vlp16", 16, 128), ("os1_128", 128, 64)])
+def test_it_completes_the_images_of_any_sensor(flow, sensor):
+    other = flow.at(flow.space.through(build_sensor(*sensor)))
+    images = torch.full((1, 2, *sensor[1:]), 0.5)
+    images[:, 0] = 20
+    state = measured(images, "rows:2")
+    r = other.space.decode(answered(other, images, state).x)[0, 0]
+    assert r.shape == sensor[1:]
+    assert (r[::2] - 20).abs().max() < 1e-4
+    assert flow.space.shape == (2, 8, 32)
+
+
+def test_rows_far_beyond_the_measured_ones_stay_empty(flow):
+    images = torch.full((1, 2, 8, 32), 0.5)
+    images[:, 0] = 20
+    state = torch.zeros(1, 8, 32, dtype=torch.uint8)
+    state[:, [3, 5]] = int(Ray.RETURN)
+    r = flow.space.decode(answered(built(nought=True), images, state).x)[0, 0]
+    assert (r > 0).all(1).tolist() == [False, False, True, True, True, True, True, False]
+
+
+def test_rows_are_known_by_all_their_elevations(flow):
+    rows = flow.space.rays[0, :, 0]
+    said = flow.rows(torch.stack([rows, rows + 0.01]), torch.tensor([[0.06, 0.2]] * 2))
+    own, other = said[:, :8, :, 0]
+    assert len(torch.unique(own.T, dim=0)) == 8
+    assert len(torch.unique(other.T, dim=0)) == 1
+
+
+def test_a_coarser_image_has_the_nearest_return_of_each_block(flow):
+    images = torch.zeros(1, 2, 8, 32)
+    images[0, :, 3, 5] = torch.tensor([30.0, 0.25])
+    images[0, :, 2, 6] = torch.tensor([12.0, 0.75])
+    small = flow.space.decode(coarser(flow.space, flow.space.encoding.encode(images)[0])[None])[0]
+    assert small.shape == (2, 4, 8)
+    assert small[:, 1, 1].tolist() == pytest.approx([12, 0.75], abs=1e-4)
+    assert int((small[0] > 0).sum()) == 1
+
+
+def test_a_part_of_a_scan_and_what_is_known_of_it_depend_on_the_image_alone(flow, scans):
+    x_1, tasks = flow.space.encoding.encode(scans[0]), Tasks(rows=4, columns=16)
+    parts = [[tasks(flow.space, x_1, noise.generator(0, "condition", k)) for k in range(40)] for _ in range(2)]
+    for one, other in zip(*parts, strict=True):
+        assert one.keys() == other.keys()
+        assert all(torch.equal(one[name], other[name]) for name in one)
+        assert one["target"].shape == (2, 4, 16)
+        assert torch.equal(one["image"], one["target"] * one["known"])
+    assert len({float(one["known"].mean()) for one in parts[0]}) > 5
+    assert any(
+        bool((one["known"][1] == 0).all())
+        for one in (Tasks(silent=1)(flow.space, x_1, noise.generator(0, "condition", 0)),)
+    )
+
+
+def stage(**changed) -> Transfer:
+    config = {**CONFIG, "data": {"name": "simulated", "batch_size": 4}, "seed": 0, "stage": {"name": "transfer"}}
+    return build_stage({**config, **changed}, built(nought=True))
+
+
+def test_what_it_learns_from_lowers_the_loss(scans):
+    learner = stage()
+    learner.log = lambda *_, **__: None
+    x_1 = learner.generator.space.encoding.encode(scans)
+    one = [learner.further(x, noise.generator(0, "condition", k)) for k, x in enumerate(x_1)]
+    batch = {name: torch.stack([part[name] for part in one]) for name in one[0]}
+    batch |= {"x_1": x_1, "x_0": torch.randn(x_1.shape), "k": torch.arange(3)}
+    u, by = torch.tensor([0.2, 0.6, 0.9]), torch.optim.Adam(learner.parameters(), 1e-2)
+    losses = []
+    for _ in range(30):
+        loss = learner.regression_loss(batch, u)
+        by.zero_grad()
+        loss.backward()
+        by.step()
+        losses.append(float(loss))
+    assert losses[-1] < losses[0] - 0.5
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in learner.parameters())
+
+
+@pytest.mark.parametrize("other", ["rectify", "reflow"])
+def test_a_stage_that_tells_nothing_refuses_it(other):
+    with pytest.raises(InputError, match=r"stage=transfer"):
+        stage(stage={"name": other})
+
+
+def test_it_draws_nothing_from_noise_alone_and_needs_a_backbone_for_any_size(flow):
+    with pytest.raises(InputError, match="begins at a scan"):
+        flow(torch.zeros(1, 2, 8, 32))
+    with pytest.raises(InputError, match="backbone=local"):
+        built(backbone={"name": "hdit", **BACKBONES["hdit"].tiny_options()})
