@@ -102,7 +102,7 @@ def test_an_answer_depends_on_seed_scan_and_its_number_alone():
     whole = checkpoint.complete(images, state, num=3, seed=1)
     batched = checkpoint.complete(images, state, num=3, seed=1, batch_size=4)
     torch.testing.assert_close(batched, whole, rtol=1e-4, atol=1e-4)
-    (alone,) = complete(checkpoint, images[2:], state[2:], num=1, seed=1, first=2)
+    (alone,) = complete(checkpoint, images[2:], state[2:], num=2, seed=1, first=2)
     assert torch.equal(alone.images[0], whole[2, 0])
     assert not torch.equal(whole[:, 0], checkpoint.complete(images, state, seed=2)[:, 0])
 

@@ -100,7 +100,7 @@ def complete(
         loaded = loaded.through(loaded.sensor, numbered=False)
     if checkpoint is None:
         print(f"the model {name}: {MODELS[name].about} (r2flow info {name})")
-    sampler = completing(loaded.generator, **how.given)
+    sampler = completing(loaded.generator, several=num > 1, **how.given)
     for line in said:
         print(line)
     for ending in sorted({scan.ending for scan in partial if answer_ending(loaded, scan) != scan.ending}):

@@ -152,7 +152,7 @@ def completion(
 
     loaded = {Path(name).stem: load_checkpoint(name, choose_device(device)) for name in models or [DENSIFY]}
     ways = [
-        Way(name, one, completing(one.generator, **SamplerOptions(sampler, steps).given))
+        Way(name, one, completing(one.generator, several=answers > 1, **SamplerOptions(sampler, steps).given))
         for name, one in loaded.items()
         for sampler in (samplers.split(",") if samplers else [None])
     ]

@@ -26,6 +26,7 @@ NEIGHBOURS, CANDIDATES = 4, 7
 FEATURES = 5 * NEIGHBOURS + 11  # of `Surroundings`
 ROW = 8  # numbers learned of each row
 SAME = 2e-4  # radians: rows of the same elevation
+BISECTIONS = 28
 FINEST = 1e-3  # of a range: no return is known better
 FREE, SHIFT = 0.3, 0.02  # how far the answer nought moves a free range, and one of a neighbour, on log r
 NEVER = -1e4  # logit of what there is not
@@ -119,6 +120,22 @@ class Answers:
         each = self.logits - (2 * self.scales).log() - (log_r - self.ranges).abs() / self.scales
         return each.logsumexp(1, keepdim=True)
 
+    def quantile(self, u: Tensor) -> Tensor:
+        """The log r below which a return lies with probability u of (0, 1), (B, 1, H, W), by bisection."""
+        p = self.logits.exp()
+        low, high = (self.ranges - 20 * self.scales).amin(1, True), (self.ranges + 20 * self.scales).amax(1, True)
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            off = (middle - self.ranges) / self.scales
+            below = (p * torch.where(off < 0, off.exp() / 2, 1 - (-off).exp() / 2)).sum(1, keepdim=True) < u
+            low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+        return (low + high) / 2
+
+    def likeliest(self, log_r: Tensor) -> Tensor:
+        """The candidate that log r is most likely of, (B, 1, H, W)."""
+        each = self.logits - self.scales.log() - (log_r - self.ranges).abs() / self.scales
+        return each.argmax(1, keepdim=True)
+
     def least_error(self) -> Tensor:
         """The candidate whose expected |log r - m_k| is least, (B, 1, H, W).
 
@@ -177,8 +194,8 @@ class TransferFlow(Flow):
         v = (E[x_1 | x_t] - x_t) / (1 - t),
 
     and a step that ends at t = 1 takes the candidate of least expected error instead, or no return where that is more
-    likely. So one evaluation gives the median of each ray, and several give answers that differ where the scan leaves
-    it open. Known rays come back to the bit. It takes images of any size and sensor (`at`).
+    likely. So one evaluation gives the median of each ray; the sampler `transport` draws answers that differ as far as
+    the scan leaves it open. Known rays come back to the bit. It takes images of any size and sensor (`at`).
 
     Args:
         space: The images it makes.
@@ -292,6 +309,21 @@ class TransferFlow(Flow):
         answers = self.answers(t, x.float(), about, condition["rows"])
         x_1 = torch.where(known > 0, image, self._chosen(answers) if last else self._mean(answers))
         return ((x_1 - x) / (1 - expand_time(t, x)).clamp(min=LAST)).to(x)
+
+    def transported(self, x_0: Tensor, condition: Condition) -> Tensor:
+        """x_1 by the monotone map of each ray's noise e to its density, in one evaluation: log r = F^-1(Phi(e)).
+
+        That is the optimal transport between the two, ray by ray: of many x_0 as many returns, and ranges, as the
+        network expects. Rays do not know of one another.
+        """
+        image, known = parts_of(condition, x_0)
+        about = Surroundings(*(condition[name] for name in Surroundings._fields))
+        answers = self.answers(torch.zeros((), device=x_0.device), x_0.float(), about, condition["rows"])
+        u = torch.special.ndtr((x_0 - about.start)[:, :1].float() / max(self.sigma, 1e-6))
+        p = answers.returns.sigmoid()
+        log_r = answers.quantile((u / p).clamp(1e-6, 1 - 1e-6))
+        strength = answers.strengths.gather(1, answers.likeliest(log_r))
+        return torch.where(known > 0, image, self._encode(self._within(log_r) * (u < p), strength * (u < p)))
 
     def _chosen(self, answers: Answers) -> Tensor:
         best = answers.least_error()

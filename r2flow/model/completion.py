@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.generators import Flow, Generator, Sampler, condition_of
+from r2flow.generators import Flow, Generator, Sampler, TransferFlow, condition_of
 from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
 from r2flow.lidar.known import Ray
@@ -63,11 +63,12 @@ def spread_of(images: Tensor) -> Tensor:
     return torch.stack([(squares / (count - 1).clamp(min=1)).sqrt(), returned.double().mean(0)]).float()
 
 
-def completing(generator: Generator, name: str | None = None, **changes: Any) -> Sampler:
+def completing(generator: Generator, name: str | None = None, *, several: bool = False, **changes: Any) -> Sampler:
     """The sampler by which a generator completes scans: its own if it takes a condition, else a flow's completer.
 
     Args:
         name: Of another sampler.
+        several: Whether answers shall differ: then a transfer flow's is `transport`.
         changes: Fields of the sampler.
 
     Raises:
@@ -76,6 +77,8 @@ def completing(generator: Generator, name: str | None = None, **changes: Any) ->
     if not (generator.told or isinstance(generator, Flow)) or generator.noise_shape != generator.space.shape:
         raise InputError(f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images.")
     if generator.told:
+        if several and name is None and not changes and isinstance(generator, TransferFlow):
+            name = "transport"
         return generator.choose(name, **changes)
     completers = {completer.name: completer for completer in getattr(generator, "completers", ())}
     completer = completers.get(name or next(iter(completers)))
@@ -112,7 +115,8 @@ def complete(
         state: `r2flow.lidar.known.Ray` of each ray, (B, H, W). If left out, a ray without a return counts as not
             measured.
         num: Answers to each scan.
-        sampler: How the generator is run; if left out, that of `completing`.
+        sampler: How the generator is run; if left out, that of `completing`, and `transport` for several answers where
+            the generator has it.
         batch_size: Answers to a scan at once. It does not change a fixed-step result beyond rounding.
         first: Number of the first scan.
         progress: Called after every network evaluation of a batch.
@@ -123,7 +127,7 @@ def complete(
             its sensor.
     """
     generator = source if isinstance(source, Generator) else source.generator
-    how = sampler or completing(generator, **changes)
+    how = sampler or completing(generator, several=num > 1, **changes)
     plain = generator.sampler if how.completes else how  # of a scan without a known ray
     images = torch.as_tensor(images).detach().float().cpu()
     if state is None:

@@ -11,7 +11,7 @@ from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.flow.solvers import Solution
 from r2flow.flow.solvers.solution import finite, stepped
-from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, OnGrid, Progress, Steps
+from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, OnGrid, Progress, Sampler, Steps
 from r2flow.samplers.ode import ODESampler
 
 
@@ -94,6 +94,21 @@ class Renoise(OnGrid):
             x, alive = stepped(x, following, alive)
             progress()
         return Generated.after(x, self.steps, alive)
+
+
+@dataclass(frozen=True)
+class Transport(Sampler):
+    """One evaluation, by which a generator carries the noise of each ray to the density of its answer."""
+
+    needs: ClassVar[str] = "transported"
+
+    def evaluations(self, generator: Any = None) -> int:
+        return 1
+
+    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
+        x = generator.transported(noise, condition)
+        progress()
+        return Generated.after(x, 1)
 
 
 def late(t_0: float, t_1: float, steps: int, k: float = 32.0) -> Tensor:

@@ -14,6 +14,7 @@ from r2flow.generators import TransferFlow, build_generator, condition_of
 from r2flow.generators.transfer import Answers
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.lidar.sensors import build_sensor
+from r2flow.model.completion import completing
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
@@ -120,6 +121,47 @@ def test_the_density_is_one_and_its_expected_error_that_of_an_integral():
         for m in answers.ranges.flatten().tolist()
     ]
     assert int(answers.least_error()) == int(np.argmin(off))
+
+
+def test_a_quantile_is_where_the_density_has_its_share():
+    draw = torch.Generator().manual_seed(6)
+    ranges, scales, logits = (torch.randn(1, 7, 1, 1, generator=draw) for _ in range(3))
+    nothing = torch.zeros(1, 7, 1, 1)
+    answers = Answers(logits.log_softmax(1), ranges, scales.abs() / 4 + 0.1, nothing[:, :1], nothing)
+    for u in (0.02, 0.3, 0.5, 0.95):
+        y = float(answers.quantile(torch.full((1, 1, 1, 1), u)))
+
+        def density(x: float) -> float:
+            return float(answers.log_density(torch.tensor(x).reshape(1, 1, 1, 1)).exp())
+
+        knots = sorted(x for x in ranges.flatten().tolist() if x < y)
+        assert quad(density, -15, y, points=knots or None, limit=200)[0] == pytest.approx(u, abs=1e-4)
+
+
+def test_transported_answers_return_as_often_as_expected_and_keep_what_is_known(flow, scans):
+    state = measured(scans)
+    condition = condition_of(flow.space, scans[:1], state[:1])
+    many = {name: value.expand(400, -1, -1, -1) for name, value in condition.items()}
+    draws = Draws(0, range(400))
+    made = flow(draws.start(flow.noise_shape), many, sampler=build_sampler("transport"), draws=draws)
+    known = many["known"] > 0
+    assert torch.equal(made.x[known], many["image"][known])
+    assert (made.evaluations == 1).all()
+    share = (flow.space.decode(made.x)[:, 0] > 0).float().mean(0)
+    seen: list[Answers] = []
+    given, flow.answers = flow.answers, lambda *args: seen.append(given(*args)) or seen[-1]
+    flow(torch.zeros(1, *flow.noise_shape), condition, sampler=build_sampler("transport"))
+    del flow.answers
+    hidden = (state[0] == Ray.UNKNOWN) & (share > 0)
+    off = (share - seen[0].returns.sigmoid()[0, 0])[hidden]
+    assert off.abs().max() < 0.15  # six standard errors of 400 draws
+    assert off.mean().abs() < 0.01
+
+
+def test_several_answers_are_drawn_by_transport(flow):
+    assert completing(flow).name == "jump"
+    assert completing(flow, several=True).name == "transport"
+    assert completing(flow, "jump", several=True, steps=4).steps == 4
 
 
 def test_the_velocity_leads_to_the_mean(flow, scans):
