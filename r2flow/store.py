@@ -261,26 +261,14 @@ class Store:
 
 
 class FileStore(Store):
-    """A store whose items are files of other formats, `NAME.ENDING`: an item is there when all its files are.
+    """A store whose items are files of other formats, `000003.ENDING`: an item is there when all its files are."""
 
-    Args:
-        names: Of the items; `000003` and so on if left out.
-    """
-
-    def __init__(
-        self,
-        folder: str | Path,
-        kind: str,
-        recipe: Mapping[str, Any],
-        endings: Sequence[str],
-        names: Sequence[str] | None = None,
-    ) -> None:
+    def __init__(self, folder: str | Path, kind: str, recipe: Mapping[str, Any], endings: Sequence[str]) -> None:
         super().__init__(folder, kind, recipe)
-        self.endings, self.names = endings, names
+        self.endings = endings
 
     def files(self, item: int) -> list[Path]:
-        name = f"{item:06d}" if self.names is None else self.names[item]
-        return [self.folder / f"{name}.{ending}" for ending in self.endings]
+        return [self.folder / f"{item:06d}.{ending}" for ending in self.endings]
 
     def has(self, item: int) -> bool:
         return all(file.is_file() for file in self.files(item))

@@ -21,7 +21,6 @@ from r2flow.cli import (  # noqa: F401 (each enters its verbs)
     sensors,
     simulate,
     train,
-    translate,
     unpack,
     view,
     weights,
@@ -37,7 +36,7 @@ USAGE_ERROR: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "
 # The verbs of --help in their order.
 GROUPS = {
     "Make": ("train", "pairs"),
-    "Draw": ("sample", "complete", "translate", "interpolate"),
+    "Draw": ("sample", "complete", "interpolate"),
     "Look": ("view", "show"),
     "Measure": ("evaluate", "compare"),
     "Data": ("simulate", "prepare", "sensor"),

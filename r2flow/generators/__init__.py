@@ -10,14 +10,13 @@ from r2flow.generators.base import Condition, Generated, Generator, Sampler
 from r2flow.generators.condition import condition_of
 from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
 from r2flow.generators.flow_map import FlowMap
-from r2flow.generators.sensor import SensorFlow
 from r2flow.generators.transfer import TransferFlow
 from r2flow.lidar.space import build_space
 from r2flow.registry import Registry, lazy
 
 __all__ = [
     "GENERATORS", "USUAL", "Condition", "Field", "Flow", "FlowMap", "Generated", "Generator", "RectifiedFlow",
-    "Sampler", "SensorFlow", "TransferFlow", "as_flow", "build_generator", "condition_of",
+    "Sampler", "TransferFlow", "as_flow", "build_generator", "condition_of",
 ]  # fmt: skip
 
 GENERATORS: Registry[type[Generator]] = Registry(
@@ -25,7 +24,6 @@ GENERATORS: Registry[type[Generator]] = Registry(
     rectified_flow=RectifiedFlow,
     flow_map=FlowMap,
     transfer_flow=TransferFlow,
-    sensor_flow=SensorFlow,
     diffusion=lazy("r2flow.systems.diffusion.generator:Diffusion"),
     vanilla_gan=lazy("r2flow.systems.gan.generator:VanillaGan"),
     dusty1=lazy("r2flow.systems.gan.generator:DustyV1"),

@@ -12,7 +12,7 @@ from r2flow.stages.base import Stage
 from r2flow.stages.flow_map import LearnFlowMap
 from r2flow.stages.rectify import Rectify
 from r2flow.stages.reflow import Distill, Reflow
-from r2flow.stages.transfer import LearnSensor, Transfer
+from r2flow.stages.transfer import Transfer
 
 STAGES: Registry[type[Stage]] = Registry(
     "stage",
@@ -21,7 +21,6 @@ STAGES: Registry[type[Stage]] = Registry(
     distill=Distill,
     flow_map=LearnFlowMap,
     transfer=Transfer,
-    sensor=LearnSensor,
     diffusion=lazy("r2flow.systems.diffusion.stage:LearnDiffusion"),
     gan=lazy("r2flow.systems.gan.stage:LearnGan"),
     score_matching=lazy("r2flow.systems.score.stage:MatchScore"),

@@ -10,18 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.flow.path import interpolate
-from r2flow.generators import Condition, Generator, TransferFlow
+from r2flow.generators import Generator, TransferFlow
 from r2flow.generators.base import IMAGE, KNOWN
-from r2flow.generators.sensor import SensorFlow, hidden_returns, target_of
 from r2flow.generators.transfer import WEIGHTS, steps_of
 from r2flow.lidar.known import every_row, random_points, random_rows
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Count, Portion, check_options
 from r2flow.stages.base import Batch, SingleLoss
-from r2flow.stages.rectify import Rectify
-
-AROUND = 32  # columns beside a part of a scan
 
 
 @dataclass(frozen=True)
@@ -117,45 +112,3 @@ class Transfer(SingleLoss):
         for name, value in parts.items():
             self.log(f"{where}/{name}", value, batch_size=len(target), sync_dist=True)
         return torch.stack([WEIGHTS[name] * value for name, value in parts.items()]).sum()
-
-
-class LearnSensor(Rectify):
-    """1-RF of ray-drop and reflectance under the geometry of real scans (`SensorFlow`).
-
-    Args:
-        columns: Of the part of each scan that a step learns from.
-        hidden: The largest share of the returns that is filled as holes are.
-    """
-
-    learns: ClassVar[type[Generator]] = SensorFlow
-    generator_name = "sensor_flow"
-    generator: SensorFlow
-
-    def __init__(self, generator: Generator, columns: Count = 256, hidden: Portion = 0.5, **options: Any) -> None:
-        super().__init__(generator, **options)
-        self.columns, self.hidden = columns, hidden
-        self.further = self._part
-
-    def _part(self, x_1: Tensor, draws: np.random.Generator) -> Batch:
-        turn, first = x_1.shape[2], int(draws.integers(x_1.shape[2]))
-        columns = min(self.columns, turn)
-        margin = min(AROUND, (turn - columns) // 2)  # what a ray's neighbours are needs no more of the turn
-        seen = (torch.arange(columns + 2 * margin) + first) % turn
-        images = self.generator.space.decode(x_1[None].index_select(3, seen))
-        noise = torch.from_numpy(draws.standard_normal((1, 3, *images.shape[2:]), dtype=np.float32))
-        with torch.no_grad():
-            hidden = hidden_returns(noise[:, :2], self.hidden * float(draws.random()))
-            features, surface, _ = self.generator.geometry(images, hidden, noise[:, 2:], ring=columns == turn)
-        parts = {"features": features, "surface": surface, "target": target_of(images)}
-        return {name: value[0, ..., margin : margin + columns].contiguous() for name, value in parts.items()}
-
-    def condition(self, batch: Batch) -> Condition:
-        return self.generator.condition(batch["features"])
-
-    def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
-        x_1, surface = batch["target"], batch["surface"]
-        t = self.time(u)
-        x_t, u_t = interpolate(batch["x_0"][..., : x_1.shape[3]], x_1, t)
-        v = self.generator.velocity(t, x_t, self.condition(batch))
-        seen = torch.cat([surface, surface & (x_1[:, :1] > 0)], 1).to(v)
-        return self.loss(v * seen, u_t * seen).mean()
