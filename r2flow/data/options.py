@@ -16,6 +16,7 @@ from r2flow.samplers import build_sampler, knot_times
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # in the table `r2flow.data.opening.SOURCES`
 Data = dict[str, Any]  # of a config
 MIXED, PAIRS = "mixed", "pairs"  # what `data.name` may be besides: several sets of scans, and pairs drawn by a flow
+MOST_SCENES = 10**7  # whose order alone takes 80 MB
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,8 @@ class SourceOptions:
     weight: Positive | None = None  # of one of several sets: its share of a run's images
 
     def __post_init__(self) -> None:
-        if self.scenes < 1:
-            raise InputError(f"data.scenes must be at least 1, found {self.scenes}.")
+        if not 1 <= self.scenes <= MOST_SCENES:
+            raise InputError(f"data.scenes must be 1 to {MOST_SCENES:,}, found {self.scenes}.")
         check_options("data.reading", ReadingOptions, self.reading or {})
         check_columns(self.columns)
 
