@@ -110,7 +110,7 @@ def complete(
     print(f"an answer has at most one point in each pixel of the image, {'x'.join(map(str, loaded.sensor.shape))}")
     about = {
         "mask": mask and mask_identity(mask), "from": source, "reflectance_scale": reflectance_scale,
-        "columns": columns, "to": to, "size": size,
+        "columns": columns,
     }  # fmt: skip
     done = write_completed(loaded, partial, out, job, sampler, about)
     skipped = len(partial) - len(done)

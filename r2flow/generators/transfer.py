@@ -87,6 +87,7 @@ class Surroundings(NamedTuple):
         there: Which candidates there are, (B, 6, H, W) bool.
         guess: The candidate that is taken for the ray before anything is learned, log r, (B, 1, H, W).
         start: It and its reflectance in model space, (B, C, H, W).
+        sure: 1 of a measured return, -1 of a ray that was measured empty, 0 of a hidden one, (B, 1, H, W).
     """
 
     features: Tensor
@@ -95,6 +96,7 @@ class Surroundings(NamedTuple):
     there: Tensor
     guess: Tensor
     start: Tensor
+    sure: Tensor
 
 
 @dataclass(frozen=True)
@@ -259,7 +261,8 @@ class TransferFlow(Flow):
                 ((log_r - guess) * returned).clamp(-3, 3), strength, nothing, guess / 3 - 1,
             ], 1
         )  # fmt: skip
-        return Surroundings(features, ranges, strengths, there, guess, torch.where(measured > 0, image, start))
+        sure = measured * torch.where(returned, 1, -1)
+        return Surroundings(features, ranges, strengths, there, guess, torch.where(measured > 0, image, start), sure)
 
     def _encode(self, r: Tensor, strength: Tensor) -> Tensor:
         """Metres and reflectance, (B, 1, H, W) each, to model space."""
@@ -286,7 +289,8 @@ class TransferFlow(Flow):
         scales = (scales - 4).clamp(max=2).exp() + FINEST
         nearest = about.strengths.gather(1, about.there.int().argmax(1, keepdim=True))
         strengths = torch.cat([about.strengths, nearest], 1) + strength
-        return Answers(logits, ranges, scales, returns + 1, strengths.clamp(0, 1) if not self.training else strengths)
+        returns = torch.where(about.sure != 0, -NEVER * about.sure, returns + 1)
+        return Answers(logits, ranges, scales, returns, strengths.clamp(0, 1) if not self.training else strengths)
 
     # -- the flow ------------------------------------------------------------------------------------------------------
 

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.generators import Flow, Generator, Sampler, TransferFlow, condition_of
+from r2flow.generators import Flow, Generator, Sampler, condition_of
 from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
 from r2flow.lidar.known import Ray
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.sampling import HasGenerator, draw
-from r2flow.samplers import build_sampler
+from r2flow.samplers import Transport, build_sampler
 
 ANSWER = 2**32  # noise numbers from one answer to the next: answer 0 of scan i has the noise of sample i
 
@@ -77,7 +77,7 @@ def completing(generator: Generator, name: str | None = None, *, several: bool =
     if not (generator.told or isinstance(generator, Flow)) or generator.noise_shape != generator.space.shape:
         raise InputError(f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images.")
     if generator.told:
-        if several and name is None and not changes and isinstance(generator, TransferFlow):
+        if several and name is None and not changes and hasattr(generator, Transport.needs):
             name = "transport"
         return generator.choose(name, **changes)
     completers = {completer.name: completer for completer in getattr(generator, "completers", ())}

@@ -125,12 +125,6 @@ class Repaint(Posterior):
                     x = torch.where(known, s * y + (1 - s) * noise(j), jump(u, t, x, s))
         return x
 
-    def check(self, generator: Any) -> None:
-        super().check(generator)
-        if generator.told:
-            kind = type(generator).__name__
-            raise InputError(f"sampler {self.name} asks a flow of whole scans; a {kind} completes by jump.")
-
     def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         if condition is None or not hasattr(generator, "repaint"):
             return super().__call__(generator, noise, condition, draws, progress)

@@ -106,3 +106,23 @@ def test_backward_in_time():
     problem = Gaussian()
     there = solve(problem, X_0, method="exprb43", tolerance=1e-4).x
     assert worst(solve(problem, there, 1.0, 0.0, method="exprb43", tolerance=1e-4).x, X_0) < 1e-3
+
+
+def test_a_scene_that_runs_away_does_not_end_its_batch():
+    """Robertson's reactions to t = 40 at a tolerance above their smallest component, beside the same in balance."""
+
+    def reactions(t, x):
+        a, b, c = x.unbind(-1)
+        slow, fast = 0.04 * a - 1e4 * b * c, 3e7 * b * b
+        return 40 * torch.stack([-slow, slow - fast, fast], -1)
+
+    x_0 = torch.tensor([[1.0, 0, 0], [0.0, 0, 1]], dtype=torch.float64)
+    found = solve(reactions, x_0, method="exprb43", tolerance=1e-4)
+    assert found.converged[1]
+    assert torch.equal(found.x[1], x_0[1])
+    exact = [0.715827069, 9.18553476e-06, 0.284163746]  # scipy's Radau at 1e-12
+    ok = found.converged[0] and torch.allclose(found.x[0], torch.tensor(exact, dtype=torch.float64), atol=1e-3)
+    assert ok or not found.converged[0]
+    close = solve(reactions, x_0[:1], method="auto", tolerance=1e-6)
+    assert close.converged.all()
+    assert torch.allclose(close.x[0], torch.tensor(exact, dtype=torch.float64), atol=1e-4)
