@@ -5,7 +5,6 @@ scans[0].read()         image, state, xyz
 """
 
 import hashlib
-import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -23,14 +22,13 @@ from r2flow.lidar.beams import full_reflectance, other_sensor
 from r2flow.lidar.scan_files import Points, read_numbers, read_points, read_range_image, scan_ending
 from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.transfer import (
-    Fired,
     Partial,
-    firing_of,
     image_of_same,
     image_through,
     points_of_same,
     points_through,
     rows_of,
+    sensor_of,
 )
 
 FEWER = 0.9  # of the columns: a turn of fewer rays leaves pixels between them
@@ -126,19 +124,19 @@ def _files(
         doubt = None if source else other_sensor(some, target)
         same = _same_view(source, target) if source else doubt is None
         try:
-            fired = firing_of(some, source or (target if same else None))
+            fired = sensor_of(some, source or (target if same else None))
         except InputError as error:
             raise InputError(f"{spec}: the sensor of the scans is not known, name it by --from: {error}") from None
-        if same and fired.steps >= FEWER * target.columns:
+        if same and fired.columns >= FEWER * target.columns:
             full = scale or (1.0 if noted else usual_scale(spec, source or target))
             by_points = partial(_read_points, reading=reading, fired=None, scale=full, strict=True)
         else:
             full = scale or (1.0 if noted else source and source.reflectance_scale) or full_reflectance(some) or 1.0
             by_points = partial(_read_points, reading=reading, fired=fired, scale=full, strict=scale is not None)
             name = source.name if source else (doubt and doubt.name) or "a sensor"
-            lines.append(_described(spec, fired.elevations, name, target, fired.steps))
+            lines.append(_described(spec, replace(fired, name=name), target, turns=True))
     elif source and not _same_image(source, target):
-        lines.append(_described(spec, np.asarray(source.elevations), source.name, target))
+        lines.append(_described(spec, source, target))
 
     def opened(path: Path) -> PartialScan:
         ending = scan_ending(path.name) or path.suffix
@@ -164,30 +162,32 @@ def _images(spec: str, reading: Reading, source: Sensor | None, most: int | None
         return PartialScan(name, ".npy", partial(_read_set, scans, number, how.sensor, target), content)
 
     same = _same_image(how.sensor, target)
-    lines = [] if same else [_described(spec, np.asarray(how.sensor.elevations), how.sensor.name, target)]
+    lines = [] if same else [_described(spec, how.sensor, target)]
     return [opened(number) for number in spread(len(scans), most or len(scans))], lines
 
 
-def _described(spec: str, elevations: np.ndarray, name: str, target: Sensor, steps: float = math.inf) -> str:
+def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -> str:
     """In a line: the sensor, how many rows it measures, what is left out.
 
     Raises:
         InputError: no beam looks into the model's view.
     """
-    rows = rows_of(elevations, target)
-    beams = f"{name} with {len(elevations)} beams from {elevations[0]:+.1f} to {elevations[-1]:+.1f} degrees"
+    e = source.elevations
+    rows = rows_of(np.asarray(e), target)
+    beams = f"{source.name} with {len(e)} beams from {e[0]:+.1f} to {e[-1]:+.1f} degrees"
     if not (rows >= 0).any():
         raise InputError(
             f"{spec}: {beams}, and the model's sensor {target.name} sees {target.row_edges[0]:+.1f} to "
             f"{target.row_edges[-1]:+.1f} degrees."
         )
     measured = f"{len(set(rows[rows >= 0]))} of the {target.shape[0]} rows of {target.name} are measured"
-    turn = f", in the columns that its {steps:.0f} rays a turn meet" if steps < FEWER * target.columns else ""
+    few = turns and source.columns < FEWER * target.columns
+    turn = f", in the columns that its {source.columns} rays a turn meet" if few else ""
     beyond = f", {int((rows < 0).sum())} beams look past its view" if (rows < 0).any() else ""
     return f"{spec}: {beams}; {measured}{turn}{beyond}"
 
 
-def _read_points(path: Path, reading: Reading, fired: Fired | None, scale: float, strict: bool) -> Partial:
+def _read_points(path: Path, reading: Reading, fired: Sensor | None, scale: float, strict: bool) -> Partial:
     """Points of the model's sensor or, with `fired`, of another one."""
     target, points = reading.sensor, read_points(path, reading.columns)
     if fired is None and reading.projection == "unfolding":

@@ -12,7 +12,7 @@ import numpy as np
 
 from r2flow.errors import InputError, naming
 from r2flow.lidar.labels import labels_beside, read_labels
-from r2flow.lidar.projection import Convention, Projection, image_of, project_indices
+from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
 from r2flow.lidar.scan_files.points import FARTHEST
 from r2flow.lidar.sensors import Sensor
@@ -120,10 +120,10 @@ def _projected(path: str | Path, reading: Reading) -> Projected:
     scaled = _scaled_reflectance(path, points, reading.reflectance_scale) if reading.reflectance else None
     with naming(path):
         pixels, chosen, r = project_indices(points.xyz, sensor, reading.projection, reading.convention, points.ring)
-    image = image_of(sensor, pixels, r, None if scaled is None else scaled[chosen])
+    image = scatter(sensor, pixels, [r] if scaled is None else [r, scaled[chosen]])
     if not image[0].any():
         raise nothing_in_view(path, points, sensor)
-    return Projected(image[: 1 + bool(reading.reflectance)], points, pixels, chosen)
+    return Projected(image, points, pixels, chosen)
 
 
 def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPointsError:

@@ -67,7 +67,7 @@ def _choose(path: Path, connections: list[Any], topic: str | None) -> list[Any]:
     topics = sorted({connection.topic for connection in clouds})
     types = ", ".join(sorted({connection.msgtype for connection in connections}))[:160]
     check(
-        bool(topics),
+        topics,
         f"{path} holds no topic of point clouds ({CLOUD}), but {types}; a ROS driver turns packets into clouds.",
     )
     if topic is None and len(topics) > 1:

@@ -142,7 +142,7 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
     if len(xyz) < FEWEST_RETURNS:
         raise InputError(f"{len(xyz)} returns are too few for an estimate: give scans with at least {FEWEST_RETURNS}.")
     beams = find_beams(scans)
-    steps = steps_of_a_turn(scans, beams)
+    steps = steps_of_a_turn(scans, beams.of_point)
     elevations = beams.elevations.round(3).tolist()
     for row, (above, below) in enumerate(pairwise(elevations)):  # equal after rounding
         if below >= above:
@@ -176,14 +176,14 @@ def _height(xyz: np.ndarray) -> float:
     return round(-float(np.median(z[np.abs(z - ground) < 0.3])), 2)
 
 
-def steps_of_a_turn(scans: Sequence[Points], beams: Beams) -> float:
-    """Azimuth steps of a full turn, 360 / step.
+def steps_of_a_turn(scans: Sequence[Points], rows: Sequence[np.ndarray]) -> float:
+    """Azimuth steps of a full turn, 360 / step, by the row of each point of each scan.
 
     The first estimate is the 30th percentile of the gaps between neighbouring returns of one beam, since most rays next
     to a return have one too; then the sum of all gaps of up to three steps divided by the number of steps in them.
     """
     gaps = []
-    for scan, row in zip(scans, beams.of_point, strict=True):
+    for scan, row in zip(scans, rows, strict=True):
         azimuth = np.rad2deg(np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]).astype(np.float64))
         order = np.lexsort((azimuth, row))
         order = order[row[order] >= 0]

@@ -1,17 +1,16 @@
 """Range images between metres and model space, [-1, 1]."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from copy import copy
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Sensor
-from r2flow.registry import Positive, Registry, check_options
+from r2flow.registry import Positive, Registry
 
 # Decoding may miss a range limit by float32's rounding: within this relative distance a range is the limit.
 LIMIT_TOLERANCE = 1e-5
@@ -166,19 +165,13 @@ class Encoding:
         """(..., 2 or 1, H, W) in metres and reflectance of [0, 1] -> (..., channels, H, W).
 
         A dropped ray, range 0, becomes exactly -1 (the origin, 0, under `cartesian`; nearly -1 under `shifted_log`).
-
-        Raises:
-            InputError: reflectance is a channel of the model and the image has none.
         """
         r = image[..., :1, :, :]
         if self.limits == "open":
             r = r * self._between(r)
         y = self.format.forward(r)
         if self.reflectance:
-            if image.shape[-3] < 2:
-                raise InputError(
-                    "the model has a reflectance channel and the scan has none; train with encoding.reflectance=false."
-                )
+            assert image.shape[-3] == 2, "a model of reflectance is given a scan without"
             y = torch.cat([y, image[..., 1:2, :, :]], dim=-3)
         return 2 * y - 1
 
@@ -206,9 +199,3 @@ class Encoding:
 
     def _between(self, r: Tensor) -> Tensor:
         return (r > self.sensor.min_range) & (r < self.sensor.max_range)
-
-
-def build_encoding(options: Mapping[str, Any], sensor: Sensor) -> Encoding:
-    """The encoding a config describes: `format`, `reflectance`, `limits` and `levels`."""
-    check_options("encoding", Encoding, options, given=1)
-    return Encoding(sensor, **options)

@@ -4,10 +4,12 @@ state = ray_states(images, parse_mask("rows:4")(images.shape[-2:], rng))
 """
 
 import hashlib
+import inspect
 import math
 from collections.abc import Callable
 from enum import IntEnum
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -16,7 +18,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.lidar.region import region
 from r2flow.lidar.scan_files import read_numbers
-from r2flow.registry import Registry, did_you_mean
+from r2flow.registry import Bound, Count, Natural, Registry, check_options
 
 
 class Ray(IntEnum):
@@ -62,28 +64,27 @@ def share_in_sectors(state: np.ndarray, least: float = 5.0) -> float:
 Mask = Callable[[tuple[int, int], np.random.Generator], np.ndarray]  # (H, W) and draws to measured rays, (H, W) bool
 
 
-def every_row(step: float, first: float = 0) -> Mask:
+Share = Annotated[float, Bound("in [0, 1]", lambda x: 0 <= x <= 1)]
+
+
+def every_row(step: Count, first: Natural = 0) -> Mask:
     """Rows first, first + step, first + 2 step, ...: a sensor with fewer beams."""
-    if step < 1 or step % 1 or first < 0 or first % 1:
-        raise InputError(f"rows:STEP,FIRST are whole numbers, STEP of at least 1, found {step:g} and {first:g}.")
 
     def mask(shape: tuple[int, int], draws: np.random.Generator) -> np.ndarray:
         measured = np.zeros(shape, dtype=bool)
-        measured[int(first) :: int(step)] = True
+        measured[first::step] = True
         return measured
 
     return mask
 
 
-def random_rows(share: float) -> Mask:
+def random_rows(share: Share) -> Mask:
     """A random share of the rows."""
-    _check_share(share)
     return lambda shape, draws: np.repeat(_chosen(shape[0], share, draws)[:, None], shape[1], axis=1)
 
 
-def random_points(share: float) -> Mask:
+def random_points(share: Share) -> Mask:
     """A random share of the rays."""
-    _check_share(share)
     return lambda shape, draws: _chosen(math.prod(shape), share, draws).reshape(shape)
 
 
@@ -127,14 +128,14 @@ def _one_mask(text: str) -> Mask:
     if text.endswith(".npy"):
         return _from_file(Path(text))
     name, _, numbers = text.partition(":")
-    if name not in MASKS:
-        raise InputError(f"no mask {text!r}: give {FORMS}.{did_you_mean(name, dict(MASKS.items()))}")
+    mask = MASKS[name]
     try:
-        return MASKS[name](*[float(number) for number in numbers.split(",")])
-    except InputError:
-        raise
+        values = [int(x) if (x := float(number)).is_integer() else x for number in numbers.split(",")]
+        options = inspect.signature(mask).bind(*values).arguments
     except (ValueError, TypeError):
         raise InputError(f"the mask {text!r} lacks its numbers: give {FORMS}.") from None
+    check_options(f"the mask {text!r}", mask, options)
+    return mask(**options)
 
 
 def _from_file(path: Path) -> Mask:
@@ -149,11 +150,6 @@ def _from_file(path: Path) -> Mask:
         return measured.astype(bool)
 
     return mask
-
-
-def _check_share(share: float) -> None:
-    if not 0 <= share <= 1:
-        raise InputError(f"a share of measured rays lies in [0, 1], found {share:g}.")
 
 
 def _chosen(count: int, share: float, draws: np.random.Generator) -> np.ndarray:

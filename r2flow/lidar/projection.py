@@ -1,6 +1,7 @@
 """Points to a range image and back."""
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -49,16 +50,14 @@ def project(
         InputError: a scan that does not unfold into the sensor's rings.
     """
     hit, chosen, r = project_indices(xyz, sensor, projection, convention, ring)
-    return image_of(sensor, hit, r, None if reflectance is None else reflectance[chosen])
+    return scatter(sensor, hit, [r, np.zeros_like(r) if reflectance is None else reflectance[chosen]])
 
 
-def image_of(sensor: Sensor, hit: np.ndarray, r: np.ndarray, reflectance: np.ndarray | None) -> np.ndarray:
-    """The range image, (2, H, W) float32, of pixels h W + w with their ranges in metres and reflectances, (M,) each."""
-    image = np.zeros((2, math.prod(sensor.shape)), dtype=np.float32)
-    image[0, hit] = r
-    if reflectance is not None:
-        image[1, hit] = reflectance
-    return image.reshape(2, *sensor.shape)
+def scatter(sensor: Sensor, pixel: np.ndarray, values: Sequence[np.ndarray]) -> np.ndarray:
+    """An image of C channels, (C, H, W) float32, of the values, (M,) each, at pixels h W + w; 0 elsewhere."""
+    image = np.zeros((len(values), math.prod(sensor.shape)), dtype=np.float32)
+    image[:, pixel] = values
+    return image.reshape(-1, *sensor.shape)
 
 
 def project_indices(

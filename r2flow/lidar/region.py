@@ -104,15 +104,13 @@ def region(
             not what it is in the whole scan.
 
     Raises:
-        InputError: a margin below 0 or without a sector; an empty sector, or one narrower than a column; angles beyond
-            360 degrees, or rows that the image does not have.
+        InputError: a sector narrower than a column, angles beyond 360 degrees, or rows that the image does not have.
     """
     height, width = shape
     first_row, last_row = rows or (0, height - 1)
     if not 0 <= first_row <= last_row < height:
         raise InputError(f"rows must be FIRST-LAST within 0-{height - 1}, found {first_row}-{last_row}.")
-    if not (0 <= margin <= 180 and (sector is not None or margin == 0)):
-        raise InputError(f"a margin is 0 to 180 degrees on either side of a sector, found {margin:g}.")
+    assert 0 <= margin <= (180 if sector else 0), margin
     left, count = _columns(width, sector) if sector is not None else (0, width)
     return Region(shape, first_row, last_row - first_row + 1, left, count, math.ceil(margin / 360 * width))
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.lidar.encoding import Encoding, build_encoding
+from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Convention, Sensor, build_sensor
 from r2flow.registry import check_options
@@ -100,4 +100,5 @@ def build_space(config: Mapping[str, Any]) -> ModelSpace:
     convention: Convention = options.pop("rays", "centre")
     check_options("sensor", build_sensor, options)
     sensor = build_sensor(**options)
-    return ModelSpace(sensor, build_encoding(config["encoding"], sensor), sensor.rays(convention))
+    check_options("encoding", Encoding, config["encoding"], given=1)
+    return ModelSpace(sensor, Encoding(sensor, **config["encoding"]), sensor.rays(convention))

@@ -133,7 +133,7 @@ def masked(scan: Partial, mask: Mask | None, number: int, seed: int, name: str) 
             raise InputError(f"{name}: the mask keeps {what} that was measured; give another --mask.")
     state = np.where(kept, scan.state, int(Ray.UNKNOWN)).astype(np.uint8)
     xyz = None if scan.xyz is None else scan.xyz * kept
-    return Partial(scan.image * kept, state, xyz, scan.outside)
+    return Partial(scan.image * kept, state, xyz)
 
 
 def hidden_errors(whole: Partial, given: Partial, completed: Completed, sensor: Sensor) -> dict[str, float]:

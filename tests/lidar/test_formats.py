@@ -225,7 +225,7 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
         ("", "empty"),
         ("# nothing\n", "no line of numbers"),
         ("x,y,z\n", "no line"),
-        ("1,5;2,5;3,5\n" * 3, "no field"),  # decimal commas
+        ("1,5;2,5;3,5\n" * 3, "convert"),  # decimal commas
         ("1 2\n3 4\n", "2 columns without names"),
         ("1,2,,4\n" * 3, "NaN"),
         ("time,lat,lon\n1,2,3\n", "no field x, y, z; it has: time, lat, lon"),

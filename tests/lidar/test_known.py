@@ -49,27 +49,15 @@ def test_random_masks_differ_between_scans_and_are_drawn_again_alike():
 
 @pytest.mark.parametrize(
     "text",
-    ["row:4", "rows:0", "rows:1.5", "rows:two", "rows", "random:1.5", "points:-1", "sector:5", "sector:5,5", "no.npy"],
-)
+    [
+        "row:4", "rows:0", "rows:1.5", "rows:4,-1", "rows:nan", "rows:two", "rows", "random:1.5", "points:-1",
+        "sector:5", "sector:5,5", "sector:1,2,3", "sector:nan,5", "no.npy",
+    ],
+)  # fmt: skip
 def test_what_is_no_mask_is_one_line(text):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=text.partition(",")[0].partition(":")[0]) as caught:
         parse_mask(text)(SHAPE, draws())
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("rows:0", "STEP of at least 1, found 0 and 0"),
-        ("rows:4,-1", "found 4 and -1"),
-        ("rows:nan", "found nan"),
-        ("random:1.5", "found 1.5"),
-        ("points:-1", "found -1"),
-    ],
-)
-def test_a_mask_of_wrong_numbers_is_told_which_it_takes(text, said):
-    with pytest.raises(InputError, match=said):
-        parse_mask(text)
 
 
 def test_a_file_that_is_no_mask_says_what_it_is(tmp_path):

@@ -157,7 +157,7 @@ def test_lost_rays_leave_every_point_its_beam(tmp_path):
     scan = read_points(tmp_path / "0.npy")
     beams = find_beams([scan])
     np.testing.assert_array_equal(beams.of_point[0], row[mixed][~lost])
-    assert steps_of_a_turn([scan], beams) == pytest.approx(480, rel=1e-3)
+    assert steps_of_a_turn([scan], beams.of_point) == pytest.approx(480, rel=1e-3)
 
 
 def test_what_training_reads_can_be_completed(tmp_path):

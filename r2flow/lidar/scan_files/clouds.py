@@ -119,7 +119,7 @@ def read_ply(path: Path, columns: object = None) -> Table:
                 pass
             case _:
                 check(False, f"it has a header line that PLY does not know: {' '.join(words)[:60]!r}.")
-    check(kind != "", f"it has no 'format' line in its header; known: {', '.join(PLY_ORDERS)}, each 1.0.")
+    check(kind, f"it has no 'format' line in its header; known: {', '.join(PLY_ORDERS)}, each 1.0.")
     index = next((i for i, element in enumerate(elements) if element.name == "vertex"), -1)
     check(index >= 0, "it has no element 'vertex', which holds the points.")
     before, vertex = elements[:index], elements[index]

@@ -4,7 +4,7 @@ import io
 import math
 import re
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -48,8 +48,7 @@ def read_npz(path: Path, columns: object = None) -> Table:
         table = next(
             (lower[name] for name in TABLES if name in lower), next(iter(members)) if len(members) == 1 else None
         )
-        roles = {alias for aliases in ROLES.values() for alias in aliases}
-        beside = [name for name in members if name.lower() in roles and name != table]
+        beside = [name for name in _named(members) if name != table]
         arrays = {}
         for name in [*([table] if table else []), *beside]:
             with archive.open(members[name]) as file:
@@ -60,6 +59,12 @@ def read_npz(path: Path, columns: object = None) -> Table:
     if names is None and beside:
         names = list(usual_names(len(fields), None))
     return [*names, *beside] if names else None, [*fields, *arrays.values()]
+
+
+def _named(names: Iterable[str]) -> list[str]:
+    """Names of columns that points use."""
+    roles = {alias for aliases in ROLES.values() for alias in aliases}
+    return [name for name in names if name.lower() in roles]
 
 
 def read_array(file: IO[bytes], size: int) -> np.ndarray:
@@ -87,7 +92,7 @@ def read_text(path: Path, columns: object = None) -> Table:
     """One point a line, numbers apart by commas, semicolons, tabs or spaces; names in the first line or a comment."""
     lines = [line.strip(" \r") for line in path.read_text("utf-8-sig", "replace").split("\n") if line.strip()]
     rows = [line for line in lines if line[0] not in "#/"]
-    check(bool(rows), "it holds no line of numbers.")
+    check(rows, "it holds no line of numbers.")
     apart = next((mark for mark in ";\t," if mark in rows[-1]), None)
 
     def words(line: str) -> list[str]:
@@ -96,20 +101,14 @@ def read_text(path: Path, columns: object = None) -> Table:
     names: list[str] | None
     if not any(map(_is_number, words(rows[0]))):
         names, rows = words(rows[0]), rows[1:]
-        check(bool(rows), "it holds no line of numbers.")
+        check(rows, "it holds no line of numbers.")
     else:  # CloudCompare writes names behind //, numpy behind #
         width, comments = len(words(rows[0])), [words(line) for line in lines if line[0] in "#/"]
         named = (line for line in comments if len(line) == width and {"x", "y", "z"} <= {word.lower() for word in line})
         names = next(named, None)
-    if apart and names is not None and rows[-1].endswith(apart) and rows[-1].count(apart) == len(names):
-        rows = [line.removesuffix(apart) for line in rows]  # a separator at the end
-    try:
-        table = np.loadtxt(rows, delimiter=apart, comments=None, ndmin=2)
-    except ValueError:
-        if apart is None:
-            raise
-        table = np.genfromtxt(rows, delimiter=apart, comments=None)  # type: ignore[call-overload]  # slower; a gap, as of a ray without return, is NaN
-    return names, list(np.atleast_2d(table).T)
+    # A gap, as of a ray without return, is NaN.
+    table = np.loadtxt(rows, delimiter=apart, comments=None, ndmin=2, converters=lambda word: float(word or "nan"))
+    return names, list(table.T)
 
 
 def _is_number(word: str) -> bool:
@@ -126,19 +125,16 @@ def read_arrow(path: Path, columns: object = None) -> Table:
     import pyarrow
     from pyarrow import feather, parquet
 
-    wanted = {alias for aliases in ROLES.values() for alias in aliases}
     if path.name.lower().endswith(".parquet"):
         file = parquet.ParquetFile(path)
-        names = [name for name in file.schema_arrow.names if name.lower() in wanted]
         check_unpacked(path, 8 * file.metadata.num_rows)  # a run of equal values takes no bytes
-        check(bool(names), f"it has no field x, y, z; it has: {', '.join(file.schema_arrow.names)[:120]}.")
-        table = file.read(names)
+        table = file.read(_named(file.schema_arrow.names) or None)
     else:
         with pyarrow.memory_map(str(path)) as source:
-            names = [name for name in pyarrow.ipc.open_file(source).schema.names if name.lower() in wanted]
-        table = feather.read_table(path, names, memory_map=False)
+            names = _named(pyarrow.ipc.open_file(source).schema.names)
+        table = feather.read_table(path, names or None, memory_map=False)
     table.validate(full=True)
-    return names, [table.column(name).to_numpy() for name in names]
+    return table.column_names, [column.to_numpy() for column in table.columns]
 
 
 def read_las(path: Path, columns: object = None) -> Table:
