@@ -8,7 +8,7 @@ python benchmarks/backbones.py                                  # forward and ba
 python benchmarks/backbones.py --backbone hdit --mode compiled-bfloat16
 python benchmarks/backbones.py --backbone hdit --mode float32 bfloat16 --threads 1 --profile  # and where the time goes
 python benchmarks/backbones.py --experiment dusty2 --options data.batch_size=4  # a step of training, on simulated scans
-python benchmarks/backbones.py --device cuda --batch 1 8 64 --attention flex tiles natten --mode compiled-bfloat16
+python benchmarks/backbones.py --device cuda --batch 1 8 64 --attention flex tiles --mode compiled-bfloat16
 """
 
 import argparse

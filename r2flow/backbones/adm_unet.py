@@ -14,8 +14,8 @@ from r2flow.backbones.convolutions import (
     RingConv2d,
     SelfAttention,
     UNet,
-    zero_convolution,
 )
+from r2flow.backbones.layers import zero_initialised
 
 FILTER = (1, 1)
 
@@ -54,7 +54,7 @@ class ADMUNet(UNet):
                     double = Resample(FILTER, up=True, ring=options.ring)
                     step.append(ADMBlock(width, width, options, double))
                 self.up_blocks.append(step)
-        head = zero_convolution(RingConv2d(width, self.out_channels, options.ring))
+        head = zero_initialised(RingConv2d(width, self.out_channels, options.ring))
         self.out_conv = nn.Sequential(GroupNorm(width, options.groups, options.eps), nn.SiLU(), head)
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:

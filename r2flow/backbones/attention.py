@@ -8,9 +8,8 @@ Backends, all of the same values and gradients:
     dense    every pair of tokens and a mask: the definition, for tests and small maps
     tiles    blocks of queries against the keys around them: plain matrix products, on every device
     flex     flex_attention: CUDA
-    natten   natten.na2d, where it is installed with its kernels: CUDA
 
-"auto" takes natten, else flex, for CUDA tensors that their kernels can take, outside torch.compile; else tiles.
+"auto" takes flex for CUDA tensors that its kernels can take, outside torch.compile; else tiles.
 """
 
 import functools
@@ -46,7 +45,7 @@ def neighbourhood_attention(
     check_window(window)
     rows = _Axis(q.shape[1], window[0], wrap=False)
     columns = _Axis(q.shape[2], window[1], wrap=wrap)
-    name = _fastest(q, rows, columns) if backend == "auto" else backend
+    name = _fastest(q, columns) if backend == "auto" else backend
     return BACKENDS[name](q, k, v, rows, columns)
 
 
@@ -195,36 +194,8 @@ def _flex(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tenso
     return out.transpose(1, 2).unflatten(1, (rows.size, columns.size))
 
 
-@functools.cache
-def _natten_kernels() -> bool:
-    if importlib.util.find_spec("natten") is None:
-        return False
-    import natten
-
-    return bool(getattr(natten, "HAS_LIBNATTEN", False))
-
-
-def _natten(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:
-    if q.device.type != "cuda" or not _natten_kernels():
-        raise InputError(
-            "attention backend 'natten' needs a CUDA device and NATTEN built with its kernels (HAS_LIBNATTEN); "
-            f"here: device {q.device.type}, kernels {'found' if _natten_kernels() else 'not found'}. "
-            "Use 'auto', which needs neither."
-        )
-    from natten import na2d
-
-    # NATTEN moves every window inside; with half a window of the ring's other side on both ends, each real
-    # token's window is centred, and the added columns are cropped
-    half = columns.asked // 2 if columns.wrap else 0
-    if half:
-        ring = torch.arange(-half, columns.size + half, device=q.device) % columns.size
-        q, k, v = (x.index_select(2, ring) for x in (q, k, v))
-    out = na2d(q, k, v, kernel_size=(rows.span, columns.span), scale=1.0)
-    return out[:, :, half : half + columns.size]
-
-
 Backend = Callable[[Tensor, Tensor, Tensor, _Axis, _Axis], Tensor]
-BACKENDS: Registry[Backend] = Registry("attention backend", dense=_dense, tiles=_tiles, flex=_flex, natten=_natten)
+BACKENDS: Registry[Backend] = Registry("attention backend", dense=_dense, tiles=_tiles, flex=_flex)
 
 
 def backend_name(name: str) -> str:
@@ -234,12 +205,7 @@ def backend_name(name: str) -> str:
     return name
 
 
-def _fastest(q: Tensor, rows: _Axis, columns: _Axis) -> str:
+def _fastest(q: Tensor, columns: _Axis) -> str:
     """What "auto" means for this input."""
-    if q.is_cuda and q.dtype != torch.float64 and not torch.compiler.is_compiling():
-        spans = rows.span, columns.span
-        if _natten_kernels() and all(span > 1 and span % 2 for span in spans) and q.shape[-1] % 8 == 0:
-            return "natten"
-        if columns.span <= columns.size and q.shape[-1] >= 16 and importlib.util.find_spec("triton"):
-            return "flex"
-    return "tiles"
+    takes = q.is_cuda and q.dtype != torch.float64 and q.shape[-1] >= 16 and columns.span <= columns.size
+    return "flex" if takes and not torch.compiler.is_compiling() and importlib.util.find_spec("triton") else "tiles"

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Unpack, cast
+from typing import Annotated, Any, Unpack
 
 import torch
 import torch.nn.functional as F
@@ -157,7 +157,7 @@ class ResidualBlock(nn.Module):
         self.conv1 = RingConv2d(channels, out_channels, options.ring)
         self.norm2 = AdaGroupNorm(out_channels, options)
         self.dropout = nn.Dropout(options.dropout)
-        self.conv2 = zero_convolution(RingConv2d(out_channels, out_channels, options.ring))
+        self.conv2 = zero_initialised(RingConv2d(out_channels, out_channels, options.ring))
 
     def residual(self, x: Tensor, condition: Tensor) -> Tensor:
         """f of an x that `norm1` has normed."""
@@ -183,14 +183,6 @@ class SelfAttention(nn.Module):
         tokens = self.norm(x).flatten(2).mT
         attended, _ = self.attn(tokens, tokens, tokens, need_weights=False)
         return (x + attended.mT.unflatten(2, x.shape[2:])) * self.scale
-
-
-def zero_convolution(layer: nn.Conv2d) -> nn.Conv2d:
-    """The layer with zero weights and bias: a residual branch that starts as the identity."""
-    nn.init.zeros_(layer.weight)
-    if layer.bias is not None:
-        nn.init.zeros_(layer.bias)
-    return layer
 
 
 class UNet(Backbone):
@@ -248,7 +240,7 @@ class UNet(Backbone):
         self.build_levels(base_channels, widths, counts, num_heads, BlockOptions(width, ring, dropout, groups, eps))
         if self.second_time:
             self.interval_embedding = time_embedding(base_channels, width, bias=False)
-            zero_initialised(cast(nn.Linear, self.interval_embedding[-1]))
+            zero_initialised(self.interval_embedding[-1])
         self.follow_rays()
 
     def build_levels(

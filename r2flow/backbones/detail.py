@@ -3,7 +3,7 @@
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.convolutions import RingConv2d, zero_convolution
+from r2flow.backbones.convolutions import RingConv2d
 from r2flow.backbones.layers import ExactLinear, RMSNorm, uncast, unshuffle, zero_initialised
 
 
@@ -40,7 +40,7 @@ class Detail(nn.Module):
         self.image = RingConv2d(ends[0], channels, ring)
         self.gain = zero_initialised(ExactLinear(condition_channels, channels, bias=False))
         self.blocks = nn.ModuleList([DetailBlock(channels, condition_channels, ring) for _ in range(blocks)])
-        self.answer = zero_convolution(RingConv2d(channels, ends[1], ring))
+        self.answer = zero_initialised(RingConv2d(channels, ends[1], ring))
 
     def forward(self, x: Tensor, tokens: Tensor, condition: Tensor) -> Tensor:
         """x (B, C, H, W), tokens (B, H/p, W/q, K), condition (B or 1, L) to (B, C', H, W)."""
@@ -59,7 +59,7 @@ class DetailBlock(nn.Module):
         super().__init__()
         self.first = RingConv2d(channels, channels, ring)
         self.modulation = zero_initialised(ExactLinear(condition_channels, 2 * channels, bias=False))
-        self.second = zero_convolution(RingConv2d(channels, channels, ring))
+        self.second = zero_initialised(RingConv2d(channels, channels, ring))
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         h = self.first(F.silu(x))

@@ -12,8 +12,8 @@ from r2flow.backbones.convolutions import (
     RingConv2d,
     SelfAttention,
     UNet,
-    zero_convolution,
 )
+from r2flow.backbones.layers import zero_initialised
 
 FILTER = (1, 3, 3, 1)
 
@@ -35,7 +35,7 @@ class EfficientUNet(UNet):
             self.add_module(f"d_block{level}", Level(above, width, count, options, attention, down=level > 1))
             channels = width if deepest else 2 * width  # with the skip
             self.add_module(f"u_block{level}", Level(channels, above, count, options, attention, up=level > 1))
-        self.out_conv = zero_convolution(RingConv2d(base_channels, self.out_channels, options.ring))
+        self.out_conv = zero_initialised(RingConv2d(base_channels, self.out_channels, options.ring))
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         condition = self.condition(self.time_embedding, t, s)

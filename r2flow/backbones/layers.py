@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Callable
-from typing import Self, cast
+from typing import Self, TypeVar, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+Layer = TypeVar("Layer", bound=nn.Module)
 
 
 def at_least_float32(x: Tensor) -> Tensor:
@@ -51,9 +53,10 @@ def uncast(layer: nn.Module, x: Tensor) -> Tensor:
         return cast(Tensor, layer(x.to(next(layer.parameters()).dtype)))
 
 
-def zero_initialised(layer: nn.Linear) -> nn.Linear:
-    """The layer with zero weights: a residual branch that starts as the identity."""
-    nn.init.zeros_(layer.weight)
+def zero_initialised(layer: Layer) -> Layer:
+    """The layer with zero weights and bias: a residual branch that starts as the identity."""
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
     return layer
 
 

@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.base import Backbone, CommonOptions, integers
-from r2flow.backbones.convolutions import time_embedding, zero_convolution
-from r2flow.backbones.layers import uncast, wrapped
+from r2flow.backbones.convolutions import time_embedding
+from r2flow.backbones.layers import uncast, wrapped, zero_initialised
 from r2flow.registry import Count
 
 
@@ -42,7 +42,7 @@ class Local(Backbone):
         self.time = time_embedding(channels, channels)
         self.image = nn.Conv2d(self.in_channels, channels, 3, padding=1)
         self.blocks = nn.ModuleList([_Block(channels, width) for width in widths])
-        self.answer = zero_convolution(nn.Conv2d(channels, self.out_channels, 3, padding=1))
+        self.answer = zero_initialised(nn.Conv2d(channels, self.out_channels, 3, padding=1))
 
     @classmethod
     def tiny_options(cls) -> Mapping[str, Any]:
@@ -69,7 +69,7 @@ class _Block(nn.Module):
         self.first, self.second = (
             nn.Conv2d(channels, channels, 3, padding=(1, width), dilation=(1, width)) for _ in range(2)
         )
-        zero_convolution(self.second)
+        zero_initialised(self.second)
 
     def forward(self, x: Tensor) -> Tensor:
         h: Tensor = self.second(F.silu(self.first(F.silu(x))))

@@ -24,11 +24,7 @@ WHOLE_ONLY = "a {} makes whole images and no part of one; leave the region out."
 
 
 def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor]:
-    """`image` and `known` of a condition, as `x` is in type and place; zeros where nothing is known.
-
-    Raises:
-        InputError: a condition of other names or shapes.
-    """
+    """`image` and `known` of a condition, as `x` is in type and place; zeros where nothing is known."""
     if condition is None:
         return torch.zeros_like(x), torch.zeros_like(x)
     if not condition.keys() >= {IMAGE, KNOWN}:
@@ -101,9 +97,6 @@ class Generator(nn.Module):
             draws: Where further noise comes from, `draws.step(shape, j)` at step j = 1, 2, ...
             precision: `bf16-mixed` computes the network's products in bfloat16; states and steps stay as they are.
             progress: Called after every evaluation of the network.
-
-        Raises:
-            InputError: the sampler cannot run this generator, or needs draws or a condition.
         """
         how = sampler or self.sampler
         how.check(self)
@@ -125,9 +118,6 @@ class Generator(nn.Module):
         """The generator's sampler with options that are not None: `few` for fewer steps, or another by its name.
 
         Another sampler takes over the number of steps and has its own defaults.
-
-        Raises:
-            InputError: an unknown name or option, or a sampler that cannot run this generator.
         """
         given = {key: value for key, value in options.items() if value is not None}
         own, steps = self.sampler, getattr(self.sampler, "steps", None)
@@ -147,29 +137,17 @@ class Generator(nn.Module):
 
     @property
     def unit(self) -> tuple[int, int]:
-        """Rows and columns that a part of the image must be a multiple of, and begin at a multiple of.
-
-        Raises:
-            InputError: this generator makes whole images only.
-        """
+        """Rows and columns that a part of the image must be a multiple of, and begin at a multiple of."""
         raise InputError(WHOLE_ONLY.format(type(self).__name__))
 
     def part(self, region: Region) -> "Generator":
-        """The same generator for a region of whole units, its weights shared.
-
-        Raises:
-            InputError: this generator makes whole images only.
-        """
+        """The same generator for a region of whole units, its weights shared."""
         if region.share < 1:
             raise InputError(WHOLE_ONLY.format(type(self).__name__))
         return self
 
     def start_from(self, parent: "Generator") -> None:
-        """Take over a trained generator's weights: every name and shape must be this one's.
-
-        Raises:
-            InputError: one is not.
-        """
+        """Take over a trained generator's weights: every name and shape must be this one's."""
         self._take(parent, parent.state_dict())
 
     def _take(self, parent: "Generator", weights: Mapping[str, Tensor]) -> None:

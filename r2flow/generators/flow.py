@@ -53,11 +53,7 @@ class Flow(Generator):
         progress: Progress = None,
         **options: Any,
     ) -> Solution:
-        """The state at t_1 of the ODE from x at t_0, (B, ...); see `r2flow.flow.solvers.solve` for the options.
-
-        Raises:
-            InputError: the sampler does not follow the flow's paths.
-        """
+        """The state at t_1 of the ODE from x at t_0, (B, ...); see `r2flow.flow.solvers.solve` for the options."""
         how = sampler or self.sampler
         how.check(self)
         return how.solve(self, x.to(self.device), t_0, t_1, condition, progress, **options)
@@ -97,10 +93,6 @@ class NetworkFlow(Flow):
 
         Of a flow map all but its velocity u(x, t, t) is forgotten. A flow that looks elsewhere, as through another
         sensor, keeps its own rays.
-
-        Raises:
-            InputError: other weights; a network that tells something else; one with weights for each place of the
-                image, and another size.
         """
         theirs_tell = getattr(parent, "answer", self.answer)
         if theirs_tell != self.answer:
@@ -208,11 +200,7 @@ def ode_sampler(flow: Flow) -> Sampler:
 
 
 def as_flow(generator: Generator, what: str) -> Flow:
-    """The generator as a flow.
-
-    Raises:
-        InputError: it follows no velocity, which `what` needs.
-    """
+    """The generator as a flow."""
     if not isinstance(generator, Flow):
         raise InputError(f"{what} needs the velocity of a flow, which a {type(generator).__name__} does not have.")
     return generator

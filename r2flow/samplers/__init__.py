@@ -99,9 +99,5 @@ def build_sampler(options: str | Mapping[str, Any], **fields: Any) -> Sampler:
 
 
 def knot_times(options: Mapping[str, Any], knots: int) -> Tensor:
-    """Times of both ends and of the inner states that a sampler keeps, (knots + 2,) float64.
-
-    Raises:
-        InputError: it keeps no such states.
-    """
+    """Times of both ends and of the inner states that a sampler keeps, (knots + 2,) float64."""
     return build_sampler(options).knot_times(knots)

@@ -93,37 +93,21 @@ class Sampler(ABC):
         return getattr(self, "steps", None)
 
     def check(self, generator: Any) -> None:
-        """Refuse a generator that the sampler cannot run.
-
-        Raises:
-            InputError: it lacks `needs`.
-        """
+        """Refuse a generator that the sampler cannot run."""
         if getattr(generator, self.needs, None) is None:
             kind = type(generator).__name__
             raise InputError(f"sampler {self.name} needs a generator with a {self.needs}, which a {kind} is not.")
 
     def solve(self, *args: Any, **options: Any) -> Solution:
-        """The state at t_1 of the ODE, by an `ODESampler`.
-
-        Raises:
-            InputError: this sampler is none.
-        """
+        """The state at t_1 of the ODE, by an `ODESampler`."""
         raise InputError(f"sampler {self.name} does not follow the flow's paths: give a solver, such as adams3.")
 
     def knot_times(self, knots: int) -> Tensor:
-        """Times of both ends and of the inner states that a solution keeps, (knots + 2,) float64.
-
-        Raises:
-            InputError: this sampler keeps no such states.
-        """
+        """Times of both ends and of the inner states that a solution keeps, (knots + 2,) float64."""
         raise InputError(f"sampler {self.name} keeps no inner states; give a solver of fixed steps, such as adams3.")
 
     def changed(self, **options: Any) -> Self:
-        """The same sampler with the options that are not None.
-
-        Raises:
-            InputError: an unknown option, or a value that it cannot have.
-        """
+        """The same sampler with the options that are not None."""
         options = {key: value.tolist() if hasattr(value, "tolist") else value for key, value in options.items()}
         options = {key: value for key, value in options.items() if value is not None}
         check_options(f"sampler '{self.name}'", type(self), {**self._fields(), **options})

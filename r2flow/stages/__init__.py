@@ -30,11 +30,7 @@ STAGES: Registry[type[Stage]] = Registry(
 
 
 def check_roll(augment: Augmentation, generator: Generator) -> None:
-    """Refuse turned scans for a generator that learns a vector for each direction.
-
-    Raises:
-        InputError: both.
-    """
+    """Refuse turned scans for a generator that learns a vector for each direction."""
     if augment.roll and generator.learns_directions:
         raise InputError(
             "data.augment.roll makes all directions alike, and backbone.position=learnable (the paper's APE) learns a "
@@ -62,11 +58,7 @@ def build_stage(config: Mapping[str, Any], generator: Generator) -> Stage:
 
 
 def _choose(generator: Generator, config: Mapping[str, Any]) -> None:
-    """Give a generator the samplers of a config's `sampler` and `few`.
-
-    Raises:
-        InputError: it cannot be run so, or it was distilled for its own sampler alone.
-    """
+    """Give a generator the samplers of a config's `sampler` and `few`."""
     own, asked = generator.sampler, dict(config.get("sampler") or {})
     sampler, few = generator.choose(**asked), config.get("few")
     if generator.fixed and sampler != own:

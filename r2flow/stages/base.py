@@ -81,11 +81,7 @@ class Stage(L.LightningModule):
         self.further: Further | None = None
 
     def check_data(self, name: str, data: Mapping[str, Any]) -> None:
-        """Refuse a config's `data` that the stage of this name cannot learn from.
-
-        Raises:
-            InputError: pairs for a stage that learns from scans, or the other way round.
-        """
+        """Refuse a config's `data` that the stage of this name cannot learn from."""
         on_pairs = data["name"] == "pairs"
         if self.needs_pairs and not on_pairs:
             raise InputError(f"stage={name} learns from pairs: give data=pairs, found {data['name']}.")

@@ -18,11 +18,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any | None = None
     ) -> None:
-        """Write a checkpoint whole; whatever happens, the ones before it stay.
-
-        Raises:
-            InputError: the disk is full, the folder cannot be written, ...
-        """
+        """Write a checkpoint whole; whatever happens, the ones before it stay."""
         try:
             with atomic_write(Path(path)) as file:
                 torch.save(checkpoint, file)

@@ -7,7 +7,7 @@ from torch import Tensor
 from r2flow.backbones.attention import BACKENDS, _Axis, _flex_mask, neighbourhood_attention
 from r2flow.errors import InputError
 
-EVERYWHERE = ["tiles"]  # flex and natten need CUDA kernels
+EVERYWHERE = ["tiles"]  # flex needs CUDA kernels
 # (rows, columns, window): tiled evenly or not, rings narrower than the window, fewer rows than the window
 MAPS = [
     (8, 24, (3, 9)),
@@ -96,7 +96,6 @@ def test_a_mask_made_while_sampling_serves_training():
     [
         ("tile", "no attention backend named 'tile'.*Did you mean 'tiles'"),
         ("flex", "'flex' has kernels for CUDA only.*cpu"),
-        ("natten", "'natten' needs a CUDA device and NATTEN built with its kernels"),
     ],
 )
 def test_a_backend_that_cannot_be_had_says_why(backend, message):
@@ -117,7 +116,7 @@ def test_the_mask_for_flex_shows_what_dense_sees(rows, columns, window, wrap):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("backend", ["tiles", "flex", "natten"])
+@pytest.mark.parametrize("backend", ["tiles", "flex"])
 def test_backends_agree_with_dense_on_a_gpu(backend):
     inputs = [x.float().cuda().requires_grad_() for x in qkv(16, 64, channels=32)]
     weights = torch.randn_like(inputs[0])
@@ -138,4 +137,4 @@ def test_an_even_window_is_refused():
 
 
 def test_every_backend_is_tested_or_needs_a_gpu():
-    assert set(BACKENDS) == {"dense", *EVERYWHERE, "flex", "natten"}
+    assert set(BACKENDS) == {"dense", *EVERYWHERE, "flex"}

@@ -106,11 +106,7 @@ def solve(
 
 
 def method_of(name: str) -> Method:
-    """The method of a solver's name.
-
-    Raises:
-        InputError: an unknown method.
-    """
+    """The method of a solver's name."""
     return TorchDiffEqMethod(name.removeprefix(TORCHDIFFEQ)) if name.startswith(TORCHDIFFEQ) else SOLVERS[name]
 
 

@@ -29,11 +29,7 @@ def torchdiffeq_methods() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class TorchDiffEqMethod:
-    """A method of torchdiffeq by its name there.
-
-    Raises:
-        InputError: torchdiffeq has no such method, or it is left out.
-    """
+    """A method of torchdiffeq by its name there."""
 
     name: str
 

@@ -12,8 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.base import integers
-from r2flow.backbones.convolutions import GroupNorm, zero_convolution
-from r2flow.backbones.layers import ExactLinear, at_least_float32
+from r2flow.backbones.convolutions import GroupNorm
+from r2flow.backbones.layers import ExactLinear, at_least_float32, zero_initialised
 from r2flow.errors import InputError
 from r2flow.registry import Count, Portion
 from r2flow.systems.latent.autoencoder import CircularConv2d
@@ -41,7 +41,7 @@ class ResidualBlock(nn.Module):
         super().__init__()
         self.in_layers = nn.Sequential(norm(channels), nn.SiLU(), CircularConv2d(channels, out_channels))
         self.emb_layers = nn.Sequential(nn.SiLU(), ExactLinear(condition_channels, out_channels))
-        last = zero_convolution(CircularConv2d(out_channels, out_channels))
+        last = zero_initialised(CircularConv2d(out_channels, out_channels))
         self.out_layers = nn.Sequential(norm(out_channels), nn.SiLU(), nn.Dropout(dropout), last)
         self.skip_connection = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
 
@@ -161,7 +161,7 @@ class LatentUNet(nn.Module):
                 layers += [Attention(here, head_channels)] if 2**level in attention else []
                 layers += [Double(here)] if level and index == blocks else []
                 self.output_blocks.append(Step(*layers))
-        self.out = nn.Sequential(norm(here), nn.SiLU(), zero_convolution(CircularConv2d(here, channels)))
+        self.out = nn.Sequential(norm(here), nn.SiLU(), zero_initialised(CircularConv2d(here, channels)))
 
     def forward(self, z: Tensor, t: Tensor) -> Tensor:
         """eps, of z's shape (B, channels, rows, columns), at the steps t, (B,)."""
