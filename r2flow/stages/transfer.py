@@ -12,7 +12,8 @@ from torch import Tensor
 
 from r2flow.generators import Generator, TransferFlow
 from r2flow.generators.base import IMAGE, KNOWN
-from r2flow.generators.transfer import WEIGHTS, steps_of
+from r2flow.generators.surroundings import steps_of
+from r2flow.generators.transfer import WEIGHTS
 from r2flow.lidar.known import every_row, random_points, random_rows
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Count, Portion, check_options
