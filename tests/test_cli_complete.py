@@ -196,7 +196,7 @@ def test_a_diffusion_completes_by_its_own_repaint(r2flow, tmp_path):  # noqa: F8
     [
         (["--mask", "points:0"], "one: the mask keeps nothing that was measured"),
         (["--mask", "points:1"], "one: the mask keeps everything that was measured"),
-        (["--mask", "row:4"], "no mask 'row:4'"),
+        (["--mask", "row:4"], "Did you mean 'rows'"),
         (["--mask", "{folder}/mask.npy"], "is of (4, 4), the scans are of (8, 64) rays"),
         (["--from", "vlp16"], "is a range image of 8x64, those of the model are 8x64: --from vlp16 has 16 rows"),
         (["--sampler", "dopri6"], "dopri6"),
