@@ -22,7 +22,7 @@ from r2flow.hashing import state_hash
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.completion import complete
-from r2flow.model.published import FORMATS, format_of, inert, plain
+from r2flow.model.published import FORMATS, format_of, garbled, inert, plain
 from r2flow.model.sampling import sample
 from r2flow.models import MODELS, find_model
 from r2flow.plugins import made_with
@@ -240,7 +240,8 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
     """What a file holds, as a generator on the CPU; see `load_checkpoint`."""
     published = format_of(content)
     if published is not None:
-        made = published.read(content, path, averaged)
+        with garbled(path):
+            made = published.read(content, path, averaged)
         config, weights, step, kind = made.config, made.weights, made.step, "published"
         drawing: Mapping[str, Any] = {"sampler": made.sampler}
     elif isinstance(content, dict) and "config" in content and "state_dict" in content:

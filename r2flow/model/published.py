@@ -88,26 +88,25 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
 
 def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """Our config of a published checkpoint's `cfg`, which holds data, model, flow, training and finetuning."""
-    with garbled(path):
-        data, model = cfg["data"], cfg["model"]
-        rows, columns = (int(n) for n in data["resolution"])
-        return {
-            "sensor": {
-                "name": "hdl64e",
-                "rows": rows,
-                "columns": columns,
-                "min_range": float(data["min_depth"]),
-                "max_range": float(data["max_depth"]),
-                "rays": "reference",
-            },
-            "encoding": {"format": data["data_format"], "reflectance": bool(data["train_reflectance"])},
-            "backbone": backbone_of(model, path),
-            "data": {
-                "name": data["dataset"],
-                "reading": {"projection": str(data["projection"]).split("-")[0], "convention": "reference"},
-            },
-            "published": dict(cfg),
-        }
+    data, model = cfg["data"], cfg["model"]
+    rows, columns = (int(n) for n in data["resolution"])
+    return {
+        "sensor": {
+            "name": "hdl64e",
+            "rows": rows,
+            "columns": columns,
+            "min_range": float(data["min_depth"]),
+            "max_range": float(data["max_depth"]),
+            "rays": "reference",
+        },
+        "encoding": {"format": data["data_format"], "reflectance": bool(data["train_reflectance"])},
+        "backbone": backbone_of(model, path),
+        "data": {
+            "name": data["dataset"],
+            "reading": {"projection": str(data["projection"]).split("-")[0], "convention": "reference"},
+        },
+        "published": dict(cfg),
+    }
 
 
 def backbone_of(model: Mapping[str, Any], path: Path) -> dict[str, Any]:

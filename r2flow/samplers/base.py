@@ -1,7 +1,7 @@
 """What every sampler has in common: noise in, scans out, and its fields as plain values."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, ClassVar, Self
 
@@ -49,6 +49,14 @@ class Generated:
         counted = torch.full((len(x),), evaluations, dtype=torch.int64, device=x.device)
         x = wide(x)
         return cls(x, counted, finite(x) if converged is None else converged)
+
+
+def last_of(states: Iterable[Tensor], progress: Call) -> Tensor:
+    """The last of a sampler's states; calls `progress` after each."""
+    for state in states:
+        progress()
+        last = state
+    return last
 
 
 class Sampler(ABC):

@@ -106,7 +106,7 @@ def test_annealed_langevin_is_the_published(shared: Path):
         path = list(
             annealed_langevin(
                 network, own["start"], own["sigmas"], lambda k: own["noise"][k - 1], own["step_lr"],
-                own["n_steps_each"], own["denoise"],
+                own["n_steps_each"],
             )
         )  # fmt: skip
     assert len(path) == 10 * 5 + 1

@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,6 +13,7 @@ import torch
 import torch.nn.functional as F
 import yaml
 from published_cases import assert_near, assert_norms, load_case
+from torch import Tensor
 
 from r2flow.callbacks.ema import DECAYS
 from r2flow.cli import main
@@ -24,10 +26,11 @@ from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws
 from r2flow.registry import options_of
-from r2flow.samplers import build_sampler
-from r2flow.systems.diffusion.sampling import noised
+from r2flow.samplers import Noise, build_sampler
+from r2flow.systems.diffusion.log_snr import square_root_linear
+from r2flow.systems.diffusion.objectives import PREDICTIONS
+from r2flow.systems.diffusion.sampling import noised, walk
 from r2flow.systems.latent.autoencoder import Autoencoder
-from r2flow.systems.latent.ddim import Tables, ddim, ddim_walk, noise_loss, square_root_linear, tables
 from r2flow.systems.latent.discriminator import (
     PatchDiscriminator,
     adaptive_weight,
@@ -35,12 +38,13 @@ from r2flow.systems.latent.discriminator import (
     hinge_loss,
     reconstruction_loss,
 )
-from r2flow.systems.latent.generator import LatentDiffusion
+from r2flow.systems.latent.generator import LatentDiffusion, some_of
 from r2flow.systems.latent.published import _autoencoder, _unet
 from r2flow.systems.latent.quantiser import Quantiser
 from r2flow.systems.latent.stage import returns
 from r2flow.systems.latent.unet import LatentUNet
 
+Predict = Callable[[Tensor, Tensor], Tensor]
 SMALL_AUTOENCODER = {"width": 32, "multipliers": [1, 1], "strides": [[2, 2]], "blocks": 1, "codes": 16}
 SMALL_UNET = {"width": 32, "multipliers": [1, 2], "blocks": 1, "attention": [2]}
 TINY: dict[str, Any] = {
@@ -68,7 +72,7 @@ def unet_of(cfg: dict[str, Any]) -> LatentUNet:
     )  # fmt: skip
 
 
-def within(state: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+def within(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
@@ -81,7 +85,7 @@ def diffusion(shared: Path) -> dict[str, Any]:
     )
     case["unet"].load_state_dict(within(case["state_dict"], "model.diffusion_model."))
     case["autoencoder"].load_state_dict(within(case["state_dict"], "first_stage_model."))
-    case["tables"] = tables(square_root_linear(0.0015, 0.0195, 1000))
+    case["log_snr"] = square_root_linear(0.0015, 0.0195, 1000)
     return case
 
 
@@ -172,28 +176,44 @@ def test_a_learned_bias_is_added_after_the_first_convolution():
 
 
 def test_schedule_is_the_published(diffusion: dict[str, Any]):
-    found: Tables = diffusion["tables"]
-    assert_near(found.beta, diffusion["schedule"]["betas"], 1e-5)
-    assert_near(found.alpha_bar, diffusion["schedule"]["alphas_cumprod"], 1e-5)
+    assert_near(diffusion["log_snr"].sigmoid(), diffusion["schedule"]["alphas_cumprod"], 1e-5)
 
 
 def test_objective_and_gradients_are_the_published(diffusion: dict[str, Any]):
-    case, unet, of = diffusion["objective"], diffusion["unet"], diffusion["tables"]
-    x, t, eps = case["x_start"], case["t"], case["noise"]
-    assert_near(noised(x, torch.logit(of.alpha_bar)[t], eps), case["x_t"], 1e-5)
-    loss = noise_loss(unet, x, t, eps, of.alpha_bar)
+    case, unet = diffusion["objective"], diffusion["unet"]
+    z = noised(case["x_start"], diffusion["log_snr"][case["t"]], case["noise"])
+    assert_near(z, case["x_t"], 1e-5)
+    loss = (unet(z, case["t"]) - case["noise"]).square().flatten(1).mean(1)
     assert_near(loss, case["per_sample"], 1e-5)
     assert_near(loss.mean(), case["loss"], 1e-5)
     loss.mean().backward()
     assert_norms(unet, case["grad_param_norms"], prefix="diffusion_model.")
 
 
+def ddim(
+    predict: Predict, z: Tensor, log_snr: Tensor, steps: int, eta: float, noise: Noise
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Each state of the walk that `LatentDDIM` takes, and the data that its step expected."""
+    times, expected = some_of(len(log_snr), steps), []
+
+    def clean(z: Tensor, t: Tensor) -> Tensor:
+        expected.append(PREDICTIONS["eps"].split(z, predict(z, t.expand(len(z))), log_snr[t])[0])
+        return expected[-1]
+
+    for state in walk(clean, z, log_snr[[*times.tolist(), 0]], eta, noise, times):
+        yield state, expected[-1]
+
+
 @pytest.mark.parametrize("name", ["ddim_10_eta0", "ddim_10_eta1"])
 def test_ddim_is_the_published(diffusion: dict[str, Any], name: str):
     case, autoencoder = diffusion["cases"][name], diffusion["autoencoder"]
-    walk = ddim_walk(diffusion["tables"].alpha_bar, case["steps"], case["eta"])
+    noise = case["noise"]
     with torch.no_grad():
-        path = list(ddim(diffusion["unet"], case["x_T"], walk, lambda k: case["noise"][k - 1]))
+        path = list(
+            ddim(
+                diffusion["unet"], case["x_T"], diffusion["log_snr"], case["steps"], case["eta"], lambda k: noise[k - 1]
+            )
+        )  # fmt: skip
         decoded = autoencoder.decode(path[-1][0]), autoencoder.decode(path[-1][0], False)
     for k, (z, x) in enumerate(path):
         assert_near(z, case["x_trajectory"][k + 1], 1e-4)
@@ -204,27 +224,26 @@ def test_ddim_is_the_published(diffusion: dict[str, Any], name: str):
 
 @pytest.mark.parametrize("name", ["S50", "S30", "S7"])
 def test_subsets_of_steps_are_the_published(diffusion: dict[str, Any], name: str):
-    case, alpha_bar = diffusion["ddim_tables"][name], diffusion["tables"].alpha_bar
-    walk = ddim_walk(alpha_bar, int(name[1:]), 1.0)
-    assert torch.equal(walk.times.flip(0), case["timesteps"])
-    alphas = walk.log_snrs.sigmoid()
-    assert_near(alphas[:-1].flip(0), case["alphas"], 1e-5)
-    assert_near(alphas[1:].flip(0), case["alphas_prev"], 1e-5)
+    case, times = diffusion["ddim_tables"][name], some_of(1000, int(name[1:])).flip(0)
+    assert torch.equal(times, case["timesteps"])
+    alphas = diffusion["log_snr"].sigmoid()
+    assert_near(alphas[times], case["alphas"], 1e-5)
+    assert_near(alphas[[0, *times[:-1].tolist()]], case["alphas_prev"], 1e-5)
 
 
 def test_ddim_without_noise_keeps_a_known_gaussian():
     # For data N(0, s^2) the best eps is sqrt(1 - a) z / (a s^2 + 1 - a); the deterministic way then scales each z by
     # the ratio of standard deviations, up to the steps' error.
-    alpha_bar, s = tables(square_root_linear(0.0015, 0.0195, 1000)).alpha_bar, 0.5
+    log_snr, s = square_root_linear(0.0015, 0.0195, 1000), 0.5
+    alpha_bar = log_snr.sigmoid()
     z = torch.linspace(-2, 2, 9)[:, None]
 
-    def predict(z: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+    def predict(z: Tensor, t: Tensor) -> Tensor:
         a = alpha_bar[t].float()[:, None]
         return (1 - a).sqrt() * z / (a * s**2 + 1 - a)
 
-    walk = ddim_walk(alpha_bar, 500, 0.0)
-    *_, (end, _) = ddim(predict, z, walk, lambda _: torch.zeros_like(z))
-    spread = [(a * s**2 + 1 - a) ** 0.5 for a in walk.log_snrs[[0, -1]].sigmoid().tolist()]
+    *_, (end, _) = ddim(predict, z, log_snr, 500, 0.0, lambda _: torch.zeros_like(z))
+    spread = [(a * s**2 + 1 - a) ** 0.5 for a in alpha_bar[[999, 0]].tolist()]
     torch.testing.assert_close(end, z * spread[1] / spread[0], rtol=0.01, atol=1e-6)
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import count
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -15,10 +14,12 @@ from r2flow.generators.flow import NetworkFlow
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Bound, Positive
 from r2flow.samplers import MMPS, Repaint
-from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Steps
+from r2flow.samplers.base import Call, Condition, Fresh, Generated, Given, Noise, OnGrid, Steps, last_of
 from r2flow.systems.diffusion.log_snr import SCHEDULES, alpha_sigma, for_images, log_snr_of, straight_time
 from r2flow.systems.diffusion.objectives import PREDICTIONS
 from r2flow.systems.diffusion.sampling import repaint, walk
+
+Share = Annotated[float, Bound("in [0, 1]", lambda eta: 0 <= eta <= 1)]
 
 
 class Diffusion(NetworkFlow):
@@ -88,24 +89,15 @@ class Diffusion(NetworkFlow):
         noise: Noise,
         repeats: int,
         jump: int,
-        progress: Progress = None,
+        progress: Call,
     ) -> Tensor:
-        """x_1 from noise z, (B, C, H, W), given the image where it is known, by the published RePaint.
-
-        Args:
-            times: From noise, 0, to data, 1, (N jump + 1,).
-            noise: Of the j-th draw.
-        """
-        j = count(1)
+        """x_1 from noise z given the image where it is known, by the published RePaint at times from 0 to 1."""
 
         def denoise(z: Tensor, log_snr: Tensor) -> Tensor:
-            x = self.denoise(z, log_snr)
-            if progress is not None:
-                progress()
-            return x
+            progress()
+            return self.denoise(z, log_snr)
 
-        lambdas = self.schedule(1 - times).to(z)
-        *_, z = repaint(denoise, z, image, known, lambdas, lambda: noise(next(j)), repeats, jump)
+        *_, z = repaint(denoise, z, image, known, self.schedule(1 - times).to(z), noise, repeats, jump)
         return z if self.clip is None else z.clamp(-self.clip, self.clip)
 
 
@@ -121,25 +113,15 @@ class DDIM(OnGrid):
     needs: ClassVar[str] = "denoise"
 
     steps: Steps = 256
-    eta: Annotated[float, Bound("in [0, 1]", lambda eta: 0 <= eta <= 1)] = 0.0
+    eta: Share = 0.0
 
     @property
     def draws(self) -> bool:  # type: ignore[override]
         return self.eta > 0
 
-    def __call__(
-        self,
-        generator: Any,
-        noise: Tensor,
-        condition: Condition | None = None,
-        draws: Noise | None = None,
-        progress: Progress = None,
-    ) -> Generated:
-        lambdas, z, j = generator.schedule(1 - self.times()).to(noise), noise, count(1)
-        for following in walk(generator.denoise, z, lambdas, self.eta, lambda: draws(next(j))):  # type: ignore[misc]
-            z = following
-            if progress is not None:
-                progress()
+    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
+        log_snrs = generator.schedule(1 - self.times()).to(noise)
+        z = last_of(walk(generator.denoise, noise, log_snrs, self.eta, draws), progress)
         clip = generator.clip
         return Generated.after(z if clip is None else z.clamp(-clip, clip), self.steps, finite(z))
 
@@ -148,4 +130,4 @@ class DDIM(OnGrid):
 class DDPM(DDIM):
     """Ancestral steps."""
 
-    eta: Annotated[float, Bound("in [0, 1]", lambda eta: 0 <= eta <= 1)] = 1.0
+    eta: Share = 1.0

@@ -88,6 +88,15 @@ class CosineInterpolated:
         return t * self.low(t) + (1 - t) * self.high(t)
 
 
+def square_root_linear(first: float, last: float, steps: int) -> Tensor:
+    """lambda_t at t = 0 .. steps - 1, (steps,) float64, of beta_t whose square roots rise in equal steps: LiDM's.
+
+    beta_t is the share of the variance that step t replaces by noise; alpha_t^2 is the product of 1 - beta.
+    """
+    beta = torch.linspace(first**0.5, last**0.5, steps, dtype=torch.float64) ** 2
+    return torch.logit((1 - beta).cumprod(0))
+
+
 SCHEDULES: Registry[Callable[..., LogSNR]] = Registry(
     "log-SNR schedule",
     cosine=Cosine,

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.errors import InputError
-from r2flow.model.published import BACKBONE, Format, Published, backbone_of, follow_rings
+from r2flow.model.published import BACKBONE, Format, Published, follow_rings
+from r2flow.model.published import published_config as flow_config
 
 RANGES = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric"}
 PREDICTIONS = {"eps": "eps", "v": "v", "x_0": "x"}
@@ -30,43 +31,20 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
 
 def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """Our config of a published checkpoint's `cfg`, which holds data, model, diffusion and training."""
-    try:
-        data, model, diffusion = cfg["data"], cfg["model"], cfg["diffusion"]
-        rows, columns = (int(n) for n in data["resolution"])
-        if diffusion["timestep_type"] != "continuous":
-            raise InputError(f"{path}: its diffusion is of discrete steps; only those of continuous time are read.")
-        if not data["train_depth"]:
-            raise InputError(f"{path}: it makes reflectance without range, of which no scan can be made.")
-        return {
-            "sensor": {
-                "name": "hdl64e",
-                "rows": rows,
-                "columns": columns,
-                "min_range": float(data.get("min_depth", MIN_RANGE)),
-                "max_range": float(data.get("max_depth", MAX_RANGE)),
-                "rays": "reference",
-            },
-            "encoding": {
-                "format": RANGES[data["depth_format"]],
-                "reflectance": bool(data["train_reflectance"]),
-                "limits": "open",
-            },
-            "backbone": backbone_of(model, path),
-            "generator": {
-                "name": "diffusion",
-                "prediction": PREDICTIONS[diffusion["prediction_type"]],
-                "schedule": {"name": diffusion["noise_schedule"]},
-            },
-            "data": {
-                "name": data["dataset"],
-                "reading": {"projection": str(data["projection"]).split("-")[0], "convention": "reference"},
-            },
-            "published": dict(cfg),
-        }
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: the published config lacks or garbles {error}.") from None
+    data, diffusion = cfg["data"], cfg["diffusion"]
+    if diffusion["timestep_type"] != "continuous":
+        raise InputError(f"{path}: its diffusion is of discrete steps; only those of continuous time are read.")
+    if not data["train_depth"]:
+        raise InputError(f"{path}: it makes reflectance without range, of which no scan can be made.")
+    limits = {"min_depth": MIN_RANGE, "max_depth": MAX_RANGE}
+    config = flow_config({**cfg, "data": {**limits, **data, "data_format": RANGES[data["depth_format"]]}}, path)
+    config["encoding"]["limits"] = "open"
+    config["generator"] = {
+        "name": "diffusion",
+        "prediction": PREDICTIONS[diffusion["prediction_type"]],
+        "schedule": {"name": diffusion["noise_schedule"]},
+    }
+    return {**config, "published": dict(cfg)}
 
 
 FORMAT = Format("R2DM", holds, read)

@@ -4,15 +4,15 @@ Noise comes in as a tensor or a function, so that a sampler is a function of it.
 """
 
 from collections.abc import Callable, Iterator
-from itertools import pairwise
+from itertools import count, pairwise
 
 import torch
 from torch import Tensor
 
+from r2flow.samplers.base import Noise
 from r2flow.systems.diffusion.log_snr import alpha_sigma, for_images
 
-Denoise = Callable[[Tensor, Tensor], Tensor]  # x of (z, log-SNR), the latter of shape ()
-Noise = Callable[[], Tensor]  # the next draw of N(0, I), in the shape of z
+Denoise = Callable[[Tensor, Tensor], Tensor]  # the data expected behind (z, log-SNR), the latter of shape ()
 
 
 def noised(x: Tensor, log_snr: Tensor, eps: Tensor) -> Tensor:
@@ -28,15 +28,7 @@ def step(z: Tensor, x: Tensor, log_snr: Tensor, next_log_snr: Tensor, eta: float
 
     with eps = (z_t - alpha_t x) / sigma_t and c = 1 - e^(lambda_t - lambda_s), the share of new noise. eta = 1 is
     DDPM's ancestral step, eta = 0 is DDIM (Song et al. 2021, "Denoising diffusion implicit models", eq. 12 and 16).
-    Written by log-SNRs it loses no digits where alpha is near 1.
-
-    Args:
-        z: (B, ...).
-        x: (B, ...), of `z` and `log_snr`.
-        log_snr: lambda_t, () or (B,).
-        next_log_snr: lambda_s, above it.
-        eta: Share of new noise, 0 to 1.
-        noise: N(0, I) in the shape of z; may be None where eta = 0.
+    Written by log-SNRs lambda, () or (B,), it loses no digits where alpha is near 1. Without noise eta must be 0.
     """
     here, there = for_images(log_snr, z), for_images(next_log_snr, z)
     (alpha, sigma), (next_alpha, next_sigma) = alpha_sigma(here), alpha_sigma(there)
@@ -46,29 +38,26 @@ def step(z: Tensor, x: Tensor, log_snr: Tensor, next_log_snr: Tensor, eta: float
 
 
 def forward_step(z: Tensor, log_snr: Tensor, next_log_snr: Tensor, noise: Tensor) -> Tensor:
-    """z_t from z_s, s < t: (alpha_t / alpha_s) z_s + sigma_t sqrt(1 - e^(lambda_t - lambda_s)) noise.
-
-    Args:
-        log_snr: lambda_s, () or (B,).
-        next_log_snr: lambda_t, below it.
-    """
+    """z_t from z_s, s < t: (alpha_t / alpha_s) z_s + sigma_t sqrt(1 - e^(lambda_t - lambda_s)) noise."""
     here, there = for_images(log_snr, z), for_images(next_log_snr, z)
     (alpha, _), (next_alpha, next_sigma) = alpha_sigma(here), alpha_sigma(there)
     return next_alpha / alpha * z + next_sigma * (-torch.expm1(there - here)).sqrt() * noise
 
 
-def walk(denoise: Denoise, z: Tensor, log_snrs: Tensor, eta: float, noise: Noise) -> Iterator[Tensor]:
-    """The states from noise to data, one after each step.
+def walk(
+    denoise: Denoise, z: Tensor, log_snrs: Tensor, eta: float, noise: Noise | None, times: Tensor | None = None
+) -> Iterator[Tensor]:
+    """The states from noise z, (B, ...), to data, one after each step.
 
     Args:
-        denoise: The expected data behind (z, lambda).
-        z: Noise, (B, ...).
         log_snrs: Rising, (N + 1,) for N steps.
         eta: See `step`.
-        noise: Asked once in each step where eta > 0, in the last one too.
+        noise: That of step 1, 2, ..., asked in the last step too; None where eta = 0.
+        times: What `denoise` is given in each step, (N,); None: the log-SNR.
     """
-    for here, there in pairwise(log_snrs):
-        z = step(z, denoise(z, here), here, there, eta, noise() if eta else None)
+    told = log_snrs if times is None else times
+    for j, (t, (here, there)) in enumerate(zip(told, pairwise(log_snrs), strict=False), start=1):
+        z = step(z, denoise(z, t), here, there, eta, noise(j) if eta and noise else None)
         yield z
 
 
@@ -89,27 +78,25 @@ def repaint(
     resampling inside each step). The last step is taken once. Evaluations: jump (repeats (N - 1) + 1).
 
     Args:
-        denoise: The expected data behind (z, lambda).
         z: Noise, (B, ...).
         image: Data, (B, ...).
         known: Where they are known, bool or 0 and 1.
         log_snrs: Rising, (N jump + 1,) for N steps.
         noise: Asked, in each part of a step, for the known pixels and for the ancestral step, and once in each
             part on the way up.
-        repeats: Times that each step is taken.
-        jump: Parts of a step.
 
     Returns:
         The state at the end of each step, repeated ones too; the last is the completed image.
     """
+    j = count(1)
     for first in range(0, len(log_snrs) - 1, jump):
         levels = log_snrs[first : first + jump + 1]
         last = first + jump == len(log_snrs) - 1
         for repeat in range(1 if last else repeats):
             if repeat:
                 for here, there in pairwise(levels.flip(0)):
-                    z = forward_step(z, here, there, noise())
+                    z = forward_step(z, here, there, noise(next(j)))
             for here, there in pairwise(levels):
-                seen = noised(image, there, noise())
-                z = torch.where(known > 0, seen, step(z, denoise(z, here), here, there, 1.0, noise()))
+                seen = noised(image, there, noise(next(j)))
+                z = torch.where(known > 0, seen, step(z, denoise(z, here), here, there, 1.0, noise(next(j))))
             yield z

@@ -5,8 +5,7 @@ All that the discriminator sees, real or generated, is changed at random, each t
 follows how sure the discriminator is of real images.
 """
 
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -50,26 +49,21 @@ def _flip(source: Source) -> Tensor:
     return (source.uniform((1,))[:, 0] < 0.5).float()
 
 
-def _log_normal(source: Source, octaves: float) -> Tensor:
-    return torch.exp2(octaves * source.normal((1,))[:, 0])
-
-
 # In the order in which they are drawn and applied: what is drawn, for a batch.
-GEOMETRY: dict[str, Any] = {
+GEOMETRY: dict[str, Callable[[Source], Tensor]] = {
     "lr_flip": _flip,
     "ud_flip": _flip,
     "int_trans": lambda source: (source.uniform((2,)).mT - 0.5) / 4,  # of the height and of the width
-    "iso_scale": lambda source: _log_normal(source, 0.2),
+    "iso_scale": lambda source: torch.exp2(0.2 * source.normal((1,))[:, 0]),
     "frac_trans": lambda source: 0.125 * source.normal((2,)).mT,
 }
-COLOUR: dict[str, Any] = {
+# Of the published ones hue and saturation are left out: they change nothing in images of one or two channels.
+COLOUR: dict[str, Callable[[Source], Tensor]] = {
     "brightness": lambda source: 0.2 * source.normal((1,))[:, 0],
-    "contrast": lambda source: _log_normal(source, 0.5),
+    "contrast": lambda source: torch.exp2(0.5 * source.normal((1,))[:, 0]),
     "luma_flip": _flip,
-    "hue": lambda source: math.pi * (2 * source.uniform((1,))[:, 0] - 1),
-    "saturation": lambda source: _log_normal(source, 1.0),
 }
-TRANSFORMATIONS = (*GEOMETRY, *COLOUR)
+TRANSFORMATIONS = GEOMETRY | COLOUR
 
 
 class AdaptiveAugment(nn.Module):
@@ -105,8 +99,7 @@ class AdaptiveAugment(nn.Module):
         self.target, self.images, self.highest, self.every = target, 1000 * kimg, highest, every
         for name in policy or {}:
             if name not in TRANSFORMATIONS:
-                known = ", ".join(TRANSFORMATIONS)
-                hint = did_you_mean(name, [*TRANSFORMATIONS])
+                known, hint = ", ".join(TRANSFORMATIONS), did_you_mean(name, TRANSFORMATIONS)
                 raise InputError(f"no augmentation named {name!r}; known: {known}.{hint}")
         self.policy = {name: float((policy or {}).get(name, 1)) for name in TRANSFORMATIONS}
         # The names of the published state.
@@ -131,86 +124,57 @@ class AdaptiveAugment(nn.Module):
 
     def draw(self, source: Source) -> dict[str, Draw]:
         """The transformations of a batch, by name. How many numbers are drawn does not depend on p."""
-        found, p = {}, float(self.p)
-        for name, values in (GEOMETRY | COLOUR).items():
-            if self.policy[name]:
-                value, u = values(source), source.uniform((1,))[:, 0]
-                chosen = (u < p * self.policy[name]).float()
-                found[name] = Draw(value.to(self.p.device), chosen.to(self.p.device))
-        return found
+        draws, p = {}, float(self.p)
+        for name, values in TRANSFORMATIONS.items():
+            value, u = values(source), source.uniform((1,))[:, 0]
+            chosen = (u < p * self.policy[name]).float()
+            draws[name] = Draw(value.to(self.p.device), chosen.to(self.p.device))
+        return draws
 
     def forward(self, x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
         """x (B, C, H, W) transformed, differentiable twice, in float32 at least."""
         with torch.autocast(x.device.type, enabled=False):
             x = x.to(torch.promote_types(x.dtype, torch.float32))
-            x = transformed(x, affine(draws, x.shape[-2], x.shape[-1]))
-            return coloured(x, colour(draws).to(x))
+            return coloured(transformed(x, *affine(draws, x.shape[-2], x.shape[-1])), draws)
 
 
-def affine(draws: Mapping[str, Draw], height: int, width: int) -> Tensor:
-    """The maps of pixels about the image's middle, (B, 3, 3), columns before rows, applied one after the other.
+def affine(draws: Mapping[str, Draw], height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Scale and shift of pixels about the image's middle by all of `GEOMETRY`, (2, B) each, rows before columns.
 
-    They keep the axes: flips, shifts of an eighth of the image at most, in whole pixels, a scale of the rows (a
-    scale of the columns would open the ring), and normal shifts.
+    Flips, shifts of an eighth of the image at most, in whole pixels, a scale of the rows (a scale of the columns would
+    open the ring), and normal shifts.
     """
-    batch = len(next(iter(draws.values())).chosen) if draws else 1
-    found = _identity(batch, 3, draws)
+    one = torch.ones_like(draws["lr_flip"].chosen)
+    scale, shift = torch.stack([one, one]), torch.stack([0 * one, 0 * one])
+    size = torch.tensor([[height], [width]], device=one.device)
     for name in GEOMETRY:
-        if name not in draws:
-            continue
         value, chosen = draws[name]
-        own = _identity(batch, 3, draws)
+        factor, offset = torch.ones_like(scale), torch.zeros_like(shift)
         if name == "lr_flip":
-            own[:, 0, 0] = 1 - 2 * value
+            factor[1] = 1 - 2 * value
         elif name == "ud_flip":
-            own[:, 1, 1] = 1 - 2 * value
+            factor[0] = 1 - 2 * value
         elif name == "iso_scale":
-            own[:, 1, 1] = value
+            factor[0] = value
         else:
-            shift = value * torch.tensor([[height], [width]], device=value.device)
-            own[:, :2, 2] = (shift.round() if name == "int_trans" else shift).flip(0).mT
-        found = _where(chosen, own) @ found
-    return found
+            offset = (value * size).round() if name == "int_trans" else value * size
+        scale = torch.where(chosen > 0, factor * scale, scale)
+        shift = torch.where(chosen > 0, factor * shift + offset, shift)
+    return scale, shift
 
 
-def colour(draws: Mapping[str, Draw]) -> Tensor:
-    """The maps of (r, g, b, 1), (B, 4, 4), applied one after the other; v is the grey axis (1, 1, 1) / sqrt 3."""
-    batch = len(next(iter(draws.values())).chosen) if draws else 1
-    found = _identity(batch, 4, draws)
-    v = torch.full((3,), 3**-0.5, device=found.device)
-    grey, eye = torch.outer(v, v), torch.eye(3, device=found.device)
-    cross = torch.linalg.cross(eye, v.expand(3, 3), dim=1)  # cross @ u = v x u
-    for name in COLOUR:
-        if name not in draws:
-            continue
-        value, chosen = draws[name]
-        own, by = _identity(batch, 4, draws), value[:, None, None]
-        if name == "brightness":
-            own[:, :3, 3] = value[:, None]
-        elif name == "contrast":
-            own[:, :3, :3] = by * eye
-        elif name == "luma_flip":
-            own[:, :3, :3] = eye - 2 * by * grey
-        elif name == "hue":  # Rodrigues' rotation about the grey axis
-            own[:, :3, :3] = by.cos() * eye + by.sin() * cross + (1 - by.cos()) * grey
-        else:
-            own[:, :3, :3] = grey + by * (eye - grey)
-            own[:, 3, 3] = value  # as published; nothing reads it, for saturation comes last
-        found = _where(chosen, own) @ found
-    return found
-
-
-def transformed(x: Tensor, maps: Tensor) -> Tensor:
-    """x (B, C, H, W) moved by maps that keep the axes, (B, 3, 3): circular in azimuth, mirrored at the edge rows.
+def transformed(x: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
+    """x (B, C, H, W) scaled and then shifted as `affine` says: circular in azimuth, mirrored at the edge rows.
 
     Each axis is doubled by the filter `SYM6`, read between two pixels, and halved by the filter again: all of it linear
     in x, one matrix for each axis of each image.
     """
-    scale = 1 / torch.diagonal(maps, dim1=1, dim2=2)[:, :2].double()
-    shift = -maps[:, :2, 2].double() * scale
-    columns = resampling(x.shape[3], scale[:, 0], shift[:, 0], "circular")
-    rows = resampling(x.shape[2], scale[:, 1], shift[:, 1], "reflect")
-    return rows[:, None].to(x) @ x @ columns[:, None].mT.to(x)
+    inverse = 1 / scale.double()
+    rows, columns = (
+        resampling(size, inverse[axis], -shift[axis] * inverse[axis], edge)[:, None].to(x)
+        for axis, (size, edge) in enumerate(zip(x.shape[2:], ("reflect", "circular"), strict=True))
+    )
+    return rows @ x @ columns.mT
 
 
 @torch.no_grad()
@@ -242,21 +206,12 @@ def _row(lines: Tensor, index: Tensor) -> Tensor:
     return lines[index.clamp(0, len(lines) - 1)] * held[..., None].to(lines)
 
 
-def coloured(x: Tensor, maps: Tensor) -> Tensor:
-    """x with colour maps (B, 4, 4) applied: their mean gain and offset for one channel; more than one stay as they are.
-
-    The published code also leaves two channels, range and reflectance, as they are.
-    """
+def coloured(x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
+    """x of one channel changed by all of `COLOUR`; range and reflectance stay as they are, as in the published code."""
     if x.shape[1] != 1:
         return x
-    mean = maps[:, :3].mean(1)
-    return x * mean[:, :3].sum(1)[:, None, None, None] + mean[:, 3, None, None, None]
-
-
-def _identity(batch: int, size: int, draws: Mapping[str, Draw]) -> Tensor:
-    device = next(iter(draws.values())).chosen.device if draws else None
-    return torch.eye(size, device=device).repeat(batch, 1, 1)
-
-
-def _where(chosen: Tensor, maps: Tensor) -> Tensor:
-    return torch.where(chosen[:, None, None] > 0, maps, torch.eye(maps.shape[-1], device=maps.device))
+    for name in COLOUR:
+        value, chosen = (one[:, None, None, None] for one in draws[name])
+        changed = x + value if name == "brightness" else x * (value if name == "contrast" else 1 - 2 * value)
+        x = torch.where(chosen > 0, changed, x)
+    return x

@@ -6,7 +6,6 @@ from itertools import pairwise
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import at_least_float32
-from r2flow.errors import InputError
 from r2flow.registry import Count
 from r2flow.systems.gan.layers import (
     IMAGE,
@@ -16,29 +15,9 @@ from r2flow.systems.gan.layers import (
     LatentGenerator,
     Pad,
     RayDrop,
-    check_shape,
+    halved,
     outputs,
 )
-
-
-def _first_map(what: str, shape: tuple[int, int], doublings: int) -> tuple[int, int]:
-    """Rows and columns of the smallest map."""
-    check_shape(what, shape, 2**doublings)
-    rows, columns = shape[0] >> doublings, shape[1] >> doublings
-    if min(rows, columns) < 2:
-        raise InputError(f"{what} has {doublings} doublings, too many for {shape[0]} x {shape[1]}: give fewer.")
-    return rows, columns
-
-
-class Projection(nn.Sequential):
-    """w (B, D) to a map (B, C, h, w) by a transposed convolution of the whole map."""
-
-    def __init__(self, in_channels: int, out_channels: int, shape: tuple[int, int]) -> None:
-        super().__init__(
-            nn.Unflatten(1, (in_channels, 1, 1)),
-            Equalised(nn.ConvTranspose2d(in_channels, out_channels, shape, bias=False)),
-            BiasedLeakyReLU(out_channels),
-        )
 
 
 def _doubling(in_channels: int, out_channels: int, ring: bool, bias: bool) -> list[nn.Module]:
@@ -51,13 +30,14 @@ class Heads(nn.Module):
 
     def __init__(self, in_channels: int, made: dict[str, int], ring: bool, tanh: bool) -> None:
         super().__init__()
-        last = {name: nn.Tanh() if tanh and name == IMAGE else nn.Identity() for name in made}
+        self.tanh = tanh
         self.heads = nn.ModuleDict(
-            {name: nn.Sequential(*_doubling(in_channels, n, ring, True), last[name]) for name, n in made.items()}
+            {name: nn.Sequential(*_doubling(in_channels, n, ring, True)) for name, n in made.items()}
         )
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
-        return {name: at_least_float32(head(x)) for name, head in self.heads.items()}
+        made = {name: at_least_float32(head(x)) for name, head in self.heads.items()}
+        return {**made, IMAGE: made[IMAGE].tanh()} if self.tanh else made
 
 
 class Generator(LatentGenerator):
@@ -67,14 +47,8 @@ class Generator(LatentGenerator):
         shape: Rows and columns of the image.
         channels: Of the image.
         drops: Whether a second head says which rays return (DUSty v1); else the vanilla GAN.
-        latent: Width of z.
-        base_channels: Width of the outermost map; it doubles inwards.
-        max_channels: Widest.
-        doublings: From the first map to the image; 4 as published.
-        tanh: Whether the image ends in tanh; the published weights have none.
-        ring: Whether the columns are a full turn.
-        dropped: The image's value at a dropped ray.
-        temperature: Of the relaxed mask.
+
+    See `r2flow.systems.gan.generator.VanillaGan` for the others.
     """
 
     def __init__(
@@ -82,26 +56,29 @@ class Generator(LatentGenerator):
         shape: tuple[int, int],
         channels: int = 1,
         drops: bool = False,
-        latent: Count = 512,
-        base_channels: Count = 64,
-        max_channels: Count = 512,
-        doublings: Count = 4,
+        latent: int = 512,
+        base_channels: int = 64,
+        max_channels: int = 512,
+        doublings: int = 4,
         tanh: bool = False,
         ring: bool = True,
-        dropped: float = -1.0,
-        temperature: float = 1.0,
     ) -> None:
-        first = _first_map("this GAN", shape, doublings)
+        first = halved("this GAN", shape, doublings, least=2)
         widths = [min(base_channels << i, max_channels) for i in reversed(range(doublings))]
+        projection = nn.Sequential(
+            nn.Unflatten(1, (latent, 1, 1)),
+            Equalised(nn.ConvTranspose2d(latent, widths[0], first, bias=False)),
+            BiasedLeakyReLU(widths[0]),
+        )
         synthesis = nn.Sequential(
-            Projection(latent, widths[0], first),
+            projection,
             *(
                 nn.Sequential(*_doubling(wide, narrow, ring, False), BiasedLeakyReLU(narrow))
                 for wide, narrow in pairwise(widths)
             ),
             Heads(widths[-1], outputs(channels, drops), ring, tanh),
         )
-        super().__init__(latent, latent, nn.Identity(), synthesis, RayDrop(dropped, temperature) if drops else None)
+        super().__init__(latent, latent, nn.Identity(), synthesis, RayDrop() if drops else None)
 
 
 class Discriminator(nn.Sequential):
@@ -125,7 +102,7 @@ class Discriminator(nn.Sequential):
         halvings: Count = 4,
         ring: bool = True,
     ) -> None:
-        last = _first_map("this discriminator", shape, halvings)
+        last = halved("this discriminator", shape, halvings, least=2)
         widths = [2 * channels, *(min(base_channels << i, max_channels) for i in range(halvings))]
         super().__init__(
             BlurBoth(ring),

@@ -1,6 +1,6 @@
 """GANs: x = G(z) in one evaluation, with a mask of dropped rays or without."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
@@ -13,11 +13,9 @@ from r2flow.generators.base import Generator
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import Bound, Count, Positive
-from r2flow.samplers.base import Condition, Generated, Noise, Progress, Sampler
+from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler
 from r2flow.systems.gan import dcgan, style_gan
 from r2flow.systems.gan.layers import LatentGenerator
-
-DROPPED = -1.0  # a dropped ray in model space
 
 
 class Gan(Generator):
@@ -25,34 +23,27 @@ class Gan(Generator):
 
     Its sampler is `Direct`.
 
-    Args:
-        space: The images it makes.
-        build: The network of a shape and a number of channels.
-
     Attributes:
         network: G.
         drops: Whether a mask of dropped rays is drawn: logistic noise of `draws.step(shape, 1)`.
-        turns: Whether the scan is turned by a random angle in training.
+        angle: Elevation and azimuth of every pixel, (1, 2, H, W), for a network that asks for them; its scans are
+            turned by random angles in training.
     """
 
-    turns: ClassVar[bool] = False
+    drops: ClassVar[bool] = True
+    angle: Tensor | None
 
-    def __init__(self, space: ModelSpace, build: Callable[[tuple[int, int], int], LatentGenerator]) -> None:
-        channels, h, w = space.shape
-        network = build((h, w), channels)
+    def __init__(self, space: ModelSpace, network: LatentGenerator) -> None:
         super().__init__(space, noise_shape=(network.latent,))
         self.run_by(Direct())
         self.network = network
-
-    @property
-    def drops(self) -> bool:
-        return self.network.measurement_model is not None
+        self.register_buffer("angle", None)
 
     def made(
         self, z: Tensor, uniform: Tensor | None = None, shift: Tensor | None = None, truncation: float = 1.0
     ) -> dict[str, Tensor]:
         """The network's outputs, see `LatentGenerator`."""
-        made: dict[str, Tensor] = self.network(z, truncation=truncation, uniform=uniform)
+        made: dict[str, Tensor] = self.network(z, self.angle, truncation=truncation, uniform=uniform, shift=shift)
         return made
 
     def further_noise(self, draws: Draws, j: int) -> Tensor:
@@ -75,22 +66,14 @@ class Direct(Sampler):
     def evaluations(self, generator: Any) -> int:
         return 1
 
-    def __call__(
-        self,
-        generator: Any,
-        noise: Tensor,
-        condition: Condition | None = None,
-        draws: Noise | None = None,
-        progress: Progress = None,
-    ) -> Generated:
+    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         uniform = None
         if generator.drops:
             if draws is None:
                 raise InputError(f"a {type(generator).__name__} draws a mask: give draws.")
             uniform = torch.special.ndtr(draws(1).double()).to(noise)
         x = generator.made(noise, uniform, truncation=self.truncation)["image"]
-        if progress is not None:
-            progress()
+        progress()
         return Generated.after(x.clamp(-1, 1), 1, finite(x))
 
 
@@ -103,10 +86,12 @@ class VanillaGan(Gan):
         latent: Width of z.
         base_channels: Width of the outermost map; it doubles inwards.
         max_channels: Widest.
-        doublings: From the first map to the image.
-        tanh: Whether the image ends in tanh.
+        doublings: From the first map to the image; 4 as published.
+        tanh: Whether the image ends in tanh; the published weights of v2 alone do.
         ring: Whether the columns are a full turn.
     """
+
+    drops = False
 
     def __init__(
         self,
@@ -119,39 +104,30 @@ class VanillaGan(Gan):
         tanh: bool = False,
         ring: bool = True,
     ) -> None:
-        def build(shape: tuple[int, int], channels: int) -> LatentGenerator:
-            widths = (latent, base_channels, max_channels, doublings)
-            return dcgan.Generator(shape, channels, False, *widths, tanh, ring)
-
-        super().__init__(space, build)
+        channels, *shape = space.shape
+        widths = latent, base_channels, max_channels, doublings
+        super().__init__(space, dcgan.Generator((shape[0], shape[1]), channels, self.drops, *widths, tanh, ring))
 
 
-class DustyV1(Gan):
+class DustyV1(VanillaGan):
     """The same with a second output, from which a mask of the rays that return is drawn (Nakashima and Kurazume 2021).
 
     Args:
         temperature: Of the relaxed mask.
-
-    See `VanillaGan` for the others.
+        options: Those of `VanillaGan`.
     """
+
+    drops = True
 
     def __init__(
         self,
         space: ModelSpace,
         backbone: Mapping[str, Any] | None = None,
-        latent: Count = 512,
-        base_channels: Count = 64,
-        max_channels: Count = 512,
-        doublings: Count = 4,
-        tanh: bool = False,
-        ring: bool = True,
         temperature: Positive = 1.0,
+        **options: Any,
     ) -> None:
-        def build(shape: tuple[int, int], channels: int) -> LatentGenerator:
-            widths = (latent, base_channels, max_channels, doublings)
-            return dcgan.Generator(shape, channels, True, *widths, tanh, ring, DROPPED, temperature)
-
-        super().__init__(space, build)
+        super().__init__(space, backbone, **options)
+        self.network.temperature = temperature
 
 
 class DustyV2(Gan):
@@ -164,9 +140,6 @@ class DustyV2(Gan):
 
     See `VanillaGan` for the others.
     """
-
-    turns = True
-    angle: Tensor
 
     def __init__(
         self,
@@ -182,19 +155,12 @@ class DustyV2(Gan):
         ring: bool = True,
         temperature: Positive = 1.0,
     ) -> None:
-        def build(shape: tuple[int, int], channels: int) -> LatentGenerator:
-            widths = (latent, code, depth, base_channels, max_channels, doublings)
-            return style_gan.Generator(shape, channels, *widths, tanh, ring, DROPPED, temperature)
-
-        super().__init__(space, build)
-        self.register_buffer("angle", space.rays[None].clone())
-
-    def made(
-        self, z: Tensor, uniform: Tensor | None = None, shift: Tensor | None = None, truncation: float = 1.0
-    ) -> dict[str, Tensor]:
-        made: dict[str, Tensor] = self.network(z, self.angle, truncation=truncation, uniform=uniform, shift=shift)
-        return made
+        channels, *shape = space.shape
+        widths = latent, code, depth, base_channels, max_channels, doublings
+        super().__init__(space, style_gan.Generator((shape[0], shape[1]), channels, *widths, tanh, ring))
+        self.network.temperature = temperature
+        self.angle = space.rays[None].clone()
 
     def start_from(self, parent: Generator) -> None:
         """Take over a trained generator's weights; the angles are this one's."""
-        self._take(parent, {**parent.state_dict(), "angle": self.angle})
+        self._take(parent, {**parent.state_dict(), "angle": self.angle})  # type: ignore[dict-item]

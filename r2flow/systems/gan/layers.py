@@ -11,8 +11,9 @@ from torch import Tensor, nn
 from r2flow.backbones.layers import ExactBuffers, at_least_float32, wrapped
 from r2flow.errors import InputError
 from r2flow.processes import averaged
-from r2flow.systems.gan.losses import logistic, straight_through_mask
 
+DROPPED = -1.0  # a dropped ray in model space
+EPS = torch.finfo(torch.float32).eps
 IMAGE, LOGIT, MASK, ORIGINAL, CODE = "image", "raydrop_logit", "raydrop_mask", "image_orig", "w"
 
 
@@ -20,11 +21,8 @@ class Equalised(nn.Module):
     """gain rate f(x / sqrt n) with weights of N(0, 1 / rate^2), zero biases and n = the elements of weight[0].
 
     Adam then learns all layers at one speed, `rate` times that of others (Karras et al. 2018, section 4.1). n is the
-    fan-in but for a transposed convolution, where the published weights were trained with out_channels k k.
-
-    Args:
-        module: f, a linear layer or a convolution; its bias is scaled too.
-        exact: Compute in float32 whatever autocast does.
+    fan-in but for a transposed convolution, where the published weights were trained with out_channels k k. `exact`
+    computes in float32 whatever autocast does.
     """
 
     def __init__(self, module: nn.Module, gain: float = 1.0, rate: float = 1.0, exact: bool = False) -> None:
@@ -107,18 +105,33 @@ class BlurBoth(nn.Module):
         return torch.cat([self.blur_v(x), self.blur_h(x)], dim=1)
 
 
+def logistic(uniform: Tensor) -> Tensor:
+    """log u - log(1 - u): standard logistic noise of u in [0, 1), clamped to [eps, 1 - eps] of float32."""
+    u = uniform.clamp(EPS, 1 - EPS)
+    return u.log() - torch.log1p(-u)
+
+
+def straight_through_mask(logit: Tensor, noise: Tensor, temperature: float = 1.0) -> Tensor:
+    """m ~ Bernoulli(sigmoid(logit)), 0 or 1, with the gradient of its relaxation s.
+
+    s = sigmoid((logit + noise) / temperature) and m = [s > 1/2] for `logistic` noise (Maddison et al. 2017, appendix B;
+    Nakashima and Kurazume 2021, eq. 4).
+    """
+    soft = torch.sigmoid((logit + noise) / temperature)
+    return soft + ((soft > 0.5).to(soft) - soft).detach()
+
+
 class RayDrop(nn.Module):
-    """The image where a drawn mask keeps a ray, `dropped` elsewhere (Nakashima and Kurazume 2021, section III-B)."""
+    """The image where a drawn mask keeps a ray, -1 elsewhere (Nakashima and Kurazume 2021, section III-B)."""
 
     raydrop_const: Tensor
 
-    def __init__(self, dropped: float, temperature: float) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.temperature = temperature
-        self.register_buffer("raydrop_const", torch.tensor(float(dropped)))
+        self.register_buffer("raydrop_const", torch.tensor(DROPPED))
 
-    def forward(self, made: dict[str, Tensor], uniform: Tensor) -> dict[str, Tensor]:
-        mask = straight_through_mask(made[LOGIT], logistic(uniform), self.temperature)
+    def forward(self, made: dict[str, Tensor], uniform: Tensor, temperature: float) -> dict[str, Tensor]:
+        mask = straight_through_mask(made[LOGIT], logistic(uniform), temperature)
         return {**made, ORIGINAL: made[IMAGE], MASK: mask, IMAGE: made[IMAGE].lerp(self.raydrop_const, 1 - mask)}
 
 
@@ -131,13 +144,18 @@ class LatentGenerator(nn.Module):
         latent: Width of z.
         code: Width of w.
         mapping: z (B, latent) to w (B, code).
-        synthesis: w to outputs by name, (B, ., H, W) float32; see `synthesise`.
+        synthesis: w, and angles with their turn if there are any, to `image` and, where rays are dropped,
+            `raydrop_logit`, (B, ., H, W) float32.
         measurement: What draws the mask; None where no ray is dropped.
         num_styles: Layers that take w.
+
+    Attributes:
+        temperature: Of the relaxed mask.
     """
 
     w_avg: Tensor
     decay = 0.995  # of the mean code
+    temperature = 1.0
 
     def __init__(
         self,
@@ -152,11 +170,6 @@ class LatentGenerator(nn.Module):
         self.latent, self.num_styles = latent, num_styles
         self.register_buffer("w_avg", torch.zeros(1, code))
         self.mapping_network, self.synthesis_network, self.measurement_model = mapping, synthesis, measurement
-
-    def synthesise(self, w: Tensor, angle: Tensor | None, shift: Tensor | None) -> dict[str, Tensor]:
-        """`image` and, where rays are dropped, `raydrop_logit`, (B, ., H, W) float32."""
-        made: dict[str, Tensor] = self.synthesis_network(w)
-        return made
 
     def forward(
         self,
@@ -187,12 +200,13 @@ class LatentGenerator(nn.Module):
             self.w_avg.lerp_(averaged(w.detach().mean(0, keepdim=True)).to(self.w_avg), 1 - self.decay)
         elif truncation != 1:
             w = self.w_avg.lerp(w, truncation)
-        made = {**self.synthesise(w, angle, shift), CODE: w[:, None].expand(-1, self.num_styles, -1)}
-        if self.measurement_model is None:
-            return made
-        assert uniform is not None
-        dropped: dict[str, Tensor] = self.measurement_model(made, uniform)
-        return dropped
+        made: dict[str, Tensor]
+        made = self.synthesis_network(w) if angle is None else self.synthesis_network(w, angle, shift)
+        made[CODE] = w[:, None].expand(-1, self.num_styles, -1)
+        if self.measurement_model is not None:
+            assert uniform is not None
+            made = self.measurement_model(made, uniform, self.temperature)
+        return made
 
 
 def outputs(channels: int, drops: bool) -> dict[str, int]:
@@ -200,7 +214,12 @@ def outputs(channels: int, drops: bool) -> dict[str, int]:
     return {IMAGE: channels, LOGIT: 1} if drops else {IMAGE: channels}
 
 
-def check_shape(what: str, shape: tuple[int, int], unit: int) -> None:
-    """Refuse an image that cannot be halved so often."""
-    if shape[0] % unit or shape[1] % unit:
-        raise InputError(f"{what} needs rows and columns that are multiples of {unit}, found {shape[0]} x {shape[1]}.")
+def halved(what: str, shape: tuple[int, int], times: int, least: int = 1) -> tuple[int, int]:
+    """Rows and columns of an image after so many halvings, at least so many; refuses an image that has no such."""
+    rows, columns = shape[0] >> times, shape[1] >> times
+    if (rows << times, columns << times) != tuple(shape) or min(rows, columns) < least:
+        raise InputError(
+            f"{what} halves images {times} times: rows and columns must be multiples of {2**times}, at least "
+            f"{least * 2**times}, found {shape[0]} x {shape[1]}."
+        )
+    return rows, columns

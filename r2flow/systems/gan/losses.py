@@ -1,14 +1,14 @@
-"""A GAN's losses and R1, relaxed ray-drop masks, and the rules of a run: learning rates, average, warm-up."""
+"""A GAN's losses and R1, and the rules of a run: learning rates, average, warm-up."""
 
 import math
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from torch.nn.functional import softplus
 
 from r2flow.registry import Natural, NonNegative, Portion
+from r2flow.systems.gan.layers import DROPPED, Filter
 
 
 def generator_loss(fake: Tensor) -> Tensor:
@@ -30,29 +30,6 @@ def r1(scores: Tensor, x: Tensor) -> Tensor:
     """
     (gradient,) = torch.autograd.grad(scores.sum(), x, create_graph=True)
     return gradient.square().flatten(1).sum(1).mean()
-
-
-EPS = torch.finfo(torch.float32).eps
-
-
-def logistic(uniform: Tensor) -> Tensor:
-    """log u - log(1 - u): standard logistic noise of u in [0, 1), clamped to [eps, 1 - eps] of float32."""
-    u = uniform.clamp(EPS, 1 - EPS)
-    return u.log() - torch.log1p(-u)
-
-
-def straight_through_mask(logit: Tensor, noise: Tensor, temperature: float = 1.0) -> Tensor:
-    """m ~ Bernoulli(sigmoid(logit)), 0 or 1, with the gradient of its relaxation s.
-
-    s = sigmoid((logit + noise) / temperature) and m = [s > 1/2] (Maddison et al. 2017, appendix B; Nakashima and
-    Kurazume 2021, eq. 4).
-
-    Args:
-        logit: Log-odds that a ray returns, (B, 1, H, W).
-        noise: `logistic` noise of the same shape.
-    """
-    soft = torch.sigmoid((logit + noise) / temperature)
-    return soft + ((soft > 0.5).to(soft) - soft).detach()
 
 
 def half_life_decay(step: int, batch_size: int, half_life: float, rampup: float) -> float:
@@ -93,19 +70,17 @@ class Warmup:
         """1 at the start, 0 from `images` on, linear between."""
         return max(1 - images / self.images, 0.0) if self.images else 0.0
 
-    def __call__(self, x: Tensor, images: int, uniform: Tensor | None, dropped: float = -1.0) -> Tensor:
-        """x after so many images of the run.
+    def __call__(self, x: Tensor, images: int, uniform: Tensor | None) -> Tensor:
+        """x (B, C, H, W) in model space after so many images of the run.
 
         Args:
-            x: (B, C, H, W) in model space.
             uniform: For each value of x, in [0, 1); None is enough once the warm-up is over.
-            dropped: The value of a dropped pixel.
         """
         left = self.left(images)
         x = blurred(x, self.blur * left)
         if uniform is None or self.dropout * left == 0:
             return x
-        return torch.where(uniform < 1 - self.dropout * left, x, torch.full_like(x, dropped))
+        return torch.where(uniform < 1 - self.dropout * left, x, DROPPED)
 
 
 def blurred(x: Tensor, sigma: float) -> Tensor:
@@ -116,7 +91,6 @@ def blurred(x: Tensor, sigma: float) -> Tensor:
     reach = math.floor(3 * sigma)
     if reach == 0:
         return x
-    taps = torch.exp2(-((torch.arange(-reach, reach + 1, device=x.device) / sigma) ** 2))
-    taps = (taps / taps.sum()).to(x.dtype).expand(x.shape[1], 1, 1, -1)
-    x = F.conv2d(F.pad(x, (reach, reach, 0, 0), mode="circular"), taps, groups=x.shape[1])
-    return F.conv2d(F.pad(x, (0, 0, reach, reach), mode="replicate"), taps.mT, groups=x.shape[1])
+    taps = torch.exp2(-((torch.arange(-reach, reach + 1) / sigma) ** 2))
+    blur: Tensor = Filter(taps.tolist(), ring=True).to(x.device)(x)
+    return blur

@@ -31,13 +31,7 @@ class Part(IntEnum):
 
 
 class BatchDraws:
-    """Random numbers of each image in one part of a step: a function of (seed, number of the image, part).
-
-    Args:
-        seed: Run seed.
-        batch: With `k`, the images' numbers, (B,), and `x_1`, on whose device the numbers come.
-        part: Which part of the step.
-    """
+    """Random numbers of each image in one part of a step: a function of (seed, number of the image, part)."""
 
     def __init__(self, seed: int, batch: Batch, part: Part) -> None:
         self.streams = [stream(seed, "training", k, part) for k in batch["k"].tolist()]
@@ -64,14 +58,12 @@ class LearnGan(Stage):
     Args:
         generator: A GAN's.
         discriminator: Name and options, as `{name: style_gan, base_channels: 32}`.
-        learning_rate: Of both.
-        betas: Adam's.
         r1: gamma of R1; 0 for none.
         r1_every: Steps between two of R1.
         warmup: Options of `Warmup`.
         augment: Options of `AdaptiveAugment`; None for no augmentation.
-        batch_size: Images a step.
-        seed: Run seed.
+
+    See `Stage` for the others.
     """
 
     learns = Gan
@@ -144,7 +136,7 @@ class LearnGan(Stage):
         """G(z), (B, C, H, W), with the mask and the turn that are drawn."""
         rows, columns = self.generator.space.shape[1:]
         uniform = draws.uniform((1, rows, columns)) if self.generator.drops else None
-        shift = draws.uniform((1,))[:, 0] if self.generator.turns else None
+        shift = None if self.generator.angle is None else draws.uniform((1,))[:, 0]
         return self.generator.made(z, uniform, shift)["image"]
 
     def shown(self, x: Tensor, images: int, draws: BatchDraws) -> Tensor:

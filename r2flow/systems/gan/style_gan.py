@@ -3,6 +3,7 @@ scene priors of 3D LiDAR data"): every pixel is made from its own angles, by a c
 """
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -21,7 +22,7 @@ from r2flow.systems.gan.layers import (
     LatentGenerator,
     Pad,
     RayDrop,
-    check_shape,
+    halved,
     outputs,
 )
 
@@ -29,21 +30,11 @@ WINDOW = (1.0, 3.0, 3.0, 1.0)
 FREQUENCIES = 256
 
 
-class PixelNorm(nn.Module):
-    """z / sqrt(mean z^2 + 1e-8) over the features (Karras et al. 2018, section 4.2)."""
-
-    def forward(self, z: Tensor) -> Tensor:
-        return z * torch.rsqrt(z.square().mean(1, keepdim=True) + 1e-8)
-
-
 class RandomFrequencies(ExactBuffers):
     """sin and cos of f_e e + f_a a + phase for 256 fixed random frequencies: 512 features of each ray.
 
     f_e is uniform within 2^(ceil(log2 H) + 2); f_a is 0 or +-2^k for k < ceil(log2 W) - 1, so that the features close
-    around the turn.
-
-    Args:
-        shape: Rows and columns of the level.
+    around the turn of a level of H rows and W columns.
     """
 
     freqs: Tensor
@@ -70,11 +61,8 @@ class ModulatedConv(nn.Module):
 
     With s = A w + b over its largest magnitude and W over its own, W'_oi = W_oi (s_i + 1), each output's weights then
     at norm 1; and all of it over the root of a running mean of the input's square (Karras et al. 2021, StyleGAN3,
-    appendix C). Weights are float32 whatever autocast does.
-
-    Args:
-        code: Width of w.
-        norm: Whether weights are normed; the last layers' are not, and are over sqrt(in_channels) instead.
+    appendix C). Weights are float32 whatever autocast does. The last layers' weights are not normed, but over
+    sqrt(in_channels).
     """
 
     ema_var: Tensor
@@ -123,13 +111,7 @@ class Level(nn.Module):
     """Features at twice the size of the last level's, beside those of the rays, and what they add to each output."""
 
     def __init__(
-        self,
-        in_channels: int,
-        channels: int,
-        made: dict[str, int],
-        code: int,
-        shape: tuple[int, int],
-        ring: bool,
+        self, in_channels: int, channels: int, made: dict[str, int], code: int, shape: tuple[int, int], ring: bool
     ) -> None:
         super().__init__()
         self.first = in_channels == 0
@@ -146,8 +128,7 @@ class Level(nn.Module):
 
     def coarser(self, angle: Tensor) -> Tensor:
         """The angles of the level before: of the filtered sines and cosines, for a mean angle would break at +-pi."""
-        e, a = self.downsample(angle.sin()), self.downsample(angle.cos())
-        return torch.atan2(e, a)
+        return torch.atan2(self.downsample(angle.sin()), self.downsample(angle.cos()))
 
     def forward(
         self, x: Tensor | None, so_far: dict[str, Tensor], w: Tensor, angle: Tensor
@@ -169,18 +150,15 @@ class Synthesis(nn.Module):
         shape: tuple[int, int],
         made: dict[str, int],
         code: int,
-        base_channels: int,
-        max_channels: int,
-        doublings: int,
+        widths: Sequence[int],
         tanh: bool,
         ring: bool,
     ) -> None:
         super().__init__()
-        widths = [0, *(min(base_channels << i, max_channels) for i in reversed(range(doublings + 1)))]
-        shapes = [(shape[0] >> i, shape[1] >> i) for i in reversed(range(doublings + 1))]
+        shapes = [(shape[0] >> i, shape[1] >> i) for i in reversed(range(len(widths)))]
         self.layers = nn.ModuleList(
-            Level(narrow, wide, made, code, size, ring)
-            for (narrow, wide), size in zip(pairwise(widths), shapes, strict=True)
+            Level(before, after, made, code, size, ring)
+            for (before, after), size in zip(pairwise([0, *widths]), shapes, strict=True)
         )
         self.tanh = tanh
 
@@ -219,50 +197,35 @@ class Generator(LatentGenerator):
     Args:
         shape: Rows and columns of the image.
         channels: Of the image.
-        latent: Width of z.
-        code: Width of w; None for `latent`.
-        depth: Layers from z to w.
-        base_channels: Width of the finest level; it doubles inwards.
-        max_channels: Widest.
-        doublings: Levels after the first one.
-        tanh: Whether the image ends in tanh.
-        ring: Whether the columns are a full turn.
-        dropped: The image's value at a dropped ray.
-        temperature: Of the relaxed mask.
+
+    See `r2flow.systems.gan.generator.DustyV2` for the others.
     """
 
     def __init__(
         self,
         shape: tuple[int, int],
         channels: int = 1,
-        latent: Count = 512,
-        code: Count | None = None,
-        depth: Count = 2,
-        base_channels: Count = 32,
-        max_channels: Count = 512,
-        doublings: Count = 4,
+        latent: int = 512,
+        code: int | None = None,
+        depth: int = 2,
+        base_channels: int = 32,
+        max_channels: int = 512,
+        doublings: int = 4,
         tanh: bool = True,
         ring: bool = True,
-        dropped: float = -1.0,
-        temperature: float = 1.0,
     ) -> None:
         code = code or latent
-        check_shape("this GAN", shape, 2**doublings)
-        widths = [latent, *[code] * depth]
+        halved("this GAN", shape, doublings)
         mapping = nn.Sequential(
-            PixelNorm(),
+            nn.RMSNorm(latent, eps=1e-8, elementwise_affine=False),
             *(
-                nn.Sequential(Equalised(nn.Linear(before, after), math.sqrt(2), 0.01, exact=True), nn.LeakyReLU(0.2))
-                for before, after in pairwise(widths)
+                nn.Sequential(Equalised(nn.Linear(before, code), math.sqrt(2), 0.01, exact=True), nn.LeakyReLU(0.2))
+                for before in [latent, *[code] * (depth - 1)]
             ),
         )
-        synthesis = Synthesis(shape, outputs(channels, True), code, base_channels, max_channels, doublings, tanh, ring)
-        super().__init__(latent, code, mapping, synthesis, RayDrop(dropped, temperature), 2 * (doublings + 1))
-
-    def synthesise(self, w: Tensor, angle: Tensor | None, shift: Tensor | None) -> dict[str, Tensor]:
-        assert angle is not None, "DUSty v2 makes an image of angles"
-        made: dict[str, Tensor] = self.synthesis_network(w, angle, shift)
-        return made
+        widths = [min(base_channels << i, max_channels) for i in reversed(range(doublings + 1))]
+        synthesis = Synthesis(shape, outputs(channels, True), code, widths, tanh, ring)
+        super().__init__(latent, code, mapping, synthesis, RayDrop(), 2 * (doublings + 1))
 
 
 class ResidualBlock(nn.Module):
@@ -293,21 +256,14 @@ def _convolution(in_channels: int, out_channels: int, ring: bool, stride: int = 
 class MinibatchDeviation(nn.Module):
     """How much images differ, as one channel more: the mean deviation of all features over groups of images.
 
-    Of a batch of B in groups of G, images b, b + B / G, ... belong together (Karras et al. 2018, section 3).
-
-    Args:
-        group: Images in a group; the largest number up to it that divides the batch.
-        features: Channels that are added, each of its own share of the features.
+    Of a batch of B in groups of G, images b, b + B / G, ... belong together (Karras et al. 2018, section 3). G is the
+    largest number up to 4 that divides B.
     """
 
-    def __init__(self, group: int, features: int) -> None:
-        super().__init__()
-        self.group, self.features = group, features
-
     def forward(self, x: Tensor) -> Tensor:
-        group = max(n for n in range(1, self.group + 1) if len(x) % n == 0)
-        grouped = at_least_float32(x).unflatten(0, (group, -1)).unflatten(2, (self.features, -1))
-        deviation = (grouped.var(0, unbiased=False) + 1e-8).sqrt().mean((2, 3, 4))
+        group = max(n for n in range(1, 5) if len(x) % n == 0)
+        grouped = at_least_float32(x).unflatten(0, (group, -1))
+        deviation = (grouped.var(0, unbiased=False) + 1e-8).sqrt().mean((1, 2, 3))[:, None]
         said = deviation.repeat(group, 1)[:, :, None, None].expand(-1, -1, *x.shape[2:])
         return torch.cat([x, said.to(x.dtype)], dim=1)
 
@@ -321,9 +277,6 @@ class Discriminator(nn.Module):
         base_channels: Width of the first map; it doubles inwards.
         max_channels: Widest.
         halvings: From the image to the last map; None for as many as leave 4 rows or columns.
-        group: Images that are compared with one another.
-        features: Channels that say how much they differ.
-        blur: Whether the image is blurred first.
         ring: Whether the columns are a full turn.
     """
 
@@ -334,30 +287,25 @@ class Discriminator(nn.Module):
         base_channels: Count = 32,
         max_channels: Count = 512,
         halvings: Count | None = None,
-        group: Count = 4,
-        features: Count = 1,
-        blur: bool = True,
         ring: bool = True,
     ) -> None:
         super().__init__()
         halvings = halvings or max(int(math.log2(min(shape) / 4)), 0)
-        check_shape("this discriminator", shape, 2**halvings)
+        rows, columns = halved("this discriminator", shape, halvings)
         widths = [min(base_channels << i, max_channels) for i in range(halvings + 1)]
-        first = nn.Conv2d((1 + blur) * channels, widths[0], 1, bias=False)
         self.layers = nn.Sequential(
-            *[BlurBoth(ring)] * blur,
-            nn.Sequential(Equalised(first)),
+            BlurBoth(ring),
+            nn.Sequential(Equalised(nn.Conv2d(2 * channels, widths[0], 1, bias=False))),
             BiasedLeakyReLU(widths[0]),
             *(ResidualBlock(narrow, wide, ring) for narrow, wide in pairwise(widths)),
         )
         last = widths[-1]
-        left = (shape[0] >> halvings) * (shape[1] >> halvings)
         self.epilogue = nn.Sequential(
-            MinibatchDeviation(group, features),
-            _convolution(last + features, last, ring),
+            MinibatchDeviation(),
+            _convolution(last + 1, last, ring),
             BiasedLeakyReLU(last),
             nn.Flatten(),
-            Equalised(nn.Linear(last * left, last, bias=False), exact=True),
+            Equalised(nn.Linear(last * rows * columns, last, bias=False), exact=True),
             BiasedLeakyReLU(last),
             Equalised(nn.Linear(last, 1), exact=True),
         )

@@ -11,9 +11,11 @@ from r2flow.errors import InputError
 from r2flow.generators.base import Generator
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Bound, Count, check_options
-from r2flow.samplers.base import Condition, Generated, Noise, Progress, Sampler
+from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
+from r2flow.systems.diffusion.log_snr import square_root_linear
+from r2flow.systems.diffusion.objectives import PREDICTIONS
+from r2flow.systems.diffusion.sampling import walk
 from r2flow.systems.latent.autoencoder import Autoencoder
-from r2flow.systems.latent.ddim import ddim, ddim_walk, square_root_linear, tables
 from r2flow.systems.latent.unet import LatentUNet
 
 Steps = Annotated[int, Bound("of at least 2", lambda n: n >= 2)]
@@ -44,12 +46,6 @@ class VQAutoencoder(Generator):
         self.first_stage_model = build_autoencoder(space, autoencoder)
         self.noise_shape = self.first_stage_model.latent_shape(*space.shape[1:])
 
-    def forward(self, noise: Tensor, condition: Condition | None = None, **how: Any) -> Generated:
-        raise InputError(
-            "an autoencoder turns scans into latents and back and makes none of noise: give the checkpoint of a latent "
-            "diffusion, or train one with experiment=lidm stage.init=FILE."
-        )
-
 
 class LatentDiffusion(Generator):
     """eps(z_t, t) by a U-Net on an autoencoder's latents, sampled by DDIM and decoded: LiDM (Ran et al. 2024).
@@ -61,11 +57,11 @@ class LatentDiffusion(Generator):
         backbone: Not used.
         autoencoder: Options of `r2flow.systems.latent.autoencoder.Autoencoder`.
         unet: Options of `r2flow.systems.latent.unet.LatentUNet`; `position: learnable` is LiDM + APE.
-        beta_first, beta_last: Of `r2flow.systems.latent.ddim.square_root_linear`.
+        beta_first, beta_last: Of `r2flow.systems.diffusion.log_snr.square_root_linear`.
         diffusion_steps: N.
     """
 
-    alpha_bar: Tensor
+    log_snr: Tensor
 
     def __init__(
         self,
@@ -84,8 +80,8 @@ class LatentDiffusion(Generator):
         check_options("generator.unet", LatentUNet, unet or {}, given=1)
         self.model = nn.ModuleDict({"diffusion_model": LatentUNet(shape, **(unet or {}))})
         with torch.device("cpu"):
-            beta = square_root_linear(beta_first, beta_last, diffusion_steps)
-        self.register_buffer("alpha_bar", tables(beta).alpha_bar.float(), persistent=False)
+            log_snr = square_root_linear(beta_first, beta_last, diffusion_steps)
+        self.register_buffer("log_snr", log_snr.float(), persistent=False)
 
     @property
     def unet(self) -> LatentUNet:
@@ -94,19 +90,22 @@ class LatentDiffusion(Generator):
         assert isinstance(network, LatentUNet)
         return network
 
-    def start_from(self, parent: Generator) -> None:
-        """Take over an autoencoder's weights, or another latent diffusion's.
+    def expected(self, z: Tensor, t: Tensor) -> Tensor:
+        """The latents that are expected behind z (B, ...) at step t, ()."""
+        x, _ = PREDICTIONS["eps"].split(z, self.unet(z, t.to(z.device).expand(len(z))), self.log_snr[t])
+        return x
 
-        Raises:
-            InputError: the autoencoder is another one, or the parent is neither.
-        """
+    def start_from(self, parent: Generator) -> None:
+        """Take over an autoencoder's weights, or another latent diffusion's."""
         new = self.state_dict() if isinstance(parent, VQAutoencoder) else {}
         self._take(parent, {**new, **parent.state_dict()})
 
 
 @dataclass(frozen=True)
 class LatentDDIM(Sampler):
-    """Every (N // steps)-th of the diffusion's N steps (`r2flow.systems.latent.ddim.ddim_walk`), and the decoder.
+    """DDIM by every (N // steps)-th of the diffusion's N steps, and the decoder.
+
+    The last step goes to lambda_0 and not to the data, as in the published code, and adds noise too.
 
     Attributes:
         eta: Share of fresh noise.
@@ -123,25 +122,23 @@ class LatentDDIM(Sampler):
         return self.eta > 0
 
     def evaluations(self, generator: Any) -> int:
-        return len(ddim_walk(generator.alpha_bar, self.steps, 0.0).times)
+        return len(some_of(len(generator.log_snr), self.steps))
 
     def check(self, generator: Any) -> None:
         super().check(generator)
         self.evaluations(generator)
 
-    def __call__(
-        self,
-        generator: Any,
-        noise: Tensor,
-        condition: Condition | None = None,
-        draws: Noise | None = None,
-        progress: Progress = None,
-    ) -> Generated:
-        walk, z = ddim_walk(generator.alpha_bar.double(), self.steps, self.eta), noise
-        for state, _ in ddim(generator.unet, z, walk, draws):  # type: ignore[arg-type]
-            z = state
-            if progress is not None:
-                progress()
+    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
+        times = some_of(len(generator.log_snr), self.steps)
+        log_snrs = generator.log_snr[[*times.tolist(), 0]]
+        z = last_of(walk(generator.expected, noise, log_snrs, self.eta, draws, times), progress)
         with torch.autocast(z.device.type, enabled=False):  # what it answers is the scan, and no step follows
             scans = generator.first_stage_model.decode(z)
-        return Generated.after(scans, len(walk.times))
+        return Generated.after(scans, len(times))
+
+
+def some_of(total: int, steps: int) -> Tensor:
+    """Every (total // steps)-th number below total, from 1 on, falling: more than `steps` if it does not divide."""
+    if not 1 <= steps < total:
+        raise InputError(f"a diffusion of {total} steps is sampled in 1 to {total - 1}, found {steps}.")
+    return torch.arange(1, total, total // steps).flip(0)

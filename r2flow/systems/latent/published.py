@@ -16,7 +16,7 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import ShiftedLog
 from r2flow.lidar.sensors import build_sensor
-from r2flow.model.published import Format, Published, garbled
+from r2flow.model.published import Format, Published
 from r2flow.systems.latent.autoencoder import UP
 
 log = logging.getLogger(__name__)
@@ -43,35 +43,27 @@ def holds_autoencoder(content: Any) -> bool:
 
 def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published:
     """A published latent diffusion, with its averaged weights, whose names have lost their dots."""
-    state = _state(content)
-    params = _params(path)
-    with garbled(path):
-        raw = {name: value for name, value in state.items() if name.startswith((UNET, AUTOENCODER))}
-        average = {name: state.get(_undotted(name), value) for name, value in raw.items()}
-        head = int(params.get("unet_config", {}).get("params", {}).get("num_head_channels", HEAD))
-        generator = {
-            "name": "latent_diffusion",
-            "autoencoder": _autoencoder(_within(raw, AUTOENCODER)),
-            "unet": {**_unet(_within(raw, UNET)), "head_channels": head},
-            "beta_first": float(f"{state['betas'][0]:.6g}"),
-            "beta_last": float(f"{state['betas'][-1]:.6g}"),
-            "diffusion_steps": len(state["betas"]),
-        }
-        config = _config(generator, path)
-    weights = average if averaged else raw
-    return Published(config, dict(weights), _step(content), {"name": "latent_ddim"})
+    state, beside = _state(content), _beside(path)
+    raw = {name: value for name, value in state.items() if name.startswith((UNET, AUTOENCODER))}
+    undotted = {name: AVERAGE + name.removeprefix("model.").replace(".", "") for name in raw}
+    unet = ((beside.get("model") or {}).get("params") or {}).get("unet_config", {}).get("params", {})
+    generator = {
+        "name": "latent_diffusion",
+        "autoencoder": _autoencoder(_within(raw, AUTOENCODER)),
+        "unet": {**_unet(_within(raw, UNET)), "head_channels": int(unet.get("num_head_channels", HEAD))},
+        "beta_first": float(f"{state['betas'][0]:.6g}"),
+        "beta_last": float(f"{state['betas'][-1]:.6g}"),
+        "diffusion_steps": len(state["betas"]),
+    }
+    weights = {name: state.get(undotted[name], value) for name, value in raw.items()} if averaged else raw
+    return Published(_config(generator, path, beside), weights, _step(content), {"name": "latent_ddim"})
 
 
 def read_autoencoder(content: Any, path: Path, averaged: bool = True) -> Published:
     """A published autoencoder; its discriminator is left out."""
     raw = {name: value for name, value in _state(content).items() if not name.startswith("loss.")}
-    with garbled(path):
-        config = _config({"name": "vq_autoencoder", "autoencoder": _autoencoder(raw)}, path)
+    config = _config({"name": "vq_autoencoder", "autoencoder": _autoencoder(raw)}, path, _beside(path))
     return Published(config, {AUTOENCODER + name: value for name, value in raw.items()}, _step(content))
-
-
-def _undotted(name: str) -> str:
-    return AVERAGE + name.removeprefix("model.").replace(".", "")
 
 
 def _within(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
@@ -130,32 +122,22 @@ def _unet(state: Mapping[str, Tensor]) -> dict[str, Any]:
 def _beside(path: Path) -> Mapping[str, Any]:
     """The published `config.yaml` beside a file; nothing where there is none."""
     file = path.with_name("config.yaml")
-    if not file.is_file():
-        return {}
     try:
-        found = yaml.safe_load(file.read_text())
+        found = yaml.safe_load(file.read_text()) if file.is_file() else {}
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"{file}, beside {path.name}, cannot be read: {' '.join(str(error).split())}.") from None
     return found if isinstance(found, Mapping) else {}
 
 
-def _params(path: Path) -> Mapping[str, Any]:
-    model = _beside(path).get("model")
-    params = model.get("params") if isinstance(model, Mapping) else None
-    return params if isinstance(params, Mapping) else {}
-
-
-def _config(generator: dict[str, Any], path: Path) -> dict[str, Any]:
+def _config(generator: dict[str, Any], path: Path, beside: Mapping[str, Any]) -> dict[str, Any]:
     """The config of a file, with what its `config.yaml` says of the data."""
-    content = _beside(path)
-    if not content:
+    if not beside:
         heads = f", attention heads of {HEAD} channels" if generator["name"] == "latent_diffusion" else ""
         log.warning(
             "%s has no config.yaml: assumed images of %d x %d, ranges of %g to %g m on a logarithmic scale%s.",
             path, *SIZE, *RANGES, heads,
         )  # fmt: skip
-    data = content.get("data") or {}
-    images = (data.get("params") or {}).get("dataset") or {}
+    images = ((beside.get("data") or {}).get("params") or {}).get("dataset") or {}
     rows, columns = (int(size) for size in images.get("size", SIZE))
     nearest, farthest = (float(limit) for limit in images.get("depth_range", RANGES))
     if tuple(images.get("fov", VIEW)) != VIEW:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from r2flow.errors import InputError
@@ -12,7 +13,7 @@ from r2flow.lidar.encoding import Encoding, ShiftedLog
 from r2flow.processes import averaged
 from r2flow.registry import Natural, NonNegative, check_options
 from r2flow.stages.base import Batch, SingleLoss, Stage
-from r2flow.systems.latent.ddim import noise_loss
+from r2flow.systems.diffusion.sampling import noised
 from r2flow.systems.latent.discriminator import (
     PatchDiscriminator,
     adaptive_weight,
@@ -139,8 +140,8 @@ class LearnLatentDiffusion(SingleLoss):
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         """Mean over images at the steps that u in [0, 1) falls on, (B,)."""
-        diffusion = self.generator
+        diffusion, eps = self.generator, batch["x_0"]
         with torch.no_grad():
             z = diffusion.first_stage_model.eval().encode(batch["x_1"]).float()  # for noise levels of all digits
-        t = (u * len(diffusion.alpha_bar)).to(torch.int64)
-        return noise_loss(diffusion.unet, z, t, batch["x_0"], diffusion.alpha_bar).mean()
+        t = (u * len(diffusion.log_snr)).to(torch.int64)
+        return F.mse_loss(diffusion.unet(noised(z, diffusion.log_snr[t], eps), t), eps)

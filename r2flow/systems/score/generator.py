@@ -12,7 +12,7 @@ from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import Generator, parts_of
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Count, Positive
-from r2flow.samplers.base import Condition, Generated, Noise, Progress, Sampler
+from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
 from r2flow.systems.score.langevin import annealed_langevin, noise_levels, toward
 from r2flow.systems.score.refinenet import RefineNet
 
@@ -28,13 +28,9 @@ class ScoreModel(Generator):
         space: The images it makes.
         backbone: Not used: the network is a `RefineNet`.
         rate: Of `r2flow.systems.score.langevin.step_sizes`.
-        denoise: Whether the last level's noise is taken off at the end.
         pull: Strength of the pull to known pixels, a step.
         width: The network's, see `RefineNet`.
         sigma_first, sigma_last, levels, spacing: The noise levels, see `r2flow.systems.score.langevin.noise_levels`.
-
-    Raises:
-        InputError: an odd height or width, noise levels that rise, an unknown spacing.
     """
 
     told = True
@@ -44,7 +40,6 @@ class ScoreModel(Generator):
         space: ModelSpace,
         backbone: Mapping[str, Any],
         rate: Positive = 6.2e-6,
-        denoise: bool = True,
         pull: Positive = 0.1,
         width: Count = 128,
         sigma_first: Positive = 50.0,
@@ -54,7 +49,7 @@ class ScoreModel(Generator):
     ) -> None:
         super().__init__(space)
         self.run_by(Langevin())
-        self.rate, self.denoise, self.pull = rate, denoise, pull
+        self.rate, self.pull = rate, pull
         channels, rows, columns = space.shape
         if rows % 2 or columns % 2:
             raise InputError(f"RefineNet halves the image: its height and width must be even, found {rows}x{columns}.")
@@ -76,25 +71,15 @@ class Langevin(Sampler):
     steps: Count = 5
 
     def evaluations(self, generator: Any) -> int:
-        return len(generator.network.sigmas) * self.steps + int(generator.denoise)
+        return len(generator.network.sigmas) * self.steps + 1
 
-    def __call__(
-        self,
-        generator: Any,
-        noise: Tensor,
-        condition: Condition | None = None,
-        draws: Noise | None = None,
-        progress: Progress = None,
-    ) -> Generated:
+    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
         x, pull = torch.special.ndtr(noise), None
         if condition is not None:
             image, known = parts_of(condition, x)
             pull = toward((image + 1) / 2, known, generator.pull)
+        assert draws is not None
         network = generator.network
-        for end in annealed_langevin(
-            network, x, network.sigmas, draws, generator.rate, self.steps, generator.denoise, pull  # type: ignore[arg-type]
-        ):  # fmt: skip
-            x = end
-            if progress is not None:
-                progress()
+        states = annealed_langevin(network, x, network.sigmas, draws, generator.rate, self.steps, pull)
+        x = last_of(states, progress)
         return Generated.after(2 * x.clamp(0, 1) - 1, self.evaluations(generator), finite(x))

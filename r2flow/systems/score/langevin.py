@@ -38,13 +38,7 @@ def step_sizes(sigmas: Tensor, rate: float) -> Tensor:
 def score_loss(score: Score, x: Tensor, noise: Tensor, labels: Tensor, sigmas: Tensor, power: float = 2.0) -> Tensor:
     """Denoising score matching, sigma^power / 2 |s(x + sigma n, i) + n / sigma|^2 of each image, (B,).
 
-    With power 2 every level weighs the same (2019, eq. 6).
-
-    Args:
-        x: Images, (B, C, H, W).
-        noise: n, standard normal, of their shape.
-        labels: i, the noise level of each, (B,) int64.
-        sigmas: Of all levels, (L,).
+    With power 2 every level weighs the same (2019, eq. 6). Noise n is standard normal, labels i are (B,) int64.
     """
     sigma = sigmas[labels][:, None, None, None]
     error = score(x + sigma * noise, labels) + noise / sigma
@@ -58,48 +52,36 @@ def annealed_langevin(
     noise: Callable[[int], Tensor],
     rate: float = 6.2e-6,
     steps: int = 5,
-    denoise: bool = True,
     pull: Callable[[Tensor], Tensor] | None = None,
 ) -> Iterator[Tensor]:
     """The states of annealed Langevin dynamics (2019, algorithm 1), after each evaluation of the score.
 
     `steps` times at each level i, from the first to the last: x <- x + e_i s(x, i) + sqrt(2 e_i) z with e_i of
-    `step_sizes`. Then, where it is asked for, the noise that the last level leaves is taken off (2020, section 3.3):
+    `step_sizes`. Then the noise that the last level leaves is taken off (2020, section 3.3):
     x <- x + sigma_{L-1}^2 s(x, L-1).
 
     Args:
         x: Where it starts, (B, C, H, W).
         sigmas: Of all levels, (L,).
         noise: z of step k = 1, 2, ..., counted over all levels, of x's shape.
-        denoise: Whether the last noise is taken off.
         pull: Added in every step, a function of the state before it: the gradient of a likelihood, as `toward`. The
             last denoising adds that of the step before once more, and the state after it is pulled once again: so
             LiDARGen completes scans.
     """
-    number, sizes = 0, step_sizes(sigmas, rate).tolist()
-    pulled: Tensor | float = 0.0
-    for level, size in enumerate(sizes):
+    number, pulled = 0, torch.zeros_like(x)
+    for level, size in enumerate(step_sizes(sigmas, rate).tolist()):
         labels = torch.full((len(x),), level, device=x.device)
         for _ in range(steps):
             number += 1
             if pull is not None:
                 pulled = pull(x)
             x = x + size * score(x, labels) + math.sqrt(2 * size) * noise(number) + pulled
-            if number < len(sizes) * steps or denoise or pull is None:
-                yield x
-    if denoise:
-        x = x + sigmas[-1].square() * score(x, torch.full((len(x),), len(sizes) - 1, device=x.device)) + pulled
-    if pull is not None:
-        x = x + pull(x)
-    if denoise or pull is not None:
-        yield x
+            yield x
+    x = x + sigmas[-1].square() * score(x, labels) + pulled
+    yield x if pull is None else x + pull(x)
 
 
 def toward(image: Tensor, mask: Tensor, strength: float = 0.1) -> Callable[[Tensor], Tensor]:
     """strength mask (image - x): pulls the known pixels to their values (Zyrianov et al. 2022, "Learning to generate
     realistic LiDAR point clouds", eq. 8); their 4-beam scans know every 16th row."""
-
-    def pull(x: Tensor) -> Tensor:
-        return strength * mask * (image - x)
-
-    return pull
+    return lambda x: strength * mask * (image - x)

@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from r2flow.model.published import Format, Published, garbled
+from r2flow.model.published import Format, Published
 
 NETWORK = "network."  # in the generator
 WRAPPED = "module."  # by torch's DataParallel
@@ -28,31 +28,26 @@ def holds(content: Any) -> bool:
 
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
     """A published score model; its averaged weights lack the buffers, and files without them have the raw ones."""
-    with garbled(path):
-        raw: dict[str, Tensor] = {name.removeprefix(WRAPPED): value for name, value in content[0].items()}
-        average = {name.removeprefix(WRAPPED): value for name, value in dict(*content[4:]).items()}
-        sigmas, step = raw["sigmas"], int(content[3])
-        config = {
-            "sensor": dict(SENSOR),
-            "encoding": {"format": "shifted_log", "reflectance": len(raw[LAST]) > 1, "limits": "open"},
-            "backbone": {"name": "refinenet"},
-            "generator": {
-                "name": "score",
-                "width": len(raw[FIRST]),
-                "sigma_first": float(f"{sigmas[0]:.6g}"),
-                "sigma_last": float(f"{sigmas[-1]:.6g}"),
-                "levels": len(sigmas),
-            },
-            "data": {"name": "kitti_360", "reading": {"projection": "spherical", "convention": "reference"}},
-            "published": {"system": "LiDARGen"},
-        }
-    weights = {**raw, **average} if averaged else raw
-    return Published(
-        config,
-        {NETWORK + name: value for name, value in weights.items()},
-        step,
-        {"name": "langevin", "steps": 5},
-    )
+    weights: dict[str, Tensor] = {name.removeprefix(WRAPPED): value for name, value in content[0].items()}
+    sigmas = weights["sigmas"]
+    config = {
+        "sensor": dict(SENSOR),
+        "encoding": {"format": "shifted_log", "reflectance": len(weights[LAST]) > 1, "limits": "open"},
+        "backbone": {"name": "refinenet"},
+        "generator": {
+            "name": "score",
+            "width": len(weights[FIRST]),
+            "sigma_first": float(f"{sigmas[0]:.6g}"),
+            "sigma_last": float(f"{sigmas[-1]:.6g}"),
+            "levels": len(sigmas),
+        },
+        "data": {"name": "kitti_360", "reading": {"projection": "spherical", "convention": "reference"}},
+        "published": {"system": "LiDARGen"},
+    }
+    if averaged:
+        weights |= {name.removeprefix(WRAPPED): value for name, value in dict(*content[4:]).items()}
+    named = {NETWORK + name: value for name, value in weights.items()}
+    return Published(config, named, int(content[3]), {"name": "langevin", "steps": 5})
 
 
 FORMAT = Format("LiDARGen", holds, read)

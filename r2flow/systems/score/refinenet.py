@@ -5,13 +5,13 @@ trained so. Parameters carry their names.
 """
 
 from collections.abc import Sequence
+from itertools import chain
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import at_least_float32
-from r2flow.errors import InputError
 from r2flow.registry import Count
 
 
@@ -58,9 +58,7 @@ class PooledConvolution(nn.Module):
 class ScoreBlock(nn.Module):
     """shortcut(x) + conv elu norm conv elu norm (x).
 
-    Args:
-        changes: Whether the shortcut is learned. Without dilation the block then halves the image, with it not.
-        dilation: Of its 3 x 3 convolutions; 1 for none.
+    A block that `changes` learns its shortcut; it halves the image if its convolutions are not dilated.
     """
 
     def __init__(self, channels: int, out_channels: int, changes: bool = False, dilation: int = 1) -> None:
@@ -89,9 +87,8 @@ class ResidualUnits(nn.Module):
     def __init__(self, channels: int, count: int) -> None:
         super().__init__()
         self.names = [(f"{unit}_1_conv", f"{unit}_2_conv") for unit in range(1, count + 1)]
-        for pair in self.names:
-            for name in pair:
-                self.add_module(name, torus_convolution(channels, channels, bias=False))
+        for name in chain(*self.names):
+            self.add_module(name, torus_convolution(channels, channels, bias=False))
 
     def forward(self, x: Tensor) -> Tensor:
         for first, second in self.names:
@@ -177,8 +174,6 @@ class RefineNet(nn.Module):
     def forward(self, x: Tensor, labels: Tensor) -> Tensor:
         """The score of images (B, C, H, W) at the noise levels (B,) int64, of their shape; H and W are even."""
         rows, columns = x.shape[2:]
-        if rows % 2 or columns % 2:
-            raise InputError(f"RefineNet halves the image: its height and width must be even, found {rows}x{columns}.")
         column = torch.linspace(0, 1, columns, device=x.device, dtype=x.dtype).expand(len(x), 1, rows, -1)
         row = torch.linspace(0, 1, rows, device=x.device, dtype=x.dtype)[:, None].expand(len(x), 1, -1, columns)
         first = self.res1(self.begin_conv(torch.cat([2 * x - 1, column, row], 1)))
