@@ -18,7 +18,7 @@ from r2flow.model.checkpoint import Checkpoint, save_checkpoint
 from r2flow.model.export import NOTES, compare, export, tableau
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
-from tests.conftest import ROOT
+from tests.conftest import ROOT, tiny_options
 
 SHORT = build_sampler("adams3", steps=3, grid="power:1.5", finish=1 / 32)
 
@@ -28,7 +28,7 @@ def flow(name: str, generator: str = "rectified_flow") -> Checkpoint:
     config = {
         "sensor": {"name": "hdl64e", "rows": 16, "columns": 64},
         "encoding": {"format": "logscale", "reflectance": True},
-        "backbone": {"name": name, **BACKBONES[name].tiny_options()},
+        "backbone": tiny_options(name),
         "generator": {"name": generator},
     }
     made = build_generator(config).eval().requires_grad_(False)

@@ -1,7 +1,7 @@
 """What all backbones share: images of one shape, seen along rays that they keep, at one time or two."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Self, TypedDict
 
 import torch
@@ -38,7 +38,6 @@ class Backbone(ExactBuffers):
     - croppable: It can be evaluated on a part of its image. Layers that use the ring have a method `open_ring`.
     - any_size: It takes images of any number of rows and columns.
     - learns_directions: It learns a vector for each direction, so that scans must not be turned in training.
-    - tiny_options: Options that build it in milliseconds, for tests.
 
     A module in it may have a method `macs` (`r2flow.backbones.cost`). `model.compile(dynamic=True)` makes it one graph
     without breaks for batches of two and more and one for a single image.
@@ -135,11 +134,6 @@ class Backbone(ExactBuffers):
     def learns_directions(self) -> bool:
         """Whether the network learns a vector for each direction."""
         return False
-
-    @classmethod
-    def tiny_options(cls) -> Mapping[str, Any]:
-        """Options of a network that builds in milliseconds and takes images of 16 x 64."""
-        return {}
 
     def cropped(self, rows: Tensor, columns: Tensor) -> Self:
         """The backbone for a part of its image, (B, C, len(rows), len(columns)), its parameters shared.

@@ -1,9 +1,9 @@
 """Pieces that the two U-Nets share: convolutions on a ring, resampling, residual and attention blocks."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Unpack
+from typing import Annotated, Unpack
 
 import torch
 import torch.nn.functional as F
@@ -253,11 +253,6 @@ class UNet(Backbone):
         """Compute again the features of the rays."""
         if self.coords_encoding is not None:
             self.register_buffer("features", self.coords_encoding(self.coords), persistent=False)
-
-    @classmethod
-    def tiny_options(cls) -> Mapping[str, Any]:
-        """Two levels of one block each."""
-        return {"base_channels": 8, "channel_multiplier": [1, 2], "num_residual_blocks": 1, "num_heads": 2}
 
     def entrance(self, x: Tensor) -> Tensor:
         """The first convolution, on the image and its rays' features."""

@@ -1,8 +1,8 @@
 """HDiT: an hourglass of transformer blocks on image tokens (paper, figure 4), with rays for positions."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any, NamedTuple, Self, Unpack, cast
+from collections.abc import Iterable, Sequence
+from typing import Annotated, NamedTuple, Self, Unpack, cast
 
 import torch
 import torch.nn.functional as F
@@ -153,11 +153,6 @@ class HDiT(Backbone):
     @property
     def learns_directions(self) -> bool:
         return self.spatial_pe is not None and self.spatial_pe.learned
-
-    @classmethod
-    def tiny_options(cls) -> Mapping[str, Any]:
-        """Two levels of one block each."""
-        return {"base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16}
 
     def cropped(self, rows: Tensor, columns: Tensor) -> Self:
         part = super().cropped(rows, columns)

@@ -1,7 +1,7 @@
 """A small convolutional network at full resolution, for work that needs no more than a ray's surroundings."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Unpack
+from collections.abc import Sequence
+from typing import Unpack
 
 import torch
 import torch.nn.functional as F
@@ -43,10 +43,6 @@ class Local(Backbone):
         self.image = nn.Conv2d(self.in_channels, channels, 3, padding=1)
         self.blocks = nn.ModuleList([_Block(channels, width) for width in widths])
         self.answer = zero_initialised(nn.Conv2d(channels, self.out_channels, 3, padding=1))
-
-    @classmethod
-    def tiny_options(cls) -> Mapping[str, Any]:
-        return {"channels": 8, "dilations": (1, 2)}
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         columns = x.shape[3]

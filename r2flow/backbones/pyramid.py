@@ -136,9 +136,3 @@ class Pyramid(Backbone):
     @property
     def learns_directions(self) -> bool:
         return self.inner.learns_directions
-
-    @classmethod
-    def tiny_options(cls) -> Mapping[str, Any]:
-        """An HDiT of two levels, two pixels to a mean."""
-        inner = {"name": "hdit", "base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16}
-        return {"inner": inner, "factor": [1, 2], "coarse": [1, 8], "detail": [1, 8], "time_channels": 16}

@@ -11,10 +11,11 @@ from omegaconf import OmegaConf
 from reference_cases import relative
 from tiny_backbones import COLUMNS, NAMES, PUBLISHED, ROWS, image, tiny, untrained
 
-from r2flow.backbones import BACKBONES, build_backbone, configurations
+from r2flow.backbones import build_backbone, configurations
 from r2flow.backbones.cost import count_macs
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS, build_sensor
+from tests.conftest import tiny_options
 
 CONF = Path(__file__).parents[2] / "conf"
 # parameters, and the names under which the published state_dicts are listed
@@ -112,7 +113,7 @@ def test_nearby_times_are_told_apart_under_autocast(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_derived_buffers_follow_loaded_rays(name):
     source = tiny(name)
-    options = {"name": name, **BACKBONES[name].tiny_options()}
+    options = tiny_options(name)
     loaded = build_backbone(options, torch.zeros(2, ROWS, COLUMNS), 2).eval()
     loaded.load_state_dict(source.state_dict())
     x = image(1)
@@ -150,7 +151,7 @@ def test_forward_leaves_no_trace_in_the_module(name):
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("dimension", [0, 1])
 def test_a_shape_that_is_not_whole_units_names_the_nearest_that_are(name, dimension):
-    unit, options = untrained(name).unit, {"name": name, **BACKBONES[name].tiny_options()}
+    unit, options = untrained(name).unit, tiny_options(name)
     if unit[dimension] == 1:
         pytest.skip("takes any size")
     shape = [3 * unit[0], 3 * unit[1]]

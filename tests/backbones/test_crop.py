@@ -7,6 +7,7 @@ from tiny_backbones import NAMES, PUBLISHED, rays
 from r2flow.backbones import BACKBONES, Backbone, build_backbone
 from r2flow.errors import InputError
 from r2flow.lidar.region import Region
+from tests.conftest import tiny_options
 
 SHAPE = (16, 64)
 RAYS = rays(*SHAPE)
@@ -15,7 +16,7 @@ CROPPABLE = [name for name, kind in BACKBONES.items() if kind.croppable]
 
 
 def backbone(name: str, rays: torch.Tensor = RAYS, **options) -> Backbone:
-    options = {"name": name, **BACKBONES[name].tiny_options(), **options}
+    options = {**tiny_options(name), **options}
     model = build_backbone(options, rays, 2).eval().requires_grad_(False)
     torch.manual_seed(1)
     for parameter in model.parameters():  # nothing at zero, or there would be nothing to see

@@ -1,23 +1,18 @@
 """A network for large images around one for small ones."""
 
-from typing import Any
-
 import pytest
 import torch
 import torch.nn.functional as F
 from tiny_backbones import COLUMNS, ROWS, image, rays, tiny, untrained
 from torch import nn
 
-from r2flow.backbones import BACKBONES, build_backbone
+from r2flow.backbones import build_backbone
 from r2flow.backbones.base import precondition
 from r2flow.backbones.layers import wrapped
 from r2flow.errors import InputError
+from tests.conftest import tiny_options
 
 TIMES = (0.0, 0.01, 0.3, 0.7, 0.98, 1.0)
-
-
-def tiny_options(name: str) -> dict[str, Any]:
-    return {"name": name, **BACKBONES[name].tiny_options()}
 
 
 class OfAGaussian(nn.Module):

@@ -6,6 +6,7 @@ import torch
 
 from r2flow.backbones import BACKBONES, Backbone, build_backbone
 from r2flow.lidar.sensors import build_sensor
+from tests.conftest import tiny_options
 
 NAMES = [*BACKBONES, "plain"]  # `plain` states nothing about itself (conftest)
 PUBLISHED = ["hdit", "adm_unet", "efficient_unet"]  # with position, ring and dropout
@@ -20,7 +21,7 @@ def rays(rows: int = ROWS, columns: int = COLUMNS) -> torch.Tensor:
 def untrained(
     name: str, in_channels: int = 2, out_channels: int | None = None, second_time: bool = False, **options: Any
 ) -> Backbone:
-    options = {"name": name, **BACKBONES[name].tiny_options(), **options}
+    options = {**tiny_options(name), **options}
     return build_backbone(options, rays(), in_channels, out_channels, second_time)
 
 

@@ -8,7 +8,6 @@ import torch
 from scipy.integrate import quad
 
 from r2flow import noise
-from r2flow.backbones import BACKBONES
 from r2flow.errors import InputError
 from r2flow.generators import TransferFlow, build_generator, condition_of
 from r2flow.generators.transfer import Answers
@@ -19,6 +18,7 @@ from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
 from r2flow.stages.transfer import Tasks, Transfer, coarser
+from tests.conftest import tiny_options
 
 CONFIG = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
@@ -276,4 +276,4 @@ def test_it_draws_nothing_from_noise_alone_and_needs_a_backbone_for_any_size(flo
     with pytest.raises(InputError, match="begins at a scan"):
         flow(torch.zeros(1, 2, 8, 32))
     with pytest.raises(InputError, match="backbone=local"):
-        built(backbone={"name": "hdit", **BACKBONES["hdit"].tiny_options()})
+        built(backbone=tiny_options("hdit"))
