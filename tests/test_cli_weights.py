@@ -43,7 +43,7 @@ def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):  # noq
     code, said, _ = r2flow("weights", "--add", "pointnet", path)
     assert code == 0
     assert said.startswith(f"{folder / 'pointnet.safetensors'}: weights ")
-    assert said.endswith("of mine.pth (not the published file)\n")
+    assert said.endswith("of mine.pth\n")
     weights = said.split(": weights ")[1].split()[0]
     code, said, _ = r2flow("weights")
     assert code == 0

@@ -36,9 +36,7 @@ def weights(
         if name not in SOURCES:
             known = [*MODELS, *SOURCES]
             raise InputError(f"no weights named {name!r}; known: {', '.join(known)}.{did_you_mean(name, known)}")
-        found = take(name, path)
-        same = {True: "the published file", False: "not the published file", None: "its published hash is not known"}
-        print(f"{kept_file(name)}: weights {found.weights} of {found.source} ({same[found.published]})")
+        print(f"{kept_file(name)}: weights {take(name, path)} of {path.name}")
         return
     models = [
         (name, model.about, "yes" if model_file(name).is_file() else "no", model.page or "in the package")
@@ -46,11 +44,8 @@ def weights(
     ]
     print_table(models, ("model", "draws", "here", "file"))
     print(f"\nLooked for in {models_folder()} (R2FLOW_MODELS) unless in the package. Draw: r2flow sample MODEL\n")
-    rows = []
-    for name, source in SOURCES.items():
-        there = kept(name)
-        rows.append((name, source.metric, f"{there.weights} of {there.source}" if there else "no", source.file))
+    rows = [(name, source.metric, kept(name) or "no", source.file) for name, source in SOURCES.items()]
     print_table(rows, ("network", "distance", "here", "published file"))
     print(f"\nLooked for in {weights_folder()} (R2FLOW_WEIGHTS). Take one from disk: r2flow weights --add NAME FILE")
     for name, source in SOURCES.items():
-        print(f"  {name}: {source.page}" + (f" (git blob {source.git_blob})" if source.git_blob else ""))
+        print(f"  {name}: {source.page}")

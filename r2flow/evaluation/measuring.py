@@ -117,7 +117,7 @@ def measure(
 
     Args:
         metrics: Built with `keep=True` where there are draws.
-        draws: Bootstrap resamples for 95 % intervals; 0 for none. Only the first process computes intervals.
+        draws: Bootstrap resamples for 95 % intervals; 0 for none.
 
     Raises:
         InputError: no generated scan, or one that cannot be read.
@@ -152,10 +152,10 @@ def measure(
         intervals: dict[str, tuple[float, float]] = {}
         if draws and not metric.resamples:
             remarks.append(f"{name} has no bootstrap interval.")
-        elif draws and work.rank == 0:
+        elif draws:
             protocol["interval"] = {"bootstrap draws": draws, "level": LEVEL, "seed": 0}
             with work.bar("resampling", draws, "sets") as advance:
-                intervals = bootstrap(metric, draws, LEVEL, advance=advance)
+                intervals = bootstrap(metric, draws, advance=advance)
         results.append(MetricResult(name, figures, protocol, remarks, intervals))
     return results
 

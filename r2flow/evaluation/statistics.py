@@ -20,7 +20,7 @@ from r2flow.metrics.base import ScanMetric
 
 log = logging.getLogger(__name__)
 
-FORMAT = 2  # to be raised when statistics of the same scans change under the same protocol
+FORMAT = 3  # to be raised when statistics of the same scans change under the same protocol
 
 
 @dataclass(frozen=True)

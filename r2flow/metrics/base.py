@@ -5,7 +5,6 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar, Literal, Self
 
 import torch
-import torch.distributed as dist
 from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
@@ -14,11 +13,10 @@ from torchmetrics.utilities.distributed import gather_all_tensors
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.scans import MASK, Scans
+from r2flow.processes import place
 
 Side = Literal["real", "generated"]
 SIDES: tuple[Side, Side] = ("real", "generated")
-_LISTS = ("real_rows", "real_numbers")
-Better = Literal["smaller", "larger"]
 
 
 @dataclass(frozen=True)
@@ -68,15 +66,12 @@ class ScanMetric(Metric):
         name, representation, mask, settings: As in `Protocol`.
         needs_reflectance, uses_reflectance: Whether scans without reflectance are refused; whether it is read where
             there is some.
-        keeping: Whether the rows are kept in memory, float32: "on request" (`keep=True`), "always" or "never".
-        resamples: Whether it has bootstrap intervals, which are made of kept rows.
+        keeping: Whether the rows are always kept in memory, float32.
+        resamples: Whether it has bootstrap intervals, for which `keep=True` keeps the rows.
         fewest: Scans of each set that an interval takes.
-        of_equal_sets: The value of its figures for two equal sets; None where it depends on the sets.
-        better: Which way its figures are better; a distance's smaller ones are.
-        ordered: Whether figures depend on the order of the scans, whose neighbours are then kept together.
 
     Args:
-        keep: Whether the rows are kept, for bootstrap intervals.
+        keep: Whether bootstrap intervals are wanted.
         sensor: Of the images that `update` is given as tensors.
         name: Where one class has several names.
         options: Those of torchmetrics' Metric: process_group, sync_on_compute, ...
@@ -91,26 +86,23 @@ class ScanMetric(Metric):
     settings: ClassVar[Mapping[str, Any]] = {}
     needs_reflectance: bool = False
     uses_reflectance: ClassVar[bool] = False
-    keeping: ClassVar[Literal["on request", "always", "never"]] = "on request"
+    keeping: ClassVar[bool] = False
     resamples: ClassVar[bool] = True
     fewest: ClassVar[int] = 2
-    of_equal_sets: ClassVar[float | None] = 0.0
-    better: ClassVar[Better] = "smaller"
-    ordered: ClassVar[bool] = False
 
     def __init__(
         self, keep: bool = False, *, sensor: Sensor | None = None, name: str | None = None, **options: Any
     ) -> None:
-        super().__init__(**options)
+        # Not cached: torchmetrics would return what was computed before `merge_state`.
+        super().__init__(**{"compute_with_cache": False, **options})
         self.name = name or type(self).name
         self.sensor = sensor
-        self.keeps = self.keeping == "always" or (keep and self.keeping == "on request")
+        self.keeps = self.keeping or (keep and self.resamples)
         for side in SIDES:
             self.add_state(f"{side}_scans", torch.tensor(0), dist_reduce_fx="sum")
             self.add_state(f"{side}_left_out", torch.tensor(0), dist_reduce_fx="sum")
-            if self.keeps:
+            if self.keeps:  # (N, 1 + D): the number of a scan, then its row
                 self.add_state(f"{side}_rows", [], dist_reduce_fx="cat")
-                self.add_state(f"{side}_numbers", [], dist_reduce_fx="cat")
         # A MetricCollection updates only one of several metrics whose states have equal names and values.
         self.add_state(f"name_{self.name}", torch.tensor(0), dist_reduce_fx="sum")
         self._remarks: list[str] = []
@@ -128,6 +120,11 @@ class ScanMetric(Metric):
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         """Figures by name, computed from the states, and the remarks on them."""
+        raise NotImplementedError
+
+    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
+        """Figures of resampled sets, (R) for each name that has intervals; `weights` is how much each kept scan counts,
+        (R, N)."""
         raise NotImplementedError
 
     def update(self, scans: Scans | Tensor, real: bool, first: int | None = None) -> None:
@@ -153,17 +150,21 @@ class ScanMetric(Metric):
             )
         if self.needs_reflectance and not scans.has_reflectance:
             raise InputError(f"'{self.name}' needs reflectance, which these scans do not have; leave it out.")
-        self.take_in(scans, side, first)
+        if len(scans):
+            self.take_in(scans, side, first)
 
     def take_in(self, scans: Scans, side: Side, first: int) -> None:
         """Add a batch to the statistics of a side."""
-        rows = self.rows(scans)
+        self.add_rows(self.rows(scans), side, first)
+
+    def add_rows(self, rows: Tensor, side: Side, first: int = 0) -> None:
+        """Add the rows of scans `first`, `first + 1`, ... to the statistics of a side."""
         whole = rows.isfinite().all(1)
         self.add_scans(side, len(rows), int((~whole).sum()))
         self.accumulate(rows[whole], side)
         if self.keeps and whole.any():
-            getattr(self, f"{side}_rows").append(rows[whole].float().to(self.device))
-            getattr(self, f"{side}_numbers").append(first + whole.nonzero()[:, 0].to(self.device))
+            numbered = torch.cat([first + whole.nonzero(), rows[whole]], 1)
+            getattr(self, f"{side}_rows").append(numbered.float().to(self.device))
 
     def forward(self, scans: Scans | Tensor, real: bool, first: int | None = None) -> dict[str, float]:
         """Take in a batch; a batch has no distance of its own, so there are no figures."""
@@ -177,8 +178,7 @@ class ScanMetric(Metric):
         return values
 
     def remarks(self) -> list[str]:
-        """What a reader of the figures must know: empty scans, fewer scans than features, a single scan."""
-        self.compute()
+        """What a reader of the last computed figures must know: empty scans, fewer scans than features."""
         return list(self._remarks)
 
     def add_scans(self, side: Side, scans: int, left_out: int) -> None:
@@ -196,71 +196,46 @@ class ScanMetric(Metric):
 
     def kept(self, side: Side) -> Tensor:
         """The kept rows of a side in the order of their scans, (N, D) float32 on the CPU."""
-        rows, numbers = getattr(self, f"{side}_rows"), getattr(self, f"{side}_numbers")
+        return self._numbered(side)[:, 1:]
+
+    def _numbered(self, side: Side) -> Tensor:
+        rows = getattr(self, f"{side}_rows")
         if not len(rows):
-            return torch.zeros(0, 0)
-        table, order = dim_zero_cat(rows).cpu(), dim_zero_cat(numbers).cpu()
-        return table if (order.diff() >= 0).all() else table[order.argsort(stable=True)]
+            return torch.zeros(0, 1)
+        table = dim_zero_cat(rows).cpu()
+        return table[table[:, 0].argsort(stable=True)]
 
     def real_state(self) -> dict[str, Tensor]:
         """All statistics of the real set, on the CPU and gathered from all processes: for a cache on disk."""
         with self.sync_context():
-            names = [name for name in self._defaults if name.startswith("real_") and name not in _LISTS]
+            names = [name for name in self._defaults if name.startswith("real_") and name != "real_rows"]
             state = {name: getattr(self, name).detach().cpu().clone() for name in names}
             if self.keeps:
-                state["real_rows"] = self.kept("real").clone()
+                state["real_rows"] = self._numbered("real")
         return state
 
     def load_real_state(self, state: Mapping[str, Tensor]) -> None:
-        """Take the real set's statistics from `real_state`, after `reset`; of several processes the first holds them.
-
-        Raises:
-            InputError: a state of another metric, or without the rows that this one keeps.
-        """
-        sums = {n: getattr(self, n) for n in self._defaults if n.startswith("real_") and n not in _LISTS}
-        fits = all(name in state and state[name].shape == value.shape for name, value in sums.items())
-        if not fits or (self.keeps and "real_rows" not in state):
-            raise InputError(f"the real set's kept statistics do not fit {self.name}; measure the real set again.")
-        self._update_count, self._computed = max(self._update_count, 1), None
-        if dist.is_available() and dist.is_initialized() and dist.get_rank() > 0:
+        """Take the real set's statistics from `real_state`, after `reset`; of several processes the first has them."""
+        if place()[0] > 0:
             return
-        for name, value in sums.items():
-            value.copy_(state[name])
-        if self.keeps and len(state["real_rows"]):
-            self.real_rows = [state["real_rows"].to(self.device)]
-            self.real_numbers = [torch.arange(len(state["real_rows"]), device=self.device)]
-
-    def merge_state(self, incoming_state: "dict[str, Any] | Metric") -> None:
-        """As torchmetrics'; what was computed before is computed again."""
-        super().merge_state(incoming_state)
-        self._update_count, self._computed = max(self._update_count, 1), None
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
-        super()._load_from_state_dict(state_dict, prefix, *others)
-        for name in self._defaults:  # sums are added to in place, and what is loaded is the caller's
-            value = getattr(self, name)
-            setattr(self, name, value.detach().clone().to(self.device) if isinstance(value, Tensor) else [*value])
-        self._update_count, self._computed = max(self._update_count, 1), None
+        for name, value in state.items():
+            if name == "real_rows":
+                self.real_rows = [value.to(self.device)] if len(value) else []
+            else:
+                getattr(self, name).copy_(value)
 
     def _sync_dist(self, dist_sync_fn: Callable[..., Any] = gather_all_tensors, process_group: Any = None) -> None:
-        if self.keeps:  # a process without rows sends none of the others' width
-            for side in SIDES:
-                rows, numbers = getattr(self, f"{side}_rows"), getattr(self, f"{side}_numbers")
-                width = torch.tensor(rows[0].shape[1] if rows else 0, device=self.device)
-                most = max(map(int, dist_sync_fn(width, group=process_group or self.process_group)))
-                if not rows:
-                    rows.append(torch.zeros(0, most, device=self.device))
-                    numbers.append(torch.zeros(0, dtype=torch.int64, device=self.device))
+        for side in SIDES if self.keeps else ():  # a process without rows sends none of the others' width
+            rows = getattr(self, f"{side}_rows")
+            width = torch.tensor(rows[0].shape[1] if rows else 0, device=self.device)
+            most = max(map(int, dist_sync_fn(width, group=process_group or self.process_group)))
+            if not rows:
+                rows.append(torch.zeros(0, most, device=self.device))
         super()._sync_dist(dist_sync_fn, process_group)
 
     def set_dtype(self, dst_type: str | torch.dtype) -> Self:
         """Nothing: states stay float64, since sums in less would lose the digits of the figures."""
         return self
-
-    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        """Figures of resampled sets, (R) for each name that has intervals; `weights` is how much each kept scan counts,
-        (R, N)."""
-        raise NotImplementedError
 
     def _left_out(self) -> list[str]:
         remarks = []

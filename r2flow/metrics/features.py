@@ -2,13 +2,12 @@
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
-from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
-from r2flow.metrics import extractors
 from r2flow.metrics.base import Protocol, ScanMetric
+from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.scans import Scans
 
@@ -29,10 +28,10 @@ class FeatureMetric(ScanMetric):
     names: ClassVar[Mapping[str, str]] = {}
 
     def __init__(self, extractor: Extractor | str, keep: bool = False, **options: Any) -> None:
-        network = extractor.eval() if isinstance(extractor, Extractor) else extractors.load_extractor(extractor)
-        random = "_random" if network.weights == "random" else ""
-        name = "" if random else self.names.get(network.name, "")
-        super().__init__(keep, name=name or f"{self.kind}_{network.name}{random}", **options)
+        network = EXTRACTORS[extractor].trained() if isinstance(extractor, str) else extractor.eval()
+        name = f"{self.kind}_{network.name}"
+        name = f"{name}_random" if network.weights == "random" else self.names.get(network.name, name)
+        super().__init__(keep, name=name, **options)
         self.extractor = network
         self.needs_reflectance = network.needs_reflectance
 
@@ -46,16 +45,11 @@ class FeatureMetric(ScanMetric):
         return extract(self.extractor, scans)
 
 
-_COMPUTED: "WeakKeyDictionary[Scans, dict[Any, Tensor]]" = WeakKeyDictionary()
-
-
 def extract(extractor: Extractor, scans: Scans) -> Tensor:
     """Features of a batch, (B, D), computed once for all metrics of the same network."""
-    # Networks of one name and equal weights are the same; random ones are told apart by the object itself, not by its
-    # id, which another one may have later.
+    # Networks of one name and equal weights are the same; random ones are told apart by the object itself.
     key = extractor if extractor.weights == "random" else (extractor.name, extractor.weights)
-    computed = _COMPUTED.setdefault(scans, {})
-    if key not in computed:
+    if key not in scans.features:
         with torch.no_grad():
-            computed[key] = extractor.features(scans)
-    return computed[key]
+            scans.features[key] = extractor.features(scans)
+    return scans.features[key]

@@ -21,9 +21,8 @@ class KernelDistance(FeatureMetric):
 
     kind = "kid"
     settings: ClassVar[Mapping[str, Any]] = {"kernel": "(a b / D + 1)^3", "estimate": "unbiased, all pairs"}
-    keeping = "always"
+    keeping = True
     resamples = False  # scans that are drawn twice would be pairs of equal ones, and the estimate biased
-    of_equal_sets = None
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         if any(self.count(side) < 2 for side in SIDES):
@@ -44,9 +43,3 @@ def _sum(x: Tensor, y: Tensor, own: bool) -> float:
     z = x @ y.T / x.shape[1]
     kernel = z * (3 + z * (3 + z))  # (z + 1)^3 - 1
     return float(kernel.sum() - (kernel.trace() if own else 0))
-
-
-def cubic_mmd(x: Tensor, y: Tensor) -> float:
-    """The unbiased squared MMD between features (m, D) and (n, D) that are at hand."""
-    (m, n), (x, y) = (len(x), len(y)), (x.double(), y.double())
-    return _sum(x, x, True) / (m * (m - 1)) + _sum(y, y, True) / (n * (n - 1)) - 2 * _sum(x, y, False) / (m * n)

@@ -8,7 +8,9 @@ al. (2018). There 2000 samples are compared with KITTI-360's drive 0003.
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from r2flow.metrics.base import SIDES, ScanMetric, Side, blocks
@@ -42,7 +44,6 @@ class JSDLiDM(ScanMetric):
     settings: ClassVar[Mapping[str, Any]] = {
         "cell": FINE, "metres": [-EXTENT, EXTENT], "logarithm": "natural", "root": True
     }  # fmt: skip
-    keeping = "never"
     resamples = False
 
     def __init__(self, keep: bool = False, **options: Any) -> None:
@@ -79,16 +80,17 @@ class MMDLiDM(ScanMetric):
     settings: ClassVar[Mapping[str, Any]] = {
         "cell": COARSE, "metres": [-EXTENT, EXTENT], "distance": "Chamfer, squared, halved"
     }  # fmt: skip
-    keeping = "always"
+    keeping = True
     resamples = False  # which scan is nearest is no smooth function of the scans
 
     def rows(self, scans: Scans) -> Tensor:
         side = round(2 * EXTENT / COARSE)
-        held = torch.zeros(len(scans), side * side, dtype=torch.bool)
-        for own, points in zip(held, scans.points, strict=True):
-            own[occupied(points, COARSE).cpu()] = True
-        maps = [squared_distance_map(own.view(side, side)).flatten() for own in held]
-        return torch.stack(maps) if maps else torch.empty(0, side * side)
+        maps = torch.empty(len(scans), side * side)
+        for own, points in zip(maps, scans.points, strict=True):
+            held = np.zeros((side, side), dtype=bool)
+            held.flat[occupied(points, COARSE).cpu().numpy()] = True
+            own[:] = torch.from_numpy(squared_distance_map(held)).flatten()
+        return maps
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         if not all(self.count(side) for side in SIDES):
@@ -111,17 +113,8 @@ def _chamfer(x: Tensor, y: Tensor) -> Tensor:
     return ((a @ y.T) / a.sum(1)[:, None] + (x @ b.T) / b.sum(1)) / 2
 
 
-def squared_distance_map(held: Tensor) -> Tensor:
-    """Squared distance of every cell from the nearest that is held, in cells, (H, W); NaN where none is held.
-
-    Exact and in two passes, as it separates: along the rows first, then d^2(i, j) = min_k (i - k)^2 + d_row^2(k, j).
-    """
+def squared_distance_map(held: np.ndarray) -> np.ndarray:
+    """Squared distance of every cell from the nearest that is held, in cells, (H, W); NaN where none is held."""
     if not held.any():
-        return torch.full(held.shape, torch.nan)
-    h, w = held.shape
-    at = torch.arange(w, dtype=torch.float32).expand(h, w)
-    before = torch.where(held, at, -torch.inf).cummax(1).values
-    after = -torch.where(held, -at, -torch.inf).flip(1).cummax(1).values.flip(1)
-    along = torch.minimum(at - before, after - at).square()
-    rows = torch.arange(h, dtype=torch.float32)
-    return ((rows[:, None] - rows).square()[:, :, None] + along).amin(1)
+        return np.full(held.shape, np.nan)
+    return np.rint(distance_transform_edt(~held) ** 2)  # whole numbers but for the rounding of the root

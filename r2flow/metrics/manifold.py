@@ -32,10 +32,8 @@ class Manifold(FeatureMetric):
 
     kind = "manifold"
     settings: ClassVar[Mapping[str, Any]] = {"neighbours": NEIGHBOURS, "distance": "Euclidean"}
-    keeping = "always"
+    keeping = True
     resamples = False
-    of_equal_sets = None
-    better = "larger"
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         names = [f"{name}_{self.name.removeprefix('manifold_')}" for name in NAMES]
@@ -43,11 +41,6 @@ class Manifold(FeatureMetric):
         if few:
             remark = f"{self.name}: too few {' and '.join(few)} scans to have {NEIGHBOURS} neighbours each."
             return dict.fromkeys(names, float("nan")), [remark]
-        per_scan = self._per_scan()
-        return {name: float(per_scan[one].mean()) for name, one in zip(names, NAMES, strict=True)}, []
-
-    def _per_scan(self) -> dict[str, Tensor]:
-        """What each scan of the side in question adds to the figures, (N)."""
         real, generated = self.kept("real"), self.kept("generated")
         middle = real[:BLOCK].double().mean(0)
         in_real, in_generated = (radii(rows, NEIGHBOURS, middle) * (1 + TIE) for rows in (real, generated))
@@ -60,12 +53,8 @@ class Manifold(FeatureMetric):
                 balls[j] += within.sum(0)
                 covered[i] |= within.any(1)
                 recalled[i] |= (d <= in_generated[j]).any(1)
-        return {
-            "precision": (balls > 0).double(),
-            "recall": recalled.double(),
-            "density": balls / NEIGHBOURS,
-            "coverage": covered.double(),
-        }
+        values = (balls > 0, recalled, balls / NEIGHBOURS, covered)
+        return {name: float(one.double().mean()) for name, one in zip(names, values, strict=True)}, []
 
 
 def radii(rows: Tensor, k: int, middle: Tensor) -> Tensor:

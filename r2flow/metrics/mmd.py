@@ -29,7 +29,7 @@ class MMD(ScanMetric):
     name = "mmd"
     representation = "bird's-eye histogram"
     settings: ClassVar[Mapping[str, Any]] = {**PROTOCOL, "kernel": "Gaussian", "sigma": SIGMA, "estimate": "biased"}
-    keeping = "always"
+    keeping = True
 
     def rows(self, scans: Scans) -> Tensor:
         return histograms(scans)
@@ -61,7 +61,6 @@ class MMDUnbiased(MMD):
     name = "mmd_unbiased"
     settings: ClassVar[Mapping[str, Any]] = {**MMD.settings, "estimate": "unbiased"}
     resamples = False  # scans that are drawn twice would be pairs of equal ones, and the estimate biased
-    of_equal_sets = None
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         n, m = sizes = [self.count(side) for side in SIDES]

@@ -4,10 +4,10 @@ Every statistic looks at more than one pixel at a time: those of single pixels c
 shuffled across the scans of another.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -87,10 +87,12 @@ def run_lengths(scan: Scan) -> np.ndarray:
 
 
 def changes_row(scan: Scan) -> np.ndarray:
-    """Neighbouring pixels of each row of which only one returned, and all, (2, H)."""
+    """Neighbouring pixels of each row of which only one returned, and all, (2, 256); 0 beyond the image's rows."""
     returned = scan.r > 0
-    changed = (returned != np.roll(returned, -1, -1)).sum(1)
-    return np.stack([changed, np.full_like(changed, returned.shape[1])])
+    counts = np.zeros((2, MOST_ROWS))
+    counts[0, : len(returned)] = (returned != np.roll(returned, -1, -1)).sum(1)
+    counts[1, : len(returned)] = returned.shape[1]
+    return counts
 
 
 def drop_range(scan: Scan) -> np.ndarray:
@@ -143,31 +145,29 @@ def birds_eye_density(scan: Scan) -> np.ndarray:
     return histogram(scan.birds_eye.ravel(), DENSITIES, scan.birds_eye.ravel())
 
 
-@dataclass(frozen=True)
-class Member:
-    """A statistic of the panel.
+def rate_distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean |x - y| of the rates of counts (lost, all) in each bin; 0 where nothing was counted."""
+    x, y = (lost / np.maximum(rays, 1) for lost, rays in (a.reshape(2, -1), b.reshape(2, -1)))
+    return float(np.abs(x - y).mean())
 
-    Attributes:
-        counts: Of one scan; added up over a set.
-        size: Of the counts; None for two counts for each row of the image.
-        is_rate: The counts are (lost, all) in each bin: their ratios are compared by mean |a - b|. Otherwise they are
-            a histogram, compared by Jensen-Shannon distance.
-        needs_reflectance: Without it in a set there is no distance.
-    """
+
+def row_distance(a: np.ndarray, b: np.ndarray) -> float:
+    """The same over the rows that the images have."""
+    rows = (a + b).reshape(2, -1)[1] > 0
+    return rate_distance(a.reshape(2, -1)[:, rows], b.reshape(2, -1)[:, rows])
+
+
+def reflectance_distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Jensen-Shannon distance; NaN where a set has no reflectance."""
+    return js_distance(a, b) if a.any() and b.any() else float("nan")
+
+
+class Member(NamedTuple):
+    """A statistic of the panel: the counts of one scan, how many they are, and the distance of two sets' sums."""
 
     counts: Callable[[Scan], np.ndarray]
-    size: int | None
-    is_rate: bool = False
-    needs_reflectance: bool = False
-
-    def distance(self, a: np.ndarray, b: np.ndarray) -> float:
-        """Between the counts of two sets; NaN where one has no reflectance."""
-        if self.needs_reflectance and not (a.any() and b.any()):
-            return float("nan")
-        if not self.is_rate:
-            return js_distance(a, b)
-        x, y = (lost / np.maximum(rays, 1) for lost, rays in (a.reshape(2, -1), b.reshape(2, -1)))
-        return float(np.abs(x - y).mean())
+    size: int
+    distance: Callable[[np.ndarray, np.ndarray], float] = js_distance
 
 
 PANEL: dict[str, Member] = {
@@ -175,31 +175,25 @@ PANEL: dict[str, Member] = {
     "gradient, elevation": Member(gradient_elevation, len(GRADIENTS) - 1),
     "steps by sector": Member(steps_by_sector, SECTORS * (len(STEPS) - 1)),
     "run lengths": Member(run_lengths, len(RUNS) - 1),
-    "changes per row": Member(changes_row, None, is_rate=True),
-    "drop rate by range": Member(drop_range, 2 * DROPS, is_rate=True),
-    "drop rate by incidence": Member(drop_incidence, 2 * (len(INCIDENCES) - 1), is_rate=True),
+    "changes per row": Member(changes_row, 2 * MOST_ROWS, row_distance),
+    "drop rate by range": Member(drop_range, 2 * DROPS, rate_distance),
+    "drop rate by incidence": Member(drop_incidence, 2 * (len(INCIDENCES) - 1), rate_distance),
     "surface normals": Member(surface_normals, len(NORMALS) - 1),
     "incidence": Member(incidence, len(COSINES) - 1),
     "range pairs": Member(range_pairs, PAIRS**2),
-    "reflectance pairs": Member(reflectance_pairs, (len(REFLECTANCES) - 1) ** 2, needs_reflectance=True),
+    "reflectance pairs": Member(reflectance_pairs, (len(REFLECTANCES) - 1) ** 2, reflectance_distance),
     "bird's-eye density": Member(birds_eye_density, len(DENSITIES) - 1),
 }
-FIXED = sum(member.size or 0 for member in PANEL.values())
-
-
-def row_of(scan: Scan) -> np.ndarray:
-    """The counts of all members one after the other, (D,); D depends on the number of rows."""
-    return np.concatenate([member.counts(scan).ravel() for member in PANEL.values()]).astype(np.float64)
+ENDS = np.cumsum([member.size for member in PANEL.values()])
 
 
 def panel_rows(scans: Scans) -> Tensor:
-    """`row_of` each scan, (B, D) float64."""
-    images, above = scans.images.cpu().numpy(), scans.birds_eye
-    rows = [
-        row_of(Scan(image[0], image[1] if scans.has_reflectance else None, scans.sensor, counts))
-        for image, counts in zip(images, above, strict=True)
-    ]
-    return torch.from_numpy(np.stack(rows)) if rows else torch.zeros(0, FIXED + 2 * scans.sensor.shape[0])
+    """The counts of all members one after the other, of each scan, (B, D) float64."""
+    rows = np.zeros((len(scans), ENDS[-1]))
+    for row, image, counts in zip(rows, scans.images.cpu().numpy(), scans.birds_eye, strict=True):
+        scan = Scan(image[0], image[1] if scans.has_reflectance else None, scans.sensor, counts)
+        row[:] = np.concatenate([member.counts(scan).ravel() for member in PANEL.values()])
+    return torch.from_numpy(rows)
 
 
 def panel(images: np.ndarray, sensor: Sensor) -> np.ndarray:
@@ -210,15 +204,13 @@ def panel(images: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 def distances(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
     """The distance of each member between the counts of two sets, (D,) each; 0 is equal."""
-    rows = len(a) - FIXED  # two counts a row
-    ends = np.cumsum([rows if member.size is None else member.size for member in PANEL.values()])[:-1]
-    parts = zip(PANEL.items(), np.split(a, ends), np.split(b, ends), strict=True)
+    parts = zip(PANEL.items(), np.split(a, ENDS[:-1]), np.split(b, ENDS[:-1]), strict=True)
     return {name: member.distance(x, y) for (name, member), x, y in parts}
 
 
-def mean_distance(lines: Mapping[str, float] | Sequence[float]) -> float:
+def mean_distance(lines: Mapping[str, float]) -> float:
     """The panel's mean over the members that both sets have."""
-    values = list(lines.values()) if isinstance(lines, Mapping) else list(lines)
+    values = list(lines.values())
     return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
 
 
@@ -230,7 +222,7 @@ class Panel(SumMetric):
     settings: ClassVar[Mapping[str, Any]] = {
         "members": list(PANEL), "distance": "Jensen-Shannon distance of histograms, mean |a - b| of rates"
     }  # fmt: skip
-    width = FIXED + 2 * MOST_ROWS
+    width = int(ENDS[-1])
     uses_reflectance = True
     resamples = False  # |a - b| of rates has a kink where the sets are nearly equal
 
@@ -247,5 +239,5 @@ class Panel(SumMetric):
     def figures(self) -> tuple[dict[str, float], list[str]]:
         values, remarks = super().figures()
         if np.isnan(values["reflectance pairs"]) and all(self.count(side) for side in SIDES):
-            remarks.append("reflectance pairs: no figure: a set has no reflectance; the panel's mean leaves them out.")
+            remarks.append("a set has no reflectance: the panel's mean leaves reflectance pairs out.")
         return values, remarks

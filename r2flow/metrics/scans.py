@@ -1,7 +1,9 @@
 """A batch of scans as every metric sees it: checked, masked, in the representation that it asks for."""
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -53,6 +55,11 @@ class Scans:
         r = images[:, :1]
         self.images = torch.where((r > MASK[0]) & (r < MASK[1]), images, torch.zeros_like(images))
         self.sensor = sensor
+
+    @cached_property
+    def features(self) -> dict[Any, Tensor]:
+        """Features of networks that were computed for these scans, by network."""
+        return {}
 
     def __len__(self) -> int:
         return len(self.images)
@@ -107,35 +114,27 @@ def on_bin_corners(r: Tensor, sensor: Sensor) -> Tensor:
 
 
 def check_values(images: Tensor, names: Sequence[object] | None = None) -> None:
-    """Refuse images, (B, 2 or 1, H, W), with values that no scan has; one look where there are none.
+    """Refuse images, (B, 2 or 1, H, W), with values that no scan has.
 
     Raises:
         InputError: what is wrong with the first such scan.
     """
-    if not images.numel():
-        return
-    low, high = images.aminmax(dim=-1)  # NaN wherever a row has one
-    low, high = low.amin((0, 2)), high.amax((0, 2))
-    if (low >= 0).all() and high[0] < FAR and (high[1:] <= FULL).all():
-        return
     for number, image in enumerate(images):
-        wrong = _wrong_with(image)
-        if wrong:
-            name = number if names is None else names[number]
-            raise InputError(f"scan {name}: {wrong}.")
+        if wrong := _wrong_with(image):
+            raise InputError(f"scan {number if names is None else names[number]}: {wrong}.")
 
 
 def _wrong_with(image: Tensor) -> str | None:
     """What is wrong with an image, (2 or 1, H, W), and what to do."""
-    for channel, what in zip(image, ("range", "reflectance"), strict=False):
-        if not channel.isfinite().all():
-            return f"its {what} is NaN or infinite in places; 0 stands for a ray without a return"
-        if channel.min() < 0:
-            hint = "is it in model space ([-1, 1])? Decode it" if channel.abs().max() <= 1 else "0 stands for no return"
-            return f"its {what} goes down to {float(channel.min()):.4g}; {hint}"
-    returned = image[0][image[0] > 0]
-    if len(returned) and returned.median() >= FAR:
-        return f"its median range is {float(returned.median()):.4g} m; are these millimetres? Give metres"
-    if len(image) > 1 and image[1].max() > FULL:
-        return f"its reflectance goes up to {float(image[1].max()):.4g}, not 1; divide by its full scale, often 255"
+    low, high = torch.stack(image.flatten(1).aminmax(dim=1)).tolist()  # NaN where a channel has one
+    for name, least, most in zip(("range", "reflectance"), low, high, strict=False):
+        if not math.isfinite(least) or not math.isfinite(most):
+            return f"its {name} is NaN or infinite in places; 0 stands for a ray without a return"
+        if least < 0:
+            hint = "is it in model space ([-1, 1])? Decode it" if max(-least, most) <= 1 else "0 stands for no return"
+            return f"its {name} goes down to {least:.4g}; {hint}"
+    if high[0] >= FAR and (median := float(image[0][image[0] > 0].median())) >= FAR:
+        return f"its median range is {median:.4g} m; are these millimetres? Give metres"
+    if max(high[1:], default=0) > FULL:
+        return f"its reflectance goes up to {high[1]:.4g}, not 1; divide by its full scale, often 255"
     return None

@@ -8,48 +8,35 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
 from r2flow.metrics.base import SIDES, ScanMetric, Side, blocks
 
-BLOCK = 1000  # scans read from a file at once
+BLOCK = 1000  # scans at once
 
 
 class SumMetric(ScanMetric):
     """A metric that adds up the rows of a set's scans, in float64: sums of whole numbers are exact in any order.
 
     Attributes:
-        width: The most numbers of a row. How many there are may depend on the sensor; a state has one size.
+        width: How many numbers a row has.
     """
 
     width: ClassVar[int]
-    real_sum: Tensor
-    generated_sum: Tensor
 
     def __init__(self, keep: bool = False, **options: Any) -> None:
         super().__init__(keep, **options)
         for side in SIDES:
             self.add_state(f"{side}_sum", torch.zeros(self.width, dtype=torch.float64), dist_reduce_fx="sum")
-            self.add_state(f"{side}_width", torch.tensor(0), dist_reduce_fx="max")
 
     @abstractmethod
     def figures_of(self, real: np.ndarray, generated: np.ndarray) -> dict[str, float]:
-        """Figures from the two sums of rows, (D) each; sums of zeros where a set has nothing to compare."""
+        """Figures from the two sums of rows, (width) each; sums of zeros where a set has nothing to compare."""
 
     def accumulate(self, rows: Tensor, side: Side) -> None:
-        width: Tensor = getattr(self, f"{side}_width")
-        if width > 0 and int(width) != rows.shape[1]:
-            raise self._other_size(int(width), rows.shape[1])
-        width.fill_(rows.shape[1])
         total: Tensor = getattr(self, f"{side}_sum")
-        total[: rows.shape[1]] += rows.sum(0, dtype=torch.float64).to(total)
+        total += rows.sum(0, dtype=torch.float64).to(total)
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
-        widths = {int(getattr(self, f"{side}_width")) for side in SIDES} - {0}
-        if len(widths) > 1:
-            raise self._other_size(*sorted(widths))
-        width = max(widths, default=0)
-        real, generated = (getattr(self, f"{side}_sum")[:width].cpu().numpy() for side in SIDES)
-        values = self.figures_of(real, generated)
+        values = self.figures_of(*(getattr(self, f"{side}_sum").cpu().numpy() for side in SIDES))
         if not all(self.given(side) for side in SIDES):
             return dict.fromkeys(values, float("nan")), []
         return values, []
@@ -61,6 +48,3 @@ class SumMetric(ScanMetric):
             sums[side] = torch.stack(parts).sum(0).numpy()
         drawn = [self.figures_of(real, generated) for real, generated in zip(*sums.values(), strict=True)]
         return {name: torch.tensor([one[name] for one in drawn], dtype=torch.float64) for name in drawn[0]}
-
-    def _other_size(self, a: int, b: int) -> InputError:
-        return InputError(f"{self.name}: scans give {a} and {b} numbers, as of two sensors; compare scans of one.")

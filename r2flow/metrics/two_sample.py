@@ -26,10 +26,8 @@ class TwoSample(FeatureMetric):
     kind = "auc"
     names: ClassVar[Mapping[str, str]] = {"handcrafted": "auc", "handcrafted_range": "auc_range"}
     settings: ClassVar[Mapping[str, Any]] = {"classifier": "logistic regression, ridge 1", "folds": "two halves"}
-    keeping = "always"
+    keeping = True
     fewest = LEAST
-    of_equal_sets = None
-    ordered = True
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         if any(self.count(side) < LEAST for side in SIDES):

@@ -1,6 +1,8 @@
 """A small sensor, scans of it, and a network that needs no weights."""
 
 from collections.abc import Callable
+from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -8,6 +10,7 @@ from torch import Tensor
 
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics import METRICS
+from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.scans import Scans
 
@@ -17,10 +20,13 @@ SMALL = SENSORS["hdl64e"].resized(8, 32)
 class Summary(Extractor):
     """Six plain averages of a scan instead of a network: each metric of features can be built on it."""
 
-    name = "summary"
     layer = "averages"
     dim = 6
     weights = "0123456789ab"
+
+    def __init__(self, name: str = "summary") -> None:
+        super().__init__()
+        self.name = name  # type: ignore[misc]
 
     def features(self, scans: Scans) -> Tensor:
         r = scans.images[:, 0]
@@ -30,10 +36,16 @@ class Summary(Extractor):
         return torch.where(scans.returned.flatten(1).any(1)[:, None], features, torch.nan)
 
 
+def put_in_place_of_networks(patch: pytest.MonkeyPatch) -> None:
+    """The stand-in, under every name of a network."""
+    stand_ins = {name: SimpleNamespace(trained=partial(Summary, name)) for name in EXTRACTORS}
+    patch.setattr(EXTRACTORS, "_entries", stand_ins)
+
+
 def one_of_each_class() -> list[str]:
     """A name of every class in the table: its other names differ by their network alone."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("r2flow.metrics.extractors.load_extractor", lambda name: Summary())
+        put_in_place_of_networks(patch)
         return list({type(build()): name for name, build in METRICS.items()}.values())
 
 
@@ -60,11 +72,5 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def summary(monkeypatch: pytest.MonkeyPatch) -> Summary:
     """The stand-in; also what every name of a network loads."""
-
-    def load(name: str) -> Extractor:
-        extractor = Summary()
-        extractor.name = name  # type: ignore[misc]
-        return extractor
-
-    monkeypatch.setattr("r2flow.metrics.extractors.load_extractor", load)
+    put_in_place_of_networks(monkeypatch)
     return Summary()

@@ -36,14 +36,6 @@ def test_a_weight_is_how_often_a_scan_is_there(name, many, scans_of, summary):
         )
 
 
-def given(metric, rows, side):
-    """A set by its rows instead of its scans."""
-    metric.add_scans(side, len(rows), 0)
-    metric.accumulate(rows, side)
-    setattr(metric, f"{side}_rows", [rows.float()])
-    setattr(metric, f"{side}_numbers", [torch.arange(len(rows))])
-
-
 class SquaredMeanDistance(SumMetric):
     """|mean x - mean y|^2 of vectors; the last number of a row is 1 and counts them."""
 
@@ -66,7 +58,7 @@ def test_intervals_are_as_wide_as_statistics_say_near_equal_sets_too(apart):
         for side, count, shift in (("real", n, 0.0), ("generated", m, apart)):
             x = draw.standard_normal((count, 32))
             x[:, 0] += shift
-            given(metric, torch.from_numpy(np.hstack([x, np.ones((count, 1))])), side)
+            metric.add_rows(torch.from_numpy(np.hstack([x, np.ones((count, 1))])), side)
         value = metric.compute()["squared"]
         _, high = bootstrap(metric, draws=60)["squared"]
         sigma = max(value * math.log(high / value), high - value if high > 2.71 * value else 0) / 2.042  # t of 30
@@ -95,15 +87,13 @@ def test_draws_depend_on_the_seed_only(scans_of):
         return bootstrap(metric, draws=26, **options)
 
     counted = []
-    assert intervals(advance=lambda: counted.append(1)) == intervals()
-    assert len(counted) == 26
+    assert intervals(advance=counted.append) == intervals()
+    assert sum(counted) == 26
     assert intervals() != intervals(seed=1)
 
 
 def test_what_cannot_be_resampled_is_refused(scans_of):
-    with pytest.raises(InputError, match="keep=True"):
-        bootstrap(METRICS["jsd"]())
-    with pytest.raises(InputError, match="found 3 and 0.95"):
+    with pytest.raises(InputError, match="found 3"):
         bootstrap(METRICS["jsd"](keep=True), draws=3)
     metric = METRICS["mmd"]()
     metric.update(scans_of(3), real=True)

@@ -10,7 +10,7 @@ import torch.multiprocessing as mp
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics import METRICS
 from r2flow.metrics.bootstrap import bootstrap
-from r2flow.metrics.extractors import extractor_class
+from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.frechet import FrechetDistance
 from r2flow.metrics.manifold import Manifold
 from r2flow.metrics.scans import Scans
@@ -29,7 +29,7 @@ def images(seed, n):
 
 def measure(rank, ranks):
     """Figures, remarks and intervals of all metrics, of two generated sets one after the other."""
-    network = extractor_class("handcrafted").trained()
+    network = EXTRACTORS["handcrafted"].trained()
     metrics = [METRICS[name](keep=True) for name in PLAIN]
     metrics += [FrechetDistance(network, keep=True), Manifold(network)]
     found = []

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING
 
-from r2flow.registry import Registry
+from r2flow.registry import Registry, lazy
 
 if TYPE_CHECKING:
     from r2flow.metrics.extractors.base import Extractor
 
 
-class Extractors(Registry["str | type[Extractor]"]):
-    """Networks by name: classes, or `module:Class` of this package, imported when it is needed."""
+class Extractors(Registry["type[Extractor]"]):
+    """Networks by name."""
 
-    def add(self, name: str, entry: str | type[Extractor]) -> None:
+    def add(self, name: str, entry: type[Extractor]) -> None:
         """Enter a network of your own, and with it the metrics of its features.
 
         Raises:
@@ -28,29 +27,11 @@ class Extractors(Registry["str | type[Extractor]"]):
 
 EXTRACTORS = Extractors(
     "extractor",
-    handcrafted="handcrafted:Handcrafted",
-    handcrafted_range="handcrafted:HandcraftedRange",
-    rangenet53="rangenet:RangeNet53",
-    rangenet21="rangenet:RangeNet21",
-    pointnet="pointnet:PointNet",
-    minkowskinet="minkowski:MinkowskiNet",
-    spvcnn="spvcnn:SPVCNN",
+    handcrafted=lazy(f"{__name__}.handcrafted:Handcrafted"),
+    handcrafted_range=lazy(f"{__name__}.handcrafted:HandcraftedRange"),
+    rangenet53=lazy(f"{__name__}.rangenet:RangeNet53"),
+    rangenet21=lazy(f"{__name__}.rangenet:RangeNet21"),
+    pointnet=lazy(f"{__name__}.pointnet:PointNet"),
+    minkowskinet=lazy(f"{__name__}.minkowski:MinkowskiNet"),
+    spvcnn=lazy(f"{__name__}.spvcnn:SPVCNN"),
 )
-
-
-def extractor_class(name: str) -> type[Extractor]:
-    """The class behind a name of `EXTRACTORS`."""
-    entry = EXTRACTORS[name]
-    if not isinstance(entry, str):
-        return entry
-    module, cls = entry.split(":")
-    return getattr(importlib.import_module(f"{__name__}.{module}"), cls)
-
-
-def load_extractor(name: str) -> Extractor:
-    """A network with its trained weights, in evaluation mode on the CPU.
-
-    Raises:
-        InputError: no such name, or weights that are not on this machine; `r2flow weights` says how to get them.
-    """
-    return extractor_class(name).trained()

@@ -71,21 +71,15 @@ class Extractor(nn.Module):
         Raises:
             InputError: parameters of another network, or some that are not finite.
         """
-        wanted = self.state_dict()
         # A count of training steps that inference does not read; older files lack it.
-        given = {**{name: value for name, value in wanted.items() if name.endswith("num_batches_tracked")}, **tensors}
-        problems = [f"'{name}' is missing" for name in wanted if name not in given]
-        problems += [f"'{name}' is unknown" for name in given if name not in wanted]
-        for name in (name for name in wanted if name in given):
-            shape, expected = tuple(given[name].shape), tuple(wanted[name].shape)
-            if shape != expected:
-                problems.append(f"'{name}' has the shape {shape}, not {expected}")
-            elif not given[name].isfinite().all():
-                problems.append(f"'{name}' has values that are not finite")
-        if problems:
-            more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-            raise InputError(f"not the weights of {self.name}: {problems[0]}{more}.")
-        self.load_state_dict(given)
+        counts = {name: value for name, value in self.state_dict().items() if name.endswith("num_batches_tracked")}
+        try:
+            self.load_state_dict({**counts, **tensors})
+        except RuntimeError as error:
+            reason = str(error).splitlines()[1].strip()
+            raise InputError(f"not the weights of {self.name}: {reason[:160]}") from None
+        if broken := [name for name, value in self.state_dict().items() if not value.isfinite().all()]:
+            raise InputError(f"not the weights of {self.name}: '{broken[0]}' has values that are not finite.")
         return self.requires_grad_(False).eval()
 
     @property

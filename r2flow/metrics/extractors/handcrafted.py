@@ -219,10 +219,7 @@ class Handcrafted(Extractor):
         """(B, D), float32, D = `dim`; a row of NaN for a scan without a single return."""
         h, w = scans.sensor.shape
         parts = scans.images.split(max(PIXELS // (h * w), 1))
-        rows = (
-            torch.cat([self._features(part) for part in parts]) if len(scans) else scans.images.new_zeros(0, self.dim)
-        )
-        return nan_where_empty(rows, scans)
+        return nan_where_empty(torch.cat([self._features(part) for part in parts]), scans)
 
     def _features(self, images: Tensor) -> Tensor:
         h, w = images.shape[2:]

@@ -99,8 +99,7 @@ class MinkowskiNet(Extractor):
     @torch.inference_mode()
     def features(self, scans: Scans) -> Tensor:
         # One scan at a time saves memory and is as fast as a batch.
-        rows = [self._scan(points.to(self.device)) for points in scans.points]
-        return torch.stack(rows) if rows else torch.zeros(0, self.dim, device=self.device)
+        return torch.stack([self._scan(points.to(self.device)) for points in scans.points])
 
     def _scan(self, points: Tensor) -> Tensor:
         if not len(points):

@@ -94,6 +94,4 @@ class PointNet(Extractor):
 
         Features are maxima over the points, so that one origin counts as much as many.
         """
-        if not len(scans):
-            return torch.zeros(0, self.dim, device=self.device)
         return nan_where_empty(self(scans.xyz.flatten(2).to(self.device) / SCALE), scans)

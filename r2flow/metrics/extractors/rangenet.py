@@ -114,8 +114,6 @@ class RangeNet(Extractor):
         h, w = scans.sensor.shape
         if w % 32 or (self.layers == 21 and h % BANDS):
             raise InputError(f"RangeNet needs images of multiples of {BANDS} x 32, found {h} x {w}; choose a --size.")
-        if not len(scans):
-            return torch.zeros(0, self.dim, device=self.device)
         reflectance = [scans.reflectance] if self.needs_reflectance else []
         image = torch.cat([scans.images[:, :1], scans.xyz, *reflectance], 1).to(self.device)
         return nan_where_empty(self.pool(self(self.normalise(image))), scans)
@@ -142,11 +140,12 @@ class RangeNet53(RangeNet):
     layers = 53
 
     def pool(self, maps: Tensor) -> Tensor:
-        return subsample(maps, self.dim)
+        flat = maps.flatten(1)
+        return flat[:, torch.tensor(_draw(flat.shape[1], self.dim), device=maps.device)]
 
 
 class RangeNet21(RangeNet):
-    """FRID's: the decoder map's mean over 16 bands of rows, over range alone."""
+    """FRID's: the decoder map's mean over 16 bands of rows, the published "depth", over range alone."""
 
     name = "rangenet21"
     layer = "decoder map, mean over 16 bands of rows"
@@ -154,24 +153,13 @@ class RangeNet21(RangeNet):
     layers = 21
 
     def pool(self, maps: Tensor) -> Tensor:
-        return mean_by_depth(maps)
+        return maps.unflatten(2, (BANDS, -1)).mean((3, 4)).flatten(1)
 
 
 @lru_cache(maxsize=8)
 def _draw(size: int, num: int) -> tuple[int, ...]:
     # The published draw is Python's own generator's; with another one it would be another metric.
     return tuple(random.Random(0).sample(range(size), num))
-
-
-def subsample(maps: Tensor, num: int = 4096) -> Tensor:
-    """`num` values of each map (B, C, H, W), the same ones at every call: (B, num)."""
-    flat = maps.flatten(1)
-    return flat[:, torch.tensor(_draw(flat.shape[1], num), device=maps.device)]
-
-
-def mean_by_depth(maps: Tensor, bands: int = BANDS) -> Tensor:
-    """Means over `bands` bands of rows, (B, C bands), C slowest: the published "depth", which means elevation."""
-    return maps.unflatten(2, (bands, -1)).mean((3, 4)).flatten(1)
 
 
 def _normalisation(config: Mapping[str, Any], channels: int) -> tuple[tuple[float, ...], tuple[float, ...]]:

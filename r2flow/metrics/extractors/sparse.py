@@ -44,25 +44,32 @@ class VoxelGrid:
         self.coords = coords
         self.finer = finer
         self._around: dict[int, KernelMap] = {}
-        self._box = Box(coords)
-        self.keys, self.order = self._box.keys(coords).sort()
+        self.low, self.high = coords.amin(0), coords.amax(0)
+        self.sizes = (self.high - self.low + 1).tolist()
+        assert math.prod(self.sizes) < 2**63, self.sizes
+        self.keys, self.order = self._keys(coords).sort()
         assert (self.keys.diff() > 0).all(), "voxels are distinct"
 
     def __len__(self) -> int:
         return len(self.coords)
 
+    def _keys(self, coords: Tensor) -> Tensor:
+        """The numbers of cells of the bounding box, the last axis fastest."""
+        scan, x, y, z = (coords - self.low).unbind(-1)
+        return ((scan * self.sizes[1] + x) * self.sizes[2] + y) * self.sizes[3] + z
+
     def find(self, coords: Tensor) -> Tensor:
         """Numbers of the voxels at coordinates (..., 4), -1 where there is none."""
-        key = self._box.keys(coords)
+        key = self._keys(coords)
         position = torch.searchsorted(self.keys, key).clamp_(max=len(self) - 1)
-        return torch.where(self._box.holds(coords) & (self.keys[position] == key), self.order[position], -1)
+        inside = ((coords >= self.low) & (coords <= self.high)).all(-1)
+        return torch.where(inside & (self.keys[position] == key), self.order[position], -1)
 
     def coarser(self) -> "VoxelGrid":
         """Voxels twice as large, each around at least one of this grid's."""
         coords = self.coords.clone()
         coords[:, 1:] = coords[:, 1:].div(2, rounding_mode="floor")
-        box = Box(coords)
-        return VoxelGrid(box.coords(box.keys(coords).unique()), finer=self)
+        return VoxelGrid(coords.unique(dim=0), finer=self)
 
     def around(self, size: int) -> KernelMap:
         """The map of a kernel of size^3 and stride 1 on this grid."""
@@ -88,29 +95,6 @@ class VoxelGrid:
             outputs = (found >= 0).nonzero()[:, 0]
             entries.append((found[outputs], outputs))
         return entries
-
-
-class Box:
-    """The bounding box of coordinates (N, 4); its cells are numbered, the last axis fastest."""
-
-    def __init__(self, coords: Tensor) -> None:
-        self.low, self.high = coords.amin(0), coords.amax(0)
-        self.sizes = (self.high - self.low + 1).tolist()
-        assert math.prod(self.sizes) < 2**63, self.sizes
-
-    def holds(self, coords: Tensor) -> Tensor:
-        return ((coords >= self.low) & (coords <= self.high)).all(-1)
-
-    def keys(self, coords: Tensor) -> Tensor:
-        scan, x, y, z = (coords - self.low).unbind(-1)
-        return ((scan * self.sizes[1] + x) * self.sizes[2] + y) * self.sizes[3] + z
-
-    def coords(self, keys: Tensor) -> Tensor:
-        parts = []
-        for size in reversed(self.sizes):
-            parts.append(keys % size)
-            keys = keys.div(size, rounding_mode="floor")
-        return torch.stack(parts[::-1], 1) + self.low
 
 
 @dataclass(frozen=True)

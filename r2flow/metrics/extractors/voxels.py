@@ -31,25 +31,24 @@ def voxelise(points: Tensor) -> tuple[Tensor, Tensor]:
     return coords[first], torch.nn.functional.pad(points[first], (0, 1), value=-1.0)
 
 
-def mean_by_distance(features: Tensor, coords: Tensor, sectors: int = SECTORS) -> Tensor:
-    """Means over sectors of distance from the centroid of the voxels, the published "depth"; (sectors C,).
+def mean_by_distance(features: Tensor, coords: Tensor) -> Tensor:
+    """Means over 16 sectors of distance from the centroid of the voxels, the published "depth"; (16 C,), C fastest.
 
     A voxel 56 m or farther from the centroid counts in none; a sector without voxels has the mean 0.
 
     Args:
         features: Of each voxel, (M, C).
         coords: Their integer coordinates, (M, 3).
-        sectors: How many; the sector is the slowest index of what is returned.
     """
-    edges = torch.linspace(NEAR, FAR, sectors + 1, device=coords.device)
+    edges = torch.linspace(NEAR, FAR, SECTORS + 1, device=coords.device)
     edges[0] = 0
     position = coords.float()
     distance = (position - position.mean(0)).norm(dim=1) * VOXEL
     sector = torch.bucketize(distance, edges, right=True) - 1
-    inside = sector < sectors
+    inside = sector < SECTORS
     sector = sector[inside]
     # float64: tens of thousands of voxels in one sum.
-    total = torch.zeros(sectors, features.shape[1], dtype=torch.float64, device=features.device)
+    total = torch.zeros(SECTORS, features.shape[1], dtype=torch.float64, device=features.device)
     total.index_add_(0, sector, features[inside].double())
-    count = torch.bincount(sector, minlength=sectors).clamp(min=1)
+    count = torch.bincount(sector, minlength=SECTORS).clamp(min=1)
     return (total / count[:, None]).to(features.dtype).flatten()

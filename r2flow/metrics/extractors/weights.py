@@ -4,8 +4,6 @@ Nothing is downloaded. A file from disk is read as tensors only, checked against
 the folder of weights, from which `Extractor.trained` reads it.
 """
 
-import gzip
-import hashlib
 import io
 import json
 import os
@@ -13,10 +11,8 @@ import pickle
 import re
 import tarfile
 import zlib
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, TypeVar
+from typing import IO, Any, NamedTuple, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -26,32 +22,22 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.files import atomic_write, parse_json, refuse_unreadable
 from r2flow.hashing import state_hash
-from r2flow.metrics.extractors import extractor_class
+from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.registry import Registry
 
 E = TypeVar("E", bound=Extractor)
 
 
-@dataclass(frozen=True)
-class Source:
-    """A published file of weights: the distance between its features, where its authors offer it, and its id in git."""
+class Source(NamedTuple):
+    """A published file of weights, and the field's name of the distance between its features."""
 
     metric: str
     page: str
-    git_blob: str | None = None
 
     @property
     def file(self) -> str:
         return self.page.rpartition("/")[2]
-
-    def matches(self, path: Path) -> bool | None:
-        """Whether a file is the published one; None where its hash is not known."""
-        if path.is_dir() or self.git_blob is None:
-            return None
-        content = path.read_bytes()
-        blob = b"blob %d\0%b" % (len(content), content)
-        return hashlib.sha1(blob, usedforsecurity=False).hexdigest() == self.git_blob
 
 
 BONN = "http://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models/"
@@ -62,12 +48,10 @@ SOURCES: Registry[Source] = Registry(
     "network with published weights",
     rangenet53=Source("FRD", f"{BONN}darknet53-1024.tar.gz"),
     rangenet21=Source("FRID", f"{R2FLOW}rangenet21_lidm.tar.gz"),
-    pointnet=Source("FPD", f"{SPARENET}cls_model_39.pth", git_blob="c9e80093a093d5667e9aa705d87d923df50f1c25"),
+    pointnet=Source("FPD", f"{SPARENET}cls_model_39.pth"),
     minkowskinet=Source("FSVD", f"{R2FLOW}minkowskinet_lidm.tar.gz"),
     spvcnn=Source("FPVD", f"{R2FLOW}spvcnn_lidm.tar.gz"),
 )
-
-DAMAGES = (tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError, ValueError, OSError)
 
 # Files of an archive that hold parameters, and its config.
 PARTS = ("backbone", "segmentation_decoder", "segmentation_head", "model.ckpt")
@@ -87,55 +71,35 @@ def kept_file(name: str) -> Path:
     return weights_folder() / f"{name}.safetensors"
 
 
-@dataclass(frozen=True)
-class InstalledWeights:
-    """Weights on this machine.
-
-    Attributes:
-        weights: First 12 digits of the SHA-256 of the parameters, whatever file they come from.
-        source: Name of the file that they come from.
-        sha256: Hash of that file; None for a folder.
-        published: Whether it is the published file; None where the hash of that is not known.
-    """
-
-    weights: str
-    source: str
-    sha256: str | None
-    published: bool | None
-
-
-def kept(name: str) -> InstalledWeights | None:
-    """The installed weights of a network, or None.
-
-    Raises:
-        InputError: a file that is not one of ours.
-    """
+def kept(name: str) -> str | None:
+    """The weights of a network on this machine, in words; None without any."""
     path = kept_file(name)
     if not path.exists():
         return None
-    notes = read_safetensors(path, with_tensors=False)[1]
-    return InstalledWeights(notes["weights"], notes["source"], notes["sha256"], notes["published"])
+    notes = read_safetensors(path)[1]
+    return f"{notes['weights']} of {notes['source']}"
 
 
-def add(name: str, path: Path) -> InstalledWeights:
+def add(name: str, path: Path) -> str:
     """Copy weights from a file, or an archive or folder of several files, into the folder of weights.
+
+    Returns:
+        First 12 digits of the SHA-256 of the parameters, whatever file they come from.
 
     Raises:
         InputError: no network of that name, a file that cannot be read safely, or weights of another network.
     """
-    source = SOURCES[name]
+    SOURCES[name]
     tensors, config = read_published(path)
     try:
-        extractor = extractor_class(name).from_tensors(tensors, config)
+        weights = weights_hash(EXTRACTORS[name].from_tensors(tensors, config))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    sha256 = None if path.is_dir() else hashlib.sha256(path.read_bytes()).hexdigest()
-    installed = InstalledWeights(weights_hash(extractor), path.name, sha256, source.matches(path))
     whole = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}  # some share their memory
-    notes = json.dumps({**asdict(installed), "config": config}, default=str)
+    notes = json.dumps({"weights": weights, "source": path.name, "config": config}, default=str)
     with atomic_write(kept_file(name)) as file:
         file.write(save(whole, metadata={"r2flow": notes}))
-    return installed
+    return weights
 
 
 def read_kept(cls: type[E]) -> E:
@@ -173,16 +137,14 @@ def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """
     import yaml
 
-    if not path.exists():
-        raise InputError(f"{path} does not exist; give a file, a .tar.gz or a folder of weights.")
     if not path.is_dir():
         refuse_unreadable(path, LARGEST, "file of weights")
-    if path.suffix == ".safetensors":
-        tensors, notes = read_safetensors(path)
-        return tensors, notes["config"]
-    if not (path.is_dir() or _is_tar(path)):
-        with path.open("rb") as file:
-            return _read_torch(file, str(path)), {}
+        if path.suffix == ".safetensors":
+            tensors, notes = read_safetensors(path)
+            return tensors, notes["config"]
+        if not _is_tar(path):
+            with path.open("rb") as file:
+                return _read_torch(file, str(path)), {}
     members = _read_members(path)
     parts = [_read_torch(io.BytesIO(members[part]), f"{path}: {part}") for part in PARTS if part in members]
     if not parts:
@@ -204,34 +166,26 @@ def _is_tar(path: Path) -> bool:
 
 def _read_members(path: Path) -> dict[str, bytes]:
     """The files of `PARTS` and `CONFIG` in a folder or a tar archive, by their last name."""
+    wanted = (*PARTS, CONFIG)
+    if path.is_dir():
+        return {name: (path / name).read_bytes() for name in wanted if (path / name).is_file()}
     members: dict[str, bytes] = {}
     try:
-        for name, size, file in _opened(path):
-            last = PurePosixPath(name).name
-            if last not in (*PARTS, CONFIG):
-                continue
-            if last in members or size > LARGEST:
-                raise InputError(f"{path} holds several networks ('{last}' twice), or a file that is too large.")
-            members[last] = file.read()
-    except DAMAGES as error:
-        if isinstance(error, InputError):
-            raise
+        with tarfile.open(path) as tar:
+            for member in tar:
+                name = PurePosixPath(member.name).name
+                if name not in wanted or not member.isreg():
+                    continue
+                if name in members or member.size > LARGEST:
+                    raise InputError(f"{path} holds several networks ('{name}' twice), or a file that is too large.")
+                content = tar.extractfile(member)
+                assert content is not None
+                members[name] = content.read()
+    except InputError:
+        raise
+    except (tarfile.TarError, zlib.error, EOFError, ValueError, OSError):
         raise InputError(f"{path} is a damaged archive; get it again.") from None
     return members
-
-
-def _opened(path: Path) -> Iterator[tuple[str, int, IO[bytes]]]:
-    """Name, size and content of each plain file in a folder or a tar archive."""
-    if path.is_dir():
-        for child in sorted(path.iterdir()):
-            if child.is_file():
-                with child.open("rb") as part:
-                    yield child.name, child.stat().st_size, part
-        return
-    with tarfile.open(path) as tar:
-        for member in tar:
-            if member.isreg() and (content := tar.extractfile(member)) is not None:
-                yield member.name, member.size, content
 
 
 def _read_torch(file: IO[bytes], label: str) -> dict[str, Tensor]:
@@ -260,7 +214,7 @@ def _is_plain(name: object, value: object) -> bool:
     return not (value.is_meta or value.is_quantized or value.is_complex())
 
 
-def read_safetensors(path: Path, with_tensors: bool = True) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors of a safetensors file, and the notes of `add`.
 
     Raises:
@@ -269,7 +223,7 @@ def read_safetensors(path: Path, with_tensors: bool = True) -> tuple[dict[str, T
     try:
         with safe_open(path, framework="pt") as file:
             noted = parse_json((file.metadata() or {}).get("r2flow", "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys() if with_tensors}  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError):
         raise InputError(f"{path} is not a safetensors file, or a damaged one.") from None
-    return tensors, {"config": {}, "weights": "", "source": path.name, "sha256": None, "published": None, **noted}
+    return tensors, {"config": {}, "weights": "", "source": path.name, **noted}
