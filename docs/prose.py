@@ -21,7 +21,7 @@ def faults(text: str, measured: bool) -> Iterator[tuple[int, str]]:
     for number, line in enumerate(text.splitlines(), start=1):
         if line.lstrip().startswith("```"):
             code = not code
-        if code or line.lstrip().startswith(("```", "    ")):
+        if code or line.lstrip().startswith(("```", "    ", "<!--")):
             continue
         shown = re.sub(r"\]\([^)]*\)|\{py:\w+\}|[`*|\[]", "", line).strip()  # as a reader sees it
         plain = re.sub(r"`[^`]*`", "code", re.sub(r"\]\([^)]*\)", "]", line))
