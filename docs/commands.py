@@ -65,7 +65,8 @@ def check(words: list[str], folder: Path) -> None:
         overrides = [re.sub(r"^([\w.]+=[\w.]+)(,[\w.]+)+$", r"\1", one) for one in overrides]
     if plugins:  # whose choices are theirs
         overrides = [one for one in overrides if not re.match(r"(backbone|stage|data)=", one)]
-    compose(overrides, [folder] if given.config_dir else [])
+    own = DOCS.parent / (given.config_dir or "")
+    compose(overrides, [own if own.is_dir() else folder] if given.config_dir else [])
 
 
 def main() -> None:
