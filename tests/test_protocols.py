@@ -77,7 +77,7 @@ def measured(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
 def figure(real: Path, judged: Path, rules, metric: str = "jsd") -> float:
     metrics = {metric: METRICS[metric]()}
     gathered = gather_real(metrics, open_scans(str(real), READING), Work(), protocol=rules)
-    (one,) = measure(metrics, gathered, open_scans(str(judged), READING), Work())
+    (one,) = measure(metrics, gathered, open_scans(str(judged), READING), Work(), protocol=rules)
     assert one.protocol["name"] == rules.name
     return one.figures[metric]
 

@@ -18,7 +18,8 @@ from r2flow.errors import InputError
 if TYPE_CHECKING:
     from r2flow.data.reading import Reading
     from r2flow.data.sets import ScanSet
-    from r2flow.evaluation.measuring import Gathered, Work
+    from r2flow.evaluation.measuring import Work
+    from r2flow.evaluation.statistics import Statistics
     from r2flow.generators import Generator, Sampler
     from r2flow.metrics.base import ScanMetric
     from r2flow.model.checkpoint import Checkpoint
@@ -112,6 +113,7 @@ def evaluate(
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.evaluation.statistics import Cache
     from r2flow.metrics import METRICS, default_metrics
+    from r2flow.processes import place
     from r2flow.reports.compare import labels
     from r2flow.reports.pages import prepare_folder
 
@@ -123,13 +125,13 @@ def evaluate(
         raise InputError(f"--{', --'.join(SAMPLING)} are of a run, a checkpoint or a model to sample; found none.")
     if len(named) == len(sampled) and (options.generated_split or options.generated_scale):
         raise InputError("--generated-split and --generated-scale are of files in GENERATED; found none.")
-    with joined(choose_device(work.device)) as place:
+    with joined(choose_device(work.device)) as device:
         keep = options.bootstrap > 0
         wanted = None
         if options.metrics not in (None, "all"):
-            wanted = _build(options.metrics.split(","), keep, place.device)
-        flows = _load_flows(sampled, place.device)
-        if flows and options.num is None and place.rank == 0:
+            wanted = _build(options.metrics.split(","), keep, device)
+        flows = _load_flows(sampled, device)
+        if flows and options.num is None and place()[0] == 0:
             print(f"{', '.join(flows)}: {SAMPLED} scans of each set are drawn (--num says how many)")
         files = [one for one in named if one not in sampled]
         reading = how.reading([real, *files, options.train], next(iter(flows.values()), None))
@@ -152,19 +154,19 @@ def evaluate(
         reflectance = all(s.about["reflectance"] for s in sets)
         reflectance = reflectance and all(flow.encoding.reflectance for flow in flows.values())
         usual = [*METRICS] if options.metrics == "all" else default_metrics(reflectance)
-        metrics = wanted or _build_possible(usual, reflectance, keep, place.device)
+        metrics = wanted or _build_possible(usual, reflectance, keep, device)
         check_reflectance(metrics, sets)
         training = None if options.train is None else _open(options.train, reading, options.train_split, None)
         for folder in (options.out, options.json.parent if options.json else None):
             if folder is not None:
                 prepare_folder(folder)
-        share = Work(work.batch_size, work.workers, place.rank, place.ranks, watched=place.rank == 0)
+        share = Work(work.batch_size, work.workers)
         cache = None if options.no_cache else Cache()
 
-        def gather(scans: "ScanSet") -> "Gathered":
+        def gather(scans: "ScanSet") -> "dict[str, Statistics]":
             return gather_real(metrics, scans, share, cache, rules)
 
-        _compare(truth, metrics, gather, share, place.device, judged, training, options)
+        _compare(truth, metrics, gather, share, device, judged, training, options)
 
 
 def _check_options(generated: Sequence[str], options: EvaluateOptions) -> None:
@@ -178,7 +180,7 @@ def _check_options(generated: Sequence[str], options: EvaluateOptions) -> None:
 def _compare(
     truth: "ScanSet",
     metrics: "Mapping[str, ScanMetric]",
-    gather: "Callable[[ScanSet], Gathered]",
+    gather: "Callable[[ScanSet], dict[str, Statistics]]",
     work: "Work",
     device: str,
     judged: "dict[str, ScanSet]",
@@ -187,8 +189,10 @@ def _compare(
 ) -> None:
     from r2flow.evaluation.copies import Nearest, copies_result, find_nearest
     from r2flow.evaluation.measuring import measure, speed_result
+    from r2flow.evaluation.protocols import PROTOCOLS
     from r2flow.evaluation.references import baseline_sets, reference_sets
     from r2flow.evaluation.results import Results
+    from r2flow.processes import place
     from r2flow.reports.evaluation import Comparison, Kind, evaluation_page, print_comparisons, write_json
     from r2flow.reports.pages import write_page
     from r2flow.reports.view.panels import write_sets
@@ -202,7 +206,8 @@ def _compare(
         num = max((len(one) for one in judged.values()), default=len(truth))
         kinds["baseline"] = {name: (truth, one) for name, one in baseline_sets(truth, min(num, SAMPLED)).items()}
     comparisons: list[Comparison] = []
-    statistics: dict[int, Gathered] = {}
+    rank, _ = place()
+    statistics: dict[int, dict[str, Statistics]] = {}
     folder = options.out and options.out / "results"
     kept = Results(folder, metrics, bootstrap=options.bootstrap, protocol=options.protocol, device=device)
     for kind, (name, (real, other)) in ((kind, pair) for kind, pairs in kinds.items() for pair in pairs.items()):
@@ -213,22 +218,22 @@ def _compare(
             if id(real) not in statistics:
                 statistics[id(real)] = gather(real)
             draws = 0 if kind == "baseline" else options.bootstrap
-            results = measure(metrics, statistics[id(real)], other, work, draws)
+            results = measure(metrics, statistics[id(real)], other, work, draws, PROTOCOLS[options.protocol])
             if sampled:
                 results.append(speed_result(real, other))
-                if work.rank == 0:
+                if rank == 0:
                     kept.write(real, other, results)
         comparisons.append(Comparison(name, real, other, results, time.monotonic() - start, kind))
-    if work.rank > 0:
+    if rank > 0:
         return
     nearest: dict[str, Nearest] = {}
     if training is not None:
-        nearest = find_nearest({**judged, REAL: truth}, training, replace(work, ranks=1), device)
+        nearest = find_nearest({**judged, REAL: truth}, training, work, device)
         of = {("judged", name): nearest[name] for name in judged} | {("reference", "real halves"): nearest[REAL]}
-        for place, one in enumerate(comparisons):
+        for index, one in enumerate(comparisons):
             if (at := of.get((one.kind, one.name))) is not None:
                 result = copies_result(at, nearest[REAL], len(training))
-                comparisons[place] = replace(one, measured=[*one.measured, result])
+                comparisons[index] = replace(one, measured=[*one.measured, result])
     seeds: dict[str, int] = {}
     if any(one.about["kind"] == "sampled" for one in judged.values()):
         seeds["sampled scans"] = options.seed

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from r2flow.errors import InputError
-from r2flow.evaluation.measuring import MetricResult, Work
+from r2flow.evaluation.measuring import MetricResult, Work, bar
 from r2flow.evaluation.sets import ScanSet
 from r2flow.lidar.encoding import Encoding
 from r2flow.metrics.base import Protocol
@@ -31,7 +31,7 @@ def described(scans: ScanSet, work: Work, device: str, doing: str) -> Iterator[T
     """Log-range averaged over cells, (B, h, w), batch by batch; NaN for a scan without a return."""
     rows, columns = scans.sensor.shape
     encoding = Encoding(scans.sensor, reflectance=False)
-    with torch.no_grad(), work.bar(doing, len(scans)) as advance:
+    with torch.no_grad(), bar(doing, len(scans)) as advance:
         for images in scans.batches(range(len(scans)), work.batch_size, work.workers):
             seen = Scans(images.to(device), scans.sensor)
             mean = adaptive_avg_pool2d(

@@ -30,6 +30,7 @@ class Statistics:
     states: Mapping[str, Tensor] = field(repr=False)  # from `ScanMetric.real_state`
     scans: int
     empty: int  # how many of them have no return within the mask
+    chosen: str = ""  # how they were chosen from the set
 
 
 class Cache:
