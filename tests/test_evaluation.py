@@ -12,11 +12,12 @@ import torch
 
 from r2flow.data.opening import open_scans, reading_for
 from r2flow.data.reading import Reading
+from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.errors import InputError
 from r2flow.evaluation import measuring
 from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
 from r2flow.evaluation.references import reference_sets
-from r2flow.evaluation.sets import ScanSet, fixed_choice, sampled_set
+from r2flow.evaluation.sets import sampled_set
 from r2flow.evaluation.statistics import FORMAT, Cache, key_of
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points

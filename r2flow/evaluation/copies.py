@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
+from r2flow.data.sets import ScanSet
 from r2flow.errors import InputError
 from r2flow.evaluation.measuring import MetricResult, Work, bar
-from r2flow.evaluation.sets import ScanSet
 from r2flow.lidar.encoding import Encoding
 from r2flow.metrics.base import Protocol
 from r2flow.metrics.scans import Scans

@@ -8,9 +8,10 @@ from typing import Any
 
 import torch
 
+from r2flow.data.sets import ScanSet
 from r2flow.errors import InputError
 from r2flow.evaluation.protocols import R2FLOW, WORDS, Rules
-from r2flow.evaluation.sets import SampledScans, ScanSet
+from r2flow.evaluation.sets import SampledScans
 from r2flow.evaluation.statistics import Cache, Statistics, key_of
 from r2flow.metrics.base import Protocol, ScanMetric
 from r2flow.metrics.bootstrap import LEVEL, bootstrap

@@ -6,8 +6,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from r2flow.data.sets import ScanSet
 from r2flow.evaluation.measuring import MetricResult
-from r2flow.evaluation.sets import ScanSet
 from r2flow.files import atomic_write, read_json
 from r2flow.metrics.base import ScanMetric
 from r2flow.store import checksum

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from r2flow.data.sets import ScanSet, fixed_choice
+from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
 from r2flow.generators import Sampler
@@ -15,8 +15,6 @@ from r2flow.generators.base import Precision
 from r2flow.model.checkpoint import Checkpoint, checkpoints_of, weights_hash
 from r2flow.model.sampling import draw
 from r2flow.models import MODELS
-
-__all__ = ["SampledScans", "ScanSet", "fixed_choice", "is_checkpoint", "sampled_set"]
 
 CHECKPOINTS = (".ckpt", ".pth", ".safetensors")
 

@@ -13,8 +13,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from r2flow.data.sets import ScanSet
 from r2flow.errors import InputError
-from r2flow.evaluation.sets import ScanSet
 from r2flow.files import atomic_write
 from r2flow.metrics.base import ScanMetric
 

@@ -68,7 +68,7 @@ class ScanMetric(Metric):
             there is some.
         keeping: Whether the rows are always kept in memory, float32.
         resamples: Whether it has bootstrap intervals, for which `keep=True` keeps the rows.
-        fewest: Scans of each set that an interval takes.
+        fewest: Scans of each set that `resampled` takes.
 
     Args:
         keep: Whether bootstrap intervals are wanted.
@@ -119,8 +119,11 @@ class ScanMetric(Metric):
         """Add rows, all finite, to the statistics of a side."""
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
-        """Figures by name, computed from the states, and the remarks on them."""
-        raise NotImplementedError
+        """Figures by name, computed from the states, and the remarks on them: as `resampled` unless overridden."""
+        if any(self.count(side) < self.fewest for side in SIDES):
+            return {self.name: float("nan")}, [f"{self.name} needs {self.fewest} scans of each set."]
+        once: dict[Side, Tensor] = {side: torch.ones(1, self.count(side), dtype=torch.float64) for side in SIDES}
+        return {name: float(value) for name, value in self.resampled(once).items()}, []
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
         """Figures of resampled sets, (R) for each name that has intervals; `weights` is how much each kept scan counts,

@@ -53,7 +53,7 @@ def bootstrap(
     with metric.sync_context():
         values = {name: value for name, value in metric.figures()[0].items() if not np.isnan(value)}
         sizes = {side: len(metric.kept(side)) for side in SIDES}
-        if not values or min(sizes.values()) < metric.fewest:
+        if not values or min(sizes.values()) < max(metric.fewest, 2):
             return {}
         drawn: dict[str, list[Tensor]] = {}
         for start in range(0, draws // 2, AT_ONCE // 2):

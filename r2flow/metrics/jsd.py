@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.metrics.base import SIDES, ScanMetric
 from r2flow.metrics.birds_eye import BINS, PROTOCOL, js_distance
 from r2flow.metrics.scans import Scans
 from r2flow.metrics.sums import SumMetric
@@ -31,20 +30,8 @@ class JSD(SumMetric):
     def figures_of(self, real: np.ndarray, generated: np.ndarray) -> dict[str, float]:
         return {self.name: js_distance(real, generated)}
 
-    def figures(self) -> tuple[dict[str, float], list[str]]:
-        values, remarks = super().figures()
-        return values, [*remarks, *one_sided(self)]
-
 
 def histograms(scans: Scans) -> Tensor:
     """Counts from above, (B, BINS^2), float64; NaN for a scan without a return there."""
     counts = torch.from_numpy(scans.birds_eye).flatten(1)
     return torch.where(counts.sum(1, keepdim=True) > 0, counts, torch.nan)
-
-
-def one_sided(metric: ScanMetric) -> list[str]:
-    """The remark for a comparison in which only one set has a return."""
-    empty = [side for side in SIDES if not metric.count(side)]
-    if len(empty) != 1:
-        return []
-    return [f"{metric.name}: no {empty[0]} scan has a return: the largest distance that there is."]

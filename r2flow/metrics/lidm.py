@@ -15,7 +15,6 @@ from torch import Tensor
 
 from r2flow.metrics.base import SIDES, ScanMetric, Side, blocks
 from r2flow.metrics.birds_eye import js_distance
-from r2flow.metrics.jsd import one_sided
 from r2flow.metrics.scans import Scans
 
 NEAR, FAR, EXTENT = 1.0, 56.0, 50  # metres
@@ -61,9 +60,8 @@ class JSDLiDM(ScanMetric):
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         real, generated = (getattr(self, f"{side}_cells").cpu().numpy() for side in SIDES)
-        if not all(self.given(side) for side in SIDES):
-            return {"jsd_lidm": float("nan")}, []
-        return {"jsd_lidm": js_distance(real, generated)}, one_sided(self)
+        known = all(self.given(side) for side in SIDES)
+        return {"jsd_lidm": js_distance(real, generated) if known else float("nan")}, []
 
 
 class MMDLiDM(ScanMetric):
@@ -94,17 +92,13 @@ class MMDLiDM(ScanMetric):
 
     def figures(self) -> tuple[dict[str, float], list[str]]:
         if not all(self.count(side) for side in SIDES):
-            return {"mmd_lidm": float("nan")}, ["mmd_lidm does not exist where a set has no return."]
-        return {"mmd_lidm": float(self._nearest().mean())}, []
-
-    def _nearest(self) -> Tensor:
-        """Chamfer distance of every real scan to the nearest generated one, (N)."""
+            return {"mmd_lidm": float("nan")}, []
         real, generated = (self.kept(side) for side in SIDES)
         nearest = torch.full((len(real),), torch.inf, dtype=torch.float64)
         for i, x in blocks(real, BLOCK):
             for _, y in blocks(generated, BLOCK):
                 nearest[i] = torch.minimum(nearest[i], _chamfer(x, y).amin(1))
-        return nearest * (COARSE / (2 * EXTENT)) ** 2
+        return {"mmd_lidm": float(nearest.mean()) * (COARSE / (2 * EXTENT)) ** 2}, []
 
 
 def _chamfer(x: Tensor, y: Tensor) -> Tensor:

@@ -30,21 +30,16 @@ class MMD(ScanMetric):
     representation = "bird's-eye histogram"
     settings: ClassVar[Mapping[str, Any]] = {**PROTOCOL, "kernel": "Gaussian", "sigma": SIGMA, "estimate": "biased"}
     keeping = True
+    fewest = 1
 
     def rows(self, scans: Scans) -> Tensor:
         return histograms(scans)
 
-    def figures(self) -> tuple[dict[str, float], list[str]]:
-        if not all(self.count(side) for side in SIDES):
-            return {self.name: float("nan")}, [f"{self.name} does not exist where a set has no return."]
-        once = {side: torch.ones(1, self.count(side), dtype=torch.float64) for side in SIDES}
-        return {self.name: float(self.resampled(once)[self.name])}, []
-
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
-        real, generated, between = self._terms(weights)
+        real, generated, between = self.terms(weights)
         return {self.name: (real + generated - 2 * between).clamp(min=0)}
 
-    def _terms(self, weights: Mapping[Side, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    def terms(self, weights: Mapping[Side, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Mean kernels, less 1, within the real scans, within the generated ones and between them, (R) each."""
         real, generated = ((self.kept(side), weights[side]) for side in SIDES)
         return mean_kernel(real, real), mean_kernel(generated, generated), mean_kernel(real, generated)
@@ -61,14 +56,12 @@ class MMDUnbiased(MMD):
     name = "mmd_unbiased"
     settings: ClassVar[Mapping[str, Any]] = {**MMD.settings, "estimate": "unbiased"}
     resamples = False  # scans that are drawn twice would be pairs of equal ones, and the estimate biased
+    fewest = 2
 
-    def figures(self) -> tuple[dict[str, float], list[str]]:
-        n, m = sizes = [self.count(side) for side in SIDES]
-        if min(sizes) < 2:
-            return {self.name: float("nan")}, [f"{self.name} needs two scans with a return of each set."]
-        once = {side: torch.ones(1, self.count(side), dtype=torch.float64) for side in SIDES}
-        real, generated, between = map(float, self._terms(once))
-        return {self.name: real * n / (n - 1) + generated * m / (m - 1) - 2 * between}, []
+    def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
+        real, generated, between = self.terms(weights)
+        n, m = (self.count(side) for side in SIDES)
+        return {self.name: real * n / (n - 1) + generated * m / (m - 1) - 2 * between}
 
 
 def mean_kernel(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:

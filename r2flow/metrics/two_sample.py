@@ -12,7 +12,6 @@ from r2flow.metrics.features import FeatureMetric
 RIDGE = 1.0  # of the squared weights of standardised features
 STEPS = 25  # of Newton's method
 SAME = 1e-5  # scores so near are equal
-LEAST = 4  # scans of each set: two to learn from, two to judge
 
 
 class TwoSample(FeatureMetric):
@@ -27,13 +26,7 @@ class TwoSample(FeatureMetric):
     names: ClassVar[Mapping[str, str]] = {"handcrafted": "auc", "handcrafted_range": "auc_range"}
     settings: ClassVar[Mapping[str, Any]] = {"classifier": "logistic regression, ridge 1", "folds": "two halves"}
     keeping = True
-    fewest = LEAST
-
-    def figures(self) -> tuple[dict[str, float], list[str]]:
-        if any(self.count(side) < LEAST for side in SIDES):
-            return {self.name: float("nan")}, [f"{self.name} needs {LEAST} scans of each set."]
-        ones: dict[Side, Tensor] = {side: torch.ones(1, self.count(side)) for side in SIDES}
-        return {self.name: float(self.resampled(ones)[self.name])}, []
+    fewest = 4  # two to learn from, two to judge
 
     def resampled(self, weights: Mapping[Side, Tensor]) -> dict[str, Tensor]:
         real, generated = (self.kept(side).double() for side in SIDES)
@@ -44,7 +37,7 @@ class TwoSample(FeatureMetric):
             areas.append(
                 area(
                     score(real[judge_real]), score(generated[judge_made]),
-                    weights["real"][:, judge_real].double(), weights["generated"][:, judge_made].double(),
+                    weights["real"][:, judge_real], weights["generated"][:, judge_made],
                 )
             )  # fmt: skip
         return {self.name: torch.stack(areas).mean(0)}

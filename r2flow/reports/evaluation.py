@@ -11,9 +11,9 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.figure import Figure
 
+from r2flow.data.sets import ScanSet
 from r2flow.evaluation.copies import Nearest
 from r2flow.evaluation.measuring import MetricResult
-from r2flow.evaluation.sets import ScanSet
 from r2flow.files import atomic_write
 from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks, plain, provenance
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range

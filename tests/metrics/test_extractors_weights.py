@@ -7,7 +7,6 @@ import tarfile
 import pytest
 import torch
 import yaml
-from safetensors.torch import load_file
 
 from r2flow.errors import InputError
 from r2flow.metrics.extractors import EXTRACTORS
@@ -193,13 +192,6 @@ def test_settings_of_an_archive_are_a_table_of_whatever(tmp_path, pointnet):
     (tmp_path / "net" / "arch_cfg.yaml").write_text("[1, 2]\n")
     with pytest.raises(InputError, match="not a table"):
         add("pointnet", tmp_path / "net")
-
-
-def test_what_is_kept_is_safetensors(pointnet, folder):
-    network, path = pointnet
-    add("pointnet", path)
-    assert set(load_file(folder / "pointnet.safetensors")) == set(network.state_dict())
-    assert [file.name for file in folder.iterdir()] == ["pointnet.safetensors"]
 
 
 def test_pipes_and_devices_are_refused_at_once(tmp_path):

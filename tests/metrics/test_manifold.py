@@ -95,10 +95,6 @@ def test_too_few_scans_have_no_neighbours():
     assert any("too few real scans to have 5 neighbours each" in one for one in said)
 
 
-def test_the_name_is_that_of_its_network():
-    assert Manifold(Given()).protocol.metric == "manifold_given"
-
-
 def kernel_distance(real, generated):
     metric = KernelDistance(Given())
     metric.update(Rows(real), real=True)

@@ -13,7 +13,6 @@ from torchmetrics import MetricCollection
 from r2flow.errors import InputError
 from r2flow.metrics import METRICS
 from r2flow.metrics.base import SIDES
-from r2flow.metrics.features import extract
 from r2flow.metrics.scans import Scans
 from tests.metrics.conftest import SMALL, one_of_each_class
 
@@ -167,20 +166,6 @@ def test_a_network_runs_once_for_all_metrics_of_it(summary, sets, monkeypatch):
     for metric in metrics:
         metric.update(sets["real"], real=True)
     assert [network.name for network in ran] == ["handcrafted", "rangenet21"]
-
-
-def test_features_of_a_deleted_network_are_not_taken_for_those_of_another(summary, sets):
-    class Numbered(type(summary)):
-        weights = "random"
-
-        def features(self, scans):
-            return torch.full((len(scans), 6), float(self.number))
-
-    for number in range(50):  # each where the one before it lay, which had its id
-        network = Numbered()
-        network.number = number
-        assert extract(network, sets["real"])[0, 0] == number
-        del network
 
 
 def test_a_batch_of_no_scans_changes_nothing(build, sets):
