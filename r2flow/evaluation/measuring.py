@@ -76,9 +76,10 @@ def gather_real(
     protocol.check(real)
     chosen = {name: real_rule(metric, real, protocol) for name, metric in metrics.items()}
     points = "" if protocol.real == "centre" else f", points {WORDS[protocol.real]}"
-    keys = {name: key_of(metric, real, chosen[name][1] + points) for name, metric in metrics.items()}
     statistics: dict[str, Statistics] = {}
+    cache = None if real.identity is None else cache  # what cannot be told apart from other scans
     if cache is not None:
+        keys = {name: key_of(metric, real, chosen[name][1] + points) for name, metric in metrics.items()}
         held = {name: one for name, key in keys.items() if (one := cache.read(key)) is not None}
         statistics = {name: replace(held[name], chosen=chosen[name][1]) for name in _common(set(held))}
     missing = {name: metric for name, metric in metrics.items() if name not in statistics}

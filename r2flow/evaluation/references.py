@@ -1,6 +1,7 @@
 """What a figure of generated scans is read against: real scans among themselves, and baselines made without a model."""
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator, standard_normal
 
-BASELINES = ("noise", "flat ground", "mean scan", "shuffled pixels")
 LEARNED_FROM = 200  # real scans that the mean and the shuffled pixels are made of, evenly spread over the set
 
 
@@ -43,25 +43,19 @@ def reference_sets(real: ScanSet, generated: Mapping[str, ScanSet] | None = None
 class Baseline(ScanSource):
     """Scans (2 or 1, H, W) made without knowledge of scenes, by their numbers.
 
-    `noise` is x_0 ~ N(0, I) decoded as if it were a scan; `flat ground` measures r = -height / sin e; `mean scan` is
-    the mean of the training scans where over half of them returned; `shuffled pixels` takes each pixel from a training
-    scan of its own.
-
     Args:
+        name: In `BASELINES`.
         training: Real scans, (N, 2 or 1, H, W).
     """
 
     def __init__(self, name: str, training: np.ndarray, sensor: Sensor, numbers: Sequence[int], seed: int = 0) -> None:
         self.name, self.training, self.sensor, self.numbers, self.seed = name, training, sensor, numbers, seed
-        self._same = {"flat ground": self._flat_ground, "mean scan": self._mean_scan}.get(name, lambda: None)()
 
     def __len__(self) -> int:
         return len(self.numbers)
 
     def __getitem__(self, index: int) -> np.ndarray:
-        if self._same is not None:
-            return self._same
-        return self._noise(self.numbers[index]) if self.name == "noise" else self._shuffled(self.numbers[index])
+        return BASELINES[self.name](self, self.numbers[index])
 
     @property
     def names(self) -> list[str]:
@@ -73,25 +67,41 @@ class Baseline(ScanSource):
     def about(self) -> dict[str, object]:
         return {"kind": "baseline", "seed": self.seed, "reflectance": self.training.shape[1] > 1}
 
-    def _noise(self, number: int) -> np.ndarray:
+    def noise(self, number: int) -> np.ndarray:
+        """x_0 ~ N(0, I), decoded as if it were a scan."""
         encoding = Encoding(self.sensor, reflectance=self.training.shape[1] > 1)
         return encoding.decode(standard_normal(self.training.shape[1:], self.seed, "evaluation", number)).numpy()
 
-    def _flat_ground(self) -> np.ndarray:
+    def flat_ground(self, number: int) -> np.ndarray:
+        """r = -height / sin e within the sensor's limits."""
         e = self.sensor.rays()[0].numpy().astype(np.float64)
         r = np.where(e < 0, -self.sensor.height / np.sin(np.minimum(e, -1e-6)), 0)
         r = np.where((r >= self.sensor.min_range) & (r <= self.sensor.max_range), r, 0)
         return np.stack([r, 0.3 * (r > 0)])[: self.training.shape[1]].astype(np.float32)
 
-    def _mean_scan(self) -> np.ndarray:
+    @cached_property
+    def _mean(self) -> np.ndarray:
         returned = self.training[:, 0] > 0
         mean = self.training.sum(0) / np.maximum(returned.sum(0), 1)
         return np.where(returned.mean(0) > 0.5, mean, 0).astype(np.float32)
 
-    def _shuffled(self, number: int) -> np.ndarray:
+    def mean_scan(self, number: int) -> np.ndarray:
+        """The mean of the training scans where over half of them returned."""
+        return self._mean
+
+    def shuffled_pixels(self, number: int) -> np.ndarray:
+        """Each pixel from a training scan of its own."""
         rows, columns = np.indices(self.sensor.shape)
         scan = generator(self.seed, "shuffle", number).integers(len(self.training), size=self.sensor.shape)
         return np.moveaxis(self.training[scan, :, rows, columns], -1, 0)
+
+
+BASELINES = {
+    "noise": Baseline.noise,
+    "flat ground": Baseline.flat_ground,
+    "mean scan": Baseline.mean_scan,
+    "shuffled pixels": Baseline.shuffled_pixels,
+}
 
 
 def baseline_sets(real: ScanSet, num: int) -> dict[str, ScanSet]:

@@ -44,9 +44,10 @@ class Cache:
         metric = json.loads(key)["protocol"]["metric"]
         return self.folder / f"{metric}-{hashlib.sha256(key.encode()).hexdigest()[:24]}.safetensors"
 
-    def read(self, key: str | None) -> Statistics | None:
+    def read(self, key: str) -> Statistics | None:
         """The statistics of a key; None where there are none that can be read."""
-        if key is None or not (path := self.path(key)).is_file():
+        path = self.path(key)
+        if not path.is_file():
             return None
         try:
             with safe_open(path, framework="pt") as file:
@@ -59,10 +60,8 @@ class Cache:
             log.warning("%s is damaged; its statistics are gathered again.", path)
             return None
 
-    def write(self, key: str | None, statistics: Statistics) -> None:
+    def write(self, key: str, statistics: Statistics) -> None:
         """Keep statistics; a disk that cannot be written to costs a warning, but no figure."""
-        if key is None:
-            return
         notes = {"key": key, "scans": str(statistics.scans), "empty": str(statistics.empty)}
         data = save({name: value.contiguous() for name, value in statistics.states.items()}, metadata=notes)
         try:
@@ -79,14 +78,12 @@ def default_folder() -> Path:
     return base.expanduser() / "statistics"
 
 
-def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str | None:
-    """Everything that a metric's statistics of a set depend on, as JSON; None for a set that is sampled.
+def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str:
+    """Everything that a metric's statistics of a set depend on, as JSON.
 
     The files of the scans with sizes and times (or seed, or manifest), sensor, projection, mask, subset, the metric's
     protocol with the hash of its weights, the kind of device, and the format of these files.
     """
-    if scans.identity is None:
-        return None
     parts = {
         "format": FORMAT, "scans": scans.identity, "subset": rule, "protocol": metric.protocol.asdict(),
         "keeps": metric.keeps, "device": torch.device(metric.device).type,

@@ -223,15 +223,11 @@ class Handcrafted(Extractor):
 
     def _features(self, images: Tensor) -> Tensor:
         h, w = images.shape[2:]
-        every = [images.new_full((len(images), n), of) for n, of in ((h, w), (w, h))]
-        counted: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+        every = torch.ones_like(images[:, 0])
         found: dict[str, tuple[Tensor, Tensor]] = {}
         for name, x, where in statistics(images[:, 0], images[:, 1] if self.needs_reflectance else None):
-            if where is None:
-                (in_rows, in_columns), held = every, x
-            else:  # kept beside its sums, so that no other one has its id
-                _, in_rows, in_columns = counted.setdefault(id(where), (where, where.sum(-1), where.sum(-2)))
-                held = x * where
+            where = every if where is None else where
+            held, in_rows, in_columns = x * where, where.sum(-1), where.sum(-2)
             in_row = held.sum(-1)
             found[name] = mean, share = _cells(in_row, in_rows, BANDS, w)
             if name + SPREAD in self.scales:
