@@ -66,11 +66,7 @@ def check_reflectance(metrics: Mapping[str, ScanMetric], sets: Iterable[ScanSet]
 def gather_real(
     metrics: Mapping[str, ScanMetric], real: ScanSet, work: Work, cache: Cache | None = None, protocol: Rules = R2FLOW
 ) -> dict[str, Statistics]:
-    """Each metric's statistics of the real scans, from the cache where it holds them.
-
-    Raises:
-        InputError: no real scan, one that cannot be read, or scans without what the protocol compares.
-    """
+    """Each metric's statistics of the real scans, from the cache where it holds them."""
     if len(real) == 0:
         raise InputError(f"{real.label} holds no scan to compare with.")
     protocol.check(real)
@@ -113,9 +109,6 @@ def measure(
         metrics: Built with `keep=True` where there are draws.
         real: Of `gather_real`, under the same protocol.
         draws: Bootstrap resamples for 95 % intervals; 0 for none.
-
-    Raises:
-        InputError: no generated scan, or one that cannot be read.
     """
     if len(generated) == 0:
         raise InputError(f"{generated.label} holds no scan to measure.")

@@ -21,9 +21,6 @@ def reference_sets(real: ScanSet, generated: Mapping[str, ScanSet] | None = None
     Halves are contiguous blocks: neighbouring scans of a drive are near-duplicates, and random halves would share
     places. The two drives are those with most scans. Distances fall with the number of scans, so generated scans that
     need not be sampled again are compared with the first half as well, as many as the second half has.
-
-    Raises:
-        InputError: fewer than two real scans.
     """
     count = len(real)
     if count < 2:

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanSource
-from r2flow.errors import InputError
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.model.checkpoint import Checkpoint, checkpoints_of, weights_hash
@@ -38,12 +37,7 @@ def sampled_set(
     """Scans 0 to num - 1 of a generator's seed, drawn when they are asked for.
 
     Their noise is that of (seed, "evaluation", i), which no training step and no reflow pair has seen.
-
-    Raises:
-        InputError: fewer than one, or a sampler that the generator does not have.
     """
-    if num < 1:
-        raise InputError(f"needs at least one scan to sample, found {num}.")
     sampler = sampler or flow.generator.sampler
     sampler.check(flow.generator)
     about = {

@@ -41,9 +41,6 @@ def bootstrap(
 
     Returns:
         (low, high) of each figure that exists and can be resampled (`ScanMetric.resamples`, `resampled`, `fewest`).
-
-    Raises:
-        InputError: fewer than four draws.
     """
     if not metric.resamples:
         return {}

@@ -1,7 +1,7 @@
 """Frechet distance between Gaussians that are fitted to features of real and generated scans."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,7 +10,6 @@ from r2flow.metrics import FIELD_NAMES
 from r2flow.metrics.base import SIDES, Side, blocks
 from r2flow.metrics.extractors.base import Extractor
 from r2flow.metrics.features import FeatureMetric
-from r2flow.metrics.moments import add_moments, merge_moments, moments, no_moments
 
 BLOCK = 4000  # kept features read at once
 FEW = (
@@ -51,6 +50,65 @@ def root(covariance: Tensor) -> Tensor:
     return vectors[:, kept] * values[kept].sqrt()
 
 
+class Moments(NamedTuple):
+    """The parts of a matrix of moments: n scans, and views of their mean (D) and scatter (D, D), in float64.
+
+    Sums of x x^T would lose the variance of features that lie far from 0. So the scatter is kept about the mean, and
+    two parts are joined by the formula of Chan, Golub and LeVeque (1979), with delta = mean_b - mean_a:
+
+        n = n_a + n_b,  mean = mean_a + n_b / n delta,  M = M_a + M_b + n_a n_b / n delta delta^T.
+
+    One matrix, (1 + D, 1 + D), holds all three, so that processes exchange one tensor: n in the corner, the mean in the
+    rest of the first row, the scatter M = sum (x - mean)(x - mean)^T below it.
+    """
+
+    n: int
+    mean: Tensor
+    scatter: Tensor
+
+    @property
+    def covariance(self) -> Tensor:
+        """M / (n - 1), the unbiased estimate, as numpy.cov; needs two scans."""
+        return self.scatter / (self.n - 1)
+
+
+def moments(matrix: Tensor) -> Moments:
+    """The parts of a matrix of moments."""
+    return Moments(int(matrix[0, 0]), matrix[0, 1:], matrix[1:, 1:])
+
+
+def add_moments(matrix: Tensor, rows: Tensor) -> None:
+    """Add features (B, D) of any precision to a matrix of moments, in place."""
+    if not len(rows):
+        return
+    x = rows.to(matrix)
+    mean = x.mean(0)
+    _join(matrix, len(x), mean, x - mean)
+
+
+def merge_moments(parts: Tensor) -> Tensor:
+    """Moments of several processes, (P, 1 + D, 1 + D), as those of one."""
+    merged = parts[0].clone()
+    for part in parts[1:]:
+        other = moments(part)
+        if other.n:
+            merged[1:, 1:] += other.scatter
+            _join(merged, other.n, other.mean, other.mean.new_zeros(0, len(other.mean)))
+    return merged
+
+
+def _join(matrix: Tensor, n: int, mean: Tensor, centred: Tensor) -> None:
+    """Add n rows with a mean and the scatter of the `centred` rows, (B, D)."""
+    old = moments(matrix)
+    total = old.n + n
+    delta = mean - old.mean
+    # The means' own difference is one more row: one product in place, where D = 4096 makes every copy 134 MB.
+    rows = torch.cat([centred, delta[None] * (old.n * n / total) ** 0.5])
+    old.scatter.addmm_(rows.T, rows)
+    old.mean.add_(delta, alpha=n / total)
+    matrix[0, 0] = total
+
+
 class FrechetDistance(FeatureMetric):
     """Frechet distance between features of real and generated scans, of Heusel et al. (2017).
 
@@ -69,8 +127,11 @@ class FrechetDistance(FeatureMetric):
 
     def __init__(self, extractor: Extractor | str, keep: bool = False, **options: Any) -> None:
         super().__init__(extractor, keep, **options)
+        dim = self.extractor.dim
         for side in SIDES:
-            self.add_state(f"{side}_moments", no_moments(self.extractor.dim), dist_reduce_fx=merge_moments)
+            self.add_state(
+                f"{side}_moments", torch.zeros(1 + dim, 1 + dim, dtype=torch.float64), dist_reduce_fx=merge_moments
+            )
 
     def accumulate(self, rows: Tensor, side: Side) -> None:
         add_moments(getattr(self, f"{side}_moments"), rows)

@@ -50,7 +50,9 @@ class Scans:
                 f"images of {sensor.name} have the shape (B, 2 or 1, {h}, {w}), not {tuple(images.shape)}."
             )
         images = images.float()
-        check_values(images, names)
+        for number, image in enumerate(images):
+            if wrong := _wrong_with(image):
+                raise InputError(f"scan {number if names is None else names[number]}: {wrong}.")
         self.rays, self._measured = rays, xyz
         r = images[:, :1]
         self.images = torch.where((r > MASK[0]) & (r < MASK[1]), images, torch.zeros_like(images))
@@ -111,17 +113,6 @@ def on_bin_corners(r: Tensor, sensor: Sensor) -> Tensor:
     degrees = np.meshgrid(sensor.row_edges[:-1], 180 - 360 * np.arange(sensor.columns) / sensor.columns, indexing="ij")
     e, a = (torch.from_numpy(one).float().deg2rad().to(r.device) for one in degrees)
     return torch.cat([r * e.cos() * a.cos(), r * e.cos() * a.sin(), r * e.sin()], 1)
-
-
-def check_values(images: Tensor, names: Sequence[object] | None = None) -> None:
-    """Refuse images, (B, 2 or 1, H, W), with values that no scan has.
-
-    Raises:
-        InputError: what is wrong with the first such scan.
-    """
-    for number, image in enumerate(images):
-        if wrong := _wrong_with(image):
-            raise InputError(f"scan {number if names is None else names[number]}: {wrong}.")
 
 
 def _wrong_with(image: Tensor) -> str | None:

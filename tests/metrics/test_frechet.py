@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.metrics.frechet import FrechetDistance, frechet_distance
-from r2flow.metrics.moments import add_moments, merge_moments, moments, no_moments
+from r2flow.metrics.frechet import FrechetDistance, add_moments, frechet_distance, merge_moments, moments
+
+
+def zeros(d):
+    """Moments of no scan."""
+    return torch.zeros(1 + d, 1 + d, dtype=torch.float64)
 
 
 def positive(d, seed, rank=None):
@@ -59,7 +63,7 @@ def test_reference_figures(shared):
     for case in cases.values():
         sides = []
         for rows in (case["f1"], case["f2"]):
-            matrix = no_moments(rows.shape[1])
+            matrix = zeros(rows.shape[1])
             for batch in rows.split(17):
                 add_moments(matrix, batch)
             sides += [moments(matrix).mean, moments(matrix).covariance]
@@ -70,7 +74,7 @@ def test_float32_features_far_from_zero_lose_nothing():
     far = (1e4 + 1e-2 * torch.randn(999, 12, dtype=torch.float64)).float()
     x = far.double().numpy()
     expected = np.cov(x, rowvar=False)
-    parts = torch.stack([no_moments(12) for _ in range(3)])
+    parts = torch.stack([zeros(12) for _ in range(3)])
     for k, batch in enumerate(far.split(10)):
         add_moments(parts[k % 3], batch)
     for found in (moments(merge_moments(parts)), moments(merge_moments(parts.flip(0)))):
@@ -81,10 +85,10 @@ def test_float32_features_far_from_zero_lose_nothing():
 
 def test_empty_parts_change_nothing():
     rows = torch.randn(9, 4)
-    one = no_moments(4)
+    one = zeros(4)
     add_moments(one, rows)
     add_moments(one, rows[:0])
-    assert torch.equal(merge_moments(torch.stack([no_moments(4), one, no_moments(4)])), one)
+    assert torch.equal(merge_moments(torch.stack([zeros(4), one, zeros(4)])), one)
 
 
 def test_fewer_scans_than_dimensions_is_exact_and_said(scans_of, summary):

@@ -14,11 +14,7 @@ class Extractors(Registry["type[Extractor]"]):
     """Networks by name."""
 
     def add(self, name: str, entry: type[Extractor]) -> None:
-        """Enter a network of your own, and with it the metrics of its features.
-
-        Raises:
-            ValueError: the name is taken.
-        """
+        """Enter a network of your own, and with it the metrics of its features."""
         from r2flow.metrics import add_network
 
         super().add(name, entry)

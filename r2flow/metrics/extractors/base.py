@@ -41,19 +41,12 @@ class Extractor(nn.Module):
         Args:
             tensors: By their published names.
             config: The published archive's config; often empty.
-
-        Raises:
-            InputError: weights of another network.
         """
         return cls().filled(tensors)
 
     @classmethod
     def trained(cls) -> Self:
-        """The network with the weights that are on this machine.
-
-        Raises:
-            InputError: there are none.
-        """
+        """The network with the weights that are on this machine."""
         from r2flow.metrics.extractors.weights import read_kept
 
         return read_kept(cls)
@@ -66,11 +59,7 @@ class Extractor(nn.Module):
             return cls().requires_grad_(False).eval()
 
     def filled(self, tensors: Mapping[str, Tensor]) -> Self:
-        """The network with these parameters, none missing and none left over, in evaluation mode.
-
-        Raises:
-            InputError: parameters of another network, or some that are not finite.
-        """
+        """The network with these parameters, none missing and none left over, in evaluation mode."""
         # A count of training steps that inference does not read; older files lack it.
         counts = {name: value for name, value in self.state_dict().items() if name.endswith("num_batches_tracked")}
         try:

@@ -103,11 +103,7 @@ def add(name: str, path: Path) -> str:
 
 
 def read_kept(cls: type[E]) -> E:
-    """A network with the weights that are kept for it, in evaluation mode on the CPU.
-
-    Raises:
-        InputError: none are kept, or not whole.
-    """
+    """A network with the weights that are kept for it, in evaluation mode on the CPU."""
     path = kept_file(cls.name)
     if not path.exists():
         raise InputError(
@@ -215,11 +211,7 @@ def _is_plain(name: object, value: object) -> bool:
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors of a safetensors file, and the notes of `add`.
-
-    Raises:
-        InputError: not such a file, or a damaged one.
-    """
+    """Tensors of a safetensors file, and the notes of `add`."""
     try:
         with safe_open(path, framework="pt") as file:
             noted = parse_json((file.metadata() or {}).get("r2flow", "{}"))
