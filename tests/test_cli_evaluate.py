@@ -88,18 +88,8 @@ def test_a_scale_of_reflectance_is_asked_for_where_it_matters(r2flow, real, tmp_
 
 def test_a_figure_that_does_not_exist_is_null_and_said(r2flow, real, tmp_path):  # noqa: F811
     empty = folder(tmp_path / "empty", np.zeros((2, 2, 8, 64), np.float32))
-    code, said, _ = r2flow(
-        "evaluate",
-        real,
-        empty,
-        "--metrics",
-        "mmd",
-        *QUICK[2:],
-        "--json",
-        tmp_path / "e.json",
-        "--out",
-        tmp_path / "page",
-    )
+    options = ("--metrics", "mmd", *QUICK[2:], "--json", tmp_path / "e.json", "--out", tmp_path / "page")
+    code, said, _ = r2flow("evaluate", real, empty, *options)
     assert code == 0
     (metric,) = json.loads((tmp_path / "e.json").read_text(), parse_constant=refuse)["comparisons"][0]["metrics"]
     assert metric["figures"] == {"mmd": None}
@@ -113,21 +103,8 @@ def test_a_figure_that_does_not_exist_is_null_and_said(r2flow, real, tmp_path): 
 
 def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):  # noqa: F811
     run = saved[0].parent.parent
-    code, said, _ = r2flow(
-        "evaluate",
-        real,
-        run,
-        "--metrics",
-        "jsd",
-        "--num",
-        3,
-        "--steps",
-        2,
-        "--workers",
-        0,
-        "--json",
-        tmp_path / "e.json",
-    )
+    options = ("--metrics", "jsd", "--num", 3, "--steps", 2, "--workers", 0, "--json", tmp_path / "e.json")
+    code, said, _ = r2flow("evaluate", real, run, *options)
     assert code == 0
     about = json.loads((tmp_path / "e.json").read_text())["comparisons"][0]["generated"]
     assert (about["kind"], about["num"], about["sampler"]["steps"], about["noise"]) == ("sampled", 3, 2, "evaluation")
@@ -157,19 +134,8 @@ def points(r2flow, real, tmp_path):  # noqa: F811
     """The sampled sets of an evaluation, as `report paper` reads them, and its Markdown page."""
 
     def measure(*arguments: object) -> tuple[list[dict[str, Any]], str]:
-        options = (
-            "--metrics",
-            "jsd",
-            "--num",
-            4,
-            "--workers",
-            0,
-            "--no-reference",
-            "--no-baselines",
-            "--out",
-            tmp_path,
-        )
-        code, _, err = r2flow("evaluate", real, *arguments, *options)
+        options = ("--metrics", "jsd", "--num", 4, "--workers", 0, "--no-reference", "--no-baselines")
+        code, _, err = r2flow("evaluate", real, *arguments, *options, "--out", tmp_path)
         assert code == 0, err
         return read_results([tmp_path / "evaluation.json"]), (tmp_path / "evaluation.md").read_text()
 

@@ -36,12 +36,3 @@ def test_a_dropped_ray_is_the_origin_in_units_of_80_m(network):
     points = torch.cat([batch.points[0], torch.zeros(1, 3)]).T[None] / 80
     order = torch.randperm(points.shape[2])
     torch.testing.assert_close(network.features(batch), network(points[:, :, order]), rtol=1e-5, atol=1e-5)
-
-
-def test_pointnet_s_features_are_of_each_scan_alone(network):
-    images = torch.rand(3, 1, *SMALL.shape) * 50 + 1
-    images[1] = 0
-    features = network.features(Scans(images, SMALL))
-    assert features.shape == (3, network.dim) == (3, 1808)
-    assert features[1].isnan().all()
-    torch.testing.assert_close(features[2:], network.features(Scans(images[2:], SMALL)), rtol=1e-5, atol=1e-5)

@@ -113,30 +113,7 @@ def test_weights_bring_their_normalisation_and_their_classes(network):
         RangeNet21.from_tensors({name: t for name, t in tensors.items() if name != "stem.0.weight"}, {})
 
 
-def test_rangenet21_s_features_are_of_each_scan_alone(network):
-    batch = scans()
-    batch.images[1] = 0
-    features = network.features(batch)
-    assert features.shape == (3, network.dim) == (3, 512)
-    assert features[1].isnan().all()
-    torch.testing.assert_close(features[2:], network.features(Scans(batch.images[2:], SMALL)), rtol=1e-5, atol=1e-5)
-    assert not features.requires_grad
-    # Range alone: reflectance is not looked at.
-    alone = network.features(Scans(batch.images[:, :1], SMALL))
-    torch.testing.assert_close(alone, features, rtol=0, atol=0, equal_nan=True)
-
-
 @pytest.mark.parametrize("size", [(16, 40), (12, 32)])
 def test_sizes_that_the_network_cannot_take_name_the_option(network, size):
     with pytest.raises(InputError, match="--size"):
         network.features(Scans(torch.ones(1, 1, *size), SENSORS["hdl64e"].resized(*size)))
-
-
-@pytest.mark.slow
-def test_rangenet53_takes_reflectance():
-    network, batch = RangeNet53.random(0), scans(2)
-    features = network.features(batch)
-    assert features.shape == (2, 4096)
-    assert features.isfinite().all()
-    brighter = batch.images * torch.tensor([1.0, 0.5]).view(1, 2, 1, 1)
-    assert (network.features(Scans(brighter, SMALL)) != features).any()

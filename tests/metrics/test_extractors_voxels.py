@@ -3,11 +3,9 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
-from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.minkowski import MinkowskiNet
 from r2flow.metrics.extractors.spvcnn import SPVCNN
 from r2flow.metrics.extractors.voxels import mean_by_distance, voxelise
-from r2flow.metrics.scans import Scans
 
 SMALL = SENSORS["hdl64e"].resized(8, 32)
 
@@ -46,31 +44,6 @@ def test_sectors_by_hand():
     assert mean_by_distance(features, coords).tolist() == [2, 15] + [0] * 14
     far = coords * 1000
     assert mean_by_distance(features, far).tolist() == [0] * 16
-
-
-@pytest.mark.parametrize("cls", [MinkowskiNet, SPVCNN])
-def test_the_sparse_networks_features_are_of_each_scan_alone(cls):
-    network = cls.random(0)
-    images = torch.rand(3, 1, *SMALL.shape) * 50 + 1
-    images[1] = 0
-    features = network.features(Scans(images, SMALL))
-    assert features.shape == (3, network.dim) == (3, 768)
-    assert features[1].isnan().all()
-    assert features[[0, 2]].isfinite().all()
-    torch.testing.assert_close(features[2:], network.features(Scans(images[2:], SMALL)), rtol=0, atol=0)
-    alone = torch.zeros(1, 1, *SMALL.shape)
-    alone[0, 0, 4, 7] = 10
-    assert network.features(Scans(alone, SMALL)).isfinite().all()  # a single return
-    assert not features.requires_grad
-
-
-def test_random_weights_are_the_seed_s():
-    before = torch.get_rng_state()
-    one, same, other = (EXTRACTORS["minkowskinet"].random(seed).stem[0].kernel for seed in (1, 1, 2))
-    assert torch.equal(one, same)
-    assert not torch.equal(one, other)
-    assert torch.equal(torch.get_rng_state(), before)
-    assert EXTRACTORS["minkowskinet"].random().weights == "random"
 
 
 @pytest.mark.parametrize("cls", [MinkowskiNet, SPVCNN])

@@ -116,15 +116,6 @@ def test_any_sensor_and_size_with_and_without_reflectance(sensor, shape):
     torch.testing.assert_close(of_range, torch.cat(list(same.values()), 1))
 
 
-def test_an_empty_scan_leaves_its_neighbours_alone():
-    some = random_scans(3).images
-    alone = BOTH.features(Scans(some[1:], SENSOR))
-    some[0] = 0
-    found = BOTH.features(Scans(some, SENSOR))
-    assert found.isfinite().all(1).tolist() == [False, True, True]
-    torch.testing.assert_close(found[1:], alone)
-
-
 def test_a_scan_of_one_return_and_the_same_scan_among_many_have_features():
     one = torch.zeros(*SENSOR.shape)
     one[3, 7] = 12.0

@@ -89,12 +89,6 @@ def test_one_mode_of_two_is_precise_and_recalls_half():
     assert coverage < 0.55
 
 
-def test_too_few_scans_have_no_neighbours():
-    found, said = figures(np.zeros((5, 3)), np.zeros((9, 3)))
-    assert np.isnan(found).all()
-    assert any("too few real scans to have 5 neighbours each" in one for one in said)
-
-
 def kernel_distance(real, generated):
     metric = KernelDistance(Given())
     metric.update(Rows(real), real=True)

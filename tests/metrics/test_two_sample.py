@@ -68,9 +68,3 @@ def test_simulated_scans_of_two_seeds_are_alike_and_of_fewer_returns_are_not():
     other.update(images[:24], real=True)
     other.update(thinned, real=False)
     assert other.compute()["auc"] > 0.95
-
-
-def test_too_few_scans_are_said():
-    found = metric(torch.randn(3, 2), torch.randn(9, 2))
-    assert math.isnan(found.compute()["auc"])
-    assert "4 scans" in found.remarks()[0]
