@@ -1,6 +1,6 @@
 """Fills the blocks of api.md, command_line.md and config.md from the code: python docs/reference.py
 
-A block stands below a comment that says what it is made of, as `<!-- signatures r2flow:load -->`.
+A block stands below a comment that says what it is made of, as `<!-- signatures :load -->` for `r2flow.load`.
 With --check nothing is written, and a page that differs from the code is an error.
 """
 
@@ -33,8 +33,7 @@ VERBS |= {f"report-{name}": verb for name, verb in VERBS.pop("report").commands.
 def first(text: str | None) -> str:
     """The first sentence of a docstring, a help text or a comment, without its full stop."""
     paragraph = re.sub(r"\s+", " ", (text or "").strip().split("\n\n")[0])
-    sentence = re.split(r"(?<=\.)\s+(?=[A-Z`])", paragraph)[0]
-    return re.sub(r"(?<=[\w)`])\.$", "", re.split(r": python train.py |; |\. ", sentence)[0])
+    return re.sub(r"(?<=[\w)`%\"])\.$", "", re.split(r": python train.py |(?<=\.)\s+(?=[A-Za-z`])", paragraph)[0])
 
 
 def plain(annotation: Any) -> str:
@@ -51,7 +50,7 @@ def plain(annotation: Any) -> str:
 def signatures(*places: str) -> Iterator[str]:
     """Of each `module:name` its signature and what it is; of a registry its names."""
     for place in places:
-        module, _, names = place.partition(":")
+        module, _, names = f"r2flow{place}".partition(":")
         thing = import_module(module)
         for name in names.split("."):
             thing = getattr(thing, name)
@@ -60,7 +59,7 @@ def signatures(*places: str) -> Iterator[str]:
             continue
         call = "" if isinstance(thing, property) else plain(inspect.signature(thing)).removesuffix(" -> None")
         call = call.replace("(self, ", "(").replace("(self)", "()")
-        yield f"{module}.{names}{call}\n    # {first(inspect.getdoc(thing))}"
+        yield f"{module + '.' if '.' not in names else ''}{names}{call}\n    # {first(inspect.getdoc(thing))}"
 
 
 def option(parameter: Any, annotation: Any) -> tuple[str, str]:
@@ -97,7 +96,7 @@ def verbs(*names: str) -> Iterator[str]:
 
 def config(group: str, *shown: str) -> Iterator[str]:
     """The choices of a config group, `.` for the top, and the keys of those that are named."""
-    files = sorted((CONF / group).glob("*.yaml"), key=lambda file: [*shown, file.stem].index(file.stem))
+    files = sorted((CONF / group).glob("*.yaml"), key=lambda file: ([*shown, file.stem].index(file.stem), file.stem))
     seen: set[str] = set()
     for file in files:
         top = re.match(r"(?:# @.*\n)?((?:# .*\n)*)", text := file.read_text())
