@@ -18,7 +18,7 @@ import numpy as np
 from r2flow.lidar.sensors import Sensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # compared and hashed by identity
 class Lasers:
     """B lasers on a spinning head.
 
@@ -226,20 +226,16 @@ RIGS = ((*_ROOF, Silhouette(-69, -20.0, 11.0, 4.4, 0.55)), _ROOF)
 
 
 @lru_cache(maxsize=16)
-def _hidden(elevation: tuple[float, ...], side: tuple[float, ...], columns: int, rig: int) -> np.ndarray:
+def hidden(lasers: Lasers, columns: int, rig: int) -> np.ndarray:
+    """Rays that end on the own car, (B, W), bool, for one of `RIGS`."""
     azimuth = 180 - 360 * (np.arange(columns) + 0.5) / columns
-    e = np.rad2deg(np.array(elevation))[:, None]
-    hidden = np.zeros((len(elevation), columns), bool)
+    e = np.rad2deg(lasers.elevation)[:, None]
+    hidden = np.zeros((len(e), columns), bool)
     for s in RIGS[rig]:
-        shift = np.rad2deg(np.arctan2(np.array(side), s.away))[:, None]
+        shift = np.rad2deg(np.arctan2(lasers.side, s.away))[:, None]
         across = ((azimuth - shift - s.azimuth + 180) % 360 - 180) / s.half_width
         up = (e - s.elevation) / s.half_height
         up = np.maximum(up, 0) if s.grounded else up
         hidden |= np.abs(across) ** s.power + np.abs(up) ** s.power < 1
     hidden.setflags(write=False)
     return hidden
-
-
-def hidden(lasers: Lasers, columns: int, rig: int) -> np.ndarray:
-    """Rays that end on the own car, (B, W), bool, for one of `RIGS`."""
-    return _hidden(tuple(lasers.elevation.tolist()), tuple(lasers.side.tolist()), columns, rig)

@@ -31,6 +31,12 @@ _CARS = (
 _SILL, _BONNET = 0.22, 0.70  # metres: heights of the body's lower edge and of the bonnet's front
 
 
+def _beside(x: float, y: float, yaw: float, u: float, v: float = 0.0) -> tuple[float, float]:
+    """The place u metres ahead of (x, y) along yaw and v metres to the left."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return x + u * c - v * s, y + u * s + v * c
+
+
 def car(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = False) -> None:
     """A body with plates, a bonnet that rises to the windscreen, a cabin with panes, four wheels."""
     draws = b.draws
@@ -39,15 +45,16 @@ def car(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = False) -
     ground, label = b.level(x, y), "moving-car" if moving else "car"
     dark = draws.chance(0.45)
     paint, albedo = ("dark paint", b.albedo("dark paint")) if dark else ("paint", draws.uniform(0.12, 0.62))
-    c, s = math.cos(yaw), math.sin(yaw)
     u, long = -form.shift * length, form.cabin * length
-    cabin_x, cabin_y, waist = x + u * c, y + u * s, ground + form.waist
+    cabin, waist = _beside(x, y, yaw, u), ground + form.waist
     bonnet = (length / 2 - (u + long / 2)) / (form.waist - _BONNET)  # leans all the way to the windscreen
     parts = (
         (Frusta(x, y, yaw, length, width, ground + _SILL, ground + _BONNET, 0.12, 0.08, 0.04), BODY),
         (Frusta(x, y, yaw, length - 0.1, width - 0.04, ground + _BONNET, waist, bonnet, 0.3, 0.10), BODY),
         (
-            Frusta(cabin_x, cabin_y, yaw, long, width - 0.10, waist, ground + form.roof, form.screen, form.rear, 0.25),
+            Frusta(
+                *_beside(x, y, yaw, u), yaw, long, width - 0.10, waist, ground + form.roof, form.screen, form.rear, 0.25
+            ),
             CABIN,
         ),
     )
@@ -55,8 +62,8 @@ def car(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = False) -
         b.add(part, label, paint, albedo, pattern=pattern, base=ground)
     for i in (-1, 1):
         for j in (-1, 1):
-            u, v = i * length * 0.30, j * (width / 2 - 0.10)
-            wheel = Boxes(x + u * c - v * s, y + u * s + v * c, yaw, 0.60, 0.22, ground, ground + 0.62)
+            place = _beside(x, y, yaw, i * length * 0.30, j * (width / 2 - 0.10))
+            wheel = Boxes(*place, yaw, 0.60, 0.22, ground, ground + 0.62)
             b.add(wheel, label, "rubber")
 
 
@@ -64,30 +71,22 @@ def truck(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = False)
     """A delivery van or lorry: cab in front of a box on wheels."""
     length, width, height = b.draws.uniform(5.5, 9.5), b.draws.uniform(2.0, 2.5), b.draws.uniform(2.4, 3.6)
     ground, label = b.level(x, y), "moving-truck" if moving else "truck"
-    c, s = math.cos(yaw), math.sin(yaw)
     cab = 1.9
-    albedo = b.draws.uniform(0.2, 0.7)
-    front, rear = (length - cab) / 2, -cab / 2
-    b.add(
-        Frusta(x + front * c, y + front * s, yaw, cab, width - 0.1, ground + 0.45, ground + 2.3, 0.25, 0, 0.04),
-        label, "paint", albedo, pattern=BODY, base=ground,
-    )  # fmt: skip
-    b.add(
-        Boxes(x + rear * c, y + rear * s, yaw, length - cab, width, ground + 0.75, ground + height),
-        label, "paint", b.draws.uniform(0.2, 0.7),
-    )  # fmt: skip
+    front, rear = _beside(x, y, yaw, (length - cab) / 2), _beside(x, y, yaw, -cab / 2)
+    driver = Frusta(*front, yaw, cab, width - 0.1, ground + 0.45, ground + 2.3, 0.25, 0, 0.04)
+    b.add(driver, label, "paint", b.draws.uniform(0.2, 0.7), pattern=BODY, base=ground)
+    load = Boxes(*rear, yaw, length - cab, width, ground + 0.75, ground + height)
+    b.add(load, label, "paint", b.draws.uniform(0.2, 0.7))
     for u in (-0.35 * length, 0.34 * length):
         for v in (-width / 2 + 0.16, width / 2 - 0.16):
-            wheel = Boxes(x + u * c - v * s, y + u * s + v * c, yaw, 0.9, 0.3, ground, ground + 0.9)
-            b.add(wheel, label, "rubber")
+            b.add(Boxes(*_beside(x, y, yaw, u, v), yaw, 0.9, 0.3, ground, ground + 0.9), label, "rubber")
 
 
 def bicycle(b: SceneBuilder, x: float, y: float, yaw: float, label: str = "bicycle") -> None:
     """Two wheels of spokes and a frame."""
-    ground, c, s = b.level(x, y), math.cos(yaw), math.sin(yaw)
+    ground = b.level(x, y)
     for u in (-0.52, 0.52):
-        wheel = Boxes(x + u * c, y + u * s, yaw, 0.62, 0.05, ground, ground + 0.66)
-        b.add(wheel, label, "rubber", closed=0.4)
+        b.add(Boxes(*_beside(x, y, yaw, u), yaw, 0.62, 0.05, ground, ground + 0.66), label, "rubber", closed=0.4)
     b.add(Boxes(x, y, yaw, 0.9, 0.06, ground + 0.35, ground + 0.95), label, "metal", closed=0.5)
 
 
@@ -105,11 +104,10 @@ def house(b: SceneBuilder, x: float, y: float, yaw: float, length: float, width:
     )  # fmt: skip
     b.add(roof, "building", "brick")
     if b.draws.chance(0.5):
-        c, s = math.cos(yaw), math.sin(yaw)
         u = b.draws.uniform(-0.35, 0.35) * length
         for v in (-width / 2, width / 2):
             bay = Boxes(
-                x + u * c - v * s, y + u * s + v * c, yaw, b.draws.uniform(1.4, 3.5), b.draws.uniform(0.8, 2.4),
+                *_beside(x, y, yaw, u, v), yaw, b.draws.uniform(1.4, 3.5), b.draws.uniform(0.8, 2.4),
                 ground - 1, ground + b.draws.uniform(2.4, height),
             )  # fmt: skip
             b.add(bay, "building", wall, albedo, pattern=FACADE, base=ground)
@@ -175,11 +173,9 @@ def woods(b: SceneBuilder, x: float, y: float) -> None:
 def hedge(b: SceneBuilder, x: float, y: float, yaw: float, length: float, height: float) -> None:
     """A trimmed hedge, in pieces of different height and depth; open where it meets a carriageway."""
     albedo = b.albedo("leaves")
-    c, s = math.cos(yaw), math.sin(yaw)
     pieces = max(1, round(length / 2.5))
     for piece in range(pieces):
-        u = ((piece + 0.5) / pieces - 0.5) * length
-        px, py = x + u * c, y + u * s
+        px, py = _beside(x, y, yaw, ((piece + 0.5) / pieces - 0.5) * length)
         ground = b.level(px, py)
         box = Boxes(
             px, py, yaw + b.draws.uniform(-0.03, 0.03), length / pieces + 0.1, b.draws.uniform(0.7, 1.1),
@@ -199,11 +195,10 @@ def fence(b: SceneBuilder, x: float, y: float, yaw: float, length: float) -> Non
         return
     closed = 1.0 if style < 0.6 else b.draws.uniform(0.25, 0.7)
     b.add(Boxes(x, y, yaw, length, 0.04, ground, ground + height), "fence", "wood", closed=closed)
-    c, s = math.cos(yaw), math.sin(yaw)
     posts = max(2, round(length / 2.5))
     for post in range(posts):
-        u = (post / (posts - 1) - 0.5) * length
-        b.add(Cylinders(x + u * c, y + u * s, 0.05, ground, ground + height + 0.08), "fence", "wood")
+        place = _beside(x, y, yaw, (post / (posts - 1) - 0.5) * length)
+        b.add(Cylinders(*place, 0.05, ground, ground + height + 0.08), "fence", "wood")
 
 
 def pole(b: SceneBuilder, x: float, y: float) -> None:
@@ -220,8 +215,7 @@ def sign(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
     ground, low = b.level(x, y), b.draws.uniform(1.7, 2.4)
     size = b.draws.uniform(0.45, 0.8)
     b.add(Cylinders(x, y, 0.04, ground - 0.3, ground + low + size), "pole", "metal")
-    c, s = math.cos(yaw), math.sin(yaw)
-    plate = Boxes(x + 0.07 * c, y + 0.07 * s, yaw, 0.03, size, ground + low, ground + low + size)
+    plate = Boxes(*_beside(x, y, yaw, 0.07), yaw, 0.03, size, ground + low, ground + low + size)
     b.add(plate, "traffic-sign", "retro")
 
 
@@ -251,14 +245,10 @@ def person(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = True)
     ground, tall = b.level(x, y), b.draws.uniform(1.55, 1.9)
     label = "moving-person" if moving else "person"
     albedo, stride = b.albedo("cloth"), b.draws.uniform(0.05, 0.25)
-    c, s = math.cos(yaw), math.sin(yaw)
     for side in (-1, 1):
-        u, v = side * stride, side * 0.09
-        leg = Cylinders(x + u * c - v * s, y + u * s + v * c, 0.08, ground, ground + 0.48 * tall)
-        b.add(leg, label, "cloth")
-        u, v = -side * stride * 0.7, side * 0.23
-        arm = Blobs(x + u * c - v * s, y + u * s + v * c, ground + 0.64 * tall, 0.07, 0.17 * tall, 0)
-        b.add(arm, label, "cloth", albedo)
+        leg, arm = _beside(x, y, yaw, side * stride, side * 0.09), _beside(x, y, yaw, -side * stride * 0.7, side * 0.23)
+        b.add(Cylinders(*leg, 0.08, ground, ground + 0.48 * tall), label, "cloth")
+        b.add(Blobs(*arm, ground + 0.64 * tall, 0.07, 0.17 * tall, 0), label, "cloth", albedo)
     b.add(Blobs(x, y, ground + 0.66 * tall, 0.20, 0.21 * tall, 0), label, "cloth", albedo)
     b.add(Blobs(x, y, ground + 0.93 * tall, 0.11, 0.13, 0), label, "skin")
 
@@ -268,6 +258,5 @@ def cyclist(b: SceneBuilder, x: float, y: float, yaw: float) -> None:
     bicycle(b, x, y, yaw, "moving-bicyclist")
     ground, albedo = b.level(x, y), b.albedo("cloth")
     b.add(Blobs(x, y, ground + 1.25, 0.22, 0.34, 0), "moving-bicyclist", "cloth", albedo)
-    b.add(Blobs(x + 0.1 * math.cos(yaw), y + 0.1 * math.sin(yaw), ground + 1.68, 0.11, 0.13, 0),
-          "moving-bicyclist", "skin")  # fmt: skip
+    b.add(Blobs(*_beside(x, y, yaw, 0.1), ground + 1.68, 0.11, 0.13, 0), "moving-bicyclist", "skin")
     b.add(Cylinders(x, y, 0.12, ground + 0.4, ground + 1.0), "moving-bicyclist", "cloth")
