@@ -28,27 +28,16 @@ def _larger(x: Where, y: Where) -> Where:
 
 
 class Street(NamedTuple):
-    """A strip along v = offset + curvature u^2 / 2, u along the heading and v to its left.
+    """A strip along v = offset + curvature u^2 / 2, u along the heading and v to its left."""
 
-    Attributes:
-        heading: Direction in radians.
-        offset: Lateral place v of the middle line in metres.
-        curvature: 1 / radius, 1 / metre.
-        half_width: Half of the carriageway in metres.
-        pavement: Width of the pavement beside it in metres; 0 for none.
-        start: Where it begins, metres along.
-        stop: Where it ends.
-        lines: Lateral places of painted lines in metres from the middle; the middle one is dashed.
-    """
-
-    heading: float
-    offset: float
-    curvature: float
-    half_width: float
-    pavement: float
-    start: float = -1e6
-    stop: float = 1e6
-    lines: tuple[float, ...] = ()
+    heading: float  # direction in radians
+    offset: float  # lateral place v of the middle line in metres
+    curvature: float  # 1 / radius, 1 / metre
+    half_width: float  # half of the carriageway in metres
+    pavement: float  # width of the pavement beside it in metres; 0 for none
+    start: float = -1e6  # where it begins, metres along
+    stop: float = 1e6  # where it ends
+    lines: tuple[float, ...] = ()  # lateral places of painted lines in metres from the middle; the middle one is dashed
 
     def locate(self, x: Where, y: Where) -> tuple[Where, Where]:
         """(u, lateral): metres along the street and to the left of its middle line."""
@@ -95,31 +84,19 @@ class Ground:
     """z = -drop + lean . p + sum_k A_k [sin(k . p + phi) - sin phi - cos phi (k . p)] + banks, and a kerb.
 
     The bracket has neither height nor slope at the origin, where the car stands.
-
-    Attributes:
-        waves: Rows (A in metres, k_x and k_y in radians / metre, phi).
-        lean: Slope of the ground along x and y relative to the car, which leans on its springs.
-        drop: How much lower than usual the ground is below the sensor, in metres.
-        streets: The streets; without any, all of the ground is verge.
-        kerb: Height of the kerb in metres.
-        tufts: Height in metres of grass and rubble beyond the pavements.
-        banks: Rise beside the first street, left and right, in metres.
-        corner: Radius of the kerb where streets meet, in metres.
-        verge: (label, material) of the ground beyond the pavements.
-        patches: Rectangles of other surfaces beside the street.
-        albedo: Reflectance reading of each material here, (M,).
     """
 
-    waves: tuple[tuple[float, float, float, float], ...] = ()
-    lean: tuple[float, float] = (0.0, 0.0)
-    drop: float = 0.0
-    streets: tuple[Street, ...] = ()
-    kerb: float = 0.0
-    tufts: float = 0.0
-    banks: tuple[float, float] = (0.0, 0.0)
-    corner: float = 4.0
-    verge: tuple[int, int] = (LABELS["terrain"], INDEX["grass"])
-    patches: tuple[Patch, ...] = ()
+    waves: tuple[tuple[float, float, float, float], ...] = ()  # rows (A in metres, k_x and k_y in radians / metre, phi)
+    lean: tuple[float, float] = (0.0, 0.0)  # slope along x and y relative to the car, which leans on its springs
+    drop: float = 0.0  # how much lower than usual the ground is below the sensor, in metres
+    streets: tuple[Street, ...] = ()  # the streets; without any, all of the ground is verge
+    kerb: float = 0.0  # height of the kerb in metres
+    tufts: float = 0.0  # height in metres of grass and rubble beyond the pavements
+    banks: tuple[float, float] = (0.0, 0.0)  # rise beside the first street, left and right, in metres
+    corner: float = 4.0  # radius of the kerb where streets meet, in metres
+    verge: tuple[int, int] = (LABELS["terrain"], INDEX["grass"])  # (label, material) of the ground beyond the pavements
+    patches: tuple[Patch, ...] = ()  # rectangles of other surfaces beside the street
+    # Reflectance reading of each material here, (M,).
     albedo: np.ndarray = field(default_factory=lambda: column("albedo"))
 
     def height(self, x: Where, y: Where) -> Where:
@@ -244,15 +221,8 @@ def _meet_profile(s: np.ndarray, z: np.ndarray, slope: np.ndarray, height: np.nd
     """Where rays of falling slopes T and nearly equal heights meet profiles z(s).
 
     The piece that a ray meets is found with the mean height of the lasers, the place on it with the ray's own.
-
-    Args:
-        s: Distances of the profile's points, (S, 1).
-        z: Heights of the ground there, (S, W).
-        slope: T of each ray, (R,).
-        height: Height of each laser, (R,).
-
-    Returns:
-        Distance of the first meeting, inf for none, and the slope of the ground there; (R, W) each.
+    s is (S, 1), z (S, W), slope and height (R,); returned are the distance of the first meeting, inf for none, and the
+    slope of the ground there, (R, W) each.
     """
     (samples, columns), rays = z.shape, len(slope)
     skyline = np.maximum.accumulate((z - height.mean()) / s, axis=0)

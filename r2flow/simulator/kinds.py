@@ -14,41 +14,23 @@ Span = tuple[float, float]
 
 
 class Kind(NamedTuple):
-    """A kind of place.
+    """A kind of place."""
 
-    Attributes:
-        share: How often it is drawn.
-        half_width: Half of the carriageway, from and to, in metres.
-        pavement: Width of the pavement, from and to, in metres.
-        setback: Distance of the houses from the pavement, from and to, in metres.
-        gap: Mean gap between houses in metres.
-        storeys: From and to.
-        built: Share of plots with a house; the others are green.
-        parked: Share of the kerb taken by parked cars.
-        plants: Trees and bushes for each 10 metres of front.
-        hedges: Share of fronts with a hedge.
-        fences: Share of fronts with a fence or wall.
-        people: Mean number of people.
-        traffic: Mean number of moving vehicles.
-        paved: Probability that the ground between pavement and houses is paved, not lawn.
-        crossing: Probability of a crossing street.
-    """
-
-    share: float
-    half_width: Span
-    pavement: Span
-    setback: Span
-    gap: float
-    storeys: tuple[int, int]
-    built: float
-    parked: float
-    plants: float
-    hedges: float
-    fences: float
-    people: float
-    traffic: float
-    paved: float
-    crossing: float
+    share: float  # how often it is drawn
+    half_width: Span  # half of the carriageway, from and to, in metres
+    pavement: Span  # width of the pavement, from and to, in metres
+    setback: Span  # distance of the houses from the pavement, from and to, in metres
+    gap: float  # mean gap between houses in metres
+    storeys: tuple[int, int]  # from and to
+    built: float  # share of plots with a house; the others are green
+    parked: float  # share of the kerb taken by parked cars
+    plants: float  # trees and bushes for each 10 metres of front
+    hedges: float  # share of fronts with a hedge
+    fences: float  # share of fronts with a fence or wall
+    people: float  # mean number of people
+    traffic: float  # mean number of moving vehicles
+    paved: float  # probability that the ground between pavement and houses is paved, not lawn
+    crossing: float  # probability of a crossing street
 
 
 KINDS = {

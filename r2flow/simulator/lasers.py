@@ -20,27 +20,16 @@ from r2flow.lidar.sensors import Sensor
 
 @dataclass(frozen=True, eq=False)  # compared and hashed by identity
 class Lasers:
-    """B lasers on a spinning head.
+    """B lasers on a spinning head."""
 
-    Attributes:
-        elevation: Inclination E in radians, falling, (B,).
-        height: Height z of each laser above the sensor's origin in metres, (B,).
-        side: Distance of each laser to the left of the axis, seen outwards, in metres, (B,).
-        block: Number of the lens block of each laser, (B,); the lasers of one block are close together.
-        phase: Where in its first azimuth bin each laser fires first, as a share of half a bin, (B,).
-        bias: Error of each laser's range in metres, (B,).
-        gain: Error of each laser's reflectance, (B,).
-        straight: Whether laser b looks along the middles of the bins of the image's row b.
-    """
-
-    elevation: np.ndarray
-    height: np.ndarray
-    side: np.ndarray
-    block: np.ndarray
-    phase: np.ndarray
-    bias: np.ndarray
-    gain: np.ndarray
-    straight: bool
+    elevation: np.ndarray  # inclination E in radians, falling, (B,)
+    height: np.ndarray  # height z of each laser above the sensor's origin in metres, (B,)
+    side: np.ndarray  # distance of each laser to the left of the axis, seen outwards, in metres, (B,)
+    block: np.ndarray  # number of the lens block of each laser, (B,); the lasers of one block are close together
+    phase: np.ndarray  # where in its first azimuth bin each laser fires first, as a share of half a bin, (B,)
+    bias: np.ndarray  # error of each laser's range in metres, (B,)
+    gain: np.ndarray  # error of each laser's reflectance, (B,)
+    straight: bool  # whether laser b looks along the middles of the bins of the image's row b
 
 
 # Inclinations in degrees of an HDL-64E S2, found by fitting z = z_i + s tan E_i to the 64 rings of scans of
@@ -114,16 +103,11 @@ class Rays:
 
     Every ray is p(s) = (s cos a, s sin a, z + s T): s the horizontal distance, a the azimuth of the column, T = tan E
     the slope of the laser and z its height. An upright surface is met at an s that depends on the column alone.
-
-    Attributes:
-        lasers: The lasers, (B,).
-        columns: Number W of azimuths; column w looks along a = pi - 2 pi (w + 1/2) / W.
-        ground: Height of the sensor's origin above the scene's z = 0, in metres.
     """
 
     lasers: Lasers
-    columns: int
-    ground: float = 0.0
+    columns: int  # number W of azimuths; column w looks along a = pi - 2 pi (w + 1/2) / W
+    ground: float = 0.0  # height of the sensor's origin above the scene's z = 0, in metres
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -9,25 +9,15 @@ import numpy as np
 
 
 class Material(NamedTuple):
-    """One material.
-
-    Attributes:
-        name: Name.
-        albedo: Usual reflectance at perpendicular incidence.
-        spread: Standard deviation of albedo from one object to the next.
-        texture: Standard deviation of reflectance from one pixel to the next.
-        gloss: g in the incidence falloff (1 + g) c / (c + g), c the cosine; a mirror has a large g.
-        swallow: Share of pulses that do not return, whatever the angle and distance.
-        depth: Mean depth in metres at which pulses return from inside (leaves, grass).
-    """
+    """One material."""
 
     name: str
-    albedo: float
-    spread: float
-    texture: float
-    gloss: float
-    swallow: float
-    depth: float
+    albedo: float  # usual reflectance at perpendicular incidence
+    spread: float  # standard deviation of albedo from one object to the next
+    texture: float  # standard deviation of reflectance from one pixel to the next
+    gloss: float  # g in the incidence falloff (1 + g) c / (c + g), c the cosine; a mirror has a large g
+    swallow: float  # share of pulses that do not return, whatever the angle and distance
+    depth: float  # mean depth in metres at which pulses return from inside (leaves, grass)
 
 
 MATERIALS = (

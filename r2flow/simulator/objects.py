@@ -46,17 +46,12 @@ def car(b: SceneBuilder, x: float, y: float, yaw: float, moving: bool = False) -
     dark = draws.chance(0.45)
     paint, albedo = ("dark paint", b.albedo("dark paint")) if dark else ("paint", draws.uniform(0.12, 0.62))
     u, long = -form.shift * length, form.cabin * length
-    cabin, waist = _beside(x, y, yaw, u), ground + form.waist
+    cabin, waist, roof = _beside(x, y, yaw, u), ground + form.waist, ground + form.roof
     bonnet = (length / 2 - (u + long / 2)) / (form.waist - _BONNET)  # leans all the way to the windscreen
     parts = (
         (Frusta(x, y, yaw, length, width, ground + _SILL, ground + _BONNET, 0.12, 0.08, 0.04), BODY),
         (Frusta(x, y, yaw, length - 0.1, width - 0.04, ground + _BONNET, waist, bonnet, 0.3, 0.10), BODY),
-        (
-            Frusta(
-                *_beside(x, y, yaw, u), yaw, long, width - 0.10, waist, ground + form.roof, form.screen, form.rear, 0.25
-            ),
-            CABIN,
-        ),
+        (Frusta(*cabin, yaw, long, width - 0.10, waist, roof, form.screen, form.rear, 0.25), CABIN),
     )
     for part, pattern in parts:
         b.add(part, label, paint, albedo, pattern=pattern, base=ground)

@@ -71,21 +71,13 @@ DRIFT = 0.03  # of half a bin: shift of the firings from one bin to the next
 
 
 class Hits(NamedTuple):
-    """What each ray meets first; (B, W) each. Rays that meet nothing have distance inf and label 0.
+    """What each ray meets first; (B, W) each. Rays that meet nothing have distance inf and label 0."""
 
-    Attributes:
-        distance: Horizontal distance s from the sensor's axis in metres.
-        cosine: Cosine of the angle between ray and surface normal.
-        label: SemanticKITTI id.
-        material: Index into `materials.MATERIALS`.
-        albedo: Reflectance at perpendicular incidence.
-    """
-
-    distance: np.ndarray
-    cosine: np.ndarray
-    label: np.ndarray
-    material: np.ndarray
-    albedo: np.ndarray
+    distance: np.ndarray  # horizontal distance s from the sensor's axis in metres
+    cosine: np.ndarray  # cosine of the angle between ray and surface normal
+    label: np.ndarray  # SemanticKITTI id
+    material: np.ndarray  # index into `materials.MATERIALS`
+    albedo: np.ndarray  # reflectance at perpendicular incidence
 
 
 def cast(scene: Scene, rays: Rays, rng: np.random.Generator) -> Hits:

@@ -36,17 +36,9 @@ TEXTURE, GLOSS, SWALLOW, DEPTH = (column(name) for name in ("texture", "gloss", 
 def report(
     sensor: Sensor, rays: Rays, hits: Hits, rig: int | None, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The image and labels that a sensor reports.
+    """Range in metres and reflectance, (2, H, W), float32, and labels (H, W), uint16, that a sensor reports of hits.
 
-    Args:
-        sensor: The sensor, for its rows and range limits.
-        rays: The rays that were cast.
-        hits: What they met, (B, W).
-        rig: Number of the silhouettes of the own car, or None without.
-        rng: Source of the noise.
-
-    Returns:
-        image (2, H, W), float32: range in metres and reflectance; labels (H, W), uint16; 0 where missing.
+    All are 0 where a return is missing; `rig` is the number of the silhouettes of the own car, or None without.
     """
     slope, rise = rays.slope[:, None], rays.height[:, None] - np.float32(rays.ground)
     noise = normals(rng, (2, *rays.shape))

@@ -15,40 +15,24 @@ PLAIN, FACADE, CABIN, BODY = range(4)  # patterns that divide a surface among ma
 
 
 class Surface(NamedTuple):
-    """The surfaces of solids; every field (P,).
+    """The surfaces of solids; every field (P,)."""
 
-    Attributes:
-        label: SemanticKITTI id.
-        material: Index into `materials.MATERIALS`.
-        albedo: Reflectance at perpendicular incidence.
-        closed: Share of the rays that the solid stops, less than 1 for a fence of slats.
-        pattern: PLAIN, FACADE (windows), CABIN (panes), BODY (number plates and lamps).
-        base: Height of the ground at the solid, above which patterns are measured.
-    """
-
-    label: np.ndarray
-    material: np.ndarray
-    albedo: np.ndarray
-    closed: np.ndarray
-    pattern: np.ndarray
-    base: np.ndarray
+    label: np.ndarray  # SemanticKITTI id
+    material: np.ndarray  # index into `materials.MATERIALS`
+    albedo: np.ndarray  # reflectance at perpendicular incidence
+    closed: np.ndarray  # share of the rays that the solid stops, less than 1 for a fence of slats
+    pattern: np.ndarray  # PLAIN, FACADE (windows), CABIN (panes), BODY (number plates and lamps)
+    base: np.ndarray  # height of the ground at the solid, above which patterns are measured
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything that rays can meet, in metres; z = 0 is the usual ground below the sensor.
-
-    Attributes:
-        ground: The ground.
-        solids: Tables of solids, one of each kind.
-        surfaces: Their surfaces, one table for each of `solids`.
-        rig: Number of the silhouettes of the own car, or None without.
-    """
+    """Everything that rays can meet, in metres; z = 0 is the usual ground below the sensor."""
 
     ground: Ground
-    solids: tuple[Shape, ...] = ()
-    surfaces: tuple[Surface, ...] = ()
-    rig: int | None = None
+    solids: tuple[Shape, ...] = ()  # tables of solids, one of each kind
+    surfaces: tuple[Surface, ...] = ()  # their surfaces, one table for each of `solids`
+    rig: int | None = None  # number of the silhouettes of the own car, or None without
 
 
 class SceneBuilder:

@@ -29,21 +29,14 @@ class Fragments(NamedTuple):
 
 
 class Normal(NamedTuple):
-    """The orientation of a surface where it was met; every field (N,).
-
-    Attributes:
-        x, y, z: Outward unit normal.
-        along: Metres along the face from its middle; 0 where there is no face.
-        end: Whether it is the front or back of a box.
-        flat: Whether it is a plane.
-    """
+    """The outward unit normal of a surface where it was met; every field (N,)."""
 
     x: np.ndarray
     y: np.ndarray
     z: np.ndarray
-    along: np.ndarray
-    end: np.ndarray
-    flat: np.ndarray
+    along: np.ndarray  # metres along the face from its middle; 0 where there is no face
+    end: np.ndarray  # whether it is the front or back of a box
+    flat: np.ndarray  # whether it is a plane
 
 
 class Shape(Protocol):
@@ -73,15 +66,8 @@ class Boxes(NamedTuple):
     def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal:
         """Of the face that the point (N,) lies nearest to."""
         u, v, c, s = _into(self, k, x, y)
-        outside = np.stack(
-            [
-                np.abs(u) - self.length[k] / 2,
-                np.abs(v) - self.width[k] / 2,
-                z - self.top[k],
-                self.bottom[k] - z,
-            ]
-        )
-        face = outside.argmax(0)
+        sides = np.abs(u) - self.length[k] / 2, np.abs(v) - self.width[k] / 2
+        face = np.stack([*sides, z - self.top[k], self.bottom[k] - z]).argmax(0)
         nu = np.where(face == 0, np.sign(u), 0)
         nv = np.where(face == 1, np.sign(v), 0)
         nz = (face == 2).astype(np.float32) - (face == 3)
@@ -235,13 +221,8 @@ def _into(solids: "Boxes | Frusta", k: np.ndarray, x: Column, y: Column) -> tupl
 
 
 def _box_spans(solids: "Boxes | Frusta", rays: Rays) -> tuple[np.ndarray, ...]:
-    """Where each column enters and leaves the outlines of the solids seen from above.
-
-    Returns:
-        Solid k, column w, and the horizontal distances near < far in metres; (N,) each.
-    """
-    everyone = np.arange(len(solids.x))
-    u, v, c, s = _into(solids, everyone, np.float32(0), np.float32(0))
+    """Where each column w enters and leaves the outlines of solids k seen from above: k, w, near < far in metres."""
+    u, v, c, s = _into(solids, np.arange(len(solids.x)), np.float32(0), np.float32(0))
     a, b = solids.length / 2, solids.width / 2
     corner_x = [solids.x + i * a * c - j * b * s for i, j in _CORNERS]
     corner_y = [solids.y + i * a * s + j * b * c for i, j in _CORNERS]
