@@ -155,7 +155,8 @@ class Backbone(ExactBuffers):
         rows, columns = rows.to(self.coords.device), columns.to(self.coords.device)
         part.coords = self.coords.index_select(-2, rows).index_select(-1, columns)
         if len(columns) < self.coords.shape[-1]:
-            open_rings(part)
+            for module in part.modules():
+                getattr(module, "open_ring", lambda: None)()
         part.follow_rays()
         return part
 
@@ -176,12 +177,6 @@ class Backbone(ExactBuffers):
                     f"{dimension} {size} cannot be used by {name} with these options: it must be a multiple of {unit}; "
                     f"nearest: {nearest}."
                 )
-
-
-def open_rings(network: nn.Module) -> None:
-    """Let the columns of all layers of a network have two ends from now on."""
-    for module in network.modules():
-        getattr(module, "open_ring", lambda: None)()
 
 
 def precondition(t: Tensor, data_std: float) -> tuple[Tensor, Tensor, Tensor]:

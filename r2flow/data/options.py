@@ -11,7 +11,7 @@ from r2flow.generators.base import Precision
 from r2flow.lidar.projection import Convention, Projection
 from r2flow.lidar.scan_files import check_columns
 from r2flow.registry import NonNegative, Positive, check_options
-from r2flow.samplers import build_sampler, knot_times
+from r2flow.samplers import build_sampler
 
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # in the table `r2flow.data.opening.SOURCES`
 Data = dict[str, Any]  # of a config
@@ -116,7 +116,7 @@ class PairOptions:
             )
         sampler = build_sampler(self.sampler).asdict()
         if self.knots:
-            knot_times(sampler, self.knots)
+            build_sampler(sampler).knot_times(self.knots)
         size = self.batch_size * 2 * math.prod(shape) * (1 + (self.knots or 0))
         shard_batches = max(round(self.shard_mib * 2**20 / size), 1)
         return PairRecipe(

@@ -20,7 +20,7 @@ from r2flow.flow.solvers import Solution
 from r2flow.generators import Generated, Generator, as_flow
 from r2flow.generators.base import Precision, autocast
 from r2flow.models import name_of
-from r2flow.samplers import build_sampler, knot_times
+from r2flow.samplers import build_sampler
 from r2flow.store import PATIENCE, Damaged, Store
 
 ELSEWHERE = "data.root=FOLDER (r2flow pairs --out FOLDER)"  # how another folder is given
@@ -52,7 +52,7 @@ class Block(NamedTuple):
         x_1: (n, C, H, W) float16.
         evaluations: (n,) int32.
         usable: (n,) bool.
-        knots: Inner states of each path, (n, K, C, H, W) float16, at `r2flow.flow.solvers.knot_times`, or None.
+        knots: Inner states of each path, (n, K, C, H, W) float16, at `r2flow.samplers.Sampler.knot_times`, or None.
     """
 
     x_1: np.ndarray
@@ -302,7 +302,7 @@ class PairDataset(Dataset[Item]):
         self.source, self.seed, self.purpose = source, seed, purpose
         self.scans, self.order = scans, order
         recipe = source.store.recipe
-        self.times = knot_times(recipe.sampler, recipe.knots).float() if recipe.knots else None
+        self.times = build_sampler(recipe.sampler).knot_times(recipe.knots).float() if recipe.knots else None
 
     def __len__(self) -> int:
         return len(self.source)

@@ -18,6 +18,7 @@ from torch.nn.utils.rnn import pad_sequence
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers.grids import build_grid
+from r2flow.flow.solvers.solution import selected
 from r2flow.flow.times import TIMES
 from r2flow.registry import Portion, Registry
 
@@ -179,17 +180,11 @@ def consistency(u: MeanVelocity, paths: Paths, t: Tensor, s: Tensor, rho: Tensor
     if bool(learned.any()):
         t, s, rho, v = t[learned], s[learned], rho[learned], v[learned]
         ahead, share = rho * (s - t), expand_time(rho, v)
-        u = _select(u, learned.nonzero()[:, 0])
+        u = selected(u, learned.nonzero()[:, 0])
         with torch.no_grad():
             later = u(t + ahead, x_t[learned] + expand_time(ahead, v) * v, s)
         target[learned] = share * v + (1 - share) * later
     return Aim(x_t, target)
-
-
-def _select(u: MeanVelocity, rows: Tensor) -> MeanVelocity:
-    """The map for some of the scans, where it has a condition for each (`r2flow.generators.flow.Conditioned`)."""
-    select: Callable[[Tensor], MeanVelocity] | None = getattr(u, "select", None)
-    return select(rows) if select else u
 
 
 OBJECTIVES: Registry[Objective] = Registry(

@@ -137,12 +137,7 @@ class NetworkFlow(Flow):
 
 
 class RectifiedFlow(NetworkFlow):
-    """v(t, x) by a backbone: 1-RF, k-RF and k-TD alike, which differ in how they are learned and in their sampler.
-
-    Args:
-        space: The images it makes.
-        backbone: Name and options, as in conf/backbone.
-    """
+    """v(t, x) by a backbone: 1-RF, k-RF and k-TD alike, which differ in how they are learned and in their sampler."""
 
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space, backbone)

@@ -15,11 +15,8 @@ from r2flow.samplers import Jump
 class FlowMap(RectifiedFlow):
     """X_{t->s}(x) = x + (s - t) u(x, t, s) with u by a backbone of two times.
 
-    It is run by `r2flow.samplers.maps`, and by a flow's samplers with v(t, x) = u(x, t, t).
-
-    Args:
-        space: The images it makes.
-        backbone: Name and options, as in conf/backbone, of one that takes a second time.
+    It is run by `r2flow.samplers.maps`, and by a flow's samplers with v(t, x) = u(x, t, t). Its backbone takes a second
+    time.
     """
 
     second_time: ClassVar[bool] = True

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 import yaml
-from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.solvers import SOLVERS, usual_grid
@@ -26,7 +25,7 @@ from r2flow.samplers.stochastic import SDE
 __all__ = [
     "MMPS", "SAMPLERS", "SDE", "Adaptive", "Chord", "Condition", "FixedSteps", "Generated", "Jump", "Noise",
     "ODESampler", "OnGrid", "Posterior", "Progress", "Renoise", "Repaint", "Replace", "Sampler", "TorchDiffEq",
-    "Transport", "build_sampler", "knot_times", "parse_sampler",
+    "Transport", "build_sampler", "parse_sampler",
 ]  # fmt: skip
 
 
@@ -96,8 +95,3 @@ def build_sampler(options: str | Mapping[str, Any], **fields: Any) -> Sampler:
         raise InputError(f"a sampler needs a 'name' and its fields, found {options!r}.")
     sampler: Sampler = SAMPLERS.build(_with_steps({k: v for k, v in {**options, **fields}.items() if v is not None}))
     return sampler
-
-
-def knot_times(options: Mapping[str, Any], knots: int) -> Tensor:
-    """Times of both ends and of the inner states that a sampler keeps, (knots + 2,) float64."""
-    return build_sampler(options).knot_times(knots)

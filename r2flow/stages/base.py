@@ -117,9 +117,11 @@ class Stage(L.LightningModule):
         """`learning_rate_factor` over the run, or its warm-up alone where the rate does not fall."""
         total = max(int(self.trainer.max_steps), 1)
         warmup = min(self.warmup_steps, total)
-        if not self.anneals:
-            return torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: min(1.0, step / warmup) if warmup else 1.0)
-        return torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: learning_rate_factor(step, warmup, total))
+
+        def factor(step: int) -> float:
+            return learning_rate_factor(step, warmup, total) if self.anneals or step < warmup else 1.0
+
+        return torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
 
     def own_optimizers(self) -> list[LightningOptimizer]:
         """The optimisers of a stage with manual optimisation, in the order of `optimizers_for`.

@@ -11,7 +11,7 @@ from r2flow.flow.solvers import SOLVERS, EmbeddedMethod, FixedStep, named_grid, 
 from r2flow.flow.solvers.external import TorchDiffEqMethod, torchdiffeq_methods
 from r2flow.flow.solvers.fixed import weights
 from r2flow.generators import Field
-from r2flow.samplers import build_sampler, knot_times
+from r2flow.samplers import build_sampler
 
 
 def logistic(t, x):
@@ -141,8 +141,7 @@ def test_the_global_error_is_estimated_and_its_cost_counted(method):
     error = (owned.x - logistic_solution(X_0, 1)).square().mean(1).sqrt()
     assert torch.equal(plain.x, owned.x)
     assert plain.global_error is None
-    assert torch.equal(owned.evaluations - owned.estimate_evaluations, plain.evaluations)
-    assert (owned.estimate_evaluations > 0).all()
+    assert (owned.evaluations > plain.evaluations).all()
     assert (owned.global_error > error / 5).all()
     assert (owned.global_error < error * 5).all()
 
@@ -257,4 +256,4 @@ def test_knots_are_states_of_the_path(method):
 def test_knots_that_a_sampler_does_not_have_are_refused():
     for sampler in ("adams3:steps=10", "dopri5", "torchdiffeq:method=rk4", "jump", "adams3:steps=8:finish=0.1"):
         with pytest.raises(InputError, match="inner states"):
-            knot_times(build_sampler(sampler).asdict(), 3)
+            build_sampler(sampler).knot_times(3)

@@ -15,7 +15,7 @@ from r2flow.flow.solvers.exponential import ExponentialMethod, automatic, exprb4
 from r2flow.flow.solvers.external import TORCHDIFFEQ, TorchDiffEqMethod
 from r2flow.flow.solvers.fixed import FixedStep, adams, euler, heun2, heun3, midpoint, rk4
 from r2flow.flow.solvers.grids import build_grid, named_grid
-from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Velocity, finite, flat, wide
+from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Velocity, finite, flat, selected, wide
 from r2flow.registry import Registry
 
 __all__ = [
@@ -98,8 +98,9 @@ def solve(
     if t_0 == t_1 or not len(x):
         return _at_rest(x, global_error, knots)
     times = torch.tensor([t_0, t_1], dtype=torch.float64) if how.adapts else build_grid(grid, t_0, t_1, steps)
-    limits = Limits(tolerance, max_evaluations, max_step=max_step)
-    solution = how.solve(Evaluations(velocity, len(x), progress), x, times, limits, knots)
+    assert not knots or isinstance(how, FixedStep)
+    limits = Limits(tolerance, max_evaluations, max_step=max_step, knots=knots)
+    solution = how.solve(Evaluations(velocity, len(x), progress), x, times, limits)
     if not (global_error and how.adapts):
         return solution
     return _with_global_error(solution, how, velocity, x, times, limits._replace(tighter=TIGHTER), progress)
@@ -132,25 +133,20 @@ def _with_global_error(
     error = torch.full((len(x),), math.inf, dtype=torch.float64)
     extra = torch.zeros_like(solution.evaluations)
     if len(scenes):
-        select = getattr(velocity, "select", None)
-        own = select(scenes) if select is not None else velocity
-        here = scenes.to(x.device)
+        here, own = scenes.to(x.device), selected(velocity, scenes)
         second = how.solve(Evaluations(own, len(scenes), progress), x[here], times, limits)
         rms = flat((solution.x[here] - second.x).detach().double().square()).mean(1).sqrt().cpu()
         error[scenes], extra[scenes] = torch.where(second.converged, rms, math.inf), second.evaluations
-    evaluations = solution.evaluations + extra
-    return replace(solution, evaluations=evaluations, global_error=error, estimate_evaluations=extra)
+    return replace(solution, evaluations=solution.evaluations + extra, global_error=error)
 
 
 def _at_rest(x: Tensor, global_error: bool, knots: int) -> Solution:
     """The solution of an empty interval or an empty batch."""
     solution = Solution.build(x, np.zeros(len(x)), 0, 0, False, finite(x).cpu().numpy())
-    nothing = torch.zeros(len(x), dtype=torch.float64)
     return replace(
         solution,
         knots=torch.stack([x] * knots, 1) if knots else None,
-        global_error=nothing if global_error else None,
-        estimate_evaluations=nothing.long() if global_error else None,
+        global_error=torch.zeros(len(x), dtype=torch.float64) if global_error else None,
     )
 
 

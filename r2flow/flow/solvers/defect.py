@@ -67,8 +67,7 @@ class Tried(NamedTuple):
 
     def roughness(self) -> np.ndarray:
         """h times the third difference of v, in tolerances, (B,)."""
-        found: np.ndarray = self.changes(weighted(self.method.third_difference, self.k))[0]
-        return found
+        return self.changes(weighted(self.method.third_difference, self.k))[0]
 
 
 @dataclass
@@ -198,7 +197,7 @@ def _ask(v: Evaluations, control: StepController, places: np.ndarray, theta: np.
     """v of some scenes within their step; NaN where the budget is used up."""
     found, able = torch.full_like(x, math.nan), control.able(v.counts, places)
     if able.any():
-        t = torch.from_numpy(control.within_step(places, theta)).to(x.device, x.dtype)
+        t = torch.from_numpy(control.time(control.reached[places] + theta * control.h[places])).to(x.device, x.dtype)
         chosen = able.nonzero()[0]
         found[torch.from_numpy(able).to(x.device)] = v.some(places[able], rows(t, chosen), rows(x, chosen))
     return found

@@ -1,7 +1,8 @@
 """Embedded Runge-Kutta methods: a step and an estimate of its error from the same stages."""
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from torch import Tensor
@@ -9,7 +10,8 @@ from torch import Tensor
 from r2flow.flow.solvers.solution import Evaluations, Limits, Solution
 
 
-class EmbeddedMethod(NamedTuple):
+@dataclass(frozen=True)
+class EmbeddedMethod:
     """The Butcher tableau of an explicit embedded method whose last stage is the next step's first (FSAL).
 
     Its last two stages are at the same t, by which stiffness is seen.
@@ -28,6 +30,8 @@ class EmbeddedMethod(NamedTuple):
         defect: Largest defect of a step in tolerances: several times that of accurate steps of the exact problems.
     """
 
+    adapts: ClassVar[bool] = True  # whether steps are chosen by a tolerance
+
     order: int
     nodes: tuple[float, ...]
     rows: tuple[tuple[float, ...], ...]
@@ -39,16 +43,10 @@ class EmbeddedMethod(NamedTuple):
     rough: tuple[int, int, int, int]
     defect: float
 
-    @property
-    def adapts(self) -> bool:
-        """Whether steps are chosen by a tolerance."""
-        return True
-
-    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits, knots: int = 0) -> Solution:
+    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
         """Solve every scene of x, (B, ...), from the first time to the last by steps of its own."""
         from r2flow.flow.solvers.adaptive import advance
 
-        assert not knots
         return advance(v, x, float(times[0]), float(times[-1]), self, limits)[0]
 
     @property

@@ -8,8 +8,9 @@ finite differences of v, one evaluation each. Scenes are solved one after anothe
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -25,24 +26,21 @@ KRYLOV = 0.05  # error of a function of J, in tolerances
 SAFETY, SHRINK, GROW = 0.8, 0.2, 8.0
 
 
-class ExponentialMethod(NamedTuple):
+@dataclass(frozen=True)
+class ExponentialMethod:
     """An exponential method.
 
     Attributes:
         start: The explicit method that solves the scenes which are not stiff; None where all are taken for stiff.
     """
 
+    adapts: ClassVar[bool] = True  # whether steps are chosen by a tolerance
+
     order: int = 4
     start: EmbeddedMethod | None = None
 
-    @property
-    def adapts(self) -> bool:
-        """Whether steps are chosen by a tolerance."""
-        return True
-
-    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits, knots: int = 0) -> Solution:
+    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
         """Solve every scene of x, (B, ...), from t_0 to t_1: the stiff ones, or all, one after another."""
-        assert not knots
         t_0, t_1 = float(times[0]), float(times[-1])
         if self.start is None:
             at = np.full(len(x), t_0)

@@ -45,7 +45,7 @@ class TorchDiffEqMethod:
 
         return not issubclass(torchdiffeq_methods()[self.name], FixedGridODESolver)
 
-    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits, knots: int = 0) -> Solution:
+    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
         """Solve one scene after another, since torchdiffeq has one error norm for a batch, which hides a hard scene.
 
         Args:
@@ -53,7 +53,6 @@ class TorchDiffEqMethod:
         """
         import torchdiffeq
 
-        assert not knots
         grid = times.to(x)
         # By the state's type: the velocity has not been called yet.
         tolerance = attainable(limits, v.coarsest(x)) if self.adapts else limits.tolerance

@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -15,7 +15,8 @@ from r2flow.flow.solvers.solution import Evaluations, Limits, Solution, Velocity
 Step = Callable[[Velocity, Tensor, Tensor, Tensor], Tensor]
 
 
-class FixedStep(NamedTuple):
+@dataclass(frozen=True)
+class FixedStep:
     """One step x(t) -> x(t + h).
 
     Attributes:
@@ -28,6 +29,8 @@ class FixedStep(NamedTuple):
         corrects: Whether that function has a corrector.
     """
 
+    adapts: ClassVar[bool] = False  # whether steps are chosen by a tolerance
+
     step: Callable[..., Any]
     order: int
     evaluations: int
@@ -35,17 +38,12 @@ class FixedStep(NamedTuple):
     multistep: bool = False
     corrects: bool = False
 
-    @property
-    def adapts(self) -> bool:
-        """Whether steps are chosen by a tolerance."""
-        return False
-
     def cost(self, steps: int) -> int:
         """Evaluations of a number of steps."""
         return self.start + steps * self.evaluations
 
-    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits | None = None, knots: int = 0) -> Solution:
-        """Take the steps of a time grid, (N + 1,) float64; keep `knots` inner states, equally many steps apart.
+    def solve(self, v: Evaluations, x: Tensor, times: Tensor, limits: Limits) -> Solution:
+        """Take the steps of a time grid, (N + 1,) float64; keep inner states, equally many steps apart.
 
         A scene whose state is no longer finite keeps its last finite one; the others are not affected.
         """
@@ -55,6 +53,7 @@ class FixedStep(NamedTuple):
         def inside(t: Tensor, state: Tensor) -> Tensor:
             return v(t.clamp(low, high), state)  # t + h can round to 1 + 1e-7
 
+        knots = limits.knots
         alive, kept, apart = finite(x), [], (len(times) - 1) // (knots + 1)
         for n, (t, following) in enumerate(pairwise(times)):
             if knots and n and n % apart == 0:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from r2flow.flow.path import expand_time
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
+V = TypeVar("V", bound=Callable[..., Any])
 PerScene = np.ndarray | Sequence[int] | Sequence[bool] | int | bool
 
 
@@ -29,7 +30,6 @@ class Solution:
         converged: Scenes that reached t_1 with finite values, (B,) bool.
         global_error: Estimated root mean square error over a scene's elements, (B,) float64; inf where there is no
             estimate; None when not asked for.
-        estimate_evaluations: Those of the evaluations that the estimate took, (B,) int64; None when not asked for.
         knots: Inner states that were asked for, (B, K, ...); None when not asked for.
     """
 
@@ -40,7 +40,6 @@ class Solution:
     stiff: Tensor
     converged: Tensor
     global_error: Tensor | None = None
-    estimate_evaluations: Tensor | None = None
     knots: Tensor | None = None
 
     @classmethod
@@ -69,6 +68,7 @@ class Limits(NamedTuple):
         tighter: The tolerance used is the attainable one divided by this.
         max_step: Longest step as a share of the interval.
         until_stiff: Whether a scene is left where it turns out to be stiff.
+        knots: Inner states to keep, of a method of fixed steps.
     """
 
     tolerance: float
@@ -76,6 +76,7 @@ class Limits(NamedTuple):
     tighter: float = 1.0
     max_step: float = 1.0
     until_stiff: bool = False
+    knots: int = 0
 
 
 class Evaluations:
@@ -129,9 +130,13 @@ class Evaluations:
     def only(self, scenes: np.ndarray) -> None:
         """The state now holds these scenes, indices into the original batch."""
         self.scenes = scenes
-        select = getattr(self._whole, "select", None)
-        if select is not None:
-            self._velocity = select(torch.from_numpy(scenes))
+        self._velocity = selected(self._whole, torch.from_numpy(scenes))
+
+
+def selected(velocity: V, scenes: Tensor) -> V:
+    """The velocity of some scenes, (N,) int64, where it differs between them: by its method `select`."""
+    select: Callable[[Tensor], V] | None = getattr(velocity, "select", None)
+    return velocity if select is None else select(scenes)
 
 
 def _own_types(velocity: Velocity) -> set[torch.dtype]:

@@ -32,7 +32,7 @@ class StepController:
         self.method, self.limits, self.nodes = method, limits, np.array(method.nodes)[:, None]
         self.t_0, self.direction = t_0, math.copysign(1.0, t_1 - t_0)
         self.length, self.t_end = abs(t_1 - t_0), t_1
-        self.low, self.high = sorted((t_0, self.t_end))
+        self.low, self.high = sorted((t_0, t_1))
         self.longest = limits.max_step * self.length
         self.eps = eps
         self.scenes, self.places = scenes, np.arange(len(scenes))
@@ -56,11 +56,6 @@ class StepController:
         """t at a length from t_0, never beyond the end."""
         t = self.t_0 + self.direction * np.minimum(reached, self.length)
         t = np.where(reached >= self.length, self.t_end, t)
-        return np.minimum(np.maximum(t, self.low), self.high)
-
-    def within_step(self, places: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """t of some scenes at a share of the step that they try, (N,); `time` needs all of them."""
-        t = self.t_0 + self.direction * (self.reached[places] + share * self.h[places])
         return np.minimum(np.maximum(t, self.low), self.high)
 
     def shortest(self) -> np.ndarray:
@@ -113,8 +108,7 @@ class StepController:
 
     def able(self, evaluations: np.ndarray, places: np.ndarray) -> np.ndarray:
         """Which of these scenes can be evaluated once more, (N,) bool."""
-        left: np.ndarray = evaluations[self.scenes[places]] < self.limits.max_evaluations
-        return left
+        return np.asarray(evaluations[self.scenes[places]] < self.limits.max_evaluations)
 
     def shorten(self, place: int, share: float) -> None:
         """A scene's step does not hold: try again with about this share of it."""
