@@ -97,6 +97,9 @@ class Generator(nn.Module):
             draws: Where further noise comes from, `draws.step(shape, j)` at step j = 1, 2, ...
             precision: `bf16-mixed` computes the network's products in bfloat16; states and steps stay as they are.
             progress: Called after every evaluation of the network.
+
+        Raises:
+            InputError: the sampler cannot run this generator, or needs draws or a condition.
         """
         how = sampler or self.sampler
         how.check(self)
@@ -118,6 +121,9 @@ class Generator(nn.Module):
         """The generator's sampler with options that are not None: `few` for fewer steps, or another by its name.
 
         Another sampler takes over the number of steps and has its own defaults.
+
+        Raises:
+            InputError: an unknown name or option, or a sampler that cannot run this generator.
         """
         given = {key: value for key, value in options.items() if value is not None}
         own, steps = self.sampler, getattr(self.sampler, "steps", None)

@@ -21,6 +21,9 @@ def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
         images: Range in metres and, where known, reflectance, (B, 2 or 1, H, W); 0 without a return. Of a scan without
             reflectance, that of its returns is not known; that of an empty ray is.
         state: `r2flow.lidar.known.Ray` of each ray, (B, H, W).
+
+    Raises:
+        InputError: images or states of another shape, or a ray that contradicts its state.
     """
     _, h, w = space.shape
     if images.ndim != 4 or images.shape[1] not in (1, 2) or tuple(images.shape[2:]) != (h, w):

@@ -53,7 +53,11 @@ class Flow(Generator):
         progress: Progress = None,
         **options: Any,
     ) -> Solution:
-        """The state at t_1 of the ODE from x at t_0, (B, ...); see `r2flow.flow.solvers.solve` for the options."""
+        """The state at t_1 of the ODE from x at t_0, (B, ...); see `r2flow.flow.solvers.solve` for the options.
+
+        Raises:
+            InputError: the sampler does not follow the flow's paths.
+        """
         how = sampler or self.sampler
         how.check(self)
         return how.solve(self, x.to(self.device), t_0, t_1, condition, progress, **options)

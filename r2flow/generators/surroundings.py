@@ -83,7 +83,7 @@ class Surroundings(NamedTuple):
 
 
 class RowFeatures(nn.Embedding):
-    """What a network is told of each row: a learned vector, elevation, angles between rows and between columns.
+    """What a network is given of each row: a learned vector, elevation, angles between rows and between columns.
 
     The vector is that of a row of the trained images, or of two together; rows of any other sensor have one for all.
 
@@ -107,7 +107,7 @@ class RowFeatures(nn.Embedding):
         Args:
             elevations: Of the rows in radians, (B, H).
             steps: Angle between rows and between columns, (B, 2).
-            known: Whether the learned vectors are told, (B,) bool; None for yes.
+            known: Whether the learned vectors are given, (B,) bool; None for yes.
         """
         off = (elevations[..., None] - self.elevations.to(elevations)).abs()
         same = (off.amin(-1) < SAME).all(1)

@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from r2flow.errors import InputError
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Sensor
 from r2flow.registry import Positive, Registry
@@ -165,13 +166,19 @@ class Encoding:
         """(..., 2 or 1, H, W) in metres and reflectance of [0, 1] -> (..., channels, H, W).
 
         A dropped ray, range 0, becomes exactly -1 (the origin, 0, under `cartesian`; nearly -1 under `shifted_log`).
+
+        Raises:
+            InputError: reflectance is a channel of the model and the image has none.
         """
         r = image[..., :1, :, :]
         if self.limits == "open":
             r = r * self._between(r)
         y = self.format.forward(r)
         if self.reflectance:
-            assert image.shape[-3] == 2, "a model of reflectance is given a scan without"
+            if image.shape[-3] < 2:
+                raise InputError(
+                    "the model has a reflectance channel and the scan has none; train with encoding.reflectance=false."
+                )
             y = torch.cat([y, image[..., 1:2, :, :]], dim=-3)
         return 2 * y - 1
 

@@ -3,7 +3,7 @@
 R2Flow's files are a dict of cfg, weights, optimizer, lr_scheduler and num_images.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -86,19 +86,18 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     return Published(published_config(content["cfg"], path), weights, _step(content), {"name": "euler"}, follow_rings)
 
 
+def sensor_of(name: str, resolution: Sequence[int], limits: Mapping[str, Any]) -> dict[str, Any]:
+    """The config of a sensor by the published names of its image's size and of its range limits in metres."""
+    rows, columns = (int(n) for n in resolution)
+    near, far = (float(limits[name]) for name in ("min_depth", "max_depth"))
+    return {"name": name, "rows": rows, "columns": columns, "min_range": near, "max_range": far}
+
+
 def published_config(cfg: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """Our config of a published checkpoint's `cfg`, which holds data, model, flow, training and finetuning."""
     data, model = cfg["data"], cfg["model"]
-    rows, columns = (int(n) for n in data["resolution"])
     return {
-        "sensor": {
-            "name": "hdl64e",
-            "rows": rows,
-            "columns": columns,
-            "min_range": float(data["min_depth"]),
-            "max_range": float(data["max_depth"]),
-            "rays": "reference",
-        },
+        "sensor": {**sensor_of("hdl64e", data["resolution"], data), "rays": "reference"},
         "encoding": {"format": data["data_format"], "reflectance": bool(data["train_reflectance"])},
         "backbone": backbone_of(model, path),
         "data": {

@@ -21,6 +21,9 @@ class Rectify(SingleLoss):
         loss: Name in `r2flow.flow.losses.LOSSES`.
         time: Name and options of a density in `r2flow.flow.times.TIMES`.
         options: Those of `Stage`.
+
+    Raises:
+        InputError: the generator is no flow, or takes a condition; an unknown loss or density.
     """
 
     learns: ClassVar[type[Generator]] = Flow

@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from r2flow.errors import InputError
 from r2flow.lidar.encoding import FORMATS, Encoding
 from r2flow.lidar.sensors import SENSORS
 
@@ -81,3 +82,8 @@ def test_a_nan_is_a_dropped_ray_and_changes_no_other():
     decoded = Encoding(HDL64E).decode(x)
     assert decoded[:, 0, 0].tolist() == [0, 0]
     assert decoded.isfinite().all()
+
+
+def test_missing_reflectance_is_an_error():
+    with pytest.raises(InputError, match="encoding.reflectance=false"):
+        Encoding(HDL64E).encode(torch.ones(1, *HDL64E.shape))

@@ -225,7 +225,7 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
         ("", "empty"),
         ("# nothing\n", "no line of numbers"),
         ("x,y,z\n", "no line"),
-        ("1,5;2,5;3,5\n" * 3, "convert"),  # decimal commas
+        ("1,5;2,5;3,5\n" * 3, "no field"),  # decimal commas
         ("1 2\n3 4\n", "2 columns without names"),
         ("1,2,,4\n" * 3, "NaN"),
         ("time,lat,lon\n1,2,3\n", "no field x, y, z; it has: time, lat, lon"),
@@ -239,7 +239,7 @@ def test_text_that_is_no_scan_is_refused(tmp_path: Path):
         assert "\n" not in str(caught.value)
 
 
-def test_a_table_may_have_units_and_gaps(tmp_path: Path):
+def test_a_table_may_have_units_gaps_and_words(tmp_path: Path):
     """VeloView's numbers of lasers, a sign of degrees in the header, and no numbers in the row of a lost ray."""
     table = zip(XYZ, INTENSITY, RING, strict=True)
     rows = "\n".join(f"{x:.3f},{y:.3f},{z:.3f},{strength},{ring},0" for (x, y, z), strength, ring in table)
@@ -250,6 +250,8 @@ def test_a_table_may_have_units_and_gaps(tmp_path: Path):
     assert points.dropped == 1
     (tmp_path / "b.csv").write_text("x,y,z,intensity\n" + "".join(f"{x},{y},{z},7,\n" for x, y, z in F4))
     same(read_points(tmp_path / "b.csv"), intensity=np.full(500, 7))
+    (tmp_path / "c.csv").write_text("x,y,z,class\n" + "".join(f"{x},{y},{z},a car\n" for x, y, z in F4))
+    same(read_points(tmp_path / "c.csv"), intensity=None)
 
 
 def test_an_intensity_that_nobody_measured_leaves_the_reflectivity(tmp_path: Path):

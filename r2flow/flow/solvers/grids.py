@@ -46,7 +46,12 @@ def named_grid(name: str) -> Callable[[float, float, int], Tensor]:
 
 
 def build_grid(grid: str | Tensor, t_0: float, t_1: float, steps: int) -> Tensor:
-    """Times from t_0 to t_1, (N + 1,) float64 on the CPU, N = steps unless the times are given."""
+    """Times from t_0 to t_1, (N + 1,) float64 on the CPU, N = steps unless the times are given.
+
+    Raises:
+        InputError: an unknown name, steps that are too short for float64, or given times that do not run from t_0 to
+            t_1 in one direction.
+    """
     if isinstance(grid, str):
         times = named_grid(grid)(t_0, t_1, steps)
     else:

@@ -1,6 +1,5 @@
 """Points as columns: rows of floats, NumPy's .npy and .npz, text, Arrow tables, LAS and LAZ."""
 
-import functools
 import io
 import math
 import re
@@ -49,17 +48,17 @@ def read_npz(path: Path, columns: object = None) -> Table:
         table = next(
             (lower[name] for name in TABLES if name in lower), next(iter(members)) if len(members) == 1 else None
         )
-        beside = [name for name in _named(members) if name != table]
+        others = [name for name in _named(members) if name != table]
         arrays = {}
-        for name in [*([table] if table else []), *beside]:
+        for name in [*([table] if table else []), *others]:
             with archive.open(members[name]) as file:
                 arrays[name] = read_array(file, members[name].file_size)
     if table is None:
-        return beside or list(members), list(arrays.values())
+        return others or list(members), list(arrays.values())
     names, fields = _columns_of(arrays.pop(table))
-    if names is None and beside:
+    if names is None and others:
         names = list(usual_names(len(fields), None))
-    return [*names, *beside] if names else None, [*fields, *arrays.values()]
+    return [*names, *others] if names else None, [*fields, *arrays.values()]
 
 
 def _named(names: Iterable[str]) -> list[str]:
@@ -107,11 +106,13 @@ def read_text(path: Path, columns: object = None) -> Table:
         width, comments = len(words(rows[0])), [words(line) for line in lines if line[0] in "#/"]
         named = (line for line in comments if len(line) == width and {"x", "y", "z"} <= {word.lower() for word in line})
         names = next(named, None)
-    read = functools.partial(np.loadtxt, rows, delimiter=apart, comments=None, ndmin=2)
     try:
-        table = read()
-    except ValueError:  # half as fast; a gap, as of a ray without return, is NaN
-        table = read(converters=lambda word: float(word.strip() or "nan"))
+        table = np.loadtxt(rows, delimiter=apart, comments=None, ndmin=2)
+    except ValueError:
+        if apart is None:
+            raise
+        # Slower; a gap, as of a ray without return, and a word are NaN.
+        table = np.genfromtxt(rows, delimiter=apart, comments=None, ndmin=2)  # type: ignore[call-overload]
     return names, list(table.T)
 
 

@@ -76,7 +76,7 @@ def kept(name: str) -> str | None:
     path = kept_file(name)
     if not path.exists():
         return None
-    notes = read_safetensors(path)[1]
+    notes = read_safetensors(path, with_tensors=False)[1]
     return f"{notes['weights']} of {notes['source']}"
 
 
@@ -210,12 +210,12 @@ def _is_plain(name: object, value: object) -> bool:
     return not (value.is_meta or value.is_quantized or value.is_complex())
 
 
-def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read_safetensors(path: Path, with_tensors: bool = True) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors of a safetensors file, and the notes of `add`."""
     try:
         with safe_open(path, framework="pt") as file:
             noted = parse_json((file.metadata() or {}).get("r2flow", "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys() if with_tensors}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError):
         raise InputError(f"{path} is not a safetensors file, or a damaged one.") from None
     return tensors, {"config": {}, "weights": "", "source": path.name, **noted}

@@ -55,8 +55,8 @@ def walk(
         noise: That of step 1, 2, ..., asked in the last step too; None where eta = 0.
         times: What `denoise` is given in each step, (N,); None: the log-SNR.
     """
-    told = log_snrs if times is None else times
-    for j, (t, (here, there)) in enumerate(zip(told, pairwise(log_snrs), strict=False), start=1):
+    times = log_snrs if times is None else times
+    for j, (t, (here, there)) in enumerate(zip(times, pairwise(log_snrs), strict=False), start=1):
         z = step(z, denoise(z, t), here, there, eta, noise(j) if eta and noise else None)
         yield z
 

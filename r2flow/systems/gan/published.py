@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from r2flow.generators import Generator
-from r2flow.model.published import Format, Published
+from r2flow.model.published import Format, Published, sensor_of
 from r2flow.systems.gan.layers import DROPPED
 
 GENERATORS = {"vanilla": "vanilla_gan", "dusty_v1": "dusty1", "dusty_v2": "dusty2"}
@@ -29,13 +29,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     if tuple(angle.shape) != (1, 2, rows, columns):
         raise ValueError(f"the angles, which are {tuple(angle.shape)}, not (1, 2, {rows}, {columns})")
     config = {
-        "sensor": {
-            "name": "hdl64e_rings",
-            "rows": rows,
-            "columns": columns,
-            "min_range": float(dataset["min_depth"]),
-            "max_range": float(dataset["max_depth"]),
-        },
+        "sensor": sensor_of("hdl64e_rings", (rows, columns), dataset),
         "encoding": {"format": "inverse_depth", "reflectance": out["image"]["ch"] == 2},
         "generator": generator,
         "backbone": None,

@@ -2,7 +2,7 @@
 autoencoder alone.
 
 The files say neither the size of the images nor the width of attention heads. Both are in the `config.yaml` that is
-published with them: where that lies beside a file it is read, else they are 64 x 1024 and 32, as in all of them.
+published with them: where that lies next to a file it is read, else they are 64 x 1024 and 32, as in all of them.
 """
 
 import logging
@@ -43,10 +43,10 @@ def holds_autoencoder(content: Any) -> bool:
 
 def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published:
     """A published latent diffusion, with its averaged weights, whose names have lost their dots."""
-    state, beside = _state(content), _beside(path)
+    state, notes = _state(content), _notes(path)
     raw = {name: value for name, value in state.items() if name.startswith((UNET, AUTOENCODER))}
     undotted = {name: AVERAGE + name.removeprefix("model.").replace(".", "") for name in raw}
-    unet = ((beside.get("model") or {}).get("params") or {}).get("unet_config", {}).get("params", {})
+    unet = ((notes.get("model") or {}).get("params") or {}).get("unet_config", {}).get("params", {})
     generator = {
         "name": "latent_diffusion",
         "autoencoder": _autoencoder(_within(raw, AUTOENCODER)),
@@ -56,13 +56,13 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
         "diffusion_steps": len(state["betas"]),
     }
     weights = {name: state.get(undotted[name], value) for name, value in raw.items()} if averaged else raw
-    return Published(_config(generator, path, beside), weights, _step(content), {"name": "latent_ddim"})
+    return Published(_config(generator, path, notes), weights, _step(content), {"name": "latent_ddim"})
 
 
 def read_autoencoder(content: Any, path: Path, averaged: bool = True) -> Published:
     """A published autoencoder; its discriminator is left out."""
     raw = {name: value for name, value in _state(content).items() if not name.startswith("loss.")}
-    config = _config({"name": "vq_autoencoder", "autoencoder": _autoencoder(raw)}, path, _beside(path))
+    config = _config({"name": "vq_autoencoder", "autoencoder": _autoencoder(raw)}, path, _notes(path))
     return Published(config, {AUTOENCODER + name: value for name, value in raw.items()}, _step(content))
 
 
@@ -119,25 +119,25 @@ def _unet(state: Mapping[str, Tensor]) -> dict[str, Any]:
     return {"width": width, "multipliers": multipliers, "blocks": counts[0], "attention": sorted(attention)}
 
 
-def _beside(path: Path) -> Mapping[str, Any]:
-    """The published `config.yaml` beside a file; nothing where there is none."""
+def _notes(path: Path) -> Mapping[str, Any]:
+    """The published `config.yaml` next to a file; nothing where there is none."""
     file = path.with_name("config.yaml")
     try:
         found = yaml.safe_load(file.read_text()) if file.is_file() else {}
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{file}, beside {path.name}, cannot be read: {' '.join(str(error).split())}.") from None
+        raise InputError(f"{file}, next to {path.name}, cannot be read: {' '.join(str(error).split())}.") from None
     return found if isinstance(found, Mapping) else {}
 
 
-def _config(generator: dict[str, Any], path: Path, beside: Mapping[str, Any]) -> dict[str, Any]:
+def _config(generator: dict[str, Any], path: Path, notes: Mapping[str, Any]) -> dict[str, Any]:
     """The config of a file, with what its `config.yaml` says of the data."""
-    if not beside:
+    if not notes:
         heads = f", attention heads of {HEAD} channels" if generator["name"] == "latent_diffusion" else ""
         log.warning(
             "%s has no config.yaml: assumed images of %d x %d, ranges of %g to %g m on a logarithmic scale%s.",
             path, *SIZE, *RANGES, heads,
         )  # fmt: skip
-    images = ((beside.get("data") or {}).get("params") or {}).get("dataset") or {}
+    images = ((notes.get("data") or {}).get("params") or {}).get("dataset") or {}
     rows, columns = (int(size) for size in images.get("size", SIZE))
     nearest, farthest = (float(limit) for limit in images.get("depth_range", RANGES))
     if tuple(images.get("fov", VIEW)) != VIEW:
