@@ -100,5 +100,6 @@ def build_space(config: Mapping[str, Any]) -> ModelSpace:
     convention: Convention = options.pop("rays", "centre")
     check_options("sensor", build_sensor, options)
     sensor = build_sensor(**options)
+    check_options("sensor.rays", sensor.rays, {"convention": convention})
     check_options("encoding", Encoding, config["encoding"], given=1)
     return ModelSpace(sensor, Encoding(sensor, **config["encoding"]), sensor.rays(convention))

@@ -31,6 +31,7 @@ from tests.training.conftest import Run
         (["encoding.format=log"], ["no range format named 'log'", "Did you mean 'logscale'?"]),
         (["encoding.reflectance=maybe"], ["reflectance must be true, false or auto", "'maybe'"]),
         (["sensor.rows=abc"], ["rows must be a whole number or null", "'abc'"]),
+        (["sensor.rays=foo"], ["'centre' or 'reference'", "'foo'"]),
         (["stage.betas=0.9"], ["betas must be a list"]),
         (["stage.time.name=discrete"], ["needs the option 'k'"]),
         (["backbone.depths=3"], ["depths must be a list"]),
