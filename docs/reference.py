@@ -96,7 +96,8 @@ def verbs(*names: str) -> Iterator[str]:
 
 def config(group: str, *shown: str) -> Iterator[str]:
     """The choices of a config group, `.` for the top, and the keys of those that are named."""
-    files = sorted((CONF / group).glob("*.yaml"), key=lambda file: ([*shown, file.stem].index(file.stem), file.stem))
+    files = [file for file in (CONF / group).glob("*.yaml") if file.stem != "base" or "base" in shown]
+    files.sort(key=lambda file: ([*shown, file.stem].index(file.stem), file.stem))
     seen: set[str] = set()
     for file in files:
         top = re.match(r"(?:# @.*\n)?((?:# .*\n)*)", text := file.read_text())

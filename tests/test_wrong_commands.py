@@ -406,6 +406,7 @@ name=x stage.time=uniform
 name=x stage.time.name=null
 name=x +stage.foo=1
 name=x stage.name=nope
+name=x stage=base
 name=x trainer=nope
 name=x trainer.devices=0
 name=x trainer.num_nodes=0

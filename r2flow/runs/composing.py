@@ -130,10 +130,8 @@ def add_choices(group: str) -> None:
             node: dict[str, Any] = {"defaults": ["base", "_self_"], "name": name}
         else:
             node = {key: value for key, value in options_of(entry, given=1).items() if key not in given_by_run}
-            if group == "stage":  # with the budget of the default stage
-                usual: Any = DictConfig(OmegaConf.load(CONF / "stage" / "rectify.yaml"))
-                budget: dict[str, Any] = {key: usual[key] for key in ("learning_rate", "warmup_images") if key in node}
-                node = {"init": None, **node, **budget}
+            if group == "stage":
+                node = {"init": None, **node}
             node = {"name": name, **node}
         store.store(name, node, group=group)
 

@@ -59,11 +59,11 @@ class Stage(L.LightningModule):
     def __init__(
         self,
         generator: Generator,
-        learning_rate: NonNegative = 1e-4,
+        learning_rate: NonNegative = 2e-3,
         betas: tuple[Portion, Portion] = (0.9, 0.99),
         weight_decay: NonNegative = 0.0,
         muon: NonNegative | None = None,
-        warmup_images: Natural = 80_000,
+        warmup_images: Natural = 400,
         batch_size: Count = 8,
         seed: int = 0,
     ) -> None:
