@@ -435,6 +435,21 @@ def test_the_model_is_chosen_by_what_is_missing(r2flow, tmp_path, mask, more, mo
     assert len(read_points(tmp_path / "out" / "one.ply").xyz) > 1000
 
 
+def test_scans_for_two_models_are_refused_together(r2flow, tmp_path):  # noqa: F811
+    sensor = SENSORS["hdl64e"].resized(64, 512)
+    image = simulate(sensor, 5, 0).image
+    for name, kept in (("cut", np.s_[:, :, 300:]), ("thin", np.s_[:, ::4])):
+        part = np.zeros_like(image)
+        part[kept] = image[kept]
+        write_points(tmp_path / "in" / f"{name}.ply", *image_to_points(part, sensor.rays()))
+    asked = tmp_path / "in", "--from", "hdl64e", "--fill-gaps", "--out", tmp_path / "out"
+    code, _, error = r2flow(*COMPLETE, *asked)
+    assert code == 2
+    assert "cut lacks whole sectors (--checkpoint street) and thin does not (--checkpoint densify)" in error
+    assert not (tmp_path / "out").exists()
+    assert r2flow(*COMPLETE, tmp_path / "in" / "cut.ply", *asked[1:])[0] == 0
+
+
 def test_a_model_of_one_image_takes_no_other(r2flow, tmp_path):  # noqa: F811
     full_scan(tmp_path / "one.npy")
     code, _, said = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", "street", "--to", "vlp16", "--out", tmp_path / "out")

@@ -76,26 +76,29 @@ def complete(
     import numpy as np
 
     from r2flow.data.opening import named_sensor, reading_for
-    from r2flow.data.partial import open_partial
+    from r2flow.data.partial import PartialScan, open_partial
     from r2flow.generators import TransferFlow
-    from r2flow.lidar.known import mask_identity, parse_mask, share_in_sectors
-    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.lidar.known import mask_identity, parse_mask
+    from r2flow.model.checkpoint import Checkpoint, load_checkpoint
     from r2flow.model.completion import completing
     from r2flow.models import DEFAULT, DENSIFY, MODELS
-    from r2flow.reports.completed import Job, answer_ending, hiding, write_completed
+    from r2flow.reports.completed import Job, answer_ending, lack_sectors, write_completed
 
     job = Job(num, seed, None if mask is None else parse_mask(mask), fill_gaps, batch_size, pictures, precision)
     sensor = None if source is None else build_sized(source, None)
-    name = str(checkpoint or (DEFAULT if how.sampler else DENSIFY))
-    while True:
+
+    def opened(name: str) -> tuple[Checkpoint, list[PartialScan], list[str]]:
         loaded = load_checkpoint(name, device=choose_device(device))
         if to or size:
             loaded = loaded.through(named_sensor(to or loaded.sensor, rows_and_columns(size)))
         reading = replace(reading_for([], loaded), columns=named_columns(columns))
-        partial, said = open_partial(what, reading, sensor, reflectance_scale, scans)
-        if checkpoint or name == DEFAULT or to or size or share_in_sectors(hiding(partial[0], job, 0)[1].state) < 0.5:
-            break
+        return loaded, *open_partial(what, reading, sensor, reflectance_scale, scans)
+
+    name = str(checkpoint or (DEFAULT if how.sampler else DENSIFY))
+    loaded, partial, said = opened(name)
+    if name == DENSIFY and not (checkpoint or to or size) and lack_sectors(partial, job):
         name = DEFAULT
+        loaded, partial, said = opened(name)
     if said and isinstance(loaded.generator, TransferFlow):  # of another sensor, which fills other rows
         loaded = loaded.through(loaded.sensor, numbered=False)
     if checkpoint is None:
@@ -115,8 +118,7 @@ def complete(
     done = write_completed(loaded, partial, out, job, sampler, about)
     skipped = len(partial) - len(done)
     print(f"{len(done)} scans completed in {out}" + (f", {skipped} were there already" if skipped else ""))
-    errors = [error for error in done.values() if error is not None]
-    if errors:
+    if errors := [error for error in done.values() if error is not None]:
         off = [error["mae_m"] for error in errors if not np.isnan(error["mae_m"])]
         mae = f"MAE {np.mean(off):.2f} m where both return" if off else "no ray returns in both"
         wrong = np.mean([error["drop_wrong"] for error in errors])

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
-from r2flow.lidar.known import Mask, Ray
+from r2flow.lidar.known import Mask, Ray, share_in_sectors
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import Sensor
@@ -23,6 +24,8 @@ from r2flow.lidar.transfer import Partial
 from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import Completed, complete
+from r2flow.models import DEFAULT, DENSIFY
+from r2flow.progress import track
 from r2flow.reports.outputs import ScanBar, recipe_of, warn_unsolved
 from r2flow.reports.pictures import completed_figure, save_figure
 from r2flow.reports.view import write_page
@@ -109,6 +112,26 @@ def write_completed(
     return done
 
 
+def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
+    """Whether most unknown rays of scans lie in sectors without any known ray; scans without an unknown ray do not count.
+
+    Raises:
+        InputError: so it is of some scans and not of others.
+    """
+    kinds: dict[bool, str] = {}
+    for number, scan in enumerate(track(scans, "looking at", "scans")):
+        state = hiding(scan, job, number)[1].state
+        if (state == Ray.UNKNOWN).any():
+            kinds.setdefault(share_in_sectors(state) >= 0.5, scan.name)
+    if len(kinds) > 1:
+        raise InputError(
+            f"{kinds[True]} lacks whole sectors (--checkpoint {DEFAULT}) and {kinds[False]} does not (--checkpoint "
+            f"{DENSIFY}): complete them apart, or give one --checkpoint for all."
+        )
+    return True in kinds
+
+
+@lru_cache(maxsize=16)  # the scans of a small folder are read once
 def hiding(scan: PartialScan, job: Job, number: int) -> tuple[Partial, Partial]:
     """What is known of scan `number`, and what the job leaves of it."""
     whole = scan.read()
