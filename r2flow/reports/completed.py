@@ -90,7 +90,7 @@ def write_completed(
     left = [number for number, scan in enumerate(scans) if not all(path.is_file() for path in files[scan.name])]
     done: dict[str, dict[str, float] | None] = {}
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
-    with ScanBar("completing", len(left), len(left) * batches) as bar:
+    with ScanBar("completing", len(left) * job.num, len(left) * batches, "answers") as bar:
         for number in left:
             scan = scans[number]
             whole, given = hiding(scan, job, number)
@@ -108,12 +108,12 @@ def write_completed(
             done[scan.name] = hidden_errors(whole, given, completed, checkpoint.sensor) if job.mask else None
             if not completed.evaluations.any():
                 print(f"{scan.name}: everything is known; see --fill-gaps and --mask")
-            bar.finished(len(done))
+            bar.finished(len(done) * job.num)
     return done
 
 
 def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
-    """Whether most unknown rays of scans lie in sectors without any known ray; scans without an unknown ray do not count.
+    """Whether most unknown rays of each scan lie in sectors without a known ray; a scan without unknown rays is either.
 
     Raises:
         InputError: so it is of some scans and not of others.

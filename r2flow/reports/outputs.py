@@ -189,10 +189,11 @@ class ScanBar(Bar):
 
     Args:
         evaluations: Network evaluations in all, batches counted as one; 0 where an adaptive solver decides.
+        unit: What is counted in the place of scans.
     """
 
-    def __init__(self, doing: str, num: int, evaluations: int = 0) -> None:
-        super().__init__(doing, num, "scans")
+    def __init__(self, doing: str, num: int, evaluations: int = 0, unit: str = "scans") -> None:
+        super().__init__(doing, num, unit)
         self._share = num / evaluations if evaluations else 0.0
         self._spent = 0
 
@@ -202,7 +203,7 @@ class ScanBar(Bar):
         self.set(note=f"{self._spent} evaluations")
 
     def finished(self, done: int) -> None:
-        """So many scans are done by now."""
+        """So many units are done by now."""
         self.set(done)
 
 
