@@ -17,6 +17,7 @@ from r2flow.data.options import DataOptions, PairOptions
 from r2flow.registry import options_of
 from r2flow.runs.composing import CONF, choices, compose
 from r2flow.stages import STAGES
+from r2flow.training import check
 
 
 @pytest.fixture(scope="module")
@@ -124,3 +125,8 @@ def test_an_override_that_is_printed_is_read_back(path: str):
     parsed = OverridesParser.create().parse_override(text)
     value = parsed.value()
     assert (parsed.key_or_group, getattr(value, "text", value)) == ("stage.init", path)
+
+
+@pytest.mark.parametrize("experiment", ["lidm_autoencoder", "lidargen", "dusty2"])
+def test_an_experiment_of_chosen_drives_takes_other_scans(experiment: str):
+    check(compose([f"experiment={experiment}", "data=simulated"]))
