@@ -1,6 +1,7 @@
 """`r2flow report`: solvers, curvature, backbones, completion and the paper's tables."""
 
 import logging
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +18,7 @@ from r2flow.cli.options import (
     SizeOption,
     build_sized,
     choose_device,
+    cores,
 )
 from r2flow.cli.output import command, finish, numbers
 from r2flow.errors import InputError
@@ -116,8 +118,11 @@ def backbones(
     chosen, where = build_sized(sensor, size), choose_device(device)
     names = only.split(",") if only else list(configurations())
     rows = backbone_costs(chosen, names, repeats, where)
+    load = os.getloadavg()[0]
     measured = list(track(rows, "measuring", "backbones", total=len(names), least=0 if repeats else 99))
     print_costs(measured, chosen, where)
+    if repeats and load > cores():
+        print(f"The machine was busy (load {load:.1f} on {cores()} cores): latencies are higher than they need be.")
 
 
 @report.command(epilog="Example: r2flow report completion kitti360/test street --num 15 --out reports")

@@ -1,3 +1,5 @@
+import os
+
 import pytest
 
 from r2flow.backbones import configurations
@@ -66,3 +68,10 @@ def test_the_verb_measures_what_it_is_asked_for(r2flow):  # noqa: F811
     code, _, err = r2flow("report", "backbones", "--only", "hditt", "--repeats", 0)
     assert code != 0
     assert "'hdit'" in err
+
+
+@pytest.mark.parametrize(("load", "busy"), [(0.0, False), (1e4, True)])
+def test_a_busy_machine_is_named(r2flow, monkeypatch, load, busy):  # noqa: F811
+    monkeypatch.setattr(os, "getloadavg", lambda: (load, load, load))
+    options = ("--only", "hdit_tiny", "--size", "16x64", "--repeats", 1, "--device", "cpu")
+    assert ("machine was busy" in r2flow("report", "backbones", *options)[1]) == busy
