@@ -105,6 +105,7 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
         assert (run / name).is_file(), name
     for words in ("[1/3] rf1", "[2/3] rf2", "[3/3] td2", "8 pairs", "evaluations a pair", "pairs/s", "r2flow sample"):
         assert words in said
+    assert said.rstrip().endswith("Open runs/demo/report/chain.png first.")
     first, second, third = (load_checkpoint(run / link) for link in LINKS)
     assert [flow.config["stage"]["name"] for flow in (first, second, third)] == ["rectify", "reflow", "distill"]
     assert second.config["parent"]["weights"] == weights_hash(first)
