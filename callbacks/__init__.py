@@ -29,11 +29,7 @@ class Entry(NamedTuple):
 
 
 def build_callbacks(config: Mapping[str, Any]) -> list[Callback]:
-    """The callbacks that a config's `callbacks` names; null leaves one out.
-
-    Raises:
-        InputError: an unknown name or option, or a value that one cannot take.
-    """
+    """The callbacks that a config's `callbacks` names; null leaves one out."""
     if config["trainer"]["fast_dev_run"]:
         return [Progress()] if config["trainer"]["enable_progress_bar"] else []
     for name in config["callbacks"]:

@@ -65,11 +65,7 @@ ELSEWHERE = (WandbLogger, MLFlowLogger)  # they may be looked at where the run's
 
 
 def build_loggers(names: Sequence[str] | None, run_dir: Path) -> list[Logger]:
-    """The loggers of a run.
-
-    Raises:
-        InputError: an unknown name, or a package that is not installed.
-    """
+    """The loggers of a run."""
     if isinstance(names, str):
         raise InputError(f"loggers must be a list, found {names!r}; write loggers=[{names}].")
     return [LOGGERS[name](run_dir) for name in names or []]

@@ -8,9 +8,6 @@ def choose_device(name: str, option: str = "--device") -> str:
 
     Args:
         option: What it was given as.
-
-    Raises:
-        InputError: another name, or a device that is not here.
     """
     import torch
 

@@ -22,11 +22,7 @@ class InputError(ValueError):
 
 
 def require(what: str, extra: str, *packages: str) -> None:
-    """Refuse what needs a package that is not installed, and say which extra of r2flow brings it.
-
-    Raises:
-        InputError: one is missing.
-    """
+    """Refuse what needs a package that is not installed, and say which extra of r2flow brings it."""
     for package in packages:
         if find_spec(package) is None:
             raise InputError(f"{what} needs the package {package}: python -m pip install 'r2flow[{extra}]'.")
@@ -49,11 +45,7 @@ def naming(path: str | Path) -> Iterator[None]:
 
 
 def explain_mistake(error: InputError | OSError) -> str:
-    """A mistake in one line: an InputError's own, or what the system refused (a read-only folder, a full disk).
-
-    Raises:
-        OSError: the error itself, where a user cannot mend it.
-    """
+    """A mistake in one line: an InputError's own, or what the system refused (a read-only folder, a full disk)."""
     if isinstance(error, OSError):
         if error.errno not in MENDABLE:
             raise error

@@ -59,11 +59,7 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder where there is none, also where another process removes it at this moment.
-
-    Raises:
-        FileExistsError: it is a file, or a link to nothing.
-    """
+    """Make a folder where there is none, also where another process removes it at this moment."""
     while True:
         try:
             return path.mkdir(parents=True, exist_ok=True)
@@ -105,11 +101,7 @@ def read_json(path: Path) -> Any:
 
 
 def refuse_unreadable(path: Path, largest: int, what: str = "file") -> None:
-    """Refuse a path that is no regular file, or of 0 or more than `largest` bytes, before it is opened.
-
-    Raises:
-        InputError: in one line, with what was found.
-    """
+    """Refuse a path that is no regular file, or of 0 or more than `largest` bytes, before it is opened."""
     if path.is_symlink() and not path.exists():
         raise InputError(f"{path} is a link to {path.readlink()}, which does not exist.")
     if not path.exists():

@@ -75,9 +75,6 @@ def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, pro
         images: Range in metres and reflectance, (B, 2 or 1, H, W), 0 where a ray was dropped.
         sampler: The solver of both ways.
         progress: Called after every network evaluation.
-
-    Raises:
-        InputError: a generator without an ODE, or jumps of a flow map that has learned none back in time.
     """
     flow = as_flow(checkpoint.generator, "inversion")
     jumps = (checkpoint.config.get("stage") or {}).get("jumps") or {}
@@ -140,9 +137,6 @@ def slerp(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
 
     Returns:
         (N, ...).
-
-    Raises:
-        InputError: x and y are opposite, so that no way between them is the shortest; or one is zero.
     """
     u, v = x.double().flatten(), y.double().flatten()
     lengths = torch.linalg.vector_norm(u), torch.linalg.vector_norm(v)
@@ -197,9 +191,6 @@ def interpolate_scans(
         batch_size: Scans at once.
         progress: Called after every network evaluation.
         arrived: Called with the number of frames that are done, the ends first.
-
-    Raises:
-        InputError: an end that is not solved, or what `invert` and `slerp` refuse.
     """
     flow = as_flow(checkpoint.generator, "interpolation")
     inverted = []

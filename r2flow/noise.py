@@ -81,11 +81,7 @@ class Draws:
         return self._of_step(shape, 0)
 
     def step(self, shape: tuple[int, ...], j: int) -> Tensor:
-        """Noise of each scan in step j >= 1, (B, *shape) float32 on the CPU.
-
-        Raises:
-            ValueError: j < 1, which is the start's noise, or j >= 2^64.
-        """
+        """Noise of each scan in step j >= 1, (B, *shape) float32 on the CPU."""
         if j < 1:
             raise ValueError(f"steps that draw noise are counted from 1, found {j}.")
         return self._of_step(shape, j)

@@ -27,11 +27,7 @@ _loaded: set[str] = set()  # names and files, as sys.modules, in which a path ha
 
 
 def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """(the other arguments, the plug-ins) of a command line with `--plugin NAME`, anywhere and any number of times.
-
-    Raises:
-        InputError: the last argument is `--plugin`.
-    """
+    """(the other arguments, the plug-ins) of a command line with `--plugin NAME`, anywhere and any number of times."""
     others: list[str] = []
     names: list[str] = []
     rest = iter(arguments)
@@ -48,11 +44,7 @@ def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def load_plugins(names: Sequence[str]) -> None:
-    """Import modules, named as in an import or by a path ending in `.py`, each once.
-
-    Raises:
-        InputError: a module that is not there, or whose import ends in an error.
-    """
+    """Import modules, named as in an import or by a path ending in `.py`, each once."""
     for name in names:
         if _known(name) in _loaded:
             continue
@@ -100,11 +92,7 @@ def _import(name: str) -> str:
 
 
 def load_installed() -> None:
-    """Import what installed packages name in the entry-point group.
-
-    Raises:
-        InputError: one of them cannot be imported.
-    """
+    """Import what installed packages name in the entry-point group."""
     load_plugins([entry.value.partition(":")[0] for entry in entry_points(group=GROUP)])
 
 

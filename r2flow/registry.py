@@ -94,21 +94,13 @@ class Registry(Generic[T]):
         return ((name, self[name]) for name in self._entries)
 
     def add(self, name: str, entry: T) -> None:
-        """Add an entry.
-
-        Raises:
-            ValueError: the name is taken.
-        """
+        """Add an entry."""
         if name in self._entries:
             raise ValueError(f"a {self.kind} named {name!r} exists already; choose another name.")
         self._entries[name] = entry
 
     def build(self, options: Mapping[str, Any], *args: Any) -> Any:
-        """Call the entry `options["name"]` with `args` and the remaining options as keywords.
-
-        Raises:
-            InputError: no such name, or an option that the constructor does not know.
-        """
+        """Call the entry `options["name"]` with `args` and the remaining options as keywords."""
         if not isinstance(options, Mapping) or "name" not in options:
             known = ", ".join(sorted(self._entries))
             raise InputError(f"a {self.kind} config needs a 'name', found {options!r}; known: {known}.")

@@ -65,11 +65,7 @@ class Store:
         return [self.folder / f"{self.kind}-{item:06d}.safetensors"]
 
     def check(self) -> bool:
-        """Whether the folder has been begun.
-
-        Raises:
-            InputError: it holds another recipe, or scans and no manifest.
-        """
+        """Whether the folder has been begun."""
         if (self.folder / MANIFEST).is_file():
             found = read_manifest(self.folder, self.kind)["recipe"]
             if other := difference(found, self.described):
@@ -86,11 +82,7 @@ class Store:
         return False
 
     def begin(self, **notes: Any) -> None:
-        """Write the manifest if it is missing: the recipe and `notes`.
-
-        Raises:
-            InputError: as `check`, or the folder cannot be written to.
-        """
+        """Write the manifest if it is missing: the recipe and `notes`."""
         try:
             if not self.check():
                 self.write_manifest(**notes)
@@ -215,9 +207,6 @@ class Store:
         Args:
             work: Makes an item and writes it, in any process: it can be pickled.
             workers: Number of processes; 1 makes the items in this one.
-
-        Raises:
-            InputError: what `work` raises, or a worker was killed.
         """
         left = list(items)
         while left:

@@ -171,9 +171,6 @@ def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent |
 
     Returns:
         The config, completed by what its parent says.
-
-    Raises:
-        InputError: what `build` refuses, or another run in its folder.
     """
     check_keys(config)
     if parent is None:
@@ -205,11 +202,7 @@ def _checked(config: Mapping[str, Any], asked: Sequence[str], parent: Parent | N
 
 
 def _refuse_unread(key: str, data: Mapping[str, Any]) -> None:
-    """Refuse what the set of scans under this key would pass over in silence.
-
-    Raises:
-        InputError: the options of files with simulated scans, those of scans with pairs, and the like.
-    """
+    """Refuse what the set of scans under this key would pass over in silence."""
     name, usual = data.get("name"), {**asdict(SourceOptions()), **resolve({})}
     every = usual.keys() - {"name"}
     if name == SIMULATED:
@@ -262,11 +255,7 @@ def _build_trainer(config: Mapping[str, Any], stage: Stage) -> L.Trainer:
 
 
 def check_trainer(options: Mapping[str, Any]) -> None:
-    """Refuse what Lightning would change in silence or end in a traceback.
-
-    Raises:
-        InputError: a value out of its range, an accelerator that is not there, a precision that a CPU does not have.
-    """
+    """Refuse what Lightning would change in silence or end in a traceback."""
     check_options("trainer", TrainerRanges, {f.name: options.get(f.name) for f in fields(TrainerRanges)})
     if str(options["precision"]) in ("16-true", "bf16-true"):
         raise InputError(

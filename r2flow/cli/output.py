@@ -14,11 +14,7 @@ if TYPE_CHECKING:
 
 
 def numbers(option: str, text: str, kind: type = float) -> list[Any]:
-    """'4,8' as [4, 8].
-
-    Raises:
-        InputError: what is not a positive number.
-    """
+    """'4,8' as [4, 8]."""
     try:
         values = [kind(part) for part in text.split(",")]
     except ValueError:

@@ -56,11 +56,7 @@ class Checkpoint:
 
     @property
     def model(self) -> nn.Module:
-        """The network v(t, x) of a flow.
-
-        Raises:
-            InputError: the generator is no rectified flow.
-        """
+        """The network v(t, x) of a flow."""
         if not isinstance(self.generator, RectifiedFlow):
             raise InputError(f"{self.path} holds a {type(self.generator).__name__}, which has no network v(t, x).")
         return self.generator.backbone
@@ -94,11 +90,7 @@ class Checkpoint:
         return torch.stack([found.images for found in complete(self, images, state, num, seed, **how)])
 
     def through(self, sensor: Sensor, numbered: bool = True) -> "Checkpoint":
-        """The same model for another sensor's images; see `TransferFlow.at`.
-
-        Raises:
-            InputError: a model of its own sensor's alone.
-        """
+        """The same model for another sensor's images; see `TransferFlow.at`."""
         if not isinstance(self.generator, TransferFlow):
             raise InputError(f"{self.path} is a model of its own sensor alone: leave --to and --size out.")
         return replace(self, generator=self.generator.at(self.generator.space.through(sensor), numbered))
@@ -128,9 +120,6 @@ def find_checkpoint(path: str | Path) -> Path:
     """A checkpoint file, the latest one of a run folder, or the file of a model of this name.
 
     A file or a run of a model's name in the current folder comes before the model.
-
-    Raises:
-        InputError: nothing is there.
     """
     name, path = str(path), Path(path).expanduser()
     if path.is_file():
@@ -151,11 +140,7 @@ def find_checkpoint(path: str | Path) -> Path:
 
 
 def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
-    """The dict in a checkpoint file of ours. Only tensors and plain values are read: a file cannot run code.
-
-    Raises:
-        InputError: not a checkpoint, a damaged one, or one that holds more than plain values.
-    """
+    """The dict in a checkpoint file of ours. Only tensors and plain values are read: a file cannot run code."""
     content = _read(path, map_location)
     if not isinstance(content, dict):
         raise InputError(_not_a_checkpoint(path))
@@ -191,11 +176,7 @@ def _read(path: str | Path, map_location: Any = "cpu") -> Any:
 
 
 def _refuse_unpacking(path: str | Path) -> None:
-    """Refuse a zip archive that holds more than its own bytes: torch writes storages as they are.
-
-    Raises:
-        InputError: an entry is compressed.
-    """
+    """Refuse a zip archive that holds more than its own bytes: torch writes storages as they are."""
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
@@ -293,11 +274,7 @@ def as_parent(config: Mapping[str, Any], path: Path, step: int, weights: str | N
 
 
 def read_safetensors(path: Path) -> dict[str, Any]:
-    """Weights and config of a `.safetensors` of ours, in the shape of our other checkpoints.
-
-    Raises:
-        InputError: not a safetensors file, one without our config, or one whose weights are not what was written.
-    """
+    """Weights and config of a `.safetensors` of ours, in the shape of our other checkpoints."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -332,9 +309,6 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
 
     Args:
         half: Round large matrices to float16, which halves the file.
-
-    Raises:
-        InputError: another ending.
     """
     from safetensors.torch import save
 
@@ -362,11 +336,7 @@ def large_matrices(module: nn.Module) -> set[str]:
 
 
 def check_weights(model: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:
-    """Account for every name and shape before anything is loaded.
-
-    Raises:
-        InputError: the first name or shape that differs, or a tensor that is not of plain numbers.
-    """
+    """Account for every name and shape before anything is loaded."""
     own = model.state_dict()
     missing, surplus = sorted(own.keys() - weights.keys()), sorted(weights.keys() - own.keys())
     wrong = [f"{len(missing)} names missing {missing[:2]}, {len(surplus)} unknown {surplus[:2]}"]

@@ -70,9 +70,6 @@ def completing(generator: Generator, name: str | None = None, *, several: bool =
         name: Of another sampler.
         several: Whether answers shall differ: then a transfer flow's is `transport`.
         changes: Fields of the sampler.
-
-    Raises:
-        InputError: it cannot complete scans, or not so.
     """
     if not (generator.told or isinstance(generator, Flow)) or generator.noise_shape != generator.space.shape:
         raise InputError(f"a {type(generator).__name__} cannot complete a scan: that needs a flow of range images.")

@@ -62,11 +62,7 @@ class _Recorder(nn.Module):
 
 
 def tableau(flow: RectifiedFlow, sampler: Sampler) -> Tableau:
-    """The coefficients of a sampler.
-
-    Raises:
-        InputError: its number of evaluations depends on the scan, or it needs more than the noise.
-    """
+    """The coefficients of a sampler."""
     sampler.check(flow)
     count = sampler.evaluations(flow)
     if count is None or sampler.draws or sampler.completes:
@@ -128,11 +124,7 @@ def _sum(row: list[float], known: list[Tensor]) -> Tensor:
 
 
 def flow_of(checkpoint: Checkpoint) -> RectifiedFlow:
-    """The flow of a checkpoint.
-
-    Raises:
-        InputError: it holds another generator.
-    """
+    """The flow of a checkpoint."""
     flow = checkpoint.generator
     if not isinstance(flow, RectifiedFlow):
         raise InputError(f"only flows can be exported, and {checkpoint.path} holds a {type(flow).__name__}.")
@@ -298,11 +290,7 @@ class Difference(NamedTuple):
 
 
 def compare(checkpoint: Checkpoint, exported: Exported, sampler: Sampler | None = None, num: int = 2) -> Difference:
-    """Draw the first scans of seed 0 by the file and by the flow.
-
-    Raises:
-        InputError: the runtime of an `.onnx` is missing.
-    """
+    """Draw the first scans of seed 0 by the file and by the flow."""
     flow = checkpoint.generator
     noise = Draws(0, range(num if exported.any_batch else 1)).start(flow.noise_shape)
     x_1 = flow(noise, sampler=sampler).x
@@ -315,11 +303,7 @@ def compare(checkpoint: Checkpoint, exported: Exported, sampler: Sampler | None 
 
 
 def run(path: Path, noise: Tensor) -> dict[str, Tensor]:
-    """`scan` and `points` of an exported sampler.
-
-    Raises:
-        InputError: the runtime of an `.onnx` is missing.
-    """
+    """`scan` and `points` of an exported sampler."""
     if path.suffix == ".pt2":
         with torch.no_grad(), warnings.catch_warnings(action="ignore"):
             scan, points = torch.export.load(path).module()(noise)

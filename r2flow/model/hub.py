@@ -42,9 +42,6 @@ class HubFlow(  # type: ignore[call-arg, unused-ignore]  # where the extra is no
 
     Attributes:
         checkpoint: What `r2flow.load` gives.
-
-    Raises:
-        InputError: there is none, no such device, or an option that `from_pretrained` does not know.
     """
 
     def __init__(self, name: str | Path, device: str = "cpu") -> None:
