@@ -9,7 +9,7 @@ from r2flow.errors import InputError
 from r2flow.generators import Generator, build_generator
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.model.completion import ANSWER, complete, completing, spread_of
+from r2flow.model.completion import ANSWER, Completed, complete, completing
 from r2flow.noise import Draws, generator
 from r2flow.samplers import build_sampler
 from tests.test_checkpoints import CONFIG
@@ -166,7 +166,7 @@ def test_a_flow_that_was_not_trained_to_complete_does_so_too():
 
 def test_spread_is_over_the_answers_with_a_return():
     images = torch.tensor([[3.0, 5.0, 0.0], [5.0, 0.0, 0.0], [7.0, 0.0, 0.0]]).view(3, 1, 1, 3)
-    deviation, share = spread_of(images)
+    deviation, share = Completed(images, 0, torch.zeros(3), torch.ones(3) > 0, 0.0).spread
     assert deviation.tolist() == [[2.0, 0.0, 0.0]]  # of 3, 5, 7: sqrt((4 + 0 + 4) / 2)
     torch.testing.assert_close(share, torch.tensor([[1, 1 / 3, 0]]))
 

@@ -51,7 +51,7 @@ def export(
         print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, SHA-256 {sha256(out.read_bytes()).hexdigest()}")
         return
     writing.FORMATS[to]
-    sampler = writing.flow_of(loaded).choose(**how.given)
+    sampler = loaded.generator.choose(**how.given)
     written = writing.export(loaded, out, sampler, what == "network")
     batch = "any batch" if written.any_batch else "one scan at a time, torch could not free its batch"
     print(

@@ -226,15 +226,11 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
         config, weights, step, kind = made.config, made.weights, made.step, "published"
         drawing: Mapping[str, Any] = {"sampler": made.sampler}
     elif isinstance(content, dict) and "config" in content and "state_dict" in content:
-        state = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
-        config, groups = content["config"], ("sensor", "encoding", "backbone", "data", "stage", "trainer")
-        entries = {"config": config, "state_dict": state}
-        entries |= {key: config.get(key) or {} for key in groups if isinstance(config, Mapping)}
-        for key, entry in entries.items():
-            if not isinstance(entry, Mapping):
-                raise InputError(f"its '{key}' has no named values. Is it of another program?")
+        state: Any = content["state_dict"] if averaged else content.get("current_model_state", content["state_dict"])
         config, step, kind = dict(content["config"]), int(content.get("global_step", 0)), "r2flow"
-        assert isinstance(state, Mapping)
+        for key in ("data", "stage", "trainer"):
+            if not isinstance(config.get(key) or {}, Mapping):
+                raise InputError(f"its '{key}' has no named values. Is it of another program?")
         weights = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
         drawing = content
     elif isinstance(content, dict):
@@ -317,22 +313,13 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path, half: bool = False
         raise InputError(f"{path}: a checkpoint is written as a .safetensors.")
     weights = {name: value.detach().cpu().contiguous() for name, value in checkpoint.generator.state_dict().items()}
     if half:
-        large = large_matrices(checkpoint.generator)
-        weights = {name: value.half() if name in large else value for name, value in weights.items()}
-    notes = {
-        "config": learned(checkpoint.config),
-        "step": checkpoint.step,
-        **checkpoint.generator.drawing(),
-    }
+        parameters = checkpoint.generator.named_parameters()
+        weights |= {n: weights[n].half() for n, value in parameters if value.ndim > 1 and value.numel() > SMALL}
+    notes = {"config": learned(checkpoint.config), "step": checkpoint.step, **checkpoint.generator.drawing()}
     # Under one key: several keys of metadata come in no fixed order.
     data = save(weights, metadata={NOTES: json.dumps({**notes, "digest": _digest(notes, weights)})})
     with atomic_write(path) as file:
         file.write(data)
-
-
-def large_matrices(module: nn.Module) -> set[str]:
-    """Names of the parameters that half precision rounds."""
-    return {name for name, value in module.named_parameters() if value.ndim > 1 and value.numel() > SMALL}
 
 
 def check_weights(model: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:

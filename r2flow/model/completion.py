@@ -5,7 +5,6 @@ for completed in complete(checkpoint, images, state, num=8):
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -17,50 +16,28 @@ from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE
 from r2flow.lidar.known import Ray
 from r2flow.lidar.sensors import Sensor
-from r2flow.model.sampling import HasGenerator, draw
+from r2flow.model.sampling import HasGenerator, Samples, draw
 from r2flow.samplers import Transport, build_sampler
 
 ANSWER = 2**32  # noise numbers from one answer to the next: answer 0 of scan i has the noise of sample i
 
 
-@dataclass(frozen=True)
-class Completed:
-    """The answers to one scan.
-
-    Attributes:
-        images: Range in metres and, of a model that has it, reflectance, (num, 2 or 1, H, W), on the CPU; 0 without a
-            return.
-        evaluations: Network evaluations of each, (num,).
-        converged: Whether each is a scan of the generator, (num,) bool.
-        seconds: Of the generation of all of them.
-    """
-
-    images: Tensor
-    evaluations: Tensor
-    converged: Tensor
-    seconds: float
+class Completed(Samples):
+    """The answers to one scan, whose number is `first`; answers have reflectance if the model has it."""
 
     @property
     def spread(self) -> Tensor:
-        """How far the answers are apart: see `spread_of`."""
-        return spread_of(self.images)
+        """Standard deviation of the range in metres and share with a return of each ray over the answers, (2, H, W).
 
-
-def spread_of(images: Tensor) -> Tensor:
-    """Standard deviation of the range in metres and share with a return of each ray over several answers, (2, H, W).
-
-    The standard deviation is over the answers with a return, with num - 1 below the fraction line; 0 where fewer than
-    two have one.
-
-    Args:
-        images: (num, 2 or 1, H, W), 0 without a return.
-    """
-    r = images[:, 0].double()
-    returned = r > 0
-    count = returned.sum(0)
-    mean = r.sum(0) / count.clamp(min=1)
-    squares = ((r - mean).square() * returned).sum(0)
-    return torch.stack([(squares / (count - 1).clamp(min=1)).sqrt(), returned.double().mean(0)]).float()
+        The standard deviation is over the answers with a return, with num - 1 below the fraction line; 0 where fewer
+        than two have one.
+        """
+        r = self.images[:, 0].double()
+        returned = r > 0
+        count = returned.sum(0)
+        mean = r.sum(0) / count.clamp(min=1)
+        squares = ((r - mean).square() * returned).sum(0)
+        return torch.stack([(squares / (count - 1).clamp(min=1)).sqrt(), returned.double().mean(0)]).float()
 
 
 def completing(generator: Generator, name: str | None = None, *, several: bool = False, **changes: Any) -> Sampler:
@@ -135,33 +112,24 @@ def complete(
     for i, (image, measured) in enumerate(zip(images, state != Ray.UNKNOWN, strict=True)):
         condition = {name: value[i : i + 1] for name, value in conditions.items()}
         known = condition["known"] > 0
-        if bool(known.all()):
-            answers = image.new_zeros(num, 1 + generator.space.encoding.reflectance, *image.shape[1:])
-            shared = min(answers.shape[1], image.shape[0])
-            answers[:, :shared] = image[:shared]
-            yield Completed(answers, torch.zeros(num, dtype=torch.int64), torch.ones(num, dtype=torch.bool), 0.0)
-            continue
         some = bool(known.any())
         parts = []
-        for start in range(0, num, batch_size):
-            numbers = [first + i + a * ANSWER for a in range(start, min(start + batch_size, num))]
+        for start in range(0, 0 if bool(known.all()) else num, batch_size):
+            numbers = [first + i + answer * ANSWER for answer in range(start, min(start + batch_size, num))]
             given = {name: value.expand(len(numbers), -1, -1, -1) for name, value in condition.items()}
             parts.append(
-                draw(
-                    generator,
-                    numbers,
-                    seed,
-                    how if some else plain,
-                    given if some else None,
-                    precision=precision,
-                    progress=progress,
-                )
-            )
+                draw(generator, numbers, seed, how if some else plain, given if some else None, precision=precision,
+                    progress=progress)
+            )  # fmt: skip
+        if not parts:
+            answers = image.new_zeros(num, 1 + generator.space.encoding.reflectance, *image.shape[1:])
+            parts = [Samples(answers, first + i, torch.zeros(num, dtype=torch.int64), torch.ones(num) > 0, 0.0)]
         answers = torch.cat([part.images for part in parts])
         shared = min(answers.shape[1], image.shape[0])
         answers[:, :shared] = torch.where(measured, image[:shared], answers[:, :shared])
         yield Completed(
             answers * (answers[:, :1] > 0),
+            first + i,
             torch.cat([part.evaluations for part in parts]),
             torch.cat([part.converged for part in parts]),
             sum(part.seconds for part in parts),

@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -123,27 +122,12 @@ def _sum(row: list[float], known: list[Tensor]) -> Tensor:
     return x
 
 
-def flow_of(checkpoint: Checkpoint) -> RectifiedFlow:
-    """The flow of a checkpoint."""
-    flow = checkpoint.generator
-    if not isinstance(flow, RectifiedFlow):
-        raise InputError(f"only flows can be exported, and {checkpoint.path} holds a {type(flow).__name__}.")
-    return flow
-
-
-@dataclass(frozen=True)
-class Exported:
-    """A file that was written.
-
-    Attributes:
-        path: Its place.
-        any_batch: Whether it takes any number of scans at once; else one.
-        notes: Its metadata.
-    """
+class Exported(NamedTuple):
+    """A file that was written."""
 
     path: Path
-    any_batch: bool
-    notes: dict[str, Any]
+    any_batch: bool  # whether it takes any number of scans at once; else one
+    notes: dict[str, Any]  # its metadata
 
 
 def export(checkpoint: Checkpoint, path: str | Path, sampler: Sampler | None = None, network: bool = False) -> Exported:
@@ -162,7 +146,9 @@ def export(checkpoint: Checkpoint, path: str | Path, sampler: Sampler | None = N
         InputError: another ending, no flow, a sampler without a fixed number of steps, a package that is missing, or
             a network that torch cannot export.
     """
-    path, flow = Path(path), flow_of(checkpoint)
+    path, flow = Path(path), checkpoint.generator
+    if not isinstance(flow, RectifiedFlow):
+        raise InputError(f"only flows can be exported, and {checkpoint.path} holds a {type(flow).__name__}.")
     write = FORMATS[path.suffix.removeprefix(".")]
     how = sampler or flow.sampler
     steps = None if network else tableau(flow, how)
@@ -276,17 +262,11 @@ def _quiet() -> Iterator[None]:
 
 
 class Difference(NamedTuple):
-    """Of the scans of an exported file to those of the flow.
+    """Of the scans of an exported file to those of the flow."""
 
-    Attributes:
-        metres: Largest difference of range over the rays that both return.
-        reflectance: Largest difference of reflectance over the same rays; 0 where there is none.
-        rays: Rays that one returns and the other does not.
-    """
-
-    metres: float
-    reflectance: float
-    rays: int
+    metres: float  # largest difference of range over the rays that both return
+    reflectance: float  # the same of reflectance; 0 where there is none
+    rays: int  # that one returns and the other does not
 
 
 def compare(checkpoint: Checkpoint, exported: Exported, sampler: Sampler | None = None, num: int = 2) -> Difference:
