@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -47,23 +47,14 @@ def real_scans(
     return [Real(name, image) for name, image in zip(names, images, strict=True)]
 
 
-@dataclass(frozen=True)
-class Inversion:
-    """Scans, their noise, and what becomes of it on the way forward again; all on the CPU.
+class Inversion(NamedTuple):
+    """Scans, their noise, and what becomes of it on the way forward again; all on the CPU."""
 
-    Attributes:
-        x_1: The scans in model space, (B, C, H, W).
-        x_0: Their noise.
-        again: x_1 once more, from x_0.
-        evaluations: Network evaluations of both ways, (B,).
-        converged: Whether both ways are solved to the tolerance and finite, (B,) bool.
-    """
-
-    x_1: Tensor
-    x_0: Tensor
-    again: Tensor
-    evaluations: Tensor
-    converged: Tensor
+    x_1: Tensor  # the scans in model space, (B, C, H, W)
+    x_0: Tensor  # their noise
+    again: Tensor  # x_1 once more, from x_0
+    evaluations: Tensor  # of the network, of both ways, (B,)
+    converged: Tensor  # whether both ways are solved to the tolerance and finite, (B,) bool
 
 
 def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, progress: Progress = None) -> Inversion:
@@ -155,23 +146,14 @@ def slerp(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
     return (of_x.view(shape) * x.double() + of_y.view(shape) * y.double()).to(x.dtype)
 
 
-@dataclass(frozen=True)
-class Interpolation:
-    """Scans on the way from one to another.
+class Interpolation(NamedTuple):
+    """Scans on the way from one to another."""
 
-    Attributes:
-        ends: The two inverted.
-        weights: Where each frame lies, (N,), from 0 to 1.
-        images: Range in metres and reflectance, (N, 2 or 1, H, W); the first and the last are the ends' round trips.
-        evaluations: Network evaluations of each frame, (N,); the ends' are those of both ways.
-        converged: Whether each is solved, (N,) bool; what is not is no scan of the flow.
-    """
-
-    ends: Inversion
-    weights: Tensor
-    images: Tensor
-    evaluations: Tensor
-    converged: Tensor
+    ends: Inversion  # the two inverted
+    weights: Tensor  # where each frame lies, (N,), from 0 to 1
+    images: Tensor  # range in metres and reflectance, (N, 2 or 1, H, W); the outer two are the ends' round trips
+    evaluations: Tensor  # of the network for each frame, (N,); the ends' are those of both ways
+    converged: Tensor  # whether each is solved, (N,) bool; what is not is no scan of the flow
 
 
 def interpolate_scans(
@@ -179,7 +161,6 @@ def interpolate_scans(
     pair: Tensor,
     frames: int,
     sampler: Sampler = TIGHT,
-    batch_size: int = 1,
     progress: Progress = None,
     arrived: Callable[[int], None] = lambda done: None,
 ) -> Interpolation:
@@ -188,26 +169,23 @@ def interpolate_scans(
     Args:
         pair: The two in metres and reflectance, (2, 2 or 1, H, W).
         frames: Scans in all, the two ends included, at least 2.
-        batch_size: Scans at once.
         progress: Called after every network evaluation.
         arrived: Called with the number of frames that are done, the ends first.
     """
     flow = as_flow(checkpoint.generator, "interpolation")
-    inverted = []
-    for scan, which in zip(pair, ("first", "last"), strict=True):
-        inverted.append(invert(checkpoint, scan[None], sampler, progress))
-        if not inverted[-1].converged.all():
-            raise InputError(
-                f"the {which} scan cannot be carried to its noise and back by {sampler.name}: try another sampler, "
-                "a larger tolerance or more steps."
-            )
-        arrived(len(inverted))
-    ends = Inversion(*(torch.cat([getattr(end, name) for end in inverted]) for name in Inversion.__annotations__))
+    ends = invert(checkpoint, pair, sampler, progress)
+    if not ends.converged.all():
+        which = "last" if ends.converged[0] else "first"
+        raise InputError(
+            f"the {which} scan cannot be carried to its noise and back by {sampler.name}: try another sampler, "
+            "a larger tolerance or more steps."
+        )
+    arrived(2)
     weights = torch.linspace(0, 1, frames, dtype=torch.float64)
-    parts: list[Any] = []
-    for noise in slerp(ends.x_0[0], ends.x_0[1], weights[1:-1]).split(batch_size) if frames > 2 else ():
-        parts.append(flow.solve(noise, sampler=sampler, progress=progress))
-        arrived(2 + sum(len(part.x) for part in parts))
+    parts = []
+    for noise in slerp(*ends.x_0, weights[1:-1]):
+        parts.append(flow.solve(noise[None], sampler=sampler, progress=progress))
+        arrived(2 + len(parts))
 
     def framed(of_ends: Tensor, name: str) -> Tensor:
         return torch.cat([of_ends[:1], *(getattr(part, name).cpu() for part in parts), of_ends[1:]])

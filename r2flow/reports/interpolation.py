@@ -55,8 +55,7 @@ def interpolation(
         The page with the figure, still to be written.
     """
     pair, names, rays = torch.stack([scan.image for scan in scans]), [s.name for s in scans], checkpoint.sensor.rays()
-    # both ends go there and back
-    with ScanBar("interpolating", frames, (frames + 2) * (sampler.evaluations(checkpoint.generator) or 0)) as bar:
+    with ScanBar("interpolating", frames, frames * (sampler.evaluations(checkpoint.generator) or 0)) as bar:
         found = interpolate_scans(checkpoint, pair, frames, sampler, progress=bar.evaluated, arrived=bar.finished)
     warn_unsolved(found.converged)
     images = found.images.nan_to_num(0.0).numpy()
