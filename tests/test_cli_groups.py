@@ -5,7 +5,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from r2flow.cli.groups import grouped
+from r2flow.cli.options import grouped
 
 
 @dataclass(frozen=True)

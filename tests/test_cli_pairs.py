@@ -105,7 +105,7 @@ def test_the_defaults_are_those_of_the_config():
 
     import yaml
 
-    from r2flow.cli.pairs import pairs
+    from r2flow.cli.train import pairs
 
     written = yaml.safe_load((Path(__file__).parents[1] / "conf/data/base.yaml").read_text())["pairs"]
     asked = {name: one.default for name, one in inspect.signature(pairs).parameters.items() if one.default is not None}

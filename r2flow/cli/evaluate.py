@@ -10,8 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.groups import ReadingOptions, SamplerOptions, WorkOptions, grouped
-from r2flow.cli.options import SETS, PrecisionOption, choose_device
+from r2flow.cli.options import (
+    SETS,
+    PrecisionOption,
+    ReadingOptions,
+    SamplerOptions,
+    WorkOptions,
+    choose_device,
+    grouped,
+)
 from r2flow.cli.output import command, numbers
 from r2flow.errors import InputError
 
@@ -108,12 +115,11 @@ def evaluate(
     Under torchrun the processes share the scans.
     """
     from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
-    from r2flow.evaluation.processes import joined
     from r2flow.evaluation.protocols import PROTOCOLS
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.evaluation.statistics import Cache
     from r2flow.metrics import METRICS, default_metrics
-    from r2flow.processes import place
+    from r2flow.processes import joined, place
     from r2flow.reports.compare import labels
     from r2flow.reports.pages import prepare_folder
 

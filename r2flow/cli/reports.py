@@ -1,4 +1,4 @@
-"""`r2flow report`: solvers, curvature, backbones, completion and the paper's tables."""
+"""`r2flow report`: solvers, curvature, backbones, completion, the paper's tables; and `r2flow compare`."""
 
 import logging
 import os
@@ -7,18 +7,20 @@ from typing import Annotated
 
 import typer
 
-from r2flow.cli.app import report
-from r2flow.cli.groups import DrawOptions, SamplerOptions, grouped
+from r2flow.cli.app import app, report
 from r2flow.cli.options import (
     SETS,
     DeviceOption,
+    DrawOptions,
     OutOption,
+    SamplerOptions,
     ScaleChoice,
     SensorOption,
     SizeOption,
     build_sized,
     choose_device,
     cores,
+    grouped,
 )
 from r2flow.cli.output import command, finish, numbers
 from r2flow.errors import InputError
@@ -210,3 +212,30 @@ def paper(
     prepare_folder(out)
     page = paper_page(runs, rows, scans, num, steps, command(), where)
     finish(page, out, page.text[:1])
+
+
+@app.command(epilog="Example: r2flow compare runs/sweep --group --out reports")
+def compare(
+    runs: Annotated[list[Path], typer.Argument(help="Run folders, or folders of them: a chain's, a sweep's.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for compare.md, .csv, .json and .png.")
+    ] = None,
+    group: Annotated[
+        bool, typer.Option("--group", help="Several seeds of one configuration as mean ± spread.")
+    ] = False,
+) -> None:
+    """Set runs side by side: loss, straightness, parameters, cost."""
+    from r2flow.reports.compare import compare_page, group_runs, read_runs, tables
+    from r2flow.reports.pages import prepare_folder, write_page
+    from r2flow.reports.tables import print_table
+
+    compared = read_runs(runs)
+    groups = group_runs(compared) if group else {run.label: [run] for run in compared}
+    if out is not None:
+        prepare_folder(out)
+    for title, (cells, headings) in tables(groups).items():
+        print_table(cells, headings, title)
+        print()
+    if out is not None:
+        for path in write_page(compare_page(groups, command()), out):
+            print(path)

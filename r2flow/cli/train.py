@@ -1,10 +1,14 @@
-"""Training, for those who have no checkout."""
+"""`r2flow train` and `r2flow pairs`."""
 
 import sys
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from r2flow.cli.app import app
+from r2flow.cli.options import DeviceOption, PrecisionOption, SamplerOptions, choose_device, grouped
+from r2flow.errors import InputError
 
 
 @app.command(
@@ -17,3 +21,59 @@ def train(context: typer.Context) -> int:
     from r2flow.runs.launch import main
 
     return main(context.args, [sys.executable, "-m", "r2flow.cli", "train"])
+
+
+@app.command(epilog="Example: torchrun --nproc-per-node 8 -m r2flow.cli pairs runs/r2flow_1rf --num 1000000")
+@grouped
+def pairs(
+    model: Annotated[str, typer.Argument(help="A model, a run folder or a checkpoint file.", show_default=False)],
+    how: SamplerOptions,
+    num: Annotated[int, typer.Option(min=1, help="Pairs in all.")] = 1000,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Their folder; `pairs` in the run's if left out.")
+    ] = None,
+    batch_size: Annotated[int, typer.Option(min=1, help="Pairs solved at once.")] = 16,
+    shard_mib: Annotated[float, typer.Option(min=0.001, help="Size of a shard.")] = 16.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of their noise.")] = 0,
+    precision: PrecisionOption = "32-true",
+    knots: Annotated[int | None, typer.Option(min=1, help="Inner states to keep of each path, for a flow map.")] = None,
+    device: DeviceOption = "auto",
+) -> None:
+    """Draw reflow pairs from a flow: what is missing or damaged, as one of any number of processes.
+
+    `python train.py experiment=reflow stage.init=RUN` makes them itself; this makes them alone, under torchrun or as a
+    SLURM array, with the settings of `data.pairs`. The sampler is adams3 in 32 steps if left out;
+    --sampler dopri5 is the paper's; chord or renoise gives a flow map's first jump as its later ones correct it.
+    """
+    from r2flow.data.options import PairOptions
+    from r2flow.data.pairs import PairStore, default_folder
+    from r2flow.model.checkpoint import load_checkpoint, weights_hash
+    from r2flow.reports.pairs import make_and_tell, place
+    from r2flow.runs.lineage import check_finished, pairs_of
+
+    rank, ranks, local = place()
+    if not 0 <= rank < ranks:
+        raise InputError(f"process {rank} of {ranks}: a SLURM array must have no gaps.")
+    where = choose_device(device)
+    if where == "cuda" and ranks > 1:
+        import torch
+
+        where = f"cuda:{local % torch.cuda.device_count()}"  # SLURM may show each task one GPU alone
+    flow = load_checkpoint(model)
+    check_finished(Path(model), flow)
+    options = {
+        "sampler": {"name": "adams3", **how.given}, "precision": precision, "num": num, "batch_size": batch_size,
+        "shard_mib": shard_mib, "seed": seed, "knots": knots,
+    }  # fmt: skip
+    recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(
+        flow.encoding.shape, flow.generator.noise_shape
+    )
+    store = PairStore(out or default_folder(flow.path), recipe)
+    make_and_tell(store, flow, num, rank, ranks, where)
+    lacking = store.missing_pairs(num)
+    if lacking:
+        print(f"{store.folder}: other processes have still to make about {lacking} of {num} pairs")
+    else:
+        shards = store.shards(num)
+        size = sum(store.files(shard)[0].stat().st_size for shard in shards)
+        print(f"{store.folder}: all {num} pairs, {len(shards)} shard{'s' * (len(shards) != 1)}, {size / 2**20:.0f} MiB")

@@ -3,28 +3,12 @@
 import logging
 import re
 import sys
-from collections.abc import Sequence
 from typing import Any
 
 import typer
 
 from r2flow import __version__
-from r2flow.cli import (  # noqa: F401 (each enters its verbs)
-    compare,
-    complete,
-    evaluate,
-    export,
-    flows,
-    pairs,
-    prepare,
-    reports,
-    sensors,
-    simulate,
-    train,
-    unpack,
-    view,
-    weights,
-)
+from r2flow.cli import data, draw, evaluate, files, reports, train, view  # noqa: F401 (each enters its verbs)
 from r2flow.cli.app import app
 from r2flow.errors import InputError, PlainFormatter, explain_mistake, one_line, open_streams
 from r2flow.plugins import load_plugins, take_plugins
@@ -89,7 +73,9 @@ def _run() -> None:
             raise
         asked = re.search(r"allocate ([\d.]+ \w+)", str(error))
         more = f" for {asked[1]} more" if asked else ""
-        print(f"error: the memory has no room{more}; give {_less_at_once(sys.argv)}.", file=sys.stderr)
+        batched = any(word.startswith("--batch-size") for word in sys.argv)
+        less = "a smaller --batch-size" if batched else "smaller batches or images"
+        print(f"error: the memory has no room{more}; give {less}.", file=sys.stderr)
         sys.exit(2)
     except USAGE_ERROR as error:
         print(f"error: {_usage(error.format_message())} See --help.", file=sys.stderr)
@@ -110,8 +96,3 @@ def _usage(message: str) -> str:
               if word in names]  # fmt: skip
     found = f", found {', '.join(values)}" if values else ""
     return f"{' or '.join(names) or wrong[1]} must be {wrong[2]}{found}."
-
-
-def _less_at_once(arguments: Sequence[str]) -> str:
-    batched = any(word.startswith("--batch-size") for word in arguments)
-    return "a smaller --batch-size" if batched else "smaller batches or images"

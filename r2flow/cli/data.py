@@ -1,0 +1,186 @@
+"""`r2flow simulate`, `prepare`, `sensor` and `unpack`: where scans come from."""
+
+import logging
+import re
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from r2flow.cli.app import app
+from r2flow.cli.options import (
+    ColumnsOption,
+    OutOption,
+    ReadingOptions,
+    SensorOption,
+    SizeOption,
+    build_sized,
+    cores,
+    grouped,
+    named_columns,
+)
+from r2flow.errors import InputError
+
+log = logging.getLogger(__name__)
+
+
+@app.command(epilog="Example: r2flow simulate --num 1000 --sensor os1_64 --seed 1 --out scans --labels")
+def simulate(
+    out: OutOption,
+    num: Annotated[int, typer.Option(min=1, help="Number of scans.")] = 100,
+    sensor: SensorOption = "hdl64e",
+    size: SizeOption = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Scan i depends on the seed and on i alone.")] = 0,
+    format: Annotated[
+        str, typer.Option(help="Any of bin,ply,pcd, or npy: the range image, (2, H, W) float32.")
+    ] = "bin",
+    labels: Annotated[bool, typer.Option("--labels", help="SemanticKITTI's .label files beside them.")] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes; one a core if left out.", show_default=False)
+    ] = None,
+) -> None:
+    """Simulate scans of street scenes. After a stop or a kill, the same command resumes."""
+    from r2flow.progress import Bar
+    from r2flow.simulator.folder import SimulatedFolder
+
+    formats = tuple(dict.fromkeys(format.split(",")))
+    folder = SimulatedFolder(out, build_sized(sensor, size), seed, formats, labels)
+    folder.begin()
+    missing = folder.missing(range(num))
+    with Bar("simulating", len(missing), "scans") as advance:
+        folder.make(missing, folder.simulate, workers or cores(), lambda scan: advance())
+    kept = f", {num - len(missing)} were there already" if len(missing) < num else ""
+    print(f"{len(missing)} scans ({', '.join(formats)}{', labels' if labels else ''}) in {out}{kept}")
+
+
+@app.command(epilog="Example: r2flow prepare kitti_360:/data/KITTI-360 --out prepared/kitti_360")
+@grouped
+def prepare(
+    reading: ReadingOptions,
+    scans: Annotated[str, typer.Argument(help="A folder of scans, or LAYOUT:FOLDER, as kitti_360:/data/KITTI-360.")],
+    out: OutOption,
+    split: Annotated[str | None, typer.Option(help="A part of the layout's split; all of it if left out.")] = None,
+    drives: Annotated[str | None, typer.Option(help="Names or numbers, separated by commas; all if left out.")] = None,
+    on_bad_scan: Annotated[
+        Literal["error", "skip"], typer.Option(help="skip: leave out by name what cannot be used.")
+    ] = "error",
+    shard_scans: Annotated[int, typer.Option(min=1, help="Scans a file.")] = 64,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; one a core if left out.")] = None,
+) -> None:
+    """Project a data set once, into shards that training reads: range in 2 bytes, reflectance in 1.
+
+    After a stop or a kill the same command resumes; two at once share the work; damaged shards are made again.
+    Then: python train.py data=prepared data.root=FOLDER.
+    """
+    from r2flow.data.opening import SOURCES, parse
+    from r2flow.data.prepared import plan_files
+    from r2flow.data.prepared import prepare as make
+    from r2flow.progress import Bar
+
+    options, file = parse(scans)
+    if file is not None:
+        raise InputError(f"{scans} is one scan; give the folder of a data set.")
+    options = replace(options, split=split, drives=[*drives.split(",")] if drives else None)
+    found = SOURCES[options.name].find_drives(options)
+    plan = plan_files(options.name, options.folder, found, reading.reading([scans]), shard_scans)
+    with Bar("checking", len(plan.shards), "shards") as checked, Bar("preparing", len(plan.shards), "shards") as made:
+        notes = make(out, plan, on_bad_scan, workers or cores(), lambda shard: checked(), lambda shard: made())
+    size = sum(plan.store(out).files(shard)[0].stat().st_size for shard in plan.shards)
+    left_out = sum(len(note["left_out"]) for note in notes)
+    scans, shards, levels = plan.recipe["scans"] - left_out, len(plan.shards), plan.recipe["levels"]
+    range_error, error = (max(note["errors"][channel] for note in notes) for channel in (0, 1))
+    kept = "no reflectance in the scans"
+    if levels is not None:
+        kept = f"reflectance as n/{levels}, " + (f"at most {error:.2g} off" if error else "exactly")
+    skipped = f"; {left_out} scans left out" if left_out else ""
+    of = f"{scans} scan{'s' * (scans != 1)} in {shards} shard{'s' * (shards != 1)}"
+    print(f"{out}: {of}, {size / 2**20:.1f} MiB; range within {range_error * 1e3:.2f} mm, {kept}{skipped}")
+
+
+@app.command(epilog="Example: r2flow sensor my/scans --out conf/sensor/mine.yaml")
+def sensor(
+    scans: Annotated[list[Path], typer.Argument(help="Scan files, or folders of them, of one sensor.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="The .yaml to write; none if left out.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
+    columns: ColumnsOption = None,
+    most: Annotated[int, typer.Option("--num", min=1, help="The most scans to read of a folder.")] = 8,
+) -> None:
+    """Estimate a sensor from scans: beams, resolution, limits, height, reflectance; write it as YAML.
+
+    The YAML is a sensor for the verbs (--sensor mine.yaml) and, in conf/sensor/, for train.py (sensor=mine).
+    """
+    from r2flow.data.sources import spread
+    from r2flow.lidar.beams import estimate_sensor, nearest_sensor
+    from r2flow.lidar.scan_files import read_points
+    from r2flow.lidar.sensor_files import ENDINGS, write_sensor
+    from r2flow.lidar.sensors import SENSORS
+    from r2flow.progress import track
+    from r2flow.reports.tables import print_table
+    from r2flow.reports.views import scans_of
+
+    if out is not None and (out.suffix.lower() not in ENDINGS or out.is_dir()):
+        raise InputError(f"--out must be a .yaml file, as --sensor expects; found {out}.")
+    if out is not None and out.exists() and not overwrite:
+        raise InputError(f"{out} exists; give another --out, or --overwrite to replace it.")
+    name = re.sub(r"\W", "_", out.stem, flags=re.ASCII) if out is not None else "mine"
+    name = f"my_{name}" if name in SENSORS or not name[:1].isalpha() else name
+    folders = [scans_of(path) for path in scans]
+    paths = [folder[index] for folder in folders for index in spread(len(folder), most)]
+    points = [read_points(path, named_columns(columns)) for path in track(paths, "reading", "scans", least=16)]
+    mine, beams, steps = estimate_sensor(points, name)
+    e, middle = mine.elevations, len(mine.elevations) // 2
+    shown = " ... ".join(f"{a:+.2f} {b:+.2f}" for a, b in (e[:2], e[middle - 1 : middle + 1], e[-2:]))
+    nearest, distance = nearest_sensor(beams.elevations)
+    scale = mine.reflectance_scale
+    rows = [
+        ("beams", f"{len(e)}: {beams.order}"),
+        ("elevations", f"{shown} degrees"),
+        ("nearest sensor", f"{nearest}, its beams {distance:.2f} degrees away" if nearest else "none of the built-in"),
+        ("resolution", f"{steps:,.0f} steps a turn; images of {mine.columns} columns"),
+        ("range", f"{mine.min_range:g} to {mine.max_range:g} m; raise min_range if the vehicle itself is seen"),
+        ("height", f"{mine.height:.2f} m above the ground"),
+        ("reflectance", "none: encoding.reflectance=false" if scale is None else f"reflectance_scale={scale:g}"),
+    ]
+    print_table(rows, ("", ""))
+    if out is not None:
+        write_sensor(mine, out, f"Estimated from {len(points)} scan(s), stored {beams.order}.")
+        print(out)
+
+
+@app.command(epilog="Example: r2flow unpack drive.mcap --topic /ouster/points --out scans")
+def unpack(
+    recording: Annotated[Path, typer.Argument(help="A .mcap, .db3 or .bag file, or the folder of a ROS 2 bag.")],
+    out: OutOption,
+    topic: Annotated[str | None, typer.Option(help="Topic of the point clouds, where there are several.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Take one message of so many.")] = 1,
+    most: Annotated[
+        int | None, typer.Option("--num", min=1, help="The most scans to write.", show_default=False)
+    ] = None,
+) -> None:
+    """Write the PointCloud2 messages of a recording as scan files, named by their time in ns.
+
+    They hold x, y, z and, where the messages do, intensity and ring.
+    """
+    from r2flow.lidar.bags import read_bag
+    from r2flow.lidar.scan_files import write_points
+    from r2flow.progress import track
+
+    written, stamps = 0, Counter[int]()
+    for number, (stamp, points) in enumerate(track(read_bag(recording, topic), "unpacking", "scans", most or 0)):
+        if number % every:
+            continue
+        if isinstance(points, InputError):
+            log.warning("left out: %s", points)
+            continue
+        stamps[stamp] += 1
+        again = f"-{stamps[stamp]}" if stamps[stamp] > 1 else ""  # clouds of one time keep apart
+        points = points.with_lost_rays()
+        write_points(out / f"{stamp:019d}{again}.ply", points.xyz, points.reflectance, points.ring)
+        written += 1
+        if written == most:
+            break
+    if not written:
+        raise InputError(f"{recording} holds no scan that could be written.")
+    print(f"{written} scans in {out}")
