@@ -183,7 +183,7 @@ def interpolate_scans(
     arrived(2)
     weights = torch.linspace(0, 1, frames, dtype=torch.float64)
     parts = []
-    for noise in slerp(*ends.x_0, weights[1:-1]):
+    for noise in slerp(ends.x_0[0], ends.x_0[1], weights[1:-1]):
         parts.append(flow.solve(noise[None], sampler=sampler, progress=progress))
         arrived(2 + len(parts))
 

@@ -18,7 +18,6 @@ from r2flow.lidar.transfer import image_through
 from r2flow.noise import generator
 from r2flow.simulator import simulate
 from r2flow.stages.checkpointing import AtomicCheckpointIO
-from r2flow.store import Store
 from tests.data.conftest import prepare_folder
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 from tests.test_completion import network, scans
@@ -196,11 +195,8 @@ def test_a_diffusion_completes_by_its_own_repaint(r2flow, tmp_path):  # noqa: F8
     [
         (["--mask", "points:0"], "one: the mask keeps nothing that was measured"),
         (["--mask", "points:1"], "one: the mask keeps everything that was measured"),
-        (["--mask", "row:4"], "Did you mean 'rows'"),
         (["--mask", "{folder}/mask.npy"], "is of (4, 4), the scans are of (8, 64) rays"),
         (["--from", "vlp16"], "is a range image of 8x64, those of the model are 8x64: --from vlp16 has 16 rows"),
-        (["--sampler", "dopri6"], "dopri6"),
-        (["--out", "{folder}"], "is the folder of the scans"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(r2flow, run, tmp_path, options, message):  # noqa: F811
@@ -228,8 +224,6 @@ def test_what_cannot_be_done_is_one_line(r2flow, run, tmp_path, options, message
             lambda path: np.save(path, scans()[0].numpy() * np.float32([[[1000]], [[1]]])),
             "none of its ranges lies within 1.45-80 m",
         ),
-        (lambda path: path.write_bytes(b""), "is empty"),
-        (lambda path: None, "does not exist"),
     ],
 )
 def test_scans_that_cannot_be_completed_are_one_line(r2flow, run, tmp_path, made, message):  # noqa: F811
@@ -284,13 +278,6 @@ def test_a_file_of_an_answer_s_name_is_no_answer(r2flow, run, tmp_path):  # noqa
     assert (tmp_path / "out" / "one.npy").read_text() == "mine"
 
 
-def test_answers_of_another_sampler_are_told_apart_by_its_setting(r2flow, run, tmp_path):  # noqa: F811
-    full_scan(tmp_path / "one.npy")
-    asked = [*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out", "--steps"]
-    assert r2flow(*asked, 1)[0] == 0
-    assert "answers: sampler" in r2flow(*asked, 2)[2]
-
-
 @pytest.mark.parametrize("ending", [".npy", ".bin"])
 def test_answers_to_another_scan_of_the_same_name_are_none(r2flow, run, tmp_path, ending):  # noqa: F811
     for number, drive in enumerate("ab"):
@@ -332,16 +319,6 @@ def test_prepared_scans_are_named_by_their_numbers_in_the_set(r2flow, run, tmp_p
     assert "3 were there already" in said
 
 
-def test_answers_to_other_prepared_scans_of_the_same_name_are_none(r2flow, run, tmp_path):  # noqa: F811
-    one, other = (prepared(tmp_path / drive, [number]) for number, drive in enumerate("ab"))
-    asked = "-c", run, "--mask", "rows:2", "--out", tmp_path / "out"
-    assert r2flow(*COMPLETE, one, *asked)[0] == 0
-    code, _, error = r2flow(*COMPLETE, other, *asked)
-    assert code == 2
-    assert "another scan of the name prep-000000" in error
-    assert "1 were there already" in r2flow(*COMPLETE, one, *asked)[1]
-
-
 def test_a_bad_scan_may_be_mended_and_the_command_given_again(r2flow, run, tmp_path):  # noqa: F811
     full_scan(tmp_path / "in" / "a.npy", 0)
     image = full_scan(tmp_path / "in" / "b.npy", 1)
@@ -368,14 +345,6 @@ def test_answers_by_another_mask_file_or_scale_are_none(r2flow, run, tmp_path): 
     code, _, error = r2flow(*asked)
     assert code == 2
     assert "mask is" in error
-
-
-def test_a_folder_of_other_samples_is_not_written_into(r2flow, run, tmp_path):  # noqa: F811
-    full_scan(tmp_path / "one.npy")
-    Store(tmp_path / "out", "samples", {"seed": 0}).begin()
-    code, _, error = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", run, "--mask", "rows:2", "--out", tmp_path / "out")
-    assert code == 2
-    assert "holds samples, not answers" in error
 
 
 @pytest.mark.slow
@@ -448,10 +417,3 @@ def test_scans_for_two_models_are_refused_together(r2flow, tmp_path):  # noqa: F
     assert "cut lacks whole sectors (--checkpoint street) and thin does not (--checkpoint densify)" in error
     assert not (tmp_path / "out").exists()
     assert r2flow(*COMPLETE, tmp_path / "in" / "cut.ply", *asked[1:])[0] == 0
-
-
-def test_a_model_of_one_image_takes_no_other(r2flow, tmp_path):  # noqa: F811
-    full_scan(tmp_path / "one.npy")
-    code, _, said = r2flow(*COMPLETE, tmp_path / "one.npy", "-c", "street", "--to", "vlp16", "--out", tmp_path / "out")
-    assert (code, "--to and --size" in said) == (2, True)
-    assert not (tmp_path / "out").exists()

@@ -81,16 +81,6 @@ def test_jumps_have_two_times():
     torch.testing.assert_close(found.states, torch.tensor([[1, 0, 0], [1, 0.5, 0], [1, 0.5, 0.5]]).double())
 
 
-def test_chords_go_towards_the_end():
-    found = tableau(
-        flow("efficient_unet", "flow_map").generator,
-        build_sampler("chord", steps=2, grid=(0.0, 0.75, 1.0)),
-    )
-    assert found.times == [0, 0.75]
-    assert found.second == [1, 1]
-    torch.testing.assert_close(found.states, torch.tensor([[1, 0, 0], [1, 0.75, 0], [1, 0.75, 0.25]]).double())
-
-
 def test_a_sampler_that_draws_noise_on_the_way_is_refused():
     with pytest.raises(InputError, match="renoise needs noise"):
         tableau(flow("efficient_unet", "flow_map").generator, build_sampler("renoise", steps=2))

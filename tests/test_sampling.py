@@ -315,15 +315,6 @@ def test_one_channel_is_that_of_both():
         next(sample(checkpoint, 1, channels="depth"))
 
 
-def test_range_alone_decodes_no_reflectance(monkeypatch):
-    checkpoint = network()
-    widths = []
-    decode = Encoding.decode
-    monkeypatch.setattr(Encoding, "decode", lambda self, x: widths.append(x.shape[1]) or decode(self, x))
-    next(sample(checkpoint, 1, steps=1, channels="range"))
-    assert widths == [1]
-
-
 def test_numeric_times_decide_the_number_of_steps():
     own = build_sampler("euler", grid=(0.0, 0.3, 1.0))
     assert own.steps == 2

@@ -110,11 +110,6 @@ def test_a_step_of_several_batches_is_measured_once(tmp_path):
     assert all(math.isfinite(float(row["curvature/s_normalised"])) for row in rows)
 
 
-def test_it_can_be_left_out(tmp_path):
-    fit(tmp_path, [Curvature(seed=0, every=0)], steps=2)
-    assert read_curves(tmp_path, ("curvature/s",)) == {}
-
-
 def test_a_resumed_run_does_not_look_again_at_the_step_that_it_goes_on_from():
     """Under accumulation a batch of the next step ends before the step does."""
 

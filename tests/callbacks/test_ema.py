@@ -122,10 +122,3 @@ def test_a_run_that_ends_before_its_average_begins_has_the_weights_that_it_learn
     trainer([ema, watch], steps, tmp_path).fit(Scripted(values), torch.utils.data.DataLoader(torch.zeros(steps)))
     copied = [values[n - n % 10] for n in range(steps - 1)]
     assert watch.trace == list(zip(values, [*copied, values[-1]], strict=True))
-
-
-def test_a_longer_run_is_averaged_as_ever(tmp_path):
-    watch = Watch(ema := EMA(0.5, every=10, warmup_steps=3))
-    values = [float(n) for n in range(1, 13)]
-    trainer([ema, watch], 12, tmp_path).fit(Scripted(values), torch.utils.data.DataLoader(torch.zeros(12)))
-    assert [average for _, average in watch.trace] == [1.0] * 10 + [6.0] * 2

@@ -135,20 +135,6 @@ def test_the_line_names_everything_needed_to_look_further(tmp_path):
         assert words in said, (words, said)
 
 
-class Poisoned(Line):
-    """One parameter's gradient is infinite; the others are as they are."""
-
-    def on_after_backward(self):
-        self.outer.weight.grad[0, 0] = INF
-
-
-def test_the_first_broken_gradient_is_named(tmp_path):
-    module = Poisoned()
-    with pytest.raises(InputError) as caught:
-        fit(module, batches(1.0), tmp_path, Guard(tmp_path, skips=1))
-    assert "gradient of outer.weight non-finite first, 1 of 4" in str(caught.value)
-
-
 def half(scale: float) -> MixedPrecision:
     """16-mixed, which Lightning has on GPUs only, with a scale to start from."""
     return MixedPrecision("16-mixed", "cpu", torch.amp.GradScaler("cpu", init_scale=scale, growth_interval=1000))
