@@ -110,15 +110,6 @@ class EMA(WeightAveraging):
                     weight.copy_(raw)
             self._raw = []
 
-    @contextmanager
-    def averaged(self, trainer: L.Trainer, pl_module: L.LightningModule) -> Iterator[None]:
-        """The module with the averaged weights in it, for the length of a block."""
-        self.on_validation_epoch_start(trainer, pl_module)
-        try:
-            yield
-        finally:
-            self.on_validation_epoch_end(trainer, pl_module)
-
 
 class HalfLifeEMA(EMA):
     """The average of a GAN's generator: half of it is from the last `half_life` images, or from a share `rampup` of
@@ -140,10 +131,12 @@ class HalfLifeEMA(EMA):
 
 @contextmanager
 def averaged_weights(trainer: L.Trainer, pl_module: L.LightningModule) -> Iterator[None]:
-    """The averaged weights where the run keeps an average, else the weights as they are."""
-    average = next((c for c in trainer.callbacks if isinstance(c, EMA)), None)  # type: ignore[attr-defined]
-    if average is None:
+    """The averaged weights in the module where the run keeps an average, else the weights as they are."""
+    averages = [c for c in trainer.callbacks if isinstance(c, EMA)]  # type: ignore[attr-defined]
+    for average in averages:
+        average.on_validation_epoch_start(trainer, pl_module)
+    try:
         yield
-    else:
-        with average.averaged(trainer, pl_module):
-            yield
+    finally:
+        for average in averages:
+            average.on_validation_epoch_end(trainer, pl_module)

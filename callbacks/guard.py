@@ -4,7 +4,7 @@ import copy
 import logging
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import lightning as L
 import torch
@@ -81,7 +81,7 @@ class Guard(L.Callback):
         self.in_a_row += first
         self.total += first and not overflow
         if self.in_a_row >= self.skips or (scale is not None and scale < self.lowest_scale):
-            raise self._stop(trainer, pl_module, loss, scale)
+            self._stop(trainer, pl_module, loss, scale)
         if trainer.is_global_zero and not overflow:
             what = "gradients" if loss - loss == 0 else f"loss {loss}"
             log.warning(
@@ -89,19 +89,17 @@ class Guard(L.Callback):
                 trainer.global_step + 1, what, self.in_a_row, self.skips,
             )  # fmt: skip
 
-    def _stop(self, trainer: L.Trainer, pl_module: L.LightningModule, loss: float, scale: float | None) -> InputError:
+    def _stop(self, trainer: L.Trainer, pl_module: L.LightningModule, loss: float, scale: float | None) -> None:
         what = f"{self.in_a_row} steps in a row were" if self.in_a_row > 1 else "the step was"
         scaled = f"loss scale {scale:g}" if scale is not None else f"no loss scale in {trainer.precision}"
         full = "" if trainer.precision == "32-true" else "try trainer.precision=32-true; "
-        error = InputError(
+        self._end(
+            trainer,
             f"stopped at step {trainer.global_step + 1}: {what} skipped for a non-finite loss or gradient, "
             f"{self.total} in the run. Loss {loss:g}; {describe_gradients(pl_module)}; {scaled}; "
             f"{describe_batch(trainer)}. {self._last_good()} Look at these scans; {full}try, in a run of another name, "
-            "a lower stage.learning_rate."
+            "a lower stage.learning_rate.",
         )
-        if not trainer.is_global_zero:
-            outlive_parent()
-        return error
 
     def on_save_checkpoint(self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
         learned = [name for name, _ in pl_module.named_parameters()]
@@ -110,14 +108,17 @@ class Guard(L.Callback):
             broken = _not_finite((name, state[name]) for name in learned if name in state)
             if broken:
                 what = "averaged weights" if key == "state_dict" and "current_model_state" in checkpoint else "weights"
-                error = InputError(
+                self._end(
+                    trainer,
                     f"stopped at step {trainer.global_step}: the {what} are no longer finite ({broken[0]} first, "
                     f"{len(broken)} of {len(learned)}), so no checkpoint was written. {self._last_good()} "
-                    "Start under another name with a lower stage.learning_rate."
+                    "Start under another name with a lower stage.learning_rate.",
                 )
-                if not trainer.is_global_zero:
-                    outlive_parent()
-                raise error
+
+    def _end(self, trainer: L.Trainer, message: str) -> NoReturn:
+        if not trainer.is_global_zero:
+            outlive_parent()
+        raise InputError(message)
 
     def _last_good(self) -> str:
         newest = next(iter(checkpoints_of(self.run_dir)), None)

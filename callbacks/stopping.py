@@ -103,7 +103,8 @@ class Stopping(L.Callback):
                 )
                 self._keep_two(trainer)
             self._training = False
-            if not trainer.is_global_zero and isinstance(_environment(trainer), LightningEnvironment):
+            environment = getattr(trainer.strategy, "cluster_environment", None)
+            if not trainer.is_global_zero and isinstance(environment, LightningEnvironment):
                 outlive_parent()
             self._leave(f"stopped at step {trainer.global_step}")
 
@@ -140,10 +141,6 @@ class Stopping(L.Callback):
             raise InputError(
                 f"{where}, but SLURM did not take job {self.job} back ({error}). Submit the same script again."
             ) from None
-
-
-def _environment(trainer: L.Trainer) -> Any:
-    return getattr(trainer.strategy, "cluster_environment", None)
 
 
 def slurm_job() -> str | None:

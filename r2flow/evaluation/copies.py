@@ -44,12 +44,8 @@ def described(scans: ScanSet, work: Work, device: str, doing: str) -> Iterator[T
 class Nearest:
     """The nearest training scan of each scan of a set, of those that were compared so far.
 
-    Attributes:
-        scans: The set.
-        numbers: Its scans that have a return, (N,); the others have no neighbour.
-        squared: d^2 of each to its nearest training scan, (N,).
-        neighbours: These training scans, (N,).
-        turns: By how many cells they are turned; negative, -1 - u, where they are mirrored first.
+    `numbers` are the scans that have a return, (N,), `squared` d^2 to the nearest training scan, `neighbours` these
+    training scans, and `turns` by how many cells they are turned: negative, -1 - u, where they are mirrored first.
     """
 
     def __init__(self, scans: ScanSet, work: Work, device: str) -> None:

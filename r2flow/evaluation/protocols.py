@@ -23,22 +23,14 @@ WORDS = {"measured": "as measured", "centre": "on rays through bin centres", "re
 
 @dataclass(frozen=True)
 class Rules:
-    """One protocol.
-
-    Attributes:
-        real, generated: Where the point of a pixel lies: where it was measured, or on a ray through its bin's middle
-            ("centre") or upper left corner ("reference").
-        convention: How points of files become images where nobody says so; None for that of the model or the scans.
-        choose: Numbers of `most` scans of a set, rising.
-        chosen: How, in words.
-    """
+    """One protocol."""
 
     name: str
-    real: Points
-    generated: Convention
-    convention: Convention | None
-    choose: Callable[[ScanSet, int], Sequence[int]]
-    chosen: str
+    real: Points  # where the point of a pixel lies: as measured, or on a ray through its bin's middle or upper left
+    generated: Convention  # corner ("reference")
+    convention: Convention | None  # how points of files become images where nobody says so; None for the model's
+    choose: Callable[[ScanSet, int], Sequence[int]]  # numbers of so many scans of a set, rising
+    chosen: str  # how, in words
 
     def describe(self) -> dict[str, Any]:
         """For a figure's protocol."""

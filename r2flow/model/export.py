@@ -32,17 +32,11 @@ LARGEST = 2**31 - 2**25  # bytes of weights in an .onnx, which is one protocol b
 
 
 class Tableau(NamedTuple):
-    """A sampler of E evaluations, v_j = v(t_j, y_j) or u(y_j, t_j, s_j), with y_j = a_j0 x_0 + sum_{i<j} a_j,i+1 v_i.
+    """A sampler of E evaluations v_j, v(t_j, y_j) or u(y_j, t_j, s_j), at y_j = a_j0 x_0 + sum_{i<j} a_j,i+1 v_i."""
 
-    Attributes:
-        times: t_j, (E,).
-        second: s_j, (E,); None for a network of one time.
-        states: a, (E + 1, E + 1) float64; its last row makes x_1.
-    """
-
-    times: list[float]
-    second: list[float] | None
-    states: Tensor
+    times: list[float]  # t_j, (E,)
+    second: list[float] | None  # s_j, (E,); None for a network of one time
+    states: Tensor  # a, (E + 1, E + 1) float64; its last row makes x_1
 
 
 class _Recorder(nn.Module):

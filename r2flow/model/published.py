@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,41 +28,21 @@ BACKBONE = "backbone."  # of a flow's network in the generator
 
 @dataclass(frozen=True)
 class Published:
-    """A generator of a published file in our terms.
+    """A generator of a published file in our terms."""
 
-    Attributes:
-        config: `r2flow.generators.build_generator` makes the generator of it; the file's own config under `published`.
-        weights: Of that generator, by our names.
-        step: Optimiser steps taken.
-        sampler: Name and fields of its sampler, as published; None for the generator's own.
-        finish: Called with the generator, which has its weights, and the config.
-    """
-
-    config: dict[str, Any]
-    weights: dict[str, Tensor]
-    step: int = 0
-    sampler: Mapping[str, Any] | None = None
-    finish: Callable[[Generator, Mapping[str, Any]], None] | None = None
-
-
-class Read(Protocol):
-    """Raises `InputError` for a file of this format that lacks or garbles a part."""
-
-    def __call__(self, content: Any, path: Path, averaged: bool = True) -> Published: ...
+    config: dict[str, Any]  # `r2flow.generators.build_generator` makes it; the file's own config is under `published`
+    weights: dict[str, Tensor]  # of that generator, by our names
+    step: int = 0  # optimiser steps taken
+    sampler: Mapping[str, Any] | None = None  # name and fields, as published; None for the generator's own
+    finish: Callable[[Generator, Mapping[str, Any]], None] | None = None  # called with generator, weights in it, config
 
 
 class Format(NamedTuple):
-    """A published layout of checkpoint files.
+    """A published layout of checkpoint files."""
 
-    Attributes:
-        system: Whose it is.
-        holds: Whether the content of a torch file is of this format.
-        read: The generator in it, with its averaged weights or, on demand, the raw ones.
-    """
-
-    system: str
-    holds: Callable[[Any], bool]
-    read: Read
+    system: str  # whose it is
+    holds: Callable[[Any], bool]  # whether the content of a torch file is of this format
+    read: Callable[[Any, Path, bool], Published]  # the generator in it, with averaged or raw weights
 
 
 @contextmanager
