@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from r2flow.data.reading import Reading
     from r2flow.data.sets import ScanSet
     from r2flow.evaluation.measuring import Work
-    from r2flow.evaluation.statistics import Statistics
     from r2flow.generators import Generator, Sampler
     from r2flow.metrics.base import ScanMetric
     from r2flow.model.checkpoint import Checkpoint
@@ -90,6 +89,17 @@ class EvaluateOptions:
     json: Annotated[Path | None, typer.Option("--json", help="File for every figure with its protocol.")] = None
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for a page.", show_default=False)] = None
 
+    def check(self, named: Sequence[str], sampled: Sequence[str]) -> None:
+        """Refuse options that do not go together, before anything is read."""
+        if not (named or self.reference or self.baselines):
+            raise InputError("nothing to compare with: give GENERATED or --reference.")
+        if self.json is not None and (self.json.is_dir() or self.json.suffix.lower() != ".json"):
+            raise InputError(f"--json must be a file that ends in .json, found {self.json}.")
+        if not sampled and any(getattr(self, key) != getattr(EvaluateOptions, key) for key in SAMPLING):
+            raise InputError(f"--{', --'.join(SAMPLING)} are of a run, a checkpoint or a model to sample; found none.")
+        if len(named) == len(sampled) and (self.generated_split or self.generated_scale):
+            raise InputError("--generated-split and --generated-scale are of files in GENERATED; found none.")
+
 
 @app.command(
     epilog="Example: r2flow evaluate kitti_360:/data/KITTI-360 runs/1rf runs/2rf others/ --split test --json e.json"
@@ -114,11 +124,11 @@ def evaluate(
     several --steps or --sampler show distance against evaluations and seconds. The same command with --out resumes.
     Under torchrun the processes share the scans.
     """
-    from r2flow.evaluation.measuring import Work, check_reflectance, gather_real
+    from r2flow.evaluation.measuring import Work, check_reflectance
     from r2flow.evaluation.protocols import PROTOCOLS
     from r2flow.evaluation.sets import is_checkpoint
-    from r2flow.evaluation.statistics import Cache
     from r2flow.metrics import METRICS, default_metrics
+    from r2flow.model.checkpoint import load_checkpoint
     from r2flow.processes import joined, place
     from r2flow.reports.compare import labels
     from r2flow.reports.pages import prepare_folder
@@ -126,17 +136,15 @@ def evaluate(
     named = list(dict.fromkeys(generated or []))
     sampled = [one for one in named if is_checkpoint(one)]
     rules = PROTOCOLS[options.protocol]
-    _check_options(named, options)
-    if not sampled and any(getattr(options, key) != getattr(EvaluateOptions, key) for key in SAMPLING):
-        raise InputError(f"--{', --'.join(SAMPLING)} are of a run, a checkpoint or a model to sample; found none.")
-    if len(named) == len(sampled) and (options.generated_split or options.generated_scale):
-        raise InputError("--generated-split and --generated-scale are of files in GENERATED; found none.")
+    options.check(named, sampled)
     with joined(choose_device(work.device)) as device:
         keep = options.bootstrap > 0
         wanted = None
         if options.metrics not in (None, "all"):
             wanted = _build(options.metrics.split(","), keep, device)
-        flows = _load_flows(sampled, device)
+        flows = {name: load_checkpoint(name, device) for name in sampled}
+        if len({(flow.sensor.shape, flow.sensor.elevations) for flow in flows.values()}) > 1:
+            raise InputError(f"{', '.join(flows)} have different sensors or image sizes; measure each by itself.")
         if flows and options.num is None and place()[0] == 0:
             print(f"{', '.join(flows)}: {SAMPLED} scans of each set are drawn (--num says how many)")
         files = [one for one in named if one not in sampled]
@@ -166,27 +174,12 @@ def evaluate(
         for folder in (options.out, options.json.parent if options.json else None):
             if folder is not None:
                 prepare_folder(folder)
-        share = Work(work.batch_size, work.workers)
-        cache = None if options.no_cache else Cache()
-
-        def gather(scans: "ScanSet") -> "dict[str, Statistics]":
-            return gather_real(metrics, scans, share, cache, rules)
-
-        _compare(truth, metrics, gather, share, device, judged, training, options)
-
-
-def _check_options(generated: Sequence[str], options: EvaluateOptions) -> None:
-    """Refuse options that do not go together, before anything is read."""
-    if not (generated or options.reference or options.baselines):
-        raise InputError("nothing to compare with: give GENERATED or --reference.")
-    if options.json is not None and (options.json.is_dir() or options.json.suffix.lower() != ".json"):
-        raise InputError(f"--json must be a file that ends in .json, found {options.json}.")
+        _compare(truth, metrics, Work(work.batch_size, work.workers), device, judged, training, options)
 
 
 def _compare(
     truth: "ScanSet",
     metrics: "Mapping[str, ScanMetric]",
-    gather: "Callable[[ScanSet], dict[str, Statistics]]",
     work: "Work",
     device: str,
     judged: "dict[str, ScanSet]",
@@ -194,10 +187,11 @@ def _compare(
     options: EvaluateOptions,
 ) -> None:
     from r2flow.evaluation.copies import Nearest, copies_result, find_nearest
-    from r2flow.evaluation.measuring import measure, speed_result
+    from r2flow.evaluation.measuring import gather_real, measure, speed_result
     from r2flow.evaluation.protocols import PROTOCOLS
     from r2flow.evaluation.references import baseline_sets, reference_sets
     from r2flow.evaluation.results import Results
+    from r2flow.evaluation.statistics import Cache, Statistics
     from r2flow.processes import place
     from r2flow.reports.evaluation import Comparison, Kind, evaluation_page, print_comparisons, write_json
     from r2flow.reports.pages import write_page
@@ -212,7 +206,7 @@ def _compare(
         num = max((len(one) for one in judged.values()), default=len(truth))
         kinds["baseline"] = {name: (truth, one) for name, one in baseline_sets(truth, min(num, SAMPLED)).items()}
     comparisons: list[Comparison] = []
-    rank, _ = place()
+    (rank, _), rules, cache = place(), PROTOCOLS[options.protocol], None if options.no_cache else Cache()
     statistics: dict[int, dict[str, Statistics]] = {}
     folder = options.out and options.out / "results"
     kept = Results(folder, metrics, bootstrap=options.bootstrap, protocol=options.protocol, device=device)
@@ -222,9 +216,9 @@ def _compare(
         results = kept.read(real, other) if sampled else None
         if results is None:
             if id(real) not in statistics:
-                statistics[id(real)] = gather(real)
+                statistics[id(real)] = gather_real(metrics, real, work, cache, rules)
             draws = 0 if kind == "baseline" else options.bootstrap
-            results = measure(metrics, statistics[id(real)], other, work, draws, PROTOCOLS[options.protocol])
+            results = measure(metrics, statistics[id(real)], other, work, draws, rules)
             if sampled:
                 results.append(speed_result(real, other))
                 if rank == 0:
@@ -256,16 +250,6 @@ def _compare(
             print(path)
         sets = {"real": truth} | {"real, judged" if name == "real" else name: one for name, one in judged.items()}
         print(write_sets(options.out / "evaluation.html", sets, title="Generated and real scans"))
-
-
-def _load_flows(names: Sequence[str], device: str) -> "dict[str, Checkpoint]":
-    from r2flow.model.checkpoint import load_checkpoint
-
-    flows = {name: load_checkpoint(name, device) for name in dict.fromkeys(names)}
-    sensors = {(flow.sensor.shape, flow.sensor.elevations) for flow in flows.values()}
-    if len(sensors) > 1:
-        raise InputError(f"{', '.join(flows)} have different sensors or image sizes; measure each by itself.")
-    return flows
 
 
 def _open(text: str, reading: "Reading", split: str | None, num: int | None) -> "ScanSet":
