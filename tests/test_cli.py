@@ -231,10 +231,6 @@ def test_a_model_has_a_name(name):
         load(name)
 
 
-def test_a_model_is_loaded_on_a_device_of_torch(saved):  # noqa: F811
-    assert load(saved[0], torch.device("cpu")).generator.device == load(saved[0]).generator.device
-
-
 def test_importing_r2flow_loads_neither_lightning_nor_matplotlib():
     code = "import r2flow, r2flow.cli.verbs, r2flow.lidar.projection, r2flow.flow.solvers, r2flow.backbones, sys; "
     code += "print([m for m in ('lightning', 'matplotlib', 'tensorboard', 'torchdiffeq') if m in sys.modules])"

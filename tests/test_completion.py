@@ -9,8 +9,8 @@ from r2flow.errors import InputError
 from r2flow.generators import Generator, build_generator
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.model.completion import ANSWER, Completed, complete, completing
-from r2flow.noise import Draws, generator
+from r2flow.model.completion import Completed, complete, completing
+from r2flow.noise import generator
 from r2flow.samplers import build_sampler
 from tests.test_checkpoints import CONFIG
 
@@ -105,11 +105,6 @@ def test_an_answer_depends_on_seed_scan_and_its_number_alone():
     (alone,) = complete(checkpoint, images[2:], state[2:], num=2, seed=1, first=2)
     assert torch.equal(alone.images[0], whole[2, 0])
     assert not torch.equal(whole[:, 0], checkpoint.complete(images, state, seed=2)[:, 0])
-
-
-def test_answers_never_share_their_noise():
-    starts = Draws(0, [0, 1, ANSWER, ANSWER + 1]).start((4,))
-    assert len(torch.unique(starts, dim=0)) == 4
 
 
 def test_scans_that_are_known_in_part_wholly_and_not_at_all_go_together():

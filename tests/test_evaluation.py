@@ -219,43 +219,11 @@ def philox() -> np.random.Philox:
 
 
 class TestSets:
-    def test_every_format_gives_the_same_figures(self, real, tmp_path):
-        made = images(10, 2)
-        files = tmp_path / "files"
-        for number, image in enumerate(made):
-            ending = ("ply", "bin", "npy", "pcd")[number % 4]
-            xyz, reflectance = image_to_points(image, SENSOR.rays())
-            write_points(files / f"{number}.{ending}", xyz, reflectance)
-        found = open_scans(str(files), READING)
-        assert found.about["reflectance"]
-        for index, name in enumerate(found.source.names):
-            np.testing.assert_allclose(found.source[index], made[int(Path(name).stem)], atol=1e-4)
-
-    def test_one_of_each_where_a_sample_lies_in_several_formats(self, generated):
-        for number, image in enumerate(images(10, 2)):
-            write_points(generated / f"{number:06d}.ply", *image_to_points(image, SENSOR.rays()))
-        assert open_scans(str(generated), READING).source.names == [f"{n:06d}.npy" for n in range(10)]
-
     def test_a_pcd_and_a_pcd_bin_of_a_name_are_one_sample(self, tmp_path):
         cloud = image_to_points(images(1, 2)[0], SENSOR.rays())
         write_points(tmp_path / "a.pcd", *cloud)
         np.column_stack([*cloud, np.zeros(len(cloud[0]))]).astype("<f4").tofile(tmp_path / "a.pcd.bin")
         assert open_scans(str(tmp_path), READING).source.names == ["a.pcd.bin"]
-
-    def test_a_layout_with_its_split_and_drives(self, kitti_360):  # noqa: F811
-        found = open_scans(f"kitti_360:{kitti_360}", READING, "test")
-        assert len(found) == 6
-        assert {drive[-9:-5]: list(numbers) for drive, numbers in found.drives.items()} == {
-            "0000": [0, 1, 2], "0002": [3, 4, 5]
-        }  # fmt: skip
-        assert found.part([4, 0], "two").drives.keys() == found.drives.keys()
-        assert found.source[4][0].max() == pytest.approx(5 + 2 * 3 + 1, abs=0.02)
-
-    def test_simulated_scenes_are_numbered_by_their_seed(self):
-        found = open_scans("simulated:3", READING, num=2)
-        assert len(found) == 2
-        assert found.about["seed"] == 3
-        np.testing.assert_array_equal(found.source[1], open_scans("simulated:3", READING, num=3).source[1])
 
     def test_scans_are_read_as_all_parts_of_a_mixture_were(self):
         parts = [
@@ -276,23 +244,6 @@ class TestSets:
         torch.testing.assert_close(batches[1][1], flow().encoding.decode(x_0[None] + v)[0])
         assert drawn.source.evaluations == [1] * 5
         assert len(drawn.source.seconds) == 3
-
-    @pytest.mark.parametrize(
-        ("text", "message"),
-        [
-            ("nowhere", "nowhere does not exist"),
-            ("kitti360:x", "Did you mean 'kitti_360'"),
-            ("simulated:x", "named by their seed"),
-        ],
-    )
-    def test_what_is_not_there_is_said(self, text, message, tmp_path, monkeypatch):
-        monkeypatch.chdir(tmp_path)
-        with pytest.raises(InputError, match=message):
-            open_scans(text, READING)
-
-    def test_another_size_names_the_option(self, real):
-        with pytest.raises(InputError, match=r"000000\.npy is a range image of 8x64, .* 16x64; give --size 8x64"):
-            next(open_scans(str(real), Reading(SENSOR.resized(16, 64))).batches([0], 1))
 
 
 class TestExtremes:

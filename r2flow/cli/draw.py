@@ -20,6 +20,7 @@ from r2flow.cli.options import (
     SizeOption,
     build_sized,
     choose_device,
+    command,
     grouped,
     named_columns,
     rows_and_columns,
@@ -118,7 +119,6 @@ def interpolate(
 
     The solver is dopri5 at a tolerance of 1e-4 if left out.
     """
-    from r2flow.cli.output import command
     from r2flow.generators import as_flow
     from r2flow.inversion import real_scans
     from r2flow.model.checkpoint import load_checkpoint

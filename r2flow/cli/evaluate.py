@@ -17,9 +17,10 @@ from r2flow.cli.options import (
     SamplerOptions,
     WorkOptions,
     choose_device,
+    command,
     grouped,
+    numbers,
 )
-from r2flow.cli.output import command, numbers
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:

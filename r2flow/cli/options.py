@@ -1,7 +1,10 @@
 """Options that several verbs share, and what becomes of them; a dataclass of options is one parameter of a verb."""
 
 import inspect
+import math
 import os
+import shlex
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
@@ -178,3 +181,19 @@ class DrawOptions:
     seed: Annotated[int, typer.Option(min=0, help="Scan i depends on the seed and on i alone.")] = 0
     batch_size: Annotated[int, typer.Option(min=1, help="Scans at once.")] = 1
     device: DeviceOption = "auto"
+
+
+def numbers(option: str, text: str, kind: type = float) -> list[Any]:
+    """'4,8' as [4, 8]."""
+    try:
+        values = [kind(part) for part in text.split(",")]
+    except ValueError:
+        values = [0]
+    if not all(0 < value < math.inf for value in values):
+        raise InputError(f"--{option} must be positive numbers separated by commas, found {text!r}.")
+    return values
+
+
+def command() -> str:
+    """The command as it was typed, for a shell."""
+    return shlex.join(["r2flow", *sys.argv[1:]])

@@ -2,8 +2,9 @@
 
 import logging
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,11 +20,24 @@ from r2flow.cli.options import (
     SizeOption,
     build_sized,
     choose_device,
+    command,
     cores,
     grouped,
+    numbers,
 )
-from r2flow.cli.output import command, finish, numbers
 from r2flow.errors import InputError
+
+if TYPE_CHECKING:
+    from r2flow.reports.pages import Page
+
+
+def finish(page: "Page", out: Path, said: Sequence[str]) -> None:
+    """Write a page; print these parts of it, and the files."""
+    from r2flow.reports.pages import write_page
+
+    written = write_page(page, out)
+    print("\n\n".join(said), end="\n\n")
+    print(*written, sep="\n")
 
 
 @report.command(epilog="Example: r2flow report curvature runs/1rf runs/2rf --out reports")

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from r2flow.cli.app import app
-from r2flow.cli.options import SETS, DeviceOption, OutOption, ReadingOptions, choose_device, grouped
-from r2flow.cli.output import numbers
+from r2flow.cli.options import SETS, DeviceOption, OutOption, ReadingOptions, choose_device, grouped, numbers
 from r2flow.errors import InputError
 
 if TYPE_CHECKING:

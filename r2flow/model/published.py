@@ -17,12 +17,7 @@ from r2flow.generators import Generator
 from r2flow.lidar.sensors import Sensor
 from r2flow.registry import Registry, did_you_mean, lazy
 
-ARCHITECTURES = {
-    "nat_hdit": "hdit",
-    "hdit": "hdit",
-    "adm_unet": "adm_unet",
-    "efficient_unet": "efficient_unet",
-}
+ARCHITECTURES = {"nat_hdit": "hdit"} | {name: name for name in ("hdit", "adm_unet", "efficient_unet")}
 BACKBONE = "backbone."  # of a flow's network in the generator
 
 
