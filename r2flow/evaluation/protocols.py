@@ -49,18 +49,16 @@ class Rules:
             )
 
 
-def published_order(scans: ScanSet) -> list[int]:
-    """The numbers of a set as the published evaluation has them: KITTI-360's training drives before its test drives."""
-    if "kitti_360" not in str(scans.about.get("kind")):
-        return list(range(len(scans)))
-    known = SOURCES["kitti_360"]
-    last = {n for drive, held in scans.drives.items() if known.split_of(drive) == "test" for n in held}
-    return sorted(range(len(scans)), key=lambda number: number in last)
-
-
 def published_choice(scans: ScanSet, most: int) -> list[int]:
-    """`most` scans by the published draw, the first of Python's `random.Random(0).shuffle`, in rising order."""
-    order = published_order(scans)
+    """`most` scans by the published draw, the first of Python's `random.Random(0).shuffle`, in rising order.
+
+    The published evaluation has KITTI-360's training drives before its test drives.
+    """
+    order = list(range(len(scans)))
+    if "kitti_360" in str(scans.about.get("kind")):
+        known = SOURCES["kitti_360"]
+        last = {n for drive, held in scans.drives.items() if known.split_of(drive) == "test" for n in held}
+        order.sort(key=lambda number: number in last)
     random.Random(0).shuffle(order)  # shuffles whatever stands at each place
     return sorted(order[:most])
 

@@ -50,7 +50,7 @@ def sampler_graph(
     noise = onnx.ValueInfoProto()
     noise.CopyFrom(next(value for value in decoded.graph.input if value.name == "x_1"))
     noise.name = "noise"
-    image = [1 + count, *_sizes(noise)]
+    image = [1 + count, *(size.dim_param or size.dim_value for size in noise.type.tensor_type.shape.dim)]
     constants = {
         "times": np.array(times, dtype=np.float32),
         "states": states.astype(np.float32),
@@ -111,10 +111,6 @@ def sampler_graph(
     model = helper.make_model(graph, opset_imports=list(versions.values()), functions=[*network.functions])
     model.ir_version = network.ir_version
     return model
-
-
-def _sizes(value: onnx.ValueInfoProto) -> list[Any]:
-    return [size.dim_param or size.dim_value for size in value.type.tensor_type.shape.dim]
 
 
 def _value(name: str, kind: int, shape: list[Any]) -> onnx.ValueInfoProto:

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.generators import Generator
-from r2flow.lidar.sensors import Sensor
 from r2flow.registry import Registry, did_you_mean, lazy
 
 ARCHITECTURES = {"nat_hdit": "hdit"} | {name: name for name in ("hdit", "adm_unet", "efficient_unet")}
@@ -58,7 +57,9 @@ def holds(content: Any) -> bool:
 def read(content: Any, path: Path, averaged: bool = True) -> Published:
     """A published flow; the file holds its averaged weights alone."""
     weights = {BACKBONE + name: value for name, value in content["weights"].items()}
-    return Published(published_config(content["cfg"], path), weights, _step(content), {"name": "euler"}, follow_rings)
+    batch = content["cfg"].get("training", {}).get("batch_size", 1)
+    step = int(content.get("num_images", 0)) // max(int(batch), 1)
+    return Published(published_config(content["cfg"], path), weights, step, {"name": "euler"}, follow_rings)
 
 
 def sensor_of(name: str, resolution: Sequence[int], limits: Mapping[str, Any]) -> dict[str, Any]:
@@ -112,23 +113,12 @@ def backbone_of(model: Mapping[str, Any], path: Path) -> dict[str, Any]:
     }
 
 
-def _step(content: Mapping[str, Any]) -> int:
-    """Optimiser steps: the images that were seen over the batch size."""
-    batch = content["cfg"].get("training", {}).get("batch_size", 1)
-    return int(content.get("num_images", 0)) // max(int(batch), 1)
-
-
 def follow_rings(generator: Generator, config: Mapping[str, Any]) -> None:
-    """Let the sensor of unfolded scans look along the rings that the weights carry."""
+    """Let the sensor of unfolded scans look along the rings that the weights carry in `coords`, (1, 2, H, W)."""
     if config["data"]["reading"]["projection"] == "unfolding":
-        sensor = published_rings(generator.space.sensor, generator.state_dict()[BACKBONE + "coords"])
+        rings = torch.rad2deg(generator.state_dict()[BACKBONE + "coords"][0, 0, :, 0].double())
+        sensor = replace(generator.space.sensor, elevations=tuple(rings.tolist()))
         generator.space = replace(generator.space, sensor=sensor)
-
-
-def published_rings(sensor: Sensor, coords: Tensor) -> Sensor:
-    """The sensor with the ring elevations that an unfolding checkpoint carries in its `coords`, (1, 2, H, W)."""
-    elevations = torch.rad2deg(coords[0, 0, :, 0].double())
-    return replace(sensor, elevations=tuple(elevations.tolist()))
 
 
 class Inert:
