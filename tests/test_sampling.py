@@ -326,18 +326,12 @@ def test_numeric_times_decide_the_number_of_steps():
 @pytest.mark.parametrize(
     ("changes", "word"),
     [
-        ({"foo": 1}, "foo"),
-        ({"grid": 3}, "grid"),
         ({"grid": ("a", "b")}, "grid"),
         ({"grid": "quadratic"}, "uniform"),
         ({"steps": 1.5}, "steps"),
-        ({"steps": True}, "steps"),
         ({"steps": 10**7}, "steps"),
         ({"name": "dopri5", "tolerance": "x"}, "tolerance"),
-        ({"name": "dopri5", "tolerance": math.inf}, "tolerance"),
         ({"name": "dopri5", "grid": "power:2"}, "grid"),
-        ({"name": "dopri5", "steps": 3}, "steps"),
-        ({"name": "euler", "tolerance": 0.1}, "tolerance"),
         ({"name": "sde", "finish": 1.5}, "finish"),
         ({"name": "sde", "churn": -1.0}, "churn"),
         ({"name": "jump"}, "map"),

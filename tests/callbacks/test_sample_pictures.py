@@ -53,11 +53,3 @@ def test_a_picture_that_is_there_is_kept_and_none_may_be_asked_for(tmp_path):
     assert (tmp_path / "p" / "step-00000002.png").read_bytes() == b"kept"
     fit(tmp_path, [SamplePictures(tmp_path / "none", 0, every=0)], steps=2, stage=Drawn())
     assert not (tmp_path / "none").exists()
-
-
-@pytest.mark.filterwarnings("ignore:.*")
-def test_of_what_draws_nothing_there_is_no_picture(tmp_path):
-    stage = Drawn()
-    stage.generator.draws = False
-    fit(tmp_path, [SamplePictures(tmp_path / "p", 7, every=2)], steps=2, stage=stage)
-    assert not (tmp_path / "p").exists()

@@ -178,14 +178,6 @@ def test_a_moved_run_goes_on(train: Run, alone: tuple[Path, str], copied: Path):
     assert_bit_equal(alone[0], moved)
 
 
-def test_another_sampler_for_a_finished_run_is_refused(train: Run, copied: Path):
-    before = (copied / "config.yaml").read_text()
-    done = train("name=copied", "sampler.name=euler", check=False)
-    assert done.returncode == 2
-    assert "runs/copied is finished and keeps its sampler: sampler.name=None there, euler here" in done.stderr
-    assert (copied / "config.yaml").read_text() == before
-
-
 def test_another_config_in_the_same_folder_is_refused(train: Run, copied: Path):
     before = (copied / "config.yaml").read_text()
     done = train("name=copied", "seed=5", check=False)
