@@ -120,15 +120,6 @@ def test_a_run_is_sampled_through_its_own_sensor(r2flow, saved, real, tmp_path):
     assert "'flat'" in said
 
 
-def test_how_many_scans_are_drawn_is_said_where_nobody_asked(r2flow, saved, real, tmp_path, monkeypatch):  # noqa: F811
-    monkeypatch.setattr("r2flow.cli.evaluate.SAMPLED", 3)
-    run, quick = saved[0].parent.parent, ("--metrics", "jsd", "--steps", 1, "--workers", 0)
-    code, said, _ = r2flow("evaluate", real, run, *quick)
-    assert (code, said.splitlines()[0]) == (0, f"{run}: 3 scans of each set are drawn (--num says how many)")
-    code, said, _ = r2flow("evaluate", real, run, *quick, "--num", 2)
-    assert (code, "drawn (" in said) == (0, False)
-
-
 @pytest.fixture
 def points(r2flow, real, tmp_path):  # noqa: F811
     """The sampled sets of an evaluation, as `report paper` reads them, and its Markdown page."""

@@ -106,33 +106,6 @@ def test_named_grids_are_sampled_on(r2flow, run, tmp_path):  # noqa: F811
     assert len(set(images.values())) == 3
 
 
-class TestBadInput:
-    """One clear line, exit code 2, nothing written."""
-
-    def check(self, result, out: Path, *words: str) -> None:
-        code, _, err = result
-        lines = [line for line in err.splitlines() if not line.startswith("WARNING")]
-        assert (code, len(lines)) == (2, 1), err
-        assert lines[0].startswith("error: ")
-        for word in words:
-            assert word in lines[0]
-        assert not out.exists()
-
-    def test_of_regions_and_channels(self, r2flow, run, tmp_path):  # noqa: F811
-        out = tmp_path / "o"
-        options = ("sample", run, "-o", out)
-        self.check(r2flow(*options, "--sector", "north"), out, "--sector", "-45,45", "'north'")
-        self.check(r2flow(*options, "--sector", "5,5"), out, "is empty")
-        self.check(r2flow(*options, "--sector", "10,10.0000001"), out, "narrower than a column")
-        self.check(r2flow(*options, "--rows", "0-8"), out, "0-7", "found 0-8")
-        self.check(r2flow(*options, "--rows", "1,2"), out, "--rows", "as 0-31")
-        self.check(r2flow(*options, "--channels", "depth"), out, "'both', 'range', 'reflectance'", "'depth'")
-        self.check(r2flow(*options, "--channels", "range", "--format", "bin"), out, "leaves it out", "ply,npy")
-        self.check(r2flow(*options, "--channels", "reflectance", "--format", "ply"), out, "need a range")
-        alone = write_checkpoint(tmp_path / "range", reflectance=False)
-        self.check(r2flow("sample", alone, "-o", out, "--channels", "reflectance"), out, "range alone")
-
-
 def test_what_is_not_asked_for_is_not_imported():
     shown = "print([m for m in ({}) if m in sys.modules]); "
     code = "import r2flow.flow.solvers, r2flow.flow.problems, r2flow.lidar.region, r2flow.backbones, sys; "

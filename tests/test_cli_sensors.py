@@ -61,30 +61,6 @@ def test_a_sensor_estimated_from_scans_is_accepted_by_the_verbs(r2flow, scans: P
     assert (tmp_path / "views" / "000000.png").stat().st_size > 10_000
 
 
-def test_errors_are_one_line(r2flow, scans: Path, tmp_path: Path):  # noqa: F811
-    np.array([[1, 2, 3, 0.5]], np.float32).tofile(tmp_path / "one.bin")
-    (tmp_path / "text.bin").write_text("one two three four, and so on for a while\n")
-    (tmp_path / "notes.txt").write_text("text")
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "folder.yaml").mkdir()
-    (tmp_path / "wrong.yaml").write_text("name: mine\nelevations: [1, 2]\n")
-    for arguments, words in (
-        ([tmp_path / "one.bin"], "too few"),
-        ([tmp_path / "text.bin"], "text"),
-        ([tmp_path / "notes.txt"], "no line of numbers"),
-        ([scans, "--out", tmp_path / "mine.txt"], "--out must be a .yaml"),
-    ):
-        code, _, error = r2flow("sensor", *arguments)
-        assert code == 2
-        assert words in error
-        assert error.count("\n") == 1
-    for sensor, words in ((tmp_path / "wrong.yaml", "fall from the top"), (tmp_path / "none.yaml", "is not a file")):
-        code, _, error = r2flow("show", scans / "000000.bin", "--sensor", sensor, "-o", tmp_path / "x")
-        assert code == 2
-        assert words in error
-        assert error.count("\n") == 1
-
-
 def test_the_wrong_sensor_is_said_in_one_line_with_the_right_one(r2flow, tmp_path: Path):  # noqa: F811
     pandar = SENSORS["pandar64"]
     draw, e = np.random.default_rng(0), pandar.rays().numpy()[0]

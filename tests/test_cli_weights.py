@@ -51,17 +51,6 @@ def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):  # noq
     assert here(said) == {**dict.fromkeys(SOURCES, False), "pointnet": True}
 
 
-def test_what_cannot_be_added_is_a_line(r2flow, tmp_path):  # noqa: F811
-    path = tmp_path / "mine.pth"
-    path.write_bytes(b"nothing of the kind")
-    code, _, said = r2flow("weights", "--add", "pointnet", path)
-    assert (code, said) == (2, f"error: {path} is not a file of weights.\n")
-    code, _, said = r2flow("weights", "--add", "pointnets", path)
-    assert code == 2
-    assert "Did you mean 'pointnet'?" in said
-    assert r2flow("weights", "--add", "pointnet")[0] == 2
-
-
 def test_the_table_of_networks_is_light():
     code = "import sys, r2flow.metrics.extractors; sys.exit(any(m in sys.modules for m in ('torch', 'torchmetrics')))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow import __version__, cli
+from r2flow import __version__
 from r2flow.backbones import BACKBONES
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
-from r2flow.model.checkpoint import Checkpoint, save_checkpoint
+from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.export import NOTES, compare, export, tableau
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
@@ -101,29 +100,6 @@ def test_a_sampler_without_a_fixed_number_of_steps_is_refused(sampler, tmp_path)
     with pytest.raises(InputError, match="cannot be exported"):
         export(flow("efficient_unet"), tmp_path / "flow.pt2", sampler)
     assert not [*tmp_path.iterdir()]
-
-
-@pytest.mark.parametrize(
-    ("options", "answer"),
-    [
-        (["--to", "onx"], "no export format named 'onx'"),
-        (["--what", "all"], "--what"),
-        (["--what", "network", "--steps", "4"], "takes no sampler: leave sampler, steps"),
-        (["--to", "pt2", "--out", "a.onnx"], "--to pt2 writes a .pt2, found --out a.onnx"),
-        (["--sampler", "dopri5"], "give --sampler adams3 --steps 16"),
-    ],
-)
-def test_wrong_options_are_one_line(options, answer, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    save_checkpoint(flow("efficient_unet"), "flow.safetensors")
-    monkeypatch.setattr(sys, "argv", ["r2flow", "export", "flow.safetensors", *options])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    error = capsys.readouterr().err
-    assert ended.value.code == 2
-    assert answer in error
-    assert error.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["flow.safetensors"]
 
 
 def test_a_missing_package_names_its_extra(tmp_path, monkeypatch):

@@ -106,12 +106,6 @@ def test_a_run_or_a_file_of_a_models_name_comes_first(saved, tmp_path, monkeypat
         load_checkpoint("street")
 
 
-def test_a_misspelt_name_is_a_line(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=r"no checkpoint at stret\. .* a model \(street.*Did you mean 'street'\?"):
-        load_checkpoint("stret")
-
-
 @pytest.fixture
 def released(saved, tmp_path, monkeypatch) -> Path:  # noqa: F811
     """The file of a model `large` that does not come with the package."""

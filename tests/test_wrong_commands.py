@@ -81,6 +81,11 @@ sample run -o out --steps 10000000 # 1,000,000
 view scans --seed 3 -o v.html # are of a run
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
 export run --to onnx --half # --half
+export run --to onx # no export format named 'onx'
+export run --what all
+export run --what network --steps 4 # takes no sampler: leave sampler, steps
+export run --to pt2 --out a.onnx # --to pt2 writes a .pt2, found --out a.onnx
+export run --sampler dopri5 # give --sampler adams3 --steps 16
 report backbones --only nope
 report backbones --size ²x²
 report backbones --size 99999999x99999999 # at most 16,777,216 pixels
@@ -237,88 +242,59 @@ name=x callbacks.guard.lowest_scale=-1
 name=x callbacks.guard.skips=a
 name=x +callbacks.ema.foo=1
 name=x callbacks=other
-name=x +callbacks.mine=null
-name=x samples.num=-1
 name=x +samples.steps=3
 name=x samples=3
 name=x sampler.name=3
-name=x sampler.name=null sampler.steps=0
 name=x sampler.grid=wave
 name=x +sampler.foo=1
 name=x backbone.base_channels=7
-name=x backbone.depths=[]
 name=x backbone.num_heads=[3,5,7]
 name=x backbone.patch=[3,5] # multiple of 12
-name=x backbone.patch=[0,1]
-name=x backbone.attention=foo
 name=x backbone.dropout=nan
 name=x backbone=adm_unet backbone.channel_multipliers=[]
 name=x backbone=nope
 name=x backbone=
 name=x backbone.name=null
 name=x sensor=nope
-name=x sensor.height=-5
 name=x sensor.rows=1
 name=x sensor.max_range=inf
-name=x sensor.rays=foo
 name=x +sensor.elevations=[1,2]
-name=x +sensor.firing=[0,1]
-name=x encoding=nope
 name=x encoding.format=null
 name=x +encoding.gamma=3
-name=x data=nope
 name=x data=null
 name=x data=kitti_raw
-name=x data=kitti_raw data.root=/nowhere
 name=x data=folder data.root=scans data.split=train
 name=x data=folder data.root=scans data.drives=[7]
 name=x data=folder data.root=scans data.reading.projection=flat
-name=x data=folder data.root=scans data.reading.reflectance_scale=0
-name=x data=folder data.root=scans data.validation.share=2
 name=x data=folder data.root=scans data.validation.data=3
 name=x data=folder data.root=scans data.pairs=3
-name=x data=folder data.root=scans data.augment.beam_dropout=-1
-name=x data=folder data.root=scans data.batch_size=0
 name=x data=folder data.root=scans data.parts=[{name:folder}]
-name=x data.memory_gib=nan
 name=x data=prepared
 name=x data=mixed data.parts=[]
 name=x data=mixed 'data.parts=[{name: folder}]'
 name=x data=mixed 'data.parts=[{name: folder, root: empty}]'
-name=x data=mixed 'data.parts=[{name: folder, root: scans, weight: -1}]'
 name=x data=mixed 'data.parts=[{name: folder, root: scans, weight: 1}, {name: folder, root: scans}]'
 name=x data=pairs
 name=x stage=reflow
 name=x stage=reflow stage.init=nowhere
-name=x stage=reflow data=pairs stage.init=run data.pairs.num=0
 name=x stage=reflow data=pairs stage.init=run data.pairs.sampler.name=eulr
-name=x stage=reflow data=pairs stage.init=run data.pairs.shard_mib=0
 name=x stage=reflow data=pairs stage.init=run +data.pairs.foo=1
-name=x stage=distill data=pairs stage.init=run stage.steps=0
 name=x stage=reflow data=pairs stage.init=run backbone=hdit
-name=x stage.learning_rate=-1
 name=x stage.loss=null
 name=x stage.time=uniform
 name=x +stage.foo=1
-name=x stage.name=nope
 name=x stage=base
 name=x trainer=nope
-name=x trainer.devices=0
-name=x trainer.max_steps=0
 name=x trainer.max_time=foo
 name=x trainer.precision=foo
 name=x trainer.accelerator=cuda
 name=x trainer.strategy=ddp_foo
 name=x trainer.gradient_clip_algorithm=foo
 name=x trainer.profiler=foo
-name=x trainer.overfit_batches=-1
-name=x trainer.fast_dev_run=-1
 name=x trainer.min_epochs=foo
 name=x trainer.barebones=true
 name=x trainer.reload_dataloaders_every_n_epochs=-1
 name=x trainer.logger=true
-name=x loggers=[foo]
-name=x seed=a
 name=x +plugins.a=3
 name=x --plugin nope
 name=x --plugin plugin.py
@@ -328,16 +304,13 @@ name=x experiment=nope
 name=x experiment=reflow
 name=x chain=[]
 name=x 'chain={a: {init: b}}'
-name=x 'chain={a: {experiment: nope}}'
 name=x 'chain={a: {plugins: [b]}}'
 name=x 'chain={a: {stage: 3}}'
 name=x 'chain={a/b: {seed: 3}}'
 name=x 'chain={"..": {seed: 3}}' # cannot be read
 name=x experiment=demo chain.rf1=null
-name=x experiment=demo chain.rf1.trainer.max_steps=0
 name=x run_dir=3
 name=a/../../b
-name=. # names a folder
 name=null # names a folder
 name=x foo
 name=x foo=
@@ -363,7 +336,6 @@ name=x generator=nope
 name=x data@foo=kitti_raw
 name=x override
 name=x ~data.batch_size
-name=x ~run_dir
 name=x ~name # every run has its name
 name=x scans=3 # no key 'scans'
 name=x +parent=3
