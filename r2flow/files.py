@@ -153,3 +153,10 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def cache_folder(variable: str, name: str = "") -> Path:
+    """The folder that an environment variable names; else `name` in r2flow's folder of the user's cache."""
+    if named := os.environ.get(variable):
+        return Path(named).expanduser()
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "r2flow", name).expanduser()

@@ -146,21 +146,18 @@ def build(config: Mapping[str, Any], asked: Sequence[str] = ()) -> Run:
     """
     check_keys(config)
     with made_with(read_config(config["run_dir"]) or {}, f"the run in {config['run_dir']}"):
-        return _build(config, asked)
-
-
-def _build(config: Mapping[str, Any], asked: Sequence[str]) -> Run:
-    parent, checkpoint = find_parent(config) or (None, None)
-    config = _checked(config, asked, parent)
-    config["encoding"]["reflectance"] = resolve_reflectance(config["encoding"].get("reflectance", AUTO), config["data"])
-    levels = reflectance_levels(config["data"])
-    if levels is not None and "encoding.levels" not in map(key_of, asked):
-        config["encoding"]["levels"] = levels
-    seed_torch(config["seed"], "weights")
-    generator = build_generator(config)
-    if checkpoint is not None:
-        generator.start_from(checkpoint.generator)
-    return _assembled(config, generator)
+        parent, checkpoint = find_parent(config) or (None, None)
+        config = _checked(config, asked, parent)
+        encoding = config["encoding"]
+        encoding["reflectance"] = resolve_reflectance(encoding.get("reflectance", AUTO), config["data"])
+        levels = reflectance_levels(config["data"])
+        if levels is not None and "encoding.levels" not in map(key_of, asked):
+            encoding["levels"] = levels
+        seed_torch(config["seed"], "weights")
+        generator = build_generator(config)
+        if checkpoint is not None:
+            generator.start_from(checkpoint.generator)
+        return _assembled(config, generator)
 
 
 def check(config: Mapping[str, Any], asked: Sequence[str] = (), parent: Parent | None = None) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import logging
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from r2flow.data.sets import ScanSet
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, cache_folder
 from r2flow.metrics.base import ScanMetric
 
 log = logging.getLogger(__name__)
@@ -37,7 +36,7 @@ class Cache:
     """Statistics of real scans in a folder, each file named by a hash of everything that it depends on."""
 
     def __init__(self, folder: str | Path | None = None) -> None:
-        self.folder = default_folder() if folder is None else Path(folder)
+        self.folder = cache_folder("R2FLOW_CACHE") / "statistics" if folder is None else Path(folder)
 
     def path(self, key: str) -> Path:
         """The file of a key of `key_of`."""
@@ -69,13 +68,6 @@ class Cache:
                 file.write(data)
         except OSError as error:
             log.warning("statistics are not kept: %s: %s", self.folder, error.strerror or error)
-
-
-def default_folder() -> Path:
-    """`statistics` in R2FLOW_CACHE, or in r2flow's folder of the user's cache."""
-    own = os.environ.get("R2FLOW_CACHE")
-    base = Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "r2flow"
-    return base.expanduser() / "statistics"
 
 
 def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str:

@@ -5,12 +5,11 @@ where `r2flow weights --add NAME FILE` puts it. Nothing is downloaded.
 """
 
 import hashlib
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, cache_folder
 from r2flow.registry import Registry
 
 SHIPPED = Path(__file__).parent
@@ -55,9 +54,7 @@ DENSIFY = "densify"
 
 def models_folder() -> Path:
     """The folder of models that do not come with the package: R2FLOW_MODELS, or ~/.cache/r2flow/models."""
-    named = os.environ.get("R2FLOW_MODELS")
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
-    return Path(named).expanduser() if named else cache / "r2flow" / "models"
+    return cache_folder("R2FLOW_MODELS", "models")
 
 
 def model_file(name: str) -> Path:

@@ -6,7 +6,6 @@ the folder of weights, from which `Extractor.trained` reads it.
 
 import io
 import json
-import os
 import pickle
 import re
 import tarfile
@@ -20,7 +19,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, parse_json, refuse_unreadable
+from r2flow.files import atomic_write, cache_folder, parse_json, refuse_unreadable
 from r2flow.hashing import state_hash
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
@@ -61,9 +60,7 @@ LARGEST = 2**31  # bytes of a file: the largest of these networks has 0.2 GB
 
 def weights_folder() -> Path:
     """The folder of weights: R2FLOW_WEIGHTS, or ~/.cache/r2flow/weights."""
-    named = os.environ.get("R2FLOW_WEIGHTS")
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
-    return Path(named).expanduser() if named else cache / "r2flow" / "weights"
+    return cache_folder("R2FLOW_WEIGHTS", "weights")
 
 
 def kept_file(name: str) -> Path:
