@@ -253,7 +253,7 @@ def test_no_error_is_told_where_no_ray_returns_in_both(r2flow, run, tmp_path):  
     )
     assert (code, error) == (0, "")
     assert "nan" not in said
-    assert "no ray returns in both" in said
+    assert "no ray returns in all" in said
     assert "wrong in ray-drop" in said
 
 

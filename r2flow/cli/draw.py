@@ -234,7 +234,7 @@ def complete(
     skipped = len(partial) - len(done)
     print(f"{len(done)} scans completed in {out}" + (f", {skipped} were there already" if skipped else ""))
     if errors := [error for error in done.values() if error is not None]:
-        off = [error["mae_m"] for error in errors if not np.isnan(error["mae_m"])]
-        mae = f"MAE {np.mean(off):.2f} m where both return" if off else "no ray returns in both"
-        wrong = np.mean([error["drop_wrong"] for error in errors])
-        print(f"on the hidden rays of {len(errors)} scans: {mae}; {wrong:.1%} of the rays wrong in ray-drop")
+        (mae, linear), (wrong, wrong_linear) = np.ma.masked_invalid(errors).mean(0).filled(np.nan)
+        print(f"on the hidden rays of {len(errors)} scans, with linear interpolation in brackets:")
+        off = f"MAE {mae:.2f} m ({linear:.2f}) where all return" if np.isfinite(mae) else "no ray returns in all"
+        print(f"{off}, {wrong:.1%} ({wrong_linear:.1%}) wrong in ray-drop")

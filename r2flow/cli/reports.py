@@ -153,7 +153,7 @@ def completion(
     samplers: Annotated[str | None, typer.Option(help="Samplers for the models, as mmps,replace.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Steps of each sampler.")] = None,
     num: Annotated[int, typer.Option(min=1, help="The most scans of a set, evenly spread over it.")] = 16,
-    answers: Annotated[int, typer.Option(min=1, help="Answers to each scan; 19 give intervals of 90 %.")] = 8,
+    answers: Annotated[int, typer.Option(min=1, help="Answers to each scan; 19 give intervals of 90 %.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of the noise. What is hidden of a scan does not depend on it.")] = 0,
     batch_size: Annotated[int, typer.Option(min=1, help="Answers at once.")] = 4,
     reflectance_scale: ScaleChoice = None,

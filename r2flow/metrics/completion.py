@@ -4,7 +4,7 @@ Images are range in metres and reflectance, (2 or 1, H, W), 0 without a return. 
 measured, (H, W) bool: figures are of these unless they say otherwise.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -45,6 +45,15 @@ def errors(truth: np.ndarray, answer: np.ndarray, hidden: np.ndarray, sensor: Se
         "chamfer_m2": _mean(there**2) + _mean(back**2),
         "reflectance_mae": _mean(np.abs(truth[1] - answer[1])[both]) if len(truth) > 1 < len(answer) else float("nan"),
     }
+
+
+def common_mae(truth: np.ndarray, answers: Sequence[np.ndarray], hidden: np.ndarray) -> list[float]:
+    """Mean absolute error in metres of each answer over the hidden rays where the truth and all answers return.
+
+    A method that leaves out the rays that are hard has the smaller error over its own returns.
+    """
+    common = hidden & np.logical_and.reduce([image[0] > 0 for image in (truth, *answers)])
+    return [_mean(np.abs(truth[0] - answer[0])[common]) for answer in answers]
 
 
 def spread_errors(truth: np.ndarray, answers: np.ndarray, hidden: np.ndarray) -> dict[str, float]:

@@ -16,12 +16,12 @@ from r2flow.errors import InputError
 from r2flow.files import atomic_write
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
+from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import Mask, Ray, share_in_sectors
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
-from r2flow.lidar.sensors import Sensor
 from r2flow.lidar.transfer import Partial
-from r2flow.metrics.completion import errors
+from r2flow.metrics.completion import common_mae
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import Completed, complete
 from r2flow.models import DEFAULT, DENSIFY
@@ -62,7 +62,7 @@ def write_completed(
     job: Job,
     sampler: Sampler,
     about: Mapping[str, Any],
-) -> dict[str, dict[str, float] | None]:
+) -> dict[str, np.ndarray | None]:
     """Complete scans and write their answers, the spread between these, pictures and pages in 3-D.
 
     Scans whose answers are all in the folder are skipped.
@@ -71,8 +71,8 @@ def write_completed(
         about: What else decides the answers, as plain values.
 
     Returns:
-        The scans that were completed now, by name, with the mean `errors` of their answers where a mask has hidden
-        some of their rays, else None.
+        The scans that were completed now, by name, with their `hidden_errors` where a mask has hidden some of their
+        rays, else None.
 
     Raises:
         InputError: a folder that holds other files or answers, or a scan that cannot be completed.
@@ -88,7 +88,7 @@ def write_completed(
     store = Store(out, "answers", recipe_of(checkpoint, job.seed, {"completion": settings}, **sampler.asdict()))
     inputs = _inputs(store, {scan.name: scan.identity() for scan in scans}, files)
     left = [number for number, scan in enumerate(scans) if not all(path.is_file() for path in files[scan.name])]
-    done: dict[str, dict[str, float] | None] = {}
+    done: dict[str, np.ndarray | None] = {}
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
     with ScanBar("completing", len(left) * job.num, len(left) * batches, "answers") as bar:
         for number in left:
@@ -105,7 +105,7 @@ def write_completed(
             if number < job.pictures:
                 _draw(checkpoint, scan, out, given, completed, whole if job.mask else None)
             _write(checkpoint, scan, out, files[scan.name], given, completed)
-            done[scan.name] = hidden_errors(whole, given, completed, checkpoint.sensor) if job.mask else None
+            done[scan.name] = hidden_errors(whole, given, completed) if job.mask else None
             if not completed.evaluations.any():
                 print(f"{scan.name}: everything is known; see --fill-gaps and --mask")
             bar.finished(len(done) * job.num)
@@ -159,12 +159,17 @@ def masked(scan: Partial, mask: Mask | None, number: int, seed: int, name: str) 
     return Partial(scan.image * kept, state, xyz)
 
 
-def hidden_errors(whole: Partial, given: Partial, completed: Completed, sensor: Sensor) -> dict[str, float]:
-    """Means over the answers of `errors` on the rays that a mask has hidden of a scan."""
-    measured = whole.state != Ray.UNKNOWN
-    hidden = measured & (given.state == Ray.UNKNOWN)
-    each = [errors(whole.image, image * measured, hidden, sensor) for image in completed.images.numpy()]
-    return {name: float(np.mean([one[name] for one in each])) for name in each[0]}
+def hidden_errors(whole: Partial, given: Partial, completed: Completed) -> np.ndarray:
+    """MAE in metres where all return and share of rays wrong in ray-drop, of the answers and of interpolation, (2, 2).
+
+    They are of the rays that a mask has hidden of a scan; of several answers the mean.
+    """
+    known = given.state != Ray.UNKNOWN
+    hidden = (whole.state != Ray.UNKNOWN) & ~known
+    images = [*completed.images.numpy(), interpolated(given.image, known)]
+    off = common_mae(whole.image, images, hidden)
+    wrong = [float(((whole.image[0] > 0) != (image[0] > 0))[hidden].mean()) for image in images]
+    return np.array([[np.mean(part[:-1]), part[-1]] for part in (off, wrong)])
 
 
 def answer_ending(checkpoint: Checkpoint, scan: PartialScan) -> str:

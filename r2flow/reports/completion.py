@@ -15,7 +15,7 @@ from r2flow.generators.base import Progress
 from r2flow.lidar.interpolation import INTERPOLATIONS
 from r2flow.lidar.known import parse_mask, ray_states
 from r2flow.lidar.sensors import Sensor
-from r2flow.metrics.completion import UNITS, errors, spread_errors
+from r2flow.metrics.completion import UNITS, common_mae, errors, spread_errors
 from r2flow.metrics.panel import distances, mean_distance, panel
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import complete
@@ -25,7 +25,8 @@ from r2flow.reports.tables import table
 
 TASKS = ("rows:4", "rows:2", "random:0.5", "points:0.1", "sector:-11.25,11.25")
 COLUMNS = {
-    "method": "method", "evaluations": "evaluations", "seconds": "seconds", **UNITS, "panel": "panel",
+    "method": "method", "evaluations": "evaluations", "seconds": "seconds",
+    "mae_common_m": "MAE where all return (m)", **UNITS, "panel": "panel",
     "mae_of_median_m": "MAE of the median (m)", "crps_m": "CRPS (m)", "coverage": "coverage", "nominal": "of nominal",
 }  # fmt: skip
 
@@ -92,9 +93,22 @@ def completion_rows(
             answers[way.name] = [one.images.numpy() for one in made]
             evaluations = float(torch.cat([one.evaluations for one in made]).float().mean())
             cost[way.name] = evaluations, sum(one.seconds for one in made) / num / len(made)
+        firsts = [[found[i][0] for found in answers.values()] for i in range(len(truths))]
+        common = _mean(
+            [
+                dict(zip(answers, common_mae(truth, images, ~mask), strict=True))
+                for truth, images, mask in zip(truths, firsts, masks, strict=True)
+            ]
+        )
         for name, found in answers.items():
             evaluations, seconds = cost.get(name, (0.0, float("nan")))
-            row = {"task": task, "method": name, "evaluations": evaluations, "seconds": seconds}
+            row = {
+                "task": task,
+                "method": name,
+                "evaluations": evaluations,
+                "seconds": seconds,
+                "mae_common_m": common[name],
+            }
             yield row | _errors(truths, found, masks, sensor, reference), found[0][0]
 
 
