@@ -69,17 +69,6 @@ def test_the_time_matters(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_it_goes_into_torchdiffeq(name):
-    from torchdiffeq import odeint
-
-    model, x_0 = tiny(name), image()
-    with torch.no_grad():
-        states = odeint(model, x_0, torch.linspace(0, 1, 3), method="euler")
-        expected = x_0 + 0.5 * model(0.0, x_0)
-    torch.testing.assert_close(states[1], expected, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", NAMES)
 def test_every_parameter_has_a_gradient(name):
     model = tiny(name).train()
     model(torch.rand(2), image()).square().mean().backward()

@@ -143,18 +143,6 @@ def test_angles_stay_exact_whatever_the_weights_become(dtype):
         assert buffer.dtype == torch.float32
 
 
-@pytest.mark.parametrize("position", ["learnable", "polar"])
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_autocast_is_near_float32_and_returns_it(dtype, position):
-    model, x, t = small(position=position), image(), torch.tensor([0.1, 0.9985])
-    with torch.no_grad():
-        expected = model(t, x)
-        with torch.autocast("cpu", dtype=dtype):
-            found = model(t, x)
-    assert found.dtype == torch.float32
-    assert relative(found, expected) < (0.05 if dtype == torch.bfloat16 else 0.01)
-
-
 def test_autocast_does_not_round_the_image_at_the_ends():
     """Where blocks add nothing and inner levels are left out, the network is linear layers between two images."""
     model, x, t = small(detail=[1, 8]), image(), torch.tensor([0.1, 0.9985])
@@ -187,12 +175,6 @@ def test_gradcheck_of_a_block():
         return torch.func.functional_call(block, weights, (x.detach(), condition.detach(), table)).sum((1, 2))
 
     assert torch.autograd.gradcheck(of_weights, tuple(parameters.values()), fast_mode=True)
-
-
-def test_lists_from_yaml_serve_as_tuples():
-    options = {"name": "hdit", **{k: list(v) if isinstance(v, tuple) else v for k, v in SMALL.items()}}
-    model = build_backbone({**options, "window": [3, 9], "patch": [2, 4]}, rays(), 2)
-    assert model(0.5, image()).shape == image().shape
 
 
 @pytest.mark.parametrize(

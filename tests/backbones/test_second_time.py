@@ -96,19 +96,6 @@ def test_nearby_second_times_are_told_apart_under_autocast(name):
         assert not torch.equal(model(0.0, x, 1.0), model(0.0, x, 0.9985))
 
 
-@pytest.mark.parametrize("name", TWO_TIMES)
-def test_forward_and_backward_in_time_differ(name):
-    model, x = tiny(name, second_time=True), image(1)
-    with torch.no_grad():
-        assert (model(0.5, x, 0.8) - model(0.5, x, 0.2)).abs().max() > 1e-4
-
-
-@pytest.mark.parametrize("name", TWO_TIMES)
-def test_a_second_time_of_another_shape_is_refused(name):
-    with pytest.raises(ValueError, match=r"s must be a scalar or of shape \(2,\), found \(3,\)"):
-        tiny(name, second_time=True)(0.5, image(), torch.rand(3))
-
-
 def test_a_backbone_that_takes_one_time_says_so_when_it_is_built():
     class OneTime(Backbone):
         pass
