@@ -198,13 +198,6 @@ Backend = Callable[[Tensor, Tensor, Tensor, _Axis, _Axis], Tensor]
 BACKENDS: Registry[Backend] = Registry("attention backend", dense=_dense, tiles=_tiles, flex=_flex)
 
 
-def backend_name(name: str) -> str:
-    """The backend of a config, so that a wrong name is found when a network is built."""
-    if name != "auto":
-        BACKENDS[name]
-    return name
-
-
 def _fastest(q: Tensor, columns: _Axis) -> str:
     """What "auto" means for this input."""
     takes = q.is_cuda and q.dtype != torch.float64 and q.shape[-1] >= 16 and columns.span <= columns.size

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.attention import backend_name, check_window, neighbourhood_attention
+from r2flow.backbones.attention import BACKENDS, check_window, neighbourhood_attention
 from r2flow.backbones.base import Backbone, CommonOptions, integers
 from r2flow.backbones.detail import Detail
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, Rotary, mean_rays, position_name, rotate
@@ -86,7 +86,8 @@ class HDiT(Backbone):
         rows, columns = rays.shape[1] // patch_h, rays.shape[2] // patch_w
         span_h, span_w = integers("window", window, 2)
         check_window((span_h, span_w))
-        local = Neighbourhood((span_h, span_w), ring, backend_name(attention))
+        _ = attention == "auto" or BACKENDS[attention]  # an unknown name is refused now
+        local = Neighbourhood((span_h, span_w), ring, attention)
         widths = [base_channels * 2**level for level in range(levels)]
 
         def blocks(level: int) -> nn.ModuleList:

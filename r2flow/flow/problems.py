@@ -27,12 +27,6 @@ class Problem:
         """x_t, (B, ...) float64, of the path that starts at x_0; t of shape () or (B,)."""
         raise NotImplementedError
 
-    def straightness(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        """s(t) = |(x_1 - x_0) - v(t, x_t)|^2 (paper, eq. 5), exact, per scene, (B,) float64."""
-        x_0, t = x_0.double(), torch.as_tensor(t, dtype=torch.float64, device=x_0.device)
-        chord = self.solution(x_0, 1.0) - x_0
-        return (chord - self(t, self.solution(x_0, t))).square().flatten(1).sum(1)
-
 
 class Gaussian(Problem):
     """x_1 ~ N(mean, std^2): x_t = t mean + sigma_t x_0 with sigma_t^2 = (1 - t)^2 + t^2 std^2.
@@ -140,9 +134,6 @@ class PointMass(Problem):
     def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
         x_0, t = _exact(x_0, t)
         return (1 - t) * x_0 + t * self.point
-
-    def straightness(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        return torch.zeros(len(x_0), dtype=torch.float64, device=x_0.device)
 
 
 class Straight(Problem):

@@ -27,11 +27,8 @@ def parts_of(condition: Condition | None, x: Tensor) -> tuple[Tensor, Tensor]:
     """`image` and `known` of a condition, as `x` is in type and place; zeros where nothing is known."""
     if condition is None:
         return torch.zeros_like(x), torch.zeros_like(x)
-    if not condition.keys() >= {IMAGE, KNOWN}:
-        raise InputError(f"the condition must have the keys '{IMAGE}' and '{KNOWN}', got {', '.join(condition)}.")
     image, known = (condition[name].to(x) for name in (IMAGE, KNOWN))
-    if image.shape != x.shape or known.shape != x.shape:
-        raise InputError(f"the condition must be {tuple(x.shape)} as the scans are, found {tuple(image.shape)}.")
+    assert image.shape == known.shape == x.shape
     return image, known
 
 

@@ -18,14 +18,10 @@ from r2flow.lidar.sensors import SENSORS, build_sensor
 from tests.conftest import tiny_options
 
 CONF = Path(__file__).parents[2] / "conf"
-# parameters, and the names under which the published state_dicts are listed
-MODELS = {
-    "hdit": (80_908_420, "hdit"),
-    "adm_unet": (87_365_058, "adm_base"),
-    "adm_unet_large": (125_246_466, "adm_large"),
-    "efficient_unet": (31_099_650, "eff_base"),
-    "efficient_unet_large": (284_624_642, "eff_large"),
-}
+LISTED = {  # under these names in the oracle
+    "hdit": "hdit", "adm_unet": "adm_base", "adm_unet_large": "adm_large",
+    "efficient_unet": "eff_base", "efficient_unet_large": "eff_large",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -236,13 +232,11 @@ def test_backbones_of_an_ablation_are_of_one_size_or_one_cost(names, count):
     assert max(counts) <= 1.1 * min(counts)
 
 
-@pytest.mark.parametrize("config", MODELS)
-def test_parameters_and_names_are_the_published_models(config, shared):
-    parameters, listed = MODELS[config]
-    expected = json.loads((shared / "oracle" / "state_dict_keys.json").read_text())[listed]
+@pytest.mark.parametrize("config", LISTED)
+def test_names_and_shapes_are_the_published_models(config, shared):
+    expected = json.loads((shared / "oracle" / "state_dict_keys.json").read_text())[LISTED[config]]
     with torch.device("meta"):
         model = build_backbone(configurations()[config], build_sensor("hdl64e").rays(), 2)
-    assert sum(p.numel() for p in model.parameters()) == parameters
     kinds = dict.fromkeys(dict(model.named_parameters()), "param")
     found = {key: (list(value.shape), kinds.get(key, "buffer")) for key, value in model.state_dict().items()}
     assert found == {key: (shape, kind) for key, shape, kind in expected}

@@ -315,11 +315,8 @@ TINY = {
 @pytest.mark.parametrize("method", ["repaint", "mmps"])
 def test_every_flow_completes_a_scan(family, method):
     flow, seen = build_generator({**TINY, "generator": {"name": family}}).eval(), []
-    x_0, how, who = (
-        Draws(0, range(2)).start(flow.noise_shape),
-        build_sampler(method, steps=3),
-        Draws(0, range(2)),
-    )
+    how, who = build_sampler(method, steps=3), Draws(0, range(2))
+    x_0 = who.start(flow.noise_shape)
     known = torch.zeros_like(x_0)
     known[:, :, ::2] = 1
     y = torch.rand(x_0.shape, generator=draws(1))
@@ -330,6 +327,8 @@ def test_every_flow_completes_a_scan(family, method):
     assert len(seen) == how.evaluations()
     with pytest.raises(InputError, match="condition"):
         flow(x_0, sampler=how, draws=who)
+    with pytest.raises(InputError, match="give draws"):
+        flow(x_0, condition, sampler=how)
     for plain in ("euler", "jump")[: 2 if family == "flow_map" else 1]:
         with pytest.raises(InputError, match="mmps"):
             flow(x_0, condition, sampler=build_sampler(plain, steps=2))
@@ -341,15 +340,9 @@ def test_numbers_that_a_sampler_does_not_have_are_refused(text):
         build_sampler(text)
 
 
-def test_what_does_not_fit_is_said_in_one_line():
-    flow, x_0 = Field(gaussian(), (WIDTH,)), torch.zeros(1, WIDTH)
-    part = {"image": x_0, "known": torch.ones_like(x_0).tril()}
+def test_times_beyond_the_flow_are_refused():
     with pytest.raises(InputError, match="time grid"):
         build_sampler("mmps", grid=(0.0, 2.0))
-    with pytest.raises(InputError, match="condition"):
-        flow(x_0, part, sampler=build_sampler("euler", steps=2))
-    with pytest.raises(InputError, match="give draws"):
-        flow(x_0, part, sampler=build_sampler("repaint", steps=2))
 
 
 @pytest.mark.parametrize("method", ALL)

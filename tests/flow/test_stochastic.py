@@ -167,28 +167,12 @@ def test_a_part_is_completed_with_the_noise_of_the_whole(method):
     torch.testing.assert_close(part, region.crop(whole), rtol=0, atol=1e-6)
 
 
-def test_a_method_asks_for_draws_where_it_needs_them():
+def test_without_fresh_noise_mmps_needs_no_draws():
     flow, x_0 = normal(), torch.ones(1, 2, 8, 32)
     known = torch.zeros_like(x_0)
     known[:, :, ::2] = 1
     told = {"image": 0.3 * known, "known": known}
     assert flow(x_0, told, sampler=build_sampler("mmps", products=1, churn=0, steps=2)).converged.all()
-    with pytest.raises(InputError, match="give draws"):
-        flow(x_0, told, sampler=build_sampler("mmps", steps=3))
-
-
-def test_what_is_known_arrives_as_it_was_given():
-    torch.manual_seed(0)
-    backbone = {"name": "local", "channels": 8}
-    flow = build_generator({**CONFIG, "backbone": backbone, "generator": {"name": "transfer_flow"}}).eval()
-    who = Draws(5, range(2))
-    x_0 = who.start(flow.noise_shape)
-    known = torch.zeros_like(x_0)
-    known[:, :, ::2] = 1
-    told = {"image": x_0.roll(1, 3) * known, "known": known}
-    made = flow(x_0, told, sampler=build_sampler("sde", steps=6), draws=who)
-    assert made.converged.all()
-    assert torch.equal(made.x[known > 0], told["image"][known > 0])
 
 
 def test_pairs_are_the_ends_of_paths():
