@@ -15,13 +15,14 @@ from r2flow.errors import InputError
 from r2flow.flow.maps import OBJECTIVES
 from r2flow.flow.path import interpolate
 from r2flow.flow.problems import Gaussian
-from r2flow.generators import Field, FlowMap, RectifiedFlow, build_generator
+from r2flow.generators import FlowMap, RectifiedFlow, build_generator
 from r2flow.lidar.region import Region
 from r2flow.noise import Draws, standard_normal
 from r2flow.runs.lineage import Parent, generator_of
 from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
 from r2flow.stages.flow_map import LearnFlowMap, paths_of
+from tests.fields import Field
 
 CONFIG = {
     "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},

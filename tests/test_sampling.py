@@ -11,7 +11,7 @@ from torch import nn
 
 from r2flow.errors import InputError
 from r2flow.evaluation.sets import sampled_set
-from r2flow.generators import Field, build_generator
+from r2flow.generators import build_generator
 from r2flow.inversion import interpolate_scans, invert, round_trip, slerp
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.region import region
@@ -23,6 +23,7 @@ from r2flow.noise import Draws
 from r2flow.reports.outputs import write_samples
 from r2flow.runs.composing import compose
 from r2flow.samplers import build_sampler
+from tests.fields import Field
 from tests.test_checkpoints import CONFIG
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)

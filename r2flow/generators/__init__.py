@@ -8,14 +8,14 @@ import torch
 from r2flow.errors import InputError
 from r2flow.generators.base import Condition, Generated, Generator, Sampler
 from r2flow.generators.condition import condition_of
-from r2flow.generators.flow import USUAL, Field, Flow, RectifiedFlow, as_flow
+from r2flow.generators.flow import USUAL, Flow, RectifiedFlow, as_flow
 from r2flow.generators.flow_map import FlowMap
 from r2flow.generators.transfer import TransferFlow
 from r2flow.lidar.space import build_space
 from r2flow.registry import Registry, lazy
 
 __all__ = [
-    "GENERATORS", "USUAL", "Condition", "Field", "Flow", "FlowMap", "Generated", "Generator", "RectifiedFlow",
+    "GENERATORS", "USUAL", "Condition", "Flow", "FlowMap", "Generated", "Generator", "RectifiedFlow",
     "Sampler", "TransferFlow", "as_flow", "build_generator", "condition_of",
 ]  # fmt: skip
 

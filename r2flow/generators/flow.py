@@ -5,7 +5,7 @@ from copy import copy
 from typing import Any, ClassVar, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from r2flow.backbones import build_backbone
 from r2flow.errors import InputError
@@ -151,30 +151,6 @@ class RectifiedFlow(NetworkFlow):
         assert condition is None
         v: Tensor = self.backbone(t, x)
         return v
-
-
-class Field(Flow):
-    """A flow whose velocity is a given function: an exact problem, or a network of another origin.
-
-    Args:
-        function: v(t, x) with t of shape () or (B,), as `r2flow.flow.solvers.solve` takes it.
-        noise_shape: Of one state.
-        space: The images that the states are, where they are images; without one there is nothing to decode.
-    """
-
-    def __init__(self, function: Velocity, noise_shape: tuple[int, ...], space: ModelSpace | None = None) -> None:
-        nn.Module.__init__(self)
-        self.function, self.noise_shape = function, noise_shape
-        self.run_by(FixedSteps())
-        if space is not None:
-            self.space = space
-
-    def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
-        return self.function(t, x)
-
-    def field(self, condition: Condition | None = None) -> Velocity:
-        assert condition is None
-        return self.function
 
 
 class Conditioned:

@@ -11,9 +11,9 @@ from torch import nn
 from r2flow.callbacks.curvature import Curvature
 from r2flow.callbacks.ema import EMA
 from r2flow.callbacks.periodic import Periodic
-from r2flow.generators import Field
 from r2flow.noise import standard_normal
 from r2flow.reports.training import read_curves
+from tests.fields import Field
 
 SHAPE = (2, 4, 8)
 

@@ -5,13 +5,13 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from r2flow.callbacks import EMA, SamplePictures
-from r2flow.generators import Field
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import standard_normal
 from r2flow.reports import pictures
 from tests.callbacks.test_curvature import Stage, fit
+from tests.fields import Field
 
 SENSOR = SENSORS["hdl64e"].resized(8, 64)
 SPACE = ModelSpace(SENSOR, Encoding(SENSOR), SENSOR.rays())

@@ -24,7 +24,6 @@ from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
-from r2flow.generators import Field
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
@@ -33,6 +32,7 @@ from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
 from r2flow.store import Store
 from tests.data.conftest import prepare_folder, write_scan
+from tests.fields import Field
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
 READING = Reading(SENSOR)

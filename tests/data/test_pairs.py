@@ -23,10 +23,10 @@ from r2flow.data.pairs import (
     pair_noise,
 )
 from r2flow.errors import InputError
-from r2flow.generators import Field
 from r2flow.noise import standard_normal
 from r2flow.samplers import build_sampler
 from r2flow.store import Store
+from tests.fields import Field
 from tests.killing import MOMENTS, die_at, was_killed
 
 SHAPE = (2, 4, 8)

@@ -9,10 +9,11 @@ from torch import Tensor
 from benchmarks.completion import Case, Correlated, bures, gaussian, map_of, moments, ring, velocity_of
 from r2flow.errors import InputError
 from r2flow.flow.solvers import named_grid
-from r2flow.generators import Field, build_generator
+from r2flow.generators import build_generator
 from r2flow.noise import Draws
 from r2flow.samplers import MMPS, Repaint, build_sampler
 from r2flow.samplers.posterior import GROWN, _solved
+from tests.fields import Field
 
 WIDTH = 32
 ROWS = torch.arange(WIDTH) % 4 == 0

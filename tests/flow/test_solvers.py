@@ -10,8 +10,8 @@ from r2flow.flow.path import expand_time
 from r2flow.flow.solvers import SOLVERS, EmbeddedMethod, FixedStep, named_grid, solve, usual_grid
 from r2flow.flow.solvers.external import TorchDiffEqMethod, torchdiffeq_methods
 from r2flow.flow.solvers.fixed import weights
-from r2flow.generators import Field
 from r2flow.samplers import build_sampler
+from tests.fields import Field
 
 
 def logistic(t, x):

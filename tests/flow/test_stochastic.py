@@ -11,7 +11,7 @@ from torch import Tensor
 
 from r2flow.errors import InputError
 from r2flow.flow.solvers import named_grid
-from r2flow.generators import USUAL, Field, build_generator
+from r2flow.generators import USUAL, build_generator
 from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.region import Region
 from r2flow.model.export import tableau
@@ -19,6 +19,7 @@ from r2flow.model.sampling import draw
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from r2flow.samplers.stochastic import back, sde, sde_step
+from tests.fields import Field
 
 STD = 0.4  # of x_1 ~ N(0, STD^2), where everything is linear
 

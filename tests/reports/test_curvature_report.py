@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import nn
 
-from r2flow.generators import Field
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import SENSORS
 from r2flow.lidar.space import ModelSpace
@@ -19,6 +18,7 @@ from r2flow.reports.curvature import (
     summary,
     trajectories_figure,
 )
+from tests.fields import Field
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 

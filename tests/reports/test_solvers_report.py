@@ -10,7 +10,6 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.flow.problems import PROBLEMS
-from r2flow.generators import Field
 from r2flow.inversion import metres_apart
 from r2flow.reports.solvers import (
     Configuration,
@@ -25,6 +24,7 @@ from r2flow.reports.solvers import (
     reached,
     solvers_page,
 )
+from tests.fields import Field
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 

@@ -6,11 +6,11 @@ from torch import nn
 
 from r2flow.errors import InputError
 from r2flow.flow.solvers import solve
-from r2flow.generators import Field
 from r2flow.noise import standard_normal
 from r2flow.stages import STAGES
 from r2flow.stages.base import learning_rate_factor
 from r2flow.stages.rectify import Rectify
+from tests.fields import Field
 
 
 def test_the_schedule_is_the_reference_s(shared):
