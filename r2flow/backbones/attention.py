@@ -4,8 +4,7 @@ Azimuth wraps, so every window is centred. Elevation ends: at the top and bottom
 start = clamp(i - half, 0, H - rows), and always holds the same number of rows. On a ring narrower than the window
 a token appears more than once in it and counts as often, as in the published models.
 
-Backends, all of the same values and gradients:
-    dense    every pair of tokens and a mask: the definition, for tests and small maps
+Backends, both of the same values and gradients:
     tiles    blocks of queries against the keys around them: plain matrix products, on every device
     flex     flex_attention: CUDA
 
@@ -70,20 +69,6 @@ class _Axis(NamedTuple):
         """First place that each token sees; on a ring modulo `size`."""
         first = tokens - self.asked // 2
         return first if self.wrap else first.clamp(0, self.size - self.span)
-
-    def counts(self, device: torch.device) -> Tensor:
-        """How often token i (rows) sees token j (columns), (size, size)."""
-        starts = self.starts(torch.arange(self.size, device=device))
-        seen = (starts[:, None] + torch.arange(self.span, device=device)) % self.size
-        return F.one_hot(seen, self.size).sum(1)
-
-
-def _dense(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:
-    counts = torch.kron(rows.counts(q.device), columns.counts(q.device))
-    q, k, v = (x.flatten(1, 2).transpose(1, 2) for x in (q, k, v))  # (B, N, HW, D)
-    # a token seen n times adds n exp(logit): log n on the logit, -inf for the unseen
-    weights = torch.softmax(q @ k.mT + counts.to(q.dtype).log(), dim=-1)
-    return (weights @ v).transpose(1, 2).unflatten(1, (rows.size, columns.size))
 
 
 GRAPHS = 64  # that torch.compile may make of flex_attention; its own limit of 8 is passed by three levels
@@ -195,7 +180,7 @@ def _flex(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tenso
 
 
 Backend = Callable[[Tensor, Tensor, Tensor, _Axis, _Axis], Tensor]
-BACKENDS: Registry[Backend] = Registry("attention backend", dense=_dense, tiles=_tiles, flex=_flex)
+BACKENDS: Registry[Backend] = Registry("attention backend", tiles=_tiles, flex=_flex)
 
 
 def _fastest(q: Tensor, columns: _Axis) -> str:

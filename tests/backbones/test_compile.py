@@ -70,16 +70,6 @@ def test_two_graphs_for_each_mode_and_then_no_more(name):
     assert counter.graphs == 2 * len(MODES)
 
 
-@pytest.mark.parametrize("backend", ["tiles", "dense"])
-def test_attention_backends_compile_without_breaks(backend):
-    torch.compiler.reset()
-    model, counter = tiny("hdit", attention=backend), Counter()
-    compiled = torch.compile(model, backend=counter, fullgraph=True)
-    x = image()
-    torch.testing.assert_close(compiled(torch.tensor(0.3), x), model(0.3, x), rtol=0, atol=1e-5)
-    assert counter.graphs == 1
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_inductor_gives_the_same_values_and_gradients(name):
