@@ -14,7 +14,7 @@ from r2flow.errors import InputError
 from r2flow.generators import Sampler, as_flow
 from r2flow.generators.base import Progress
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.samplers import Adaptive, Jump
+from r2flow.samplers import Adaptive
 
 TIGHT = Adaptive(tolerance=1e-5)
 
@@ -68,11 +68,6 @@ def invert(checkpoint: Checkpoint, images: Tensor, sampler: Sampler = TIGHT, pro
         progress: Called after every network evaluation.
     """
     flow = as_flow(checkpoint.generator, "inversion")
-    jumps = (checkpoint.config.get("stage") or {}).get("jumps") or {}
-    if isinstance(sampler, Jump) and not jumps.get("backward"):
-        raise InputError(
-            "this flow map has learned no jumps back in time (stage.jumps.backward): give --sampler adams3."
-        )
     assert images.shape[2:] == checkpoint.sensor.shape
     x_1 = checkpoint.encoding.encode(images[:, : 1 + checkpoint.encoding.reflectance])
     there = flow.solve(x_1, 1.0, 0.0, sampler=sampler, progress=progress)

@@ -27,7 +27,7 @@ NEAREST = 4  # knots of the polynomial between two of them: its error is of orde
 
 
 def jump(u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
-    """X_{t->s}(x), (B, ...), for times of shape () or (B,); backward in time where s < t."""
+    """X_{t->s}(x), (B, ...), for times of shape () or (B,)."""
     return x + expand_time(s - t, x) * u(t, x, s)
 
 
@@ -101,7 +101,6 @@ class JumpTimes:
         grid: Where these steps fall, of `r2flow.flow.solvers.grids.named_grid`.
         share: Of the jumps that these steps take.
         diagonal: Share of the rest with s = t.
-        backward: Share of the rest with s < t.
         ends: Share of the rest that goes to the end, s = 1, from times of the density `time`.
         time: Density of the times of velocities, of `r2flow.flow.times.TIMES`; None: `u_shaped`, as in reflow.
     """
@@ -110,7 +109,6 @@ class JumpTimes:
     grid: str = "uniform"
     share: Portion = 0.55
     diagonal: Portion = 0.55
-    backward: Portion = 0.0
     ends: Portion = 0.0
     time: Mapping[str, Any] | None = None
 
@@ -118,11 +116,8 @@ class JumpTimes:
         if not self.steps or min(self.steps) < 1:
             raise InputError(f"the steps of a flow map's jumps must be numbers of at least 1, found {self.steps}.")
         _ = self.velocities, self.times  # an unknown density or grid is refused now
-        if self.diagonal + self.backward + self.ends > 1:
-            raise InputError(
-                "diagonal, backward and ends are shares of one rest, at most 1 in all; "
-                f"found {self.diagonal}, {self.backward} and {self.ends}."
-            )
+        if self.diagonal + self.ends > 1:
+            raise InputError(f"diagonal and ends are shares of one rest; found {self.diagonal} and {self.ends}.")
 
     @cached_property
     def velocities(self) -> Callable[[Tensor], Tensor]:
@@ -145,8 +140,6 @@ class JumpTimes:
         rest = (which - self.share) / (1 - self.share)
         velocity = self.velocities(a)
         low, high = (torch.where(rest < self.diagonal, velocity, time) for time in (low, high))
-        turned = (rest >= self.diagonal) & (rest < self.diagonal + self.backward)
-        low, high = torch.where(turned, high, low), torch.where(turned, low, high)
         last = rest >= 1 - self.ends
         low, high = torch.where(last, velocity, low), torch.where(last, 1.0, high)
         given = which < self.share

@@ -14,7 +14,7 @@ from r2flow.generators.base import Condition, Generator
 from r2flow.lidar.region import Region
 from r2flow.lidar.space import ModelSpace
 from r2flow.noise import Draws
-from r2flow.samplers import MMPS, FixedSteps, Progress, Sampler
+from r2flow.samplers import MMPS, FixedSteps, ODESampler, Progress, Sampler
 
 USUAL = FixedSteps(method="adams3", steps=16, grid="power:1.5", finish=1 / 32)  # of a new flow: docs/results.md
 
@@ -171,7 +171,7 @@ class Conditioned:
 
 def ode_sampler(flow: Flow) -> Sampler:
     """A flow's own sampler if it follows the flow's paths, else the usual one."""
-    return flow.sampler if flow.sampler.follows else USUAL
+    return flow.sampler if isinstance(flow.sampler, ODESampler) else USUAL
 
 
 def as_flow(generator: Generator, what: str) -> Flow:

@@ -67,14 +67,12 @@ class Sampler(ABC):
         draws: Whether noise is drawn on the way.
         paired: Whether x_1 still belongs to its noise x_0, so that both can be a reflow pair.
         completes: Whether a condition is needed.
-        follows: Whether it follows the flow's own paths, forward and backward in time (`ODESampler`).
         needs: Attribute of the generators that the sampler can run.
     """
 
     draws: ClassVar[bool] = False
     paired: ClassVar[bool] = True
     completes: ClassVar[bool] = False
-    follows: ClassVar[bool] = False
     needs: ClassVar[str] = "velocity"
 
     @abstractmethod

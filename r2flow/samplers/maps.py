@@ -7,47 +7,30 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
 from r2flow.flow.maps import MeanVelocity, jump
-from r2flow.flow.solvers import Solution
 from r2flow.flow.solvers.solution import finite, stepped
-from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, OnGrid, Progress, Sampler, Steps
-from r2flow.samplers.ode import ODESampler
+from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, OnGrid, Sampler, Steps
 
 
 @dataclass(frozen=True)
-class Jump(OnGrid, ODESampler):
+class Jump(OnGrid):
     """X_{t->s} from each time of the grid to the next."""
 
     needs: ClassVar[str] = "map"
 
     steps: Steps = 4
 
-    def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, end: Tensor) -> Tensor:
-        """x_s."""
+    def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, e: Tensor) -> Tensor:
+        """x_s, with fresh noise e where the sampler draws."""
         return jump(u, t, x, s)
 
-    def solve(
-        self,
-        generator: Any,
-        x: Tensor,
-        t_0: float = 0.0,
-        t_1: float = 1.0,
-        condition: Given = None,
-        progress: Progress = None,
-        **options: Any,
-    ) -> Solution:
-        if any(options.values()):
-            raise InputError(f"{self.name} has no {', '.join(options)}; give a solver, such as adams3.")
-        u, alive = generator.map(condition), finite(x)
-        times = (self.times(t_0, t_1) if t_0 != t_1 and len(x) else torch.empty(0)).to(x)
-        for t, s in pairwise(times):
-            x, alive = stepped(x, self.step(u, t, x, s, times[-1]), alive)
-            if progress is not None:
-                progress()
-        count = max(len(times) - 1, 0)
-        evaluations = torch.full((len(x),), count).numpy()
-        return Solution.build(x, evaluations, count, 0, False, alive.cpu().numpy())
+    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
+        u, x, alive, times = generator.map(condition), noise, finite(noise), self.times().to(noise)
+        for j, (t, s) in enumerate(pairwise(times), start=1):
+            e = draws(j) if self.draws and draws is not None and s < 1 else torch.zeros_like(x)
+            x, alive = stepped(x, self.step(u, t, x, s, e), alive)
+            progress()
+        return Generated.after(x, self.steps, alive)
 
 
 @dataclass(frozen=True)
@@ -65,35 +48,24 @@ class Chord(Jump):
     steps: Steps = 2
     grid: Grid | None = None  # type: ignore[assignment]
 
-    def times(self, t_0: float = 0.0, t_1: float = 1.0, fewer: int = 0) -> Tensor:
-        return late(t_0, t_1, self.steps) if self.grid is None else super().times(t_0, t_1, fewer)
+    def times(self, *args: Any, **options: Any) -> Tensor:
+        return late(self.steps) if self.grid is None else super().times(*args, **options)
 
-    def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, end: Tensor) -> Tensor:
-        return x + (s - t) * u(t, x, end)
+    def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, e: Tensor) -> Tensor:
+        return x + (s - t) * u(t, x, torch.ones_like(t))
 
 
 @dataclass(frozen=True)
-class Renoise(OnGrid):
+class Renoise(Jump):
     """x_s = (1 - s) e + s X_{t->1}(x_t) with fresh noise e (Song et al. 2023, consistency models, algorithm 1).
 
     A sample of the same distribution where the map is exact, and not the end of this noise's own path.
     """
 
-    needs: ClassVar[str] = "map"
     draws: ClassVar[bool] = True
 
-    steps: Steps = 4
-
-    def __call__(self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call) -> Generated:
-        assert draws is not None
-        u, x, alive, times = generator.map(condition), noise, finite(noise), self.times().to(noise)
-        for j, (t, s) in enumerate(pairwise(times), start=1):
-            following = jump(u, t, x, times[-1])
-            if s < 1:
-                following = s * following + (1 - s) * draws(j)
-            x, alive = stepped(x, following, alive)
-            progress()
-        return Generated.after(x, self.steps, alive)
+    def step(self, u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor, e: Tensor) -> Tensor:
+        return s * jump(u, t, x, torch.ones_like(t)) + (1 - s) * e
 
 
 @dataclass(frozen=True)
@@ -111,11 +83,10 @@ class Transport(Sampler):
         return Generated.after(x, 1)
 
 
-def late(t_0: float, t_1: float, steps: int, k: float = 32.0) -> Tensor:
+def late(steps: int, k: float = 32.0) -> Tensor:
     """One long step, the rest near t = 1: 1 - t falls evenly on a log scale about 1 / k, from at most 2 / k.
 
-    1 - t_j = 2^(1 - (2 j - 1) / (N - 1)) / k for j = 1 to N - 1 of N steps from 0 to 1.
+    1 - t_j = 2^(1 - (2 j - 1) / (N - 1)) / k for j = 1 to N - 1 of N steps.
     """
     share = (2 * torch.arange(1, steps, dtype=torch.float64) - 1) / max(steps - 1, 1)
-    rising = torch.cat([torch.zeros(1), 1 - 2 ** (1 - share) / k, torch.ones(1)])
-    return t_0 + (t_1 - t_0) * rising if t_0 <= t_1 else (t_1 + (t_0 - t_1) * rising).flip(0)
+    return torch.cat([torch.zeros(1), 1 - 2 ** (1 - share) / k, torch.ones(1)])

@@ -1,7 +1,7 @@
 """The ODE dx/dt = v(t, x) of a flow, by a solver of `r2flow.flow.solvers`."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from torch import Tensor
 
@@ -13,8 +13,6 @@ from r2flow.samplers.base import Call, Fresh, Generated, Given, OnGrid, Progress
 
 class ODESampler(Sampler):
     """A sampler that follows the flow's own paths, forward and backward in time."""
-
-    follows: ClassVar[bool] = True
 
     def options(self) -> dict[str, Any]:
         """Options of `r2flow.flow.solvers.solve`."""
