@@ -12,14 +12,14 @@ python benchmarks/solvers.py --checkpoint runs/demo/rf1 --num 2     # minutes on
 
 import argparse
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from r2flow.flow.problems import Discontinuous, Gaussian, Mixed, Problem, RayDrop, Straight, TwoModes
+from r2flow.flow.problems import Discontinuous, Gaussian, Problem, RayDrop, Straight, TwoModes
 from r2flow.flow.solvers import Velocity, solve
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.noise import Draws, standard_normal
@@ -29,6 +29,38 @@ ELEMENTS = 256
 TOLERANCES = (1e-2, 1e-3, 1e-4)
 PROBLEMS: dict[str, Problem] = {"Gaussian": Gaussian(), "two modes": TwoModes(), "ray-drop": RayDrop()}
 Solve = Callable[[Velocity, Tensor, float], tuple[Tensor, int]]  # of (velocity, x_0, tolerance): x_1 and evaluations
+
+
+class Mixed(Problem):
+    """A batch in which every scene has a problem of its own; `select` is for solvers whose scenes leave the batch.
+
+    Args:
+        problems: One for each scene.
+    """
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        self.problems = tuple(problems)
+        groups: dict[Problem, list[int]] = {}
+        for scene, problem in enumerate(self.problems):
+            groups.setdefault(problem, []).append(scene)
+        self._groups = [(problem, torch.tensor(scenes)) for problem, scenes in groups.items()]
+
+    def select(self, scenes: Tensor) -> "Mixed":
+        """The problem of some of the scenes, indices (N,)."""
+        return Mixed([self.problems[scene] for scene in scenes.tolist()])
+
+    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
+        v = torch.empty_like(x)
+        for problem, scenes in self._groups:
+            v[scenes] = problem(t[scenes] if t.ndim else t, x[scenes])
+        return v
+
+    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
+        t = torch.as_tensor(t, dtype=torch.float64)
+        x_t = torch.empty_like(x_0, dtype=torch.float64)
+        for problem, scenes in self._groups:
+            x_t[scenes] = problem.solution(x_0[scenes], t[scenes] if t.ndim else t)
+        return x_t
 
 
 class Counted:

@@ -148,16 +148,16 @@ class HDiT(Backbone):
             rays = mean_rays(self.coords, (self.patch[0] << level, self.patch[1] << level))
             table = _shared_rotation(level, self._blocks(level)).table(rays)
             self.register_buffer(f"table_{level}", table, persistent=False)
-        if self.spatial_pe is not None:
+        if isinstance(self.spatial_pe, FeaturePosition):
             self.spatial_pe.follow(mean_rays(self.coords, self.patch))
 
     @property
     def learns_directions(self) -> bool:
-        return self.spatial_pe is not None and self.spatial_pe.learned
+        return isinstance(self.spatial_pe, LearnablePosition)
 
     def cropped(self, rows: Tensor, columns: Tensor) -> Self:
         part = super().cropped(rows, columns)
-        if part.spatial_pe is not None:
+        if isinstance(part.spatial_pe, LearnablePosition):
             part.spatial_pe.crop(*(n[::step] // step for n, step in zip((rows, columns), self.patch, strict=True)))
         return part
 
@@ -191,17 +191,12 @@ def _shared_rotation(level: int, blocks: Sequence["Block"]) -> Rotary:
 class LearnablePosition(nn.Module):
     """One learned vector for each token, added to it: the absolute position embedding of the paper."""
 
-    learned = True
-
     def __init__(self, tokens: tuple[int, int], channels: int) -> None:
         super().__init__()
         self.embedding = nn.Parameter(nn.init.trunc_normal_(torch.empty(1, *tokens, channels), std=0.02))
 
     def forward(self) -> Tensor:
         return self.embedding
-
-    def follow(self, rays: Tensor) -> None:
-        """Nothing of it derives from the rays."""
 
     def crop(self, rows: Tensor, columns: Tensor) -> None:
         """Keep the tokens of these rows and columns, as a constant."""
@@ -213,8 +208,6 @@ class LearnablePosition(nn.Module):
 class FeaturePosition(nn.Sequential):
     """Features of the mean ray of each token through a mapping network."""
 
-    learned = False
-
     def __init__(self, name: str, tokens: tuple[int, int], channels: int, dropout: float) -> None:
         features = RayFeatures(ENCODINGS[name](tokens), channels)
         super().__init__(features, mapping_network(channels, linear=nn.Linear, dropout=dropout))
@@ -223,9 +216,6 @@ class FeaturePosition(nn.Sequential):
         """Compute the features again."""
         features = cast(RayFeatures, self[0])
         features.register_buffer("features", features.embedding(rays).permute(0, 2, 3, 1), persistent=False)
-
-    def crop(self, rows: Tensor, columns: Tensor) -> None:
-        """Its features follow the rays."""
 
     def forward(self) -> Tensor:  # type: ignore[override]  # its input are the rays, which it holds
         features, mapping = self

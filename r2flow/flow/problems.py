@@ -233,38 +233,6 @@ class Pulse(Problem):
         return x_0 + ((t - self.at) / self.width + 0.5).clamp(0, 1)
 
 
-class Mixed(Problem):
-    """A batch in which every scene has a problem of its own; `select` is for solvers whose scenes leave the batch.
-
-    Args:
-        problems: One for each scene.
-    """
-
-    def __init__(self, problems: Sequence[Problem]) -> None:
-        self.problems = tuple(problems)
-        groups: dict[Problem, list[int]] = {}
-        for scene, problem in enumerate(self.problems):
-            groups.setdefault(problem, []).append(scene)
-        self._groups = [(problem, torch.tensor(scenes)) for problem, scenes in groups.items()]
-
-    def select(self, scenes: Tensor) -> "Mixed":
-        """The problem of some of the scenes, indices (N,)."""
-        return Mixed([self.problems[scene] for scene in scenes.tolist()])
-
-    def __call__(self, t: Tensor, x: Tensor) -> Tensor:
-        v = torch.empty_like(x)
-        for problem, scenes in self._groups:
-            v[scenes] = problem(t[scenes] if t.ndim else t, x[scenes])
-        return v
-
-    def solution(self, x_0: Tensor, t: Tensor | float) -> Tensor:
-        t = torch.as_tensor(t, dtype=torch.float64)
-        x_t = torch.empty_like(x_0, dtype=torch.float64)
-        for problem, scenes in self._groups:
-            x_t[scenes] = problem.solution(x_0[scenes], t[scenes] if t.ndim else t)
-        return x_t
-
-
 def _exact(x_0: Tensor, t: Tensor | float) -> tuple[Tensor, Tensor]:
     """x_0 and t in float64, t in a shape that multiplies x_0."""
     x_0 = x_0.double()

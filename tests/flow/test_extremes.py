@@ -6,9 +6,10 @@ import math
 import pytest
 import torch
 
+from benchmarks.solvers import Mixed
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
-from r2flow.flow.problems import Gaussian, Mixed, PointMass, Rotating, StiffLinear, Straight
+from r2flow.flow.problems import Gaussian, PointMass, Rotating, StiffLinear, Straight
 from r2flow.flow.solvers import LEAST_TOLERANCE, SOLVERS, solve
 
 METHODS = [*SOLVERS, "torchdiffeq:dopri5", "torchdiffeq:rk4"]

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from r2flow.flow.problems import PROBLEMS, Gaussian, Mixed, NarrowJet, PointMass, RayDrop, Rotating, Straight, TwoModes
+from r2flow.flow.problems import PROBLEMS, Gaussian, NarrowJet, PointMass, RayDrop, Rotating, Straight, TwoModes
 from r2flow.flow.solvers import solve
 
 
@@ -101,12 +101,3 @@ def test_a_wide_jet_has_its_exact_solution():
     assert (problem.solution(X_0, 0.0) - X_0).abs().max() < 1e-14
     end = solve(problem, X_0, method="dopri5", tolerance=1e-13).x
     torch.testing.assert_close(end, problem.solution(X_0, 1.0), rtol=0, atol=1e-11)
-
-
-def test_scenes_of_a_mixed_batch_follow_their_own_problem():
-    problems = [Straight(), TwoModes(), Rotating()]
-    batch, t = Mixed(problems), torch.tensor([0.2, 0.4, 0.6], dtype=torch.float64)
-    for scene, problem in enumerate(problems):
-        assert torch.equal(batch(t, X_0)[scene], problem(t[scene], X_0[scene : scene + 1])[0])
-        alone = batch.select(torch.tensor([scene]))
-        assert torch.equal(alone.solution(X_0[scene : scene + 1], 1.0), batch.solution(X_0, 1.0)[scene : scene + 1])

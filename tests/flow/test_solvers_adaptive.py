@@ -6,12 +6,12 @@ import statistics
 import pytest
 import torch
 
+from benchmarks.solvers import Mixed
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import (
     PROBLEMS,
     Discontinuous,
     Gaussian,
-    Mixed,
     Pulse,
     RayDrop,
     Rotating,

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
+from benchmarks.solvers import Mixed
 from r2flow.flow.path import expand_time
-from r2flow.flow.problems import Gaussian, Mixed, Rotating, StiffLinear, Straight
+from r2flow.flow.problems import Gaussian, Rotating, StiffLinear, Straight
 from r2flow.flow.solvers import solve
 
 X_0 = torch.randn(2, 16, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
