@@ -16,7 +16,6 @@ from r2flow.flow.maps import OBJECTIVES
 from r2flow.flow.path import interpolate
 from r2flow.flow.problems import Gaussian
 from r2flow.generators import FlowMap, RectifiedFlow, build_generator
-from r2flow.lidar.region import Region
 from r2flow.noise import Draws, standard_normal
 from r2flow.runs.lineage import Parent, generator_of
 from r2flow.samplers import build_sampler
@@ -153,14 +152,6 @@ def test_renoised_samples_of_an_exact_map_have_the_data_s_distribution(exact):
     torch.testing.assert_close(twice, expected, rtol=0, atol=1e-5)
 
 
-def test_a_part_is_renoised_with_the_noise_of_the_whole(exact):
-    region, draws, sampler = Region((8, 32), 0, 8, 8, 16), Draws(5, [0]), build_sampler("renoise", steps=3)
-    x_0 = draws.start(exact.noise_shape)
-    whole = exact(x_0, sampler=sampler, draws=draws)
-    part = exact.part(region)(region.crop(x_0), sampler=sampler, draws=draws)
-    torch.testing.assert_close(part.x, region.crop(whole.x), rtol=0, atol=1e-6)
-
-
 def test_it_can_also_be_solved_as_the_flow_that_it_is(grown):
     x_0 = Draws(0, range(2)).start(grown.noise_shape)
     how = build_sampler("adams3", steps=4)
@@ -215,13 +206,6 @@ def test_a_run_notes_the_sampler_for_few(grown):
     assert stage.generator.few == build_sampler("chord")
     with pytest.raises(InputError, match="cord"):
         build_stage({**config, "few": {"name": "cord"}}, flow_map())
-
-
-@pytest.mark.parametrize("method", ["jump", "chord", "renoise", "euler"])
-def test_a_condition_that_it_has_not_learned_is_refused(grown, method):
-    noise = torch.zeros(1, *grown.noise_shape)
-    with pytest.raises(InputError, match="condition"):
-        grown(noise, {"image": noise}, sampler=build_sampler(method, steps=2), draws=Draws(0, [0]))
 
 
 # ---- the stage
@@ -287,37 +271,10 @@ def test_renoised_pairs_are_one_jump_and_what_the_map_makes_of_it_later(exact, t
         make_pairs(PairStore(tmp_path / "other", other), exact, 6)
 
 
-def test_pairs_by_the_chord_are_its_samples(exact, tmp_path: Path):
-    options = PairOptions(
-        sampler={"name": "chord", "steps": 2, "grid": "power:5"}, num=4, batch_size=2, seed=3, parent="a"
-    )
-    store = PairStore(tmp_path, options.recipe(exact.space.shape))
-    make_pairs(store, exact, 4)
-    mean, std, late = exact.problem.mean, exact.problem.std, 1 - 0.5**5
-    for x_0, x_1 in (PairSource(store, 4)[k] for k in range(4)):
-        x_t = (1 - late) * x_0 + late * (mean + std * x_0)
-        expected = mean + std * (x_t - late * mean) / ((1 - late) ** 2 + (late * std) ** 2) ** 0.5
-        torch.testing.assert_close(x_1, expected, rtol=2**-11, atol=2e-5)
-
-
 @pytest.mark.parametrize("method", ["chord", "renoise"])
 def test_a_map_s_own_pairs_need_no_knots(method):
     data = {**DATA, "pairs": {"sampler": {"name": method}}}
     assert stage(data, objective="knots").objective is OBJECTIVES["knots"]
-
-
-@pytest.mark.parametrize("ranks", [2, 3])
-def test_pairs_with_knots_are_the_same_bytes_from_any_number_of_processes(tmp_path: Path, ranks: int):
-    options = PairOptions(
-        sampler={"name": "adams3", "steps": 4}, num=12, knots=1, batch_size=2, shard_mib=0.001, parent="a"
-    )
-    for folder, count in ((tmp_path / "one", 1), (tmp_path / "many", ranks)):
-        store = PairStore(folder, options.recipe((2, 4, 8)))
-        for rank in range(count):
-            make_pairs(store, Field(lambda t, x: x, (2, 4, 8)), 12, rank, count)
-    shards = {p.name: p.read_bytes() for p in (tmp_path / "one").glob("*.safetensors")}
-    assert len(shards) > 1
-    assert shards == {p.name: p.read_bytes() for p in (tmp_path / "many").glob("*.safetensors")}
 
 
 @pytest.mark.parametrize("objective", list(OBJECTIVES))

@@ -240,17 +240,3 @@ def test_names_and_shapes_are_the_published_models(config, shared):
     kinds = dict.fromkeys(dict(model.named_parameters()), "param")
     found = {key: (list(value.shape), kinds.get(key, "buffer")) for key, value in model.state_dict().items()}
     assert found == {key: (shape, kind) for key, shape, kind in expected}
-
-
-def test_unknown_names_and_options_are_explained():
-    with pytest.raises(InputError, match=r"no backbone named 'hditt'.*Did you mean 'hdit'"):
-        build_backbone({"name": "hditt"}, torch.zeros(2, 8, 32), 2)
-    for name, wrong, meant in (("hdit", "depth", "depths"), ("adm_unet", "num_head", "num_heads")):
-        with pytest.raises(InputError, match=rf"backbone '{name}' has no option '{wrong}'.*Did you mean '{meant}'"):
-            build_backbone({"name": name, wrong: 3}, torch.zeros(2, 8, 32), 2)
-
-
-@pytest.mark.parametrize("name", PUBLISHED)
-def test_the_unit_follows_from_other_options_and_is_none(name):
-    with pytest.raises(InputError, match=f"backbone '{name}' has no option 'unit'"):
-        build_backbone({"name": name, "unit": (1, 1)}, torch.zeros(2, 8, 32), 2)

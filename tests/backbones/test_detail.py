@@ -97,8 +97,3 @@ def test_half_precision_keeps_the_skip_exact():
     x = image()
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert torch.equal(model(0.0, x), -x)
-
-
-def test_a_standard_deviation_that_is_none():
-    with pytest.raises(InputError, match="data_std"):
-        untrained("hdit", data_std=-1.0)

@@ -33,15 +33,6 @@ def test_with_the_weights_of_one_time_it_is_that_network_for_every_s(name, autoc
 
 
 @pytest.mark.parametrize("name", TWO_TIMES)
-def test_only_the_new_names_are_new(name):
-    one, two = untrained(name), untrained(name, second_time=True)
-    assert set(two.state_dict()) - set(one.state_dict()) == two.second_time_names()
-    assert set(one.state_dict()) <= set(two.state_dict())
-    assert one.second_time_names() == frozenset()
-    assert len(two.second_time_names()) > 0
-
-
-@pytest.mark.parametrize("name", TWO_TIMES)
 def test_a_seed_gives_both_the_same_weights(name):
     states = []
     for second_time in (False, True):
@@ -68,16 +59,6 @@ def test_training_reaches_the_second_time(name):
     with torch.no_grad():
         assert (two(t, x, s) - two(t, x)).abs().max() > 1e-4
         assert torch.equal(two(t, x), two(t, x, t))
-
-
-@pytest.mark.parametrize("name", TWO_TIMES)
-def test_scalar_and_batched_second_times_agree(name):
-    model, x, t = tiny(name, second_time=True), image(3), torch.tensor([0.1, 0.5, 0.9])
-    with torch.no_grad():
-        batched = model(t, x, torch.full((3,), 0.6))
-        for s in (0.6, torch.tensor(0.6), torch.tensor([0.6])):
-            torch.testing.assert_close(model(t, x, s), batched, rtol=0, atol=1e-5)
-        torch.testing.assert_close(model(0.5, x, t)[1:], model(0.5, x[1:], t[1:]), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", TWO_TIMES)

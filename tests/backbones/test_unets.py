@@ -5,9 +5,7 @@ import torch
 from reference_cases import assert_gradients, load_case
 
 from r2flow.backbones import BACKBONES, Backbone, build_backbone
-from r2flow.backbones.adm_unet import ADMBlock
-from r2flow.backbones.convolutions import BlockOptions, Resample, SinusoidalTime
-from r2flow.backbones.efficient_unet import Level
+from r2flow.backbones.convolutions import Resample, SinusoidalTime
 from r2flow.errors import InputError
 from r2flow.registry import check_options
 
@@ -65,38 +63,6 @@ def test_resampling_keeps_a_constant_ring_constant(window):
     for up in (True, False):
         inner = Resample(window, up=up, ring=True)(x)[:, :, 1:-1]  # the filter sees zeros above and below
         torch.testing.assert_close(inner, torch.full_like(inner, 2.5))
-
-
-OPTIONS = BlockOptions(condition_channels=4, ring=True, dropout=0.0)
-
-
-def randomised(module: torch.nn.Module) -> torch.nn.Module:
-    for parameter in module.parameters():
-        torch.nn.init.normal_(parameter, std=0.3)
-    return module.double()
-
-
-@pytest.mark.parametrize(
-    "block",
-    [
-        lambda: ADMBlock(8, 16, OPTIONS, Resample((1, 1), up=False, ring=True), heads=2),
-        lambda: Level(8, 16, 1, OPTIONS, heads=2, down=True),
-        lambda: Level(8, 8, 1, OPTIONS, heads=2, up=True),
-    ],
-    ids=["adm", "efficient down", "efficient up"],
-)
-def test_gradcheck_of_a_block(block):
-    module = randomised(block())
-    x = torch.randn(1, 8, 4, 4, dtype=torch.float64, requires_grad=True)
-    condition = torch.randn(1, 4, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(module, (x, condition), fast_mode=True)
-    parameters = dict(module.named_parameters())
-
-    def of_weights(*values: torch.Tensor) -> torch.Tensor:
-        weights = dict(zip(parameters, values, strict=True))
-        return torch.func.functional_call(module, weights, (x.detach(), condition.detach()))
-
-    assert torch.autograd.gradcheck(of_weights, tuple(parameters.values()), fast_mode=True)
 
 
 @pytest.mark.parametrize("name", ["adm_unet", "efficient_unet"])

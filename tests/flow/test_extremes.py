@@ -95,14 +95,6 @@ def test_an_empty_interval_returns_the_start_without_evaluations(method):
         assert solution.global_error.tolist() == [0.0] * 4
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_velocities_are_evaluated_at_exactly_0_and_1(method):
-    problem, tolerance = Gaussian(), 1e-4 if method == "exprb43" else 1e-7
-    there = solve(problem, X_0.double(), 0.0, 1.0, method=method, steps=128, tolerance=tolerance).x
-    back = solve(problem, there, 1.0, 0.0, method=method, steps=128, tolerance=tolerance).x
-    torch.testing.assert_close(back, X_0.double(), rtol=0, atol=0.2 if method == "euler" else 1e-2)
-
-
 def test_numbers_out_of_range_are_refused():
     for wrong, message in [
         ({"steps": 0}, "step"),

@@ -51,8 +51,3 @@ def test_pseudo_huber_is_finite_wherever_its_value_is(size):
     loss.sum().backward()
     assert loss.item() == pytest.approx(size, rel=1e-3)
     assert v.grad.sum().item() == pytest.approx(1, rel=1e-3)
-
-
-def test_the_absolute_loss_is_the_mean_error_of_each_sample():
-    v, u = torch.tensor([[1.0, -2.0], [0.5, 0.5]]), torch.tensor([[0.0, 2.0], [0.5, 1.0]])
-    assert LOSSES["absolute"](v, u).tolist() == [2.5, 0.25]

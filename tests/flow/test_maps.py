@@ -4,10 +4,9 @@ import math
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from r2flow.errors import InputError
-from r2flow.flow.losses import pseudo_huber
 from r2flow.flow.maps import OBJECTIVES, JumpTimes, Paths, consistency, jump
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, Straight
@@ -55,12 +54,6 @@ def test_between_knots_the_error_is_of_fourth_order():
         at = [t.expand(3) for t in torch.linspace(0, 1, 321, dtype=torch.float64)]
         errors.append(max(float((paths.at(t) - X_0 * torch.sin(3 * t[0])).abs().max()) for t in at))
     assert math.log2(errors[0] / errors[1]) / 2 == pytest.approx(4, abs=0.3)
-
-
-def test_the_chord_is_straight_between_the_ends():
-    chord = paths_of(lambda x, t: x * (1 - t) ** 3 + t**2).chord
-    torch.testing.assert_close(chord.at(T), X_0 * expand_time(1 - T, X_0) + expand_time(T, X_0))
-    torch.testing.assert_close(chord.mean_velocity(T, S), 1 - X_0)
 
 
 def test_jump_times_keep_their_shares():
@@ -177,43 +170,9 @@ def test_each_scan_is_asked_for_under_its_own_condition():
     torch.testing.assert_close(target, expand_time(torch.tensor([1.0, 7.0, 3.0]).double(), X_0).expand_as(X_0))
 
 
-class Tiny(nn.Module):
-    """A smooth network of two times, in float64."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(nn.Linear(6, 5), nn.Tanh(), nn.Linear(5, 4)).double()
-
-    def forward(self, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
-        times = torch.stack([t, s], 1)
-        return self.layers(torch.cat([x.flatten(1), times], 1)).view_as(x)
-
-
 @pytest.mark.parametrize("name", list(OBJECTIVES))
-def test_the_gradient_is_that_of_the_prediction_alone(name):
-    """By central differences, the target held where it is: an objective's own evaluations have no gradient."""
-    model, rho = Tiny(), torch.full_like(T, 0.3)
+def test_a_target_has_no_gradient(name):
+    weight = torch.ones((), dtype=torch.float64, requires_grad=True)
     paths = paths_of(lambda x, t: x * torch.cos(2 * t) + t)
-
-    def prediction(x_t: Tensor, target: Tensor) -> Tensor:
-        return pseudo_huber(model(T, x_t, S), target).mean()
-
-    x_t, target = OBJECTIVES[name](model, paths, T, S, rho)
-    prediction(x_t, target).backward()
-    weight = model.layers[0].weight
-    assert weight.grad is not None
-    for index in ((0, 0), (2, 4), (4, 5)):
-        values = []
-        for step in (1e-5, -1e-5):
-            with torch.no_grad():
-                weight[index] += step
-                values.append(float(pseudo_huber_64(model(T, x_t, S), target.detach())))
-                weight[index] -= step
-        assert float(weight.grad[index]) == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-4)
-
-
-def pseudo_huber_64(v: Tensor, u: Tensor) -> Tensor:
-    """The paper's loss over sqrt(d), in float64, written again."""
-    r = (v - u).flatten(1)
-    c = 0.00054 * math.sqrt(r.shape[1])
-    return (((r.square().sum(1) + c**2).sqrt() - c) / math.sqrt(r.shape[1])).mean()
+    aim = OBJECTIVES[name](lambda t, x, s: weight * x, paths, T, S, torch.full_like(T, 0.3))
+    assert not any(part.requires_grad for part in aim)

@@ -50,18 +50,6 @@ def test_the_dense_gaussian_moves_with_its_velocity():
         torch.testing.assert_close(central, prior(torch.tensor(t), prior.solution(x_0, t)), rtol=1e-6, atol=1e-6)
 
 
-def test_a_mixture_s_velocity_is_the_regression_of_x_1_minus_x_0():
-    """E[(x_1 - x_0 - v) f(x_t)] = 0 for any f, by samples."""
-    prior = Correlated(randn(2, 3), torch.stack([torch.eye(3).double(), 0.2 + torch.eye(3).double()]))
-    x_1, x_0 = prior.sample(50_000, draws(1)), randn(50_000, 3, seed=2)
-    t = torch.tensor(0.6, dtype=torch.float64)
-    x = t * x_1 + (1 - t) * x_0
-    rest = x_1 - x_0 - prior(t, x)
-    for f in (torch.ones_like(x), x, x.sin(), x.sign()):
-        deviation = (rest * f).std(0) / math.sqrt(len(x))
-        assert ((rest * f).mean(0).abs() < 4.5 * deviation).all()
-
-
 def test_the_posterior_of_a_known_part_is_that_of_the_precision_matrix():
     prior = gaussian()
     y = randn(int(ROWS.sum()))
@@ -72,21 +60,6 @@ def test_the_posterior_of_a_known_part_is_that_of_the_precision_matrix():
     torch.testing.assert_close(found.means[0][~ROWS], mean)
     torch.testing.assert_close(found.covariances[0][~ROWS][:, ~ROWS], torch.linalg.inv(inner))
     torch.testing.assert_close(found.means[0][ROWS], y)
-
-
-def test_the_posterior_of_a_mixture_has_bayes_weights():
-    prior = Correlated(torch.tensor([[1.0], [-1.0]]).double(), torch.full((2, 1, 1), 0.25).double())
-    found = prior.posterior(torch.eye(1).double(), torch.tensor([0.2]).double(), 0.5)
-    odds = math.exp(-((0.2 - 1) ** 2) / (2 * 0.5) + (0.2 + 1) ** 2 / (2 * 0.5))
-    assert float(found.weights[0] / found.weights[1]) == pytest.approx(odds)
-    torch.testing.assert_close(found.covariances.flatten(), torch.full((2,), 1 / (4 + 4)).double())
-
-
-def test_with_nothing_measured_the_posterior_is_the_prior():
-    prior = gaussian()
-    found = prior.posterior(torch.zeros(0, WIDTH).double(), torch.zeros(0).double(), 0.0)
-    assert torch.equal(found.means, prior.means)
-    assert torch.equal(found.covariances, prior.covariances)
 
 
 # What is measured
@@ -109,17 +82,6 @@ def bad_matrix(least: float) -> tuple[Tensor, Tensor]:
     vectors = torch.linalg.qr(randn(WIDTH, WIDTH, seed=5))[0]
     spectrum = torch.logspace(math.log10(least), 0, WIDTH).double()
     return vectors * spectrum @ vectors.T + 0.002 * randn(WIDTH, WIDTH, seed=6), vectors
-
-
-@pytest.mark.parametrize("steps", [1, 2])
-def test_the_least_residual_of_the_same_directions(steps, monkeypatch):
-    monkeypatch.setattr("r2flow.samplers.posterior.GROWN", -1.0)
-    matrix, r = bad_matrix(1e-3)[0], randn(3, WIDTH, seed=7)
-    found = _solved(lambda p: (p, p @ matrix.T), r, steps)
-    for row, x in zip(r, found, strict=True):
-        directions = torch.stack([torch.linalg.matrix_power(matrix, k) @ row for k in range(steps)], 1)
-        best = directions @ torch.linalg.lstsq(matrix @ directions, row[:, None]).solution[:, 0]
-        torch.testing.assert_close(x, best)
 
 
 def test_each_scan_whose_residual_grows_tenfold_gets_the_least_one():
@@ -243,41 +205,6 @@ def test_with_nothing_measured_it_draws_from_the_prior(method):
 
 
 @pytest.mark.parametrize("method", ALL)
-def test_known_values_arrive_as_they_were_given(method):
-    prior, y = gaussian(), randn(3, WIDTH).float()
-    known = torch.rand(3, WIDTH, generator=draws(1)) < 0.4
-    found = sample_posterior(velocity_of(prior), randn(3, WIDTH, seed=2).float(), y, known, method, times(4),
-                             lambda j: randn(3, WIDTH, seed=j).float())  # fmt: skip
-    assert found.isfinite().all()
-    assert found.dtype == torch.float32
-    assert torch.equal(found[known], y[known])
-
-
-@pytest.mark.parametrize("method", ALL)
-def test_it_evaluates_within_the_flow_as_often_as_it_says(method):
-    prior, seen, products = gaussian(), [], [0]
-
-    def count(_: Tensor) -> None:
-        products[0] += 1
-
-    def u(t: Tensor, x: Tensor, s: Tensor) -> Tensor:
-        seen.append(float(t))
-        v = prior(t, x)
-        if v.requires_grad:
-            v.register_hook(count)
-        return v
-
-    measured = Case(ROWS).measurement(randn(2, 8))
-    for steps in (1, 2, 5, 8):
-        seen.clear()
-        products[0] = 0
-        sampler = build_sampler(method, steps=steps)
-        sampler.given(u, randn(2, WIDTH), *measured, sampler.times(), numbered((2, WIDTH)))
-        assert len(seen) + products[0] == sampler.evaluations()
-        assert 0 <= min(seen) <= max(seen) < 1
-
-
-@pytest.mark.parametrize("method", ALL)
 def test_a_rolled_scan_gives_a_rolled_answer(method):
     prior = gaussian()  # as much the same in all directions as a network without absolute positions
     y, known, shift = randn(2, WIDTH), torch.rand(2, WIDTH, generator=draws(1)) < 0.3, 5
@@ -313,7 +240,7 @@ TINY = {
 
 
 @pytest.mark.parametrize("family", ["rectified_flow", "flow_map"])
-@pytest.mark.parametrize("method", ["repaint", "mmps"])
+@pytest.mark.parametrize("method", ALL)
 def test_every_flow_completes_a_scan(family, method):
     flow, seen = build_generator({**TINY, "generator": {"name": family}}).eval(), []
     how, who = build_sampler(method, steps=3), Draws(0, range(2))
@@ -328,8 +255,9 @@ def test_every_flow_completes_a_scan(family, method):
     assert len(seen) == how.evaluations()
     with pytest.raises(InputError, match="condition"):
         flow(x_0, sampler=how, draws=who)
-    with pytest.raises(InputError, match="give draws"):
-        flow(x_0, condition, sampler=how)
+    if how.draws:
+        with pytest.raises(InputError, match="give draws"):
+            flow(x_0, condition, sampler=how)
     for plain in ("euler", "jump")[: 2 if family == "flow_map" else 1]:
         with pytest.raises(InputError, match="mmps"):
             flow(x_0, condition, sampler=build_sampler(plain, steps=2))

@@ -8,7 +8,6 @@ import torch
 from r2flow.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers import SOLVERS, EmbeddedMethod, FixedStep, named_grid, solve, usual_grid
-from r2flow.flow.solvers.external import TorchDiffEqMethod, torchdiffeq_methods
 from r2flow.flow.solvers.fixed import weights
 from r2flow.samplers import build_sampler
 from tests.fields import Field
@@ -61,29 +60,6 @@ def test_an_adaptive_method_of_equal_steps_has_its_order(method):
         return (solution.x - logistic_solution(X_0, 1)).abs().max().item()
 
     assert math.log2(error(32) / error(64)) == pytest.approx(SOLVERS[method].order, abs=0.35)
-
-
-THEIR_FIXED = [name for name in torchdiffeq_methods() if not TorchDiffEqMethod(name).adapts]
-
-
-@pytest.mark.parametrize("method", THEIR_FIXED)
-def test_torchdiffeq_s_methods_have_their_order_through_our_call(method):
-    def error(steps):
-        end = solve(logistic, X_0, method=f"torchdiffeq:{method}", steps=steps).x
-        return (end - logistic_solution(X_0, 1)).abs().max().item()
-
-    assert math.log2(error(16) / error(32)) == pytest.approx(torchdiffeq_methods()[method].order, abs=0.25)
-
-
-@pytest.mark.parametrize(("nodes", "end", "expected"), [
-    ([0.0, 1.0], 2.0, [-1 / 2, 3 / 2]),  # Adams-Bashforth and Adams-Moulton: Hairer, Norsett, Wanner, III.1
-    ([0.0, 1.0, 2.0], 3.0, [5 / 12, -16 / 12, 23 / 12]),
-    ([0.0, 1.0], 1.0, [1 / 2, 1 / 2]),
-    ([0.0, 1.0, 2.0], 2.0, [-1 / 12, 8 / 12, 5 / 12]),
-    ([0.0, 1.0, 2.0, 3.0], 3.0, [1 / 24, -5 / 24, 19 / 24, 9 / 24]),
-])  # fmt: skip
-def test_the_weights_of_equal_steps_are_the_textbook_s(nodes, end, expected):
-    assert weights(nodes, end - 1, end) == pytest.approx(expected, abs=1e-15)
 
 
 @pytest.mark.parametrize("nodes", [[0.3], [0.9, 0.2], [0.1, 0.11, 0.7], [1.0, 0.5, 0.4999, -3.0]])
@@ -173,14 +149,6 @@ def test_backward_in_time_returns_to_the_start(method):
     torch.testing.assert_close(back, X_0, rtol=0, atol=2e-3 if method == "euler" else 1e-5)
 
 
-def test_a_straight_flow_takes_one_euler_step():
-    target = torch.randn(2, 2, 4, 8)
-    x_0 = torch.randn(2, 2, 4, 8)
-    end = solve(lambda t, x: target - x_0, x_0, steps=1)
-    torch.testing.assert_close(end.x, target)
-    assert end.evaluations.tolist() == [1, 1]
-
-
 @pytest.mark.parametrize("method", FIXED)
 def test_evaluations_are_counted(method):
     per_step = SOLVERS[method].evaluations
@@ -189,11 +157,6 @@ def test_evaluations_are_counted(method):
     expected = 5 * per_step + (method == "adams4")  # whose first step is Heun's
     assert solution.evaluations.tolist() == [expected] * 3
     assert len(calls) == SOLVERS[method].cost(5) == expected
-
-
-def test_torchdiffeq_solves_to_its_tolerance():
-    end = solve(logistic, X_0, method="torchdiffeq:dopri5", tolerance=1e-8)
-    torch.testing.assert_close(end.x, logistic_solution(X_0, 1), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("method", ["euler", "midpoint", "heun2", "heun3", "rk4"])

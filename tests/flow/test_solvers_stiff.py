@@ -103,12 +103,6 @@ def test_the_order_is_at_least_4():
     assert gained / math.log(fine.accepted[0] / coarse.accepted[0]) > 3.5
 
 
-def test_backward_in_time():
-    problem = Gaussian()
-    there = solve(problem, X_0, method="exprb43", tolerance=1e-4).x
-    assert worst(solve(problem, there, 1.0, 0.0, method="exprb43", tolerance=1e-4).x, X_0) < 1e-3
-
-
 def test_a_scene_that_runs_away_does_not_end_its_batch():
     """Robertson's reactions to t = 40 at a tolerance above their smallest component, beside the same in balance."""
 
