@@ -74,15 +74,7 @@ class ADMUNet(UNet):
 
 
 class ADMBlock(ResidualBlock):
-    """A residual block that may resample after its first norm, and attend last.
-
-    Args:
-        channels: Width that comes in.
-        out_channels: Width that goes out.
-        options: What all blocks have in common.
-        resample: Applied to the normed input and to the skip alike.
-        heads: Attention heads; None for no attention.
-    """
+    """A residual block that may resample, the normed input and the skip alike, and attend last."""
 
     def __init__(
         self,

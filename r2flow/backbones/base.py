@@ -13,7 +13,7 @@ from r2flow.registry import Positive
 
 
 class CommonOptions(TypedDict, total=False):
-    """The options of every backbone: a subclass takes them as `**common` and hands them to `Backbone`."""
+    """The options of every backbone: a subclass takes them as `**common`, after its rays, and hands them on."""
 
     in_channels: int
     out_channels: int | None

@@ -38,13 +38,7 @@ class Resample(ExactBuffers):
     """Twice or half the resolution by a separable filter, circular in azimuth, zeros or repeats beyond other edges.
 
     Down: every second value of the filtered image. Up: the filtered image of the pixels among zeros, the filter
-    doubled so that its sum over either phase is 1.
-
-    Args:
-        window: Filter taps, normalised to sum 1; an even number.
-        up: Whether to double rather than halve.
-        ring: Whether the columns are a ring.
-        repeat: Whether the pixels at the other edges are repeated beyond them.
+    doubled so that its sum over either phase is 1. The number of filter taps is even.
     """
 
     kernel: Tensor
@@ -128,15 +122,7 @@ def time_embedding(channels: int, out_channels: int, bias: bool = True) -> nn.Se
 
 @dataclass(frozen=True)
 class BlockOptions:
-    """What all residual blocks of a U-Net have in common.
-
-    Attributes:
-        condition_channels: Width of the time embedding.
-        ring: Whether the columns are a full turn.
-        dropout: Share of activations dropped in training.
-        groups: Of group norms.
-        eps: Added to their variance.
-    """
+    """What all residual blocks of a U-Net have in common: see `UNet`."""
 
     condition_channels: int
     ring: bool
@@ -191,7 +177,6 @@ class UNet(Backbone):
     Parameters carry the published weights' names.
 
     Args:
-        rays: Elevation and azimuth of every pixel in radians, (2, H, W).
         base_channels: Width of the first convolution, of the outermost level and of the sinusoidal time features.
         channel_multiplier: Width of each level over base_channels.
         num_residual_blocks: Residual blocks of each level, or one number for all.
@@ -202,7 +187,6 @@ class UNet(Backbone):
         dropout: Share of activations dropped in training.
         groups: Of group norms; every width is a multiple of it.
         eps: Added to their variance.
-        common: See `Backbone`.
     """
 
     takes_second_time = True

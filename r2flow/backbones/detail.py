@@ -12,15 +12,7 @@ class Detail(nn.Module):
 
     Near t = 1 a velocity is the noise that is left, pixel by pixel. A token of p x q pixels learns to pass it on
     slowly; a convolution finds it in a few hundred steps, as what differs from the neighbours. The path starts at zero.
-
-    Args:
-        blocks: Residual blocks.
-        channels: Their width.
-        ends: Channels of the image and of the answer.
-        token_channels: Width of the tokens.
-        patch: Rows and columns of a token.
-        condition_channels: Width of the condition.
-        ring: Whether the columns are a full turn.
+    Its `ends` are the channels of the image and of the answer.
     """
 
     def __init__(
@@ -34,7 +26,7 @@ class Detail(nn.Module):
         ring: bool,
     ) -> None:
         super().__init__()
-        self.size, self.patch = (blocks, channels), patch
+        self.patch = patch
         self.norm = RMSNorm(token_channels)
         self.spread = nn.Linear(token_channels, patch[0] * patch[1] * channels, bias=False)
         self.image = RingConv2d(ends[0], channels, ring)

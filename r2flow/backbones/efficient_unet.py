@@ -51,17 +51,7 @@ class EfficientUNet(UNet):
 
 
 class Level(nn.Module):
-    """One resolution on the way down or up: halving, residual blocks, attention, doubling; each where asked for.
-
-    Args:
-        channels: Width that comes in.
-        out_channels: Width that goes out.
-        count: Residual blocks.
-        options: What all blocks have in common.
-        heads: Attention heads; None for no attention.
-        down: Whether to halve the resolution first.
-        up: Whether to double it last.
-    """
+    """One resolution on the way down or up: halving, residual blocks, attention, doubling; each where asked for."""
 
     def __init__(
         self,

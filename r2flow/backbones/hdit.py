@@ -39,7 +39,6 @@ class HDiT(Backbone):
     carry the names of the published weights. Under autocast the layers at both ends keep the weights' type (`uncast`).
 
     Args:
-        rays: Elevation and azimuth of every pixel in radians, (2, H, W).
         base_channels: Width of the outermost level, doubled at each level further in.
         depths: Blocks of each level, the last one the middle.
         num_heads: Heads of each level; the middle takes the last.
@@ -53,7 +52,6 @@ class HDiT(Backbone):
         attention: Backend of `neighbourhood_attention`.
         detail: Blocks and channels of a convolutional path at full resolution beside the tokens (`Detail`), which
             learns smooth surfaces sooner; None for the paper's network.
-        common: See `Backbone`.
     """
 
     takes_second_time = True
@@ -245,22 +243,13 @@ class Neighbourhood(NamedTuple):
 
 
 class BlockOptions(NamedTuple):
-    """What all blocks of a level have in common.
-
-    Attributes:
-        channels: Width C.
-        heads: Attention heads N.
-        condition_channels: Width of the condition.
-        highest: Highest harmonics of the rotation in elevation and azimuth.
-        neighbourhood: What a token attends to; None for all tokens.
-        dropout: See `HDiT`.
-    """
+    """What all blocks of a level have in common."""
 
     channels: int
     heads: int
     condition_channels: int
-    highest: tuple[int, int]
-    neighbourhood: Neighbourhood | None
+    highest: tuple[int, int]  # harmonics of the rotation in elevation and azimuth
+    neighbourhood: Neighbourhood | None  # what a token attends to; None for all tokens
     dropout: float
 
 

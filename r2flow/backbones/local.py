@@ -19,11 +19,9 @@ class Local(Backbone):
     Columns are circular where the image is a full turn; elsewhere zeros lie beyond its edges.
 
     Args:
-        rays: Elevation and azimuth of every pixel in radians, (2, H, W).
         channels: Width of the hidden layers.
         dilations: Columns between the taps of each block's two convolutions.
         ring: Whether the columns are a full turn.
-        common: Options of `Backbone`.
     """
 
     croppable = any_size = True

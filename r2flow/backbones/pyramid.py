@@ -39,7 +39,6 @@ class Pyramid(Backbone):
     P u = (P x_s - P x_t) / (s - t) = (sqrt(n) - 1) / sqrt(n) y + u' / w.
 
     Args:
-        rays: Elevation and azimuth of every pixel in radians, (2, H, W).
         inner: Name and options of the inner network.
         factor: Rows p and columns q of a mean.
         coarse: Blocks and channels of the path among the means.
@@ -48,7 +47,6 @@ class Pyramid(Backbone):
         below_std: Standard deviation of x_1 - U P x_1 in model space, times sqrt(n / (n - 1)), for a mean of n values
             takes a degree of freedom.
         ring: Whether the columns are a full turn.
-        common: See `Backbone`.
     """
 
     takes_second_time = True

@@ -72,14 +72,7 @@ def sde_step(t: float, s: float, c: float, t_b: float | None = None) -> Step:
 def sde(estimate: Estimate, x: Tensor, times: Tensor, c: float, noise: Noise) -> Iterator[Tensor]:
     """The states after each step, (B, ...); the last one is x_1. One estimate a step.
 
-    Where x_1hat is linear in x the law of x_1 is of order 2 in the steps.
-
-    Args:
-        estimate: x_1hat of t, of shape (), and x.
-        x: Noise, (B, ...).
-        times: Rising from 0 to 1, (N + 1,) float64.
-        c: Share of fresh noise, at least 0.
-        noise: Of step j = 1, 2, ...
+    Where x_1hat is linear in x the law of x_1 is of order 2 in the steps. `times` rise from 0 to 1, (N + 1,) float64.
     """
     former: tuple[float, Tensor] | None = None
     for j, (t, s) in enumerate(pairwise(times.tolist()), start=1):

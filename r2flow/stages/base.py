@@ -99,29 +99,25 @@ class Stage(L.LightningModule):
         return self.optimizers_for(self.generator.parameters())
 
     def optimizers_for(self, *groups: Iterable[torch.nn.Parameter]) -> Any:
-        """An optimiser with its schedule for each group of parameters, as `configure_optimizers` returns them."""
-        optimizers = [self.optimizer_for(group) for group in groups]
-        return optimizers, [{"scheduler": self.schedule_for(one), "interval": "step"} for one in optimizers]
-
-    def optimizer_for(self, parameters: Iterable[torch.nn.Parameter]) -> torch.optim.AdamW:
-        """AdamW, or `Muon`, with the stage's options."""
+        """AdamW or `Muon` with its schedule for each group of parameters, as `configure_optimizers` returns them."""
         options: dict[str, Any] = {
             "lr": self.learning_rate,
             "betas": (self.betas[0], self.betas[1]),
             "eps": 1e-8,
             "weight_decay": self.weight_decay,
         }
-        return torch.optim.AdamW(parameters, **options) if self.muon is None else Muon(parameters, self.muon, **options)
-
-    def schedule_for(self, optimizer: torch.optim.Optimizer) -> torch.optim.lr_scheduler.LambdaLR:
-        """`learning_rate_factor` over the run, or its warm-up alone where the rate does not fall."""
         total = max(int(self.trainer.max_steps), 1)
         warmup = min(self.warmup_steps, total)
 
         def factor(step: int) -> float:
             return learning_rate_factor(step, warmup, total) if self.anneals or step < warmup else 1.0
 
-        return torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        optimizers = [
+            torch.optim.AdamW(group, **options) if self.muon is None else Muon(group, self.muon, **options)
+            for group in groups
+        ]
+        schedules = [torch.optim.lr_scheduler.LambdaLR(one, factor) for one in optimizers]
+        return optimizers, [{"scheduler": schedule, "interval": "step"} for schedule in schedules]
 
     def own_optimizers(self) -> list[LightningOptimizer]:
         """The optimisers of a stage with manual optimisation, in the order of `optimizers_for`.

@@ -122,17 +122,11 @@ class StepController:
 
     def judge(
         self, good: np.ndarray, error: np.ndarray, dk: np.ndarray, dy: np.ndarray, evaluations: np.ndarray
-    ) -> np.ndarray:
-        """Accept or reject every scene's step and choose its next step size.
+    ) -> None:
+        """Accept the good steps, reject the others, and choose every scene's next step size.
 
-        Args:
-            good: Whose step is within the tolerance and holds, (B,) bool.
-            error: Norm of the local error divided by the tolerance, (B,).
-            dk, dy: Norms of the differences in v and x between the last two stages, (B,).
-            evaluations: Evaluations so far, (B,).
-
-        Returns:
-            Whose step is accepted, (B,) bool.
+        `error` is the norm of the local error over the tolerance; `dk` and `dy` are those of the differences in v and x
+        between the last two stages.
         """
         finite = np.isfinite(error) & np.isfinite(dk) & np.isfinite(dy)
         self.accepted[self.places] += good
@@ -150,19 +144,15 @@ class StepController:
         self.crossing = (self.begin - self.reached <= self.shortest()) & ~spent
         self.arrived = good & (self.reached >= self.length) & ~self.crossing
         stuck = (self.h < self.shortest()) & ~good & (self.begin == np.inf)
-        self.leaving = self.arrived | stuck | spent | self._handed_over()
-        return good
+        handed_over = self.stiff[self.places] & self.limits.until_stiff & ~self.crossing
+        self.leaving = self.arrived | stuck | spent | handed_over
 
     def note_pole(self, places: np.ndarray, h: np.ndarray, share: np.ndarray, back: np.ndarray) -> None:
         """A scene leaves without having arrived once the path does not shorten with the step.
 
         About a pole without an integral, as 1 / (t - a), steps of 1e-4, 1e-5 and 1e-6 of the interval all move x by the
-        same share of its size, and a step that happens to straddle the pole can meet a loose tolerance.
-
-        Args:
-            h: Lengths of accepted steps of these scenes, (N,).
-            share: |h v| / |1 + |x||, (N,).
-            back: Whether v points back at the end of the step, which tells a pole one power of ten earlier.
+        same share |h v| / |1 + |x|| of its size, and a step that happens to straddle the pole can meet a loose
+        tolerance. Where v points back at the end of the step, a pole is told one power of ten earlier.
         """
         decade = 2 ** np.floor(-np.log10(h / self.length)).astype(int)
         self.decades[places] |= np.where(share > FAR, decade, 0)
@@ -212,9 +202,6 @@ class StepController:
             self.oscillating_run = np.where(self.calm_run >= SMOOTH_AFTER, 0, self.oscillating_run + oscillating)
             self.stiff[self.places] |= self.oscillating_run >= OSCILLATING_AFTER
         self.stiff[self.places] |= self.stiff_run >= STIFF_AFTER
-
-    def _handed_over(self) -> np.ndarray:
-        return self.stiff[self.places] & self.limits.until_stiff & ~self.crossing
 
     def keep(self, rest: np.ndarray) -> None:
         """Keep these scenes; of the others, note which have arrived, and where the others are."""
