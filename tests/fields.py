@@ -7,6 +7,12 @@ from r2flow.generators import Flow
 from r2flow.lidar.space import ModelSpace
 from r2flow.samplers import FixedSteps
 
+CONFIG = {
+    "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
+    "encoding": {"format": "logscale", "reflectance": True},
+    "backbone": {"name": "hdit", "base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
+}  # of a tiny flow
+
 
 class Field(Flow):
     """dx/dt = function(t, x) on states of `noise_shape`; without a space there is nothing to decode."""

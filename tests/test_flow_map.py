@@ -21,13 +21,7 @@ from r2flow.runs.lineage import Parent, generator_of
 from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
 from r2flow.stages.flow_map import LearnFlowMap, paths_of
-from tests.fields import Field
-
-CONFIG = {
-    "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
-    "encoding": {"format": "logscale", "reflectance": True},
-    "backbone": {"name": "hdit", "base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
-}
+from tests.fields import CONFIG, Field
 
 
 def parent() -> RectifiedFlow:

@@ -234,7 +234,6 @@ class UNet(Backbone):
         raise NotImplementedError
 
     def follow_rays(self) -> None:
-        """Compute again the features of the rays."""
         if self.coords_encoding is not None:
             self.register_buffer("features", self.coords_encoding(self.coords), persistent=False)
 

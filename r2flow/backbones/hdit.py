@@ -141,7 +141,6 @@ class HDiT(Backbone):
         return v if self.detail is None else v + self.detail(x, h, condition)
 
     def follow_rays(self) -> None:
-        """Compute again the rotary table of each level and the position features."""
         for level in range(self.levels):
             rays = mean_rays(self.coords, (self.patch[0] << level, self.patch[1] << level))
             table = _shared_rotation(level, self._blocks(level)).table(rays)

@@ -46,7 +46,6 @@ class Rectify(SingleLoss):
         return None
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
-        """Mean loss of v(t, x_t) against x_1 - x_0 at the times that the density makes of u in [0, 1), (B,)."""
         x_0, x_1 = batch["x_0"], batch["x_1"]
         t = self.time(u)
         x_t, u_t = interpolate(x_0, x_1, t)

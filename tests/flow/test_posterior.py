@@ -13,7 +13,7 @@ from r2flow.generators import build_generator
 from r2flow.noise import Draws
 from r2flow.samplers import MMPS, Repaint, build_sampler
 from r2flow.samplers.posterior import GROWN, _solved
-from tests.fields import Field
+from tests.fields import CONFIG, Field
 
 WIDTH = 32
 ROWS = torch.arange(WIDTH) % 4 == 0
@@ -232,17 +232,10 @@ def test_a_scan_s_answer_does_not_depend_on_its_batch(method):
         torch.testing.assert_close(alone.x[0], whole.x[i])
 
 
-TINY = {
-    "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
-    "encoding": {"format": "logscale", "reflectance": True},
-    "backbone": {"name": "hdit", "base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
-}
-
-
 @pytest.mark.parametrize("family", ["rectified_flow", "flow_map"])
 @pytest.mark.parametrize("method", ALL)
 def test_every_flow_completes_a_scan(family, method):
-    flow, seen = build_generator({**TINY, "generator": {"name": family}}).eval(), []
+    flow, seen = build_generator({**CONFIG, "generator": {"name": family}}).eval(), []
     how, who = build_sampler(method, steps=3), Draws(0, range(2))
     x_0 = who.start(flow.noise_shape)
     known = torch.zeros_like(x_0)

@@ -19,7 +19,7 @@ from r2flow.model.sampling import draw
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from r2flow.samplers.stochastic import back, sde, sde_step
-from tests.fields import Field
+from tests.fields import CONFIG, Field
 
 STD = 0.4  # of x_1 ~ N(0, STD^2), where everything is linear
 
@@ -83,13 +83,6 @@ def test_going_back_by_fresh_noise_keeps_the_law(r):
     there = math.sqrt(variance(r)) * units[0]  # the flow map of a Gaussian scales its deviation
     found = back(there, r, s, units[1])
     assert float(found.square().sum()) == pytest.approx(variance(s), rel=1e-12)
-
-
-CONFIG = {
-    "sensor": {"name": "hdl64e", "rows": 8, "columns": 32},
-    "encoding": {"format": "logscale", "reflectance": True},
-    "backbone": {"name": "hdit", "base_channels": 16, "depths": [1, 1], "num_heads": [1, 2], "time_channels": 16},
-}
 
 
 def normal() -> Field:
