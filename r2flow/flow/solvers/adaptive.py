@@ -85,16 +85,16 @@ def _step(
     good = control.within(size, dk, dy, whole / tolerance)
     good = inspect(v, control, Tried(method, x, y, k, h, scale), good)
     short = (good & (control.h < SHORT * control.length)).nonzero()[0]
-    accepted = control.judge(good, size, dk, dy, v.counts[control.scenes])
+    control.judge(good, size, dk, dy, v.counts[control.scenes])
     if len(short):
         way, length = rows(k[-1] * expand_time(h, x), short), 1 + rows(y, short).abs()
         share = way.flatten(1).norm(dim=1) / length.flatten(1).norm(dim=1)
         back = (rows(k[0], short) * way * expand_time(rows(h, short), way)).flatten(1).sum(1) < 0
         control.note_pole(short, rows(h, short).abs().cpu().numpy(), share.cpu().numpy(), back.cpu().numpy())
-    if accepted.all():
+    if good.all():
         x, k_1 = y, k[-1]
-    elif accepted.any():
-        chosen = expand_time(torch.from_numpy(accepted).to(x.device), x)
+    elif good.any():
+        chosen = expand_time(torch.from_numpy(good).to(x.device), x)
         x, k_1 = torch.where(chosen, y, x), torch.where(chosen, k[-1], k_1)
     return _cross(v, control, x, k_1) if control.crossing.any() else (x, k_1)
 
