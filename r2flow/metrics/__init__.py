@@ -40,6 +40,7 @@ METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     jsd_lidm=_lazily("lidm:JSDLiDM"),
     mmd_lidm=_lazily("lidm:MMDLiDM"),
     panel=_lazily("panel:Panel"),
+    things=_lazily("things:Things"),
     auc=_lazily("two_sample:TwoSample", "handcrafted"),
     auc_range=_lazily("two_sample:TwoSample", "handcrafted_range"),
 )
