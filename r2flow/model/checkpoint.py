@@ -1,6 +1,7 @@
 """A trained generator on disk, whatever its family: written whole, checked when read, no code from it run."""
 
 import json
+import os
 import pickle
 import re
 import warnings
@@ -8,7 +9,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -143,7 +144,7 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
     """The dict in a checkpoint file of ours. Only tensors and plain values are read: a file cannot run code."""
     content = _read(path, map_location)
     if not isinstance(content, dict):
-        raise InputError(_not_a_checkpoint(path))
+        raise InputError(_not_a_checkpoint(path, Path(path).stat().st_size))
     return content
 
 
@@ -151,45 +152,58 @@ def _read(path: str | Path, map_location: Any = "cpu") -> Any:
     """What a torch file holds, ours or a published one, which may be a list."""
     if not Path(path).is_file():  # a pipe would be waited for
         raise InputError(f"no checkpoint at {path}. Give a checkpoint file or a run folder.")
-    _refuse_unpacking(path)
+    try:
+        with open(path, "rb") as file:
+            return read_torch(file, path, map_location)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
+
+
+def read_torch(file: IO[bytes], name: object, map_location: Any = "cpu") -> Any:
+    """Tensors and plain values of one of torch's files. It cannot run code.
+
+    Args:
+        name: What the file is called in a message.
+
+    Raises:
+        InputError: another file, a damaged one, or one that holds more than plain values.
+    """
+    _refuse_unpacking(file, name)
     try:
         with warnings.catch_warnings(action="ignore"), inert():  # warnings of torch's, on bytes that are no checkpoint
-            content = torch.load(path, map_location=map_location, weights_only=True)
+            content = torch.load(file, map_location=map_location, weights_only=True)
             if not isinstance(content, dict):
                 return content
             content = {key: plain(value) for key, value in content.items()}
             check_tree(content.get("config") or {})
             return content
-    except pickle.UnpicklingError as error:
-        if "Unsupported global" in str(error) or "Unsupported class" in str(error):
-            name = re.search(r"GLOBAL (\S+)", str(error))
-            held = f" ({name.group(1)})" if name else ""
-            raise InputError(
-                f"{path} is refused: it holds objects that would run code when loaded{held}, not only tensors and "
-                "plain values. Ask its author for a weights-only file."
-            ) from None
-        raise InputError(_not_a_checkpoint(path)) from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
-    except Exception:  # torch's reader raises nearly anything on bytes that are none of its own
-        raise InputError(_not_a_checkpoint(path)) from None
+    except Exception as error:  # torch's reader raises nearly anything on bytes that are none of its own
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        held = re.search(r"(?:GLOBAL|Unsupported (?:global|class):?(?: GLOBAL)?) (\S+)", str(error))
+        if held is None or not isinstance(error, pickle.UnpicklingError):
+            raise InputError(_not_a_checkpoint(name, file.seek(0, os.SEEK_END))) from None
+        raise InputError(
+            f"{name} is refused: it holds objects that would run code when loaded ({held[1]}), not only tensors and "
+            "plain values. Ask its author for a weights-only file."
+        ) from None
 
 
-def _refuse_unpacking(path: str | Path) -> None:
+def _refuse_unpacking(file: IO[bytes], name: object) -> None:
     """Refuse a zip archive that holds more than its own bytes: torch writes storages as they are."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(file) as archive:
             entries = archive.infolist()
     except Exception:  # torch's older format, or damaged: torch.load says which
-        return
+        entries = []
     packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
-    if packed or sum(entry.file_size for entry in entries) > Path(path).stat().st_size:
-        raise InputError(f"{path} holds compressed tensors, which torch never writes. Ask its author for another file.")
+    if packed or sum(entry.file_size for entry in entries) > file.seek(0, os.SEEK_END):
+        raise InputError(f"{name} holds compressed tensors, which torch never writes. Ask its author for another file.")
+    file.seek(0)
 
 
-def _not_a_checkpoint(path: str | Path) -> str:
-    size = Path(path).stat().st_size
-    return f"{path} is not a checkpoint, or a damaged one ({size} bytes). Give a .ckpt of r2flow or a published .pth."
+def _not_a_checkpoint(name: object, size: int) -> str:
+    return f"{name} is not a checkpoint, or a damaged one ({size} bytes). Give a .ckpt of r2flow or a published file."
 
 
 def load_checkpoint(path: str | Path, device: str | torch.device = "cpu", averaged: bool = True) -> Checkpoint:
@@ -240,7 +254,7 @@ def _built(content: Any, path: Path, averaged: bool) -> Checkpoint:
             f"(ours) nor the layout of a published one ({systems}); found {', '.join(map(repr, list(content)[:6]))}."
         )
     else:
-        raise InputError(_not_a_checkpoint(path))
+        raise InputError(_not_a_checkpoint(path, Path(path).stat().st_size))
     with made_with(config, str(path)):
         generator = build_generator(config)
     check_weights(generator, weights, path)

@@ -6,14 +6,13 @@ the folder of weights, from which `Extractor.trained` reads it.
 
 import io
 import json
-import pickle
-import re
 import tarfile
 import zlib
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, NamedTuple, TypeVar
 
 import torch
+import yaml
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -23,6 +22,7 @@ from r2flow.files import atomic_write, cache_folder, parse_json, refuse_unreadab
 from r2flow.hashing import state_hash
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor
+from r2flow.model.checkpoint import read_torch
 from r2flow.registry import Registry
 
 E = TypeVar("E", bound=Extractor)
@@ -128,8 +128,6 @@ def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises:
         InputError: nothing there, no weights in it, or objects that would run code when loaded.
     """
-    import yaml
-
     if not path.is_dir():
         refuse_unreadable(path, LARGEST, "file of weights")
         if path.suffix == ".safetensors":
@@ -181,23 +179,14 @@ def _read_members(path: Path) -> dict[str, bytes]:
     return members
 
 
-def _read_torch(file: IO[bytes], label: str) -> dict[str, Tensor]:
+def _read_torch(file: IO[bytes], name: str) -> dict[str, Tensor]:
     """The tensors of one of torch's files, by name."""
-    try:
-        content = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many kinds of errors on other files
-        held = re.search(r"(?:GLOBAL|Unsupported (?:global|class):?(?: GLOBAL)?) (\S+)", str(error))
-        if held is None or not isinstance(error, pickle.UnpicklingError):
-            raise InputError(f"{label} is not a file of weights.") from None
-        raise InputError(
-            f"{label} is refused: it holds objects that would run code when loaded ({held[1]}). Save its 'state_dict' "
-            "alone, where you trust it: torch.save(torch.load(FILE, weights_only=False)['state_dict'], 'weights.pth')."
-        ) from None
+    content = read_torch(file, name)
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         content = content["state_dict"]
     if not isinstance(content, dict) or not content or not all(_is_plain(*item) for item in content.items()):
-        raise InputError(f"{label} holds no table of tensors.")
-    return dict(content)
+        raise InputError(f"{name} holds no table of tensors.")
+    return content
 
 
 def _is_plain(name: object, value: object) -> bool:
