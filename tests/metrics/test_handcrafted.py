@@ -46,7 +46,7 @@ def by_name(rows, extractor=BOTH):
 def statistics(some):
     """Of a scan whose rays all returned: the features taken back to the statistics' own units."""
     whole = FAR_OUT * (BOTH.features(some) / FAR_OUT).sinh() * (1 + FEW)
-    return {name: SCALES[name].centre + SCALES[name].spread * x[0].numpy() for name, x in by_name(whole).items()}
+    return {name: SCALES[name][0] + SCALES[name][1] * x[0].numpy() for name, x in by_name(whole).items()}
 
 
 def test_a_constant_image():
@@ -59,7 +59,7 @@ def test_a_constant_image():
         "reflectance row step": math.log2(FINE), "log-range, sectors": 3, "reflectance, sectors": 0.3,
     }  # fmt: skip
     for name, value in expected.items():
-        np.testing.assert_allclose(found[name], value, atol=2e-3 * max(1, 30 * SCALES[name].spread), err_msg=name)
+        np.testing.assert_allclose(found[name], value, atol=2e-3 * max(1, 30 * SCALES[name][1]), err_msg=name)
 
 
 def test_one_wall_before_another_has_two_edges_in_every_row():
@@ -98,7 +98,7 @@ def test_a_turn_changes_the_sectors_alone_and_a_mirror_image_sides_and_signs():
             torch.testing.assert_close(any_turn[name], x, atol=1e-4, rtol=0)
         alike = name not in signed and not name.endswith(SECTORED)
         assert torch.allclose(mirrored[name], x, atol=1e-4) == alike, name
-    slant = [FAR_OUT * (s["row slant"] / FAR_OUT).sinh() + SCALES["row slant"].centre / SCALES["row slant"].spread
+    slant = [FAR_OUT * (s["row slant"] / FAR_OUT).sinh() + SCALES["row slant"][0] / SCALES["row slant"][1]
              / (1 + FEW) for s in (own, mirrored)]  # fmt: skip
     torch.testing.assert_close(slant[0], -slant[1], atol=0.01, rtol=0)
 

@@ -10,7 +10,7 @@ damage; docs/metrics.md has what it found on the other half.
 
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, Self
 
 import torch
 import torch.nn.functional as F
@@ -30,139 +30,124 @@ FEW = 0.01  # share of the rays of a cell; a statistic of fewer is drawn to its 
 FAR_OUT = 5.0  # scales from the centre, from where on features grow as a logarithm
 
 
-class Scale(NamedTuple):
-    """A statistic is (x - centre) / spread as a feature: its mean and its deviation over simulated hdl64e scans."""
-
-    centre: float
-    spread: float
-
-
+# A statistic is (x - centre) / spread as a feature: its mean and its deviation over simulated hdl64e scans.
 SPREAD, BEAMS, SECTORED = ", spread", ", beams", ", sectors"
 SCALES = {
-    "returns": Scale(0.76, 0.029),
-    "row changes": Scale(0.026, 0.009),
-    "column changes": Scale(0.2, 0.019),
-    "single losses": Scale(0.0034, 0.0013),
-    "single returns": Scale(0.0018, 0.0011),
-    "log-range": Scale(3.3, 0.2),
-    "beyond 0 m": Scale(0.11, 0.055),
-    "beyond 5 m": Scale(0.36, 0.092),
-    "beyond 10 m": Scale(0.19, 0.063),
-    "beyond 20 m": Scale(0.077, 0.04),
-    "beyond 40 m": Scale(0.029, 0.023),
-    "row step": Scale(-5.0, 0.23),
-    "row edges": Scale(0.042, 0.011),
-    "row slant": Scale(0.0004, 0.0079),
-    "row equal": Scale(0.13, 0.025),
-    "row step of 8": Scale(-3.1, 0.41),
-    "row step of 64": Scale(-0.54, 0.55),
-    "row bend": Scale(-4.8, 0.25),
-    "row bend sign": Scale(0.022, 0.0048),
-    "row smooth": Scale(0.095, 0.067),
-    "column step": Scale(-2.6, 0.49),
-    "column edges": Scale(0.14, 0.06),
-    "column slant": Scale(-0.29, 0.069),
-    "column bend": Scale(-3.2, 0.37),
-    "column bend sign": Scale(0.018, 0.0093),
-    "rows agree": Scale(0.23, 0.062),
-    "diagonals": Scale(0.0043, 0.018),
-    "reflectance": Scale(0.27, 0.032),
-    "reflectance from 0": Scale(0.1, 0.041),
-    "reflectance from 0.1": Scale(0.2, 0.049),
-    "reflectance from 0.25": Scale(0.42, 0.073),
-    "reflectance from 0.5": Scale(0.041, 0.036),
-    "reflectance row step": Scale(-4.7, 0.14),
-    "reflectance row smooth": Scale(-0.24, 0.011),
-    "reflectance row bend": Scale(-3.9, 0.14),
-    "reflectance column step": Scale(-4.1, 0.13),
-    "reflectance at edges": Scale(0.16, 0.035),
-    "reflectance rows agree": Scale(0.012, 0.0061),
-    "reflectance with range": Scale(-0.19, 0.063),
-    "log-range, spread": Scale(0.54, 0.076),
-    "row step, spread": Scale(1.7, 0.15),
-    "row bend, spread": Scale(2.0, 0.16),
-    "column step, spread": Scale(1.8, 0.15),
-    "column bend, spread": Scale(1.9, 0.12),
-    "reflectance, spread": Scale(0.14, 0.019),
-    "returns, beams": Scale(0.16, 0.033),
-    "log-range, beams": Scale(0.076, 0.025),
-    "row step, beams": Scale(0.17, 0.061),
-    "reflectance, beams": Scale(0.065, 0.015),
-    "returns, sectors": Scale(0.76, 0.046),
-    "log-range, sectors": Scale(3.4, 0.29),
-    "beyond 0 m, sectors": Scale(0.11, 0.098),
-    "row edges, sectors": Scale(0.042, 0.018),
-    "row step, sectors": Scale(-4.9, 0.33),
-    "reflectance, sectors": Scale(0.26, 0.05),
+    "returns": (0.76, 0.029),
+    "row changes": (0.026, 0.009),
+    "column changes": (0.2, 0.019),
+    "single losses": (0.0034, 0.0013),
+    "single returns": (0.0018, 0.0011),
+    "log-range": (3.3, 0.2),
+    "beyond 0 m": (0.11, 0.055),
+    "beyond 5 m": (0.36, 0.092),
+    "beyond 10 m": (0.19, 0.063),
+    "beyond 20 m": (0.077, 0.04),
+    "beyond 40 m": (0.029, 0.023),
+    "row step": (-5.0, 0.23),
+    "row edges": (0.042, 0.011),
+    "row slant": (0.0004, 0.0079),
+    "row equal": (0.13, 0.025),
+    "row step of 8": (-3.1, 0.41),
+    "row step of 64": (-0.54, 0.55),
+    "row bend": (-4.8, 0.25),
+    "row bend sign": (0.022, 0.0048),
+    "row smooth": (0.095, 0.067),
+    "column step": (-2.6, 0.49),
+    "column edges": (0.14, 0.06),
+    "column slant": (-0.29, 0.069),
+    "column bend": (-3.2, 0.37),
+    "column bend sign": (0.018, 0.0093),
+    "rows agree": (0.23, 0.062),
+    "diagonals": (0.0043, 0.018),
+    "reflectance": (0.27, 0.032),
+    "reflectance from 0": (0.1, 0.041),
+    "reflectance from 0.1": (0.2, 0.049),
+    "reflectance from 0.25": (0.42, 0.073),
+    "reflectance from 0.5": (0.041, 0.036),
+    "reflectance row step": (-4.7, 0.14),
+    "reflectance row smooth": (-0.24, 0.011),
+    "reflectance row bend": (-3.9, 0.14),
+    "reflectance column step": (-4.1, 0.13),
+    "reflectance at edges": (0.16, 0.035),
+    "reflectance rows agree": (0.012, 0.0061),
+    "reflectance with range": (-0.19, 0.063),
+    "log-range, spread": (0.54, 0.076),
+    "row step, spread": (1.7, 0.15),
+    "row bend, spread": (2.0, 0.16),
+    "column step, spread": (1.8, 0.15),
+    "column bend, spread": (1.9, 0.12),
+    "reflectance, spread": (0.14, 0.019),
+    "returns, beams": (0.16, 0.033),
+    "log-range, beams": (0.076, 0.025),
+    "row step, beams": (0.17, 0.061),
+    "reflectance, beams": (0.065, 0.015),
+    "returns, sectors": (0.76, 0.046),
+    "log-range, sectors": (3.4, 0.29),
+    "beyond 0 m, sectors": (0.11, 0.098),
+    "row edges, sectors": (0.042, 0.018),
+    "row step, sectors": (-4.9, 0.33),
+    "reflectance, sectors": (0.26, 0.05),
 }
 
 
-class Statistic(NamedTuple):
-    """A number for every pixel, and the pixels whose mean is taken.
+def statistics(r: Tensor, q: Tensor | None) -> Iterator[tuple[str, Tensor, Tensor | None]]:
+    """Names in `SCALES`, a number for each pixel and which pixels count (1, or None for all), (B, H, W) each.
 
-    Attributes:
-        name: In `SCALES`.
-        values: (B, H, W).
-        where: 1 where the value counts, (B, H, W); None where it does for every ray.
+    Args:
+        r: Ranges in metres, (B, H, W); 0 without a return.
+        q: Reflectances.
     """
-
-    name: str
-    values: Tensor
-    where: Tensor | None = None
-
-
-def statistics(r: Tensor, q: Tensor | None) -> Iterator[Statistic]:
-    """What is known of each pixel of ranges in metres and of reflectances, (B, H, W) each; 0 without a return."""
     m = (r > 0).to(r)
     right, left, lower = _right(m), _right(m, -1), _lower(m)
-    yield Statistic("returns", m)
-    yield Statistic("row changes", (m - right).abs())
-    yield Statistic("column changes", (m - lower).abs())
-    yield Statistic("single losses", (1 - m) * right * left)
-    yield Statistic("single returns", m * (1 - right) * (1 - left))
+    yield "returns", m, None
+    yield "row changes", (m - right).abs(), None
+    yield "column changes", (m - lower).abs(), None
+    yield "single losses", (1 - m) * right * left, None
+    yield "single returns", m * (1 - right) * (1 - left), None
     log_range = torch.log2(r + 1)
-    yield Statistic("log-range", log_range, m)
+    yield "log-range", log_range, m
     for low, high in pairwise(RANGES):
-        yield Statistic(f"beyond {low} m", ((r > low) & (r <= high)).to(r))
+        yield f"beyond {low} m", ((r > low) & (r <= high)).to(r), None
 
     step, both = _right(r) - r, m * right
     edge = (step.abs() > EDGE).to(r) * both
-    yield Statistic("row step", _size(step), both)
-    yield Statistic("row edges", edge)
-    yield Statistic("row slant", torch.tanh(step / EDGE), both)
-    yield Statistic("row equal", (step.abs() < SAME).to(r), both)
+    yield "row step", _size(step), both
+    yield "row edges", edge, None
+    yield "row slant", torch.tanh(step / EDGE), both
+    yield "row equal", (step.abs() < SAME).to(r), both
     for far in (8, 64):
-        yield Statistic(f"row step of {far}", _size(_right(r, far) - r), m * _right(m, far))
+        yield f"row step of {far}", _size(_right(r, far) - r), m * _right(m, far)
     before, three = _right(step, -1), both * left
-    yield Statistic("row bend", _size(step - before), three)
-    yield Statistic("row bend sign", torch.tanh((step - before) / 0.1), three)
-    yield Statistic("row smooth", _agreement(step, before), three)
+    yield "row bend", _size(step - before), three
+    yield "row bend sign", torch.tanh((step - before) / 0.1), three
+    yield "row smooth", _agreement(step, before), three
 
     down, two = _lower(r) - r, m * lower
-    yield Statistic("column step", _size(down), two)
-    yield Statistic("column edges", (down.abs() > EDGE).to(r) * two)
-    yield Statistic("column slant", torch.tanh(down / EDGE), two)
+    yield "column step", _size(down), two
+    yield "column edges", (down.abs() > EDGE).to(r) * two, None
+    yield "column slant", torch.tanh(down / EDGE), two
     bend, whole = down - (r - _upper(r)), two * _upper(m)
-    yield Statistic("column bend", _size(bend), whole)
-    yield Statistic("column bend sign", torch.tanh(bend / EDGE), whole)
+    yield "column bend", _size(bend), whole
+    yield "column bend sign", torch.tanh(bend / EDGE), whole
     four = both * _lower(both)
-    yield Statistic("rows agree", _agreement(step, _lower(step)), four)
-    yield Statistic("diagonals", _size(_lower(_right(r)) - r) - _size(_right(r) - _lower(r)), four)
+    yield "rows agree", _agreement(step, _lower(step)), four
+    yield "diagonals", _size(_lower(_right(r)) - r) - _size(_right(r) - _lower(r)), four
 
     if q is None:
         return
-    yield Statistic("reflectance", q, m)
+    yield "reflectance", q, m
     for low, high in pairwise(REFLECTANCES):
-        yield Statistic(f"reflectance from {low}", ((q >= low) & (q < high)).to(r) * m)
+        yield f"reflectance from {low}", ((q >= low) & (q < high)).to(r) * m, None
     step = _right(q) - q
     before = _right(step, -1)
-    yield Statistic("reflectance row step", _size(step), both)
-    yield Statistic("reflectance row smooth", _agreement(step, before), three)
-    yield Statistic("reflectance row bend", _size(step - before), three)
-    yield Statistic("reflectance column step", _size(_lower(q) - q), two)
-    yield Statistic("reflectance at edges", step.abs(), edge)
-    yield Statistic("reflectance rows agree", _agreement(step, _lower(step)), four)
-    yield Statistic("reflectance with range", q * (log_range - 4), m)
+    yield "reflectance row step", _size(step), both
+    yield "reflectance row smooth", _agreement(step, before), three
+    yield "reflectance row bend", _size(step - before), three
+    yield "reflectance column step", _size(_lower(q) - q), two
+    yield "reflectance at edges", step.abs(), edge
+    yield "reflectance rows agree", _agreement(step, _lower(step)), four
+    yield "reflectance with range", q * (log_range - 4), m
 
 
 def _right(x: Tensor, by: int = 1) -> Tensor:
