@@ -28,7 +28,7 @@ from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from r2flow.stages import build_stage
 from r2flow.systems.gan import dcgan, losses, style_gan
-from r2flow.systems.gan.augment import TRANSFORMATIONS, AdaptiveAugment, Draw, affine, coloured, transformed
+from r2flow.systems.gan.augment import TRANSFORMATIONS, AdaptiveAugment, affine, coloured, transformed
 from r2flow.systems.gan.generator import DustyV1
 from r2flow.systems.gan.layers import logistic, straight_through_mask
 from r2flow.systems.gan.losses import discriminator_loss, generator_loss, r1
@@ -295,7 +295,7 @@ def test_augmentation_is_the_published_one(cases: Any, number: int):
     given = zip(names, zip(drawn[::2], drawn[1::2], strict=True), strict=True)
     x = case["x"].clone().requires_grad_()
     none = torch.zeros(len(x))
-    draws = {name: Draw(none, none) for name in TRANSFORMATIONS} | {name: Draw(*pair) for name, pair in given}
+    draws = dict.fromkeys(TRANSFORMATIONS, (none, none)) | dict(given)
     scale, shift = affine(draws, *x.shape[-2:])
     maps = torch.diag_embed(torch.cat([scale.flip(0), torch.ones(1, len(x))]).T)
     maps[:, :2, 2] = shift.flip(0).T  # the published maps have columns before rows
@@ -324,17 +324,17 @@ def test_augmentation_draws_the_published_distributions():
     draws = augment.draw(Source(20_000))
     assert list(draws) == list(TRANSFORMATIONS)
     for name, draw in draws.items():
-        assert draw.chosen.mean().item() == pytest.approx(0.4, abs=0.015), name
+        assert draw[1].mean().item() == pytest.approx(0.4, abs=0.015), name
     for name, mean, deviation in (
         ("lr_flip", 0.5, 0.5), ("int_trans", 0.0, 0.25 / 12**0.5), ("frac_trans", 0.0, 0.125), ("brightness", 0.0, 0.2),
         ("luma_flip", 0.5, 0.5),
     ):  # fmt: skip
-        values = draws[name].value
+        values = draws[name][0]
         assert values.mean().item() == pytest.approx(mean, abs=5 * deviation / len(values.flatten()) ** 0.5), name
         assert values.std().item() == pytest.approx(deviation, rel=0.03), name
     for name, octaves in (("iso_scale", 0.2), ("contrast", 0.5)):
-        assert draws[name].value.log2().std().item() == pytest.approx(octaves, rel=0.03), name
-    assert draws["int_trans"].value.shape == draws["frac_trans"].value.shape == (2, 20_000)
+        assert draws[name][0].log2().std().item() == pytest.approx(octaves, rel=0.03), name
+    assert draws["int_trans"][0].shape == draws["frac_trans"][0].shape == (2, 20_000)
 
 
 def test_augmentation_without_a_transformation_leaves_it_out_and_refuses_an_unknown_one():

@@ -6,7 +6,7 @@ follows how sure the discriminator is of real images.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -33,16 +33,8 @@ class Source(Protocol):
     def normal(self, shape: tuple[int, ...]) -> Tensor: ...
 
 
-class Draw(NamedTuple):
-    """One transformation of a batch.
-
-    Attributes:
-        value: How much, (B,), or (2, B) for rows and columns.
-        chosen: Whether at all, (B,), 0 or 1.
-    """
-
-    value: Tensor
-    chosen: Tensor
+Draw = tuple[Tensor, Tensor]
+"""One transformation of a batch: how much, (B,), or (2, B) for rows and columns; whether at all, (B,), 0 or 1."""
 
 
 def _flip(source: Source) -> Tensor:
@@ -128,7 +120,7 @@ class AdaptiveAugment(nn.Module):
         for name, values in TRANSFORMATIONS.items():
             value, u = values(source), source.uniform((1,))[:, 0]
             chosen = (u < p * self.policy[name]).float()
-            draws[name] = Draw(value.to(self.p.device), chosen.to(self.p.device))
+            draws[name] = value.to(self.p.device), chosen.to(self.p.device)
         return draws
 
     def forward(self, x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
@@ -144,7 +136,7 @@ def affine(draws: Mapping[str, Draw], height: int, width: int) -> tuple[Tensor, 
     Flips, shifts of an eighth of the image at most, in whole pixels, a scale of the rows (a scale of the columns would
     open the ring), and normal shifts.
     """
-    one = torch.ones_like(draws["lr_flip"].chosen)
+    one = torch.ones_like(draws["lr_flip"][1])
     scale, shift = torch.stack([one, one]), torch.stack([0 * one, 0 * one])
     size = torch.tensor([[height], [width]], device=one.device)
     for name in GEOMETRY:

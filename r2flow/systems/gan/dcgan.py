@@ -90,7 +90,6 @@ class Discriminator(nn.Sequential):
         base_channels: Width of the first map; it doubles inwards.
         max_channels: Widest.
         halvings: From the image to the last map; 4 as published.
-        ring: Whether the columns are a full turn.
     """
 
     def __init__(
@@ -100,15 +99,14 @@ class Discriminator(nn.Sequential):
         base_channels: Count = 64,
         max_channels: Count = 512,
         halvings: Count = 4,
-        ring: bool = True,
     ) -> None:
         last = halved("this discriminator", shape, halvings, least=2)
         widths = [2 * channels, *(min(base_channels << i, max_channels) for i in range(halvings))]
         super().__init__(
-            BlurBoth(ring),
+            BlurBoth(),
             *(
                 nn.Sequential(
-                    Pad(ring, "reflect"),
+                    Pad(True, "reflect"),
                     Equalised(nn.Conv2d(narrow, wide, 4, stride=2, bias=False)),
                     BiasedLeakyReLU(wide),
                 )

@@ -76,19 +76,18 @@ class Filter(ExactBuffers):
 
     kernel: Tensor
 
-    def __init__(self, window: Sequence[float], ring: bool, axes: str = "hw") -> None:
+    def __init__(self, window: Sequence[float], axes: str = "hw") -> None:
         super().__init__()
         taps = torch.tensor(window, dtype=torch.float32)
         self.register_buffer("kernel", taps / taps.sum())
-        self.ring, self.axes = ring, axes
+        self.axes = axes
 
     def forward(self, x: Tensor) -> Tensor:
         size, channels = len(self.kernel), x.shape[1]
         before, after = size // 2, (size - 1) // 2
         kernel = self.kernel.to(x.dtype).expand(channels, 1, 1, -1)
         if "w" in self.axes:
-            x = wrapped(x, before, after) if self.ring else F.pad(x, (before, after, 0, 0), mode="replicate")
-            x = F.conv2d(x, kernel, groups=channels)
+            x = F.conv2d(wrapped(x, before, after), kernel, groups=channels)
         if "h" in self.axes:
             x = F.conv2d(F.pad(x, (0, 0, before, after), mode="replicate"), kernel.mT, groups=channels)
         return x
@@ -97,9 +96,9 @@ class Filter(ExactBuffers):
 class BlurBoth(nn.Module):
     """The image blurred in elevation and, as further channels, blurred in azimuth (Kaneko and Harada 2020, NR-GAN)."""
 
-    def __init__(self, ring: bool) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.blur_v, self.blur_h = Filter((1, 2, 1), ring, "h"), Filter((1, 2, 1), ring, "w")
+        self.blur_v, self.blur_h = Filter((1, 2, 1), "h"), Filter((1, 2, 1), "w")
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.cat([self.blur_v(x), self.blur_h(x)], dim=1)

@@ -234,12 +234,12 @@ class ResidualBlock(nn.Module):
     The residual network of StyleGAN2's discriminator (Karras et al. 2020, figure 7c).
     """
 
-    def __init__(self, in_channels: int, out_channels: int, ring: bool) -> None:
+    def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
-        self.conv1 = _convolution(in_channels, in_channels, ring)
+        self.conv1 = _convolution(in_channels, in_channels)
         self.bias_act1 = BiasedLeakyReLU(in_channels)
-        self.resample = Filter(WINDOW, ring)
-        self.conv2 = _convolution(in_channels, out_channels, ring, stride=2)
+        self.resample = Filter(WINDOW)
+        self.conv2 = _convolution(in_channels, out_channels, stride=2)
         self.bias_act2 = BiasedLeakyReLU(out_channels)
         self.skip = nn.Sequential(Equalised(nn.Conv2d(in_channels, out_channels, 1, stride=2, bias=False)))
 
@@ -248,9 +248,9 @@ class ResidualBlock(nn.Module):
         return (self.bias_act2(h) + self.skip(self.resample(x))) / math.sqrt(2)
 
 
-def _convolution(in_channels: int, out_channels: int, ring: bool, stride: int = 1) -> nn.Sequential:
+def _convolution(in_channels: int, out_channels: int, stride: int = 1) -> nn.Sequential:
     layer = nn.Conv2d(in_channels, out_channels, 3, stride=stride, bias=False)
-    return nn.Sequential(Pad(ring, "replicate"), Equalised(layer))
+    return nn.Sequential(Pad(True, "replicate"), Equalised(layer))
 
 
 class MinibatchDeviation(nn.Module):
@@ -277,7 +277,6 @@ class Discriminator(nn.Module):
         base_channels: Width of the first map; it doubles inwards.
         max_channels: Widest.
         halvings: From the image to the last map; None for as many as leave 4 rows or columns.
-        ring: Whether the columns are a full turn.
     """
 
     def __init__(
@@ -287,22 +286,21 @@ class Discriminator(nn.Module):
         base_channels: Count = 32,
         max_channels: Count = 512,
         halvings: Count | None = None,
-        ring: bool = True,
     ) -> None:
         super().__init__()
         halvings = halvings or max(int(math.log2(min(shape) / 4)), 0)
         rows, columns = halved("this discriminator", shape, halvings)
         widths = [min(base_channels << i, max_channels) for i in range(halvings + 1)]
         self.layers = nn.Sequential(
-            BlurBoth(ring),
+            BlurBoth(),
             nn.Sequential(Equalised(nn.Conv2d(2 * channels, widths[0], 1, bias=False))),
             BiasedLeakyReLU(widths[0]),
-            *(ResidualBlock(narrow, wide, ring) for narrow, wide in pairwise(widths)),
+            *(ResidualBlock(narrow, wide) for narrow, wide in pairwise(widths)),
         )
         last = widths[-1]
         self.epilogue = nn.Sequential(
             MinibatchDeviation(),
-            _convolution(last + 1, last, ring),
+            _convolution(last + 1, last),
             BiasedLeakyReLU(last),
             nn.Flatten(),
             Equalised(nn.Linear(last * rows * columns, last, bias=False), exact=True),

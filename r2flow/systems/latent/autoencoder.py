@@ -5,6 +5,7 @@ Circular in azimuth, zeros beyond the top and bottom. Parameters carry the publi
 """
 
 import math
+from collections import OrderedDict
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -99,27 +100,15 @@ class Middle(nn.Module):
         return self.block_2(self.attn_1(self.block_1(x)))
 
 
-class Downsample(nn.Module):
+def _downsample(channels: int, stride: Size) -> nn.Module:
     """A convolution that takes every stride-th row and column."""
-
-    def __init__(self, channels: int, stride: Size) -> None:
-        super().__init__()
-        self.conv = CircularConv2d(channels, channels, *DOWN[stride], stride=stride)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.conv(x)
+    return nn.Sequential(OrderedDict(conv=CircularConv2d(channels, channels, *DOWN[stride], stride=stride)))
 
 
-class Upsample(nn.Module):
+def _upsample(channels: int, stride: Size) -> nn.Module:
     """Bilinear between the outermost pixels, which stay where they are, then a convolution."""
-
-    def __init__(self, channels: int, stride: Size) -> None:
-        super().__init__()
-        self.stride = stride
-        self.conv = CircularConv2d(channels, channels, *UP[stride])
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.conv(F.interpolate(x, scale_factor=self.stride, mode="bilinear", align_corners=True))
+    enlarge = nn.Upsample(scale_factor=stride, mode="bilinear", align_corners=True)
+    return nn.Sequential(OrderedDict(enlarge=enlarge, conv=CircularConv2d(channels, channels, *UP[stride])))
 
 
 class Level(nn.Module):
@@ -142,9 +131,9 @@ class Level(nn.Module):
         self.block = nn.ModuleList(ResidualBlock(*pair, shape, dropout) for pair in pairwise(widths))
         self.attn = nn.ModuleList(Attention(width) for width in widths[1:] if attends)
         if down is not None:
-            self.downsample = Downsample(widths[-1], down)
+            self.downsample = _downsample(widths[-1], down)
         if up is not None:
-            self.upsample = Upsample(widths[-1], up)
+            self.upsample = _upsample(widths[-1], up)
 
     def forward(self, x: Tensor) -> Tensor:
         for index, block in enumerate(self.block):

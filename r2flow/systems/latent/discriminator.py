@@ -1,11 +1,10 @@
 """A discriminator of patches, and the reconstruction that it sharpens (Esser et al. 2021, "Taming transformers")."""
 
-from collections.abc import Callable
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from r2flow.processes import averaged
 from r2flow.registry import Count
 
 
@@ -44,26 +43,20 @@ class PatchDiscriminator(nn.Module):
         return self.main(x)
 
 
-Mean = Callable[[Tensor], Tensor]
-
-
 def hinge_loss(real: Tensor, fake: Tensor) -> Tensor:
     """(mean max(0, 1 - real) + mean max(0, 1 + fake)) / 2 of the discriminator's scores."""
     return (F.relu(1 - real).mean() + F.relu(1 + fake).mean()) / 2
 
 
-def adaptive_weight(
-    reconstruction: Tensor, adversarial: Tensor, last: Tensor, weight: float, mean: Mean = lambda g: g
-) -> Tensor:
+def adaptive_weight(reconstruction: Tensor, adversarial: Tensor, last: Tensor, weight: float) -> Tensor:
     """weight |grad R| / (|grad A| + 1e-4), at most 1e4 weight: the adversarial loss A then pulls as hard as the
     reconstruction R does at the decoder's last weights (eq. 7).
 
     Args:
-        last: These weights.
-        mean: Of a gradient over all processes.
+        last: These weights, whose gradients are averaged over all processes.
     """
     toward, against = (
-        mean(torch.autograd.grad(loss, last, retain_graph=True)[0]).norm() for loss in (reconstruction, adversarial)
+        averaged(torch.autograd.grad(loss, last, retain_graph=True)[0]).norm() for loss in (reconstruction, adversarial)
     )
     return weight * (toward / (against + 1e-4)).clamp(0, 1e4).detach()
 

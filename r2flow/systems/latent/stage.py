@@ -10,7 +10,6 @@ from torch import Tensor
 from r2flow.errors import InputError
 from r2flow.generators import Generator
 from r2flow.lidar.encoding import Encoding, ShiftedLog
-from r2flow.processes import averaged
 from r2flow.registry import Natural, NonNegative, check_options
 from r2flow.stages.base import Batch, SingleLoss, Stage
 from r2flow.systems.diffusion.sampling import noised
@@ -101,7 +100,7 @@ class LearnAutoencoder(Stage):
         if factor:
             adversarial = -self.discriminator(made).mean()
             last = self.autoencoder.decoder.conv_out.weight
-            weight = adaptive_weight(reconstruction, adversarial, last, self.adversarial_weight, averaged)
+            weight = adaptive_weight(reconstruction, adversarial, last, self.adversarial_weight)
             loss = loss + factor * weight * adversarial
         self.take_step(for_autoencoder, loss)
         real = x if mask is None else torch.cat([x, mask], 1)

@@ -5,6 +5,7 @@ Parameters carry the published weights' names.
 """
 
 import math
+from collections import OrderedDict
 from collections.abc import Sequence
 
 import torch
@@ -73,22 +74,12 @@ class Attention(nn.Module):
         return x + self.proj_out(attended).view(x.shape)
 
 
-class Halve(nn.Module):
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.op = CircularConv2d(channels, channels, stride=2)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.op(x)
+def _halve(channels: int) -> nn.Module:
+    return nn.Sequential(OrderedDict(op=CircularConv2d(channels, channels, stride=2)))
 
 
-class Double(nn.Module):
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.conv = CircularConv2d(channels, channels)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.conv(F.interpolate(x, scale_factor=2, mode="nearest"))
+def _double(channels: int) -> nn.Module:
+    return nn.Sequential(OrderedDict(enlarge=nn.Upsample(scale_factor=2), conv=CircularConv2d(channels, channels)))
 
 
 class Step(nn.Sequential):
@@ -150,7 +141,7 @@ class LatentUNet(nn.Module):
                 here = after
                 skips.append(here)
             if level < len(widths) - 1:
-                self.input_blocks.append(Step(Halve(here)))
+                self.input_blocks.append(Step(_halve(here)))
                 skips.append(here)
         self.middle_block = Step(block(here, here), Attention(here, head_channels), block(here, here))
         self.output_blocks = nn.ModuleList()
@@ -159,7 +150,7 @@ class LatentUNet(nn.Module):
                 layers: list[nn.Module] = [block(here + skips.pop(), widths[level])]
                 here = widths[level]
                 layers += [Attention(here, head_channels)] if 2**level in attention else []
-                layers += [Double(here)] if level and index == blocks else []
+                layers += [_double(here)] if level and index == blocks else []
                 self.output_blocks.append(Step(*layers))
         self.out = nn.Sequential(norm(here), nn.SiLU(), zero_initialised(CircularConv2d(here, channels)))
 

@@ -4,6 +4,7 @@ Most convolutions are circular in azimuth and in elevation too, where an image i
 trained so. Parameters carry their names.
 """
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from itertools import chain
 
@@ -44,15 +45,10 @@ class InstanceNormPlus(nn.Module):
         return (gamma * (F.instance_norm(wide) + alpha * centred) + beta).to(x.dtype)
 
 
-class PooledConvolution(nn.Module):
+def pooled_convolution(channels: int, out_channels: int, size: int) -> nn.Module:
     """A convolution, zeros beyond the edges, then the mean of every 2 x 2 pixels."""
-
-    def __init__(self, channels: int, out_channels: int, size: int) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(channels, out_channels, size, padding=size // 2)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return F.avg_pool2d(self.conv(x), 2)
+    convolution = nn.Conv2d(channels, out_channels, size, padding=size // 2)
+    return nn.Sequential(OrderedDict(conv=convolution, pool=nn.AvgPool2d(2)))
 
 
 class ScoreBlock(nn.Module):
@@ -69,8 +65,8 @@ class ScoreBlock(nn.Module):
         self.shortcut: nn.Module = nn.Identity()
         self.conv2: nn.Module
         if changes and dilation == 1:
-            self.conv2 = PooledConvolution(channels, out_channels, 3)
-            self.shortcut = PooledConvolution(channels, out_channels, 1)
+            self.conv2 = pooled_convolution(channels, out_channels, 3)
+            self.shortcut = pooled_convolution(channels, out_channels, 1)
         else:
             self.conv2 = torus_convolution(out_channels, out_channels, dilation)
             if changes:
