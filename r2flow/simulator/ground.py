@@ -61,22 +61,13 @@ class Street(NamedTuple):
 
 
 class Patch(NamedTuple):
-    """A rectangle of another surface: a drive, a car park; x, y, yaw, length and width as of a box."""
+    """A paved rectangle, a drive or a yard; x, y, yaw, length and width as of a box."""
 
     x: float
     y: float
     yaw: float
     length: float
     width: float
-    label: int
-    material: int
-
-
-class GroundHit(NamedTuple):
-    """Where rays meet the ground; (B, W) each. A ray that meets none has distance inf."""
-
-    distance: np.ndarray
-    cosine: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -95,7 +86,7 @@ class Ground:
     banks: tuple[float, float] = (0.0, 0.0)  # rise beside the first street, left and right, in metres
     corner: float = 4.0  # radius of the kerb where streets meet, in metres
     verge: tuple[int, int] = (LABELS["terrain"], INDEX["grass"])  # (label, material) of the ground beyond the pavements
-    patches: tuple[Patch, ...] = ()  # rectangles of other surfaces beside the street
+    patches: tuple[Patch, ...] = ()  # drives and yards beside the street
     # Reflectance reading of each material here, (M,).
     albedo: np.ndarray = field(default_factory=lambda: column("albedo"))
 
@@ -134,7 +125,7 @@ class Ground:
             c, s = math.cos(patch.yaw), math.sin(patch.yaw)
             dx, dy = x - patch.x, y - patch.y
             on = (abs(dx * c + dy * s) * 2 <= patch.length) & (abs(dy * c - dx * s) * 2 <= patch.width)
-            label[on], material[on] = patch.label, patch.material
+            label[on], material[on] = LABELS["parking"], INDEX["paving"]
         if self.streets:
             away = self.off_street(x, y)
             pavement = max(street.pavement for street in self.streets)
@@ -161,8 +152,8 @@ class Ground:
             on &= other.away(x, y) > 1
         return on & (u > street.start) & (u < street.stop)
 
-    def meet(self, rays: Rays) -> GroundHit:
-        """First meeting of every ray with the ground, kerbs included.
+    def meet(self, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
+        """First meeting of every ray with the ground, kerbs included: distance, inf for none, and cosine, (B, W) each.
 
         The profile of each column is a chain of straight pieces. A ray meets the first piece at whose end the running
         maximum of (ground - laser) / s, the slope to the ground's skyline, exceeds its own slope.
@@ -180,7 +171,7 @@ class Ground:
             distance, cosine = self._step_up(rays, distance, approach, cosine)
         if self.tufts > 0:
             distance = self._overgrown(rays, distance, approach)
-        return GroundHit(distance, cosine)
+        return distance, cosine
 
     def _step_up(
         self, rays: Rays, low: np.ndarray, approach: np.ndarray, cosine: np.ndarray

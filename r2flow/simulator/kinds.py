@@ -132,5 +132,5 @@ def _drives(draws: ScalarDraws, main: Street) -> tuple[Patch, ...]:
         length, width = draws.uniform(2.5, 9), draws.uniform(4, 10)
         lateral = draws.side() * (main.half_width + main.pavement + width / 2)
         x, y, heading = main.place(draws.uniform(-40, 40), lateral)
-        out.append(Patch(x, y, heading, length, width, LABELS["parking"], INDEX["paving"]))
+        out.append(Patch(x, y, heading, length, width))
     return tuple(out)

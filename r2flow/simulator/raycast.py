@@ -82,22 +82,17 @@ class Hits(NamedTuple):
 
 def cast(scene: Scene, rays: Rays, rng: np.random.Generator) -> Hits:
     """The nearest meeting of every ray; `rng` decides which rays pass through leaves and slats."""
-    ground = scene.ground.meet(rays)
-    distance = ground.distance.ravel().copy()
-    met = [_visible(shape, surface, rays, distance, rng) for shape, surface in _tables(scene)]
+    low, cosine = (q.ravel() for q in scene.ground.meet(rays))
+    distance = low.copy()
+    met = [_visible(shape, surface, rays, distance, rng) for shape, surface in scene.tables]
     for fragments in met:
         np.minimum.at(distance, fragments.pixel, fragments.distance)
-    hits = _on_ground(scene, rays, ground.distance.ravel(), ground.cosine.ravel())
-    hits = hits._replace(distance=distance)
+    hits = _on_ground(scene, rays, low, cosine)._replace(distance=distance)
     # All nearest fragments are found before any is written, since writing moves some a little behind their surface.
     won = [fragments.distance == distance[fragments.pixel] for fragments in met]
-    for fragments, first, (shape, surface) in zip(met, won, _tables(scene), strict=True):
+    for fragments, first, (shape, surface) in zip(met, won, scene.tables, strict=True):
         _on_solid(hits, rays, shape, surface, Fragments(*(q[first] for q in fragments)))
     return Hits(*(q.reshape(rays.shape) for q in hits))
-
-
-def _tables(scene: Scene) -> list[tuple[Shape, Surface]]:
-    return list(zip(scene.solids, scene.surfaces, strict=True))
 
 
 def _visible(shape: Shape, surface: Surface, rays: Rays, limit: np.ndarray, rng: np.random.Generator) -> Fragments:

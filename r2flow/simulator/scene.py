@@ -1,7 +1,7 @@
 """A scene: the ground and tables of solids with their surfaces."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from r2flow.lidar.labels import LABELS
 from r2flow.simulator.draws import ScalarDraws
 from r2flow.simulator.ground import Ground
 from r2flow.simulator.materials import INDEX, MATERIALS
-from r2flow.simulator.shapes import Blobs, Boxes, Cylinders, Frusta, Shape
+from r2flow.simulator.shapes import Shape
 
 PLAIN, FACADE, CABIN, BODY = range(4)  # patterns that divide a surface among materials
 
@@ -30,8 +30,7 @@ class Scene:
     """Everything that rays can meet, in metres; z = 0 is the usual ground below the sensor."""
 
     ground: Ground
-    solids: tuple[Shape, ...] = ()  # tables of solids, one of each kind
-    surfaces: tuple[Surface, ...] = ()  # their surfaces, one table for each of `solids`
+    tables: tuple[tuple[Shape, Surface], ...] = ()  # solids of one kind with their surfaces
     rig: int | None = None  # number of the silhouettes of the own car, or None without
 
 
@@ -43,13 +42,11 @@ class SceneBuilder:
         draws: Source of their random numbers.
     """
 
-    SHAPES = (Boxes, Frusta, Cylinders, Blobs)
-
     def __init__(self, ground: Ground, draws: ScalarDraws) -> None:
         self.ground = ground
         self.draws = draws
-        self._rows: dict[type, list[tuple[float, ...]]] = {shape: [] for shape in self.SHAPES}
-        self._surfaces: dict[type, list[tuple[float, ...]]] = {shape: [] for shape in self.SHAPES}
+        self._rows: dict[type, list[tuple[float, ...]]] = {shape: [] for shape in get_args(Shape)}
+        self._surfaces: dict[type, list[tuple[float, ...]]] = {shape: [] for shape in self._rows}
 
     def level(self, x: float, y: float) -> float:
         """Height of the ground at a place, kerb included, in metres."""
@@ -63,7 +60,7 @@ class SceneBuilder:
 
     def add(
         self,
-        solid: Boxes | Frusta | Cylinders | Blobs,
+        solid: Shape,
         label: str,
         material: str,
         albedo: float | None = None,
@@ -79,10 +76,12 @@ class SceneBuilder:
 
     def build(self, rig: int | None = None) -> Scene:
         """The scene as tables."""
-        kinds = [shape for shape in self.SHAPES if self._rows[shape]]
-        solids = tuple(shape(*_columns(self._rows[shape])) for shape in kinds)
-        surfaces = tuple(_surface(_columns(self._surfaces[shape])) for shape in kinds)
-        return Scene(self.ground, solids, surfaces, rig)
+        tables = tuple(
+            (shape(*_columns(rows)), _surface(_columns(self._surfaces[shape])))
+            for shape, rows in self._rows.items()
+            if rows
+        )
+        return Scene(self.ground, tables, rig)
 
 
 def _columns(rows: list[tuple[float, ...]]) -> np.ndarray:

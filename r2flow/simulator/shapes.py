@@ -5,7 +5,7 @@ metres in the scene's frame: x ahead and y left of the sensor's axis, z up. A so
 (cos yaw, sin yaw).
 """
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,14 +37,6 @@ class Normal(NamedTuple):
     along: np.ndarray  # metres along the face from its middle; 0 where there is no face
     end: np.ndarray  # whether it is the front or back of a box
     flat: np.ndarray  # whether it is a plane
-
-
-class Shape(Protocol):
-    """A table of solids of one kind."""
-
-    def fragments(self, rays: Rays, rng: np.random.Generator) -> Fragments: ...
-
-    def normal(self, k: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Normal: ...
 
 
 class Boxes(NamedTuple):
@@ -197,6 +189,10 @@ class Blobs(NamedTuple):
         t = (z - self.z[k]) / self.height[k] ** 2
         norm = 1 / np.maximum(np.sqrt(u * u + v * v + t * t), 1e-6)
         return _round(u * norm, v * norm, t * norm)
+
+
+Shape = Boxes | Frusta | Cylinders | Blobs
+"""A table of solids of one kind."""
 
 
 def _depths(k: np.ndarray, b: np.ndarray, w: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -16,27 +16,27 @@ STRAIGHT = Street(heading=0.0, offset=0.0, curvature=0.0, half_width=4.0, paveme
 
 @pytest.mark.parametrize("lean", [(0.05, 0.0), (-0.03, 0.02), (0.0, -0.04)])
 def test_a_slope_is_met_where_ray_and_plane_cross(lean):
-    hit = Ground(lean=lean).meet(RAYS)
+    distance, _ = Ground(lean=lean).meet(RAYS)
     closing = (lean[0] * RAYS.cos + lean[1] * RAYS.sin) - RAYS.slope[:, None]
     exact = HEIGHT / np.where(closing > 0.03, closing, np.nan)
     clear = exact < 85
     assert clear.mean() > 0.5
-    np.testing.assert_allclose(hit.distance[clear], exact[clear], rtol=1e-4)
+    np.testing.assert_allclose(distance[clear], exact[clear], rtol=1e-4)
 
 
 def test_the_normal_of_a_slope_sets_the_angle_of_incidence():
-    hit = Ground(lean=(0.1, 0.0)).meet(RAYS)
+    distance, cosine = Ground(lean=(0.1, 0.0)).meet(RAYS)
     column = HDL64E.columns // 2  # ahead, to within a fifth of a degree
     e = RAYS.lasers.elevation
-    met = np.isfinite(hit.distance[:, column])
-    np.testing.assert_allclose(hit.cosine[met, column], np.sin(np.arctan(0.1) - e[met]), atol=1e-4)
+    met = np.isfinite(distance[:, column])
+    np.testing.assert_allclose(cosine[met, column], np.sin(np.arctan(0.1) - e[met]), atol=1e-4)
 
 
 def test_on_waves_a_ray_ends_where_it_first_meets_the_surface():
     ground = Ground(waves=((0.4, 2 * np.pi / 60, 0.02, 1.0), (0.2, 0.0, 2 * np.pi / 45, 2.0)))
-    hit = ground.meet(RAYS)
-    met = np.isfinite(hit.distance)
-    s, a = np.where(met, hit.distance, 1.0), np.broadcast_to(RAYS.azimuth, RAYS.shape)
+    distance, _ = ground.meet(RAYS)
+    met = np.isfinite(distance)
+    s, a = np.where(met, distance, 1.0), np.broadcast_to(RAYS.azimuth, RAYS.shape)
     slope = np.broadcast_to(np.tan(RAYS.lasers.elevation)[:, None], RAYS.shape)
     for share, tolerance in ((1.0, 0.0), (0.9, 0.02), (0.6, 0.02), (0.3, 0.02)):
         above = HEIGHT + share * s * slope - ground.height(share * s * np.cos(a), share * s * np.sin(a))
@@ -48,12 +48,12 @@ def test_on_waves_a_ray_ends_where_it_first_meets_the_surface():
 
 def test_beside_the_street_the_ground_is_higher_by_the_kerb():
     kerb = 0.12
-    hit = Ground(streets=(STRAIGHT,), kerb=kerb).meet(RAYS)
-    y = hit.distance * RAYS.sin
-    z = HEIGHT + hit.distance * RAYS.slope[:, None]
-    met = np.isfinite(hit.distance)
+    distance, _ = Ground(streets=(STRAIGHT,), kerb=kerb).meet(RAYS)
+    y = distance * RAYS.sin
+    z = HEIGHT + distance * RAYS.slope[:, None]
+    met = np.isfinite(distance)
     np.testing.assert_allclose(z[met & (np.abs(y) < 3.99)], 0, atol=1e-3)
-    np.testing.assert_allclose(z[met & (np.abs(y) > 4.01) & (hit.distance < 40)], kerb, atol=2e-3)
+    np.testing.assert_allclose(z[met & (np.abs(y) > 4.01) & (distance < 40)], kerb, atol=2e-3)
     assert z[met].min() > -1e-3
     on_face = met & (z > 0.01) & (z < kerb - 0.01)
     assert on_face.any()

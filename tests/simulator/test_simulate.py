@@ -28,7 +28,7 @@ def scans():
 def test_no_hedge_stands_on_a_carriageway(seed, index):
     # One across a junction once held the sensor: a scan without a return.
     scene = draw_scene(generator(seed, "simulator", index))
-    for solid, surface in zip(scene.solids, scene.surfaces, strict=True):
+    for solid, surface in scene.tables:
         for k in np.flatnonzero(surface.label == LABELS["vegetation"]) if isinstance(solid, Boxes) else ():
             assert scene.ground.off_street(float(solid.x[k]), float(solid.y[k])) > 0
 
@@ -73,7 +73,7 @@ def test_other_instructions_and_threads_draw_the_same_scans():
 
 def test_the_scene_is_drawn_before_anything_of_the_sensor():
     one, two = (draw_scene(generator(5, "simulator", 2)) for _ in range(2))
-    for a, b in zip(one.solids, two.solids, strict=True):
+    for (a, _), (b, _) in zip(one.tables, two.tables, strict=True):
         np.testing.assert_array_equal(np.stack(a), np.stack(b))
     # and so an image of a quarter of the columns shows the same large things at the same places
     fine, coarse = simulate(HDL64E, 5, 2), simulate(HDL64E.resized(64, 256), 5, 2)
