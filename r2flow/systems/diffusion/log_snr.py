@@ -47,45 +47,30 @@ class Linear:
         return -(1e-4 + 10 * t.square()).expm1().log()
 
 
-class CosineShifted:
-    """lambda(t) = cosine + 2 ln(noise_d / image_d): more noise for larger images (Hoogeboom et al. 2023, eq. 5).
+class CosineInterpolated(Cosine):
+    """lambda(t) = cosine + 2 t ln(noise_d_low / image_d) + 2 (1 - t) ln(noise_d_high / image_d): more noise for larger
+    images (Hoogeboom et al. 2023, eq. 6).
 
     Args:
         image_d: Side of the images.
-        noise_d: Side at which images would be as noisy under the cosine schedule.
-        lowest, highest: Of `Cosine`, before the shift.
+        noise_d_low: Side at which images would be as noisy under the cosine schedule, towards t = 1.
+        noise_d_high: The same towards t = 0.
+        options: Of `Cosine`, before the shift.
     """
+
+    def __init__(self, image_d: Positive, noise_d_low: Positive, noise_d_high: Positive, **options: float) -> None:
+        super().__init__(**options)
+        self.low, self.high = (2 * math.log(noise_d / image_d) for noise_d in (noise_d_low, noise_d_high))
+
+    def __call__(self, t: Tensor) -> Tensor:
+        return super().__call__(t) + t * self.low + (1 - t) * self.high
+
+
+class CosineShifted(CosineInterpolated):
+    """The same shift at all times (Hoogeboom et al. 2023, eq. 5)."""
 
     def __init__(self, image_d: Positive, noise_d: Positive, lowest: float = -15.0, highest: float = 15.0) -> None:
-        self.cosine, self.shift = Cosine(lowest, highest), 2 * math.log(noise_d / image_d)
-
-    def __call__(self, t: Tensor) -> Tensor:
-        return self.cosine(t) + self.shift
-
-
-class CosineInterpolated:
-    """lambda(t) = t shifted(noise_d_low) + (1 - t) shifted(noise_d_high) (Hoogeboom et al. 2023, eq. 6).
-
-    Args:
-        image_d: Side of the images.
-        noise_d_low: `noise_d` of `CosineShifted` towards t = 1.
-        noise_d_high: The same towards t = 0.
-        lowest, highest: Of `Cosine`, before the shift.
-    """
-
-    def __init__(
-        self,
-        image_d: Positive,
-        noise_d_low: Positive,
-        noise_d_high: Positive,
-        lowest: float = -15.0,
-        highest: float = 15.0,
-    ) -> None:
-        self.low = CosineShifted(image_d, noise_d_low, lowest, highest)
-        self.high = CosineShifted(image_d, noise_d_high, lowest, highest)
-
-    def __call__(self, t: Tensor) -> Tensor:
-        return t * self.low(t) + (1 - t) * self.high(t)
+        super().__init__(image_d, noise_d, noise_d, lowest=lowest, highest=highest)
 
 
 def square_root_linear(first: float, last: float, steps: int) -> Tensor:

@@ -17,7 +17,7 @@ from r2flow.backbones.base import integers
 from r2flow.backbones.convolutions import GroupNorm
 from r2flow.backbones.layers import wrapped
 from r2flow.errors import InputError
-from r2flow.registry import Count, NonNegative, Portion
+from r2flow.registry import Count, NonNegative
 from r2flow.systems.latent.quantiser import Quantised, Quantiser
 
 GROUPS = 32
@@ -55,20 +55,17 @@ class CircularConv2d(nn.Conv2d):
 class ResidualBlock(nn.Module):
     """shortcut(x) + conv silu norm conv silu norm (x)."""
 
-    def __init__(
-        self, channels: int, out_channels: int, shape: tuple[Size, Margins] = SQUARE, dropout: float = 0.0
-    ) -> None:
+    def __init__(self, channels: int, out_channels: int, shape: tuple[Size, Margins] = SQUARE) -> None:
         super().__init__()
         self.norm1 = GroupNorm(channels, GROUPS)
         self.conv1 = CircularConv2d(channels, out_channels, *shape)
         self.norm2 = GroupNorm(out_channels, GROUPS)
-        self.dropout = nn.Dropout(dropout)
         self.conv2 = CircularConv2d(out_channels, out_channels, *shape)
         self.nin_shortcut = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         h = self.conv1(F.silu(self.norm1(x)))
-        return self.nin_shortcut(x) + self.conv2(self.dropout(F.silu(self.norm2(h))))
+        return self.nin_shortcut(x) + self.conv2(F.silu(self.norm2(h)))
 
 
 class Attention(nn.Module):
@@ -87,17 +84,10 @@ class Attention(nn.Module):
         return x + self.proj_out(attended)
 
 
-class Middle(nn.Module):
+def _middle(channels: int) -> nn.Module:
     """A residual block, attention and another one."""
-
-    def __init__(self, channels: int, dropout: float) -> None:
-        super().__init__()
-        self.block_1 = ResidualBlock(channels, channels, dropout=dropout)
-        self.attn_1 = Attention(channels)
-        self.block_2 = ResidualBlock(channels, channels, dropout=dropout)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.block_2(self.attn_1(self.block_1(x)))
+    blocks = ResidualBlock(channels, channels), ResidualBlock(channels, channels)
+    return nn.Sequential(OrderedDict(block_1=blocks[0], attn_1=Attention(channels), block_2=blocks[1]))
 
 
 def _downsample(channels: int, stride: Size) -> nn.Module:
@@ -123,12 +113,11 @@ class Level(nn.Module):
         widths: Sequence[int],
         shape: tuple[Size, Margins],
         attends: bool,
-        dropout: float,
         down: Size | None = None,
         up: Size | None = None,
     ) -> None:
         super().__init__()
-        self.block = nn.ModuleList(ResidualBlock(*pair, shape, dropout) for pair in pairwise(widths))
+        self.block = nn.ModuleList(ResidualBlock(*pair, shape) for pair in pairwise(widths))
         self.attn = nn.ModuleList(Attention(width) for width in widths[1:] if attends)
         if down is not None:
             self.downsample = _downsample(widths[-1], down)
@@ -156,16 +145,15 @@ class Encoder(nn.Module):
         strides: Sequence[Size],
         blocks: int,
         attends: Sequence[int],
-        dropout: float,
     ) -> None:
         super().__init__()
         self.conv_in = CircularConv2d(channels, widths[0])
         before = [widths[0], *widths]
         self.down = nn.ModuleList(
-            Level([before[i], *[width] * blocks], SQUARE, i in attends, dropout, down=stride)
+            Level([before[i], *[width] * blocks], SQUARE, i in attends, down=stride)
             for i, (width, stride) in enumerate(zip(widths, [*strides, None], strict=True))
         )
-        self.mid = Middle(widths[-1], dropout)
+        self.mid = _middle(widths[-1])
         self.norm_out = GroupNorm(widths[-1], GROUPS)
         self.conv_out = CircularConv2d(widths[-1], out_channels)
 
@@ -187,18 +175,16 @@ class Decoder(nn.Module):
         strides: Sequence[Size],
         blocks: int,
         attends: Sequence[int],
-        dropout: float,
     ) -> None:
         super().__init__()
         self.conv_in = CircularConv2d(channels, widths[-1])
-        self.mid = Middle(widths[-1], dropout)
+        self.mid = _middle(widths[-1])
         deeper = [*widths[1:], widths[-1]]
         self.up = nn.ModuleList(
             Level(
                 [deeper[i], *[width] * (blocks + 1)],
                 FLAT if stride is None else BLOCK[stride],
                 i in attends,
-                dropout,
                 up=stride,
             )
             for i, (width, stride) in enumerate(zip(widths, [None, *strides], strict=True))
@@ -229,7 +215,6 @@ class Autoencoder(nn.Module):
         beta: See `Quantiser`.
         legacy: See `Quantiser`.
         mask: Whether the decoder says, in one channel more, which rays return; where it is negative there is none.
-        dropout: Share of activations dropped in training.
     """
 
     def __init__(
@@ -246,7 +231,6 @@ class Autoencoder(nn.Module):
         beta: NonNegative = 0.25,
         legacy: bool = False,
         mask: bool = False,
-        dropout: Portion = 0.0,
     ) -> None:
         super().__init__()
         given = [tuple(stride) for stride in strides]
@@ -259,7 +243,7 @@ class Autoencoder(nn.Module):
             )
         widths = [width * multiplier for multiplier in integers("multipliers", multipliers, len(multipliers))]
         self.mask, self.code_channels = mask, code_channels
-        shared = widths, self.strides, blocks, attention, dropout
+        shared = widths, self.strides, blocks, attention
         self.encoder = Encoder(channels, latent_channels, *shared)
         self.decoder = Decoder(latent_channels, channels + mask, *shared)
         self.quantize = Quantiser(codes, code_channels, beta, legacy)

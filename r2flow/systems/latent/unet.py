@@ -16,7 +16,7 @@ from r2flow.backbones.base import integers
 from r2flow.backbones.convolutions import GroupNorm
 from r2flow.backbones.layers import ExactLinear, at_least_float32, zero_initialised
 from r2flow.errors import InputError
-from r2flow.registry import Count, Portion
+from r2flow.registry import Count
 from r2flow.systems.latent.autoencoder import CircularConv2d
 
 GROUPS, EPS = 32, 1e-5
@@ -38,12 +38,12 @@ def cosines_and_sines(t: Tensor, channels: int) -> Tensor:
 class ResidualBlock(nn.Module):
     """skip(x) + conv silu norm (conv silu norm (x) + W silu(c)), its last convolution zero at the start."""
 
-    def __init__(self, channels: int, out_channels: int, condition_channels: int, dropout: float) -> None:
+    def __init__(self, channels: int, out_channels: int, condition_channels: int) -> None:
         super().__init__()
         self.in_layers = nn.Sequential(norm(channels), nn.SiLU(), CircularConv2d(channels, out_channels))
         self.emb_layers = nn.Sequential(nn.SiLU(), ExactLinear(condition_channels, out_channels))
         last = zero_initialised(CircularConv2d(out_channels, out_channels))
-        self.out_layers = nn.Sequential(norm(out_channels), nn.SiLU(), nn.Dropout(dropout), last)
+        self.out_layers = nn.Sequential(norm(out_channels), nn.SiLU(), nn.Identity(), last)  # dropout, as published
         self.skip_connection = nn.Identity() if channels == out_channels else nn.Conv2d(channels, out_channels, 1)
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
@@ -103,7 +103,6 @@ class LatentUNet(nn.Module):
         head_channels: Of an attention head.
         position: "learnable" adds a learned bias for each place after the first convolution, (width, rows, columns),
             zero at the start: the paper's LiDM + APE. "none": LiDM.
-        dropout: Share of activations dropped in training.
     """
 
     def __init__(
@@ -115,7 +114,6 @@ class LatentUNet(nn.Module):
         attention: Sequence[int] = (1, 2, 4),
         head_channels: Count = 32,
         position: str = "none",
-        dropout: Portion = 0.0,
     ) -> None:
         super().__init__()
         channels, rows, columns = shape
@@ -130,7 +128,7 @@ class LatentUNet(nn.Module):
         self.position = nn.Parameter(torch.zeros(width, rows, columns)) if position == "learnable" else None
 
         def block(before: int, after: int) -> ResidualBlock:
-            return ResidualBlock(before, after, condition, dropout)
+            return ResidualBlock(before, after, condition)
 
         here, skips = width, [width]
         self.input_blocks = nn.ModuleList([Step(CircularConv2d(channels, width))])
