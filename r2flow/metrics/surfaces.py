@@ -24,23 +24,20 @@ def normals(r: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     d = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     p = r[:, None] * d
     left, right = np.roll(p, SPAN, axis=-1), np.roll(p, -SPAN, axis=-1)  # azimuth falls with w
-    n = np.cross(_below(p, -1) - _below(p, 1), left - right, axis=1)
+    above, below = _above_and_below(p)
+    n = np.cross(above - below, left - right, axis=1)
     size = np.sqrt((n**2).sum(1))
     usable = (r > 0) & (size > 0)
-    for other in (_below(r, -1), _below(r, 1), np.roll(r, SPAN, -1), np.roll(r, -SPAN, -1)):
+    for other in (*_above_and_below(r), np.roll(r, SPAN, -1), np.roll(r, -SPAN, -1)):
         usable &= (other > 0) & (np.abs(other - r) < STEP * r)
     n = n / np.where(usable, size, np.nan)[:, None]
     return n[:, 2], np.abs((n * d).sum(1))
 
 
-def _below(x: np.ndarray, by: int) -> np.ndarray:
-    """Each pixel's neighbour `by` = 1 row below, or -1: above; 0 beyond the image."""
-    out = np.zeros_like(x)
-    if by > 0:
-        out[..., :-1, :] = x[..., 1:, :]
-    else:
-        out[..., 1:, :] = x[..., :-1, :]
-    return out
+def _above_and_below(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each pixel's neighbours in the rows above and below; 0 beyond the image."""
+    wider = np.pad(x, [(0, 0)] * (x.ndim - 2) + [(1, 1), (0, 0)])
+    return wider[..., :-2, :], wider[..., 2:, :]
 
 
 def bridged(x: np.ndarray, known: np.ndarray, gap: int = GAP) -> np.ndarray:

@@ -22,15 +22,10 @@ REVISION = 3  # of the scans: rises with every change after which a seed gives o
 
 @dataclass(frozen=True)
 class SimulatedScan:
-    """One scan.
+    """One scan."""
 
-    Attributes:
-        image: Range in metres and reflectance in [0, 1], (2, H, W), float32; 0 where missing.
-        labels: SemanticKITTI ids, (H, W), uint16; 0 where missing.
-    """
-
-    image: np.ndarray
-    labels: np.ndarray
+    image: np.ndarray  # range in metres and reflectance in [0, 1], (2, H, W), float32; 0 where missing
+    labels: np.ndarray  # SemanticKITTI ids, (H, W), uint16; 0 where missing
 
 
 def simulate(sensor: Sensor, seed: int, index: int) -> SimulatedScan:

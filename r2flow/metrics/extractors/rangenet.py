@@ -9,7 +9,6 @@ import math
 import random
 import re
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import Any, ClassVar, Self
 
 import torch
@@ -141,7 +140,9 @@ class RangeNet53(RangeNet):
 
     def pool(self, maps: Tensor) -> Tensor:
         flat = maps.flatten(1)
-        return flat[:, torch.tensor(_draw(flat.shape[1], self.dim), device=maps.device)]
+        # The published draw is Python's own generator's; with another one it would be another metric.
+        drawn = random.Random(0).sample(range(flat.shape[1]), self.dim)
+        return flat[:, torch.tensor(drawn, device=maps.device)]
 
 
 class RangeNet21(RangeNet):
@@ -154,12 +155,6 @@ class RangeNet21(RangeNet):
 
     def pool(self, maps: Tensor) -> Tensor:
         return maps.unflatten(2, (BANDS, -1)).mean((3, 4)).flatten(1)
-
-
-@lru_cache(maxsize=8)
-def _draw(size: int, num: int) -> tuple[int, ...]:
-    # The published draw is Python's own generator's; with another one it would be another metric.
-    return tuple(random.Random(0).sample(range(size), num))
 
 
 def _normalisation(config: Mapping[str, Any], channels: int) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -6,13 +6,14 @@ follows how sure the discriminator is of real images.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
+from r2flow.noise import generator
 from r2flow.processes import summed
 from r2flow.registry import Natural, NonNegative, Portion, did_you_mean
 
@@ -25,24 +26,34 @@ SYM6 = (
 MARGIN = len(SYM6) // 4  # pixels computed beyond each edge, which the filter needs
 
 
-class Source(Protocol):
-    """Where random numbers come from, of shape (B, *shape)."""
+class BatchDraws:
+    """Random numbers of each image in one part of a step: a function of (seed, number of the image, part)."""
 
-    def uniform(self, shape: tuple[int, ...]) -> Tensor: ...
+    def __init__(self, seed: int, batch: Mapping[str, Tensor], part: int) -> None:
+        self.streams = [generator(seed, "training", k, part) for k in batch["k"].tolist()]
+        self.device = batch["x_1"].device
 
-    def normal(self, shape: tuple[int, ...]) -> Tensor: ...
+    def uniform(self, shape: tuple[int, ...]) -> Tensor:
+        """In [0, 1), (B, *shape)."""
+        rows = [torch.from_numpy(one.random(shape, dtype="float32")) for one in self.streams]
+        return torch.stack(rows).to(self.device)
+
+    def normal(self, shape: tuple[int, ...]) -> Tensor:
+        """N(0, 1), (B, *shape)."""
+        rows = [torch.from_numpy(one.standard_normal(shape, dtype="float32")) for one in self.streams]
+        return torch.stack(rows).to(self.device)
 
 
 Draw = tuple[Tensor, Tensor]
 """One transformation of a batch: how much, (B,), or (2, B) for rows and columns; whether at all, (B,), 0 or 1."""
 
 
-def _flip(source: Source) -> Tensor:
+def _flip(source: BatchDraws) -> Tensor:
     return (source.uniform((1,))[:, 0] < 0.5).float()
 
 
 # In the order in which they are drawn and applied: what is drawn, for a batch.
-GEOMETRY: dict[str, Callable[[Source], Tensor]] = {
+GEOMETRY: dict[str, Callable[[BatchDraws], Tensor]] = {
     "lr_flip": _flip,
     "ud_flip": _flip,
     "int_trans": lambda source: (source.uniform((2,)).mT - 0.5) / 4,  # of the height and of the width
@@ -50,7 +61,7 @@ GEOMETRY: dict[str, Callable[[Source], Tensor]] = {
     "frac_trans": lambda source: 0.125 * source.normal((2,)).mT,
 }
 # Of the published ones hue and saturation are left out: they change nothing in images of one or two channels.
-COLOUR: dict[str, Callable[[Source], Tensor]] = {
+COLOUR: dict[str, Callable[[BatchDraws], Tensor]] = {
     "brightness": lambda source: 0.2 * source.normal((1,))[:, 0],
     "contrast": lambda source: torch.exp2(0.5 * source.normal((1,))[:, 0]),
     "luma_flip": _flip,
@@ -114,7 +125,7 @@ class AdaptiveAugment(nn.Module):
         self.n_pred_cum.zero_()
         return sign
 
-    def draw(self, source: Source) -> dict[str, Draw]:
+    def draw(self, source: BatchDraws) -> dict[str, Draw]:
         """The transformations of a batch, by name. How many numbers are drawn does not depend on p."""
         draws, p = {}, float(self.p)
         for name, values in TRANSFORMATIONS.items():

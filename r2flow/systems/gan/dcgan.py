@@ -8,7 +8,6 @@ from torch import Tensor, nn
 from r2flow.backbones.layers import at_least_float32
 from r2flow.registry import Count
 from r2flow.systems.gan.layers import (
-    IMAGE,
     BiasedLeakyReLU,
     BlurBoth,
     Equalised,
@@ -28,16 +27,14 @@ def _doubling(in_channels: int, out_channels: int, ring: bool, bias: bool) -> li
 class Heads(nn.Module):
     """One last doubling for each output."""
 
-    def __init__(self, in_channels: int, made: dict[str, int], ring: bool, tanh: bool) -> None:
+    def __init__(self, in_channels: int, made: dict[str, int], ring: bool) -> None:
         super().__init__()
-        self.tanh = tanh
         self.heads = nn.ModuleDict(
             {name: nn.Sequential(*_doubling(in_channels, n, ring, True)) for name, n in made.items()}
         )
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
-        made = {name: at_least_float32(head(x)) for name, head in self.heads.items()}
-        return {**made, IMAGE: made[IMAGE].tanh()} if self.tanh else made
+        return {name: at_least_float32(head(x)) for name, head in self.heads.items()}
 
 
 class Generator(LatentGenerator):
@@ -76,9 +73,9 @@ class Generator(LatentGenerator):
                 nn.Sequential(*_doubling(wide, narrow, ring, False), BiasedLeakyReLU(narrow))
                 for wide, narrow in pairwise(widths)
             ),
-            Heads(widths[-1], outputs(channels, drops), ring, tanh),
+            Heads(widths[-1], outputs(channels, drops), ring),
         )
-        super().__init__(latent, latent, nn.Identity(), synthesis, RayDrop() if drops else None)
+        super().__init__(latent, latent, nn.Identity(), synthesis, RayDrop() if drops else None, tanh)
 
 
 class Discriminator(nn.Sequential):

@@ -146,6 +146,7 @@ class LatentGenerator(nn.Module):
         synthesis: w, and angles with their turn if there are any, to `image` and, where rays are dropped,
             `raydrop_logit`, (B, ., H, W) float32.
         measurement: What draws the mask; None where no ray is dropped.
+        tanh: Whether the image ends in tanh.
         num_styles: Layers that take w.
 
     Attributes:
@@ -163,10 +164,11 @@ class LatentGenerator(nn.Module):
         mapping: nn.Module,
         synthesis: nn.Module,
         measurement: RayDrop | None,
+        tanh: bool,
         num_styles: int = 1,
     ) -> None:
         super().__init__()
-        self.latent, self.num_styles = latent, num_styles
+        self.latent, self.tanh, self.num_styles = latent, tanh, num_styles
         self.register_buffer("w_avg", torch.zeros(1, code))
         self.mapping_network, self.synthesis_network, self.measurement_model = mapping, synthesis, measurement
 
@@ -201,6 +203,8 @@ class LatentGenerator(nn.Module):
             w = self.w_avg.lerp(w, truncation)
         made: dict[str, Tensor]
         made = self.synthesis_network(w) if angle is None else self.synthesis_network(w, angle, shift)
+        if self.tanh:
+            made[IMAGE] = made[IMAGE].tanh()
         made[CODE] = w[:, None].expand(-1, self.num_styles, -1)
         if self.measurement_model is not None:
             assert uniform is not None

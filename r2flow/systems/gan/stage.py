@@ -1,18 +1,16 @@
 """A GAN: a generator and a discriminator that learn from each other."""
 
 from collections.abc import Mapping
-from enum import IntEnum
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from r2flow.generators import Generator
-from r2flow.noise import generator as stream
 from r2flow.registry import Count, NonNegative, Portion, Registry, check_options
 from r2flow.stages.base import Batch, Stage
 from r2flow.systems.gan import dcgan, style_gan
-from r2flow.systems.gan.augment import AdaptiveAugment
+from r2flow.systems.gan.augment import AdaptiveAugment, BatchDraws
 from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.losses import Warmup, discriminator_loss, generator_loss, lazy_adam, r1
 
@@ -21,31 +19,7 @@ DISCRIMINATORS: Registry[type[nn.Module]] = Registry(
 )
 
 
-class Part(IntEnum):
-    """The parts of a step, each with draws of its own for every image."""
-
-    GENERATOR = 1
-    FAKE = 2
-    REAL = 3
-    PENALTY = 4
-
-
-class BatchDraws:
-    """Random numbers of each image in one part of a step: a function of (seed, number of the image, part)."""
-
-    def __init__(self, seed: int, batch: Batch, part: Part) -> None:
-        self.streams = [stream(seed, "training", k, part) for k in batch["k"].tolist()]
-        self.device = batch["x_1"].device
-
-    def uniform(self, shape: tuple[int, ...]) -> Tensor:
-        """In [0, 1), (B, *shape)."""
-        rows = [torch.from_numpy(one.random(shape, dtype="float32")) for one in self.streams]
-        return torch.stack(rows).to(self.device)
-
-    def normal(self, shape: tuple[int, ...]) -> Tensor:
-        """N(0, 1), (B, *shape)."""
-        rows = [torch.from_numpy(one.standard_normal(shape, dtype="float32")) for one in self.streams]
-        return torch.stack(rows).to(self.device)
+GENERATOR, FAKE, REAL, PENALTY = range(1, 5)  # parts of a step, each with draws of its own for every image
 
 
 class LearnGan(Stage):
@@ -105,17 +79,17 @@ class LearnGan(Stage):
         for_generator, for_discriminator = self.own_optimizers()
         images, real = step * self.batch_size, batch["x_1"]
 
-        draws = BatchDraws(self.seed, batch, Part.GENERATOR)
+        draws = BatchDraws(self.seed, batch, GENERATOR)
         self.discriminator.requires_grad_(False)
         loss = generator_loss(self.discriminator(self.shown(self.make(batch["x_0"], draws), images, draws)))
         self.take_step(for_generator, loss)
         self.discriminator.requires_grad_(True)
 
-        draws = BatchDraws(self.seed, batch, Part.FAKE)
+        draws = BatchDraws(self.seed, batch, FAKE)
         with torch.no_grad():
             made = self.make(draws.normal(self.generator.noise_shape), draws)
             fake = self.shown(made, images, draws)
-            seen = self.shown(real, images, BatchDraws(self.seed, batch, Part.REAL))
+            seen = self.shown(real, images, BatchDraws(self.seed, batch, REAL))
         of_real, of_fake = self.discriminator(seen), self.discriminator(fake)
         wrong = discriminator_loss(of_real, of_fake)
         self.take_step(for_discriminator, wrong)
@@ -123,7 +97,7 @@ class LearnGan(Stage):
             self.augment.count(of_real)
 
         if self.r1 and step % self.r1_every == 0:
-            penalty = self.penalty(real, images, BatchDraws(self.seed, batch, Part.PENALTY))
+            penalty = self.penalty(real, images, BatchDraws(self.seed, batch, PENALTY))
             self.take_step(for_discriminator, self.r1 * self.r1_every / 2 * penalty)
             self.log("train/r1", penalty, sync_dist=True)
         if self.augment is not None and self.augment.every and step % self.augment.every == 0:

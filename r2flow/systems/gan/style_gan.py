@@ -14,7 +14,6 @@ from r2flow.backbones.layers import ExactBuffers, at_least_float32
 from r2flow.processes import averaged
 from r2flow.registry import Count
 from r2flow.systems.gan.layers import (
-    IMAGE,
     BiasedLeakyReLU,
     BlurBoth,
     Equalised,
@@ -151,7 +150,6 @@ class Synthesis(nn.Module):
         made: dict[str, int],
         code: int,
         widths: Sequence[int],
-        tanh: bool,
         ring: bool,
     ) -> None:
         super().__init__()
@@ -160,7 +158,6 @@ class Synthesis(nn.Module):
             Level(before, after, made, code, size, ring)
             for (before, after), size in zip(pairwise([0, *widths]), shapes, strict=True)
         )
-        self.tanh = tanh
 
     def forward(self, w: Tensor, angle: Tensor, shift: Tensor | None) -> dict[str, Tensor]:
         if shift is not None:
@@ -175,8 +172,7 @@ class Synthesis(nn.Module):
             x, made = level(x, made, w, seen)
         if shift is not None:
             made = {name: turned_back(o, shift) for name, o in made.items()}
-        made = {name: o / 4 for name, o in made.items()}
-        return {**made, IMAGE: made[IMAGE].tanh()} if self.tanh else made
+        return {name: o / 4 for name, o in made.items()}
 
 
 def turned_back(x: Tensor, shift: Tensor) -> Tensor:
@@ -224,8 +220,8 @@ class Generator(LatentGenerator):
             ),
         )
         widths = [min(base_channels << i, max_channels) for i in reversed(range(doublings + 1))]
-        synthesis = Synthesis(shape, outputs(channels, True), code, widths, tanh, ring)
-        super().__init__(latent, code, mapping, synthesis, RayDrop(), 2 * (doublings + 1))
+        synthesis = Synthesis(shape, outputs(channels, True), code, widths, ring)
+        super().__init__(latent, code, mapping, synthesis, RayDrop(), tanh, 2 * (doublings + 1))
 
 
 class ResidualBlock(nn.Module):

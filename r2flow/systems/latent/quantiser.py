@@ -10,17 +10,11 @@ AT_ONCE = 4096  # vectors whose distances to all codes are held at a time
 
 
 class Quantised(NamedTuple):
-    """What a quantiser makes of z, (B, C, H, W).
+    """What a quantiser makes of z, (B, C, H, W)."""
 
-    Attributes:
-        codes: The nearest codes, (B, C, H, W), with the gradient of z (straight through).
-        loss: What draws codes and vectors to each other, ().
-        indices: Of the codes, (B H W,) int64.
-    """
-
-    codes: Tensor
-    loss: Tensor
-    indices: Tensor
+    codes: Tensor  # the nearest codes, (B, C, H, W), with the gradient of z (straight through)
+    loss: Tensor  # what draws codes and vectors to each other, ()
+    indices: Tensor  # of the codes, (B H W,) int64
 
 
 class Quantiser(nn.Module):
