@@ -100,6 +100,7 @@ def weights(
     ~/.cache/r2flow/models. A network is read as tensors alone, checked and kept in R2FLOW_WEIGHTS, or
     ~/.cache/r2flow/weights.
     """
+    from r2flow.metrics import FIELD_NAMES
     from r2flow.metrics.extractors.weights import SOURCES, kept, kept_file, weights_folder
     from r2flow.metrics.extractors.weights import add as take
     from r2flow.models import MODELS, add_model, model_file, models_folder
@@ -121,8 +122,8 @@ def weights(
     ]
     print_table(models, ("model", "draws", "here", "file"))
     print(f"\nLooked for in {models_folder()} (R2FLOW_MODELS) unless in the package. Draw: r2flow sample MODEL\n")
-    rows = [(name, source.metric, kept(name) or "no", source.file) for name, source in SOURCES.items()]
+    rows = [(name, FIELD_NAMES[name].upper(), kept(name) or "no", Path(page).name) for name, page in SOURCES.items()]
     print_table(rows, ("network", "distance", "here", "published file"))
     print(f"\nLooked for in {weights_folder()} (R2FLOW_WEIGHTS). Take one from disk: r2flow weights --add NAME FILE")
-    for name, source in SOURCES.items():
-        print(f"  {name}: {source.page}")
+    for name, page in SOURCES.items():
+        print(f"  {name}: {page}")

@@ -72,8 +72,8 @@ def pack(folder, kind):
 
 def test_every_network_says_where_its_weights_are_got(folder):
     assert set(SOURCES) == {"rangenet53", "rangenet21", "pointnet", "minkowskinet", "spvcnn"} <= set(EXTRACTORS)
-    for name, source in SOURCES.items():
-        assert source.page.startswith("http")
+    for name, page in SOURCES.items():
+        assert page.startswith("http")
         assert kept(name) is None
         assert EXTRACTORS[name].name == name
         with pytest.raises(InputError, match=f"no weights of {name} in {folder}.*r2flow weights --add {name} FILE"):

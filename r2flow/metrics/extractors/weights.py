@@ -9,7 +9,7 @@ import json
 import tarfile
 import zlib
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, NamedTuple, TypeVar
+from typing import IO, Any, TypeVar
 
 import torch
 import yaml
@@ -28,28 +28,18 @@ from r2flow.registry import Registry
 E = TypeVar("E", bound=Extractor)
 
 
-class Source(NamedTuple):
-    """A published file of weights, and the field's name of the distance between its features."""
-
-    metric: str
-    page: str
-
-    @property
-    def file(self) -> str:
-        return self.page.rpartition("/")[2]
-
-
 BONN = "http://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models/"
 R2FLOW = "https://github.com/kazuto1011/r2flow/releases/download/weights/"
 SPARENET = "https://github.com/microsoft/SpareNet/raw/main/Frechet/"
 
-SOURCES: Registry[Source] = Registry(
+# Where a network's file is published.
+SOURCES: Registry[str] = Registry(
     "network with published weights",
-    rangenet53=Source("FRD", f"{BONN}darknet53-1024.tar.gz"),
-    rangenet21=Source("FRID", f"{R2FLOW}rangenet21_lidm.tar.gz"),
-    pointnet=Source("FPD", f"{SPARENET}cls_model_39.pth"),
-    minkowskinet=Source("FSVD", f"{R2FLOW}minkowskinet_lidm.tar.gz"),
-    spvcnn=Source("FPVD", f"{R2FLOW}spvcnn_lidm.tar.gz"),
+    rangenet53=f"{BONN}darknet53-1024.tar.gz",
+    rangenet21=f"{R2FLOW}rangenet21_lidm.tar.gz",
+    pointnet=f"{SPARENET}cls_model_39.pth",
+    minkowskinet=f"{R2FLOW}minkowskinet_lidm.tar.gz",
+    spvcnn=f"{R2FLOW}spvcnn_lidm.tar.gz",
 )
 
 # Files of an archive that hold parameters, and its config.
@@ -104,7 +94,7 @@ def read_kept(cls: type[E]) -> E:
     path = kept_file(cls.name)
     if not path.exists():
         raise InputError(
-            f"no weights of {cls.name} in {path.parent}: get {SOURCES[cls.name].file} and give "
+            f"no weights of {cls.name} in {path.parent}: get {PurePosixPath(SOURCES[cls.name]).name} and give "
             f"r2flow weights --add {cls.name} FILE (r2flow weights says where from)."
         )
     tensors, notes = read_safetensors(path)
