@@ -8,6 +8,7 @@ import torch
 
 from r2flow.metrics.extractors.pointnet import PointNet
 from r2flow.metrics.extractors.weights import SOURCES
+from tests.metrics.conftest import untrained
 from tests.test_cli import r2flow  # noqa: F401  a fixture
 
 
@@ -39,7 +40,7 @@ def test_the_table_says_which_weights_are_here(r2flow, tmp_path, folder):  # noq
     assert here(said) == dict.fromkeys(SOURCES, False)
 
     path = tmp_path / "mine.pth"
-    torch.save(PointNet.random(0).state_dict(), path)
+    torch.save(untrained(PointNet).state_dict(), path)
     code, said, _ = r2flow("weights", "--add", "pointnet", path)
     assert code == 0
     assert said.startswith(f"{folder / 'pointnet.safetensors'}: weights ")

@@ -36,6 +36,13 @@ class Summary(Extractor):
         return torch.where(scans.returned.flatten(1).any(1)[:, None], features, torch.nan)
 
 
+def untrained(network: type[Extractor], seed: int = 0) -> Extractor:
+    """A network with random weights of a seed."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return network().requires_grad_(False).eval()
+
+
 def put_in_place_of_networks(patch: pytest.MonkeyPatch) -> None:
     """The stand-in, under every name of a network."""
     stand_ins = {name: SimpleNamespace(trained=partial(Summary, name)) for name in EXTRACTORS}

@@ -6,13 +6,14 @@ import torch
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.scans import Scans
+from tests.metrics.conftest import untrained
 
 SMALL = SENSORS["hdl64e"].resized(16, 32)
 
 
 @pytest.mark.parametrize("name", EXTRACTORS)
 def test_features_are_of_each_scan_alone(name):
-    network = EXTRACTORS[name].random(0)
+    network = untrained(EXTRACTORS[name])
     draw = torch.Generator().manual_seed(0)
     r, q = torch.rand(2, 4, 1, *SMALL.shape, generator=draw)
     images = torch.cat([r * 50 + 1, q], 1) * (torch.rand(r.shape, generator=draw) > 0.2)
@@ -30,12 +31,3 @@ def test_features_are_of_each_scan_alone(name):
         assert (network.features(Scans(darker, SMALL))[0] != features[0]).any()
     else:
         torch.testing.assert_close(network.features(Scans(images[:, :1], SMALL)), features, equal_nan=True)
-
-
-def test_random_weights_are_the_seed_s():
-    before = torch.get_rng_state()
-    one, same, other = (EXTRACTORS["minkowskinet"].random(seed).stem[0].kernel for seed in (1, 1, 2))
-    assert torch.equal(one, same)
-    assert not torch.equal(one, other)
-    assert torch.equal(torch.get_rng_state(), before)
-    assert EXTRACTORS["minkowskinet"].random().weights == "random"

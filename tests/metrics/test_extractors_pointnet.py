@@ -7,13 +7,14 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.extractors import pointnet
 from r2flow.metrics.extractors.pointnet import PointNet
 from r2flow.metrics.scans import Scans
+from tests.metrics.conftest import untrained
 
 SMALL = SENSORS["hdl64e"].resized(8, 32)
 
 
 @pytest.fixture(scope="module")
 def network():
-    return PointNet.random(0)
+    return untrained(PointNet)
 
 
 @torch.inference_mode()

@@ -8,6 +8,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.extractors.rangenet import RangeNet21, RangeNet53, translate
 from r2flow.metrics.scans import Scans
+from tests.metrics.conftest import untrained
 
 SMALL = SENSORS["hdl64e"].resized(16, 32)
 
@@ -22,7 +23,7 @@ def case(shared):
 
 @pytest.fixture(scope="module")
 def network():
-    return RangeNet21.random(0)
+    return untrained(RangeNet21)
 
 
 def scans(num: int = 3, channels: int = 2) -> Scans:

@@ -12,6 +12,7 @@ from r2flow.errors import InputError
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.pointnet import PointNet
 from r2flow.metrics.extractors.weights import SOURCES, add, kept, read_published, weights_hash
+from tests.metrics.conftest import untrained
 
 PARTS = {
     "backbone": {"conv1.weight": torch.ones(2)},
@@ -39,7 +40,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def pointnet(tmp_path):
-    network = PointNet.random(3)
+    network = untrained(PointNet, 3)
     path = tmp_path / "cls_model_39.pth"
     torch.save(network.state_dict(), path)
     return network, path
@@ -95,8 +96,7 @@ def test_weights_that_are_added_are_those_that_are_loaded(pointnet, folder):
     torch.save({"state_dict": network.state_dict(), "epoch": 39}, path)
     assert add("pointnet", path) == weights
     assert add("pointnet", folder / "pointnet.safetensors") == weights
-    assert PointNet.random(4).weights == "random"
-    assert weights_hash(PointNet.random(4)) != weights
+    assert weights_hash(untrained(PointNet, 4)) != weights
 
 
 def test_kept_weights_that_were_changed_are_not_used(pointnet, folder):

@@ -482,12 +482,10 @@ def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"autoencoder": {"strides": [[3, 3], [2, 2], [2, 2]]}}, r"each \[1, 2\] or \[2, 2\]"),
         ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1, 2], [2, 2]]}}, "needs 1 strides"),
         ({"autoencoder": {"multipliers": [1], "strides": []}, "unet": {"multipliers": [1] * 5}}, "cannot be halved 4"),
         ({"unet": {"position": "polar"}, "autoencoder": SMALL_AUTOENCODER}, "no position named 'polar'"),
         ({"unet": {"wdith": 3}, "autoencoder": SMALL_AUTOENCODER}, "generator.unet has no option 'wdith'"),
-        ({"unet": {"multipliers": []}, "autoencoder": SMALL_AUTOENCODER}, "multipliers must be 1 integers"),
         ({"autoencoder": {"multipliers": [], "strides": []}}, "multipliers must be 1 integers"),
         ({"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1]]}}, r"each \[1, 2\] or \[2, 2\]; found \[\[1\]\]"),
         ({"diffusion_steps": 1}, "diffusion_steps must be a whole number of at least 2"),

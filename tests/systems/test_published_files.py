@@ -29,20 +29,8 @@ def test_a_published_file_is_sampled_and_evaluated(r2flow, shared, tmp_path: Pat
     code, said, error = r2flow("sample", path, *options, "--num", 2, "--pictures", 0, "--device", "cpu", "--out", out)
     assert code == 0, error
     assert (out / "000001.npy").is_file()
-    rate = ["--metrics", "jsd", "--workers", 0, "--device", "cpu"]
-    code, _, error = r2flow(
-        "evaluate",
-        out,
-        path,
-        *options,
-        *rate,
-        "--num",
-        2,
-        "--no-reference",
-        "--no-baselines",
-        "--json",
-        tmp_path / "e.json",
-    )
+    alone = ["--num", 2, "--metrics", "jsd", "--no-reference", "--no-baselines", "--workers", 0, "--device", "cpu"]
+    code, _, error = r2flow("evaluate", out, path, *options, *alone, "--json", tmp_path / "e.json")
     assert code == 0, error
     (found,) = json.loads((tmp_path / "e.json").read_text())["comparisons"]
     assert found["generated"]["num"] == 2

@@ -8,7 +8,6 @@ from torch import Tensor, nn
 
 from r2flow.errors import InputError
 from r2flow.metrics.scans import Scans
-from r2flow.noise import seed_torch
 
 
 class Extractor(nn.Module):
@@ -50,13 +49,6 @@ class Extractor(nn.Module):
         from r2flow.metrics.extractors.weights import read_kept
 
         return read_kept(cls)
-
-    @classmethod
-    def random(cls, seed: int = 0) -> Self:
-        """The network with random weights of a seed, for tests and dry runs: its `weights` are "random"."""
-        with torch.random.fork_rng(devices=[]):
-            seed_torch(seed, "weights")
-            return cls().requires_grad_(False).eval()
 
     def filled(self, tensors: Mapping[str, Tensor]) -> Self:
         """The network with these parameters, none missing and none left over, in evaluation mode."""
