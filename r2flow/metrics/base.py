@@ -138,9 +138,6 @@ class ScanMetric(Metric):
                 [0, 1], 0 where a ray has no return. Metrics of one network run it once for one `Scans` object.
             first: Number of the first scan: kept rows are sorted by it, so that intervals do not depend on the order
                 of the batches. Numbered on if left out.
-
-        Raises:
-            InputError: something else, scans without the reflectance that is needed, or values that no scan has.
         """
         side: Side = "real" if real else "generated"
         first = self.given(side) if first is None else first

@@ -18,9 +18,6 @@ class FeatureMetric(ScanMetric):
     Args:
         extractor: The network, or its name in `EXTRACTORS`: then it is loaded with its weights.
         keep, options: As `ScanMetric`.
-
-    Raises:
-        InputError: no network of that name, or no weights for it on this machine.
     """
 
     representation = "features of a network"

@@ -70,12 +70,6 @@ class Scans:
     def has_reflectance(self) -> bool:
         return self.images.shape[1] > 1
 
-    @property
-    def reflectance(self) -> Tensor:
-        """Reflectance of every pixel, (B, 1, H, W); 0 where missing."""
-        assert self.has_reflectance
-        return self.images[:, 1:]
-
     @cached_property
     def returned(self) -> Tensor:
         """Pixels with a return, (B, 1, H, W), bool."""

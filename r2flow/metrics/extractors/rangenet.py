@@ -113,8 +113,8 @@ class RangeNet(Extractor):
         h, w = scans.sensor.shape
         if w % 32 or (self.layers == 21 and h % BANDS):
             raise InputError(f"RangeNet needs images of multiples of {BANDS} x 32, found {h} x {w}; choose a --size.")
-        reflectance = [scans.reflectance] if self.needs_reflectance else []
-        image = torch.cat([scans.images[:, :1], scans.xyz, *reflectance], 1).to(self.device)
+        reflectance = scans.images[:, 1 : 1 + self.needs_reflectance]
+        image = torch.cat([scans.images[:, :1], scans.xyz, reflectance], 1).to(self.device)
         return nan_where_empty(self.pool(self(self.normalise(image))), scans)
 
     def pool(self, maps: Tensor) -> Tensor:

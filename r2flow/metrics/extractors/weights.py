@@ -113,11 +113,7 @@ def weights_hash(extractor: Extractor) -> str:
 
 
 def read_published(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors by name, and the archive's config, of a file or of an archive or folder of several.
-
-    Raises:
-        InputError: nothing there, no weights in it, or objects that would run code when loaded.
-    """
+    """Tensors by name, and the archive's config, of a file or of an archive or folder of several."""
     if not path.is_dir():
         refuse_unreadable(path, LARGEST, "file of weights")
         if path.suffix == ".safetensors":
