@@ -8,6 +8,8 @@ from torch import Tensor, nn
 from r2flow.backbones.layers import at_least_float32
 from r2flow.registry import Count
 from r2flow.systems.gan.layers import (
+    IMAGE,
+    LOGIT,
     BiasedLeakyReLU,
     BlurBoth,
     Equalised,
@@ -15,7 +17,6 @@ from r2flow.systems.gan.layers import (
     Pad,
     RayDrop,
     halved,
-    outputs,
 )
 
 
@@ -73,7 +74,7 @@ class Generator(LatentGenerator):
                 nn.Sequential(*_doubling(wide, narrow, ring, False), BiasedLeakyReLU(narrow))
                 for wide, narrow in pairwise(widths)
             ),
-            Heads(widths[-1], outputs(channels, drops), ring),
+            Heads(widths[-1], {IMAGE: channels, LOGIT: 1} if drops else {IMAGE: channels}, ring),
         )
         super().__init__(latent, latent, nn.Identity(), synthesis, RayDrop() if drops else None, tanh)
 

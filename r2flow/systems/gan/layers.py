@@ -212,11 +212,6 @@ class LatentGenerator(nn.Module):
         return made
 
 
-def outputs(channels: int, drops: bool) -> dict[str, int]:
-    """Channels of what a synthesis makes, by name."""
-    return {IMAGE: channels, LOGIT: 1} if drops else {IMAGE: channels}
-
-
 def halved(what: str, shape: tuple[int, int], times: int, least: int = 1) -> tuple[int, int]:
     """Rows and columns of an image after so many halvings, at least so many; refuses an image that has no such."""
     rows, columns = shape[0] >> times, shape[1] >> times

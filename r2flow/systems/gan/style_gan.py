@@ -14,6 +14,8 @@ from r2flow.backbones.layers import ExactBuffers, at_least_float32
 from r2flow.processes import averaged
 from r2flow.registry import Count
 from r2flow.systems.gan.layers import (
+    IMAGE,
+    LOGIT,
     BiasedLeakyReLU,
     BlurBoth,
     Equalised,
@@ -22,7 +24,6 @@ from r2flow.systems.gan.layers import (
     Pad,
     RayDrop,
     halved,
-    outputs,
 )
 
 WINDOW = (1.0, 3.0, 3.0, 1.0)
@@ -220,7 +221,7 @@ class Generator(LatentGenerator):
             ),
         )
         widths = [min(base_channels << i, max_channels) for i in reversed(range(doublings + 1))]
-        synthesis = Synthesis(shape, outputs(channels, True), code, widths, ring)
+        synthesis = Synthesis(shape, {IMAGE: channels, LOGIT: 1}, code, widths, ring)
         super().__init__(latent, code, mapping, synthesis, RayDrop(), tanh, 2 * (doublings + 1))
 
 

@@ -12,6 +12,7 @@ from r2flow.generators.base import Generator
 from r2flow.lidar.space import ModelSpace
 from r2flow.registry import Bound, Count, check_options
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
+from r2flow.systems.diffusion.generator import Share
 from r2flow.systems.diffusion.log_snr import square_root_linear
 from r2flow.systems.diffusion.objectives import PREDICTIONS
 from r2flow.systems.diffusion.sampling import walk
@@ -19,7 +20,7 @@ from r2flow.systems.latent.autoencoder import Autoencoder
 from r2flow.systems.latent.unet import LatentUNet
 
 Steps = Annotated[int, Bound("of at least 2", lambda n: n >= 2)]
-Share = Annotated[float, Bound("in (0, 1)", lambda x: 0 < x < 1)]
+Beta = Annotated[float, Bound("in (0, 1)", lambda x: 0 < x < 1)]
 
 
 def build_autoencoder(space: ModelSpace, options: Mapping[str, Any] | None) -> Autoencoder:
@@ -69,8 +70,8 @@ class LatentDiffusion(Generator):
         backbone: Mapping[str, Any],
         autoencoder: Mapping[str, Any] | None = None,
         unet: Mapping[str, Any] | None = None,
-        beta_first: Share = 0.0015,
-        beta_last: Share = 0.0195,
+        beta_first: Beta = 0.0015,
+        beta_last: Beta = 0.0195,
         diffusion_steps: Steps = 1000,
     ) -> None:
         super().__init__(space)
@@ -115,7 +116,7 @@ class LatentDDIM(Sampler):
     needs: ClassVar[str] = "unet"
 
     steps: Count = 50
-    eta: Annotated[float, Bound("in [0, 1]", lambda eta: 0 <= eta <= 1)] = 1.0
+    eta: Share = 1.0
 
     @property
     def draws(self) -> bool:  # type: ignore[override]
