@@ -103,29 +103,13 @@ def test_images_are_within_the_sensors_limits(sensor: Sensor):
     assert set(np.unique(scan.labels)) <= {0, *LABELS.values()}
 
 
-@pytest.mark.parametrize(
-    "names",
-    [
-        ("road",),
-        ("sidewalk",),
-        ("terrain",),
-        ("building",),
-        ("car",),
-        ("moving-car",),
-        ("truck", "moving-truck"),
-        ("pole",),
-        ("traffic-sign",),
-        ("fence",),
-        ("vegetation",),
-        ("trunk",),
-        ("person", "moving-person"),
-        ("lane-marking",),
-    ],
-    ids=lambda names: names[0],
-)
-def test_every_kind_of_object_appears(scans, names):
-    wanted = [LABELS[name] for name in names]
-    assert sum(int(np.isin(scan.labels, wanted).sum()) for scan in scans) > 50
+def test_every_kind_of_object_appears(scans):
+    for names in (
+        "road", "sidewalk", "terrain", "building", "car", "moving-car", "truck moving-truck", "pole", "traffic-sign",
+        "fence", "vegetation", "trunk", "person moving-person", "lane-marking",
+    ):  # fmt: skip
+        wanted = [LABELS[name] for name in names.split()]
+        assert sum(int(np.isin(scan.labels, wanted).sum()) for scan in scans) > 50, names
 
 
 def test_the_road_passes_below_the_sensor_at_its_height(scans):

@@ -26,7 +26,6 @@ from r2flow.model.published import inert
 from r2flow.model.sampling import sample
 from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
-from r2flow.stages import build_stage
 from r2flow.systems.gan import dcgan, losses, style_gan
 from r2flow.systems.gan.augment import TRANSFORMATIONS, AdaptiveAugment, affine, coloured, transformed
 from r2flow.systems.gan.generator import DustyV1
@@ -431,10 +430,6 @@ def test_a_file_that_would_run_code_beside_its_config_is_refused(shared: Path, t
     ("change", "said"),
     [
         (lambda cfg: cfg["model"]["generator"].update(arch="stylegan"), "lacks or garbles 'stylegan'"),
-        (
-            lambda cfg: cfg["model"]["generator"]["synthesis_kwargs"].update(use_noise=True),
-            "lacks or garbles use_noise",
-        ),
         (lambda cfg: cfg["dataset"].pop("min_depth"), "lacks or garbles 'min_depth'"),
         (lambda cfg: cfg["dataset"].update(max_depth=1.0), "needs 0 < min_range < max_range"),
         (
@@ -501,22 +496,6 @@ def test_a_generator_with_a_mask_needs_draws():
     made = generator(noise, draws=Draws(0, range(2)), sampler=build_sampler("direct", truncation=0.7))
     assert made.evaluations.tolist() == [1, 1]
     assert float(made.x.abs().max()) <= 1
-
-
-def test_a_stage_of_another_generator_and_unknown_options_are_refused():
-    for wrong, said in (
-        ({"discriminator": {"name": "patch"}}, "no discriminator named 'patch'"),
-        ({"muon": 0.1}, "no option 'muon'"),
-        ({"r1_every": 0}, "r1_every must be a whole number of at least 1"),
-        ({"warmup": {"dropout": 2}}, r"dropout must be a finite number in \[0, 1\)"),
-    ):
-        config = tiny("dusty2")
-        config["stage"].update(wrong)
-        with pytest.raises(InputError, match=said):
-            build_stage(config, build_generator(config))
-    flow = {**tiny("dusty2"), "generator": None}
-    with pytest.raises(InputError, match="Gan"):
-        build_stage(flow, build_generator(flow))
 
 
 RUN = [
