@@ -22,8 +22,7 @@ from r2flow.evaluation.statistics import FORMAT, Cache, key_of
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.metrics.jsd import JSD
-from r2flow.metrics.mmd import MMD
+from r2flow.metrics.jsd_mmd import JSD, MMD
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import standard_normal
 from r2flow.samplers import build_sampler

@@ -34,9 +34,9 @@ def _lazily(where: str, *given: Any) -> Callable[..., ScanMetric]:
 
 METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     "metric",
-    jsd=_lazily("jsd:JSD"),
-    mmd=_lazily("mmd:MMD"),
-    mmd_unbiased=_lazily("mmd:MMDUnbiased"),
+    jsd=_lazily("jsd_mmd:JSD"),
+    mmd=_lazily("jsd_mmd:MMD"),
+    mmd_unbiased=_lazily("jsd_mmd:MMDUnbiased"),
     jsd_lidm=_lazily("lidm:JSDLiDM"),
     mmd_lidm=_lazily("lidm:MMDLiDM"),
     panel=_lazily("panel:Panel"),

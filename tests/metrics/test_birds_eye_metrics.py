@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.metrics import lidm, mmd
+from r2flow.metrics import jsd_mmd, lidm
 from r2flow.metrics.birds_eye import birds_eye_histogram, js_distance
-from r2flow.metrics.jsd import JSD
+from r2flow.metrics.jsd_mmd import JSD, MMD, MMDUnbiased
 from r2flow.metrics.lidm import JSDLiDM, MMDLiDM, squared_distance_map
-from r2flow.metrics.mmd import MMD, MMDUnbiased
 from r2flow.metrics.scans import Scans
 
 
@@ -56,7 +55,7 @@ def test_mmd_is_the_mean_over_all_pairs_in_blocks_of_any_size(monkeypatch):
 
     unbiased = others(p[:10]) + others(p[10:]) - 2 * mean(p[:10], p[10:])
     for block in (3, 1000):
-        monkeypatch.setattr(mmd, "BLOCK", block)
+        monkeypatch.setattr(jsd_mmd, "BLOCK", block)
         sets = Seen(counts[:10]), Seen(counts[10:])
         assert figure(MMD(), *sets)["mmd"] == pytest.approx(expected, rel=1e-9)
         assert figure(MMDUnbiased(), *sets)["mmd_unbiased"] == pytest.approx(unbiased, rel=1e-9)
