@@ -69,14 +69,6 @@ def test_disjoint_sets_have_the_largest_distance(scans_of):
     assert figure(JSDLiDM(), near, far)["jsd_lidm"] == pytest.approx(math.sqrt(math.log(2)), rel=1e-12)
 
 
-def test_a_set_without_a_return_is_said(scans_of):
-    empty = Scans(torch.zeros(2, 2, 8, 32), scans_of(1).sensor)
-    for metric in (JSD(), JSDLiDM()):
-        value = figure(metric, scans_of(3), empty)
-        assert list(value.values()) == [pytest.approx(math.sqrt(math.log(2)))]
-        assert any("none of the 2 generated scans" in said for said in metric.remarks())
-
-
 def cells(points, size, depth=(1.0, 56.0)):
     """Cells that hold a return, by another way: a set of pairs."""
     r = np.linalg.norm(points, axis=1)

@@ -54,21 +54,6 @@ def test_files_that_exist_are_kept_and_missing_ones_are_made(tmp_path):
     assert (tmp_path / "000001.bin").stat().st_mtime_ns == kept
 
 
-def test_a_scan_does_not_depend_on_the_others(tmp_path):
-    write_folder(SimulatedFolder(tmp_path / "all", SMALL, 1), range(4), workers=1)
-    for index in (3, 1):
-        write_folder(SimulatedFolder(tmp_path / "some", SMALL, 1), [index], workers=1)
-    everything = contents(tmp_path / "all")
-    assert {name: everything[name] for name in contents(tmp_path / "some")} == contents(tmp_path / "some")
-
-
-@pytest.mark.slow
-def test_two_processes_write_what_one_writes(tmp_path):
-    for workers in (1, 2):
-        write_folder(SimulatedFolder(tmp_path / str(workers), SMALL, 1, labels=True), range(12), workers)
-    assert contents(tmp_path / "1") == contents(tmp_path / "2")
-
-
 @pytest.mark.parametrize(
     ("other", "words"),
     [

@@ -194,18 +194,6 @@ def test_a_garbled_checkpoint_is_one_line(tmp_path: Path):
         load_checkpoint(path)
 
 
-def test_a_scan_is_a_function_of_its_number_alone():
-    torch.manual_seed(0)
-    generator = build_generator(TINY)
-    shape = generator.noise_shape
-    three, one = Draws(0, [4, 5, 6]), Draws(0, [5])
-    many = generator(three.start(shape), draws=three)
-    alone = generator(one.start(shape), draws=one)
-    torch.testing.assert_close(many.x[1:2], alone.x, rtol=0, atol=1e-4)
-    assert many.x.abs().max() <= 1
-    assert many.evaluations.tolist() == [3 * 5 + 1] * 3
-
-
 def test_known_pixels_stay_near_their_values():
     torch.manual_seed(0)
     generator = build_generator(TINY)
@@ -216,10 +204,3 @@ def test_known_pixels_stay_near_their_values():
     made = generator(draws.start(shape), told, draws=draws).x
     known, unknown = (made[:, :, start::4] for start in (0, 2))
     assert (known - 0.5).abs().mean() < (unknown - 0.5).abs().mean()
-
-
-def test_a_sampler_of_another_family_is_refused():
-    generator = build_generator(TINY)
-    for wrong in ({"name": "euler"}, {"tolerance": 0.1}, {"grid": "power:2"}):
-        with pytest.raises(InputError):
-            generator.choose(**wrong)

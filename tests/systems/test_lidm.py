@@ -24,7 +24,6 @@ from r2flow.lidar.projection import project, unproject
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.sampling import sample
-from r2flow.noise import Draws
 from r2flow.registry import options_of
 from r2flow.samplers import Noise, build_sampler
 from r2flow.systems.diffusion.log_snr import square_root_linear
@@ -439,20 +438,6 @@ def test_a_latent_diffusion_starts_from_its_autoencoder_alone():
     other = {**AUTOENCODER["generator"], "autoencoder": {**SMALL_AUTOENCODER, "codes": 32}}
     with pytest.raises(InputError, match="do not fit"):
         generator.start_from(build_generator({**AUTOENCODER, "generator": other}))
-
-
-def test_a_scan_is_a_function_of_its_number_alone():
-    torch.manual_seed(0)
-    generator = build_generator(DIFFUSION).eval()
-    generator.sampler = generator.sampler.changed(steps=7)
-    shape = generator.noise_shape
-    three, one = Draws(0, [4, 5, 6]), Draws(0, [5])
-    many = generator(three.start(shape), draws=three)
-    alone = generator(one.start(shape), draws=one)
-    torch.testing.assert_close(many.x[1:2], alone.x, rtol=0, atol=1e-4)
-    assert many.x.shape == (3, 1, 8, 32)
-    assert many.evaluations.tolist() == [8] * 3  # 1000 // 7 = 142 goes 8 times into 1000
-    assert generator.sampler.evaluations(generator) == 8
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ from r2flow.backbones import Backbone, build_backbone
 from r2flow.callbacks.ema import ema_decay
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
-from r2flow.generators.flow import ode_sampler
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.region import Region
@@ -487,15 +486,6 @@ def test_a_sampler_that_a_diffusion_does_not_have_is_refused(exact):
             build_sampler(wrong)
     with pytest.raises(InputError, match="map"):
         exact.choose("jump")
-
-
-@pytest.mark.parametrize(
-    ("text", "draws"), [("ddpm", True), ("ddim:eta=0.3", True), ("ddim", False), ("adams3", False)]
-)
-def test_which_samplers_draw_noise_on_the_way(exact, text, draws):
-    exact.sampler = build_sampler(text, steps=4)
-    assert exact.sampler.draws is draws
-    assert ode_sampler(exact).paired
 
 
 def test_what_a_diffusion_cannot_do_is_said(exact):
