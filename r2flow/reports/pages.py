@@ -119,7 +119,8 @@ def provenance(page: Page) -> dict[str, Any]:
 
 
 def blank_figure(width: float, height: float, title: str = "") -> Figure:
-    """A white page of inches, its parts laid out so that nothing overlaps."""
+    """A white page of inches, at least as wide as its title, its parts laid out so that nothing overlaps."""
+    width = max(width, 0.08 * len(title))  # a letter takes about 0.075 inches
     figure = Figure(figsize=(width, height), facecolor="white", layout="constrained")
     if title:
         figure.suptitle(title, fontsize=11)

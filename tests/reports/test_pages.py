@@ -9,6 +9,7 @@ import torch
 import r2flow
 from r2flow.errors import InputError
 from r2flow.reports.pages import STYLES, Page, blank_figure, prepare_folder, write_page
+from r2flow.reports.pictures import figure_pixels
 from r2flow.reports.tables import table
 
 ROWS = [
@@ -84,6 +85,13 @@ def test_a_page_that_fails_leaves_the_old_one(tmp_path):
     with pytest.raises(TypeError):
         write_page(page(rows=[{"solver": object()}]), tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.iterdir() if path.suffix != ".png"} == before
+
+
+def test_a_figure_is_as_wide_as_its_title():
+    figure = blank_figure(2, 2, "Each metric's first figure, generated scans and real ones")
+    figure_pixels(figure)
+    title = figure.texts[0].get_window_extent()
+    assert 0 <= title.x0 < title.x1 <= figure.bbox.width
 
 
 def test_styles_differ_without_colour():
