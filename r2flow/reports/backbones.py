@@ -1,12 +1,12 @@
 """What each backbone costs: the paper's table II, measured here."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
-from torch import nn
 
 from r2flow.backbones import Backbone, build_backbone, configurations
 from r2flow.backbones.cost import RULE, count_macs, count_parameters
@@ -14,21 +14,16 @@ from r2flow.errors import InputError
 from r2flow.generators import RectifiedFlow, build_generator
 from r2flow.lidar.sensors import Sensor
 from r2flow.reports.tables import print_table
-from r2flow.reports.timing import timed
+
+T = TypeVar("T")
 
 
 def backbone_costs(
     sensor: Sensor, names: Sequence[str] | None = None, repeats: int = 3, device: str = "cpu"
 ) -> Iterator[dict[str, Any]]:
-    """Parameters, GMAC and median latency of every configuration for one image of two channels, one at a time.
+    """Parameters, GMAC and median latency in float32 of every configuration for one image of two channels.
 
-    Args:
-        names: Of `configurations`; None for all.
-        repeats: Timed evaluations after one warm-up; with 0 the latency is None.
-
-    Returns:
-        `{name, parameters, gmac, latency_ms}`; a configuration that cannot take the size has None for all three and
-        says why under `error`.
+    With no `repeats` the latency is None. A configuration that cannot take the size has no figures and an `error`.
     """
     known = configurations()
     for name in names or known:
@@ -53,15 +48,22 @@ def cost(config: Mapping[str, Any], repeats: int = 0, device: str = "cpu") -> di
 
 def _cost_of(model: Backbone, shape: tuple[int, ...], repeats: int, device: str) -> dict[str, Any]:
     row = {"parameters": count_parameters(model), "gmac": count_macs(model) / 1e9, "latency_ms": None}
-    return row | {"latency_ms": latency(model.to(device), shape, repeats, device)} if repeats else row
+    if repeats:
+        model, x, t = model.to(device), torch.randn(shape, device=device), torch.full((1,), 0.5, device=device)
+        with torch.inference_mode():
+            seconds = [timed(partial(model, t, x), device)[1] for _ in range(repeats + 1)]
+        row["latency_ms"] = 1e3 * median(seconds[1:])  # without the warm-up
+    return row
 
 
-def latency(model: nn.Module, shape: tuple[int, ...], repeats: int, device: str) -> float:
-    """Median milliseconds of one evaluation in float32, without gradients."""
-    x, t = torch.randn(shape, device=device), torch.full((shape[0],), 0.5, device=device)
-    with torch.inference_mode():
-        seconds = [timed(partial(model, t, x), device)[1] for _ in range(repeats + 1)]
-    return 1e3 * median(seconds[1:])
+def timed(call: Callable[[], T], device: torch.device | str = "cpu") -> tuple[T, float]:
+    """What a call returns, and its seconds, the device's work included."""
+    wait = torch.cuda.synchronize if torch.device(device).type == "cuda" else lambda device: None
+    wait(device)
+    begin = time.perf_counter()
+    result = call()
+    wait(device)
+    return result, time.perf_counter() - begin
 
 
 def print_costs(rows: Sequence[dict[str, Any]], sensor: Sensor, device: str) -> None:

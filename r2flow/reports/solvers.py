@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,9 +21,9 @@ from r2flow.inversion import metres_apart, rms
 from r2flow.lidar.encoding import Encoding
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.noise import Draws
+from r2flow.reports.backbones import timed
 from r2flow.reports.pages import STYLES, Page, blank_figure
 from r2flow.reports.tables import Row, shown, table
-from r2flow.reports.timing import timed
 
 METHODS = (*SOLVERS, f"{TORCHDIFFEQ}dopri5")
 TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5)  # of the adaptive methods
@@ -34,27 +34,12 @@ ROUNDING = 1e-9  # the least error that is told apart from rounding in float64
 WANTED = (0.2, 0.05, 0.01)  # RMS errors of the range, m
 
 
-@dataclass(frozen=True)
-class Configuration:
-    """A solver at a number of steps, or at a tolerance."""
+class Configuration(NamedTuple):
+    """A solver at a number of steps, or at a tolerance, as options of `solve`."""
 
     method: str
-    steps: int | None = None
-    tolerance: float | None = None
-
-    @property
-    def label(self) -> str:
-        """'midpoint, 8 steps', 'dopri5, 1e-03'."""
-        if self.steps is None:
-            return f"{self.method}, {self.tolerance:.0e}"
-        return f"{self.method}, {self.steps} step{'s' * (self.steps > 1)}"
-
-    @property
-    def fields(self) -> dict[str, Any]:
-        """Of `solve`, and as options of `r2flow sample`."""
-        if self.steps is None:
-            return {"tolerance": self.tolerance}
-        return {"steps": self.steps, "grid": usual_grid(self.method)}
+    label: str
+    fields: dict[str, Any]
 
 
 def configurations(
@@ -65,11 +50,12 @@ def configurations(
     for method in methods:
         how = method_of(method)
         if how.adapts:
-            chosen += [Configuration(method, tolerance=tolerance) for tolerance in tolerances]
+            chosen += [Configuration(method, f"{method}, {one:.0e}", {"tolerance": one}) for one in tolerances]
             continue
         start, per_step = getattr(how, "start", 0), getattr(how, "evaluations", 1)
-        steps = sorted({(budget - start) // per_step for budget in budgets if budget >= start + per_step})
-        chosen += [Configuration(method, steps=count) for count in steps]
+        for count in sorted({(budget - start) // per_step for budget in budgets if budget >= start + per_step}):
+            fields = {"steps": count, "grid": usual_grid(method)}
+            chosen.append(Configuration(method, f"{method}, {count} step{'s' * (count > 1)}", fields))
     return chosen
 
 
@@ -142,14 +128,13 @@ def measure(
         with torch.inference_mode():
             subject.velocity(torch.zeros((), device=subject.x_0.device), subject.x_0[:1])  # warm up
             for repeat, (i, one) in product(range(REPEATS), enumerate(chosen)):
-                for x_0 in subject.x_0.split(subject.batch_size) if repeat == 0 or sum(seconds[i]) < PATIENCE else ():
-                    call = partial(
-                        solve, subject.velocity, x_0, method=one.method, max_evaluations=MOST_EVALUATIONS, **one.fields
-                    )
-                    solution, taken = timed(call, x_0.device)
+                if repeat > 0 and sum(seconds[i]) >= PATIENCE:
+                    continue
+                how = {"method": one.method, "max_evaluations": MOST_EVALUATIONS, **one.fields}
+                for x_0 in subject.x_0.split(subject.batch_size):
+                    solution, taken = timed(partial(solve, subject.velocity, x_0, **how), x_0.device)
                     seconds[i].append(taken / len(x_0))
-                    if repeat == 0:
-                        solutions[i].append(solution)
+                    solutions[i] += [] if repeat else [solution]
                 if progress is not None and repeat == 0:
                     progress()
         rows += [_row(subject, *one) for one in zip(chosen, seconds, solutions, strict=True)]
@@ -159,10 +144,11 @@ def measure(
 def _row(subject: Subject, one: Configuration, seconds: list[float], solutions: Sequence[Solution]) -> dict[str, Any]:
     x_1 = torch.cat([solution.x for solution in solutions])
     errors = rms(x_1 - subject.x_1)
+    sampler = one.method.replace(TORCHDIFFEQ, f"{TORCHDIFFEQ}method=")
     fields = [f"--{key} {value:g}" if key == "tolerance" else f"--{key} {value}" for key, value in one.fields.items()]
     row = {
         "problem": subject.name, "method": one.method, "label": one.label,
-        "options": " ".join([f"--sampler {one.method}", *fields]), "scans": len(errors),
+        "options": " ".join([f"--sampler {sampler}", *fields]), "scans": len(errors),
         "evaluations": float(torch.cat([solution.evaluations for solution in solutions]).double().mean()),
         "seconds": float(np.median(seconds)), "error": float(errors.median()), "error_worst": float(errors.max()),
         "floor": subject.floor, "length": float(rms(subject.x_1 - subject.x_0).median()),
@@ -212,18 +198,12 @@ def solvers_page(
     command: str,
     device: str = "cpu",
 ) -> Page:
-    """The report.
-
-    Args:
-        rows: From `measure`.
-        subject: The trained flow among the subjects.
-        budgets: Evaluations within which the most accurate solver is named.
-    """
+    """The report on the rows of `measure`; `subject` is the trained flow among the subjects."""
     text: list[str] = []
     figures: dict[str, Figure] = {}
     groups = _by(rows, "problem")
-    flow = None if subject is None else groups.pop(subject.name)
-    if subject is not None and flow is not None:
+    if subject is not None:
+        flow = groups.pop(subject.name)
         text += flow_text(flow, subject, budgets)
         axes = product(("evaluations", "seconds"), ("error", "range_rms_m"))
         figures["solvers"] = _figure([(subject.name, flow, x, y) for x, y in axes], 2)
@@ -243,20 +223,19 @@ def solvers_page(
 def flow_text(rows: Sequence[Row], subject: Subject, budgets: Sequence[int]) -> list[str]:
     """Which solver for which budget and which error on a trained flow."""
     by_budget = [{"budget": budget, **(best_within(rows, budget) or {"label": "none"})} for budget in sorted(budgets)]
-    by_error: list[dict[str, Any]] = []
+    by_error = []
     for metres in WANTED:
-        row = cheapest(rows, metres)
-        how = {"how": "none"} if row is None else {**row, "how": f"`r2flow sample {subject.name} {row['options']}`"}
-        by_error.append({**how, "wanted": f"{metres:g} m"})
+        row = cheapest(rows, metres) or {}
+        how = f"`r2flow sample {subject.name} {row['options']}`" if row else "none"
+        by_error.append({**row, "how": how, "wanted": f"{metres:g} m"})
+    errors = {"error": "RMS error", "range_rms_m": "range, RMS m"}
     return [
         f"**{subject.name}**, {len(subject.x_0)} scans, against its own tight solution. Errors above "
         f"{shown(subject.floor)} can be measured.",
         "The sampler of fewest evaluations that reaches an RMS error of the range:",
         table(by_error, {"wanted": "error", "how": "sampler", "evaluations": "evaluations", "seconds": "s a scan"}),
         "The most accurate solver within a number of evaluations:",
-        table(
-            by_budget, {"budget": "evaluations", "label": "solver", "error": "RMS error", "range_rms_m": "range, RMS m"}
-        ),
+        table(by_budget, {"budget": "evaluations", "label": "solver", **errors}),
     ]
 
 

@@ -2,7 +2,6 @@ import os
 
 import pytest
 
-from r2flow.backbones import configurations
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.backbones import backbone_costs
@@ -48,16 +47,6 @@ def test_latency_is_measured():
 @pytest.mark.slow
 def test_every_configuration_takes_every_sensor_s_shape(sensor):
     assert [row for row in backbone_costs(sensor, list(PARAMETERS), repeats=0) if "error" in row] == []
-
-
-@pytest.mark.slow
-def test_the_verb_prints_every_configuration(r2flow):  # noqa: F811
-    code, out, _ = r2flow("report", "backbones", "--repeats", 0, "--device", "cpu")
-    assert code == 0
-    for name in configurations():
-        assert name in out
-    for words in ("64 x 1024", "GMAC", *(f"{count:,}" for count in PARAMETERS.values())):
-        assert words in out
 
 
 def test_the_verb_measures_what_it_is_asked_for(r2flow):  # noqa: F811
