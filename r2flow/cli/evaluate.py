@@ -194,8 +194,8 @@ def _compare(
     from r2flow.evaluation.results import Results
     from r2flow.evaluation.statistics import Cache, Statistics
     from r2flow.processes import place
-    from r2flow.reports.evaluation import Comparison, Kind, evaluation_page, print_comparisons, write_json
-    from r2flow.reports.pages import write_page
+    from r2flow.reports.evaluation import Comparison, Kind, evaluation_page, print_comparisons
+    from r2flow.reports.pages import write_json, write_page
     from r2flow.reports.view.panels import write_sets
 
     kinds: dict[Kind, dict[str, tuple[ScanSet, ScanSet]]]

@@ -1,11 +1,9 @@
 """The figures of an evaluation in the terminal, as JSON and as a page."""
 
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import cycle, product
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -14,12 +12,10 @@ from matplotlib.figure import Figure
 from r2flow.data.sets import ScanSet
 from r2flow.evaluation.copies import Nearest
 from r2flow.evaluation.measuring import MetricResult
-from r2flow.files import atomic_write
-from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks, plain, provenance
+from r2flow.reports.pages import STYLES, Page, blank_figure, few_log_ticks
 from r2flow.reports.pictures import BACKGROUND, FOREGROUND, draw_range
 from r2flow.reports.tables import print_table, shown, table
 
-FORMAT = "r2flow evaluation 1"
 Kind = Literal["judged", "reference", "baseline"]
 ENDS = (" low", " high")  # of the names of an interval's ends
 AXES = (("evaluations", "network evaluations a scan"), ("seconds", "seconds a scan"))
@@ -54,17 +50,25 @@ def heading(metric: str, figure: str) -> tuple[str, float]:
 
 def rows_of(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
     """A row for each figure."""
+    return [
+        {"comparison": one.name, "kind": one.kind, **row}
+        for one in comparisons
+        for result in one.measured
+        for row in _rows_of(result)
+    ]
+
+
+def _rows_of(result: MetricResult) -> list[dict[str, Any]]:
     rows = []
-    for comparison, result in ((one, result) for one in comparisons for result in one.measured):
-        for name, value in result.figures.items():
-            title, factor = heading(result.metric, name)
-            low, high = result.intervals.get(name, (None, None))
-            sizes = result.protocol["sizes"]
-            rows.append({
-                "comparison": comparison.name, "kind": comparison.kind, "metric": result.metric, "figure": name,
-                "value": value, "low": low, "high": high, "printed_as": title, "printed": value * factor,
-                "real": sizes["real"], "generated": sizes["generated"], "remarks": "; ".join(result.remarks),
-            })  # fmt: skip
+    for name, value in result.figures.items():
+        title, factor = heading(result.metric, name)
+        low, high = result.intervals.get(name, (None, None))
+        sizes = result.protocol["sizes"]
+        rows.append({
+            "metric": result.metric, "figure": name, "value": value, "low": low, "high": high, "printed_as": title,
+            "printed": value * factor, "real": sizes["real"], "generated": sizes["generated"],
+            "remarks": "; ".join(result.remarks),
+        })  # fmt: skip
     return rows
 
 
@@ -75,13 +79,6 @@ def print_comparisons(comparisons: Sequence[Comparison]) -> None:
     print_table(lines, columns)
     for remark in _remarks(comparisons):
         print(f"  {remark}")
-
-
-def write_json(page: Page, path: Path) -> None:
-    """Write every figure with its protocol, remarks and origin, as strict JSON; a missing figure is null."""
-    content = {"format": FORMAT, "origin": provenance(page), **page.more}
-    with atomic_write(path, "w") as file:
-        file.write(json.dumps(plain(content), indent=2, allow_nan=False) + "\n")
 
 
 def evaluation_page(
@@ -200,18 +197,7 @@ def _plain_comparison(one: Comparison) -> dict[str, Any]:
         **{side: {"set": s.label, "scans": len(s), **s.about} for side, s in sets.items()},
         "seconds": round(one.seconds, 2),
         "metrics": [
-            {
-                "metric": result.metric,
-                "figures": dict(result.figures),
-                "printed": {
-                    title: value * factor
-                    for name, value in result.figures.items()
-                    for title, factor in [heading(result.metric, name)]
-                },
-                "intervals": {name: list(ends) for name, ends in result.intervals.items()},
-                "protocol": dict(result.protocol),
-                "remarks": list(result.remarks),
-            }
+            asdict(result) | {"printed": {row["printed_as"]: row["printed"] for row in _rows_of(result)}}
             for result in one.measured
         ],
     }

@@ -63,11 +63,7 @@ class Page:
 
 
 def write_page(page: Page, out: str | Path) -> list[Path]:
-    """Write `out/NAME.png ...`, `NAME.csv`, `NAME.json` and `NAME.md`, each whole or not at all, in this order.
-
-    Returns:
-        The files, the page last.
-    """
+    """Write `out/NAME.png ...`, `NAME.csv`, `NAME.json` and `NAME.md`, each whole or not at all; the files in order."""
     out, origin = Path(out), provenance(page)
     # Figures travel without their page. Latin-1 is all that the notes of a PNG hold.
     note = printable(json.dumps(origin)).encode("latin-1", "backslashreplace").decode("latin-1")
@@ -77,7 +73,7 @@ def write_page(page: Page, out: str | Path) -> list[Path]:
     ]
     contents = {
         "csv": _csv(page.rows, origin),
-        "json": json.dumps(plain({"origin": origin, "rows": page.rows, **page.more}), indent=1, allow_nan=False) + "\n",
+        "json": _json(page, origin),
         "md": _markdown(page, origin),
     }
     for ending, content in contents.items():
@@ -85,6 +81,12 @@ def write_page(page: Page, out: str | Path) -> list[Path]:
         with atomic_write(written[-1], "w") as file:
             file.write(content)
     return written
+
+
+def write_json(page: Page, path: Path) -> None:
+    """Write the JSON of a page alone."""
+    with atomic_write(path, "w") as file:
+        file.write(_json(page, provenance(page)))
 
 
 def prepare_folder(out: str | Path) -> Path:
@@ -145,6 +147,19 @@ def _csv(rows: Sequence[Row], origin: Mapping[str, Any]) -> str:
     return text.getvalue()
 
 
+def _json(page: Page, origin: Mapping[str, Any]) -> str:
+    return json.dumps(_plain({"origin": origin, "rows": page.rows, **page.more}), indent=1, allow_nan=False) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    """For JSON, which has neither NaN nor infinity."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def _markdown(page: Page, origin: Mapping[str, Any]) -> str:
     pictures = [f"![{name.replace('_', ' ')}]({name}.png)" for name in page.figures]
     notes = [f"- {key}: {_one_line(value)}" for key, value in origin.items() if key not in ("report", "command")]
@@ -156,15 +171,6 @@ def _one_line(value: Any) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {item}" for key, item in value.items()) or "none"
     return str(value)
-
-
-def plain(value: Any) -> Any:
-    """For JSON, which has neither NaN nor infinity."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _cpu_name() -> str:

@@ -94,11 +94,6 @@ def test_a_figure_is_as_wide_as_its_title():
     assert 0 <= title.x0 < title.x1 <= figure.bbox.width
 
 
-def test_styles_differ_without_colour():
-    assert len({str((style["marker"], style["linestyle"])) for style in STYLES}) == len(STYLES)
-    assert len({style["marker"] for style in STYLES}) == len(STYLES)
-
-
 def test_a_folder_that_cannot_be_one_is_refused_before_anything_is_measured(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError, match=r"file is a file, not a folder; give another name"):
