@@ -5,6 +5,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rich.cells import cell_len
+
 from r2flow.errors import printable
 
 Row = Mapping[str, Any]
@@ -25,27 +27,17 @@ def table(rows: Rows, columns: Columns) -> str:
 
 def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
     """Rows as a table in the terminal: numbers to the right, no cell cut short; all headings "": no line of them."""
-    from rich.console import Console
-    from rich.measure import Measurement
-    from rich.table import Table
-    from rich.text import Text
-
     headings, cells = _text(rows, columns)
-    grid = Table(
-        box=None, header_style="bold", pad_edge=False, title=title or None, title_justify="left",
-        show_header=any(headings),
-    )  # fmt: skip
-    for heading, column in zip(headings, zip(*cells, strict=True) if cells else headings, strict=True):
-        right = bool(cells) and all(NUMBER.match(cell) for cell in column)
-        grid.add_column(Text(heading), justify="right" if right else "left", no_wrap=True)
-    for line in cells:
-        grid.add_row(*(Text(printable(cell)) for cell in line))
-    console = Console()
-    # A terminal that is too narrow wraps the lines.
-    console.width = max(console.width, Measurement.get(console, console.options.update(width=10**5), grid).maximum)
-    with console.capture() as drawn:
-        console.print(grid, crop=False)
-    print("\n".join(line.rstrip() for line in drawn.get().splitlines()))  # no cell is as wide as the widest one
+    cells = [[printable(cell) for cell in line] for line in cells]
+    lines = [headings, *cells] if any(headings) else cells
+    widths = [max(map(cell_len, column)) for column in zip(*lines, strict=True)]
+    right = [bool(cells) and all(map(NUMBER.match, column)) for column in zip(*cells or [headings], strict=True)]
+    if title:
+        print(title)
+    for line in lines:
+        gaps = [" " * (width - cell_len(cell)) for cell, width in zip(line, widths, strict=True)]
+        padded = [gap + cell if r else cell + gap for cell, gap, r in zip(line, gaps, right, strict=True)]
+        print("  ".join(padded).rstrip())
 
 
 def shown(value: Any) -> str:
