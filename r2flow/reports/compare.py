@@ -52,9 +52,6 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
     """Run folders: those given, and for a folder of runs (a chain's, a sweep's, a sweep's of chains) those in it.
 
     Paths that are neither are skipped with a warning where there are others, as in `runs/sweep/*`.
-
-    Raises:
-        InputError: a path that does not exist, or no run among the paths.
     """
     found: list[Path] = []
     others: list[Path] = []

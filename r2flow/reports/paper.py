@@ -80,7 +80,8 @@ def paper_page(
     roles = {weights_hash(run.checkpoint): run.role for run in runs}
     evaluated = [{**row, "role": roles[row["weights"]]} for row in rows if row["weights"] in roles]
     architectures = architecture_rows(runs, evaluated, device)
-    text = ["## Table I: methods and metrics", table_i(evaluated)]
+    named = ", ".join(f"{run.label} ({run.role})" for run in runs)
+    text = [f"{len(runs)} generators: {named}.", "## Table I: methods and metrics", table_i(evaluated)]
     if architectures:
         text += ["## Table II: velocity estimators", table(architectures, ARCHITECTURES)]
     figures: dict[str, Figure] = {}
@@ -96,18 +97,15 @@ def paper_page(
         {run.label: _from_above(drawn[run.label], run.checkpoint) for run in runs},
         None if truth is None else _from_above(truth, runs[0].checkpoint),
     )
-    names = [f"{name}/{name}" for name in COLUMNS if any(f"{name}/{name}" in row for row in evaluated)]
-    if names:
+    if names := [f"{name}/{name}" for name in COLUMNS if any(f"{name}/{name}" in row for row in evaluated)]:
         figures["figure_6"] = speed_figure([{**row, "flow": row["role"]} for row in evaluated], names)
     figures["figure_7"] = scans_figure(runs, drawn, truth)
-    straight = [
-        measure_paths(run.checkpoint, run.label, steps=steps, batch_size=4)
-        for run in track([run for run in flows if not run.checkpoint.generator.fixed], "following paths")
-    ]
-    if straight:
-        figures |= {"figure_8a": curvature_figure(straight), "figure_8b": trajectories_figure(straight)}
-        text += ["## Figure 8: straightness", *curvature_text(straight)]
-    text.insert(0, f"{len(runs)} generators: {', '.join(f'{run.label} ({run.role})' for run in runs)}.")
+    curved = [run for run in flows if not run.checkpoint.generator.fixed]
+    if curved:
+        tracked = track(curved, "following paths")
+        paths = [measure_paths(run.checkpoint, run.label, steps=steps, batch_size=4) for run in tracked]
+        figures |= {"figure_8a": curvature_figure(paths), "figure_8b": trajectories_figure(paths)}
+        text += ["## Figure 8: straightness", *curvature_text(paths)]
     return Page(
         "paper", "The paper's tables and figures", text, evaluated, figures, command, {"sampled scans": 0}, device,
         {"architectures": architectures},
@@ -115,11 +113,7 @@ def paper_page(
 
 
 def read_results(files: Sequence[Path]) -> list[dict[str, Any]]:
-    """A row for each sampled set of the JSON files of `r2flow evaluate`; see `r2flow.reports.evaluation.points`.
-
-    Raises:
-        InputError: a file that cannot be read or holds something else.
-    """
+    """A row for each sampled set of the JSON files of `r2flow evaluate`; see `r2flow.reports.evaluation.points`."""
     rows = []
     for file in files:
         try:
@@ -196,14 +190,9 @@ def _from_above(images: np.ndarray, checkpoint: Checkpoint) -> np.ndarray:
     return np.sum([birds_eye_histogram(image_to_points(image, rays)[0]) for image in images], axis=0)
 
 
-def marginals(birds_eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How many points lie at each x, (100,), and at each y, of a bird's-eye histogram (100, 100)."""
-    return birds_eye.sum(1), birds_eye.sum(0)
-
-
 def marginals_apart(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean Jensen-Shannon distance of two histograms' marginals."""
-    return float(np.mean([js_distance(x, y) for x, y in zip(marginals(a), marginals(b), strict=True)]))
+    """Mean Jensen-Shannon distance of the marginals of two bird's-eye histograms, (100, 100)."""
+    return float(np.mean([js_distance(a.sum(axis), b.sum(axis)) for axis in (0, 1)]))
 
 
 def birds_eye_figure(made: Mapping[str, np.ndarray], real: np.ndarray | None) -> Figure:
@@ -222,9 +211,9 @@ def birds_eye_figure(made: Mapping[str, np.ndarray], real: np.ndarray | None) ->
         axes.set(xlabel="y, m", ylabel="x, m" if place == 0 else "")
         for histogram, style in ((counts, {"color": "#1f6fb4"}), (real, {"color": "0.2", "ls": ":"})):
             if histogram is not None:
-                along_x, along_y = (m / max(m.sum(), 1) for m in marginals(histogram))
-                above.plot(centres, along_y, lw=0.9, **style)
-                beside.plot(along_x, centres, lw=0.9, **style)
+                part = histogram / max(histogram.sum(), 1)
+                above.plot(centres, part.sum(0), lw=0.9, **style)
+                beside.plot(part.sum(1), centres, lw=0.9, **style)
         above.set(xlim=(EXTENT, -EXTENT))
         beside.set(ylim=(-EXTENT, EXTENT))
         for panel in (above, beside, corner):

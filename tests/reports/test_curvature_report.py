@@ -16,7 +16,6 @@ from r2flow.reports.curvature import (
     curvature_rows,
     measure_paths,
     summary,
-    trajectories_figure,
 )
 from tests.fields import Field
 from tests.test_checkpoints import saved  # noqa: F401  a fixture
@@ -103,12 +102,6 @@ def test_a_flow_that_goes_nowhere_has_no_normalised_integral():
 def test_a_flow_of_nan_is_said(caplog):
     measure_paths(checkpoint(Falling(math.nan)), "broken", 2, 4, 5)
     assert "broken: s(t) is not finite for 2 of 2 scans" in caplog.text
-
-
-def test_panels_are_named_by_the_end_of_their_path():
-    labels = ["/a/b/runs/x/rf1", "/a/b/runs/x/rf2", "/a/b/runs/y/rf1"]
-    figure = trajectories_figure([measure_paths(checkpoint(Falling()), label, 1, STEPS, 0) for label in labels])
-    assert [axes.get_title() for axes in figure.axes] == ["x/rf1", "x/rf2", "y/rf1"]
 
 
 def test_the_verb_writes_the_report(r2flow, saved, tmp_path):  # noqa: F811

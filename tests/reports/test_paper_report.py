@@ -10,7 +10,7 @@ import pytest
 from r2flow.metrics import METRICS
 from r2flow.metrics.birds_eye import js_distance
 from r2flow.model.checkpoint import load_checkpoint, weights_hash
-from r2flow.reports.paper import marginals, marginals_apart, role_of, same_architecture, table_i
+from r2flow.reports.paper import marginals_apart, role_of, same_architecture, table_i
 from r2flow.reports.printed import COLUMNS, TABLE_I, TABLE_II
 from r2flow.stages.checkpointing import AtomicCheckpointIO
 from tests.test_cli import r2flow  # noqa: F401  a fixture
@@ -59,13 +59,9 @@ def test_an_evaluated_row_stands_below_the_printed_row_of_its_evaluations():
 
 
 def test_marginals_are_sums_over_the_other_axis():
-    counts = np.zeros((100, 100))
-    counts[3, 7], counts[3, 9] = 2, 1
-    along_x, along_y = marginals(counts)
-    assert (along_x[3], along_y[7], along_y[9]) == (3, 2, 1)
-    other = np.zeros((100, 100))
-    other[3, 50] = 5
-    assert marginals_apart(counts, other) == pytest.approx(js_distance(along_y, other.sum(0)) / 2)
+    counts, other = np.zeros((2, 100, 100))
+    counts[3, 7], counts[3, 9], other[3, 50] = 2, 1, 5  # one x, and other y
+    assert marginals_apart(counts, other) == pytest.approx(js_distance(counts[3], other[3]) / 2)
 
 
 def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):  # noqa: F811
@@ -77,18 +73,8 @@ def test_the_page_has_tables_and_figures(r2flow, runs, tmp_path):  # noqa: F811
     results = tmp_path / "e.json"
     results.write_text(json.dumps({"comparisons": comparisons}))
     options = ("--num", 2, "--steps", 2, "--device", "cpu", "--real", "simulated:0")
-    code, said, _ = r2flow(
-        "report",
-        "paper",
-        f"9-RF={runs['2-RF']}",
-        runs["1-RF"],
-        runs["4-TD"],
-        "--results",
-        results,
-        *options,
-        "-o",
-        tmp_path / "out",
-    )
+    named = (f"9-RF={runs['2-RF']}", runs["1-RF"], runs["4-TD"])
+    code, said, _ = r2flow("report", "paper", *named, "--results", results, *options, "-o", tmp_path / "out")
     assert code == 0
     assert "3 generators" in said
     assert "(9-RF)" in said
