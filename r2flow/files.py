@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
+
 from r2flow.errors import InputError
 
 
@@ -56,6 +58,12 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
         if temporary is not None:
             with suppress(FileNotFoundError):
                 os.unlink(temporary)
+
+
+def save_array(path: str | Path, array: np.ndarray) -> None:
+    """Write a .npy, whole or not at all."""
+    with atomic_write(path) as file:
+        np.save(file, array)
 
 
 def make_folder(path: Path) -> None:

@@ -53,9 +53,7 @@ def show(
     format: Annotated[Literal["png", "npy"], typer.Option(help="npy: range images, (2, H, W).")] = "png",
 ) -> None:
     """Draw scans: range, reflectance, bird's-eye view and perspective, a PNG each; or write range images."""
-    import numpy as np
-
-    from r2flow.files import atomic_write
+    from r2flow.files import save_array
     from r2flow.reports.pictures import save_figure, scan_figure
 
     names: list[str] = []
@@ -64,8 +62,7 @@ def show(
         names.append(next(one for n in count(1) if (one := stem if n == 1 else f"{stem}_{n}") not in names))
         path = out / f"{names[-1]}.{format}"
         if format == "npy":
-            with atomic_write(path) as file:
-                np.save(file, view.image)
+            save_array(path, view.image)
             size, returns = " x ".join(map(str, view.image.shape)), (view.image[0] > 0).mean()
             print(f"{path}: {size}, {returns:.1%} returns")
             continue

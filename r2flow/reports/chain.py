@@ -1,7 +1,6 @@
 """What reflow and distillation change: every generator of a chain at few and at many steps, from the same noise."""
 
 import math
-import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -23,24 +22,18 @@ from r2flow.reports.tables import print_table, table
 from r2flow.runs.folder import read_config
 
 MANY = 32  # steps that are taken for the limit of many
-
-
 COLUMNS = {
     "flow": "flow", "steps": "steps", "seconds": "seconds a scan", "bend": "bend",
     "mean": "distance to held-out scans",
 }  # fmt: skip
 
 
-def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu", command: str = "") -> Path:
+def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str = "cpu", command: str = "") -> None:
     """Sample every generator, compare the samples with held-out scans, and write figure, table and scans.
 
     Args:
         runs: Run folders by name, the first one trained on scans.
         num: Scans of each, for each number of steps.
-        command: What makes the page again.
-
-    Returns:
-        The page.
     """
     out = Path(out)
     flows = {name: load_checkpoint(run, device) for name, run in runs.items()}
@@ -51,12 +44,12 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     bends = {name: bend(flow, num) for name, flow in flows.items()}
     cells = [(name, steps) for name, flow in flows.items() for steps in steps_of(flow, flows.values())]
     for name, steps in track(cells, "sampling"):
-        start = time.perf_counter()
-        images = np.concatenate([one.images.numpy() for one in sample(flows[name], num, steps=steps)])
-        seconds = (time.perf_counter() - start) / num
+        made = list(sample(flows[name], num, steps=steps))
+        images = np.concatenate([one.images.numpy() for one in made])
+        seconds = sum(one.seconds for one in made) / num
         lines = distances(truth, panel(images, first.sensor))
-        mean = mean_distance(lines)
-        rows.append({"flow": name, "steps": steps, "seconds": seconds, "bend": bends[name], "mean": mean, **lines})
+        means = {"bend": bends[name], "mean": mean_distance(lines)}
+        rows.append({"flow": name, "steps": steps, "seconds": seconds, **means, **lines})
         drawn[name, steps] = images
     shown = list(drawn[cells[-1]][:4])
     for index, image in enumerate(shown):
@@ -89,7 +82,6 @@ Shown: in how many steps a flow draws a scan, and how far its scans are from hel
 Open {out / "chain.png"} first.""",
         flush=True,
     )
-    return written
 
 
 def steps_of(flow: Checkpoint, flows: Iterable[Checkpoint]) -> list[int]:

@@ -13,20 +13,18 @@ import torch
 from r2flow import noise
 from r2flow.data.partial import PartialScan
 from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.files import atomic_write, save_array
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import Mask, Ray, share_in_sectors
-from r2flow.lidar.projection import image_to_points
-from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.transfer import Partial
 from r2flow.metrics.completion import common_mae
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import Completed, complete
 from r2flow.models import DEFAULT, DENSIFY
 from r2flow.progress import track
-from r2flow.reports.outputs import ScanBar, recipe_of, warn_unsolved
+from r2flow.reports.outputs import ScanBar, recipe_of, warn_unsolved, write_cloud
 from r2flow.reports.pictures import completed_figure, save_figure
 from r2flow.reports.view import write_page
 from r2flow.store import Store, read_manifest
@@ -73,20 +71,20 @@ def write_completed(
     Returns:
         The scans that were completed now, by name, with their `hidden_errors` where a mask has hidden some of their
         rays, else None.
-
-    Raises:
-        InputError: a folder that holds other files or answers, or a scan that cannot be completed.
     """
-    files = {scan.name: answer_files(checkpoint, scan, out, job.num) for scan in scans}
+    digits = len(str(job.num - 1))
+    numbers = [""] if job.num == 1 else [f"_{answer:0{digits}d}" for answer in range(job.num)]
+    files = {scan.name: [out / f"{scan.name}{n}{answer_ending(checkpoint, scan)}" for n in numbers] for scan in scans}
     for scan in scans:
         if scan.path and (out / scan.name).resolve().parent == scan.path.resolve().parent:
             raise InputError(f"{out} is the folder of the scans; give another --out.")
-    settings = {
-        "num": job.num, "fill_gaps": job.fill_gaps,
-        **about, "precision": job.precision,
-    }  # fmt: skip
-    store = Store(out, "answers", recipe_of(checkpoint, job.seed, {"completion": settings}, **sampler.asdict()))
-    inputs = _inputs(store, {scan.name: scan.identity() for scan in scans}, files)
+    settings = {"num": job.num, "fill_gaps": job.fill_gaps, **about, "precision": job.precision}
+    store = Store(out, "answers", recipe_of(checkpoint, job.seed, sampler, completion=settings))
+    before: dict[str, str] = read_manifest(out, store.kind)["inputs"] if store.check() else {}
+    inputs = {scan.name: scan.identity() for scan in scans}
+    for name, paths in files.items():
+        if before.get(name) != inputs[name] and any(path.exists() for path in paths):
+            raise InputError(f"{out} holds files of another scan of the name {name}; give another --out.")
     left = [number for number, scan in enumerate(scans) if not all(path.is_file() for path in files[scan.name])]
     done: dict[str, np.ndarray | None] = {}
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
@@ -100,7 +98,7 @@ def write_completed(
                 precision=job.precision, progress=bar.evaluated,
             )  # fmt: skip
             if not done:  # the first answer shows that the settings can be used
-                store.write_manifest(inputs=inputs)
+                store.write_manifest(inputs={**before, **inputs})
             warn_unsolved(completed.converged)
             if number < job.pictures:
                 _draw(checkpoint, scan, out, given, completed, whole if job.mask else None)
@@ -108,15 +106,14 @@ def write_completed(
             done[scan.name] = hidden_errors(whole, given, completed) if job.mask else None
             if not completed.evaluations.any():
                 print(f"{scan.name}: everything is known; see --fill-gaps and --mask")
-            bar.finished(len(done) * job.num)
+            bar.set(len(done) * job.num)
     return done
 
 
 def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
     """Whether most unknown rays of each scan lie in sectors without a known ray; a scan without unknown rays is either.
 
-    Raises:
-        InputError: so it is of some scans and not of others.
+    Scans of both kinds are refused.
     """
     kinds: dict[bool, str] = {}
     for number, scan in enumerate(track(scans, "looking at", "scans")):
@@ -133,30 +130,20 @@ def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
 
 @lru_cache(maxsize=16)  # the scans of a small folder are read once
 def hiding(scan: PartialScan, job: Job, number: int) -> tuple[Partial, Partial]:
-    """What is known of scan `number`, and what the job leaves of it."""
+    """What is known of scan `number`, and what the job's mask keeps of it, a function of (seed, number)."""
     whole = scan.read()
     if job.fill_gaps:
         gaps = np.where(whole.state == Ray.EMPTY, int(Ray.UNKNOWN), whole.state)
         whole = replace(whole, state=gaps.astype(np.uint8))
-    return whole, masked(whole, job.mask, number, job.seed, scan.name)
-
-
-def masked(scan: Partial, mask: Mask | None, number: int, seed: int, name: str) -> Partial:
-    """A scan of which a mask keeps a part; the part of scan `number` is a function of (seed, number).
-
-    Raises:
-        InputError: nothing is kept, or all.
-    """
-    if mask is None:
-        return scan
-    kept = mask(scan.state.shape, noise.generator(seed, "condition", number))
-    measured = scan.state != Ray.UNKNOWN
-    for wrong, what in ((not (measured & kept).any(), "nothing"), (not (measured & ~kept).any(), "everything")):
-        if wrong:
-            raise InputError(f"{name}: the mask keeps {what} that was measured; give another --mask.")
-    state = np.where(kept, scan.state, int(Ray.UNKNOWN)).astype(np.uint8)
-    xyz = None if scan.xyz is None else scan.xyz * kept
-    return Partial(scan.image * kept, state, xyz)
+    if job.mask is None:
+        return whole, whole
+    kept = job.mask(whole.state.shape, noise.generator(job.seed, "condition", number))
+    measured = whole.state != Ray.UNKNOWN
+    for some, what in ((measured & kept, "nothing"), (measured & ~kept, "everything")):
+        if not some.any():
+            raise InputError(f"{scan.name}: the mask keeps {what} that was measured; give another --mask.")
+    state = np.where(kept, whole.state, int(Ray.UNKNOWN)).astype(np.uint8)
+    return whole, Partial(whole.image * kept, state, None if whole.xyz is None else whole.xyz * kept)
 
 
 def hidden_errors(whole: Partial, given: Partial, completed: Completed) -> np.ndarray:
@@ -179,33 +166,8 @@ def answer_ending(checkpoint: Checkpoint, scan: PartialScan) -> str:
     return scan.ending
 
 
-def answer_files(checkpoint: Checkpoint, scan: PartialScan, out: Path, num: int) -> list[Path]:
-    """The files of a scan's answers."""
-    ending, digits = answer_ending(checkpoint, scan), len(str(num - 1))
-    numbers = [""] if num == 1 else [f"_{answer:0{digits}d}" for answer in range(num)]
-    return [out / f"{scan.name}{number}{ending}" for number in numbers]
-
-
-def _inputs(store: Store, inputs: Mapping[str, str], files: Mapping[str, Sequence[Path]]) -> dict[str, str]:
-    """Identities of the scans that a folder's answers belong to, by name, with those of `inputs`.
-
-    Raises:
-        InputError: the folder holds answers by other settings, or files of an answer's name that are not its.
-    """
-    before: dict[str, str] = read_manifest(store.folder, store.kind)["inputs"] if store.check() else {}
-    for name, paths in files.items():
-        if before.get(name) != inputs[name] and any(path.exists() for path in paths):
-            raise InputError(f"{store.folder} holds files of another scan of the name {name}; give another --out.")
-    return {**before, **inputs}
-
-
 def _write(
-    checkpoint: Checkpoint,
-    scan: PartialScan,
-    out: Path,
-    files: Sequence[Path],
-    given: Partial,
-    completed: Completed,
+    checkpoint: Checkpoint, scan: PartialScan, out: Path, files: Sequence[Path], given: Partial, completed: Completed
 ) -> None:
     if len(files) > 1:
         deviation, returned = completed.spread.numpy()
@@ -214,24 +176,21 @@ def _write(
     measured = None if given.xyz is None else given.xyz * (given.state == Ray.RETURN)
     for path, image in zip(files, completed.images.numpy(), strict=True):
         if scan.image:
-            with atomic_write(path) as file:
-                np.save(file, image)
+            save_array(path, image)
         else:
-            xyz, reflectance = image_to_points(image, checkpoint.sensor.rays(), measured)
-            write_points(path, xyz, reflectance if len(image) > 1 else None)
+            write_cloud(path, image, checkpoint.sensor.rays(), measured)
 
 
 def _draw(
     checkpoint: Checkpoint, scan: PartialScan, out: Path, given: Partial, completed: Completed, truth: Partial | None
 ) -> None:
     """`NAME.png` with two answers, `NAME.html` with more."""
-    rays, answers = checkpoint.sensor.rays(), completed.images.numpy()
-    known = [("what is known", given.image)]
+    rays = checkpoint.sensor.rays()
     whole = [("the whole scan", truth.image)] if truth else []
-    rows = [(f"answer {number}", image) for number, image in enumerate(answers[:SHOWN])]
-    named = [*known, *rows, *whole]
-    page = out / f"{scan.name}.html"
-    write_page(page, [image for _, image in named], rays, [name for name, _ in named], title=scan.name)
-    spread = completed.spread.numpy() if len(answers) > 1 else None
-    figure = completed_figure([*known, *rows[:2], *whole], given.state == Ray.UNKNOWN, rays, scan.name, spread)
+    answers = [(f"answer {number}", image) for number, image in enumerate(completed.images.numpy()[:SHOWN])]
+    first, *_ = named = [("what is known", given.image), *answers, *whole]
+    names, images = zip(*named, strict=True)
+    write_page(out / f"{scan.name}.html", images, rays, names, title=scan.name)
+    spread = completed.spread.numpy() if len(completed.images) > 1 else None
+    figure = completed_figure([first, *answers[:2], *whole], given.state == Ray.UNKNOWN, rays, scan.name, spread)
     save_figure(figure, out / f"{scan.name}.png")

@@ -1,5 +1,6 @@
 """Scans of which a part is hidden, completed by models and by interpolation: errors and cost."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -45,11 +46,7 @@ class Way:
 
 
 def measured_by(task: str, sensor: Sensor, number: int) -> np.ndarray:
-    """The rays of scan `number` that a mask leaves, (H, W) bool, a function of both alone.
-
-    Raises:
-        InputError: no such mask, or one that hides nothing or all.
-    """
+    """The rays of scan `number` that a mask leaves, (H, W) bool, a function of both alone."""
     measured = parse_mask(task)(sensor.shape, noise.generator(0, "condition", number))
     if measured.all() or not measured.any():
         raise InputError(f"the task {task!r} hides {'no' if measured.all() else 'every'} ray; give another mask.")
@@ -84,32 +81,19 @@ def completion_rows(
         for name, fill in INTERPOLATIONS.items():
             answers[name] = [fill(image, mask)[None] for image, mask in zip(given, masks, strict=True)]
         for way in ways:
-            made = list(
-                complete(
-                    way.checkpoint, images, state, num, seed, sampler=way.sampler, batch_size=batch_size,
-                    progress=progress,
-                )
-            )  # fmt: skip
+            how: Any = {"sampler": way.sampler, "batch_size": batch_size, "progress": progress}
+            made = list(complete(way.checkpoint, images, state, num, seed, **how))
             answers[way.name] = [one.images.numpy() for one in made]
             evaluations = float(torch.cat([one.evaluations for one in made]).float().mean())
             cost[way.name] = evaluations, sum(one.seconds for one in made) / num / len(made)
-        firsts = [[found[i][0] for found in answers.values()] for i in range(len(truths))]
-        common = _mean(
-            [
-                dict(zip(answers, common_mae(truth, images, ~mask), strict=True))
-                for truth, images, mask in zip(truths, firsts, masks, strict=True)
-            ]
-        )
-        for name, found in answers.items():
-            evaluations, seconds = cost.get(name, (0.0, float("nan")))
-            row = {
-                "task": task,
-                "method": name,
-                "evaluations": evaluations,
-                "seconds": seconds,
-                "mae_common_m": common[name],
-            }
-            yield row | _errors(truths, found, masks, sensor, reference), found[0][0]
+        firsts = [[of_method[i][0] for of_method in answers.values()] for i in range(len(truths))]
+        cases = zip(truths, firsts, masks, strict=True)
+        common = means([dict(zip(answers, common_mae(x, y, ~mask), strict=True)) for x, y, mask in cases])
+        for name, of_method in answers.items():
+            evaluations, seconds = cost.get(name, (0.0, math.nan))
+            row = {"task": task, "method": name, "evaluations": evaluations, "seconds": seconds}
+            row["mae_common_m"] = common[name]
+            yield row | _errors(truths, of_method, masks, sensor, reference), of_method[0][0]
 
 
 def _errors(
@@ -120,16 +104,15 @@ def _errors(
     reference: np.ndarray,
 ) -> dict[str, float]:
     cases = list(zip(truths, answers, masks, strict=True))
-    scans = [_mean([errors(truth, image, ~mask, sensor) for image in images]) for truth, images, mask in cases]
-    row = {key: value for key, value in _mean(scans).items() if np.isfinite(value)}
-    apart = distances(panel(np.stack([images[0] for images in answers]), sensor), reference)
-    row["panel"] = mean_distance(apart)
+    scans = [means([errors(truth, image, ~mask, sensor) for image in images]) for truth, images, mask in cases]
+    row = {key: value for key, value in means(scans).items() if np.isfinite(value)}
+    row["panel"] = mean_distance(distances(panel(np.stack([images[0] for images in answers]), sensor), reference))
     if len(answers[0]) > 1:
-        row |= _mean([spread_errors(truth, images, ~mask) for truth, images, mask in cases])
+        row |= means([spread_errors(truth, images, ~mask) for truth, images, mask in cases])
     return row
 
 
-def _mean(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """The mean of each column without its NaNs; NaN for a column of NaNs."""
     columns = {key: np.array([row[key] for row in rows]) for key in rows[0]}
     return {key: float(np.nanmean(x)) if np.isfinite(x).any() else float("nan") for key, x in columns.items()}

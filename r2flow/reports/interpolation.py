@@ -28,7 +28,7 @@ from r2flow.reports.view import most_images
 from r2flow.reports.view.panels import Panel, write_panels
 
 MOST = 8  # frames in the figure, evenly chosen
-# In rows: the first two draw points, the others the image.
+# In rows: the first two are of points, the others of the image.
 PANELS = {
     "perspective": draw_perspective, "bird's-eye view": draw_birds_eye, "range": draw_range,
     "reflectance": draw_reflectance,
@@ -56,15 +56,16 @@ def interpolation(
     """
     pair, names, rays = torch.stack([scan.image for scan in scans]), [s.name for s in scans], checkpoint.sensor.rays()
     with ScanBar("interpolating", frames, frames * (sampler.evaluations(checkpoint.generator) or 0)) as bar:
-        found = interpolate_scans(checkpoint, pair, frames, sampler, progress=bar.evaluated, arrived=bar.finished)
+        found = interpolate_scans(checkpoint, pair, frames, sampler, progress=bar.evaluated, arrived=bar.set)
     warn_unsolved(found.converged)
-    images = found.images.nan_to_num(0.0).numpy()
+    images, weights = found.images.nan_to_num(0.0).numpy(), found.weights.tolist()
     rows = []
-    for number, (weight, image) in enumerate(zip(found.weights.tolist(), images, strict=True)):
+    for number, (weight, image) in enumerate(zip(weights, images, strict=True)):
         write_scan(image, rays, Path(out, "frames"), f"{number:03d}", ("ply", "npy"))
-        row = {"frame": number, "weight": weight, "returns": int((image[0] > 0).sum())}
-        row |= {"evaluations": int(found.evaluations[number]), "converged": bool(found.converged[number])}
-        rows.append(row)
+        rows.append({
+            "frame": number, "weight": weight, "returns": int((image[0] > 0).sum()),
+            "evaluations": int(found.evaluations[number]), "converged": bool(found.converged[number]),
+        })  # fmt: skip
     errors = round_trip(checkpoint, found.ends) | {"converged": found.ends.converged}
     ends_rows = [{"scan": name} | {key: errors[key][i].item() for key in errors} for i, name in enumerate(names)]
     text = (
@@ -74,12 +75,12 @@ def interpolation(
         table(ends_rows, ENDS),
         table(rows, BETWEEN),
     )
-    ends = [Panel(f"real: {name}", image[None], rays) for name, image in zip(names, pair.numpy(), strict=True)]
+    first, last = (Panel(f"real: {name}", image[None], rays) for name, image in zip(names, pair.numpy(), strict=True))
     chosen = spread(len(images), most_images(images.shape) - 2)
-    said = [f"w = {weight:.2f}" for weight in found.weights[chosen].tolist()]
-    panels = [ends[0], Panel("between", images[chosen], rays), ends[1]]
+    said = [f"w = {weights[i]:.2f}" for i in chosen]
+    panels = [first, Panel("between", images[chosen], rays), last]
     write_panels(Path(out, "interpolation.html"), panels, said, "From scan to scan")
-    figures = {"interpolation": interpolation_figure(pair.numpy(), images, found.weights.tolist(), rays, names)}
+    figures = {"interpolation": interpolation_figure(pair.numpy(), images, weights, rays, names)}
     device = str(checkpoint.generator.device)
     return Page("interpolation", "From scan to scan", text, rows, figures, command, device=device)
 
@@ -89,10 +90,7 @@ def interpolation_figure(
 ) -> Figure:
     """Columns from one real scan over the frames between to the other; perspective, bird's-eye view and images.
 
-    Args:
-        real: The two scans, (2, 2 or 1, H, W), in metres.
-        frames: Scans on the way, (N, 2 or 1, H, W); the first and the last are the real ones' round trips.
-        weights: Of the frames, (N,).
+    The first and the last of the frames are the round trips of the real scans.
     """
     last = len(frames) - 1
     chosen = sorted({round(i) for i in np.linspace(0, last, MOST)})
@@ -106,7 +104,7 @@ def interpolation_figure(
         xyz, _ = image_to_points(image, rays)
         colour = REAL if place in (0, len(columns) - 1) else FOREGROUND
         for axes, (name, draw) in zip(panels[:, place], PANELS.items(), strict=False):
-            draw(axes, xyz if "view" in name or name == "perspective" else image, label=False)
+            draw(axes, xyz if name in ("perspective", "bird's-eye view") else image, label=False)
             if place == 0:
                 axes.set_ylabel(name, color=FOREGROUND, fontsize=8)
             if colour == REAL:

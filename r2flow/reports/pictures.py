@@ -26,13 +26,7 @@ RANGES = (2.0, 80.0)  # metres over which range is coloured, on a logarithmic sc
 
 
 def scan_figure(image: np.ndarray, rays: Tensor, title: str = "", labels: np.ndarray | None = None) -> Figure:
-    """One scan on a page.
-
-    Args:
-        image: Range in metres and reflectance, (2 or 1, H, W).
-        rays: Elevation and azimuth in radians, (2, H, W).
-        labels: Semantic id of every pixel, (H, W), drawn as a row of its own.
-    """
+    """One scan on a page; the semantic ids of its pixels, (H, W), are a row of their own."""
     figure = dark_figure(13, 8.6 if labels is None else 9.6)
     strips = len(image) + (labels is not None)
     grid = figure.add_gridspec(

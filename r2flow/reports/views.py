@@ -51,11 +51,7 @@ class View(NamedTuple):
 
 
 def scans_of(path: Path) -> list[Path]:
-    """The file itself, or the scans of a folder.
-
-    Raises:
-        InputError: nothing is there, or a folder without scans.
-    """
+    """The file itself, or the scans of a folder."""
     if not path.exists():
         raise InputError(f"{path} does not exist.")
     if not path.is_dir():

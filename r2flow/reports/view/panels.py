@@ -57,11 +57,7 @@ def scan_panels(views: Sequence[View]) -> list[Panel]:
 
 
 def in_turn(panels: Sequence[Panel], caption: str) -> tuple[Panel, list[str]]:
-    """Panels as one, each a frame, and what the slider says.
-
-    Raises:
-        InputError: they differ in size or rays, or some have reflectance or labels and some not.
-    """
+    """Panels as one, each a frame, and what the slider says."""
     captions, images, rays, labels = zip(*panels, strict=True)
     for name, image, ray, label in panels[1:]:
         alike = image.shape == images[0].shape and (label is None) == (labels[0] is None)
@@ -75,20 +71,20 @@ def in_turn(panels: Sequence[Panel], caption: str) -> tuple[Panel, list[str]]:
 def sample_panels(flow: Checkpoint, label: str, num: int, seed: int = 0, steps: Sequence[int] = ()) -> list[Panel]:
     """Scans 0 to num - 1 of a seed, a panel each; with `steps`, a panel for each number of steps, a scan each frame."""
     samplers = [flow.generator.choose(steps=count) for count in steps] or [flow.generator.sampler]
-    drawn = []
     evaluations = num * sum(one.evaluations(flow.generator) or 0 for one in samplers)
+    drawn = []
     with ScanBar("sampling", num * len(samplers), evaluations) as bar:
         for one in samplers:
             made = list(sample(flow, num, seed, sampler=one, progress=bar.evaluated))
             for batch in made:
                 warn_unsolved(batch.converged, batch.first)
             drawn.append(torch.cat([batch.images for batch in made]).nan_to_num(0.0).numpy())
-            bar.finished(num * len(drawn))
+            bar.set(num * len(drawn))
     rays = flow.sensor.rays()
-    if steps:
-        captions = [f"{label}, {count} step{'s' * (count > 1)}" for count in steps]
-        return [Panel(caption, images, rays) for caption, images in zip(captions, drawn, strict=True)]
-    return [Panel(f"{label}, sample {number}", image[None], rays) for number, image in enumerate(drawn[0])]
+    if not steps:
+        return [Panel(f"{label}, sample {number}", image[None], rays) for number, image in enumerate(drawn[0])]
+    captions = [f"{label}, {count} step{'s' * (count > 1)}" for count in steps]
+    return [Panel(caption, images, rays) for caption, images in zip(captions, drawn, strict=True)]
 
 
 def way_panels(
@@ -110,7 +106,7 @@ def way_panels(
         for t_0, t_1 in pairwise(at):
             x = solved.solve(x, t_0, t_1, sampler=share, progress=bar.evaluated).x
             decoded.append(flow.encoding.decode(x.cpu()))
-            bar.finished(len(decoded) - 1)
+            bar.set(len(decoded) - 1)
     images = torch.stack(decoded, 1).nan_to_num(0.0).numpy()
     panels = [Panel(f"{label}, sample {number}", image, flow.sensor.rays()) for number, image in enumerate(images)]
     return panels, [f"t = {t:.3g}" for t in at]
