@@ -54,7 +54,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     shown = list(drawn[cells[-1]][:4])
     for index, image in enumerate(shown):
         write_scan(image, rays, out, f"{index:06d}", ("ply", "npy"))
-    draw_pages(shown, rays, out)
+    draw_pages(shown, rays, out, f"{last}, seed 0")
     text = [
         f"{num} scans of each generator and number of steps, all from the same noise, against {len(real)} held-out "
         "scans. *Bend* is the integral of the paper's s(t) over the squared length of the path (median over scans, 0 "

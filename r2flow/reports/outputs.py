@@ -21,7 +21,7 @@ from r2flow.generators.base import Precision
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.region import Region
 from r2flow.lidar.scan_files import write_points
-from r2flow.model.checkpoint import Checkpoint, weights_hash
+from r2flow.model.checkpoint import FOLDER, Checkpoint, weights_hash
 from r2flow.model.sampling import batches, draw
 from r2flow.progress import Bar, track
 from r2flow.reports.view import most_images, write_page
@@ -108,7 +108,9 @@ def write_samples(
     if shown and channels == "reflectance":
         draw_reflectances(shown[:8], out)
     elif shown:
-        draw_pages(shown, rays, out)
+        path = checkpoint.path.resolve()
+        model = path.parents[1].name if path.parent.name == FOLDER else path.stem
+        draw_pages(shown, rays, out, f"{model}, seed {seed}")
 
 
 def warn_unsolved(converged: Tensor, first: int = 0) -> None:
@@ -179,8 +181,8 @@ def write_cloud(path: Path, image: np.ndarray, rays: Tensor, measured: np.ndarra
     write_points(path, xyz, reflectance if len(image) > 1 else None)
 
 
-def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path) -> None:
-    """A picture of each image, `samples.png` of the first 8, and `samples.html` of all that fit."""
+def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str) -> None:
+    """A picture of each image, `samples.png` of the first 8, and `samples.html` of all that fit, with a title."""
     from r2flow.reports.pictures import contact_sheet, save_figure, scan_figure
 
     for index, image in track(list(enumerate(images)), "drawing", "pages", least=3):
@@ -188,7 +190,7 @@ def draw_pages(images: Sequence[np.ndarray], rays: Tensor, out: Path) -> None:
     save_figure(contact_sheet(images[:8], rays), out / "samples.png")
     images = images[: most_images(rays.shape)]
     captions = [f"sample {number}" for number in range(len(images))]
-    write_page(out / "samples.html", images, rays, captions, title=out.name)
+    write_page(out / "samples.html", images, rays, captions, title=title)
 
 
 def draw_reflectances(images: Sequence[np.ndarray], out: Path) -> None:

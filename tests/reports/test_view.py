@@ -182,7 +182,8 @@ class TestTheVerb:
 
         assert r2flow("view", saved[0], "--num", 2, "--steps", "1,3", "--out", tmp_path / "a.html")[0] == 0
         data = Parsed((tmp_path / "a.html").read_text()).data
-        assert [one["caption"].rpartition(", ")[2] for one in data["scans"]] == ["1 step", "3 steps"]
+        names = [f"{saved[0]}, seed 0, {steps}" for steps in ("1 step", "3 steps")]
+        assert [one["caption"] for one in data["scans"]] == names
         expected = package.load(saved[0]).sample(2, steps=3)
         for frame in range(2):
             assert np.abs(unpacked(data, 1, frame)[0] - expected[frame, 0].numpy()).max() < 0.0021

@@ -80,7 +80,7 @@ def sample_panels(flow: Checkpoint, label: str, num: int, seed: int = 0, steps: 
                 warn_unsolved(batch.converged, batch.first)
             drawn.append(torch.cat([batch.images for batch in made]).nan_to_num(0.0).numpy())
             bar.set(num * len(drawn))
-    rays = flow.sensor.rays()
+    rays, label = flow.sensor.rays(), f"{label}, seed {seed}"
     if not steps:
         return [Panel(f"{label}, sample {number}", image[None], rays) for number, image in enumerate(drawn[0])]
     captions = [f"{label}, {count} step{'s' * (count > 1)}" for count in steps]
@@ -108,7 +108,8 @@ def way_panels(
             decoded.append(flow.encoding.decode(x.cpu()))
             bar.set(len(decoded) - 1)
     images = torch.stack(decoded, 1).nan_to_num(0.0).numpy()
-    panels = [Panel(f"{label}, sample {number}", image, flow.sensor.rays()) for number, image in enumerate(images)]
+    rays, label = flow.sensor.rays(), f"{label}, seed {seed}"
+    panels = [Panel(f"{label}, sample {number}", image, rays) for number, image in enumerate(images)]
     return panels, [f"t = {t:.3g}" for t in at]
 
 
