@@ -117,19 +117,18 @@ def _draw_row(figure: Figure, grid: Any, row: int, image: np.ndarray, rays: Tens
 
 def draw_range(axes: Any, image: np.ndarray, label: bool = True) -> None:
     """Range on a logarithmic colour scale, dropped rays black."""
-    _draw_channel(axes, image, np.log(np.maximum(image[0], 1e-3)), _ranges(), np.log(RANGES), "range" if label else "")
+    _draw_channel(axes, image, "range", np.log(np.maximum(image[0], 1e-3)), np.log(RANGES), label)
 
 
 def draw_reflectance(axes: Any, image: np.ndarray, label: bool = True) -> None:
     """Reflectance of [0, 1] from blue to yellow, its square root shown, dropped rays black."""
-    shown = np.sqrt(np.clip(image[1], 0, 1))
-    _draw_channel(axes, image, shown, _colours("cividis"), (0, 0.9), "reflectance" if label else "")
+    _draw_channel(axes, image, "reflectance", np.sqrt(np.clip(image[1], 0, 1)), (0, 0.9), label)
 
 
-def _draw_channel(axes: Any, image: np.ndarray, shown: np.ndarray, colours: Any, limits: Any, title: str) -> None:
+def _draw_channel(axes: Any, image: np.ndarray, what: str, shown: np.ndarray, limits: Any, label: bool) -> None:
     shown = np.ma.masked_where(image[0] <= 0, shown)
-    axes.imshow(shown, cmap=colours, vmin=limits[0], vmax=limits[1], aspect="auto", interpolation="nearest")
-    _strip(axes, title)
+    axes.imshow(shown, cmap=colours(what), vmin=limits[0], vmax=limits[1], aspect="auto", interpolation="nearest")
+    _strip(axes, what if label else "")
 
 
 def draw_labels(axes: Any, image: np.ndarray, labels: np.ndarray) -> None:
@@ -225,20 +224,13 @@ def dark_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), facecolor=BACKGROUND)
 
 
-def colour_table(what: str) -> np.ndarray:
-    """The 256 colours of range, height or reflectance from their low to their high end, (256, 4) uint8."""
-    colours = _ranges() if what == "range" else _colours({"height": "turbo", "reflectance": "cividis"}[what])
-    return np.asarray(colours(np.arange(256), bytes=True))
-
-
-def _colours(name: str) -> Any:
-    return colormaps[name].with_extremes(bad="black")
-
-
 @cache
-def _ranges() -> Any:
-    """turbo from warm (near) to cold (far), without its dark ends, which would look like dropped rays."""
-    return ListedColormap(_colours("turbo_r")(np.linspace(0.1, 0.93, 256))).with_extremes(bad="black")
+def colours(what: str) -> Any:
+    """Of range, height or reflectance from their low to their high end; black where there is none."""
+    scale = colormaps[{"range": "turbo_r", "height": "turbo", "reflectance": "cividis"}[what]]
+    if what == "range":  # warm (near) to cold (far), without the dark ends, which would look like dropped rays
+        scale = ListedColormap(scale(np.linspace(0.1, 0.93, 256)))
+    return scale.with_extremes(bad="black")
 
 
 def _strip(axes: Any, title: str) -> None:

@@ -1,4 +1,5 @@
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -40,10 +41,15 @@ def test_extreme_scans_are_drawn_too():
     figure_pixels(interpolation_figure(empty, empty, [0.0, 1.0], SENSOR.rays(), ["a", "b"]), dpi=40)
 
 
-def test_a_page_says_what_was_measured(tmp_path):
-    paths = [tmp_path / "one.npy", tmp_path / "two.npy"]
-    for path, image in zip(paths, scans(2).numpy(), strict=True):
-        np.save(path, image)
+@pytest.fixture
+def paths(tmp_path) -> list[Path]:
+    """Two range images."""
+    for name, image in zip(("one", "two"), scans(2).numpy(), strict=True):
+        np.save(tmp_path / f"{name}.npy", image)
+    return [tmp_path / "one.npy", tmp_path / "two.npy"]
+
+
+def test_a_page_says_what_was_measured(tmp_path, paths):
     sampler = build_sampler("dopri5", tolerance=1e-4)
     page = interpolation(flow(), real_scans(flow(), paths), 3, tmp_path / "o", sampler)
     assert [row["frame"] for row in page.rows] == [0, 1, 2]
@@ -64,10 +70,7 @@ class LostBetween(GaussianFlow):
         return v if self.evaluations <= 2 * 16 else torch.full_like(v, math.nan)
 
 
-def test_a_frame_that_is_not_solved_is_reported(tmp_path, caplog):
-    paths = [tmp_path / "one.npy", tmp_path / "two.npy"]
-    for path, image in zip(paths, scans(2).numpy(), strict=True):
-        np.save(path, image)
+def test_a_frame_that_is_not_solved_is_reported(tmp_path, paths, caplog):
     checkpoint = flow(LostBetween())
     page = interpolation(checkpoint, real_scans(checkpoint, paths), 4, tmp_path / "o", build_sampler("rk4", steps=4))
     assert [row["converged"] for row in page.rows] == [True, False, False, True]
@@ -75,7 +78,7 @@ def test_a_frame_that_is_not_solved_is_reported(tmp_path, caplog):
     assert "| no |" in page.text[2]
 
 
-def test_an_end_without_its_noise_is_refused(tmp_path):
+def test_an_end_without_its_noise_is_refused():
     bad = scans(2)
     bad[1, 0, 0, 0] = math.nan
     with pytest.raises(InputError, match="the last scan cannot be carried to its noise"):

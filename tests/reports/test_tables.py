@@ -35,11 +35,6 @@ def test_in_the_terminal_numbers_stand_to_the_right_and_nothing_is_cut(capsys, m
     assert lines[0].index("[1, 2]") == lines[1].index("-")
 
 
-def test_without_headings_there_is_no_line_of_them(capsys):
-    print_table([("step", 7)], ("", ""))
-    assert capsys.readouterr().out.split() == ["step", "7"]
-
-
 def test_a_long_value_cuts_no_key_and_pads_no_line(capsys):
     print_table([["a.key.of.some.length", "x" * 3000], ["another", 1]], ("", ""))
     assert capsys.readouterr().out.splitlines() == [f"a.key.of.some.length  {'x' * 3000}", "another               1"]

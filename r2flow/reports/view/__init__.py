@@ -23,11 +23,12 @@ from torch import Tensor
 
 from r2flow.errors import InputError, printable
 from r2flow.files import atomic_write
-from r2flow.reports.pictures import HEIGHTS, RANGES, class_colours, colour_table
+from r2flow.reports.pictures import HEIGHTS, RANGES, class_colours, colours
 
 MOST = 256 * 64 * 1024  # pixels of a page, all images together: about 33 MB
 STEP = 0.004  # metres of a range code: uint16 reaches 262 m, and a range is off by 2 mm at most
 CODES = 2**16
+SCALES = ("range", "height", "reflectance")  # as `view.js` numbers them
 
 Images = np.ndarray | Tensor
 Rays = np.ndarray | Tensor
@@ -90,7 +91,7 @@ def page(
         "metres": step,
         "ranges": RANGES,
         "heights": HEIGHTS,
-        "colours": _text(np.concatenate([colour_table(name) for name in ("range", "height", "reflectance")]).tobytes()),
+        "colours": _text(b"".join(colours(name)(np.arange(256), bytes=True).tobytes() for name in SCALES)),
         "classes": [("no class", "#808080"), *classes.values()],
         "legend": list(dict(classes.values()).items()),
         "shown": {"reflectance": any(s["reflectance"] for s in scans), "label": any(s["labels"] for s in scans)},
