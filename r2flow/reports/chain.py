@@ -73,6 +73,7 @@ def report(runs: Mapping[str, Path], out: str | Path, num: int = 16, device: str
     print(
         f"""
 pictures      {out / "chain.png"} (every generator, few and many steps), {out / "samples.png"} ({last})
+in 3-D        {out / "samples.html"}, in a browser
 point clouds  {out / "000000.ply"} ...
 table         {written}
 flows         {", ".join(map(str, runs.values()))}
