@@ -52,11 +52,10 @@ class FlowDataset(Dataset[Item]):
         draw = noise.generator(self.seed, self.purpose, k)
         x_0 = torch.from_numpy(draw.standard_normal(self.noise_shape, dtype=np.float32))
         u = torch.tensor(draw.random(dtype=np.float32))
+        image = self.source[index]
         if self.augment:
-            image = self.augment(self.source[index], self.seed, k)
-            x_1 = self.encoding.encode(torch.from_numpy(image))
-        else:
-            x_1 = self.source.encoded(index, self.encoding)
+            image = self.augment(image, self.seed, k)
+        x_1 = self.encoding.encode(torch.from_numpy(image))
         item = {"x_1": x_1, "x_0": x_0, "u": u, "k": torch.tensor(k)}
         if self.further is None:
             return item

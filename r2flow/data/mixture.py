@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from torch import Tensor
 
 from r2flow import noise
 from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
-from r2flow.lidar.encoding import Encoding
 
 
 class Mixture(ScanSource):
@@ -43,10 +41,6 @@ class Mixture(ScanSource):
     def with_points(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         part, number = self.locate(index)
         return self.parts[part].with_points(number)
-
-    def encoded(self, index: int, encoding: Encoding) -> Tensor:
-        part, number = self.locate(index)
-        return self.parts[part].encoded(number, encoding)
 
     def subset(self, indices: Sequence[int]) -> "Mixture":
         """Some of the scans, named in ascending order, as a mixture of the same parts."""

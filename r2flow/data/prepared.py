@@ -2,7 +2,6 @@
 
     source = open_scans("prepared/kitti_360").source
     source[0]                       range in metres and reflectance, (2, H, W)
-    source.encoded(0, encoding)     the same in model space
 
 A shard is an item of `r2flow.store`: `range` uint16 (n, H, W) and, where the scans have any, `reflectance` uint8
 (n, H, W), in the codes of `r2flow.data.quantise`.
@@ -19,16 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from safetensors import safe_open
-from torch import Tensor
 
 from r2flow.data.layouts import Drive
 from r2flow.data.quantise import OTHER_LEVELS, RangeCodes, ReflectanceCodes, find_levels
 from r2flow.data.reading import Reading, lacks_reflectance, range_image, stored_reflectance
 from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
 from r2flow.errors import InputError
-from r2flow.lidar.encoding import Encoding
 from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, difference, read_manifest
 
 log = logging.getLogger(__name__)
@@ -242,8 +238,6 @@ class PreparedScans(ScanSource):
             place = {int(number): row for row, number in enumerate(self.rows[:, 0])}
             self.rows = self.rows[[place[number] for number in numbers if number in place]]
         self._values = [codes.values for codes in codes_of(self.recipe)[: 1 + reflectance]]
-        self._encoding: Encoding | None = None
-        self._model: list[np.ndarray] = []
         self._shards: dict[int, list[Any]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -293,24 +287,6 @@ class PreparedScans(ScanSource):
         return {os.path.join(real, name) for name in self.names}
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return self._looked_up(index, self._values)
-
-    def encoded(self, index: int, encoding: Encoding) -> Tensor:
-        """`encoding.encode` of a scan, bit for bit, (C, H, W), where `encoding` is of this source's sensor.
-
-        Where a channel depends on its own code alone there are no more values than codes: encoded once, then looked up.
-        """
-        if encoding.format.channels != 1 or encoding.reflectance != self.reflectance:
-            return super().encoded(index, encoding)
-        if self._encoding is not encoding:
-            # The tables of codes, encoded as an image that shows every code.
-            ranges, *values = self._values
-            image = np.stack([ranges.reshape(256, 256), *(np.tile(table, (256, 1)) for table in values)])
-            first, *others = encoding.encode(torch.from_numpy(image)).numpy()
-            self._encoding, self._model = encoding, [first.ravel().copy(), *(one[0].copy() for one in others)]
-        return torch.from_numpy(self._looked_up(index, self._model))
-
-    def _looked_up(self, index: int, tables: Sequence[np.ndarray]) -> np.ndarray:
         _, shard, row = map(int, self.rows[index])
         try:
             if shard not in self._shards:
@@ -320,11 +296,8 @@ class PreparedScans(ScanSource):
         except (Damaged, OSError) as error:
             raise self._damaged(shard, error) from None
         codes = [image[row : row + 1][0] for image in self._shards[shard]]
-        image = np.empty((len(tables), *codes[0].shape), dtype=np.float32)
-        for channel, (table, code) in enumerate(zip(tables, codes, strict=True)):
-            # No index is out of bounds, and "clip" spares the check: a code has as many values as its table.
-            np.take(table, code, out=image[channel], mode="clip")
-        return image
+        # No index is out of bounds; "clip" only skips the check.
+        return np.stack([np.take(values, code, mode="clip") for values, code in zip(self._values, codes, strict=True)])
 
     def _damaged(self, shard: int, error: Exception) -> InputError:
         path = self.store.files(shard)[0]

@@ -20,7 +20,6 @@ from torch import Tensor
 from r2flow.data.reading import Reading, range_image, read_image, read_points_image
 from r2flow.errors import InputError
 from r2flow.lidar.beams import other_sensor
-from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import Sensor
 from r2flow.store import MANIFEST
@@ -77,10 +76,6 @@ class ScanSource(ABC):
             InputError: the points are not known.
         """
         raise InputError(f"{self.names[index]} holds ranges alone, not the measured coordinates of its points.")
-
-    def encoded(self, index: int, encoding: Encoding) -> Tensor:
-        """A scan in model space, (C, H, W)."""
-        return encoding.encode(torch.from_numpy(self[index]))
 
     def about(self) -> dict[str, Any]:
         """What a reader of a figure must know of the scans, as plain values; no path is among them."""

@@ -24,7 +24,7 @@ from r2flow.data.quantise import RangeCodes, ReflectanceCodes, find_levels
 from r2flow.data.reading import Reading
 from r2flow.data.sources import ScanFiles
 from r2flow.errors import InputError
-from r2flow.lidar.encoding import FORMATS, Encoding
+from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.store import MANIFEST, read_manifest
@@ -210,45 +210,6 @@ def test_training_from_shards_is_training_from_the_files(clouds: Path, tmp_path:
                 assert torch.equal(item[key], same[key])
             # Model space is steepest at 1.45 m: 2 / (ln 81 (1 + 1.45)) = 0.186 a metre.
             assert (item["x_1"] - same["x_1"]).abs().max() <= 0.186 * MILLIMETRE
-
-
-class Images:
-    """Images as a source."""
-
-    def __init__(self, images: np.ndarray) -> None:
-        self.images = images
-        self.names = [f"{i}" for i in range(len(images))]
-
-    def __len__(self) -> int:
-        return len(self.images)
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        return self.images[index]
-
-    def subset(self, indices):
-        return Images(self.images[list(indices)])
-
-
-@pytest.mark.parametrize("format", list(FORMATS))
-@pytest.mark.parametrize("reflectance", [True, False])
-def test_encoded_is_the_encoding_of_the_decoded_bit_for_bit_in_every_code(
-    tmp_path: Path, format: str, reflectance: bool
-):
-    sensor = SENSORS["hdl64e"]
-    metres = RangeCodes(sensor.min_range, sensor.max_range).values.reshape(64, 1024)
-    values = np.random.default_rng(0).permutation(np.arange(65536) % 101).reshape(64, 1024) / np.float32(100)
-    image = np.stack([metres, np.where(metres > 0, values, 0).astype(np.float32)])
-    recipe = {"layout": "folder", "scans": 1, "levels": 100, "shard_scans": 1}
-    recipe["reading"] = Reading(sensor, reflectance=True).described()
-    make(tmp_path, Plan(recipe, (Drive("", ("a",)),), Images(image[None])))
-    source = prepared_in(tmp_path, sensor, reflectance=reflectance)
-    assert np.array_equal(source[0], image[: 1 + reflectance])
-    encoding = Encoding(sensor, format, reflectance)
-    expected = encoding.encode(torch.from_numpy(image[: 1 + reflectance]))
-    for _ in range(2):
-        assert torch.equal(source.encoded(0, encoding), expected)
-    other = Encoding(sensor, "metric", reflectance)  # another encoding after the first has its own table
-    assert torch.equal(source.encoded(0, other), other.encode(torch.from_numpy(image[: 1 + reflectance])))
 
 
 # What is stored
