@@ -21,7 +21,6 @@ class ReflowPairs(L.Callback):
         data = trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, ScanDataModule) or data.pairs is None or self.of is None:
             return
-        store, num = data.pair_store, data.pairs.num
-        device, flow = trainer.strategy.root_device, load_checkpoint(self.of)
+        store, device, flow = data.pair_store, trainer.strategy.root_device, load_checkpoint(self.of)
         # Locks of files, not a barrier: a collective call gives up after half an hour, and a slow rank may take longer.
-        make_and_tell(store, flow, num, trainer.global_rank, trainer.world_size, device, wait=True)
+        make_and_tell(store, flow, trainer.global_rank, trainer.world_size, device)

@@ -13,7 +13,9 @@ Every file is written under a temporary name and renamed when it is whole, so th
 import hashlib
 import json
 import logging
+import math
 import multiprocessing
+import re
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -38,6 +40,7 @@ log = logging.getLogger(__name__)
 MANIFEST = "manifest.json"
 STALE = 3600  # seconds after which a temporary file has no writer any more
 PATIENCE = 0.2  # seconds between two looks at what other processes make
+QUIET = 20.0  # seconds of waiting after which a line says for whom
 
 Advance = Callable[[int], None]  # called with the number of each item that is done
 
@@ -181,13 +184,16 @@ class Store:
                 path.unlink(missing_ok=True)
             advance(item)
 
+    def _lock(self, item: int) -> Path:
+        return self.folder / f".{self.kind}-{item:06d}.lock"
+
     @contextmanager
     def claim(self, item: int) -> Iterator[bool]:
         """Hold an item's lock, which ends with this process; False where another process holds it.
 
         The lock saves work and decides nothing: what two processes write for one item are the same bytes.
         """
-        path = self.folder / f".{self.kind}-{item:06d}.lock"
+        path = self._lock(item)
         lock = FileLock(path, timeout=0)
         make_folder(self.folder)
         with suppress(Timeout):
@@ -200,15 +206,21 @@ class Store:
             lock.release()
 
     def make(
-        self, items: Iterable[int], work: Callable[[int], None], workers: int = 1, advance: Advance = lambda item: None
+        self,
+        items: Iterable[int],
+        work: Callable[[int], None],
+        workers: int = 1,
+        advance: Advance = lambda item: None,
+        wait: bool = True,
     ) -> None:
         """Make items, and wait for those that other commands make at the same time.
 
         Args:
             work: Makes an item and writes it, in any process: it can be pickled.
             workers: Number of processes; 1 makes the items in this one.
+            wait: Whether to wait; else those that other commands are making are left to them.
         """
-        left = list(items)
+        left, since = list(items), time.monotonic()
         while left:
             waiting = []
             for item, done in self._attempts(left, work, workers):
@@ -216,8 +228,15 @@ class Store:
                     advance(item)
                 else:
                     waiting.append(item)
-            if len(waiting) == len(left):
+            if not wait:
+                return
+            if len(waiting) < len(left):
+                since = time.monotonic()
+            else:
                 time.sleep(PATIENCE)
+            if waiting and time.monotonic() - since > QUIET:
+                lock, since = self._lock(waiting[0]), math.inf  # said once
+                log.warning("%s: waiting for %s, which makes it", self.files(waiting[0])[0], _holder(lock))
             left = waiting
 
     def _attempts(self, items: list[int], work: Callable[[int], None], workers: int) -> Iterator[tuple[int, bool]]:
@@ -277,6 +296,15 @@ def _begin_worker(store: Store, work: Callable[[int], None]) -> None:
 def _attempt(item: int) -> bool:
     store, work = _job
     return store.attempt(item, work)
+
+
+def _holder(lock: Path) -> str:
+    """Who holds a lock, by its number where Linux tells."""
+    with suppress(OSError):
+        locks, inode = Path("/proc/locks").read_text(), lock.stat().st_ino
+        if found := re.search(rf" (\d+) \S+:{inode} ", locks):
+            return f"process {found[1]}"
+    return f"the process that holds {lock}"
 
 
 def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:

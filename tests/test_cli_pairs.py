@@ -29,7 +29,7 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):  # noqa: F811
     flow = load_checkpoint(path)
     options = {"sampler": {"name": "euler", "steps": 2}, "num": 10, "batch_size": 4}
     recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(flow.encoding.shape)
-    assert len(PairSource(PairStore(folder, recipe), 10)) == 10
+    assert len(PairSource(PairStore(folder, recipe, 10))) == 10
     code, said, _ = r2flow("pairs", path, *QUICK)
     assert code == 0
     assert "pairs/s" not in said  # nothing was left to make

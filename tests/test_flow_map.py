@@ -231,9 +231,9 @@ def test_on_pairs_alone_the_path_is_the_straight_line_between_them():
 def test_the_knots_of_pairs_on_disk_are_the_path_of_the_flow_that_drew_them(tmp_path: Path):
     """dx/dt = x: x_t = e^t x_0, and the mean velocity (e^s - e^t) / (s - t) x_0."""
     options = PairOptions(sampler={"name": "adams3", "steps": 64}, num=6, knots=7, batch_size=2, parent="a")
-    store = PairStore(tmp_path, options.recipe((2, 4, 8)))
-    make_pairs(store, Field(lambda t, x: x, (2, 4, 8)), 6)
-    dataset = PairDataset(PairSource(store, 6), 0, "training")
+    store = PairStore(tmp_path, options.recipe((2, 4, 8)), 6)
+    make_pairs(store, Field(lambda t, x: x, (2, 4, 8)))
+    dataset = PairDataset(PairSource(store), 0, "training")
     batch = torch.utils.data.default_collate([dataset[k, k] for k in range(6)])
     assert batch["knots"].shape == (6, 7, 2, 4, 8)
     t = torch.tensor([0.0, 0.11, 0.4, 0.63, 0.9, 1.0])
@@ -249,11 +249,11 @@ def test_renoised_pairs_are_one_jump_and_what_the_map_makes_of_it_later(exact, t
     options = PairOptions(
         sampler={"name": "renoise", "steps": 2, "grid": "power:5"}, num=6, batch_size=2, seed=3, parent="a"
     )
-    store = PairStore(tmp_path, options.recipe(exact.space.shape))
-    make_pairs(store, exact, 6)
+    store = PairStore(tmp_path, options.recipe(exact.space.shape), 6)
+    make_pairs(store, exact)
     mean, std = exact.problem.mean, exact.problem.std
     late = 1 - 0.5**5  # where the second of two steps on power:5 begins
-    for index, (x_0, x_1) in enumerate(PairSource(store, 6)[k] for k in range(6)):
+    for index, (x_0, x_1) in enumerate(PairSource(store)[k] for k in range(6)):
         assert torch.equal(x_0, standard_normal(exact.noise_shape, 3, "pairs", index))
         guess = mean + std * x_0
         fresh = standard_normal(exact.noise_shape, 3, "pairs", index, 1)
@@ -262,7 +262,7 @@ def test_renoised_pairs_are_one_jump_and_what_the_map_makes_of_it_later(exact, t
         torch.testing.assert_close(x_1, expected, rtol=2**-11, atol=2e-5)
     other = PairOptions(num=6, sampler={"name": "sde"}, parent="a").recipe(exact.space.shape)
     with pytest.raises(InputError, match="sde"):
-        make_pairs(PairStore(tmp_path / "other", other), exact, 6)
+        make_pairs(PairStore(tmp_path / "other", other, 6), exact)
 
 
 @pytest.mark.parametrize("method", ["chord", "renoise"])
@@ -353,7 +353,7 @@ def test_a_batch_of_pairs_with_scans_beside_is_a_function_of_its_number(tmp_path
         pairs={"sampler": {"name": "adams3", "steps": 1}, "num": 10, "batch_size": 2, "parent": "a"},
         **keys,
     )
-    make_pairs(data.pair_store, Field(lambda t, x: x, flow.noise_shape), 10)
+    make_pairs(data.pair_store, Field(lambda t, x: x, flow.noise_shape))
     data.setup()
     data._ready()
     assert data.fingerprint().startswith("10 pairs, ")

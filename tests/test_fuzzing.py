@@ -15,7 +15,7 @@ import pytest
 import torch
 import yaml
 
-from r2flow.data.pairs import Block, PairRecipe, PairStore
+from r2flow.data.pairs import PairRecipe, PairStore
 from r2flow.data.reading import Reading
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensor_files import write_sensor
@@ -81,13 +81,10 @@ def write_stores(folder: Path, beside: Path) -> None:
     prepare_folder(scans, beside / "prepared", SENSOR)
     keep(folder, "prepared", *(beside / "prepared").iterdir())
     recipe = PairRecipe("0" * 16, (2, 8, 64), 0, 0, "euler", 1, 1e-5, 2, 2)
-    store = PairStore(beside / "pairs", recipe)
+    store = PairStore(beside / "pairs", recipe, 4)
     store.begin()
-    blocks = []
-    for _ in range(2):
-        x_1 = DRAW.standard_normal((2, 2, 8, 64)).astype(np.float16)
-        blocks.append(Block(x_1, np.ones(2, np.int32), np.ones(2, bool)))
-    store.append(0, blocks)
+    x_1 = DRAW.standard_normal((4, 2, 8, 64)).astype(np.float16)
+    store.write(0, {"x_1": x_1, "evaluations": np.ones(4, np.int32)}, {"usable": [1] * 4})
     keep(folder, "pairs", *(file for file in (beside / "pairs").iterdir() if file.is_file()))
     write_points(beside / "scan.bin", XYZ, REFLECTANCE)
     (folder / "labels").mkdir()

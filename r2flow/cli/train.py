@@ -68,12 +68,11 @@ def pairs(
     recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(
         flow.encoding.shape, flow.generator.noise_shape
     )
-    store = PairStore(out or default_folder(flow.path), recipe)
-    make_and_tell(store, flow, num, rank, ranks, where)
-    lacking = store.missing_pairs(num)
-    if lacking:
+    store = PairStore(out or default_folder(flow.path), recipe, num)
+    make_and_tell(store, flow, rank, ranks, where, wait=False)
+    if lacking := store.missing_pairs():
         print(f"{store.folder}: other processes have still to make about {lacking} of {num} pairs")
     else:
-        shards = store.shards(num)
+        shards = store.shards
         size = sum(store.files(shard)[0].stat().st_size for shard in shards)
         print(f"{store.folder}: all {num} pairs, {len(shards)} shard{'s' * (len(shards) != 1)}, {size / 2**20:.0f} MiB")

@@ -82,7 +82,8 @@ class ScanDataModule(L.LightningDataModule):
     def pair_store(self) -> PairStore:
         """The folder of the run's pairs, whatever it holds yet."""
         assert self.pairs is not None
-        return PairStore(self.options.folder, self.pairs.recipe(self.encoding.shape, self.noise_shape))
+        recipe = self.pairs.recipe(self.encoding.shape, self.noise_shape)
+        return PairStore(self.options.folder, recipe, self.pairs.num)
 
     def setup(self, stage: str | None = None) -> None:
         if self.training_source is not None or self.scans is not None:
@@ -203,7 +204,7 @@ class ScanDataModule(L.LightningDataModule):
         """Open what is there by now: pairs are made after `setup`."""
         self.setup()
         if self.pairs is not None and self.training_source is None:
-            pairs = PairSource(self.pair_store, self.pairs.num)
+            pairs = PairSource(self.pair_store)
             first, last = holdout_block(len(pairs), self.validation.share)
             self.training_source = pairs.subset(first)
             self.validation_source = pairs.subset([last[i] for i in spread(len(last), self.validation.scans)])

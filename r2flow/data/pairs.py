@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from r2flow.generators import Generated, Generator, as_flow
 from r2flow.generators.base import Precision, autocast
 from r2flow.models import name_of
 from r2flow.samplers import build_sampler
-from r2flow.store import PATIENCE, Damaged, Store
+from r2flow.store import Store
 
 ELSEWHERE = "data.root=FOLDER (r2flow pairs --out FOLDER)"  # how another folder is given
 
@@ -42,79 +42,31 @@ class PairRecipe:
     precision: Precision = "32-true"  # of the network
 
 
-NO_KNOTS = np.empty(0, np.float16)
-
-
-class Block(NamedTuple):
-    """Consecutive pairs.
-
-    Attributes:
-        x_1: (n, C, H, W) float16.
-        evaluations: (n,) int32.
-        usable: (n,) bool.
-        knots: Inner states of each path, (n, K, C, H, W) float16, at `r2flow.samplers.Sampler.knot_times`, or None.
-    """
-
-    x_1: np.ndarray
-    evaluations: np.ndarray
-    usable: np.ndarray
-    knots: np.ndarray = NO_KNOTS
-
-    def with_knots(self, knots: Tensor | None) -> "Block":
-        """With inner states, (n, K, C, H, W); a path with one that half precision cannot hold is not usable."""
-        assert knots is not None
-        kept = knots.to(torch.float16).cpu()
-        return self._replace(knots=kept.numpy(), usable=self.usable & kept.isfinite().flatten(1).all(1).numpy())
-
-
 class PairStore(Store):
     """A folder of pairs: shard s holds the batches [s S, (s + 1) S), batch b the indices first + [b B, (b + 1) B).
 
-    The last shard is as long as the pairs that were asked for need, and grows when more are asked for.
-
-    Raises:
-        InputError: the folder holds other pairs, or a damaged manifest.
+    The last shard is as long as the first `num` pairs need, and is made again when more are asked for.
     """
 
-    def __init__(self, folder: str | Path, recipe: PairRecipe) -> None:
+    def __init__(self, folder: str | Path, recipe: PairRecipe, num: int) -> None:
+        self.recipe, self.num = recipe, num
         super().__init__(folder, "pairs", asdict(recipe), ELSEWHERE)
-        self.recipe = recipe
         self.check()
+        self.shards = range(-(-num // (recipe.shard_batches * recipe.batch_size)))
 
-    def shards(self, num: int) -> range:
-        return range(-(-num // (self.recipe.batch_size * self.recipe.shard_batches)))
-
-    def batches_of(self, shard: int, num: int) -> range:
+    def batches_of(self, shard: int) -> range:
         """The batches of a shard that the first `num` pairs need."""
-        size, needed = self.recipe.shard_batches, -(-num // self.recipe.batch_size)
-        return range(shard * size, min((shard + 1) * size, needed))
+        size = self.recipe.shard_batches
+        return range(shard * size, min((shard + 1) * size, -(-self.num // self.recipe.batch_size)))
 
-    def usable(self, shard: int) -> list[int]:
-        """Whether each pair of a shard can be used; empty where the shard is missing or damaged."""
-        try:
-            usable: list[int] = self.head(shard)["usable"]
-        except (FileNotFoundError, Damaged):
-            return []
-        return usable
+    def has(self, item: int) -> bool:
+        """Whether a shard is there and as long as the first `num` pairs need."""
+        pairs = len(self.batches_of(item)) * self.recipe.batch_size
+        return super().has(item) and len(self.head(item)["usable"]) >= pairs
 
-    def lacking(self, shard: int, num: int) -> range:
-        """The batches that a shard lacks of those that the first `num` pairs need."""
-        return self.batches_of(shard, num)[len(self.usable(shard)) // self.recipe.batch_size :]
-
-    def missing_pairs(self, num: int) -> int:
-        return sum(len(self.lacking(shard, num)) for shard in self.shards(num)) * self.recipe.batch_size
-
-    def append(self, shard: int, blocks: list[Block]) -> None:
-        """Write a shard: the pairs that it holds already, and these."""
-        if self.has(shard):
-            tensors, notes = self.read(shard)
-            usable = np.array(notes["usable"], bool)
-            blocks = [Block(tensors["x_1"], tensors["evaluations"], usable, tensors.get("knots", NO_KNOTS)), *blocks]
-        whole = Block(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
-        tensors = {"evaluations": whole.evaluations, "x_1": whole.x_1}
-        if self.recipe.knots:
-            tensors["knots"] = whole.knots
-        self.write(shard, tensors, {"usable": [int(one) for one in whole.usable]})
+    def missing_pairs(self) -> int:
+        """How many pairs are in the shards that have yet to be made."""
+        return sum(len(self.batches_of(shard)) for shard in self.missing(self.shards)) * self.recipe.batch_size
 
 
 def pair_noise(recipe: PairRecipe, index: int) -> Tensor:
@@ -135,13 +87,12 @@ class Made:
 def make_pairs(
     store: PairStore,
     generator: Generator,
-    num: int,
     rank: int = 0,
     ranks: int = 1,
     progress: Callable[[Made], None] = lambda made: None,
-    wait: bool = False,
+    wait: bool = True,
 ) -> Made:
-    """Make those of the first `num` pairs that are missing or damaged, and that no other process is making.
+    """Make those of the store's pairs that are missing or damaged, and that no other process is making.
 
     x_1 is where the generator carries x_0 = `pair_noise`, neither clamped nor snapped, in half precision. By `chord` or
     `renoise` of a flow map it is where its first jump goes, as its later jumps correct it; fresh noise is a function of
@@ -152,8 +103,7 @@ def make_pairs(
         wait: Whether to wait for the shards that other processes are making.
 
     Raises:
-        InputError: no pair is usable: the flow is broken, or the tolerance out of its reach; or the folder cannot be
-            written, or holds other pairs.
+        InputError: no pair is usable: the flow is broken, or the tolerance out of its reach.
     """
     if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
         raise InputError(f"these pairs are of another noise than the generator's {generator.noise_shape}.")
@@ -166,97 +116,75 @@ def make_pairs(
             f"this generator was distilled for {generator.sampler} and draws no pairs by {sampler}: give the same "
             "data.pairs.sampler, or pairs of the flow that it comes from."
         )
+    made, start = Made(), time.monotonic()
+
+    def make_shard(shard: int) -> None:
+        store.mend([shard])
+        batches = []
+        for batch in store.batches_of(shard):
+            batches.append(solve_batch(store.recipe, generator, batch))
+            made.pairs += store.recipe.batch_size
+            made.evaluations += int(batches[-1]["evaluations"].sum())
+            made.unusable += int((~batches[-1]["usable"]).sum())
+            made.seconds = time.monotonic() - start
+            progress(made)
+            if made.unusable == made.pairs and (made.pairs > 64 or batch == store.batches_of(shard)[-1]):
+                raise InputError(
+                    f"none of {made.pairs} pairs came to an end with sampler {sampler.name}: the flow is broken, or "
+                    "the tolerance out of its reach."
+                )
+        tensors = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
+        usable = tensors.pop("usable").astype(int).tolist()
+        store.write(shard, tensors, {"usable": usable})
+
     store.begin()
-    shards, made, start = store.shards(num), Made(), time.monotonic()
-    store.mend(shards[rank::ranks])
-    left = sorted(shards, key=lambda shard: ((shard - rank) % ranks, shard))
-    while left := [shard for shard in left if store.lacking(shard, num)]:
-        before = made.pairs
-        for shard in left:
-            with store.claim(shard) as mine:
-                if mine:
-                    _make_shard(store, generator, shard, num, made, start, progress)
-        if not wait:
-            break
-        if made.pairs == before:
-            time.sleep(PATIENCE)
-    made.seconds = time.monotonic() - start
+    store.mend(store.shards[rank::ranks])
+    in_turn = sorted(store.missing(store.shards), key=lambda shard: ((shard - rank) % ranks, shard))
+    store.make(in_turn, make_shard, wait=wait)
     return made
 
 
-def _make_shard(
-    store: PairStore,
-    generator: Generator,
-    shard: int,
-    num: int,
-    made: Made,
-    start: float,
-    progress: Callable[[Made], None],
-) -> None:
-    store.mend([shard])
-    blocks = []
-    for batch in store.lacking(shard, num):
-        block = solve_batch(store.recipe, generator, batch)
-        made.pairs += len(block.usable)
-        made.evaluations += int(block.evaluations.sum())
-        made.unusable += int((~block.usable).sum())
-        if made.unusable == made.pairs > 64:
-            break
-        blocks.append(block)
-        made.seconds = time.monotonic() - start
-        progress(made)
-    if made.pairs and made.unusable == made.pairs:
-        raise InputError(
-            f"none of {made.pairs} pairs came to an end with sampler {store.recipe.sampler['name']}: the flow is "
-            "broken, or the tolerance out of its reach."
-        )
-    if blocks:
-        store.append(shard, blocks)
+def solve_batch(recipe: PairRecipe, generator: Generator, batch: int) -> dict[str, np.ndarray]:
+    """The pairs first + [b B, (b + 1) B) of batch b: x_1, evaluations, usable and, with knots, the inner states.
 
-
-def solve_batch(recipe: PairRecipe, generator: Generator, batch: int) -> Block:
-    """The pairs first + [b B, (b + 1) B) of batch b."""
-    first = recipe.first + batch * recipe.batch_size
-    x_0 = torch.stack([pair_noise(recipe, index) for index in range(first, first + recipe.batch_size)])
-    x_0 = x_0.to(generator.device)
+    States are float16, (B, C, H, W) and (B, K, C, H, W); a pair with one that half precision cannot hold is not usable.
+    """
+    indices = range(recipe.first + batch * recipe.batch_size, recipe.first + (batch + 1) * recipe.batch_size)
+    x_0 = torch.stack([pair_noise(recipe, index) for index in indices]).to(generator.device)
+    sampler, states = build_sampler(recipe.sampler), {}
     end: Generated | Solution
-    how = build_sampler(recipe.sampler)
     if recipe.knots:
         with autocast(generator.device, recipe.precision):
-            end = as_flow(generator, "data.pairs.knots").solve(x_0, sampler=how, knots=recipe.knots)
+            end = as_flow(generator, "data.pairs.knots").solve(x_0, sampler=sampler, knots=recipe.knots)
+        assert end.knots is not None
+        states["knots"] = end.knots
     else:
-        fresh = noise.Draws(recipe.seed, range(first, first + recipe.batch_size), "pairs")
-        end = generator(x_0, sampler=how, draws=fresh if how.draws else None, precision=recipe.precision)
-    x_1, usable = end.x.to(torch.float16).cpu(), end.converged.cpu()
-    usable = usable & x_1.isfinite().flatten(1).all(1)
-    block = Block(x_1.numpy(), end.evaluations.cpu().numpy().astype(np.int32), usable.numpy())
-    return block if not isinstance(end, Solution) else block.with_knots(end.knots)
+        fresh = noise.Draws(recipe.seed, indices, "pairs") if sampler.draws else None
+        end = generator(x_0, sampler=sampler, draws=fresh, precision=recipe.precision)
+    states["x_1"] = end.x
+    tensors, usable = {"evaluations": end.evaluations.cpu().numpy().astype(np.int32)}, end.converged.cpu().numpy()
+    for name, values in states.items():
+        tensors[name] = values.to(torch.float16).cpu().numpy()
+        usable = usable & np.isfinite(tensors[name]).reshape(len(usable), -1).all(1)
+    return {**tensors, "usable": usable}
 
 
 class PairSource:
-    """The usable ones of a store's first `num` pairs, each (x_0, x_1), both (C, H, W) float32 in model space.
+    """The usable ones of a store's pairs, each (x_0, x_1), both (C, H, W) float32 in model space."""
 
-    Raises:
-        InputError: some have yet to be made.
-    """
-
-    def __init__(self, store: PairStore, num: int) -> None:
+    def __init__(self, store: PairStore) -> None:
         self.store = store
-        if lacking := store.missing_pairs(num):
-            raise InputError(f"{store.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.")
-        usable = [flag for shard in store.shards(num) for flag in store.usable(shard)]
-        self.indices = np.flatnonzero(usable[:num])
-        self._opened: dict[tuple[int, str], Any] = {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_opened": {}}  # memory maps stay in their process
+        if lacking := store.missing_pairs():
+            raise InputError(f"{store.folder} lacks about {lacking} of {store.num} pairs; make them: r2flow pairs RUN.")
+        usable = [flag for shard in store.shards for flag in store.head(shard)["usable"]]
+        self.indices = np.flatnonzero(usable[: store.num])
 
     def __len__(self) -> int:
         return len(self.indices)
 
     def subset(self, indices: Sequence[int]) -> "PairSource":
         part = copy.copy(self)
-        part.indices, part._opened = self.indices[np.asarray(indices, dtype=np.int64)], {}
+        part.indices = self.indices[np.asarray(indices, dtype=np.int64)]
         return part
 
     def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
@@ -270,15 +198,13 @@ class PairSource:
     def _read(self, name: str, number: int) -> Tensor:
         recipe = self.store.recipe
         shard, offset = divmod(number, recipe.shard_batches * recipe.batch_size)
+        (path,) = self.store.files(shard)
         try:
-            if (shard, name) not in self._opened:
-                (path,) = self.store.files(shard)
-                self._opened[shard, name] = safe_open(path, framework="pt").get_slice(name)
-            values: Tensor = self._opened[shard, name][offset : offset + 1][0].float()
-        except (SafetensorError, OSError, IndexError) as error:
+            with safe_open(path, framework="pt") as file:
+                values: Tensor = file.get_slice(name)[offset].float()
+        except (SafetensorError, OSError) as error:
             raise InputError(
-                f"{self.store.files(shard)[0]} was lost or damaged while it was in use ({error}). "
-                "The same command makes it again and resumes."
+                f"{path} was lost or damaged while it was in use ({error}). The same command makes it again."
             ) from None
         return values
 

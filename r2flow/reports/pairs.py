@@ -13,17 +13,16 @@ from r2flow.progress import Bar
 def make_and_tell(
     store: PairStore,
     checkpoint: Checkpoint,
-    num: int,
     rank: int = 0,
     ranks: int = 1,
     device: torch.device | str = "cpu",
-    wait: bool = False,
+    wait: bool = True,
 ) -> Made:
     """`make_pairs` with a bar; with lines where several processes work."""
     generator = checkpoint.generator.to(device)
     who = f"process {rank + 1} of {ranks}: " if ranks > 1 else ""
-    with Bar(f"{who}drawing", store.missing_pairs(num), "pairs", lines=ranks > 1) as bar:
-        made = make_pairs(store, generator, num, rank, ranks, lambda made: bar.set(made.pairs), wait)
+    with Bar(f"{who}drawing", store.missing_pairs(), "pairs", lines=ranks > 1) as bar:
+        made = make_pairs(store, generator, rank, ranks, lambda made: bar.set(made.pairs), wait)
     if made.pairs:
         unusable = f", {made.unusable} did not converge and are left out" if made.unusable else ""
         rate, cost = made.pairs / made.seconds, made.evaluations / made.pairs

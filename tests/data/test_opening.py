@@ -323,12 +323,12 @@ def test_pairs_are_made_of_noise_of_their_own_shape(tmp_path: Path):
     plain, own = (PairOptions(num=4, batch_size=4).recipe((2, 4, 8), shape) for shape in ((2, 4, 8), (5,)))
     assert pair_noise(plain, 3).shape == (2, 4, 8)
     assert torch.equal(pair_noise(own, 3), standard_normal((5,), 0, "pairs", 3))
-    store = PairStore(tmp_path, own)
-    make_pairs(store, Field(lambda t, x: torch.zeros_like(x), (5,)), 4)
-    x_0, x_1 = PairSource(PairStore(tmp_path, own), 4)[2]
+    store = PairStore(tmp_path, own, 4)
+    make_pairs(store, Field(lambda t, x: torch.zeros_like(x), (5,)))
+    x_0, x_1 = PairSource(store)[2]
     assert torch.equal(x_1, x_0.half().float())
     with pytest.raises(InputError, match="holds other pairs: noise_shape"):
-        PairStore(tmp_path, plain)
+        PairStore(tmp_path, plain, 4)
 
 
 def test_a_part_of_a_part_is_not_the_same_part_of_the_whole(numbered: Path):

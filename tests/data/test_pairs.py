@@ -5,6 +5,7 @@ import math
 import os
 import resource
 import signal
+import threading
 import time
 import traceback
 from pathlib import Path
@@ -40,7 +41,8 @@ OPTIONS = {
 
 
 def store_in(folder: Path, **options) -> PairStore:
-    return PairStore(folder, PairOptions(**{**OPTIONS, **options}).recipe(SHAPE))
+    chosen = PairOptions(**{**OPTIONS, **options})
+    return PairStore(folder, chosen.recipe(SHAPE), chosen.num)
 
 
 grow = Field(lambda t, x: x, SHAPE)
@@ -64,8 +66,8 @@ def files(folder: Path) -> dict[str, bytes]:
 
 def test_a_pair_is_its_noise_and_where_the_flow_carries_it(tmp_path: Path):
     store = store_in(tmp_path)
-    make_pairs(store, grow, 50)
-    source = PairSource(store, 50)
+    make_pairs(store, grow)
+    source = PairSource(store)
     assert len(source) == 50
     for index in (0, 17, 49):
         x_0, x_1 = source[index]
@@ -77,7 +79,7 @@ def test_a_pair_is_its_noise_and_where_the_flow_carries_it(tmp_path: Path):
 
 
 def test_shards_of_three_batches_and_nothing_else_stay(tmp_path: Path):
-    make_pairs(store_in(tmp_path), grow, 50)
+    make_pairs(store_in(tmp_path), grow)
     # 50 pairs are 13 whole batches of 4, these 5 shards of 3.
     assert list(files(tmp_path)) == ["manifest.json", *(f"pairs-{i:06d}.safetensors" for i in range(5))]
     assert json.loads((tmp_path / "manifest.json").read_text())["recipe"]["parent"] == "abc"
@@ -85,9 +87,9 @@ def test_shards_of_three_batches_and_nothing_else_stay(tmp_path: Path):
 
 @pytest.mark.parametrize("ranks", [2, 3])
 def test_any_number_of_processes_writes_the_same_bytes(tmp_path: Path, ranks: int):
-    make_pairs(store_in(tmp_path / "one"), grow, 50)
+    make_pairs(store_in(tmp_path / "one"), grow)
     for rank in reversed(range(ranks)):
-        make_pairs(store_in(tmp_path / "many"), grow, 50, rank, ranks)
+        make_pairs(store_in(tmp_path / "many"), grow, rank, ranks)
     assert files(tmp_path / "one") == files(tmp_path / "many")
 
 
@@ -99,7 +101,7 @@ def in_process(folder: Path, rank: int = 0, ranks: int = 1, dies: tuple[int, boo
             torch.set_num_threads(1)  # a forked OpenMP pool hangs
             if dies:
                 die_at(*dies)
-            make_pairs(store_in(folder), grow, 50, rank, ranks)
+            make_pairs(store_in(folder), grow, rank, ranks)
         finally:
             os._exit(0)
     return child
@@ -107,7 +109,7 @@ def in_process(folder: Path, rank: int = 0, ranks: int = 1, dies: tuple[int, boo
 
 def test_processes_at_once_write_the_same_bytes(tmp_path: Path):
     torch.set_num_threads(1)
-    make_pairs(store_in(tmp_path / "one"), grow, 50)
+    make_pairs(store_in(tmp_path / "one"), grow)
     # Two of them are the same process started twice by mistake.
     children = [in_process(tmp_path / "many", rank, 3) for rank in (0, 1, 2, 2)]
     for child in children:
@@ -117,27 +119,27 @@ def test_processes_at_once_write_the_same_bytes(tmp_path: Path):
 
 def test_killed_again_and_again_the_same_command_ends_alike(tmp_path: Path):
     torch.set_num_threads(1)
-    make_pairs(store_in(tmp_path / "one"), grow, 50)
+    make_pairs(store_in(tmp_path / "one"), grow)
     for dies in MOMENTS[:-1]:
         assert was_killed(in_process(tmp_path / "killed", dies=dies))
-    make_pairs(store_in(tmp_path / "killed"), grow, 50)
+    make_pairs(store_in(tmp_path / "killed"), grow)
     assert files(tmp_path / "killed") == files(tmp_path / "one")
 
 
 def test_nothing_is_made_twice(tmp_path: Path):
-    make_pairs(store_in(tmp_path), grow, 20)
+    make_pairs(store_in(tmp_path, num=20), grow)
     flow = Counted()
-    made = make_pairs(store_in(tmp_path), Field(flow, SHAPE), 20)
+    made = make_pairs(store_in(tmp_path, num=20), Field(flow, SHAPE))
     assert (made.pairs, flow.begun) == (0, 0)
-    made = make_pairs(store_in(tmp_path), grow, 50)  # five batches are there, 13 are wanted
-    assert made.pairs == 8 * 4
+    made = make_pairs(store_in(tmp_path), grow)  # one of the five shards is whole
+    assert made.pairs == (13 - 3) * 4
 
 
 def test_more_pairs_later_are_those_of_one_command(tmp_path: Path):
-    make_pairs(store_in(tmp_path / "one"), grow, 50)
+    make_pairs(store_in(tmp_path / "one"), grow)
     for num in (3, 20, 50):
-        make_pairs(store_in(tmp_path / "grown"), grow, num)
-        assert len(PairSource(store_in(tmp_path / "grown"), num)) == num
+        make_pairs(store_in(tmp_path / "grown", num=num), grow)
+        assert len(PairSource(store_in(tmp_path / "grown", num=num))) == num
     assert files(tmp_path / "one") == files(tmp_path / "grown")
 
 
@@ -168,10 +170,10 @@ def _flip_a_flag(path: Path) -> None:
 @pytest.mark.parametrize("harm", [_cut, _empty, _text, _flip_a_value, _flip_a_flag, Path.unlink])
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_a_damaged_shard_is_found_and_made_again_and_no_other(tmp_path: Path, harm, ranks: int, caplog):
-    make_pairs(store_in(tmp_path), grow, 50)
+    make_pairs(store_in(tmp_path), grow)
     before = files(tmp_path)
     harm(tmp_path / "pairs-000001.safetensors")
-    made = sum(make_pairs(store_in(tmp_path), grow, 50, rank, ranks).pairs for rank in range(ranks))
+    made = sum(make_pairs(store_in(tmp_path), grow, rank, ranks).pairs for rank in range(ranks))
     assert made == 12
     assert files(tmp_path) == before
     assert harm is Path.unlink or "pairs-000001.safetensors is damaged" in caplog.text
@@ -185,28 +187,28 @@ def test_a_damaged_shard_is_found_and_made_again_and_no_other(tmp_path: Path, ha
     ],
 )  # fmt: skip
 def test_other_pairs_in_the_folder_are_refused(tmp_path: Path, option: str, value):
-    make_pairs(store_in(tmp_path), grow, 8)
+    make_pairs(store_in(tmp_path, num=8), grow)
     with pytest.raises(InputError, match=f"holds other pairs: {option}"):
         store_in(tmp_path, **{option: value})
 
 
 def test_whole_shards_of_other_pairs_are_never_taken_for_damaged_ones(tmp_path: Path):
-    make_pairs(store_in(tmp_path), grow, 50)
+    make_pairs(store_in(tmp_path), grow)
     (tmp_path / "manifest.json").unlink()
     before = files(tmp_path)
     with pytest.raises(InputError, match="holds pairs of another recipe"):
-        make_pairs(store_in(tmp_path, sampler={"name": "dopri5"}), grow, 50)
+        make_pairs(store_in(tmp_path, sampler={"name": "dopri5"}), grow)
     (tmp_path / "manifest.json").unlink()
     with pytest.raises(InputError, match="holds pairs of another recipe"):
-        PairSource(store_in(tmp_path, sampler={"name": "dopri5"}), 50)
+        PairSource(store_in(tmp_path, sampler={"name": "dopri5"}))
     assert files(tmp_path) == before
 
 
 def test_of_two_recipes_begun_at_once_one_is_refused(tmp_path: Path):
     first, second = store_in(tmp_path), store_in(tmp_path, sampler={"name": "dopri5"})
-    make_pairs(first, grow, 8)
+    make_pairs(first, grow)
     with pytest.raises(InputError, match="holds other pairs: sampler"):
-        make_pairs(second, grow, 8)
+        make_pairs(second, grow)
 
 
 def test_one_and_one_point_nought_are_one_tolerance():
@@ -221,9 +223,9 @@ def test_numbers_out_of_range_are_refused(option: str, value):
 
 
 def test_how_pairs_are_drawn_is_for_their_generator_to_say(tmp_path: Path):
-    store = PairStore(tmp_path / "pairs", PairOptions(sampler={"name": "direct"}).recipe(SHAPE))
+    store = PairStore(tmp_path / "pairs", PairOptions(sampler={"name": "direct"}).recipe(SHAPE), 8)
     with pytest.raises(InputError, match="direct"):  # which is of GANs
-        make_pairs(store, grow, 8)
+        make_pairs(store, grow)
     assert not store.folder.exists()
 
 
@@ -231,10 +233,10 @@ def test_a_distilled_flow_draws_pairs_by_its_own_steps_alone(tmp_path: Path):
     flow = Field(lambda t, x: x, SHAPE)
     flow.run_by(build_sampler("euler", steps=2, grid="power:3"), fixed=True)
     with pytest.raises(InputError, match="distilled"):
-        make_pairs(store_in(tmp_path / "others"), flow, 8)
+        make_pairs(store_in(tmp_path / "others"), flow)
     assert not (tmp_path / "others").exists()
     own = store_in(tmp_path / "own", sampler={"name": "euler", "steps": 2, "grid": "power:3"})
-    assert make_pairs(own, flow, 8).unusable == 0
+    assert make_pairs(own, flow).unusable == 0
 
 
 def test_runs_that_share_pairs_share_the_work(tmp_path: Path):
@@ -253,7 +255,7 @@ def test_runs_that_share_pairs_share_the_work(tmp_path: Path):
         child = os.fork()
         if child == 0:
             try:
-                make_pairs(store_in(tmp_path / "pairs"), Field(slow, SHAPE), 200)
+                make_pairs(store_in(tmp_path / "pairs", num=200), Field(slow, SHAPE))
                 os._exit(0)
             except BaseException:
                 traceback.print_exc()
@@ -261,12 +263,12 @@ def test_runs_that_share_pairs_share_the_work(tmp_path: Path):
         children.append(child)
     assert [os.waitpid(child, 0)[1] for child in children] == [0, 0]
     assert begun.stat().st_size == 50  # batches, each by one of the two
-    assert len(PairSource(store_in(tmp_path / "pairs"), 200)) == 200
+    assert len(PairSource(store_in(tmp_path / "pairs", num=200))) == 200
 
 
 def test_a_shard_lost_in_use_says_how_to_go_on(tmp_path: Path):
-    make_pairs(store_in(tmp_path), grow, 50)
-    source = PairSource(store_in(tmp_path), 50)
+    make_pairs(store_in(tmp_path), grow)
+    source = PairSource(store_in(tmp_path))
     (tmp_path / "pairs-000001.safetensors").unlink()
     _cut(tmp_path / "pairs-000002.safetensors")
     assert source[0][1].isfinite().all()
@@ -276,7 +278,7 @@ def test_a_shard_lost_in_use_says_how_to_go_on(tmp_path: Path):
 
 
 def test_a_damaged_manifest_says_what_to_do(tmp_path: Path):
-    make_pairs(store_in(tmp_path), grow, 8)
+    make_pairs(store_in(tmp_path, num=8), grow)
     (tmp_path / "manifest.json").write_text("{")
     with pytest.raises(InputError, match="Delete"):
         store_in(tmp_path)
@@ -290,30 +292,30 @@ def test_a_pair_that_does_not_come_to_an_end_is_left_out(tmp_path: Path):
         hit = (x - bad).abs().amax((1, 2, 3), keepdim=True) < 1e-6
         return torch.where(hit, torch.nan, 0.0) * x
 
-    made = make_pairs(store_in(tmp_path), Field(broken, SHAPE), 8)
+    made = make_pairs(store_in(tmp_path, num=8), Field(broken, SHAPE))
     assert made.unusable == 1
-    source = PairSource(store_in(tmp_path), 8)
+    source = PairSource(store_in(tmp_path, num=8))
     assert source.indices.tolist() == [0, 1, 2, 3, 4, 6, 7]
     assert all(source[i][1].isfinite().all() for i in range(7))
 
 
 def test_a_flow_that_is_broken_is_said_to_be(tmp_path: Path):
     with pytest.raises(InputError, match="none of 8 pairs came to an end"):
-        make_pairs(store_in(tmp_path), Field(lambda t, x: x * math.nan, SHAPE), 8)
+        make_pairs(store_in(tmp_path, num=8), Field(lambda t, x: x * math.nan, SHAPE))
 
 
 def test_missing_pairs_are_named(tmp_path: Path):
-    make_pairs(store_in(tmp_path), grow, 8)
-    with pytest.raises(InputError, match="lacks about 12 of 20 pairs"):
-        PairSource(store_in(tmp_path), 20)
+    make_pairs(store_in(tmp_path, num=8), grow)
+    with pytest.raises(InputError, match="lacks about 20 of 20 pairs"):
+        PairSource(store_in(tmp_path, num=20))
 
 
 def test_an_item_has_the_pair_s_noise_and_the_run_s_time(tmp_path: Path):
     import pickle
 
-    store = store_in(tmp_path)
-    make_pairs(store, grow, 12)
-    source = PairSource(store, 12)
+    store = store_in(tmp_path, num=12)
+    make_pairs(store, grow)
+    source = PairSource(store)
     dataset = PairDataset(source, seed=3, purpose="training")
     item = dataset[(70, 11)]
     assert torch.equal(item["x_0"], pair_noise(store.recipe, 11))
@@ -325,7 +327,7 @@ def test_an_item_has_the_pair_s_noise_and_the_run_s_time(tmp_path: Path):
 
 
 def test_a_full_disk_loses_nothing(tmp_path: Path):
-    make_pairs(store_in(tmp_path), grow, 12)
+    make_pairs(store_in(tmp_path, num=12), grow)
     before = files(tmp_path)
     child = os.fork()
     if child == 0:
@@ -333,7 +335,7 @@ def test_a_full_disk_loses_nothing(tmp_path: Path):
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (512, 512))
         try:
-            make_pairs(store_in(tmp_path), grow, 50)
+            make_pairs(store_in(tmp_path), grow)
         except OSError:
             os._exit(7)
         os._exit(0)
@@ -353,8 +355,8 @@ def test_the_folder_is_in_the_run_s():
 
 
 def test_a_pair_takes_two_bytes_an_element(tmp_path: Path):
-    store = store_in(tmp_path, shard_mib=1)
-    make_pairs(store, grow, 400)
+    store = store_in(tmp_path, shard_mib=1, num=400)
+    make_pairs(store, grow)
     size = sum(len(data) for data in files(tmp_path).values())
     assert size < 400 * (2 * np.prod(SHAPE) + 4) * 1.1
 
@@ -373,8 +375,30 @@ def test_processes_that_wait_return_when_all_pairs_are_there(tmp_path: Path):
     torch.set_num_threads(1)
     child = os.fork()
     if child == 0:
-        make_pairs(store_in(tmp_path), Field(lambda t, x: time.sleep(0.001) or x, SHAPE), 50, 1, 2)
+        make_pairs(store_in(tmp_path), Field(lambda t, x: time.sleep(0.001) or x, SHAPE), 1, 2)
         os._exit(0)
-    make_pairs(store_in(tmp_path), grow, 50, 0, 2, wait=True)
-    assert len(PairSource(store_in(tmp_path), 50)) == 50
+    make_pairs(store_in(tmp_path), grow, 0, 2)
+    assert len(PairSource(store_in(tmp_path))) == 50
     assert os.waitpid(child, 0)[1] == 0
+
+
+def test_who_waits_says_for_whom_and_who_does_not_leaves_the_rest(tmp_path: Path, monkeypatch, caplog):
+    torch.set_num_threads(1)
+    monkeypatch.setattr("r2flow.store.QUIET", 0.1)
+    store, (read, write) = store_in(tmp_path), os.pipe()
+    child = os.fork()
+    if child == 0:
+        with store.claim(1):
+            os.write(write, b"1")
+            os.kill(os.getpid(), signal.SIGSTOP)
+            os._exit(0)  # the lock's file stays, its lock goes
+    os.read(read, 1)
+    made = make_pairs(store, grow, wait=False)
+    assert (made.pairs, store.missing(store.shards)) == (10 * 4, [1])
+    timer = threading.Timer(1, os.kill, (child, signal.SIGKILL))
+    timer.start()
+    assert make_pairs(store, grow).pairs == 3 * 4
+    timer.join()
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL
+    assert caplog.text.count("waiting for ") == 1
+    assert not store.missing(store.shards)
