@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import secrets
 import shutil
 import stat
 import tempfile
@@ -29,14 +30,14 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """
     path = Path(path)
     is_stream = _is_stream(path)
-    make_folder(path.parent)
+    path.parent.mkdir(parents=True, exist_ok=True)
     target = Path(os.path.realpath(path))
-    temporary = None
+    folder = Path(tempfile.gettempdir()) if is_stream else target.parent
+    temporary = folder / f".{target.name}.{secrets.token_hex(4)}.part"
+    # A file's name may be part of a text, and need not be UTF-8.
+    encoding, errors = (None, None) if "b" in mode else ("utf-8", "backslashreplace")
     try:
-        handle, temporary = _temporary(target.name, None if is_stream else target.parent)
-        # A file's name may be part of a text, and need not be UTF-8.
-        encoding, errors = (None, None) if "b" in mode else ("utf-8", "backslashreplace")
-        with os.fdopen(handle, mode, encoding=encoding, errors=errors) as file:
+        with open(temporary, mode.replace("w", "x"), encoding=encoding, errors=errors) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -44,9 +45,8 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
             with open(temporary, "rb") as whole, open(path, "wb") as stream:
                 shutil.copyfileobj(whole, stream)
         else:
-            os.chmod(temporary, 0o666 & ~_umask())  # mkstemp is private to the user; outputs are not
             os.replace(temporary, target)
-            _sync_folder(target.parent)
+            _sync_folder(folder)
     except OSError as error:
         if error.errno is None:  # numpy's, of fewer bytes written than there are
             error = OSError(errno.ENOSPC, f"cannot be written whole, is there room? ({error})")
@@ -55,9 +55,8 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
             error.filename = str(path)
         raise error
     finally:
-        if temporary is not None:
-            with suppress(FileNotFoundError):
-                os.unlink(temporary)
+        with suppress(OSError):
+            temporary.unlink()
 
 
 def save_array(path: str | Path, array: np.ndarray) -> None:
@@ -66,32 +65,8 @@ def save_array(path: str | Path, array: np.ndarray) -> None:
         np.save(file, array)
 
 
-def make_folder(path: Path) -> None:
-    """Make a folder where there is none, also where another process removes it at this moment."""
-    while True:
-        try:
-            return path.mkdir(parents=True, exist_ok=True)
-        except FileExistsError:
-            if os.path.lexists(path) and not path.is_dir():
-                raise
-
-
-def _temporary(name: str, folder: Path | None) -> tuple[int, str]:
-    """An open temporary file in a folder, which another process that is done with it may have removed meanwhile."""
-    for _ in range(20):
-        with suppress(FileNotFoundError):
-            return tempfile.mkstemp(".part", f".{name}.", folder)
-        if folder is not None:
-            make_folder(folder)
-    return tempfile.mkstemp(".part", f".{name}.", folder)
-
-
 def parse_json(text: str) -> Any:
-    """What a text of JSON says.
-
-    Raises:
-        ValueError: it is none, or nested too deeply to be one that was written here.
-    """
+    """What a text of JSON says; a ValueError if it is not JSON or nested too deeply."""
     try:
         return json.loads(text)
     except RecursionError:
@@ -99,12 +74,7 @@ def parse_json(text: str) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """What a file of JSON says.
-
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is none; see `parse_json`.
-    """
+    """What a file of JSON says; raises as `parse_json`."""
     return parse_json(path.read_text(encoding="utf-8"))
 
 
@@ -144,19 +114,10 @@ def _is_stream(path: Path) -> bool:
     return not stat.S_ISREG(kind)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
 def _sync_folder(folder: Path) -> None:
     if os.name == "nt":  # folders cannot be opened for syncing there
         return
-    try:
-        descriptor = os.open(folder, os.O_RDONLY)
-    except FileNotFoundError:  # whoever took the file out of it removed it
-        return
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

@@ -31,7 +31,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from r2flow.errors import InputError
-from r2flow.files import atomic_write, make_folder, parse_json, read_json
+from r2flow.files import atomic_write, parse_json, read_json
 from r2flow.lidar.scan_files import FIRM_ENDINGS
 from r2flow.signals import end_with_parent, out_of_reach
 
@@ -195,7 +195,7 @@ class Store:
         """
         path = self._lock(item)
         lock = FileLock(path, timeout=0)
-        make_folder(self.folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
         with suppress(Timeout):
             lock.acquire()
         try:

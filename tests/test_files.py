@@ -3,14 +3,13 @@ import io
 import os
 import socket
 import stat
-import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from r2flow.errors import InputError, explain_mistake
-from r2flow.files import atomic_write, make_folder
+from r2flow.files import atomic_write
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
@@ -113,36 +112,6 @@ def test_the_file_that_a_link_leads_to_is_replaced(tmp_path, to):
     assert os.listdir(target.parent) == ["file"]
 
 
-def test_a_folder_that_another_process_removes_is_made_again(tmp_path, monkeypatch):
-    """The batches of a shard lie in a folder that goes when the last of them is sealed, by whichever process."""
-    folder, make = tmp_path / "batches", tempfile.mkstemp
-    lost = iter([True, True, False])
-
-    def late(*arguments):
-        if next(lost):
-            folder.rmdir()
-        return make(*arguments)
-
-    monkeypatch.setattr(tempfile, "mkstemp", late)
-    with atomic_write(folder / "one", "w") as file:
-        file.write("kept")
-    assert (folder / "one").read_text() == "kept"
-
-
-def test_a_file_that_another_process_takes_with_its_folder_was_written(tmp_path, monkeypatch):
-    folder, replace = tmp_path / "batches", os.replace
-
-    def taken(source, target):
-        replace(source, target)
-        os.unlink(target)
-        folder.rmdir()
-
-    monkeypatch.setattr(os, "replace", taken)
-    with atomic_write(folder / "one", "w") as file:
-        file.write("taken")
-    assert not folder.exists()
-
-
 def test_a_link_to_nothing_is_refused_in_one_line(tmp_path):
     link = tmp_path / "link"
     link.symlink_to("nothing")
@@ -166,34 +135,10 @@ def test_links_in_a_circle_are_refused_in_one_line(tmp_path):
 
 def test_a_read_only_folder_is_an_error_with_the_file_s_own_name(tmp_path, monkeypatch):
     # Root may write into a read-only folder: what the system says to others is said here by hand.
-    def refused(suffix, prefix, folder):
-        raise PermissionError(errno.EACCES, "Permission denied", f"{folder}/{prefix}xyz{suffix}")
+    def refused(path, *_, **__):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
-    monkeypatch.setattr("tempfile.mkstemp", refused)
+    monkeypatch.setattr("r2flow.files.open", refused, raising=False)
     with pytest.raises(PermissionError) as raised, atomic_write(tmp_path / "out.json"):
         pass
     assert explain_mistake(raised.value) == f"{tmp_path / 'out.json'}: Permission denied"
-
-
-def test_a_folder_that_another_process_removes_meanwhile_is_made_again(tmp_path, monkeypatch):
-    """os.mkdir finds it there, and a look behind it does not."""
-    real, calls = os.mkdir, []
-
-    def raced(path, *rest):
-        calls.append(path)
-        if len(calls) == 1:
-            raise FileExistsError(errno.EEXIST, "File exists", str(path))
-        real(path, *rest)
-
-    monkeypatch.setattr(os, "mkdir", raced)
-    make_folder(tmp_path / "made")
-    assert (tmp_path / "made").is_dir()
-    assert len(calls) == 2
-
-
-@pytest.mark.parametrize("kind", ["file", "link"])
-def test_what_is_no_folder_is_none(tmp_path, kind):
-    path = tmp_path / "taken"
-    path.touch() if kind == "file" else path.symlink_to(tmp_path / "nothing")
-    with pytest.raises(FileExistsError):
-        make_folder(path)
