@@ -165,22 +165,16 @@ class Store:
         except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
             raise Damaged(str(error)) from None
 
-    def damage(self, item: int) -> str | None:
-        """What is wrong with an item, every byte of which is read; None where it is whole, or missing."""
-        try:
-            self.read(item)
-        except FileNotFoundError:
-            return None
-        except Damaged as error:
-            return str(error)
-        return None
-
     def mend(self, items: Iterable[int], advance: Advance = lambda item: None) -> None:
         """Read every byte of some items, and remove the damaged ones with a warning."""
         for item in items:
-            if damage := self.damage(item):
+            try:
+                self.read(item)
+            except FileNotFoundError:
+                pass
+            except Damaged as error:
                 (path,) = self.files(item)
-                log.warning("%s is damaged (%s): it is made again.", path, damage)
+                log.warning("%s is damaged (%s): it is made again.", path, error)
                 path.unlink(missing_ok=True)
             advance(item)
 
@@ -308,12 +302,7 @@ def _holder(lock: Path) -> str:
 
 
 def read_manifest(folder: Path, kind: str | None = None) -> dict[str, Any]:
-    """The manifest of a folder, checked.
-
-    Raises:
-        FileNotFoundError: the folder has no manifest.
-        InputError: the manifest is damaged, or of another kind.
-    """
+    """The manifest of a folder, checked."""
     path = folder / MANIFEST
     try:
         content: dict[str, Any] = read_json(path)

@@ -50,8 +50,10 @@ def prepared(path: Path) -> bytes:
     folder = in_folder("prepared")(path)
     source = open_prepared(folder, Reading(SENSOR, reflectance=True))
     for shard in source.rows[:, 1]:
-        if damage := source.store.damage(int(shard)):
-            raise InputError(damage)
+        try:
+            source.store.read(int(shard))
+        except Damaged as error:
+            raise InputError(str(error)) from None
     return b"".join(source[number].tobytes() for number in range(len(source)))
 
 

@@ -14,9 +14,6 @@ class Augmentation:
 
     Image k's draws depend on (seed, k) alone, each kind's not on which others are on, and none is shared with its noise
     and time.
-
-    Raises:
-        InputError: a share outside [0, 1).
     """
 
     flip: bool = False  # mirror half of the images: azimuth -> -azimuth, exact as bins lie symmetrically about ahead

@@ -42,9 +42,6 @@ class ScanDataModule(L.LightningDataModule):
 
     Attributes:
         further: What the run's stage adds to each scan of a batch.
-
-    Raises:
-        InputError: an unknown key, or values that cannot be.
     """
 
     def __init__(

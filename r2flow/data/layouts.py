@@ -62,11 +62,7 @@ class SourceKind:
         return next((part for part, members in self.splits.items() if names & set(members)), None)
 
     def chosen(self, drives: list[Drive], split: str | None, names: Sequence[str | int] | None) -> list[Drive]:
-        """Those of a part of the standard split; of these, those of some names or numbers; None takes all.
-
-        Raises:
-            InputError: an unknown split, or a drive that is not there or not alone.
-        """
+        """Those of a part of the standard split; of these, those of some names or numbers; None takes all."""
         if split is not None:
             if split not in self.splits:
                 known = f"known: {', '.join(self.splits)}" if self.splits else "the data set has no standard split"
@@ -74,11 +70,7 @@ class SourceKind:
             drives = [drive for drive in drives if self.split_of(drive.name) == split]
         if names is None:
             return drives
-        found = [named_drive(drives, str(name)) for name in names]
-        twice = next((drive.name for i, drive in enumerate(found) if drive in found[:i]), None)
-        if twice is not None:
-            raise InputError(f"drive {twice} is named twice in {', '.join(map(str, names))}; name it once.")
-        return found
+        return list(dict.fromkeys(named_drive(drives, str(name)) for name in names))
 
 
 @dataclass(frozen=True)
@@ -95,11 +87,7 @@ class Layout(SourceKind):
     levels: int | None = None
 
     def find_drives(self, options: SourceOptions) -> list[Drive]:
-        """Those of the split and the drives that `options` names; a drive without a scan is none.
-
-        Raises:
-            InputError: a root that is missing or holds no such scan, an unknown split, or a drive that is not there.
-        """
+        """Those of the split and the drives that `options` names; a drive without a scan is none."""
         name, split, root = options.name, options.split, Path(options.folder).expanduser()
         self.chosen([], split, None)  # a split that is not known is refused before anything is looked for
         if not root.is_dir():

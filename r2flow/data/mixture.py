@@ -55,9 +55,6 @@ class MixedOrder:
     """Which scan of a mixture is image k of a run: a part by its weight, then one of its scans, each alike.
 
     A function of (seed, k): part p with probability w_p / sum w, drawn with replacement.
-
-    Raises:
-        InputError: a part without scans.
     """
 
     def __init__(self, sizes: Sequence[int], weights: Sequence[float], seed: int) -> None:

@@ -300,11 +300,7 @@ def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
 
 
 def refuse_parts(spec: str | Path) -> None:
-    """Refuse samples of a part of each image: beside whole scans they would be judged as scans that lack the rest.
-
-    Raises:
-        InputError: the folder's note names a region, or cannot be read.
-    """
+    """Refuse samples of a part of each image: beside whole scans they would be judged as scans that lack the rest."""
     options, _ = parse(str(spec))
     if options.name != FOLDER:
         return
@@ -321,11 +317,7 @@ def refuse_parts(spec: str | Path) -> None:
 def open_prepared(
     root: str | Path, reading: Reading, split: str | None = None, drives: Sequence[str | int] | None = None
 ) -> PreparedScans:
-    """The scans of a folder that `r2flow prepare` has written, by the split and the drives of their data set.
-
-    Raises:
-        InputError: no prepared scans, unfinished or damaged ones, ones of other images, or no such split or drive.
-    """
+    """The scans of a folder that `r2flow prepare` has written, by the split and the drives of their data set."""
     folder = Path(root).expanduser()
     recipe, held = read_prepared(folder)
     refuse_other_images(folder, recipe, reading)
@@ -352,9 +344,6 @@ def resolve(data: Mapping[str, Any], scale: float | None = None, parent: Mapping
     Args:
         scale: The value that means full reflectance in files of the sensor.
         parent: The reading of the run that this run starts from, or of the flow that draws its pairs.
-
-    Raises:
-        InputError: an unknown key, or sets of scans that cannot be.
     """
     check_options("data", DataOptions, data)
     run = DataOptions(**data)

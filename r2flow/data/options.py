@@ -99,11 +99,7 @@ class PairOptions:
     parent: str | None = None  # hash of the flow; the run fills it in
 
     def recipe(self, shape: tuple[int, int, int], noise_shape: tuple[int, ...] | None = None) -> PairRecipe:
-        """All that pairs depend on, where scans and their noise have these shapes in model space.
-
-        Raises:
-            InputError: a number out of its range.
-        """
+        """All that pairs depend on, where scans and their noise have these shapes in model space."""
         if min(self.num, self.batch_size) < 1 or not 0 < self.shard_mib < math.inf:
             raise InputError(
                 "data.pairs: num and batch_size must be at least 1 and shard_mib positive; "

@@ -101,9 +101,6 @@ def make_pairs(
 
     Args:
         wait: Whether to wait for the shards that other processes are making.
-
-    Raises:
-        InputError: no pair is usable: the flow is broken, or the tolerance out of its reach.
     """
     if generator.noise_shape != (store.recipe.noise_shape or store.recipe.shape):
         raise InputError(f"these pairs are of another noise than the generator's {generator.noise_shape}.")

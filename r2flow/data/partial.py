@@ -80,9 +80,6 @@ def open_partial(
         source: The sensor of the scans, where it is known.
         scale: The value in scan files that means full reflectance; the usual one if left out.
         most: The most scans of each name, evenly spread; all of them, and `FEW` simulated ones, if left out.
-
-    Raises:
-        InputError: no scan, one that cannot be read, or a sensor that cannot be told.
     """
     scans: list[PartialScan] = []
     lines: list[str] = []
@@ -167,11 +164,7 @@ def _images(spec: str, reading: Reading, source: Sensor | None, most: int | None
 
 
 def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -> str:
-    """In a line: the sensor, how many rows it measures, what is left out.
-
-    Raises:
-        InputError: no beam looks into the model's view.
-    """
+    """In a line: the sensor, how many rows it measures, what is left out."""
     e = source.elevations
     rows = rows_of(np.asarray(e), target)
     beams = f"{source.name} with {len(e)} beams from {e[0]:+.1f} to {e[-1]:+.1f} degrees"

@@ -150,9 +150,6 @@ def prepare(
 
     Returns:
         The notes of the shards: numbers of the scans left out, and the largest errors of range and reflectance.
-
-    Raises:
-        InputError: other scans are in the folder, or a scan cannot be used.
     """
     store = plan.store(folder)
     if not store.check() or store.missing(plan.shards):
@@ -176,11 +173,7 @@ def codes_of(recipe: Mapping[str, Any]) -> list[RangeCodes | ReflectanceCodes]:
 
 
 def read_prepared(folder: Path) -> tuple[dict[str, Any], list[Drive]]:
-    """The recipe of prepared scans, and their names by drive.
-
-    Raises:
-        InputError: the folder holds none, or its manifest is damaged.
-    """
+    """The recipe of prepared scans, and their names by drive."""
     try:
         content = read_manifest(folder, KIND)
     except FileNotFoundError:
@@ -210,9 +203,6 @@ class PreparedScans(ScanSource):
 
     Args:
         numbers: Of the data set's scans; those that were left out are passed over. None takes all.
-
-    Raises:
-        InputError: a shard is missing or damaged, or the scans have no reflectance where it is needed.
     """
 
     def __init__(self, folder: Path, numbers: Sequence[int] | None = None, reflectance: bool = True) -> None:

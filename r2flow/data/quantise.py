@@ -45,11 +45,7 @@ class RangeCodes:
         self.values[0] = 0
 
     def encode(self, r: np.ndarray) -> np.ndarray:
-        """Ranges in metres, 0 where no return, to the codes nearest to them, uint16.
-
-        Raises:
-            ValueError: a range outside [min_range, max_range]: no projection gives one.
-        """
+        """Ranges in metres, 0 where no return, to the codes nearest to them, uint16."""
         returned = r != 0
         if not ((r >= self.near) & (r <= self.far) | ~returned).all():  # NaN is refused too
             raise ValueError(f"ranges must be 0 or lie in [{self.near:g}, {self.far:g}] m.")

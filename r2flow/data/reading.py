@@ -86,22 +86,13 @@ class Projected(NamedTuple):
 
 
 def read_scan(path: str | Path, sensor: Sensor, **options: Any) -> np.ndarray:
-    """One scan file as a range image, (2, H, W), or (1, H, W) without `reflectance`; the options are `Reading`'s.
-
-    Raises:
-        InputError: as `read_projected`.
-    """
+    """One scan file as a range image, (2, H, W), or (1, H, W) without `reflectance`; the options are `Reading`'s."""
     reading = Reading(sensor, **{"reflectance": True, "on_bad_scan": "error", **options})
     return read_projected(path, reading).image
 
 
 def read_projected(path: str | Path, reading: Reading) -> Projected:
-    """A file of points as an image, and the points behind it.
-
-    Raises:
-        InputError: the file cannot be read, no point of it lies in the sensor's view and range (`NoPointsError`, unless
-            that is an empty image), or it has no reflectance, or one beyond the scale, where it is needed.
-    """
+    """A file of points as an image, and the points behind it."""
     try:
         return _projected(path, reading)
     except NoPointsError:
@@ -140,9 +131,6 @@ def read_labelled_scan(path: str | Path, reading: Reading) -> tuple[np.ndarray, 
     """The image of `read_scan`, and the semantic id of each pixel's return, (H, W) uint16, 0 where none was kept.
 
     The ids are None where no labels lie beside the scan.
-
-    Raises:
-        InputError: what `read_scan` refuses, or labels that are damaged or of another scan.
     """
     found = read_projected(path, reading)
     file = labels_beside(path)
@@ -178,11 +166,7 @@ def _scaled_reflectance(path: str | Path, points: Points, scale: float | None) -
 
 
 def range_image(path: Path, shape: tuple[int, int] | None = None) -> np.ndarray | None:
-    """The range image in a file, `read_range_image`; None where the file holds no range image.
-
-    Raises:
-        InputError: the file cannot be read, or its size is not the (H, W) of `shape`.
-    """
+    """The range image in a file, `read_range_image`; None where the file holds no range image."""
     array = read_range_image(path)
     if array is not None and shape is not None and array.shape[1:] != shape:
         found, wanted = ("x".join(map(str, one)) for one in (array.shape[1:], shape))
@@ -194,12 +178,7 @@ def range_image(path: Path, shape: tuple[int, int] | None = None) -> np.ndarray 
 
 
 def read_image(path: Path, reading: Reading) -> np.ndarray:
-    """A scan file or a range image as an image, (2 or 1, H, W).
-
-    Raises:
-        InputError: it cannot be read, has another size, or no reflectance where that is needed; it has no return in the
-            sensor's view and `reading.on_bad_scan` is not `empty`.
-    """
+    """A scan file or a range image as an image, (2 or 1, H, W)."""
     channels = 1 + bool(reading.reflectance)
     image = range_image(path, reading.sensor.shape)
     if image is None:
@@ -229,11 +208,7 @@ def _within_limits(path: Path, image: np.ndarray, reading: Reading) -> np.ndarra
 
 
 def read_points_image(path: Path, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
-    """A file of points as an image, (2 or 1, H, W), and its pixels' points in metres, (3, H, W) float32, 0 for none.
-
-    Raises:
-        InputError: as `read_image`.
-    """
+    """A file of points as an image, (2 or 1, H, W), and its pixels' points in metres, (3, H, W) float32, 0 for none."""
     found = read_projected(path, reading)
     xyz = found.spread(found.points.xyz[found.chosen].astype(np.float32))
     return found.image, np.ascontiguousarray(np.moveaxis(xyz, -1, 0))
@@ -245,11 +220,8 @@ def lacks_reflectance(
     """Why scan files count as files without reflectance; None where they have it.
 
     The one rule, for training, measuring and pictures: the first scan that has a return decides, and reflectance that
-    is 0 throughout is none, because a KITTI .bin has a column for it whatever the sensor reports.
-
-    Raises:
-        InputError: a scan that cannot be read. With `on_bad_scan="skip"` it is passed over; with `empty`, one alone
-            that has no point.
+    is 0 throughout is none, because a KITTI .bin has a column for it whatever the sensor reports. Scans that cannot be
+    read are passed over with `on_bad_scan="skip"`, those without a point also with "empty".
     """
     for path in paths:
         try:

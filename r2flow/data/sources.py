@@ -107,9 +107,6 @@ def warn_of_other_sensor(paths: Sequence[str | Path], reading: Reading, root: st
 
     For bare scan files alone: what r2flow wrote says its sensor, and range images have no beams. Files that cannot be
     read are reported when their turn comes.
-
-    Raises:
-        InputError: the scans are for a model (`reading.within_limits`), and those of no spinning LiDAR.
     """
     if made_here(root):
         return

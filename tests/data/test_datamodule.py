@@ -198,15 +198,6 @@ def test_parts_are_those_of_a_mixture(numbered: Path):
         module(name="folder", root=str(numbered), parts=[{"name": "folder", "root": str(numbered)}])
 
 
-def test_whole_drives_are_held_out_where_they_come_near(tmp_path: Path):
-    for drive, count in (("a", 7), ("b", 9), ("c", 4)):
-        folder_of(tmp_path / drive, {"a": 0, "b": 7, "c": 16}[drive], count)
-    data = module(name="folder", root=str(tmp_path), validation={"share": 0.15})  # 3 scans, and the last drive has 4
-    assert numbers(data.validation_source) == [16, 17, 18, 19]
-    data = module(name="folder", root=str(tmp_path), validation={"share": 0.05})  # 1 scan
-    assert numbers(data.validation_source) == [19]
-
-
 def test_validation_is_never_augmented(numbered: Path):
     options = {"name": "folder", "root": str(numbered), "validation": {"share": 0.5}}
     plain = next(iter(module(**options).val_dataloader()))
@@ -241,23 +232,6 @@ class TestReflectance:
     def ply(path: Path) -> Path:
         write_points(path, np.array([[10, 0, -1]], np.float32))
         return path.parent
-
-    def test_scans_that_have_it_give_a_channel(self, numbered: Path, caplog):
-        with caplog.at_level("INFO"):
-            assert resolve_reflectance("auto", {"name": "folder", "root": str(numbered)})
-        assert [r.message for r in caplog.records] == ["encoding.reflectance=auto is true here: the scans have it"]
-        assert resolve_reflectance("auto", {"name": "simulated"})
-
-    def test_scans_that_lack_it_give_a_flow_of_range_alone(self, tmp_path: Path, caplog):
-        self.ply(tmp_path / "scan.ply")
-        with caplog.at_level("INFO"):
-            assert not resolve_reflectance("auto", {"name": "folder", "root": str(tmp_path)})
-        (record,) = caplog.records
-        assert "scan.ply has no reflectance" in record.message
-
-    def test_a_column_of_zeros_is_none(self, tmp_path: Path):
-        write_scan(tmp_path / "000000.bin", 0, reflectance=0.0)
-        assert not resolve_reflectance("auto", {"name": "folder", "root": str(tmp_path)})
 
     def test_one_part_without_it_is_enough(self, numbered: Path, tmp_path: Path):
         root = self.ply(tmp_path / "other" / "scan.ply")

@@ -136,12 +136,6 @@ def test_notes_beside_scans_are_no_scans(tmp_path: Path):
     assert [d.scans for d in find_drives("folder", tmp_path) if d.scans] == [(str(tmp_path / "scans" / "0.bin"),)]
 
 
-def test_a_drive_is_named_once(tmp_path: Path):
-    write_scan(tmp_path / "sequences" / "00" / "velodyne" / "000000.bin", 0)
-    with pytest.raises(InputError, match="drive 00 is named twice in 0, 00; name it once"):
-        find_drives("odometry", tmp_path, drives=[0, "00"])
-
-
 def test_linked_folders_are_looked_into_and_circles_end(tmp_path: Path):
     write_scan(tmp_path / "elsewhere" / "deep" / "b.bin", 0)
     write_scan(tmp_path / "scans" / "here" / "a.bin", 0)

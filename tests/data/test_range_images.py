@@ -14,7 +14,6 @@ import pytest
 from r2flow.data.reading import Reading, range_image, read_image
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
-from tests.test_cli import r2flow  # noqa: F401  a fixture
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
 READING = Reading(SENSOR, reflectance=True, on_bad_scan="error")
@@ -98,16 +97,6 @@ def test_pipes_devices_and_links_to_them_are_refused_at_once(tmp_path: Path):
         assert "not a regular file" in refused(tmp_path / name)
     assert "does not exist" in refused(tmp_path / "nothing.npy")
     assert "is a folder" in refused(tmp_path / "folder.npy")
-
-
-def test_the_verbs_say_it_in_one_line(r2flow, tmp_path: Path):  # noqa: F811
-    for number, (content, words) in enumerate(FILES.values()):
-        path = tmp_path / f"{number}.npy"
-        path.write_bytes(content)
-        code, _, error = r2flow("show", path, "--out", tmp_path / "views")
-        assert (code, error.count("\n")) == (2, 1)
-        assert words in error
-    assert not (tmp_path / "views").exists()
 
 
 def test_range_images_are_read_as_they_were(tmp_path: Path):
