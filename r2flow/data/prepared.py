@@ -13,7 +13,7 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, difference
 log = logging.getLogger(__name__)
 
 KIND = "scans"
+CHANNELS = ("range", "reflectance")
 SHARD_SCANS = 64  # 13 MB at 64 x 1024, held in memory while they are made
 PROBED = 8  # scans that tell whether a data set has reflectance, and in which steps
 PROJECTION = 1  # to be raised when the same files give other images, or images other codes
@@ -101,37 +102,27 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
     return levels
 
 
-@dataclass(frozen=True)
-class _Work:
-    """Projects and codes the scans of a shard."""
-
-    store: Store
-    source: ScanSource
-    skip: bool
-
-    def __call__(self, shard: int) -> None:
-        recipe, kept, left_out, errors = self.store.described, [], [], [[0.0, 0.0]]
-        coders = codes_of(recipe)
-        for number in range(recipe["scans"])[shard * recipe["shard_scans"] :][: recipe["shard_scans"]]:
-            try:
-                image = self.source[number]
-            except InputError as error:
-                if not self.skip:
-                    raise
-                log.warning("left out: %s", error)
-                left_out.append(number)
-                continue
-            codes = [coder.encode(channel) for coder, channel in zip(coders, image, strict=False)]
-            off = [np.abs(c.values[code] - ch).max() for c, code, ch in zip(coders, codes, image, strict=False)]
-            errors.append([*map(float, off), 0.0][:2])
-            kept.append(codes)
-        channels = zip(("range", "reflectance"), coders, strict=False)
-        shape = (len(kept), *Reading.of(recipe["reading"]).sensor.shape)
-        tensors = {
-            name: np.array([codes[i] for codes in kept], coder.dtype).reshape(shape)
-            for i, (name, coder) in enumerate(channels)
-        }
-        self.store.write(shard, tensors, {"left_out": left_out, "errors": np.max(errors, axis=0).tolist()})
+def _make_shard(store: Store, source: ScanSource, skip: bool, shard: int) -> None:
+    """Project and code the scans of a shard."""
+    recipe, numbers, left_out, errors = store.described, _numbers_of(store.described, shard), [], [0.0, 0.0]
+    coders = dict(zip(CHANNELS, codes_of(recipe), strict=False))
+    shape = (len(numbers), *Reading.of(recipe["reading"]).sensor.shape)
+    tensors = {name: np.empty(shape, coder.dtype) for name, coder in coders.items()}
+    for number in numbers:
+        try:
+            image = source[number]
+        except InputError as error:
+            if not skip:
+                raise
+            log.warning("left out: %s", error)
+            left_out.append(number)
+            continue
+        row = number - numbers.start - len(left_out)
+        for i, (name, coder) in enumerate(coders.items()):
+            codes = tensors[name][row] = coder.encode(image[i])
+            errors[i] = max(errors[i], float(np.abs(coder.values[codes] - image[i]).max()))
+    kept = {name: codes[: len(numbers) - len(left_out)] for name, codes in tensors.items()}
+    store.write(shard, kept, {"left_out": left_out, "errors": errors})
 
 
 def prepare(
@@ -155,11 +146,18 @@ def prepare(
     if not store.check() or store.missing(plan.shards):
         store.begin(drives=[[drive.name, drive.scans] for drive in plan.drives])
     store.mend(plan.shards, checked)
-    store.make(store.missing(plan.shards), _Work(store, plan.source, on_bad_scan == "skip"), workers, made)
+    work = partial(_make_shard, store, plan.source, on_bad_scan == "skip")
+    store.make(store.missing(plan.shards), work, workers, made)
     notes = [store.head(shard) for shard in plan.shards]
     if sum(len(note["left_out"]) for note in notes) == plan.recipe["scans"]:
         raise InputError(f"all {plan.recipe['scans']} scans were left out as unusable; remove {store.folder}.")
     return notes
+
+
+def _numbers_of(recipe: Mapping[str, Any], shard: int) -> range:
+    """The numbers of the scans of a shard."""
+    size = recipe["shard_scans"]
+    return range(recipe["scans"])[shard * size : (shard + 1) * size]
 
 
 def codes_of(recipe: Mapping[str, Any]) -> list[RangeCodes | ReflectanceCodes]:
@@ -219,8 +217,7 @@ class PreparedScans(ScanSource):
                 raise InputError(f"{folder} is not finished: the same r2flow prepare command resumes.") from None
             except Damaged as error:
                 raise self._damaged(shard, error) from None
-            begin, size = shard * self.recipe["shard_scans"], self.recipe["shard_scans"]
-            rows = [n for n in range(begin, min(begin + size, self.recipe["scans"])) if n not in left_out]
+            rows = [number for number in _numbers_of(self.recipe, shard) if number not in left_out]
             held += [(number, shard, row) for row, number in enumerate(rows)]
         #: Rows of (number in the data set, shard, row of the shard).
         self.rows = np.array(held, dtype=np.int64).reshape(-1, 3)
@@ -282,7 +279,7 @@ class PreparedScans(ScanSource):
             if shard not in self._shards:
                 self.store.head(shard)  # as long as its head says, and of this recipe
                 file = safe_open(self.store.files(shard)[0], framework="numpy")
-                self._shards[shard] = [file.get_slice(name) for name in ("range", "reflectance")[: len(self._values)]]
+                self._shards[shard] = [file.get_slice(name) for name in CHANNELS[: len(self._values)]]
         except (Damaged, OSError) as error:
             raise self._damaged(shard, error) from None
         codes = [image[row : row + 1][0] for image in self._shards[shard]]
