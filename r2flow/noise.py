@@ -34,19 +34,16 @@ def generator(seed: int, purpose: str, index: int, step: int = 0) -> np.random.G
 
     Raises:
         InputError: a seed that is no whole number or outside its range, which is the user's to choose.
-        ValueError: an unknown purpose, or an index or a step outside its range.
+        OverflowError: an index or a step outside its range.
     """
-    if purpose not in PURPOSES:
-        raise ValueError(f"no purpose named {purpose!r}; known: {', '.join(PURPOSES)}.")
+    assert purpose in PURPOSES, purpose
+    assert index >= 0 <= step, (index, step)
     try:
         seed = index_of(seed)
     except TypeError:
         raise InputError(f"a seed must be a whole number, found {seed!r}.") from None
     if not 0 <= seed < 2**64:
         raise InputError(f"a seed must lie in [0, 2^64), found {seed}.")
-    for what, number in (("an index", index), ("a step", step)):
-        if not 0 <= number < 2**64:
-            raise ValueError(f"{what} must lie in [0, 2^64), found {number}.")
     # Philox4x64 has a 128-bit key and a 256-bit counter that counts blocks of four draws in its low
     # words: index and step go into the two highest words, which leaves 2^128 blocks to each pair.
     key = np.array([seed, zlib.crc32(purpose.encode())], dtype=np.uint64)
@@ -81,9 +78,8 @@ class Draws:
         return self._of_step(shape, 0)
 
     def step(self, shape: tuple[int, ...], j: int) -> Tensor:
-        """Noise of each scan in step j >= 1, (B, *shape) float32 on the CPU."""
-        if j < 1:
-            raise ValueError(f"steps that draw noise are counted from 1, found {j}.")
+        """Noise of each scan in step j >= 1, (B, *shape) float32 on the CPU; that of step 0 is the start's."""
+        assert j >= 1
         return self._of_step(shape, j)
 
     def _of_step(self, shape: tuple[int, ...], j: int) -> Tensor:

@@ -77,9 +77,3 @@ def test_noise_of_steps_is_standard_normal_and_uncorrelated_with_its_neighbours(
     # A correlation of n pairs has standard error 1 / sqrt(n).
     for a, b in ((x[:-1], x[1:]), (x[:, :-1], x[:, 1:]), (x[1:, :-1], x[:-1, 1:])):
         assert (a * b).mean(-1).abs().max() < 5 / n**0.5
-
-
-@pytest.mark.parametrize("j", [0, -1, 2**64])
-def test_a_step_out_of_range_is_refused(j):
-    with pytest.raises(ValueError, match=f"found {j}"):
-        Draws(0, [0]).step((1,), j)

@@ -161,17 +161,15 @@ def samples_of(run: Path) -> Path | None:
     """The samples of a run folder: its `samples`, else its only folder of samples; None where it is no run folder."""
     if not (run / "config.yaml").is_file() and not (run / "checkpoints").is_dir():
         return None
-    noted = {note.parent for note in run.glob(f"*/{MANIFEST}") if drawn_recipe(note.parent) is not None}
-    found = sorted(noted | {run / "samples"} if (run / "samples").is_dir() else noted)
+    if (run / "samples").is_dir():
+        return run / "samples"
+    found = sorted(note.parent for note in run.glob(f"*/{MANIFEST}") if drawn_recipe(note.parent) is not None)
     if not found:
         raise InputError(f"{run} is a run without samples; draw some: r2flow sample {run} --out {run / 'samples'}.")
-    if len(found) == 1:
-        return found[0]
-    names = ", ".join(one.name for one in found)
-    if run / "samples" not in found:
+    if len(found) > 1:
+        names = ", ".join(folder.name for folder in found)
         raise InputError(f"{run} has several folders of samples ({names}); name one of them.")
-    log.warning("%s has several folders of samples (%s): samples is taken", run, names)
-    return run / "samples"
+    return found[0]
 
 
 class Model(Protocol):

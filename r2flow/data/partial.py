@@ -15,7 +15,7 @@ import numpy as np
 
 from r2flow.data.opening import SOURCES, open_scans, own_reading, parse, usual_scale
 from r2flow.data.options import PREPARED, SIMULATED
-from r2flow.data.reading import Reading, nothing_in_view
+from r2flow.data.reading import Reading, nothing_in_view, scaled_reflectance
 from r2flow.data.sources import LOOKED_AT, ScanSource, spread
 from r2flow.errors import InputError, naming
 from r2flow.lidar.beams import full_reflectance, other_sensor
@@ -250,10 +250,5 @@ def _strength(path: Path, points: Points, scale: float, strict: bool) -> np.ndar
     """Reflectance of [0, 1]; None where a file has none, or 0 throughout."""
     if points.reflectance is None or not points.reflectance.any():
         return None
-    scaled = points.reflectance / np.float32(scale)
-    if strict and not (float(scaled.max()) <= 1 + 1e-3 and float(scaled.min()) >= 0):
-        raise InputError(
-            f"{path}: reflectance must lie in [0, {scale:g}], found up to {points.reflectance.max():g}. Say what means "
-            "full reflectance there, often 255: --reflectance-scale 255."
-        )
+    scaled = scaled_reflectance(path, points, scale) if strict else points.reflectance / np.float32(scale)
     return scaled.clip(0, 1)

@@ -108,7 +108,7 @@ def _projected(path: str | Path, reading: Reading) -> Projected:
         log.warning("%s: dropped %d points, NaN, infinite or beyond %g m", path, points.dropped, FARTHEST)
     if reading.projection == "unfolding":
         points = points.with_lost_rays()
-    scaled = _scaled_reflectance(path, points, reading.reflectance_scale) if reading.reflectance else None
+    scaled = scaled_reflectance(path, points, reading.reflectance_scale) if reading.reflectance else None
     with naming(path):
         pixels, chosen, r = project_indices(points.xyz, sensor, reading.projection, reading.convention, points.ring)
     image = scatter(sensor, pixels, [r] if scaled is None else [r, scaled[chosen]])
@@ -148,7 +148,8 @@ def _no_reflectance(path: str | Path) -> InputError:
     )
 
 
-def _scaled_reflectance(path: str | Path, points: Points, scale: float | None) -> np.ndarray:
+def scaled_reflectance(path: str | Path, points: Points, scale: float | None) -> np.ndarray:
+    """The reflectance of points in [0, 1]; the scale is guessed if None."""
     if points.reflectance is None:
         raise _no_reflectance(path)
     highest = float(np.nan_to_num(points.reflectance).max(initial=0))
