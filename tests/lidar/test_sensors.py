@@ -50,22 +50,6 @@ def test_resizing_keeps_the_field_of_view(sensor):
     np.testing.assert_allclose(even.row_edges, np.linspace(10, -30, 11), atol=1e-12)
 
 
-def test_impossible_sensors_are_refused():
-    with pytest.raises(InputError, match="fall from the top"):
-        Sensor("s", (0.0, 1.0))
-    with pytest.raises(InputError, match="min_range < max_range"):
-        Sensor("s", (1.0, 0.0), min_range=5, max_range=4)
-    with pytest.raises(InputError, match="columns"):
-        Sensor("s", (1.0, 0.0), columns=0)
-    # Sizes that no memory holds are refused before anything is allocated.
-    with pytest.raises(InputError, match="at most 16,777,216 pixels"):
-        Sensor("s", (1.0, 0.0), columns=10**13)
-    with pytest.raises(InputError, match="at most 16,777,216 pixels"):
-        build_sensor("hdl64e", 10**13)
-    with pytest.raises(InputError, match="Did you mean 'hdl64e'"):
-        build_sensor("hdl64")
-
-
 @pytest.mark.parametrize(
     ("name", "lasers"),
     [
@@ -149,6 +133,12 @@ def test_a_user_s_own_sensor_is_built():
         ({"elevations": [2, 1], "height": math.inf}, "height must be metres above the ground"),
         ({"elevations": [2, 1], "max_range": math.nan}, "min_range < max_range"),
         ({"name": "vlp16", "elevations": [2, 1]}, "another one"),
+        ({"elevations": [1, 0], "min_range": 5, "max_range": 4}, "min_range < max_range"),
+        ({"elevations": [1, 0], "columns": 0}, "columns"),
+        # Sizes that no memory holds are refused before anything is allocated.
+        ({"elevations": [1, 0], "columns": 10**13}, "pixels"),
+        ({"name": "hdl64e", "rows": 10**13}, "pixels"),
+        ({"name": "hdl64"}, "Did you mean 'hdl64e'"),
         ({}, "no sensor named 'mine'"),
     ],
 )
