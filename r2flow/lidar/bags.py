@@ -24,9 +24,6 @@ def read_bag(path: Path, topic: str | None = None) -> Iterator[tuple[int, Points
 
     Args:
         topic: Its name; may be left out where there is one topic of point clouds.
-
-    Raises:
-        InputError: rosbags is not installed, the recording cannot be read, or it has no such topic.
     """
     require(str(path), "formats", "rosbags")
     from rosbags.rosbag1 import Reader as Reader1

@@ -40,20 +40,12 @@ class NoBeamsError(InputError):
 
 @dataclass(frozen=True)
 class Beams:
-    """The beams of a sensor.
+    """The beams of a sensor."""
 
-    Attributes:
-        elevations: Median elevation of each in degrees, the top one first, (H,).
-        of_point: Row of each point of each scan; -1 for a ray without return.
-        order: How the scans are stored: `RINGS`, `FIRINGS`, ...
-        firing: Row of laser 0, 1, ... of ring numbers or whole firings; None where lasers are counted from the top or
-            from the bottom.
-    """
-
-    elevations: np.ndarray
-    of_point: list[np.ndarray]
-    order: str = UNORDERED
-    firing: tuple[int, ...] | None = None
+    elevations: np.ndarray  # median elevation of each in degrees, the top one first, (H,)
+    of_point: list[np.ndarray]  # row of each point of each scan; -1 for a ray without return
+    order: str = UNORDERED  # how the scans are stored: `RINGS`, `FIRINGS`, ...
+    firing: tuple[int, ...] | None = None  # row of laser 0, 1, ... where lasers are not counted from one end
 
 
 class Estimate(NamedTuple):
@@ -133,11 +125,7 @@ def _distance(beams: np.ndarray, table: np.ndarray) -> float:
 
 
 def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
-    """A sensor by its scans, which are in its own frame; range limits without one return in ten thousand, rounded.
-
-    Raises:
-        InputError: fewer than 200 returns, or no beams in them.
-    """
+    """A sensor by its scans, which are in its own frame; range limits without one return in ten thousand, rounded."""
     xyz = np.concatenate([scan.xyz[scan.xyz.any(axis=1)] for scan in scans])
     if len(xyz) < FEWEST_RETURNS:
         raise InputError(f"{len(xyz)} returns are too few for an estimate: give scans with at least {FEWEST_RETURNS}.")
@@ -213,12 +201,7 @@ def full_reflectance(scans: Sequence[Points]) -> float | None:
 
 
 def find_beams(scans: Sequence[Points]) -> Beams:
-    """The beams by ring numbers, else by the order of the points, else by their elevations alone.
-
-    Raises:
-        NoBeamsError: the points lie on no beams at all.
-        InputError: no beams can be told apart.
-    """
+    """The beams by ring numbers, else by the order of the points, else by their elevations alone."""
     beams = _beams([scan.with_lost_rays() for scan in scans])
     pairs = zip(beams.of_point, scans, strict=True)
     return replace(beams, of_point=[row if len(row) == len(scan.xyz) else row[scan.kept] for row, scan in pairs])

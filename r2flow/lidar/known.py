@@ -106,11 +106,7 @@ FORMS = "rows:4, rows:4,FIRST, random:0.5, points:0.1, sector:-30,30 or a .npy o
 
 
 def parse_mask(text: str) -> Mask:
-    """A mask by its text: `NAME:NUMBERS` of `MASKS`, a .npy file, or several joined by +, which must all measure a ray.
-
-    Raises:
-        InputError: no such mask, numbers that it does not take, or a file without a mask.
-    """
+    """A mask by its text: `NAME:NUMBERS` of `MASKS`, a .npy file, or several joined by +: all measure a ray."""
     parts = [_one_mask(part.strip()) for part in text.split("+")]
     return lambda shape, draws: np.logical_and.reduce([part(shape, draws) for part in parts])
 

@@ -50,9 +50,6 @@ def read_labels(path: str | Path, scan: str | Path, points: Points | None = None
         path: A `.label` file: uint32 for each row of the scan's file, the id in its low 16 bits, an instance above.
         scan: The scan that it belongs to.
         points: That scan, where it has been read already.
-
-    Raises:
-        InputError: a file that is missing or cannot be read, is no label file, or that of another scan.
     """
     path = Path(path)
     points = read_points(scan) if points is None else points

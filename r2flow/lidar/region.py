@@ -15,23 +15,14 @@ MARGIN = 11.25
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle of an image whose columns are a full turn.
+    """A rectangle of an image whose columns are a full turn."""
 
-    Attributes:
-        shape: Rows and columns (H, W) of the whole image.
-        top: First row.
-        height: Number of rows.
-        left: First column.
-        width: Number of columns, which go on at column 0 behind the last.
-        margin: Number of columns on either side that are generated with it and cut off.
-    """
-
-    shape: tuple[int, int]
+    shape: tuple[int, int]  # rows and columns (H, W) of the whole image
     top: int
     height: int
     left: int
-    width: int
-    margin: int = 0
+    width: int  # columns, which go on at column 0 behind the last
+    margin: int = 0  # columns on either side that are generated with it and cut off
 
     @property
     def rows(self) -> Tensor:
@@ -102,9 +93,6 @@ def region(
         rows: First and last row, both included, 0 at the top. None for all.
         margin: Degrees on either side of the sector that are generated with it and cut off, as what is next to a cut is
             not what it is in the whole scan.
-
-    Raises:
-        InputError: a sector narrower than a column, angles beyond 360 degrees, or rows that the image does not have.
     """
     height, width = shape
     first_row, last_row = rows or (0, height - 1)

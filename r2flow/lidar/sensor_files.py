@@ -20,9 +20,6 @@ def read_sensor(path: str | Path, rows: int | None = None, columns: int | None =
 
     Args:
         rows, columns: Image size, if not the file's.
-
-    Raises:
-        InputError: the file is missing, cannot be read as YAML or describes no possible sensor.
     """
     path = Path(path)
     if not path.is_file():

@@ -33,9 +33,6 @@ class Sensor:
         firing: Row of laser 0, 1, ... in the order of the sensor's packets, which scan unfolding needs; None where that
             is from the top row down or from the bottom up.
         reflectance_scale: The value in its scan files that means full reflectance; None where they do not say.
-
-    Raises:
-        InputError: a value that no sensor has; NaN is refused too, since comparisons with it are false.
     """
 
     name: str
@@ -206,11 +203,7 @@ def build_sensor(
     firing: Sequence[int] | None = None,
     reflectance_scale: float | None = None,
 ) -> Sensor:
-    """A built-in sensor by its name, or your own by `elevations`, with the size and limits that are given.
-
-    Raises:
-        InputError: an unknown name; elevations with the name of a built-in sensor; or no possible sensor.
-    """
+    """A built-in sensor by its name, or your own by `elevations`, with the size and limits that are given."""
     if elevations is not None and name in SENSORS:
         raise InputError(f"{name!r} is the name of a built-in sensor; give your own sensor another one.")
     limits = {"min_range": min_range, "max_range": max_range, "height": height, "reflectance_scale": reflectance_scale}

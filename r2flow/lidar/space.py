@@ -42,11 +42,7 @@ class ModelSpace:
         return self.encoding.shape
 
     def check_channels(self, channels: str) -> None:
-        """Refuse channels that an image of this space cannot give.
-
-        Raises:
-            InputError: no such channel, or reflectance where there is none.
-        """
+        """Refuse channels that an image of this space cannot give."""
         if channels not in CHANNELS:
             raise InputError(f"channels must be {', '.join(CHANNELS[:-1])} or {CHANNELS[-1]}, found {channels!r}.")
         if channels == "reflectance" and not self.encoding.reflectance:
@@ -74,9 +70,6 @@ class ModelSpace:
         Returns:
             For each image x, y, z in metres (x ahead, y left, z up) and reflectance, (N, 4) float32; N differs from
             scan to scan. Reflectance is 0 where it is not known.
-
-        Raises:
-            InputError: images of another shape.
         """
         images = torch.as_tensor(images)
         if images.ndim != 4 or images.shape[1] not in (1, 2) or tuple(images.shape[2:]) != self.sensor.shape:
@@ -88,11 +81,7 @@ class ModelSpace:
 
 
 def build_space(config: Mapping[str, Any]) -> ModelSpace:
-    """The model space of a config with the keys `sensor` and `encoding`.
-
-    Raises:
-        InputError: a key is missing, a name or an option is unknown, or the numbers do not fit together.
-    """
+    """The model space of a config with the keys `sensor` and `encoding`."""
     for key in ("sensor", "encoding"):
         if key not in config:
             raise InputError(f"the config has no '{key}'.")

@@ -37,11 +37,7 @@ class Partial:
 
 
 def sensor_of(scans: list[Points], named: Sensor | None = None) -> Sensor:
-    """The sensor of some scans, named or estimated, with as many columns as it fires rays in a turn.
-
-    Raises:
-        InputError: no beams can be told apart and no sensor is named.
-    """
+    """The sensor of some scans, named or estimated, with as many columns as it fires rays in a turn."""
     if named is None:
         estimate = estimate_sensor(scans)
         return replace(estimate.sensor, columns=round(estimate.steps))

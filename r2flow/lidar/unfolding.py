@@ -15,9 +15,6 @@ def unfolded_rows(xyz: np.ndarray, sensor: Sensor, convention: Convention, ring:
     The lasers are found in one of three ways, tried in this order: by ring numbers; by whole firings of H points each,
     rays without return included, all in one order of the lasers; or ring after ring (`rings_from_order`), aligned at
     the bottom because rings that see only sky are missing at the top. `reference` uses the last way only.
-
-    Raises:
-        InputError: the file allows none of these ways, or its lasers are not the sensor's.
     """
     rows = sensor.shape[0]
     if ring is not None:
@@ -148,16 +145,10 @@ def median_of_seen(values: np.ndarray) -> np.ndarray:
 
 
 def best_order(elevation: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, float]:
-    """Row of each laser in the order that fits their elevations best, and how well it fits.
+    """Row of each laser in the order that fits their elevations best, (H,) int64.
 
-    The orders are from the top row down, from the bottom up and the sensor's own firing order. Where several fit
-    equally, as with a single laser that returned, the one whose rows lie nearest to the elevations.
-
-    Args:
-        elevation: Elevation of laser 0, 1, ..., (H,); NaN for one without returns.
-
-    Returns:
-        (H,) int64, and the share of neighbouring lasers, in that order, whose elevations fall.
+    The orders are from the top row down, from the bottom up and the sensor's own firing order. The second value is the
+    share of neighbouring lasers, in that order, whose elevations fall; of equals the order with the nearest rows wins.
     """
     rows = len(elevation)
     orders = [np.arange(rows), np.arange(rows)[::-1]]

@@ -113,9 +113,6 @@ def read_range_image(path: str | Path) -> np.ndarray | None:
     """The range image in a .npy of floats (2 or 1, H, W), float32; None for any other array.
 
     What is not finite is 0, a ray without return; so is a range that no LiDAR measures, with a warning.
-
-    Raises:
-        InputError: the file is missing, no regular file or damaged, or most of its ranges are such.
     """
     if Path(path).suffix.lower() != ".npy":
         return None
@@ -141,11 +138,7 @@ def read_range_image(path: str | Path) -> np.ndarray | None:
 
 
 def read_numbers(path: str | Path) -> np.ndarray:
-    """The array of numbers in a .npy, of any shape and type. Nothing is unpickled.
-
-    Raises:
-        InputError: the file is missing, no regular file, damaged, or holds objects.
-    """
+    """The array of numbers in a .npy, of any shape and type. Nothing is unpickled."""
     path = Path(path)
     with _door(path):
         refuse_unreadable(path, LARGEST_FILE, ".npy file")
@@ -184,9 +177,6 @@ def write_points(
         xyz: Points in metres, (N, 3), sensor frame.
         reflectance: (N,), or None for none.
         ring: Number of each point's beam, (N,), or None; for a .ply.
-
-    Raises:
-        InputError: an unknown format, a .bin without reflectance, or a path that cannot be written.
     """
     path = Path(path)
     ending = path.suffix.lower()

@@ -164,9 +164,6 @@ def decompress_lzf(stream: bytes, size: int) -> bytes:
     A control byte below 32 announces control + 1 literal bytes. Any other copies what was written before: its upper
     three bits hold length - 2, where 7 means that one more byte is to be added; its lower five bits and the next byte
     hold distance - 1. A copy may overlap its own output, which repeats a pattern.
-
-    Raises:
-        ValueError: the stream is cut, refers to before its beginning, or does not give `size` bytes.
     """
     output = bytearray()
     position, end = 0, len(stream)

@@ -69,11 +69,7 @@ def check(holds: object, message: str) -> None:
 
 
 def check_columns(columns: Sequence[str] | None) -> None:
-    """Refuse names of columns that do not have x, y and z once each.
-
-    Raises:
-        InputError: what was given, and an example.
-    """
+    """Refuse names of columns that do not have x, y and z once each."""
     names = [str(name).lower() for name in columns or "xyz"]
     counts = {role: sum(name in aliases for name in names) for role, aliases in ROLES.items()}
     check(
