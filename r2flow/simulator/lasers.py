@@ -10,7 +10,7 @@ places and full in others.
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -97,47 +97,24 @@ def rows_of(sensor: Sensor, slope: np.ndarray) -> np.ndarray:
     return np.where((row >= 0) & (row < h), row, -1)
 
 
-@dataclass(frozen=True)
 class Rays:
     """B lasers by W azimuths.
 
     Every ray is p(s) = (s cos a, s sin a, z + s T): s the horizontal distance, a the azimuth of the column, T = tan E
     the slope of the laser and z its height. An upright surface is met at an s that depends on the column alone.
+
+    Args:
+        columns: Number W of azimuths; column w looks along a = pi - 2 pi (w + 1/2) / W.
+        ground: Height of the sensor's origin above the scene's z = 0, in metres.
     """
 
-    lasers: Lasers
-    columns: int  # number W of azimuths; column w looks along a = pi - 2 pi (w + 1/2) / W
-    ground: float = 0.0  # height of the sensor's origin above the scene's z = 0, in metres
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(B, W)."""
-        return len(self.lasers.elevation), self.columns
-
-    @cached_property
-    def azimuth(self) -> np.ndarray:
-        """Azimuth a in radians, (W,), float64."""
-        return np.pi - 2 * np.pi * (np.arange(self.columns) + 0.5) / self.columns
-
-    @cached_property
-    def cos(self) -> np.ndarray:
-        """cos a, (W,), float32."""
-        return np.cos(self.azimuth).astype(np.float32)
-
-    @cached_property
-    def sin(self) -> np.ndarray:
-        """sin a, (W,), float32."""
-        return np.sin(self.azimuth).astype(np.float32)
-
-    @cached_property
-    def slope(self) -> np.ndarray:
-        """T = tan E, falling, (B,), float32."""
-        return np.tan(self.lasers.elevation).astype(np.float32)
-
-    @cached_property
-    def height(self) -> np.ndarray:
-        """Height z of each laser above the scene's z = 0 in metres, (B,), float32."""
-        return (self.lasers.height + self.ground).astype(np.float32)
+    def __init__(self, lasers: Lasers, columns: int, ground: float = 0.0) -> None:
+        self.lasers, self.columns, self.ground = lasers, columns, ground
+        self.shape = len(lasers.elevation), columns
+        self.azimuth = np.pi - 2 * np.pi * (np.arange(columns) + 0.5) / columns  # a in radians, (W,), float64
+        self.cos, self.sin = np.cos(self.azimuth).astype(np.float32), np.sin(self.azimuth).astype(np.float32)
+        self.slope = np.tan(lasers.elevation).astype(np.float32)  # T, falling, (B,)
+        self.height = (lasers.height + ground).astype(np.float32)  # z of each laser above the scene's z = 0, (B,)
 
 
 def expand(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
