@@ -6,11 +6,15 @@ import logging
 import os
 import sys
 import unicodedata
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any
+
+log = logging.getLogger(__name__)
 
 
 class InputError(ValueError):
@@ -42,6 +46,28 @@ def naming(path: str | Path) -> Iterator[None]:
         yield
     except InputError as error:
         raise type(error)(f"{path}: {error}") from None
+
+
+# Oddities of scan files, told once for a folder: files by folder and kind, with how many values of each are odd.
+_odd: defaultdict[tuple[Path, str], dict[Path, int]] = defaultdict(dict)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_odd.clear)
+
+
+def note_odd(path: Path, kind: str, count: int) -> None:
+    """Note that `count` values of a file are odd, for `tell_odd` or, at the latest, the end of the process."""
+    if not _odd:
+        Finalize(None, tell_odd, exitpriority=0)  # in workers, too, where atexit is not enough
+    _odd[path.parent, kind][path] = count
+
+
+def tell_odd() -> None:
+    """Warn of what `note_odd` has collected, in one line for each folder and kind."""
+    for (folder, kind), files in _odd.items():
+        worst = max(files, key=files.__getitem__)
+        number = f"{len(files)} file{'s' * (len(files) > 1)}"
+        log.warning("%s: %s; %s, most in %s (%d)", folder, kind, number, worst.name, files[worst])
+    _odd.clear()
 
 
 def explain_mistake(error: InputError | OSError) -> str:

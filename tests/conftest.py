@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from r2flow import errors
 from r2flow.lidar.sensors import SENSORS, Sensor
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -49,5 +50,6 @@ def sensor(request: pytest.FixtureRequest) -> Sensor:
 
 
 @pytest.fixture(autouse=True)
-def _fixed_seed() -> None:
+def _from_the_start() -> None:
     torch.manual_seed(0)
+    errors._odd.clear()

@@ -21,7 +21,7 @@ from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, Sour
 from r2flow.data.pairs import PairDataset, PairSource, PairStore
 from r2flow.data.reading import Reading
 from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
-from r2flow.errors import InputError
+from r2flow.errors import InputError, tell_odd
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.progress import track
@@ -169,6 +169,7 @@ class ScanDataModule(L.LightningDataModule):
                 for number in track(range(len(part)), f"reading {what}", least=16):
                     images[number] = part[number]
                 parts[i] = InMemory(images, part.names)
+        tell_odd()
         return _joined(parts)
 
     def _ranks(self) -> tuple[int, int]:

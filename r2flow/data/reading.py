@@ -1,7 +1,6 @@
 """How a scan file, or a range image, becomes an image of one sensor."""
 
 import json
-import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -10,14 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from r2flow.errors import InputError, naming
+from r2flow.errors import InputError, naming, note_odd
 from r2flow.lidar.labels import labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
 from r2flow.lidar.scan_files.points import FARTHEST
 from r2flow.lidar.sensors import Sensor
-
-log = logging.getLogger(__name__)
 
 AUTO = "auto"
 
@@ -105,7 +102,7 @@ def read_projected(path: str | Path, reading: Reading) -> Projected:
 def _projected(path: str | Path, reading: Reading) -> Projected:
     points, sensor = read_points(path, reading.columns), reading.sensor
     if points.dropped:
-        log.warning("%s: dropped %d points, NaN, infinite or beyond %g m", path, points.dropped, FARTHEST)
+        note_odd(Path(path), f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped", points.dropped)
     if reading.projection == "unfolding":
         points = points.with_lost_rays()
     scaled = scaled_reflectance(path, points, reading.reflectance_scale) if reading.reflectance else None

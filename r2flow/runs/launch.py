@@ -25,7 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from r2flow import __version__
 from r2flow.config import key_of
-from r2flow.errors import InputError, explain_mistake, one_line, open_streams
+from r2flow.errors import InputError, explain_mistake, one_line, open_streams, tell_odd
 from r2flow.plugins import load_plugins, take_plugins
 from r2flow.runs.composing import (
     CONF,
@@ -105,6 +105,8 @@ def main(arguments: Sequence[str], command: Sequence[str]) -> int:
     except (InputError, OSError) as error:
         print(f"error: {explain_mistake(error)}", file=sys.stderr)
         return 2
+    finally:
+        tell_odd()
     return 0
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from r2flow.data.reading import Reading, range_image, read_image
-from r2flow.errors import InputError
+from r2flow.errors import InputError, tell_odd
 from r2flow.lidar.sensors import SENSORS
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
@@ -130,10 +130,15 @@ def test_ranges_that_no_lidar_measures_are_reported_and_are_no_returns(tmp_path:
     image[0] = 20
     np.save(tmp_path / "whole.npy", image)
     assert np.array_equal(range_image(tmp_path / "whole.npy"), image)
+    for count in (1, 4, 2):
+        image[0, 3, 5:9], image[0, 3, 5 : 5 + count] = 20, absurd
+        np.save(tmp_path / f"{count}.npy", image)
+        range_image(tmp_path / f"{count}.npy")
+    found = range_image(tmp_path / "4.npy")
     assert not caplog.text
-    image[0, 3, 5:9] = absurd
-    np.save(tmp_path / "image.npy", image)
-    found = range_image(tmp_path / "image.npy")
-    assert "image.npy: 4 ranges" in caplog.text
+    tell_odd()
+    tell_odd()
+    assert caplog.text.count(f"{tmp_path}: ranges below 0") == 1
+    assert "3 files, most in 4.npy (4)" in caplog.text
     image[:, 3, 5:9] = 0
     assert np.array_equal(found, image)

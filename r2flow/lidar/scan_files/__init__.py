@@ -4,14 +4,13 @@ points = read_points("000000.bin")
 write_points("000000.ply", points.xyz, points.reflectance)
 """
 
-import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from r2flow.errors import InputError, naming
+from r2flow.errors import InputError, naming, note_odd
 from r2flow.files import atomic_write, refuse_unreadable
 from r2flow.lidar.scan_files.clouds import read_pcd, read_ply, write_pcd, write_ply
 from r2flow.lidar.scan_files.points import NoPointsError, Points, check, check_columns, column_points
@@ -69,8 +68,6 @@ SCAN_ENDINGS = tuple(_READERS)
 LOOSE_ENDINGS = (".csv", ".txt", ".npz")  # which other things than scans have too
 FIRM_ENDINGS = tuple(ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS)
 
-log = logging.getLogger(__name__)
-
 FARTHEST_RAY = 400.0  # metres; no spinning LiDAR measures farther
 LARGEST_FILE = 1 << 30  # bytes: 67 million points, hundreds of scans; reading more exhausts the memory
 
@@ -123,16 +120,14 @@ def read_range_image(path: str | Path) -> np.ndarray | None:
         image = np.nan_to_num(array.astype(np.float32), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     wrong = (image[0] < 0) | (image[0] > FARTHEST_RAY)
     if wrong.any():
-        ends = f"from {image[0][wrong].min():.3g} to {image[0][wrong].max():.3g}"
         if 2 * wrong.sum() > np.count_nonzero(image[0]):
+            ends = f"from {image[0][wrong].min():.3g} to {image[0][wrong].max():.3g}"
             raise InputError(
                 f"{path}: most of its ranges are below 0 or above {FARTHEST_RAY:g} m, {ends}. Are these millimetres, "
                 "or a scan in model space? Give metres."
             )
-        log.warning(
-            "%s: %d ranges below 0 or above %g m, %s, are taken as no return; ranges are metres",
-            path, wrong.sum(), FARTHEST_RAY, ends,
-        )  # fmt: skip
+        kind = f"ranges below 0 or above {FARTHEST_RAY:g} m are taken as no return; ranges are metres"
+        note_odd(Path(path), kind, int(wrong.sum()))
         image[:, wrong] = 0
     return image
 
