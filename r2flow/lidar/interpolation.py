@@ -25,11 +25,11 @@ def interpolated(image: np.ndarray, measured: np.ndarray, rule: Rule = "inverse"
     """
     if measured.all() or not measured.any():
         return image * measured
-    filled, done = _along(image * measured, measured, 1, rule)
+    filled, done = (array.swapaxes(-1, -2) for array in _along((image * measured).swapaxes(1, 2), measured.T, rule))
     if not done.all():
         columns = image.shape[2]
         ring = np.concatenate([filled] * 3, axis=2), np.concatenate([done] * 3, axis=1)
-        wide = _along(*ring, 2, rule, extend=True)[0][..., columns : 2 * columns]
+        wide = _along(*ring, rule, extend=True)[0][..., columns : 2 * columns]
         filled = _rows_beyond(np.where(done, filled, wide), done)
     return filled.astype(np.float32)
 
@@ -50,23 +50,18 @@ def _rows_beyond(image: np.ndarray, done: np.ndarray) -> np.ndarray:
     return image
 
 
-def _along(
-    image: np.ndarray, known: np.ndarray, axis: int, rule: Rule, extend: bool = False
-) -> tuple[np.ndarray, np.ndarray]:
-    """Fill between known rays along an axis (1 for columns' rows, 2 for rows' columns); and what is known then.
+def _along(values: np.ndarray, known: np.ndarray, rule: Rule, extend: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Fill between the known places of each line, (C, lines, places); and which places are known then.
 
-    Args:
-        extend: Whether a line with one known ray has that everywhere.
+    With `extend` a line with one known place has its values everywhere.
     """
-    flat = known.T if axis == 1 else known  # lines, places
-    values = np.moveaxis(image, axis, 2) if axis == 1 else image
-    count = flat.shape[1]
-    at, lines = np.arange(count), np.arange(len(flat))[:, None]
-    left, right = _neighbours(flat, at)
+    count = known.shape[1]
+    at, lines = np.arange(count), np.arange(len(known))[:, None]
+    left, right = _neighbours(known, at)
     inside = (left >= 0) & (right < count)
-    held = (left >= 0) | (right < count) if extend else inside & (flat.sum(1, keepdims=True) > 1)
+    held = (left >= 0) | (right < count) if extend else inside & (known.sum(1, keepdims=True) > 1)
     nearest = np.where((left < 0) | ((right < count) & (right - at < at - left)), right, left).clip(0, count - 1)
-    returned = flat & (values[0] > 0)
+    returned = known & (values[0] > 0)
     back = returned[lines, nearest]
     if rule == "nearest":
         filled = values[:, lines, nearest]
@@ -79,9 +74,7 @@ def _along(
             source = np.concatenate([1 / values[:1].astype(np.float64) if invert else values[:1], values[1:]])
             filled = (1 - share) * source[:, lines, one] + share * source[:, lines, other]
             filled[0] = 1 / filled[0] if invert else filled[0]
-    filled = np.where(flat, values, np.where(back & held, filled, 0))
-    done = flat | held
-    return (np.moveaxis(filled, 2, 1), done.T) if axis == 1 else (filled, done)
+    return np.where(known, values, np.where(back & held, filled, 0)), known | held
 
 
 def _neighbours(known: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

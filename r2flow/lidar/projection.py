@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -12,8 +12,6 @@ from r2flow.lidar.sensors import Convention, Sensor
 from r2flow.lidar.unfolding import unfolded_rows
 
 Projection = Literal["spherical", "unfolding"]
-PROJECTIONS = ("spherical", "unfolding")
-CONVENTIONS = ("centre", "reference")
 
 
 def project(
@@ -72,8 +70,8 @@ def project_indices(
     Returns:
         The pixels that keep one, h W + w, ascending; the index of its point in `xyz`; its range in metres: (M,) each.
     """
-    assert convention in CONVENTIONS, convention
-    assert projection in PROJECTIONS, projection
+    assert convention in get_args(Convention), convention
+    assert projection in get_args(Projection), projection
     xyz = np.asarray(xyz, dtype=np.float32)
     rows, columns = sensor.shape
     r = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))

@@ -1,12 +1,11 @@
 """Your own sensor as a dozen lines of YAML, for the verbs and, in conf/sensor/, for training."""
 
-import textwrap
-from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import yaml
 
-from r2flow.errors import InputError
+from r2flow.errors import InputError, naming
 from r2flow.files import atomic_write
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.registry import check_options
@@ -38,39 +37,16 @@ def read_sensor(path: str | Path, rows: int | None = None, columns: int | None =
     sized = {"rows": rows, "columns": columns}
     options.update({key: value for key, value in sized.items() if value is not None})
     check_options(str(path), build_sensor, options)
-    try:
+    with naming(path):
         return build_sensor(**options)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
-    """Write a sensor as a YAML file.
-
-    Args:
-        comment: First lines of the file: where the numbers come from.
-    """
-    lines = [
-        *(f"# {line}" for line in comment.splitlines()),
-        f"name: {sensor.name}",
-        *_listed("elevations", sensor.elevations, "degrees, the top row first"),
-        "rows: null # null: one for each elevation",
-        f"columns: {sensor.columns} # of an image, a full turn",
-        "rays: centre",
-        f"min_range: {sensor.min_range} # metres",
-        f"max_range: {sensor.max_range}",
-        f"height: {sensor.height} # above the ground",
-    ]
-    if sensor.reflectance_scale is not None:
-        lines.append(f"reflectance_scale: {sensor.reflectance_scale} # in its files it means full reflectance")
-    if sensor.firing is not None:
-        lines += _listed("firing", sensor.firing, "row of laser 0, 1, ... in the order of the files")
+    """Write a sensor as a YAML file, whose first lines say where the numbers come from."""
+    options = {key: value for key, value in asdict(sensor).items() if value is not None}
+    options |= {key: list(value) for key, value in options.items() if isinstance(value, tuple)}
+    options |= {"rows": None, "rays": "centre"}
+    units = "Elevations in degrees, the top row first, a row each where rows is null; ranges and height in metres."
     with atomic_write(path, "w") as file:
-        file.write("\n".join(lines) + "\n")
-
-
-def _listed(key: str, values: Sequence[float], comment: str) -> list[str]:
-    return [
-        f"{key}: # {comment}",
-        *textwrap.wrap(f"[{', '.join(map(str, values))}]", 100, initial_indent="  ", subsequent_indent="  "),
-    ]
+        file.writelines(f"# {line}\n" for line in (*comment.splitlines(), units))
+        yaml.safe_dump(options, file, default_flow_style=None, sort_keys=False, width=100)
