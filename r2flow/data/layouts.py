@@ -75,12 +75,9 @@ class SourceKind:
 
 @dataclass(frozen=True)
 class Layout(SourceKind):
-    """A data set of scan files, whose drives `find` finds below its folder, in order.
+    """A data set of scan files, whose drives `find` finds below its folder, in order."""
 
-    The first line of its docstring says what it looks for.
-    """
-
-    find: Callable[[Path], list[Drive]]
+    find: Callable[[Path], list[Drive]]  # the first line of its docstring says what it looks for
     splits: Mapping[str, Sequence[int | str]] = field(default_factory=dict)
     sensor: str = "hdl64e"
     reflectance_scale: float = 1.0
@@ -100,21 +97,12 @@ class Layout(SourceKind):
             raise InputError(f"{root} holds no scan. Looked for ({name}): {where}{_elsewhere(root)}")
         found = self.chosen(held, split, None)
         if not found:
-            raise InputError(f"{root} holds no scan of its {split} split; {self._held(held)}.")
+            names = ", ".join(f"{drive.name} ({self.split_of(drive.name)})" for drive in held)
+            raise InputError(
+                f"{root} holds no scan of its {split} split; it holds {names[:200]}: give another data.split "
+                "(--split), or null for all."
+            )
         return self.chosen(found, None, options.drives)
-
-    def _held(self, drives: Sequence[Drive]) -> str:
-        """What there is in place of a split's drives, and how it is taken."""
-        parts: dict[str | None, list[Drive]] = {}
-        for drive in drives:
-            parts.setdefault(self.split_of(drive.name), []).append(drive)
-        there = "; ".join(
-            f"{sum(len(drive.scans) for drive in found)} of {f'its {part} split' if part else 'no split'} "
-            f"({', '.join(drive.name for drive in found[:3])}{', ...' * (len(found) > 3)})"
-            for part, found in parts.items()
-        )
-        ways = [f"data.split={part} (--split {part})" for part in parts if part]
-        return f"it holds {there}: give {', '.join([*ways, 'data.split=null for all'])}"
 
     def open(self, options: SourceOptions, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanFiles:
         if reading.projection == "unfolding" and reading.sensor.name == "hdl64e":
@@ -215,10 +203,8 @@ def _elsewhere(root: Path) -> str:
 
 
 def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:
-    chosen = {
-        path[: len(path) - len(scan_ending(path))]: path for path in sorted(paths, key=lambda p: p.endswith(".npy"))
-    }
-    kept = set(chosen.values())
+    images_last = sorted(paths, key=lambda path: path.endswith(".npy"))
+    kept = set({path[: len(path) - len(scan_ending(path))]: path for path in images_last}.values())
     return tuple(path for path in paths if path in kept)
 
 

@@ -21,10 +21,11 @@ from r2flow.data import layouts
 from r2flow.data.layouts import Drive, Layout, SourceKind, spans_of
 from r2flow.data.options import FOLDER, MIXED, PAIRS, PREPARED, SIMULATED, Data, DataOptions, SourceOptions
 from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_images
-from r2flow.data.reading import AUTO, Reading, lacks_reflectance, range_image
+from r2flow.data.reading import AUTO, Reading, lacks_reflectance
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans, made_here, warn_of_other_sensor
 from r2flow.errors import InputError, tell_odd
+from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensor_files import ENDINGS, read_sensor
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 from r2flow.registry import Registry, check_options, did_you_mean
@@ -102,7 +103,7 @@ def open_scans(
             seed, options = int(options.folder), replace(options, root=None)
             return ScanSet(label, open_source(options, reading, seed), reading.sensor)
         return ScanSet(label, open_source(options, reading), reading.sensor).limited(num)
-    image = range_image(file)
+    image = read_range_image(file)
     if image is not None:  # points can be seen through any sensor
         refuse_other_samples(file.parent, reading.sensor)
     elif not own_size:
@@ -252,13 +253,12 @@ def read(path: str | Path, sensor: Sensor | str | None = None) -> Tensor:
 def own_reading(spec: str | Path) -> Reading | None:
     """How scans that r2flow wrote are read: prepared scans, samples and simulated scans; None for other scans."""
     options, _ = parse(str(spec))
-    if options.name == PREPARED:
-        there = Reading.of(read_prepared(Path(options.folder).expanduser())[0]["reading"])
-        return replace(there, reflectance=AUTO, within_limits=False)
-    if options.name != FOLDER:
+    if options.name not in (PREPARED, FOLDER):
         return None
-    reading = _manifest(Path(options.folder)).get("recipe", {}).get("reading")
-    return None if reading is None else Reading.of(reading)
+    described = _manifest(Path(options.folder).expanduser()).get("recipe", {}).get("reading")
+    if described is None or options.name == FOLDER:
+        return described and Reading.of(described)
+    return replace(Reading.of(described), reflectance=AUTO, within_limits=False)
 
 
 def usual_scale(spec: str | Path, sensor: Sensor) -> float:
@@ -301,9 +301,7 @@ def refuse_other_samples(folder: Path, sensor: Sensor) -> None:
 def refuse_parts(spec: str | Path) -> None:
     """Refuse samples of a part of each image: beside whole scans they would be judged as scans that lack the rest."""
     options, _ = parse(str(spec))
-    if options.name != FOLDER:
-        return
-    if (drawn_recipe(Path(options.folder)) or {}).get("region"):
+    if options.name == FOLDER and (drawn_recipe(Path(options.folder)) or {}).get("region"):
         raise InputError(
             f"{spec} holds a part of each scan alone (its {MANIFEST} says so) and cannot be judged beside whole scans: "
             "sample without --sector and --rows."

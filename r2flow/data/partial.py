@@ -16,7 +16,7 @@ import numpy as np
 from r2flow.data.opening import SOURCES, open_scans, own_reading, parse, usual_scale
 from r2flow.data.options import PREPARED, SIMULATED
 from r2flow.data.reading import Reading, nothing_in_view, scaled_reflectance
-from r2flow.data.sources import LOOKED_AT, ScanSource, spread
+from r2flow.data.sources import LOOKED_AT, spread
 from r2flow.errors import InputError, naming
 from r2flow.lidar.beams import full_reflectance, other_sensor
 from r2flow.lidar.scan_files import Points, read_numbers, read_points, read_range_image, scan_ending
@@ -39,26 +39,17 @@ Opened = tuple[list["PartialScan"], list[str]]  # scans, and lines about their s
 
 @dataclass(frozen=True)
 class PartialScan:
-    """A scan that is read when its turn comes.
+    """A scan that is read when its turn comes."""
 
-    Attributes:
-        name: Of its answers, without an ending: its path below the folder that was named.
-        ending: Of its file; `.npy` of an image.
-        read: What is known of it.
-        content: What tells it from another scan of this name.
-        path: Its file; None where it has none of its own.
-        image: Whether it is a range image, as its answers are then, or points.
-    """
-
-    name: str
-    ending: str
+    name: str  # of its answers, without an ending: its path below the folder that was named
+    ending: str  # of its file; `.npy` of an image
     read: Callable[[], Partial]
     content: Callable[[], bytes]
-    path: Path | None = None
-    image: bool = True
+    path: Path | None = None  # its file; None where it has none of its own
+    image: bool = True  # whether it is a range image, as its answers are then, or points
 
     def identity(self) -> str:
-        """A hash of `content`."""
+        """What tells the scan from another scan of its name."""
         return hashlib.sha256(self.content()).hexdigest()[:16]
 
 
@@ -81,29 +72,26 @@ def open_partial(
         scale: The value in scan files that means full reflectance; the usual one if left out.
         most: The most scans of each name, evenly spread; all of them, and `FEW` simulated ones, if left out.
     """
-    scans: list[PartialScan] = []
-    lines: list[str] = []
+    opened: list[Opened] = []
     groups: dict[tuple[Path, str], list[Path]] = {}  # files that are named one by one, by their folder
     for spec in specs:
         options, file = parse(str(spec))
         if options.name in (SIMULATED, PREPARED):
-            opened = _images(str(spec), reading, source, most)
-            scans, lines = scans + opened[0], lines + opened[1]
+            opened.append(_images(str(spec), reading, source, most))
         elif file is not None:
             groups.setdefault((file.parent, ""), []).append(file)
         else:
             paths = [Path(path) for drive in SOURCES[options.name].find_drives(options) for path in drive.scans]
             chosen = [paths[number] for number in spread(len(paths), most or len(paths))]
             groups[Path(options.folder).expanduser(), str(spec)] = chosen
-    for (folder, spec), paths in groups.items():
-        opened = _files(folder, paths, spec or str(paths[0]), reading, source, scale)
-        scans, lines = scans + opened[0], lines + opened[1]
-    if not scans:
-        raise InputError("no scan is named; give scan files, range images, folders of them or simulated:SEED.")
+    opened += [
+        _files(folder, paths, spec or str(paths[0]), reading, source, scale) for (folder, spec), paths in groups.items()
+    ]
+    scans = [scan for some, _ in opened for scan in some]
     twice = [name for name, count in Counter(scan.name for scan in scans).items() if count > 1]
     if twice:
         raise InputError(f"two of the scans are called {twice[0]}, and so would be their answers: complete them apart.")
-    return scans, lines
+    return scans, [line for _, lines in opened for line in lines]
 
 
 def _files(
@@ -155,8 +143,8 @@ def _images(spec: str, reading: Reading, source: Sensor | None, most: int | None
 
     def opened(number: int) -> PartialScan:
         name = f"{kind}-{number:06d}"
-        content = name.encode if simulated else partial(_content, scans, number)
-        return PartialScan(name, ".npy", partial(_read_set, scans, number, how.sensor, target), content)
+        content = name.encode if simulated else lambda: scans[number].tobytes()
+        return PartialScan(name, ".npy", lambda: _seen(scans[number], how.sensor, target), content)
 
     same = _same_image(how.sensor, target)
     lines = [] if same else [_described(spec, how.sensor, target)]
@@ -221,29 +209,17 @@ def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
     return image_of_same(image, target)
 
 
-def _read_set(scans: ScanSource, number: int, source: Sensor, target: Sensor) -> Partial:
-    return _seen(scans[number], source, target)
-
-
-def _content(scans: ScanSource, number: int) -> bytes:
-    return scans[number].tobytes()
-
-
 def _seen(image: np.ndarray, source: Sensor, target: Sensor) -> Partial:
     return image_of_same(image, target) if _same_image(source, target) else image_through(image, source, target)
 
 
 def _same_view(source: Sensor, target: Sensor) -> bool:
-    if source.shape[0] < target.shape[0]:
-        return False
-    try:
-        return bool(np.allclose(source.resized(target.shape[0]).elevations, target.elevations, atol=1e-3))
-    except InputError:
-        return False
+    rows = target.shape[0]
+    return source.shape[0] >= rows and np.allclose(source.resized(rows).elevations, target.elevations, atol=1e-3)
 
 
 def _same_image(source: Sensor, target: Sensor) -> bool:
-    return source.shape == target.shape and bool(np.allclose(source.elevations, target.elevations, atol=1e-3))
+    return source.shape == target.shape and np.allclose(source.elevations, target.elevations, atol=1e-3)
 
 
 def _strength(path: Path, points: Points, scale: float, strict: bool) -> np.ndarray | None:

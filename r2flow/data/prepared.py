@@ -22,9 +22,10 @@ from safetensors import safe_open
 
 from r2flow.data.layouts import Drive
 from r2flow.data.quantise import OTHER_LEVELS, RangeCodes, ReflectanceCodes, find_levels
-from r2flow.data.reading import Reading, lacks_reflectance, range_image, stored_reflectance
+from r2flow.data.reading import Reading, lacks_reflectance, stored_reflectance
 from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
 from r2flow.errors import InputError
+from r2flow.lidar.scan_files import read_range_image
 from r2flow.store import MANIFEST, Advance, Damaged, Store, checksum, difference, read_manifest
 
 log = logging.getLogger(__name__)
@@ -87,7 +88,7 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
         with suppress(InputError):  # reported when the scan's turn comes
             reflectance = stored_reflectance(paths[index], reading.columns)
             if reflectance is not None:
-                is_image = range_image(Path(paths[index])) is not None  # whose reflectance lies in [0, 1]
+                is_image = read_range_image(paths[index]) is not None  # whose reflectance lies in [0, 1]
                 found.append(reflectance / np.float32(1.0 if is_image else scale))
                 images |= is_image
     values = np.concatenate(found) if found else np.zeros(0)

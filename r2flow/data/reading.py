@@ -26,15 +26,12 @@ class Reading:
     Attributes:
         projection, convention: As in `r2flow.lidar.projection.project`.
         reflectance_scale: The value in the files that means full reflectance; None guesses it from each file, which is
-            good enough for a picture and for nothing else.
-        reflectance: Whether images have reflectance: True needs it of every scan, False leaves it out, `auto` decides
-            by `lacks_reflectance` when the scans are opened.
-        on_bad_scan: What is done with a scan that cannot be used. `error` stops; `skip` takes the next usable scan in
-            its place; `empty` stops too, but a scan without a return in the sensor's view is an empty image: a
-            generator that makes such scans is judged by them.
-        within_limits: Whether a range beyond the sensor's limits in a range image is a dropped ray, as it is in a file
-            of points: what a model is given.
-        columns: What the columns of files without names hold, as in `r2flow.lidar.scan_files.read_points`.
+            good enough for a picture alone.
+        reflectance: Whether images have reflectance: True needs it of every scan; `auto` is `lacks_reflectance`.
+        on_bad_scan: What is done with a scan that cannot be used. `error` stops; `skip` takes the next usable scan;
+            `empty` stops, too, but a scan without a return in the sensor's view is an empty image.
+        within_limits: Whether a range in a range image beyond the sensor's limits is a dropped ray, as among points.
+        columns: As in `r2flow.lidar.scan_files.read_points`.
     """
 
     sensor: Sensor
@@ -163,24 +160,18 @@ def scaled_reflectance(path: str | Path, points: Points, scale: float | None) ->
     return scaled
 
 
-def range_image(path: Path, shape: tuple[int, int] | None = None) -> np.ndarray | None:
-    """The range image in a file, `read_range_image`; None where the file holds no range image."""
-    array = read_range_image(path)
-    if array is not None and shape is not None and array.shape[1:] != shape:
-        found, wanted = ("x".join(map(str, one)) for one in (array.shape[1:], shape))
+def read_image(path: Path, reading: Reading) -> np.ndarray:
+    """A scan file or a range image as an image, (2 or 1, H, W)."""
+    channels = 1 + bool(reading.reflectance)
+    image = read_range_image(path)
+    if image is None:
+        return read_projected(path, reading).image
+    if image.shape[1:] != reading.sensor.shape:
+        found, wanted = ("x".join(map(str, shape)) for shape in (image.shape[1:], reading.sensor.shape))
         raise InputError(
             f"{path} is a range image of {found}, the sensor's is {wanted}; give --size {found}, or its points "
             "(.bin, .ply, .pcd), which take any size."
         )
-    return array
-
-
-def read_image(path: Path, reading: Reading) -> np.ndarray:
-    """A scan file or a range image as an image, (2 or 1, H, W)."""
-    channels = 1 + bool(reading.reflectance)
-    image = range_image(path, reading.sensor.shape)
-    if image is None:
-        return read_projected(path, reading).image
     if len(image) < channels:
         raise _no_reflectance(path)
     image = image[:channels]
@@ -237,7 +228,7 @@ def lacks_reflectance(
 
 def stored_reflectance(path: str | Path, columns: Sequence[str] | None = None) -> np.ndarray | None:
     """The reflectance of all returns of a scan file or a range image, as it is stored; None where there is none."""
-    image = range_image(Path(path))
+    image = read_range_image(path)
     if image is None:
         return read_points(path, columns).reflectance
     return image[1][image[0] > 0] if len(image) > 1 else None

@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.data.reading import Reading, range_image, read_image, read_points_image
+from r2flow.data.reading import Reading, read_image, read_points_image
 from r2flow.errors import InputError
 from r2flow.lidar.beams import other_sensor
-from r2flow.lidar.scan_files import read_points
+from r2flow.lidar.scan_files import read_points, read_range_image
 from r2flow.lidar.sensors import Sensor
 from r2flow.store import MANIFEST
 
@@ -156,7 +156,7 @@ class ScanFiles(ScanSource):
     @cached_property
     def measured(self) -> bool:  # type: ignore[override]
         arrays = (path for path in self.paths if str(path).lower().endswith((".npy", ".npz")))
-        return next((range_image(Path(path)) is None for path in arrays), True)
+        return next((read_range_image(path) is None for path in arrays), True)
 
     @property
     def names(self) -> list[str]:

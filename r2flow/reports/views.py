@@ -10,11 +10,12 @@ from torch import Tensor
 
 from r2flow.data.opening import find_drives, open_scans, own_reading, parse
 from r2flow.data.options import FOLDER, SIMULATED
-from r2flow.data.reading import Reading, range_image, read_labelled_scan
+from r2flow.data.reading import Reading, read_labelled_scan
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanFiles, SimulatedScans, spread, warn_of_other_sensor
 from r2flow.errors import InputError
 from r2flow.lidar.labels import labels_beside
+from r2flow.lidar.scan_files import read_range_image
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +46,7 @@ class View(NamedTuple):
         if not isinstance(source, ScanFiles):
             return self.image, None
         path, how = Path(source.paths[self.number]), source.reading
-        if labels_beside(path) is None or range_image(path) is not None:
+        if labels_beside(path) is None or read_range_image(path) is not None:
             return self.image, None
         return read_labelled_scan(path, replace(how, on_bad_scan="error"))
 

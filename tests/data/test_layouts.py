@@ -108,8 +108,8 @@ def test_a_split_that_holds_nothing_says_what_there_is_and_how_to_take_it(kitti_
     with pytest.raises(InputError) as caught:
         find_drives("odometry", odometry_of(kitti_360, "08", "11", "12"), "train")
     assert str(caught.value).endswith(
-        "holds no scan of its train split; it holds 1 of its validation split (08); 2 of its test split (11, 12): give "
-        "data.split=validation (--split validation), data.split=test (--split test), data.split=null for all."
+        "holds no scan of its train split; it holds 08 (validation), 11 (test), 12 (test): give another data.split "
+        "(--split), or null for all."
     )
 
 

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.data.reading import Reading, range_image, read_image
+from r2flow.data.reading import Reading, read_image
 from r2flow.errors import InputError, tell_odd
+from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensors import SENSORS
 
 SENSOR = SENSORS["hdl64e"].resized(8, 32)
@@ -103,14 +104,14 @@ def test_range_images_are_read_as_they_were(tmp_path: Path):
     for number, array in enumerate((IMAGE, np.asfortranarray(IMAGE), IMAGE[:1], IMAGE.astype(np.float64))):
         path = tmp_path / f"{number}.npy"
         np.save(path, array)
-        np.testing.assert_array_equal(range_image(path), array)
+        np.testing.assert_array_equal(read_range_image(path), array)
     holes = IMAGE.copy()
     holes[0, 0, :3] = np.nan, np.inf, -np.inf
     np.save(tmp_path / "holes.npy", holes)
-    np.testing.assert_array_equal(range_image(tmp_path / "holes.npy")[0, 0, :3], 0)
+    np.testing.assert_array_equal(read_range_image(tmp_path / "holes.npy")[0, 0, :3], 0)
     np.save(tmp_path / "points.npy", np.ones((9, 4), np.float32))
-    assert range_image(tmp_path / "points.npy") is None
-    assert range_image(tmp_path / "image.bin") is None
+    assert read_range_image(tmp_path / "points.npy") is None
+    assert read_range_image(tmp_path / "image.bin") is None
 
 
 def test_no_more_memory_is_taken_than_a_few_times_the_file(tmp_path: Path):
@@ -118,7 +119,7 @@ def test_no_more_memory_is_taken_than_a_few_times_the_file(tmp_path: Path):
     np.save(path, np.ones((2, 512, 2048), np.float32))
     tracemalloc.start()
     try:
-        range_image(path)
+        read_range_image(path)
         assert tracemalloc.get_traced_memory()[1] < 4 * path.stat().st_size
     finally:
         tracemalloc.stop()
@@ -129,12 +130,12 @@ def test_ranges_that_no_lidar_measures_are_reported_and_are_no_returns(tmp_path:
     image = np.full((2, 8, 32), 0.5, np.float32)
     image[0] = 20
     np.save(tmp_path / "whole.npy", image)
-    assert np.array_equal(range_image(tmp_path / "whole.npy"), image)
+    assert np.array_equal(read_range_image(tmp_path / "whole.npy"), image)
     for count in (1, 4, 2):
         image[0, 3, 5:9], image[0, 3, 5 : 5 + count] = 20, absurd
         np.save(tmp_path / f"{count}.npy", image)
-        range_image(tmp_path / f"{count}.npy")
-    found = range_image(tmp_path / "4.npy")
+        read_range_image(tmp_path / f"{count}.npy")
+    found = read_range_image(tmp_path / "4.npy")
     assert not caplog.text
     tell_odd()
     tell_odd()
