@@ -58,18 +58,12 @@ class Reading:
 
 
 class Projected(NamedTuple):
-    """A scan file, and which of its points each pixel has kept.
+    """A scan file, and which of its points each pixel has kept."""
 
-    Attributes:
-        image: (2 or 1, H, W).
-        points: All of the file.
-        pixels, chosen: The pixels that keep one, h W + w, and the index of that point, (M,) each.
-    """
-
-    image: np.ndarray
-    points: Points
-    pixels: np.ndarray
-    chosen: np.ndarray
+    image: np.ndarray  # (2 or 1, H, W)
+    points: Points  # all of the file
+    pixels: np.ndarray  # the pixels that keep one, h W + w, (M,)
+    chosen: np.ndarray  # the index of that point, (M,)
 
     def spread(self, values: np.ndarray) -> np.ndarray:
         """Values of the kept points, (M, ...), at their pixels, (H, W, ...); 0 elsewhere."""

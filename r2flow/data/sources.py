@@ -70,11 +70,7 @@ class ScanSource(ABC):
         return torch.from_numpy(np.stack([self[index] for index in indices]))
 
     def with_points(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """An image, and the measured x, y, z of each pixel's point in metres, (3, H, W) float32, 0 where missing.
-
-        Raises:
-            InputError: the points are not known.
-        """
+        """An image, and the measured x, y, z of each pixel's point in metres, (3, H, W) float32, 0 where missing."""
         raise InputError(f"{self.names[index]} holds ranges alone, not the measured coordinates of its points.")
 
     def about(self) -> dict[str, Any]:

@@ -63,13 +63,10 @@ def _choose(path: Path, connections: list[Any], topic: str | None) -> list[Any]:
     clouds = [connection for connection in connections if connection.msgtype == CLOUD]
     topics = sorted({connection.topic for connection in clouds})
     types = ", ".join(sorted({connection.msgtype for connection in connections}))[:160]
-    check(
-        topics,
-        f"{path} holds no topic of point clouds ({CLOUD}), but {types}; a ROS driver turns packets into clouds.",
-    )
-    if topic is None and len(topics) > 1:
-        raise InputError(f"{path} holds several topics of point clouds; give one by --topic: {', '.join(topics)}.")
-    check(topic in (None, *topics), f"{path} holds no topic {topic!r} of point clouds; known: {', '.join(topics)}.")
+    known = ", ".join(topics)
+    check(topics, f"{path} has no topic of point clouds ({CLOUD}), but {types}: a ROS driver makes clouds of packets.")
+    check(topic or len(topics) == 1, f"{path} holds several topics of point clouds; give one by --topic: {known}.")
+    check(topic in (None, *topics), f"{path} holds no topic {topic!r} of point clouds; known: {known}.")
     return [connection for connection in clouds if connection.topic == (topic or topics[0])]
 
 

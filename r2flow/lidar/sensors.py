@@ -21,28 +21,17 @@ MOST_PIXELS = 1 << 24  # of an image, 128 x 131,072: more than any sensor has, a
 
 @dataclass(frozen=True)
 class Sensor:
-    """A spinning LiDAR as an image of H beams by W azimuth bins.
-
-    Attributes:
-        name: Name in the table.
-        elevations: Elevation of each row in degrees, the top row first, strictly falling.
-        columns: Azimuth bins W of a full turn; column 0 begins at +180 degrees and azimuth falls with w.
-        min_range: Nearest valid range in metres.
-        max_range: Farthest valid range in metres.
-        height: Usual height of the sensor above the ground in metres.
-        firing: Row of laser 0, 1, ... in the order of the sensor's packets, which scan unfolding needs; None where that
-            is from the top row down or from the bottom up.
-        reflectance_scale: The value in its scan files that means full reflectance; None where they do not say.
-    """
+    """A spinning LiDAR as an image of H beams by W azimuth bins."""
 
     name: str
-    elevations: tuple[float, ...]
-    columns: int = 1024
-    min_range: float = 1.45
+    elevations: tuple[float, ...]  # of each row in degrees, the top row first, strictly falling
+    columns: int = 1024  # azimuth bins W of a full turn; column 0 begins at +180 degrees and azimuth falls with w
+    min_range: float = 1.45  # valid ranges, in metres
     max_range: float = 80.0
-    height: float = 1.73
+    height: float = 1.73  # usual height of the sensor above the ground in metres
+    #: Row of laser 0, 1, ... in the order of the sensor's packets; None where that is from the top down or bottom up.
     firing: tuple[int, ...] | None = None
-    reflectance_scale: float | None = None
+    reflectance_scale: float | None = None  # what means full reflectance in its scan files; None where not known
 
     def __post_init__(self) -> None:
         e, near, far, scale = self.elevations, self.min_range, self.max_range, self.reflectance_scale

@@ -20,17 +20,11 @@ CHANNELS = ("both", "range", "reflectance")
 
 @dataclass(frozen=True, eq=False)
 class ModelSpace:
-    """Images (C, H, W) in model space: a sensor's range images, encoded.
-
-    Attributes:
-        sensor: What the images look through.
-        encoding: Between model space and metres.
-        rays: Elevation and azimuth of every pixel in radians, (2, H, W), as networks are told.
-    """
+    """Images (C, H, W) in model space: a sensor's range images, encoded."""
 
     sensor: Sensor
     encoding: Encoding
-    rays: Tensor
+    rays: Tensor  # elevation and azimuth of every pixel in radians, (2, H, W), as networks are told
 
     def through(self, sensor: Sensor) -> "ModelSpace":
         """The images of another sensor in the same encoding."""

@@ -23,17 +23,11 @@ BLIND = 5.0  # degrees: in a wider sector without any return nothing was measure
 
 @dataclass(frozen=True)
 class Partial:
-    """What is known of an image.
+    """What is known of an image."""
 
-    Attributes:
-        image: Range in metres and, where known, reflectance, (2 or 1, H, W) float32; 0 without a return.
-        state: `Ray` of each ray, (H, W) uint8.
-        xyz: The measured points of the returns in metres, (3, H, W) float32; None where only ranges are known.
-    """
-
-    image: np.ndarray
-    state: np.ndarray
-    xyz: np.ndarray | None = None
+    image: np.ndarray  # range in metres and, where known, reflectance, (2 or 1, H, W) float32; 0 without a return
+    state: np.ndarray  # `Ray` of each ray, (H, W) uint8
+    xyz: np.ndarray | None = None  # the measured points of the returns in metres, (3, H, W) float32, where known
 
 
 def sensor_of(scans: list[Points], named: Sensor | None = None) -> Sensor:

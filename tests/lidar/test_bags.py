@@ -114,7 +114,7 @@ def test_recordings_without_clouds_or_damaged_are_one_line(r2flow, tmp_path: Pat
     other = tmp_path / "other.bag"
     other.write_bytes(b"#ROSBAG V2.0\n" + bytes(400))
     for path, words in (
-        (whole, "holds no topic of point clouds"),
+        (whole, "has no topic of point clouds"),
         (cut, "not a readable recording"),
         (other, "not a readable recording"),
         (tmp_path / "missing.mcap", "is not a .mcap"),

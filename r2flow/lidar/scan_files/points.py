@@ -28,22 +28,13 @@ class NoPointsError(InputError):
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """The N points of one scan, in the file's order.
+    """The N points of one scan, in the file's order."""
 
-    Attributes:
-        xyz: Coordinates in metres, (N, 3), float32, sensor frame: x ahead, y left, z up.
-        reflectance: As stored, (N,), float32, not rescaled; None when the file has none.
-        ring: Number of the beam, (N,), uint16; None when the file has none.
-        dropped: Number of rows left out because a coordinate or the reflectance was NaN or infinite, or a coordinate
-            beyond `FARTHEST`.
-        kept: Index in the file of each row that is left, (N,); None when all are.
-    """
-
-    xyz: np.ndarray
-    reflectance: np.ndarray | None = None
-    ring: np.ndarray | None = None
-    dropped: int = 0
-    kept: np.ndarray | None = None
+    xyz: np.ndarray  # coordinates in metres, (N, 3), float32, sensor frame: x ahead, y left, z up
+    reflectance: np.ndarray | None = None  # as stored, (N,), float32, not rescaled; None when the file has none
+    ring: np.ndarray | None = None  # number of the beam, (N,), uint16; None when the file has none
+    dropped: int = 0  # rows left out: a value was NaN or infinite, or a coordinate beyond `FARTHEST`
+    kept: np.ndarray | None = None  # index in the file of each row that is left, (N,); None when all are
 
     def with_lost_rays(self) -> "Points":
         """The rows of the file again, dropped ones at the origin, as rays without return.
@@ -100,13 +91,8 @@ def find_roles(names: Sequence[str]) -> dict[str, list[int]]:
 def column_points(names: Sequence[str], columns: Sequence[np.ndarray], raw: bool = False) -> Points:
     """Points from all columns of a file, (N,) each: those that are finite and within `FARTHEST`; refuses other files.
 
-    Args:
-        raw: Whether the file has no header. It is also refused where most rows are not finite or reflectance is
-            negative, as in rows of another layout.
-
-    Raises:
-        NoPointsError: no point, or rays without return alone.
-        InputError: no finite point, or values that no LiDAR measures.
+    A file without header, `raw`, is refused, too, where most rows are not finite or reflectance is negative, as in rows
+    of another layout. A file without a point, or of rays without return alone, is a `NoPointsError`.
     """
     roles = {role: [np.asarray(columns[index]) for index in indices] for role, indices in find_roles(names).items()}
     rows = roles["x"][0].shape[:1]
