@@ -27,6 +27,7 @@ Count = Annotated[int, Bound("of at least 1", lambda n: n >= 1)]
 Natural = Annotated[int, Bound("of at least 0", lambda n: n >= 0)]
 Positive = Annotated[float, Bound("above 0", lambda x: x > 0)]
 NonNegative = Annotated[float, Bound("of at least 0", lambda x: x >= 0)]
+Seed = Annotated[int, Bound("of at least 0 and below 2^63", lambda n: 0 <= n < 2**63)]
 Portion = Annotated[float, Bound("in [0, 1)", lambda x: 0 <= x < 1)]
 
 

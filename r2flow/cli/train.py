@@ -9,6 +9,7 @@ import typer
 from r2flow.cli.app import app
 from r2flow.cli.options import DeviceOption, PrecisionOption, SamplerOptions, choose_device, grouped
 from r2flow.errors import InputError
+from r2flow.registry import check_options
 
 
 @app.command(
@@ -65,6 +66,7 @@ def pairs(
         "sampler": {"name": "adams3", **how.given}, "precision": precision, "num": num, "batch_size": batch_size,
         "shard_mib": shard_mib, "seed": seed, "knots": knots,
     }  # fmt: skip
+    check_options("the options of pairs", PairOptions, options)
     recipe = PairOptions(**pairs_of(flow, options, weights_hash(flow))).recipe(
         flow.encoding.shape, flow.generator.noise_shape
     )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from r2flow import noise
-from r2flow.errors import InputError
+from r2flow.registry import Portion
 
 
 @dataclass(frozen=True)
@@ -18,13 +18,8 @@ class Augmentation:
 
     flip: bool = False  # mirror half of the images: azimuth -> -azimuth, exact as bins lie symmetrically about ahead
     roll: bool = False  # turn each about the sensor by a whole number of columns, drawn uniformly: exact on the ring
-    beam_dropout: float = 0.0  # share of the rows that lose all their returns
-    ray_dropout: float = 0.0  # share of the returns that are lost one by one
-
-    def __post_init__(self) -> None:
-        for name in ("beam_dropout", "ray_dropout"):
-            if not 0 <= getattr(self, name) < 1:
-                raise InputError(f"data.augment.{name} must lie in [0, 1), found {getattr(self, name)}.")
+    beam_dropout: Portion = 0.0  # share of the rows that lose all their returns
+    ray_dropout: Portion = 0.0  # share of the returns that are lost one by one
 
     def __bool__(self) -> bool:
         return self != Augmentation()

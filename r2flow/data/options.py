@@ -10,7 +10,7 @@ from r2flow.errors import InputError
 from r2flow.generators.base import Precision
 from r2flow.lidar.projection import Convention, Projection
 from r2flow.lidar.scan_files import check_columns
-from r2flow.registry import NonNegative, Positive, check_options
+from r2flow.registry import Count, Natural, NonNegative, Portion, Positive, Seed, check_options
 from r2flow.samplers import build_sampler
 
 SIMULATED, PREPARED, FOLDER = "simulated", "prepared", "folder"  # in the table `r2flow.data.opening.SOURCES`
@@ -74,25 +74,21 @@ class SourceOptions:
 class ValidationOptions:
     """What is held out of the training (`data.validation`)."""
 
-    share: float = 0.1  # about this share of the scans, in one contiguous block
-    scans: int = 64  # the most scans to validate on
+    share: Portion = 0.1  # about this share of the scans, in one contiguous block
+    scans: Natural = 64  # the most scans to validate on
     data: Mapping[str, Any] | None = None  # another set of scans to hold out instead: {name, root, split, drives, ...}
-
-    def __post_init__(self) -> None:
-        if not (isinstance(self.scans, int) and self.scans >= 0 and math.isfinite(self.share)):
-            raise InputError(f"data.validation.scans must be a whole number, found {self.scans!r}.")
 
 
 @dataclass(frozen=True)
 class PairOptions:
     """The choices behind a set of pairs (`data.pairs`)."""
 
-    num: int = 1000
+    num: Count = 1000
     sampler: Mapping[str, Any] = field(default_factory=lambda: {"name": "adams3"})  # of the flow that draws them
-    batch_size: int = 16  # pairs solved together; the last bits of a pair depend on it
-    shard_mib: float = 16.0  # of a shard, which a killed process begins again
-    seed: int = 0  # of the noise; not the run's: runs of several seeds can share one set of pairs
-    first: int | None = None  # index of the first pair; None: behind the pairs that the flow itself was trained on
+    batch_size: Count = 16  # pairs solved together; the last bits of a pair depend on it
+    shard_mib: Positive = 16.0  # of a shard, which a killed process begins again
+    seed: Seed = 0  # of the noise; not the run's: runs of several seeds can share one set of pairs
+    first: Seed | None = None  # index of the first pair; None: behind the pairs that the flow itself was trained on
     precision: Precision = "32-true"  # of the network
     knots: int | None = None  # inner states of each path to keep with its pair, for stage=flow_map
     of: str | None = None  # the flow that draws them; None: that of stage.init
@@ -100,23 +96,13 @@ class PairOptions:
 
     def recipe(self, shape: tuple[int, int, int], noise_shape: tuple[int, ...] | None = None) -> PairRecipe:
         """All that pairs depend on, where scans and their noise have these shapes in model space."""
-        if min(self.num, self.batch_size) < 1 or not 0 < self.shard_mib < math.inf:
-            raise InputError(
-                "data.pairs: num and batch_size must be at least 1 and shard_mib positive; "
-                f"found {self.num}, {self.batch_size} and {self.shard_mib}."
-            )
-        first = self.first or 0
-        if not (0 <= self.seed < 2**63 and 0 <= first < 2**63):
-            raise InputError(
-                f"data.pairs: seed and first must be at least 0 and below 2^63, found {self.seed} and {first}."
-            )
         sampler = build_sampler(self.sampler).asdict()
         if self.knots:
             build_sampler(sampler).knot_times(self.knots)
         size = self.batch_size * 2 * math.prod(shape) * (1 + (self.knots or 0))
         shard_batches = max(round(self.shard_mib * 2**20 / size), 1)
         return PairRecipe(
-            self.parent or "", shape, self.seed, first, sampler, self.batch_size, shard_batches,
+            self.parent or "", shape, self.seed, self.first or 0, sampler, self.batch_size, shard_batches,
             None if noise_shape == shape else noise_shape, self.knots or 0, self.precision,
         )  # fmt: skip
 
@@ -130,8 +116,8 @@ class DataOptions(SourceOptions):
 
     parts: Sequence[Mapping[str, Any]] | None = None  # of `mixed`: {name, root, split, drives, ..., weight} each
     augment: Mapping[str, Any] | None = None  # `r2flow.data.augment.Augmentation`, of training scans alone
-    batch_size: int = 8  # images in one optimiser step, over all devices and accumulated batches
-    workers: int = 0  # loader processes of each device
+    batch_size: Count = 8  # images in one optimiser step, over all devices and accumulated batches
+    workers: Natural = 0  # loader processes of each device
     memory_gib: NonNegative = 2.0  # training scans are kept in memory where they fit into this, else read when needed
     validation: Mapping[str, Any] | None = None  # `ValidationOptions`
     pairs: Mapping[str, Any] | None = None  # `PairOptions`, where the data are pairs
@@ -139,11 +125,6 @@ class DataOptions(SourceOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.batch_size < 1 or self.workers < 0:
-            raise InputError(
-                "data.batch_size must be at least 1 and data.workers at least 0; "
-                f"found {self.batch_size} and {self.workers}."
-            )
         if self.parts is not None and self.name != MIXED:
             raise InputError(f"data.parts are those of data=mixed, found data={self.name}; leave them out, or give it.")
         if self.scans is not None and self.name != PAIRS:

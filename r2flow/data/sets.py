@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from r2flow.data.sources import ScanSource, spread
 from r2flow.lidar.sensors import Sensor
@@ -86,25 +86,12 @@ class ScanSet:
     def _read(
         self, read: Callable[[list[int]], Any], numbers: Sequence[int], batch_size: int, workers: int
     ) -> Iterator[Any]:
-        chunks = [list(numbers[i : i + batch_size]) for i in range(0, len(numbers), batch_size)]
+        chunks: Any = [list(numbers[i : i + batch_size]) for i in range(0, len(numbers), batch_size)]
         # Processes cost seconds to start; and what is drawn is drawn where the network is.
-        alone = self.source.drawn or len(chunks) < 8
-        workers = 0 if alone else workers
+        workers = 0 if self.source.drawn or len(chunks) < 8 else workers
         return iter(
-            DataLoader(
-                _Batches(read), batch_size=None, sampler=chunks, num_workers=workers, worker_init_fn=end_with_parent
-            )
+            DataLoader(chunks, batch_size=None, collate_fn=read, num_workers=workers, worker_init_fn=end_with_parent)
         )
-
-
-class _Batches(Dataset[Any]):
-    """Batches by the numbers of their scans."""
-
-    def __init__(self, read: Callable[[list[int]], Any]) -> None:
-        self.read = read
-
-    def __getitem__(self, numbers: list[int]) -> Any:
-        return self.read(numbers)
 
 
 def _with_points(source: ScanSource, numbers: list[int]) -> tuple[Tensor, Tensor]:

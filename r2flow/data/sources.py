@@ -275,8 +275,6 @@ def holdout_block(count: int, share: float, starts: Sequence[int] = ()) -> tuple
     begin at the numbers `starts`, come within half of the share at the end, they are held out, so that no scan has a
     neighbour on the other side; else exactly the share is.
     """
-    if not 0 <= share < 1:
-        raise InputError(f"data.validation.share must lie in [0, 1), found {share}.")
     held = min(math.ceil(count * share), count - 1)
     whole = [count - start for start in starts if start > 0 and abs(count - start - held) <= held / 2]
     held = min(whole, key=lambda one: abs(one - held), default=held) if held else 0

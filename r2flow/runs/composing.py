@@ -21,7 +21,7 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 
 from r2flow.errors import InputError
-from r2flow.registry import Bound, check_options, did_you_mean, options_of
+from r2flow.registry import Bound, Seed, check_options, did_you_mean, options_of
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 
@@ -75,7 +75,7 @@ class Keys:
     callbacks: Mapping[str, Any]
     samples: Mapping[str, Any]
     run_dir: Annotated[str, Bound("that names a folder", lambda text: text.strip("/ "))]
-    seed: Annotated[int, Bound("of at least 0 and below 2^63", lambda n: 0 <= n < 2**63)]
+    seed: Seed
     name: Annotated[str, Bound("that names a folder in runs", names_folder)] | int | float = "run"
     experiment: str | Sequence[str] | None = None
     generator: Mapping[str, Any] | str | None = None

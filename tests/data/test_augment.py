@@ -7,7 +7,6 @@ import torch
 from r2flow.data.augment import Augmentation
 from r2flow.data.loader import FlowDataset
 from r2flow.data.sources import ScanSource
-from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.sensors import SENSORS
@@ -107,5 +106,3 @@ def test_an_image_depends_on_its_number_alone_and_is_left_as_it_was():
 def test_off_by_default():
     assert not Augmentation()
     assert all(Augmentation(**{kind: value}) for kind, value in KINDS.items())
-    with pytest.raises(InputError, match=r"beam_dropout must lie in \[0, 1\), found 1"):
-        Augmentation(beam_dropout=1)

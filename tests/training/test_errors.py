@@ -29,7 +29,7 @@ from tests.training.conftest import Run
         (["+data.validation.data={name: folder, root: x, splt: test}"], ["no option 'splt'", "Did you mean 'split'?"]),
         (["loggers=csv"], ["loggers=[csv]"]),
         (["data.augment.roll=true"], ["data.augment.roll", "backbone.position=learnable", "backbone.position=none"]),
-        (["data.augment.ray_dropout=1.5"], ["data.augment.ray_dropout must lie in [0, 1)", "1.5"]),
+        (["data.augment.ray_dropout=1.5"], ["data.augment: ray_dropout must be a finite number in [0, 1)", "1.5"]),
         (["data=mixed", "data.parts=[{name: folder, rot: x}]"], ["data.parts[0] has no option 'rot'", "'root'"]),
         (["data.validation.data={name: mixed}"], ["needs the name of a data set"]),
     ],

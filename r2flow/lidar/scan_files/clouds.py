@@ -39,9 +39,7 @@ def read_pcd(path: Path, columns: object = None) -> Table:
     check(header.keys() >= {"FIELDS", "SIZE", "TYPE"}, "its header has no FIELDS, SIZE or TYPE line.")
     names, kinds = header["FIELDS"], [k + s for k, s in zip(header["TYPE"], header["SIZE"], strict=True)]
     check(len(kinds) == len(names), f"it declares {len(names)} FIELDS but {len(kinds)} SIZE.")
-    check(
-        set(kinds) <= PCD_TYPES, f"it declares types {', '.join(kinds)[:60]}; PCD knows {', '.join(sorted(PCD_TYPES))}."
-    )
+    check(set(kinds) <= PCD_TYPES, f"it declares types {', '.join(kinds)[:60]}, not I, U or F of 1 to 8 bytes.")
     widths = [_whole(number) for number in header.get("COUNT", ["1"] * len(names))]
     check(len(widths) == len(names) and all(widths), "its COUNT must have a positive number for each field.")
     sizes = {key: _whole("".join(header[key])) for key in ("WIDTH", "HEIGHT", "POINTS") if key in header}
