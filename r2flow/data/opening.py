@@ -159,18 +159,12 @@ def find_drives(
 
 
 def samples_of(run: Path) -> Path | None:
-    """The samples of a run folder: its `samples`, else its only folder of samples; None where it is no run folder."""
+    """The folder `samples` of a run folder; None where it is no run folder."""
     if not (run / "config.yaml").is_file() and not (run / "checkpoints").is_dir():
         return None
-    if (run / "samples").is_dir():
-        return run / "samples"
-    found = sorted(note.parent for note in run.glob(f"*/{MANIFEST}") if drawn_recipe(note.parent) is not None)
-    if not found:
+    if not (run / "samples").is_dir():
         raise InputError(f"{run} is a run without samples; draw some: r2flow sample {run} --out {run / 'samples'}.")
-    if len(found) > 1:
-        names = ", ".join(folder.name for folder in found)
-        raise InputError(f"{run} has several folders of samples ({names}); name one of them.")
-    return found[0]
+    return run / "samples"
 
 
 class Model(Protocol):

@@ -77,13 +77,6 @@ def test_what_a_mac_leaves_beside_a_scan_is_none(tmp_path: Path):
     assert len(find_drives("folder", tmp_path)[0].scans) == 1
 
 
-def test_a_drive_is_in_one_part_of_the_standard_split():
-    assert SOURCES["kitti_360"].split_of("2013_05_28_drive_0002_sync") == "test"
-    assert SOURCES["odometry"].split_of("08") == "validation"
-    assert SOURCES["object"].split_of("training") == "train"
-    assert SOURCES["kitti_raw"].split_of("2011_09_26_drive_0002_sync") is None
-
-
 @pytest.mark.parametrize("layout", [name for name, kind in SOURCES.items() if isinstance(kind, Layout)])
 def test_a_missing_or_empty_root_says_what_was_looked_for(layout: str, tmp_path: Path):
     with pytest.raises(InputError, match="is not a folder"):

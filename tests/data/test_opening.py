@@ -13,15 +13,13 @@ from r2flow.data.layouts import Drive, Layout, SourceKind
 from r2flow.data.opening import (
     SOURCES,
     open_scans,
-    open_source,
     own_reading,
     reading_for,
     resolve_reflectance,
 )
-from r2flow.data.options import PairOptions, SourceOptions
+from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairSource, PairStore, make_pairs, pair_noise
 from r2flow.data.reading import Reading
-from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
@@ -73,10 +71,6 @@ class TestNames:
         scans = open_scans(tmp_path / "shards")
         assert scans.sensor == SENSOR
         assert numbers(scans) == list(range(12))
-
-    def test_options_of_a_run(self, numbered: Path):
-        source = open_source(SourceOptions("folder", str(numbered)), READING)
-        assert numbers(ScanSet("", source, SENSOR)) == list(range(12))
 
     def test_one_file_of_each_scan_is_taken(self, tmp_path: Path):
         write_scan(tmp_path / "a.bin", 1)
@@ -138,13 +132,8 @@ class TestSamples:
         (tmp_path / "config.yaml").touch()
         with pytest.raises(InputError, match="is a run without samples; draw some: r2flow sample"):
             open_scans(tmp_path)
-        self.samples(tmp_path / "more")
-        assert open_scans(tmp_path).source.places() == {str(tmp_path / "more" / "000000.npy")}
         self.samples(tmp_path / "samples")
         assert open_scans(tmp_path).source.places() == {str(tmp_path / "samples" / "000000.npy")}
-        (tmp_path / "samples").rename(tmp_path / "others")
-        with pytest.raises(InputError, match=r"several folders of samples \(more, others\); name one of them"):
-            open_scans(tmp_path)
 
     def test_a_folder_that_says_nothing_is_read_as_asked_for(self, tmp_path: Path):
         write_image(tmp_path / "000000.npy", 2)
@@ -213,12 +202,6 @@ class TestReflectance:
             scans = open_scans(tmp_path, Reading(SENSOR, on_bad_scan=on_bad_scan))
             assert scans.about["reflectance"] == expected
             assert len(scans.source[len(scans) - 1]) == 1 + expected
-
-    def test_a_later_scan_without_it_is_one_line(self, tmp_path: Path):
-        write_image(tmp_path / "0.npy", 1)
-        write_image(tmp_path / "1.npy", 1, channels=1)
-        with pytest.raises(InputError, match="1.npy has no reflectance and .* the first scan of its set has it"):
-            open_scans(tmp_path, READING).source[1]
 
 
 def test_values_out_of_the_sensor_s_limits_are_dropped_for_a_model_alone(tmp_path: Path):

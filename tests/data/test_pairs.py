@@ -27,7 +27,6 @@ from r2flow.noise import standard_normal
 from r2flow.samplers import build_sampler
 from r2flow.store import Store
 from tests.fields import Field
-from tests.killing import MOMENTS, die_at, was_killed
 
 SHAPE = (2, 4, 8)
 OPTIONS = {
@@ -90,39 +89,6 @@ def test_any_number_of_processes_writes_the_same_bytes(tmp_path: Path, ranks: in
     for rank in reversed(range(ranks)):
         make_pairs(store_in(tmp_path / "many"), grow, rank, ranks)
     assert files(tmp_path / "one") == files(tmp_path / "many")
-
-
-def in_process(folder: Path, rank: int = 0, ranks: int = 1, dies: tuple[int, bool] | None = None) -> int:
-    """make_pairs in a child of its own, which may die at a moment of `die_at`: its process id."""
-    child = os.fork()
-    if child == 0:
-        try:
-            torch.set_num_threads(1)  # a forked OpenMP pool hangs
-            if dies:
-                die_at(*dies)
-            make_pairs(store_in(folder), grow, rank, ranks)
-        finally:
-            os._exit(0)
-    return child
-
-
-def test_processes_at_once_write_the_same_bytes(tmp_path: Path):
-    torch.set_num_threads(1)
-    make_pairs(store_in(tmp_path / "one"), grow)
-    # Two of them are the same process started twice by mistake.
-    children = [in_process(tmp_path / "many", rank, 3) for rank in (0, 1, 2, 2)]
-    for child in children:
-        os.waitpid(child, 0)
-    assert files(tmp_path / "one") == files(tmp_path / "many")
-
-
-def test_killed_again_and_again_the_same_command_ends_alike(tmp_path: Path):
-    torch.set_num_threads(1)
-    make_pairs(store_in(tmp_path / "one"), grow)
-    for dies in MOMENTS[:-1]:
-        assert was_killed(in_process(tmp_path / "killed", dies=dies))
-    make_pairs(store_in(tmp_path / "killed"), grow)
-    assert files(tmp_path / "killed") == files(tmp_path / "one")
 
 
 def test_nothing_is_made_twice(tmp_path: Path):

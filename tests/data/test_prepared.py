@@ -545,12 +545,3 @@ def test_no_flipped_bit_of_the_manifest_goes_unnoticed(clouds: Path, tmp_path: P
     path.unlink()
     with pytest.raises(InputError, match="holds no prepared scans"):
         prepared_in(tmp_path)
-
-
-def test_the_first_scan_decides_whether_there_is_reflectance(tmp_path: Path):
-    """As everywhere. One later scan without it is an error of its own, and takes no channel from the others."""
-    for number in range(20):
-        write_cloud(tmp_path / f"{number:02}.ply", number, None if number == 11 else 255)
-    assert plan_of(tmp_path).recipe["levels"] == 255
-    write_cloud(tmp_path / "00.ply", 0, None)
-    assert plan_of(tmp_path).recipe["levels"] is None

@@ -187,13 +187,6 @@ def test_every_beam_of_a_real_unit_has_its_own_row(shared):
     assert rows(SENSORS["os1_64"]) < 64  # the design's beams miss this unit's: some rows stay empty
 
 
-def test_real_scans_whose_order_was_lost_are_refused_not_guessed(shared):
-    (points,) = real(shared, "kitti360/**/*.bin", 15)
-    shuffled = np.random.default_rng(0).permutation(len(points.xyz))
-    with pytest.raises(InputError, match="beams cannot be told apart"):
-        estimate_sensor([Points(points.xyz[shuffled])])
-
-
 @pytest.mark.parametrize("name", SENSORS)
 def test_the_height_of_simulated_scans_is_found(name):
     """Beams close to the horizon meet more hedges and cars than ground."""

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.errors import InputError
 from r2flow.lidar.projection import image_to_points, project, project_indices, unproject
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -97,26 +96,6 @@ def test_uneven_beams_get_the_row_of_the_nearest_edge_pair():
     just_inside = np.array([point(10, edges[3] - 0.01, 1), point(20, edges[3] + 0.01, -1)])
     rows = np.argwhere(project(just_inside, np.ones(2), sensor)[0] > 0)[:, 0]
     assert sorted(rows) == [2, 3]
-
-
-def test_a_ring_column_in_the_file_gives_the_rows():
-    sensor = SENSORS["hdl32e"].resized(columns=64)
-    image = random_image(sensor)
-    rows, columns = np.nonzero(image[0])
-    shuffled = np.random.default_rng(0).permutation(len(rows))
-    rays = sensor.rays().numpy()
-    r = image[0, rows, columns]
-    e, a = rays[:, rows, columns]
-    xyz = np.stack([r * np.cos(e) * np.cos(a), r * np.cos(e) * np.sin(a), r * np.sin(e)], 1)[shuffled]
-    for ring in (rows, 31 - rows):  # numbered from the top, or from the bottom
-        again = project(xyz, None, sensor, "unfolding", ring=ring[shuffled])
-        np.testing.assert_allclose(again[0], image[0], rtol=1e-5)
-
-
-def test_a_scan_that_does_not_unfold_is_refused():
-    draw = np.random.default_rng(0)
-    with pytest.raises(InputError, match=r"unfolds into \d+ rings, but sensor 'hdl64e' has 64.*spherical"):
-        project(draw.normal(size=(5000, 3)) * 10, None, HDL64E, "unfolding")
 
 
 def reference_rows_and_columns(points):
