@@ -181,24 +181,6 @@ class Store:
     def _lock(self, item: int) -> Path:
         return self.folder / f".{self.kind}-{item:06d}.lock"
 
-    @contextmanager
-    def claim(self, item: int) -> Iterator[bool]:
-        """Hold an item's lock, which ends with this process; False where another process holds it.
-
-        The lock saves work and decides nothing: what two processes write for one item are the same bytes.
-        """
-        path = self._lock(item)
-        lock = FileLock(path, timeout=0)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with suppress(Timeout):
-            lock.acquire()
-        try:
-            yield lock.is_locked
-        finally:
-            if lock.is_locked:
-                path.unlink(missing_ok=True)
-            lock.release()
-
     def make(
         self,
         items: Iterable[int],
@@ -255,11 +237,23 @@ class Store:
             pool.shutdown(cancel_futures=True)
 
     def attempt(self, item: int, work: Callable[[int], None]) -> bool:
-        """Make an item unless it is there; False where another process is making it."""
-        with self.claim(item) as mine:
-            if mine and not self.has(item):
+        """Make an item unless it is there; False where another process is making it.
+
+        The lock ends with its process. It saves work alone: what two processes write for one item are the same bytes.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(self._lock(item), timeout=0)
+        try:
+            lock.acquire()
+        except Timeout:
+            return False
+        try:
+            if not self.has(item):
                 work(item)
-            return mine
+        finally:
+            self._lock(item).unlink(missing_ok=True)
+            lock.release()
+        return True
 
 
 class FileStore(Store):

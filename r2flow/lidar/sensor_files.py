@@ -6,8 +6,8 @@ from pathlib import Path
 import yaml
 
 from r2flow.errors import InputError, naming
-from r2flow.files import atomic_write
-from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
+from r2flow.files import atomic_write, refuse_unreadable
+from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.registry import check_options
 
 ENDINGS = (".yaml", ".yml")
@@ -21,10 +21,7 @@ def read_sensor(path: str | Path, rows: int | None = None, columns: int | None =
         rows, columns: Image size, if not the file's.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path} is not a file. A sensor is a name ({', '.join(SENSORS)}) or a YAML file of your own.")
-    if path.stat().st_size > LARGEST_FILE:
-        raise InputError(f"{path} has {path.stat().st_size} bytes, too many for a sensor's YAML. Is it another file?")
+    refuse_unreadable(path, LARGEST_FILE, "sensor's YAML")
     try:
         options = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: not UTF-8, or a date of month 13
